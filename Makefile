@@ -1,0 +1,64 @@
+# Everything is set up in .venv; 'make demo' and 'make test' set it up themselves.
+
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/ready
+# A photo inside the scikit-image wheel, so that none has to be downloaded.
+PHOTO := .venv/lib/python3*/site-packages/skimage/data/astronaut.png
+
+LLVM_ADVICE := install LLVM 17 or newer and libatomic (as root: Debian, Ubuntu 'apt install \
+libllvm19 libatomic1', Fedora 'dnf install llvm-libs libatomic', macOS 'brew install llvm'), \
+then make again
+VENV_ADVICE := as root, type 'apt install python3-venv', then make again
+
+# Shell function: apt_install PACKAGES ADVICE installs where that is allowed, else says what to do.
+APT_INSTALL := apt_install() { \
+	if [ "$$(id -u)" = 0 ]; then as_root=env; else as_root='sudo -n'; fi; \
+	echo "make setup: installing $$1"; \
+	get="$$as_root apt-get -qq -y -o DPkg::Lock::Timeout=120"; \
+	{ $$get install $$1 || { $$get update && $$get install $$1; }; } </dev/null >/dev/null 2>&1 \
+	|| { echo "make setup: $$2" >&2; exit 1; }; }
+
+.PHONY: help setup demo test test-slow bench clean
+
+help:
+	@echo "make demo       fit a photo; shows PSNR, time and the picture it wrote"
+	@echo "make test       linters, type checker, tests"
+	@echo "make test-slow  the tests that take minutes"
+	@echo "make bench      time the renderer"
+	@echo "make setup      only set up .venv, and libLLVM where none works"
+	@echo "make clean      remove what these made"
+
+setup: $(READY)
+
+$(READY): pyproject.toml
+	@$(APT_INSTALL); $(PYTHON) -c 'import ensurepip' 2>/dev/null \
+		|| apt_install python3-venv "$(VENV_ADVICE)"
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --editable '.[dev]'
+	@$(APT_INSTALL); $(BIN)/eigengs-dr doctor >/dev/null \
+		|| apt_install "libllvm19 libatomic1" "$(LLVM_ADVICE)"
+	$(BIN)/eigengs-dr doctor
+	@touch $@
+
+demo: $(READY)
+	@mkdir -p build/demo
+	$(BIN)/eigengs-dr fit $(PHOTO) -o build/demo/astronaut.npz \
+		--preview build/demo/astronaut.png --report build/demo/astronaut.json
+
+test: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -q
+
+test-slow: $(READY)
+	$(BIN)/python -m pytest -q -m slow
+
+bench: $(READY)
+	@mkdir -p build/bench
+	$(BIN)/eigengs-dr bench kernels --report build/bench/kernels.json
+
+clean:
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

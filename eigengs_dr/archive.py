@@ -1,0 +1,126 @@
+"""Files of arrays: ``.npz`` without pickle, checked before anything is allocated."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from .atomic import replacing
+
+MOST_ENTRIES = 1 << 28
+"""Largest number of elements read for one array: what a file claims is not believed beyond."""
+
+
+class BadValue(ValueError):
+    """Something in a file that does not fit; callers put the name of the file before it."""
+
+
+class Field(NamedTuple):
+    """What an array in a file must be: NumPy kind ("f4", "i8", "U") and number of dimensions."""
+
+    kind: str
+    ndim: int
+
+
+def write(
+    path: str | os.PathLike[str], name: str, version: int, arrays: dict[str, NDArray[Any]]
+) -> None:
+    """Write arrays with the name and version of their format, all or nothing.
+
+    Parameters
+    ----------
+    path : path-like
+    name : str
+        Format, e.g. ``"eigengs_dr.gaussians"``.
+    version : int
+    arrays : dict of str to ndarray
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written; an existing one is then as before.
+    """
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, format=np.array(name), version=np.array(version), **arrays)  # type: ignore[arg-type]
+
+
+def read(
+    path: str | os.PathLike[str], name: str, version: int, layout: dict[str, Field]
+) -> dict[str, NDArray[Any]]:
+    """Read the arrays of `layout` from a file that `write` wrote; the file may be hostile.
+
+    Parameters
+    ----------
+    path : path-like
+    name : str
+        Format expected.
+    version : int
+        Newest version understood.
+    layout : dict of str to Field
+
+    Returns
+    -------
+    dict of str to ndarray
+
+    Raises
+    ------
+    ValueError
+        If the file is no such archive, truncated, of another format or newer, or an array is
+        missing, of another type or larger than it may be. One line: file, key, what was expected.
+    OSError
+        If it cannot be opened.
+    """
+    path = Path(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            found = str(_member(archive, "format", Field("U", 0)))
+            if found != name:
+                raise BadValue(f"format is {found[:40]!r}, expected {name!r}")
+            newest = int(_member(archive, "version", Field("i8", 0)))
+            if not 1 <= newest <= version:
+                raise BadValue(
+                    f"version is {newest}, this package reads up to {version}; upgrade eigengs-dr"
+                )
+            return {key: _member(archive, key, field) for key, field in layout.items()}
+    except BadValue as error:
+        raise ValueError(f"{path}: {error}") from None
+    except (zipfile.BadZipFile, EOFError, ValueError, KeyError, NotImplementedError) as error:
+        raise ValueError(
+            f"{path}: not a readable {name} file ({' '.join(str(error).split())[:80]}); "
+            "it may be damaged or something else"
+        ) from None
+
+
+def _member(archive: zipfile.ZipFile, key: str, field: Field) -> NDArray[Any]:
+    """Read one array after its header was checked."""
+    try:
+        entry = archive.getinfo(f"{key}.npy")
+    except KeyError:
+        raise BadValue(f"key '{key}' is missing") from None
+    with archive.open(entry) as file:
+        major = npy.read_magic(file)  # type: ignore[arg-type]
+        read_header = npy.read_array_header_1_0 if major == (1, 0) else npy.read_array_header_2_0
+        shape, fortran, dtype = read_header(file)  # type: ignore[arg-type]
+        expected = np.dtype(field.kind)
+        fits = dtype.kind == "U" if expected.kind == "U" else dtype == expected
+        if not fits or len(shape) != field.ndim:
+            raise BadValue(
+                f"key '{key}' is {len(shape)}-dimensional {dtype}, "
+                f"expected {field.ndim}-dimensional {expected.name if expected.kind != 'U' else 'text'}"
+            )
+        count = int(np.prod(shape, dtype=object)) if shape else 1
+        if dtype.kind == "U" and dtype.itemsize > 4 * 64:
+            raise BadValue(f"key '{key}' is a text of over 64 characters")
+        if count > MOST_ENTRIES or count * dtype.itemsize > entry.file_size:
+            raise BadValue(f"key '{key}' claims shape {shape}, more than the file holds")
+        data = file.read(count * dtype.itemsize)
+    if len(data) != count * dtype.itemsize:
+        raise BadValue(f"key '{key}' is cut off")
+    order = "F" if fortran else "C"
+    return np.frombuffer(data, dtype).reshape(shape, order=order)  # type: ignore[call-overload]

@@ -1,0 +1,81 @@
+"""The Dr.Jit array types that go together, found from one array."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any, NamedTuple
+
+import drjit as dr
+
+
+class ArrayTypes(NamedTuple):
+    """The types of one backend and one float precision that the splat programs use."""
+
+    Float: Any
+    Int: Any
+    UInt: Any
+    Bool: Any
+    Float2: Any
+    Float3: Any
+    Float4: Any
+    UInt2: Any
+    FloatX: Any
+    Tensor: Any
+    backend: str
+    bits: int
+
+
+def types_of(array: Any) -> ArrayTypes:
+    """Find the types that belong to a Dr.Jit array.
+
+    Parameters
+    ----------
+    array : Dr.Jit array
+        Any floating-point array of a JIT backend with derivatives, e.g. of ``drjit.llvm.ad``.
+
+    Returns
+    -------
+    ArrayTypes
+        Types of the same backend and precision.
+
+    Raises
+    ------
+    TypeError
+        If the array is not a floating-point array of ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
+    """
+    leaf = dr.leaf_t(array)
+    module = leaf.__module__
+    if module not in ("drjit.llvm.ad", "drjit.cuda.ad") or not dr.is_float_v(leaf):
+        raise TypeError(
+            f"expected float arrays of drjit.llvm.ad or drjit.cuda.ad, got {type(array).__module__}."
+            f"{type(array).__name__}"
+        )
+    return _types(module, 64 if dr.type_v(leaf) == dr.VarType.Float64 else 32)
+
+
+def types_in(module: Any) -> ArrayTypes:
+    """Return the single-precision types of ``drjit.llvm.ad`` or ``drjit.cuda.ad``."""
+    return _types(module.__name__, 32)
+
+
+def _types(module: str, bits: int) -> ArrayTypes:
+    names = sys.modules[module]
+    suffix = "64" if bits == 64 else ""
+
+    def of(name: str) -> Any:
+        return getattr(names, name + suffix)
+
+    return ArrayTypes(
+        Float=of("Float"),
+        Int=names.Int32,  # type: ignore[attr-defined]
+        UInt=names.UInt32,  # type: ignore[attr-defined]
+        Bool=names.Bool,  # type: ignore[attr-defined]
+        Float2=of("Array2f"),
+        Float3=of("Array3f"),
+        Float4=of("Array4f"),
+        UInt2=names.Array2u,  # type: ignore[attr-defined]
+        FloatX=of("ArrayXf"),
+        Tensor=of("TensorXf"),
+        backend=module.split(".")[1],
+        bits=bits,
+    )

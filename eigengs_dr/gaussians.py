@@ -1,0 +1,337 @@
+"""A set of 2D Gaussians: its parameters, their bounds, files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import archive
+from .arrays import types_in, types_of
+from .backend import select
+from .color import SPACES
+
+FORMAT = "eigengs_dr.gaussians"
+VERSION = 1
+
+NARROWEST = 0.25
+"""Smallest standard deviation along an axis of the factor, in pixels: what is narrower falls between
+pixel centres, and its gradient with it."""
+
+
+@dataclass
+class Gaussians:
+    """N two-dimensional Gaussians and a constant background: an image of any size.
+
+    ``I(x) = background + sum_n color_n exp(-1/2 |F_n (x - mean_n)|^2)``, ``F = [[a, b], [0, c]]``:
+    the covariance of a splat is ``(F^T F)^-1``, positive definite for any a, c > 0. x points right
+    and y down, and pixel centres are at +0.5.
+
+    A PyTree: `drjit` functions such as `drjit.eval`, `drjit.enable_grad` or `drjit.grad` traverse it.
+
+    Attributes
+    ----------
+    mean : Array2f, shape (2, N)
+        Pixels of the native size.
+    factor : Array3f, shape (3, N)
+        a, b, c in 1 / pixels.
+    color : ArrayXf, shape (C, N)
+        C = 1, 3 or 4 (or any other number) channels; 1 is white.
+    background : ArrayXf, shape (C, 1)
+        Value of every pixel before the splats are added.
+    width, height : int
+        Native size in pixels.
+    space : str
+        What the channels mean, one of `eigengs_dr.color.SPACES`.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg
+    >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
+    >>> len(g), g.channels
+    (1, 1)
+    """
+
+    mean: Any
+    factor: Any
+    color: Any
+    background: Any
+    width: int
+    height: int
+    space: str = "ycbcr"
+
+    @classmethod
+    def from_arrays(
+        cls,
+        mean: ArrayLike,
+        factor: ArrayLike,
+        color: ArrayLike,
+        background: ArrayLike | None = None,
+        *,
+        size: tuple[int, int],
+        space: str = "ycbcr",
+        backend: str | None = None,
+    ) -> Gaussians:
+        """Upload NumPy arrays.
+
+        Parameters
+        ----------
+        mean : array_like, shape (N, 2)
+            x, y in pixels.
+        factor : array_like, shape (N, 3)
+            a, b, c in 1 / pixels.
+        color : array_like, shape (N, C)
+        background : array_like, shape (C,), optional
+            Zero by default.
+        size : (int, int)
+            Native width and height in pixels.
+        space : str, optional
+        backend : {"llvm", "cuda"}, optional
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit each other, a or c is not positive, or a value is not finite.
+        """
+        arrays = {"mean": mean, "factor": factor, "color": color}
+        if background is not None:
+            arrays["background"] = background
+        checked = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
+        checked.setdefault("background", np.zeros(checked["color"].shape[-1], np.float32))
+        try:
+            _check(checked, size, space)
+        except archive.BadValue as error:
+            raise ValueError(f"Gaussians: {error}") from None
+        types = types_in(select(backend))
+        return cls(
+            mean=types.Float2(*_columns(types, checked["mean"])),
+            factor=types.Float3(*_columns(types, checked["factor"])),
+            color=types.FloatX(_columns(types, checked["color"])),
+            background=types.FloatX(_columns(types, checked["background"][None])),
+            width=int(size[0]),
+            height=int(size[1]),
+            space=space,
+        )
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Download mean (N, 2), factor (N, 3), color (N, C) and background (C,) as NumPy arrays."""
+        n = len(self)
+        return {
+            "mean": _rows(self.mean, n),
+            "factor": _rows(self.factor, n),
+            "color": _rows(self.color, n),
+            "background": _rows(self.background, 1)[0],
+        }
+
+    def __len__(self) -> int:
+        """Count the splats."""
+        return max(dr.width(self.mean), dr.width(self.factor), dr.width(self.color))
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return len(self.color)
+
+    def __getitem__(self, index: Any) -> Gaussians:
+        """Select splats by a slice, an integer array or a boolean mask; the background stays.
+
+        Differentiable with respect to the parameters of the splats that are kept.
+        """
+        types = types_of(self.mean)
+        kept = np.atleast_1d(np.arange(len(self), dtype=np.uint32)[index])
+        chosen = types.UInt(kept)
+
+        def pick(rows: Any) -> Any:
+            return type(rows)([dr.gather(types.Float, row, chosen) for row in rows])
+
+        return replace(
+            self, mean=pick(self.mean), factor=pick(self.factor), color=pick(self.color)
+        )
+
+    def scaled(self, width: int, height: int) -> Gaussians:
+        """Return the same picture with another native size, in pixels.
+
+        Raises
+        ------
+        ValueError
+            If a side is not positive.
+        """
+        if width < 1 or height < 1:
+            raise ValueError(f"size {width}x{height}: both sides must be at least 1 pixel")
+        if (width, height) == (self.width, self.height):
+            return self
+        sx, sy = width / self.width, height / self.height
+        types = types_of(self.mean)
+        a, b, c = self.factor
+        return replace(
+            self,
+            mean=types.Float2(self.mean[0] * sx, self.mean[1] * sy),
+            factor=types.Float3(a * (1 / sx), b * (1 / sy), c * (1 / sy)),
+            width=width,
+            height=height,
+        )
+
+    def bounded(self) -> Gaussians:
+        """Return the set with every parameter inside its bounds, whatever a step did to it.
+
+        Means stay in the image, a and c between 1 / (twice the longer side) and 1 / `NARROWEST`, b
+        within +-1 / `NARROWEST`: the inverse covariance then has ``det = (a c)^2 > 0``. Values that
+        are not finite are replaced: a mean by the middle, a factor by the bound, a colour by 0.
+        """
+        types = types_of(self.mean)
+        low, high = 1 / (2 * max(self.width, self.height)), 1 / NARROWEST
+
+        def inside(x: Any, low: float, high: float, otherwise: float) -> Any:
+            return dr.select(dr.isfinite(x), dr.clip(x, low, high), otherwise)
+
+        a, b, c = self.factor
+        return replace(
+            self,
+            mean=types.Float2(
+                inside(self.mean[0], 0.0, float(self.width), 0.5 * self.width),
+                inside(self.mean[1], 0.0, float(self.height), 0.5 * self.height),
+            ),
+            factor=types.Float3(
+                inside(a, low, high, high), inside(b, -high, high, 0.0), inside(c, low, high, high)
+            ),
+            color=dr.select(dr.isfinite(self.color), self.color, 0),
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the set as an ``.npz`` file, all or nothing.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written; an existing one is then as before.
+        """
+        archive.write(
+            path,
+            FORMAT,
+            VERSION,
+            {
+                **self.to_arrays(),
+                "size": np.array([self.width, self.height], np.int64),
+                "space": np.array(self.space),
+            },
+        )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], backend: str | None = None) -> Gaussians:
+        """Read a set that `save` wrote.
+
+        Parameters
+        ----------
+        path : path-like
+        backend : {"llvm", "cuda"}, optional
+
+        Raises
+        ------
+        ValueError
+            If the file is not one of these, is damaged, newer than this package, or holds values
+            that are not finite or do not fit together: one line that names file and key.
+        OSError
+            If it cannot be opened.
+        """
+        path = Path(path)
+        arrays = archive.read(path, FORMAT, VERSION, LAYOUT)
+        try:
+            size = tuple(int(v) for v in arrays.pop("size"))
+            space = str(arrays.pop("space"))
+            _check(arrays, size, space)
+        except archive.BadValue as error:
+            raise ValueError(f"{path}: {error}") from None
+        return cls.from_arrays(**arrays, size=size, space=space, backend=backend)
+
+
+LAYOUT: dict[str, archive.Field] = {
+    "mean": archive.Field("f4", 2),
+    "factor": archive.Field("f4", 2),
+    "color": archive.Field("f4", 2),
+    "background": archive.Field("f4", 1),
+    "size": archive.Field("i8", 1),
+    "space": archive.Field("U", 0),
+}
+"""What a file holds: the kind and the number of dimensions of each array."""
+
+
+def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
+    """Join sets of splats; backgrounds add, so that rendering the result is the sum of renderings.
+
+    Parameters
+    ----------
+    sets : sequence of Gaussians
+        At least one; all of the same native size, space, channels and backend.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or they differ.
+    """
+    if not sets:
+        raise ValueError("concatenate: no sets were given")
+    first = sets[0]
+    kinds = {(g.width, g.height, g.space, g.channels, type(g.mean)) for g in sets}
+    if len(kinds) > 1:
+        raise ValueError(
+            "concatenate: sets differ in size, space, channels or backend; "
+            "bring them to one size with scaled() first"
+        )
+    if len(sets) == 1:
+        return first
+
+    def join(name: str) -> Any:
+        parts = [getattr(g, name) for g in sets]
+        rows = [dr.concat([part[k] for part in parts]) for k in range(len(parts[0]))]
+        return type(parts[0])(*rows) if name != "color" else type(parts[0])(rows)
+
+    return replace(
+        first,
+        mean=join("mean"),
+        factor=join("factor"),
+        color=join("color"),
+        background=sum((g.background for g in sets[1:]), first.background),
+    )
+
+
+def _columns(types: Any, array: NDArray[Any]) -> list:
+    return [types.Float(np.ascontiguousarray(column)) for column in array.T]
+
+
+def _rows(rows: Any, count: int) -> NDArray[Any]:
+    """Stack Dr.Jit rows, some of which may be literals, to a (count, rows) array."""
+    columns = [np.broadcast_to(dr.detach(row).numpy(), count) for row in rows]
+    return np.stack(columns, axis=1)
+
+
+def _check(arrays: dict[str, NDArray[Any]], size: tuple[int, ...], space: str) -> None:
+    """Raise `archive.BadValue` where arrays, size and space do not make a set."""
+    mean, factor, color = arrays["mean"], arrays["factor"], arrays["color"]
+    if mean.ndim != 2 or mean.shape[1] != 2 or len(mean) == 0:
+        raise archive.BadValue(f"mean has shape {mean.shape}, expected (N, 2) with N >= 1")
+    for name, array, expected in (
+        ("factor", factor, (len(mean), 3)),
+        ("color", color, (len(mean), color.shape[-1] if color.ndim == 2 else 3)),
+        ("background", arrays["background"], (color.shape[-1],)),
+    ):
+        if array.shape != expected:
+            raise archive.BadValue(f"{name} has shape {array.shape}, expected {expected}")
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise archive.BadValue(f"{name} holds values that are not finite")
+    if not (factor[:, [0, 2]] > 0).all():
+        raise archive.BadValue("factor has a or c <= 0; both must be positive")
+    if len(size) != 2 or not all(1 <= side <= 1 << 16 for side in size):
+        raise archive.BadValue(f"size is {size}, expected two sides from 1 to 65536")
+    if space not in SPACES:
+        raise archive.BadValue(f"space is {space!r}, expected one of {', '.join(SPACES)}")
+    if space in ("ycbcr", "rgb", "linear") and color.shape[1] not in (1, 3, 4):
+        raise archive.BadValue(f"color has {color.shape[1]} channels; space {space!r} has 1, 3 or 4")
+    if space == "ycbcr" and color.shape[1] != 3:
+        raise archive.BadValue(f"color has {color.shape[1]} channels; space 'ycbcr' has 3")

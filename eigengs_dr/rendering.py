@@ -1,0 +1,212 @@
+"""`render`: Gaussians to an image, differentiable in both modes for every parameter."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from .arrays import ArrayTypes, types_of
+from .color import decode
+from .gaussians import Gaussians
+from .kernels import accumulate, adjoint
+from .splat import UNIT, gather_run, pack
+from .tiles import Grid, TileLists, build_lists
+
+CUTOFF = 3.0
+"""Default cutoff in standard deviations. What is left out of a splat is below ``exp(-cutoff^2 / 2)``
+of its amplitude at any point: 1.1 % at 3, 0.034 % at 4, 3.7e-6 at 5."""
+
+WIDEST_CUTOFF = 12.0
+"""``exp(-72)`` is below the precision of any format here; the fast exponential needs a bound."""
+
+
+def render(
+    gaussians: Gaussians,
+    width: int | None = None,
+    height: int | None = None,
+    cutoff: float = CUTOFF,
+) -> Any:
+    """Render a set of Gaussians at any size.
+
+    Differentiable with respect to mean, factor, color and background, in forward and reverse mode.
+    Sets in YCbCr come out as RGB; nothing is clamped.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    width, height : int, optional
+        Size of the image in pixels; the native size by default. One of the two gives the other by
+        the native aspect ratio.
+    cutoff : float, optional
+        Standard deviations after which a splat ends, up to 12. The error at a point is at most
+        ``exp(-cutoff^2 / 2)`` times the sum of the absolute colours of the splats that are cut off
+        there.
+
+    Returns
+    -------
+    TensorXf, shape (height, width, C)
+        Dr.Jit tensor of the backend and precision of the set; 1 is white.
+
+    Raises
+    ------
+    ValueError
+        If a side is not positive or the cutoff not in (0, 12].
+
+    Notes
+    -----
+    The order of summation is a function of the input: renderings on one machine and backend are
+    bit-equal. A splat with a parameter that is not finite is not drawn.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg
+    >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
+    >>> eg.render(g).shape, eg.render(g, width=16).shape
+    ((8, 8, 1), (16, 16, 1))
+    """
+    width, height = _size(gaussians, width, height)
+    scaled = gaussians.scaled(width, height)
+    values, background = splat_values(scaled)
+    lists = lists_for(scaled, cutoff)
+    return to_tensor(splat(values, background, lists, cutoff), lists.grid, len(background))
+
+
+def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[int, int]:
+    if width is None and height is None:
+        return gaussians.width, gaussians.height
+    if width is None:
+        assert height is not None
+        width = max(1, round(height * gaussians.width / gaussians.height))
+    if height is None:
+        height = max(1, round(width * gaussians.height / gaussians.width))
+    return width, height
+
+
+def splat_values(gaussians: Gaussians) -> tuple[list, list]:
+    """Parameters as the kernels take them: [mean x, mean y, a, b, c in `UNIT`, RGB...], background.
+
+    Colours are decoded here: the conversion is linear, so that N splats are converted, not H W pixels.
+    """
+    black = decode(gaussians.space, [0.0] * gaussians.channels)
+    color = [c - k for c, k in zip(decode(gaussians.space, list(gaussians.color)), black, strict=True)]
+    background = decode(gaussians.space, list(gaussians.background))
+    return [*gaussians.mean, *[f * UNIT for f in gaussians.factor], *color], background
+
+
+def lists_for(gaussians: Gaussians, cutoff: float = CUTOFF, pad: float = 0.0) -> TileLists:
+    """List the splats of every tile of the image at native size; see `eigengs_dr.tiles`.
+
+    Raises
+    ------
+    ValueError
+        If the cutoff is not in (0, 12].
+    """
+    if not 0 < cutoff <= WIDEST_CUTOFF:
+        raise ValueError(f"cutoff is {cutoff}; it must be above 0 and at most {WIDEST_CUTOFF:g}")
+    types = types_of(gaussians.mean)
+    shape = [*gaussians.mean, *[f * UNIT for f in gaussians.factor]]
+    n = len(gaussians)
+    shape = [dr.detach(v) + dr.zeros(types.Float, n) for v in shape]
+    return build_lists(shape, UNIT * cutoff, Grid(gaussians.width, gaussians.height), pad)
+
+
+def splat(values: list, background: list, lists: TileLists, cutoff: float = CUTOFF) -> Any:
+    """Sum splats to an image in tile layout; the differentiable operation behind `render`.
+
+    Parameters
+    ----------
+    values : list of Float, shape (N,)
+        From `splat_values`.
+    background : list of Float, shape (1,)
+    lists : TileLists
+        Of these splats, or of where they were a few small steps ago.
+    cutoff : float, optional
+
+    Returns
+    -------
+    Float, shape (tiles * pixels * channels,)
+        See `eigengs_dr.kernels` for the layout, `to_tensor` for an image.
+    """
+    return dr.custom(_Splat, values, background, lists, UNIT * cutoff)
+
+
+class _Splat(dr.CustomOp):
+    """``I = background + sum_n c_n w_n`` with the kernels' own derivatives.
+
+    With ``w_n = 2^-q_n``, reverse mode gives every splat the sum over its pixels of ``dL/dI`` times
+    the derivative of its contribution; forward mode sums the derivatives of the contributions.
+    """
+
+    def eval(self, values: list, background: list, lists: TileLists, radius: float) -> Any:
+        self.lists, self.radius, self.channels = lists, radius, len(background)
+        self.packed = pack(values)
+        return accumulate(self.packed, background, lists, radius * radius)
+
+    def forward(self) -> None:
+        tangent = pack(self.grad_in("values"))
+        start = self.grad_in("background")
+        self.set_grad_out(
+            accumulate(self.packed, start, self.lists, self.radius * self.radius, tangent)
+        )
+
+    def backward(self) -> None:
+        delta = self.grad_out()
+        gradient = adjoint(self.packed, delta, self.channels, self.lists, self.radius)
+        self.set_grad_in("values", gradient)
+        types, grid = types_of(delta), self.lists.grid
+        tile = dr.arange(types.UInt, grid.tiles)
+        d = gather_run(types, delta, tile, grid.pixels * self.channels, True)
+        totals = [dr.sum(sum(d[c :: self.channels], types.Float(0))) for c in range(self.channels)]
+        self.set_grad_in("background", totals)
+
+
+def to_tensor(image: Any, grid: Grid, channels: int) -> Any:
+    """Bring an image from tile layout to a tensor (height, width, channels); differentiable."""
+    types = types_of(image)
+    shape = (grid.ny * grid.tile[1], grid.nx * grid.tile[0], channels)
+    whole = types.Tensor(dr.custom(_Rows, image, grid, channels), shape)
+    if shape[:2] == (grid.height, grid.width):
+        return whole
+    return whole[: grid.height, : grid.width]
+
+
+class _Rows(dr.CustomOp):
+    """Permute tile layout to rows; its transpose permutes back. One packet copy of a run of pixels."""
+
+    def eval(self, image: Any, grid: Grid, channels: int) -> Any:
+        types = types_of(image)
+        index = dr.arange(types.UInt, grid.nx * grid.ny * grid.tile[1])
+        column, row = index % grid.nx, index // grid.nx
+        tile_row, inner = row // grid.tile[1], row % grid.tile[1]
+        self.by_row = index
+        self.by_tile = (tile_row * grid.nx + column) * grid.tile[1] + inner
+        self.run = grid.tile[0] * channels
+        return self._permute(image, self.by_tile, self.by_row)
+
+    def forward(self) -> None:
+        self.set_grad_out(self._permute(self.grad_in("image"), self.by_tile, self.by_row))
+
+    def backward(self) -> None:
+        self.set_grad_in("image", self._permute(self.grad_out(), self.by_row, self.by_tile))
+
+    def _permute(self, values: Any, source: Any, target: Any) -> Any:
+        types = types_of(values)
+        result = dr.empty(types.Float, self.run * dr.width(source))
+        dr.scatter(result, types.FloatX(gather_run(types, values, source, self.run, True)), target)
+        return result
+
+
+def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid, padding: float = 0.0) -> Any:
+    """Upload an image (height, width, channels) in tile layout, overhanging pixels set to `padding`."""
+    height, width, channels = image.shape
+    tile_width, tile_height = grid.tile
+    padded = np.full(
+        (grid.ny * tile_height, grid.nx * tile_width, channels), padding, dtype=image.dtype
+    )
+    padded[:height, :width] = image
+    tiled = padded.reshape(grid.ny, tile_height, grid.nx, tile_width, channels)
+    flat = np.ascontiguousarray(tiled.transpose(0, 2, 1, 3, 4)).ravel()
+    return dr.copy(types.Float(flat))

@@ -1,0 +1,42 @@
+"""Reports: all figures of a run as JSON, one stable key a figure."""
+
+import json
+import math
+import os
+from typing import Any
+
+from .atomic import replacing
+
+
+def write_report(path: str | os.PathLike[str], figures: dict[str, Any]) -> None:
+    """Write figures as JSON, in one step.
+
+    Parameters
+    ----------
+    path : str or os.PathLike
+        The file to write.
+    figures : dict
+        Strings, numbers (NumPy's too), lists and dictionaries. Infinity and NaN, which JSON does
+        not have, become null: the PSNR of two equal images is one.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written; one that was there is then unchanged.
+    """
+    text = json.dumps(_plain(figures), indent=2, allow_nan=False)
+    with replacing(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    """Turn a value into one that JSON has."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

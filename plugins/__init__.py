@@ -1,0 +1,1 @@
+"""Mitsuba plugins, one file a plugin; imported as ``eigengs_dr.plugins``, never as ``plugins``."""

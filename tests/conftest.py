@@ -1,0 +1,17 @@
+import pytest
+
+from eigengs_dr.backend import BackendError, select
+
+
+def _is_present(backend):
+    try:
+        select(backend)
+    except BackendError:
+        return False
+    return True
+
+
+@pytest.fixture(params=[name for name in ("llvm", "cuda") if _is_present(name)])
+def backend(request):
+    """Name of a backend of this machine: a test that takes it runs once for each."""
+    return request.param

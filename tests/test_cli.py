@@ -1,0 +1,354 @@
+"""The command line: results, reports, and one line and exit code 2 for every mistake."""
+
+import json
+import shutil
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+import eigengs_dr as eg
+from eigengs_dr.backend import BackendError, select
+from eigengs_dr.cli import main
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def succeeded(result):
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def assert_refused(result, *words):
+    """Check that a command ended with exit code 2 and one line that names what went wrong."""
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    assert result.stderr.startswith("eigengs-dr: error: ")
+    assert result.stderr.count("\n") == 1
+    for word in words:
+        assert str(word) in result.stderr
+
+
+def smooth_pixels(width, height, channels=3):
+    """A picture of 8-bit waves."""
+    y, x, c = np.mgrid[:height, :width, :channels]
+    return (127 + 60 * np.sin(x / 5 + c) + 60 * np.cos(y / 7)).astype(np.uint8)
+
+
+@pytest.fixture
+def photo(tmp_path):
+    path = tmp_path / "photo.png"
+    Image.fromarray(smooth_pixels(32, 32)).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """The outputs of one small fit; tests read them only."""
+    folder = tmp_path_factory.mktemp("fitted")
+    Image.fromarray(smooth_pixels(32, 24)).save(folder / "photo.png")
+    outputs = ["-o", folder / "fit.npz", "--report", folder / "fit.json"]
+    settings = ["--gaussians", 50, "--iterations", 5, "--preview", folder / "both.png"]
+    result = succeeded(run("fit", folder / "photo.png", *outputs, *settings))
+    return folder, result
+
+
+def test_fit_says_what_it_did(fitted):
+    folder, result = fitted
+    for word in ("50 Gaussians", "5 iterations", "psnr_ycbcr", "psnr_rgb", folder / "both.png"):
+        assert str(word) in result.stdout
+
+
+def test_fit_report(fitted):
+    folder, _ = fitted
+    report = json.loads((folder / "fit.json").read_text())
+    expected = {"gaussians": 50, "width": 32, "height": 24, "seed": 0, "stopped": "iterations"}
+    assert {key: report[key] for key in expected} == expected
+    assert report["input"] == str(folder / "photo.png")
+    assert report["output"] == str(folder / "fit.npz")
+    assert report["command"].startswith("eigengs-dr fit ")
+    assert "--iterations 5" in report["command"]
+    assert report["backend"] in ("llvm", "cuda")
+    assert report["threads"] >= 1
+    assert report["versions"]["drjit"]
+    assert report["iterations"] == 5
+    assert report["psnr_ycbcr"] > report["psnr_rgb"] > 15
+    assert 0 < report["ssim"] <= 1
+    assert 0 < report["ms_ssim"] <= 1
+    assert 0 <= report["seconds_init"] <= report["seconds"]
+    assert {"iteration", "seconds", "psnr_ycbcr", "psnr_rgb"} <= set(report["trace"][-1])
+
+
+def test_fit_preview_is_photo_beside_fit(fitted):
+    folder, _ = fitted
+    preview = np.asarray(Image.open(folder / "both.png"))
+    assert preview.shape == (24, 64, 3)
+    assert np.array_equal(preview[:, :32], smooth_pixels(32, 24))
+
+
+def test_quiet(photo, tmp_path):
+    result = run(
+        "fit", photo, "-o", tmp_path / "x.npz", "--gaussians", 9, "--iterations", 1, "--quiet"
+    )
+    assert succeeded(result).output == ""
+
+
+def test_fit_uses_at_most_one_gaussian_a_pixel_by_default(tmp_path):
+    Image.fromarray(smooth_pixels(6, 4)).save(tmp_path / "small.png")
+    arguments = ["-o", tmp_path / "x.npz", "--iterations", 0]
+    succeeded(run("fit", tmp_path / "small.png", *arguments))
+    info = json.loads(run("info", tmp_path / "x.npz", "--json").stdout)
+    assert info["gaussians"] == 24
+
+
+def test_fit_several_images_into_folders(photo, tmp_path):
+    other = tmp_path / "other.png"
+    Image.fromarray(smooth_pixels(20, 30)).save(other)
+    settings = ["--gaussians", 20, "--iterations", 1, "--report", tmp_path / "r.json"]
+    folders = ["-o", tmp_path / "fits", "--preview", tmp_path / "previews"]
+    succeeded(run("fit", photo, other, *folders, *settings))
+    assert sorted(path.name for path in (tmp_path / "fits").iterdir()) == ["other.npz", "photo.npz"]
+    assert (tmp_path / "previews" / "other.png").exists()
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert [row["width"] for row in report["images"]] == [32, 20]
+    assert "versions" in report
+
+
+@pytest.mark.parametrize(
+    ("options", "size"),
+    [([], (32, 24)), (["--scale", "2"], (64, 48)), (["--size", "10x7"], (10, 7))],
+)
+def test_render_sizes(fitted, tmp_path, options, size):
+    folder, _ = fitted
+    succeeded(run("render", folder / "fit.npz", "-o", tmp_path / "y.png", *options))
+    assert Image.open(tmp_path / "y.png").size == size
+
+
+def test_render_is_what_was_fitted(fitted, tmp_path):
+    folder, _ = fitted
+    succeeded(run("render", folder / "fit.npz", "-o", tmp_path / "y.png"))
+    fit = np.asarray(Image.open(folder / "both.png")).astype(int)[:, 32:]
+    assert np.abs(fit - np.asarray(Image.open(tmp_path / "y.png"))).max() <= 1
+
+
+def test_info(fitted):
+    folder, _ = fitted
+    found = json.loads(succeeded(run("info", folder / "fit.npz", "--json")).stdout)
+    expected = {"gaussians": 50, "width": 32, "height": 24, "channels": 3, "space": "ycbcr"}
+    assert {key: found[key] for key in expected} == expected
+    assert "gaussians  50" in run("info", folder / "fit.npz").stdout
+
+
+def test_doctor():
+    text = succeeded(run("doctor")).stdout
+    assert "llvm" in text
+    assert "libLLVM" in text
+    found = json.loads(run("doctor", "--json").stdout)
+    assert found["llvm"]["works"] or found["cuda"]["works"]
+
+
+@pytest.mark.parametrize("command", [[], ["fit"], ["render"], ["info"], ["doctor"], ["bench"]])
+def test_help_has_an_example(command):
+    text = succeeded(run(*command, "--help")).stdout
+    assert "Example" in text
+    assert "eigengs-dr " + " ".join(command) in text
+
+
+SMALL_IMAGES = {
+    "one-pixel": lambda: Image.fromarray(smooth_pixels(1, 1)),
+    "one-row": lambda: Image.fromarray(smooth_pixels(17, 1)),
+    "one-column": lambda: Image.fromarray(smooth_pixels(1, 17)),
+    "grey": lambda: Image.fromarray(smooth_pixels(20, 12, 1)[..., 0]),
+    "16-bit": lambda: Image.fromarray(smooth_pixels(20, 12, 1)[..., 0].astype(np.uint16) * 257),
+    "palette": lambda: Image.fromarray(smooth_pixels(20, 12)).quantize(16),
+    "constant": lambda: Image.new("RGB", (20, 12), (10, 200, 90)),
+    "black": lambda: Image.new("RGB", (20, 12)),
+}
+
+
+@pytest.mark.parametrize("kind", SMALL_IMAGES)
+def test_unusual_images_fit(kind, tmp_path):
+    SMALL_IMAGES[kind]().save(tmp_path / "x.png")
+    fits_without_nan(tmp_path / "x.png", notes=0)
+
+
+def test_cmyk_fits(tmp_path):
+    Image.fromarray(smooth_pixels(20, 12)).convert("CMYK").save(tmp_path / "x.jpg")
+    fits_without_nan(tmp_path / "x.jpg", notes=0)
+
+
+def test_alpha_fits_with_a_note(tmp_path):
+    Image.fromarray(smooth_pixels(20, 12, 4), "RGBA").save(tmp_path / "x.png")
+    assert "white" in fits_without_nan(tmp_path / "x.png", notes=1)
+
+
+def test_animated_fits_with_a_note(tmp_path):
+    first, second = (Image.fromarray(smooth_pixels(20, n)) for n in (12, 12))
+    second.putpixel((0, 0), (0, 0, 0))
+    first.save(tmp_path / "x.gif", save_all=True, append_images=[second])
+    assert "2 frames" in fits_without_nan(tmp_path / "x.gif", notes=1)
+
+
+def fits_without_nan(path, notes):
+    """Fit an image in a few iterations; return what was said on standard error."""
+    output, report = path.parent / "out.npz", path.parent / "out.json"
+    result = succeeded(run("fit", path, "-o", output, "--iterations", 3, "--report", report))
+    assert result.stderr.count("\n") == result.stderr.count("eigengs-dr: note: ") == notes
+    figures = json.loads(report.read_text())
+    # Null stands for infinity, which equal images have.
+    assert figures["psnr_rgb"] is None or figures["psnr_rgb"] > 5
+    with np.load(output, allow_pickle=False) as file:
+        arrays = [file[key] for key in file.files]
+    assert all(np.isfinite(array).all() for array in arrays if array.dtype.kind == "f")
+    return result.stderr
+
+
+@pytest.fixture
+def existing(tmp_path):
+    """An output file of an earlier run, which a refused run has to leave as it is."""
+    path = tmp_path / "existing.npz"
+    path.write_bytes(b"earlier")
+    before = sorted(tmp_path.iterdir())
+    yield path
+    assert path.read_bytes() == b"earlier"
+    assert set(before) <= set(tmp_path.iterdir())
+
+
+def test_missing_image(tmp_path, existing):
+    assert_refused(run("fit", tmp_path / "gone.png", "-o", existing), "gone.png")
+
+
+def test_folder_as_image(tmp_path, existing):
+    assert_refused(run("fit", tmp_path, "-o", existing), tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"this is text, not a picture\n"])
+def test_file_that_is_no_image(tmp_path, existing, content):
+    (tmp_path / "x.png").write_bytes(content)
+    assert_refused(run("fit", tmp_path / "x.png", "-o", existing), "x.png")
+
+
+def test_truncated_image(photo, existing):
+    photo.write_bytes(photo.read_bytes()[:300])
+    assert_refused(run("fit", photo, "-o", existing), photo)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "word"),
+    [
+        ("--gaussians", 0, "gaussians"),
+        ("--gaussians", -5, "gaussians"),
+        ("--gaussians", "many", "gaussians"),
+        ("--gaussians", 1025, "1025"),
+        ("--iterations", -1, "iterations"),
+        ("--init", "nowhere", "init"),
+        ("--seed", -1, "seed"),
+    ],
+)
+def test_bad_settings(photo, existing, option, value, word):
+    assert_refused(run("fit", photo, "-o", existing, option, value), word)
+
+
+def test_cuda_without_gpu(photo, existing):
+    try:
+        select("cuda")
+    except BackendError:
+        assert_refused(run("fit", photo, "-o", existing, "--backend", "cuda"), "CUDA", "llvm")
+    else:
+        pytest.skip("this machine has a GPU")
+
+
+def test_unwritable_outputs(photo, existing, tmp_path, monkeypatch):
+    monkeypatch.setattr(eg, "fit", lambda *_, **__: pytest.fail("the work was started"))
+    gone = tmp_path / "gone"
+    assert_refused(run("fit", photo, "-o", gone / "x.npz"), gone)
+    assert_refused(run("fit", photo, "-o", photo / "x.npz"), photo)
+    assert_refused(run("fit", photo, "-o", existing, "--report", gone / "r.json"), gone)
+    assert_refused(run("fit", photo, "-o", existing, "--report", tmp_path), tmp_path)
+    assert_refused(run("fit", photo, "-o", existing, "--preview", gone / "p.png"), gone)
+
+
+def test_outputs_of_the_wrong_kind(photo, existing, tmp_path):
+    assert_refused(run("fit", photo, "-o", tmp_path / "x.png"), "x.png", ".npz")
+    assert_refused(run("fit", photo, "-o", existing, "--preview", tmp_path / "p.txt"), ".png")
+
+
+def test_outputs_that_would_overwrite_each_other(photo, existing, tmp_path):
+    assert_refused(run("fit", photo, "-o", existing, "--report", existing), existing)
+    pixels = photo.read_bytes()
+    assert_refused(run("fit", photo, "-o", existing, "--preview", photo), photo)
+    assert photo.read_bytes() == pixels
+    (tmp_path / "sub").mkdir()
+    shutil.copy(photo, tmp_path / "sub" / "photo.png")
+    assert_refused(
+        run("fit", photo, tmp_path / "sub" / "photo.png", "-o", tmp_path / "out"), "name"
+    )
+
+
+def test_several_images_into_a_file(photo, existing):
+    assert_refused(run("fit", photo, photo, "-o", existing), existing, "folder")
+
+
+@pytest.mark.parametrize("keep", [0, 10, 0.5, 0.95])
+def test_truncated_model(fitted, existing, tmp_path, keep):
+    folder, _ = fitted
+    content = (folder / "fit.npz").read_bytes()
+    model = tmp_path / "cut.npz"
+    model.write_bytes(content[: keep if isinstance(keep, int) else int(keep * len(content))])
+    assert_refused(run("info", model), "cut.npz")
+    assert_refused(run("render", model, "-o", tmp_path / "y.png"), "cut.npz")
+    assert not (tmp_path / "y.png").exists()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--scale", "2", "--size", "10x10"],
+        ["--scale", "0"],
+        ["--scale", "-1"],
+        ["--scale", "nan"],
+        ["--scale", "inf"],
+        ["--scale", "1e9"],
+        ["--size", "10"],
+        ["--size", "0x10"],
+        ["--size", "10x-1"],
+        ["--size", "99999999999x10"],
+    ],
+)
+def test_bad_render_sizes(fitted, tmp_path, options):
+    folder, _ = fitted
+    assert_refused(run("render", folder / "fit.npz", "-o", tmp_path / "y.png", *options))
+    assert not (tmp_path / "y.png").exists()
+
+
+def test_interrupted_fit_is_kept(photo, tmp_path, monkeypatch):
+    complete = eg.fit
+
+    def interrupted(*arguments, **settings):
+        result = complete(*arguments, **settings)
+        names = ("gaussians", "trace", "image", "seconds", "seconds_init", "iterations")
+        fields = {name: getattr(result, name) for name in names}
+        return SimpleNamespace(**fields, stopped="interrupted")
+
+    monkeypatch.setattr(eg, "fit", interrupted)
+    settings = ["--gaussians", 20, "--iterations", 1, "--report", tmp_path / "r.json"]
+    result = run("fit", photo, "-o", tmp_path / "x.npz", *settings)
+    assert result.exit_code == 130
+    assert result.stderr.count("\n") == 1
+    assert "interrupted" in result.stderr
+    assert json.loads((tmp_path / "r.json").read_text())["stopped"] == "interrupted"
+    assert succeeded(run("info", tmp_path / "x.npz"))
+
+
+def test_interrupted_before_there_is_a_fit(photo, existing, monkeypatch):
+    def interrupted(*arguments, **settings):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(eg, "fit", interrupted)
+    result = run("fit", photo, "-o", existing)
+    assert result.exit_code == 130
+    assert result.stderr.strip() == "eigengs-dr: interrupted"

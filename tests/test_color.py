@@ -1,0 +1,95 @@
+"""Colour spaces against scikit-image, and the same formula on NumPy and Dr.Jit arrays."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from skimage.color import rgb2ycbcr
+
+from eigengs_dr.color import SPACES, YCBCR_OFFSET, decode, rgb_to_ycbcr, ycbcr_to_rgb
+
+PRECISION = {np.float32: 2e-6, np.float64: 1e-14}
+
+images = hnp.arrays(
+    np.float64,
+    hnp.array_shapes(min_dims=0, max_dims=2, max_side=4).map(lambda shape: (*shape, 3)),
+    elements=st.floats(-2, 2),
+)
+
+
+@pytest.mark.parametrize("dtype", PRECISION)
+def test_equals_scikit_image(dtype):
+    image = np.random.default_rng(0).random((7, 5, 3)).astype(dtype)
+    result = rgb_to_ycbcr(image)
+    assert result.dtype == dtype
+    np.testing.assert_allclose(result, rgb2ycbcr(image) / 255, atol=PRECISION[dtype])
+
+
+def test_known_colours_of_bt601():
+    colours = {
+        (0, 0, 0): (16, 128, 128),
+        (1, 1, 1): (235, 128, 128),
+        (1, 0, 0): (81.481, 90.203, 240),
+        (0, 1, 0): (144.553, 53.797, 34.214),
+        (0, 0, 1): (40.966, 240, 109.786),
+    }
+    rgb = np.array(list(colours), np.float64)
+    expected = np.array(list(colours.values())) / 255
+    np.testing.assert_allclose(rgb_to_ycbcr(rgb), expected, atol=1e-12)
+
+
+@given(images)
+def test_round_trip(image):
+    for dtype, precision in PRECISION.items():
+        result = ycbcr_to_rgb(rgb_to_ycbcr(image.astype(dtype)))
+        assert result.dtype == dtype
+        np.testing.assert_allclose(result, image, atol=10 * precision)
+
+
+@pytest.mark.parametrize("convert", [rgb_to_ycbcr, ycbcr_to_rgb])
+def test_refuses_what_would_be_misread(convert):
+    with pytest.raises(ValueError, match="uint8"):
+        convert(np.zeros((2, 2, 3), np.uint8))
+    for shape in ((), (2, 2), (2, 2, 4)):
+        with pytest.raises(ValueError, match="shape"):
+            convert(np.zeros(shape))
+
+
+@pytest.mark.parametrize("dtype", PRECISION)
+def test_decode_equals_the_image_conversion(dtype):
+    image = np.random.default_rng(1).random((4, 6, 3)).astype(dtype)
+    channels = decode("ycbcr", [image[..., i] for i in range(3)])
+    assert all(channel.dtype == dtype for channel in channels)
+    np.testing.assert_allclose(
+        np.stack(channels, axis=-1), ycbcr_to_rgb(image), atol=5 * PRECISION[dtype]
+    )
+
+
+def test_decode_leaves_other_spaces_alone():
+    channels = [np.zeros(2), np.ones(2), np.ones(2), np.zeros(2)]
+    for space in SPACES:
+        if space != "ycbcr":
+            assert decode(space, channels) == channels
+            assert decode(space, channels[:1]) == channels[:1]
+
+
+def test_decode_errors_say_what_to_do():
+    with pytest.raises(ValueError, match="use one of ycbcr, rgb, linear, data"):
+        decode("hsv", [np.zeros(1)] * 3)
+    with pytest.raises(ValueError, match="needs 3 channels, not 1"):
+        decode("ycbcr", [np.zeros(1)])
+
+
+def test_decode_is_differentiable_and_stays_float32_in_drjit():
+    dr = pytest.importorskip("drjit")
+    from drjit.auto.ad import Float
+
+    y, cb, cr = (Float(value) for value in YCBCR_OFFSET)
+    dr.enable_grad(cr)
+    red, green, blue = decode("ycbcr", [y, cb, cr])
+    assert type(red) is Float
+    np.testing.assert_allclose([red[0], green[0], blue[0]], 0, atol=1e-6)
+    dr.backward(red)
+    # One step of Cr is worth 255/224 * 2 * (1 - 0.299) of red: the BT.601 decoding matrix.
+    assert dr.grad(cr)[0] == pytest.approx(2 * (1 - 0.299) * 255 / 224, rel=1e-4)

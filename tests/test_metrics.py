@@ -1,0 +1,185 @@
+"""Metrics against closed forms, scikit-image and slow computations written another way."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.signal import correlate2d
+from skimage import color, metrics
+
+from eigengs_dr.metrics import ms_ssim, psnr, ssim
+
+SIZES = [(1, 1), (1, 9), (2, 3), (10, 11), (12, 40), (23, 22), (45, 50)]
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def picture(rng, height=48, width=48):
+    """Make a smooth random picture, whose contrast survives averaging."""
+    y, x = np.mgrid[:height, :width][..., None] / 9
+    waves = 2 * np.pi * rng.random((3, 3))
+    return 0.5 + 0.3 * np.sin(x * waves[0] + y * waves[1] + waves[2])
+
+
+def noisy(rng, image, sigma):
+    return image + sigma * rng.standard_normal(image.shape)
+
+
+def test_psnr_of_a_uniform_error(rng):
+    image = rng.integers(0, 200, (6, 5, 3)) / 255
+    assert psnr(image, image + 10 / 255) == pytest.approx(20 * math.log10(255 / 10))
+    # Grey moves Y alone, by 219/255: a third of the channels carry the error.
+    expected = 20 * math.log10(255 / 10) + 20 * math.log10(255 / 219) + 10 * math.log10(3)
+    assert psnr(image, image + 10 / 255, space="ycbcr") == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("space", ["rgb", "ycbcr"])
+def test_psnr_of_equal_images_is_infinite(rng, space):
+    image = rng.random((3, 4, 3))
+    assert psnr(image, image, space=space) == math.inf
+
+
+def test_psnr_rgb_sees_eight_bits_only():
+    black = np.zeros((2, 2, 3))
+    assert psnr(black, black - 5) == math.inf
+    assert psnr(black, black + 0.49 / 255) == math.inf
+    assert psnr(black, black + 0.51 / 255) == pytest.approx(20 * math.log10(255))
+    assert math.isfinite(psnr(black, black - 5, space="ycbcr"))
+
+
+def test_psnr_equals_scikit_image(rng):
+    a, b = rng.random((9, 7, 3)), rng.random((9, 7, 3))
+    bytes_a, bytes_b = (np.rint(255 * image).astype(np.uint8) for image in (a, b))
+    assert psnr(a, b) == pytest.approx(metrics.peak_signal_noise_ratio(bytes_a, bytes_b))
+    ycbcr_a, ycbcr_b = (color.rgb2ycbcr(image) / 255 for image in (a, b))
+    expected = metrics.peak_signal_noise_ratio(ycbcr_a, ycbcr_b, data_range=1)
+    assert psnr(a, b, space="ycbcr") == pytest.approx(expected)
+
+
+def test_psnr_reads_higher_in_ycbcr(rng):
+    image = np.full((64, 64, 3), 0.5)
+    white = noisy(rng, image, 0.05)
+    assert psnr(image, white, "ycbcr") - psnr(image, white) == pytest.approx(4.94, abs=0.1)
+    grey = image + 0.05 * rng.standard_normal((64, 64, 1))
+    assert psnr(image, grey, "ycbcr") - psnr(image, grey) == pytest.approx(6.09, abs=0.02)
+
+
+def test_psnr_of_nan_is_nan():
+    image = np.zeros((2, 2, 3))
+    broken = np.where(np.eye(2)[..., None] > 0, np.nan, image)
+    assert math.isnan(psnr(image, broken)) and math.isnan(psnr(image, broken, "ycbcr"))
+
+
+def test_ssim_equals_its_definition(rng):
+    a = picture(rng, 20, 17)
+    b = np.clip(noisy(rng, a, 0.05), 0, 1)
+    window = gaussian_window(11)
+    expected = [np.mean(similarity_maps(a[..., i], b[..., i], window)[0]) for i in range(3)]
+    assert ssim(a, b) == pytest.approx(np.mean(expected), abs=1e-12)
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("metric", [ssim, ms_ssim])
+def test_similarity_of_any_size(rng, metric, size):
+    a, b = rng.random((*size, 3)), rng.random((*size, 3))
+    assert metric(a, a) == pytest.approx(1, abs=1e-12)
+    assert metric(a, b) < 1
+    assert metric(a, b) == pytest.approx(metric(b, a), abs=1e-12)
+
+
+@pytest.mark.parametrize("metric", [ssim, ms_ssim])
+def test_similarity_falls_with_noise(rng, metric):
+    image = picture(rng)
+    noise = rng.standard_normal(image.shape)
+    values = [metric(image, image + sigma * noise) for sigma in (0, 0.02, 0.05, 0.1, 0.2)]
+    assert values == sorted(values, reverse=True) and len(set(values)) == len(values)
+
+
+def test_ssim_of_constant_images_is_the_luminance_term():
+    a, b = np.full((16, 16, 3), 0.2), np.full((16, 16, 3), 0.6)
+    expected = (2 * 0.2 * 0.6 + 1e-4) / (0.2**2 + 0.6**2 + 1e-4)
+    assert ssim(a, b) == pytest.approx(expected, abs=1e-9)
+    assert ssim(a[:1, :1], b[:1, :1]) == pytest.approx(expected, abs=1e-9)
+
+
+def test_ssim_sees_clamped_images():
+    a = np.zeros((12, 12, 3))
+    assert ssim(a, a - 3) == ssim(a + 1, a + 4) == 1
+
+
+@pytest.mark.parametrize(
+    ("size", "scales"), [((11, 12), 1), ((22, 30), 2), ((45, 47), 3), ((176, 180), 5)]
+)
+def test_ms_ssim_equals_its_definition(rng, size, scales):
+    a = picture(rng, *size)
+    b = noisy(rng, a, 0.1)
+    assert ms_ssim(a, b) == pytest.approx(slow_ms_ssim(a, b, scales), abs=1e-12)
+
+
+def test_ms_ssim_takes_negative_correlation_as_zero(rng):
+    image = picture(rng)
+    assert ms_ssim(image, 1 - image) == 0
+
+
+def test_ms_ssim_forgives_fine_noise_more_than_ssim(rng):
+    image = picture(rng, 176, 176)
+    fine = noisy(rng, image, 0.1)
+    assert ms_ssim(image, fine) > ssim(image, fine)
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim, ms_ssim])
+def test_refuses_images_that_do_not_fit(metric):
+    image = np.zeros((4, 4, 3))
+    with pytest.raises(ValueError, match=r"shapes \(4, 4, 3\) and \(4, 5, 3\)"):
+        metric(image, np.zeros((4, 5, 3)))
+    for shape in ((4, 4), (4, 4, 1), (0, 4, 3)):
+        with pytest.raises(ValueError, match="expected"):
+            metric(np.zeros(shape), np.zeros(shape))
+
+
+def test_refuses_an_unknown_space():
+    with pytest.raises(ValueError, match="use 'rgb' or 'ycbcr'"):
+        psnr(np.zeros((1, 1, 3)), np.zeros((1, 1, 3)), space="lab")
+
+
+def gaussian_window(size):
+    """Make the two-dimensional window in one go, where the package filters rows, then columns."""
+    y, x = np.mgrid[:size, :size] - size // 2
+    window = np.exp(-(x**2 + y**2) / (2 * 1.5**2))
+    return window / window.sum()
+
+
+def similarity_maps(x, y, window):
+    """SSIM and its contrast-structure term at every pixel, by the formulas of the 2004 paper."""
+
+    def mean(image):
+        return correlate2d(image, window, mode="valid")
+
+    mean_x, mean_y = mean(x), mean(y)
+    luminance = (2 * mean_x * mean_y + 0.01**2) / (mean_x**2 + mean_y**2 + 0.01**2)
+    covariance = mean(x * y) - mean_x * mean_y
+    variances = mean(x * x) - mean_x**2 + mean(y * y) - mean_y**2
+    structure = (2 * covariance + 0.03**2) / (variances + 0.03**2)
+    return luminance * structure, structure
+
+
+def slow_ms_ssim(a, b, scales):
+    weights = np.array([0.0448, 0.2856, 0.3001, 0.2363, 0.1333])
+    weights = weights[:scales] / weights[:scales].sum() * weights.sum()
+    values = []
+    for channel in range(3):
+        x, y = (color.rgb2ycbcr(image)[..., channel] / 255 for image in (a, b))
+        value = 1.0
+        for scale, weight in enumerate(weights):
+            whole, structure = similarity_maps(x, y, gaussian_window(11))
+            term = whole if scale == scales - 1 else structure
+            value *= max(term.mean(), 0) ** weight
+            rows, columns = x.shape[0] // 2 * 2, x.shape[1] // 2 * 2
+            x, y = (
+                sum(z[i:rows:2, j:columns:2] for i in (0, 1) for j in (0, 1)) / 4 for z in (x, y)
+            )
+        values.append(value)
+    return np.mean(values)

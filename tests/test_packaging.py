@@ -1,0 +1,53 @@
+"""The plugins are installed inside the package, from a wheel and from an editable install.
+
+Needs the package to be installed, as ``make setup`` does.
+"""
+
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+
+FIND = """
+import importlib.util, sys
+sys.path[:0] = sys.argv[1:]
+import eigengs_dr.plugins
+print(eigengs_dr.plugins.__file__)
+print(importlib.util.find_spec("plugins"))
+"""
+
+
+def find_plugins(folder, *paths):
+    """Where the plugins are found from another folder, and whether they are top-level too."""
+    command = [sys.executable, "-c", FIND, *map(str, paths)]
+    process = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    return process.stdout.splitlines()
+
+
+def test_installed(tmp_path):
+    where, top_level = find_plugins(tmp_path)
+    assert Path(where).parent.name == "plugins"
+    assert top_level == "None"
+
+
+def test_wheel(tmp_path):
+    # A copy, because building leaves files behind.
+    source = tmp_path / "source"
+    hidden = shutil.ignore_patterns(".*", "build", "*.egg-info")
+    shutil.copytree(ROOT, source, ignore=hidden)
+    build = ["pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", str(tmp_path)]
+    subprocess.run([sys.executable, "-m", *build, str(source)], check=True)
+    [wheel] = tmp_path.glob("*.whl")
+
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"eigengs_dr"}
+    modules = {path.relative_to(ROOT).as_posix() for path in ROOT.glob("eigengs_dr/**/*.py")}
+    plugins = {
+        "eigengs_dr/" + path.relative_to(ROOT).as_posix() for path in ROOT.glob("plugins/*.py")
+    }
+    assert modules | plugins <= set(names)
+    assert find_plugins(tmp_path, wheel) == [str(wheel / "eigengs_dr/plugins/__init__.py"), "None"]
