@@ -1,21 +1,27 @@
 """EigenGS for Dr.Jit and Mitsuba: images as sums of differentiable 2D Gaussians.
 
-Importing the package starts no backend and sets no Mitsuba variant.
+Importing the package starts no backend and sets no Mitsuba variant: what it offers is imported when
+it is first used, because Dr.Jit loads libLLVM while it is imported.
 """
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from .backend import BackendError, prepare
 
-prepare()  # before anything imports Dr.Jit, which looks for libLLVM once
-
-from .gaussians import Gaussians, concatenate  # noqa: E402
-from .images import load_image, sample, save_image  # noqa: E402
-from .metrics import ms_ssim, psnr, ssim  # noqa: E402
-from .rendering import render  # noqa: E402
+if TYPE_CHECKING:
+    from .fitting import Fit, fit
+    from .gaussians import Gaussians, concatenate
+    from .images import load_image, sample, save_image
+    from .metrics import ms_ssim, psnr, ssim
+    from .rendering import render
 
 __all__ = [
     "BackendError",
+    "Fit",
     "Gaussians",
     "concatenate",
+    "fit",
     "load_image",
     "ms_ssim",
     "psnr",
@@ -26,3 +32,22 @@ __all__ = [
 ]
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "fitting": ("Fit", "fit"),
+    "gaussians": ("Gaussians", "concatenate"),
+    "images": ("load_image", "sample", "save_image"),
+    "metrics": ("ms_ssim", "psnr", "ssim"),
+    "rendering": ("render",),
+}
+
+prepare()  # before anything imports Dr.Jit, which looks for libLLVM once
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first asked for."""
+    for module, names in _HOMES.items():
+        if name in names:
+            value = globals()[name] = getattr(import_module(f".{module}", __name__), name)
+            return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

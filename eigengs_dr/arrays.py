@@ -6,6 +6,8 @@ import sys
 from typing import Any, NamedTuple
 
 import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
 
 
 class ArrayTypes(NamedTuple):
@@ -79,3 +81,26 @@ def _types(module: str, bits: int) -> ArrayTypes:
         backend=module.split(".")[1],
         bits=bits,
     )
+
+
+def upload(kind: Any, values: NDArray[Any]) -> Any:
+    """Copy a flat NumPy array into memory that Dr.Jit owns.
+
+    ``kind(values)`` may keep NumPy's memory, which is aligned by luck: packet gathers from it are
+    replaced by single ones, 10 times slower, and a frozen function is traced again.
+
+    Parameters
+    ----------
+    kind : type
+        Dr.Jit array type, e.g. ``drjit.llvm.ad.Float``.
+    values : ndarray, shape (n,)
+
+    Returns
+    -------
+    Dr.Jit array of type `kind`, evaluated
+    """
+    target = dr.empty(kind, len(values))
+    index = dr.arange(dr.uint32_array_t(kind), len(values))
+    dr.scatter(target, kind(np.ascontiguousarray(values)), index)
+    dr.eval(target)
+    return target

@@ -139,7 +139,7 @@ def render(
     select(backend)
     import eigengs_dr as eg
 
-    gaussians = eg.Gaussians.load(file)
+    gaussians = eg.Gaussians.load(file, backend=backend)
     width, height = _render_size(gaussians.width, gaussians.height, scale, size)
     eg.save_image(output, eg.render(gaussians, width=width, height=height).numpy())
 

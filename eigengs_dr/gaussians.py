@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import archive
-from .arrays import types_in, types_of
+from .arrays import types_in, types_of, upload
 from .backend import select
 from .color import SPACES
 
@@ -301,7 +301,7 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
 
 
 def _columns(types: Any, array: NDArray[Any]) -> list:
-    return [types.Float(np.ascontiguousarray(column)) for column in array.T]
+    return [upload(types.Float, column) for column in array.T]
 
 
 def _rows(rows: Any, count: int) -> NDArray[Any]:

@@ -13,8 +13,8 @@ from typing import Any
 import drjit as dr
 
 from .arrays import ArrayTypes, types_of
-from .splat import SHAPE, gather_run, unpack, weights
-from .tiles import TileLists, walk
+from .splat import SHAPE, gather_run, unpack, weights, weights_pullback
+from .tiles import Grid, TileLists, walk
 
 # ---------------------------------------------------------------------------------------------
 #  Sum over splats, one lane a tile
@@ -129,25 +129,21 @@ def adjoint(
         d = gather_run(types, delta, types.UInt(tile), length, active)
         x = types.Float(column * grid.tile[0]) + 0.5
         y = types.Float(row * grid.tile[1]) + 0.5
-        if color_only:
-            w = weights(splat[:SHAPE], x, y, grid.tile, limit)
+        color = sums[-channels:]
+
+        def pull(k: int, w: Any) -> Any:
+            g = type(w)(0)
             for c in range(channels):
-                for k in range(grid.pixels):
-                    sums[c] = dr.fma(w[k], d[k * channels + c], sums[c])
-            return sums
-        with dr.resume_grad():
-            p = [types.Float(v) for v in splat]
-            dr.enable_grad(p)
-            loss = types.Float(0)
-            w = weights(p[:SHAPE], x, y, grid.tile, limit)
-            for k in range(grid.pixels):
-                value = p[SHAPE] * d[k * channels]
-                for c in range(1, channels):
-                    value = dr.fma(p[SHAPE + c], d[k * channels + c], value)
-                loss = dr.fma(w[k], value, loss)
-            dr.backward_from(loss)
-            gradient = dr.grad(p)
-        return [s + g for s, g in zip(sums, gradient, strict=True)]
+                color[c] = dr.fma(w, d[k * channels + c], color[c])
+                g = dr.fma(splat[SHAPE + c], d[k * channels + c], g)
+            return g
+
+        if color_only:
+            for k, w in enumerate(weights(splat[:SHAPE], x, y, grid.tile, limit)):
+                pull(k, w)
+            return color
+        gradient = weights_pullback(splat[:SHAPE], x, y, grid.tile, limit, pull)
+        return [s + g for s, g in zip(sums, gradient, strict=False)] + color
 
     number = channels if color_only else SHAPE + channels
     sums = walk(
@@ -168,6 +164,14 @@ def _restore_order(types: ArrayTypes, sums: list, order: Any) -> list:
     packed = dr.empty(types.Float, stride * count)
     dr.scatter(packed, types.FloatX([*sums, *[types.Float(0)] * (stride - number)]), order)
     return unpack(packed, dr.arange(types.UInt, count), number)
+
+
+def channel_sums(image: Any, channels: int, grid: Grid) -> list:
+    """Sum every channel of an image in tile layout: a list of `channels` arrays of one element."""
+    types = types_of(image)
+    tile = dr.arange(types.UInt, grid.tiles)
+    values = gather_run(types, image, tile, grid.pixels * channels, True)
+    return [dr.sum(sum(values[c::channels], types.Float(0))) for c in range(channels)]
 
 
 def _list_entry(types: ArrayTypes, splat: Any, i: Any, active: Any) -> Any:

@@ -8,10 +8,10 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import ArrayTypes, types_of
+from .arrays import ArrayTypes, types_of, upload
 from .color import decode
 from .gaussians import Gaussians
-from .kernels import accumulate, adjoint
+from .kernels import accumulate, adjoint, channel_sums
 from .splat import UNIT, gather_run, pack
 from .tiles import Grid, TileLists, build_lists
 
@@ -156,11 +156,7 @@ class _Splat(dr.CustomOp):
         delta = self.grad_out()
         gradient = adjoint(self.packed, delta, self.channels, self.lists, self.radius)
         self.set_grad_in("values", gradient)
-        types, grid = types_of(delta), self.lists.grid
-        tile = dr.arange(types.UInt, grid.tiles)
-        d = gather_run(types, delta, tile, grid.pixels * self.channels, True)
-        totals = [dr.sum(sum(d[c :: self.channels], types.Float(0))) for c in range(self.channels)]
-        self.set_grad_in("background", totals)
+        self.set_grad_in("background", channel_sums(delta, self.channels, self.lists.grid))
 
 
 def to_tensor(image: Any, grid: Grid, channels: int) -> Any:
@@ -208,5 +204,5 @@ def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid, padding: float 
     )
     padded[:height, :width] = image
     tiled = padded.reshape(grid.ny, tile_height, grid.nx, tile_width, channels)
-    flat = np.ascontiguousarray(tiled.transpose(0, 2, 1, 3, 4)).ravel()
-    return dr.copy(types.Float(flat))
+    flat = tiled.transpose(0, 2, 1, 3, 4).reshape(-1)
+    return upload(types.Float, flat)

@@ -7,6 +7,7 @@ has the weight ``exp(-1/2 |F (x - mu)|^2)`` at x, and 0 where ``|F (x - mu)| > c
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -81,18 +82,73 @@ def weights(shape: list, x: Any, y: Any, tile: tuple[int, int], limit: float) ->
         Weights in [0, 1], row after row. Cost: one `exp2_neg`, a comparison and 2 or 3 more
         operations a point.
     """
+    return [
+        falloff(dr.fma(u, u, v * v), limit) for us, v in _rows(shape, x, y, tile) for u in us
+    ]
+
+
+def _rows(shape: list, x: Any, y: Any, tile: tuple[int, int]) -> list[tuple[list, Any]]:
+    """``F (x - mu) = (u, v)`` at a block of pixels: for every row its u's and its one v."""
     mean_x, mean_y, a, b, c = shape
     dx, dy = x - mean_x, y - mean_y
     u0, v0 = dr.fma(a, dx, b * dy), c * dy
-    result = []
+    rows = []
     for j in range(tile[1]):
-        u_row = dr.fma(b, float(j), u0) if j else u0
+        u = dr.fma(b, float(j), u0) if j else u0
         v = dr.fma(c, float(j), v0) if j else v0
-        v2 = v * v
-        for i in range(tile[0]):
-            u = dr.fma(a, float(i), u_row) if i else u_row
-            result.append(falloff(dr.fma(u, u, v2), limit))
-    return result
+        rows.append(([dr.fma(a, float(i), u) if i else u for i in range(tile[0])], v))
+    return rows
+
+
+def weights_pullback(
+    shape: list, x: Any, y: Any, tile: tuple[int, int], limit: float, pull: Callable[[int, Any], Any]
+) -> list:
+    """Gradient of ``sum_k g_k w_k`` with respect to the shape, where ``g_k = pull(k, w_k)``.
+
+    Derived by hand beside `weights`, which a test compares it with, because it halves the adjoint:
+    with ``e = -2 ln(2) g w``, ``du = e u`` and ``dv = e v``, and (i, j) the place in the block,
+    ``da = sum du (dx + i)``, ``db = sum du (dy + j)``, ``dc = sum dv (dy + j)`` and
+    ``d mu = -(a sum du, b sum du + c sum dv)``.
+
+    Parameters
+    ----------
+    shape, x, y, tile, limit
+        As in `weights`.
+    pull : callable
+        ``pull(k, w)`` receives the weight of the k-th point and returns the derivative of the loss
+        with respect to it.
+
+    Returns
+    -------
+    list of 5 Float
+        Derivatives with respect to mean x, mean y, a, b, c.
+    """
+    mean_x, mean_y, a, b, c = shape
+    du = dui = duj = dv = dvj = type(mean_x)(0)
+    for j, (us, v) in enumerate(_rows(shape, x, y, tile)):
+        e_row = u_row = type(mean_x)(0)
+        for i, u in enumerate(us):
+            w = falloff(dr.fma(u, u, v * v), limit)
+            e = w * pull(j * tile[0] + i, w)
+            e_row = e_row + e
+            u_row = dr.fma(e, u, u_row)
+            if i:
+                dui = dr.fma(e * u, float(i), dui)
+        dv_row = e_row * v
+        du, dv = du + u_row, dv + dv_row
+        if j:
+            duj, dvj = dr.fma(u_row, float(j), duj), dr.fma(dv_row, float(j), dvj)
+    dx, dy = x - mean_x, y - mean_y
+    return [
+        k * (-2 * LN2)
+        for k in (
+            -a * du,
+            -dr.fma(b, du, c * dv),
+            dr.fma(dx, du, dui),
+            dr.fma(dy, du, duj),
+            dr.fma(dy, dv, dvj),
+        )
+    ]
 
 
 def pack(values: list) -> Any:

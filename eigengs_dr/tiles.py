@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .arrays import ArrayTypes, types_of
+from .arrays import ArrayTypes, types_of, upload
 
 TILE = (4, 4)
 """Width and height of a tile in pixels. Measured on 2 cores with AVX-512: 4x4 holds the sums of 16
@@ -58,7 +58,7 @@ class TileLists:
     ----------
     grid : Grid
     splat : UInt32, shape (entries,)
-        Indices of splats, tile after tile; padded to one of a few lengths.
+        Indices of splats, tile after tile; padded to a power of two.
     begin, end : UInt32, shape (tiles,)
         Where the list of the tile `order[i]` lies in `splat`.
     order : UInt32, shape (tiles,)
@@ -248,9 +248,9 @@ def _lists(
     starts = types.UInt(
         dr.binary_search(0, entries, lambda i: dr.gather(type(keys), keys, types.UInt(i)) < needle)
     )
-    # Few distinct sizes, so that frozen programs are seldom traced again; even, to be read in pairs.
-    step = max(2, 1 << entries.bit_length() - 4) if entries >= 16 else 2
-    splat = dr.zeros(types.UInt, (entries // step + 1) * step)
+    # A power of two: few distinct sizes, so that frozen programs are seldom traced again; and even,
+    # to be read in pairs.
+    splat = dr.zeros(types.UInt, 2 << entries.bit_length())
     dr.scatter(splat, types.UInt(keys % count), dr.arange(types.UInt, len(keys)))
     dr.eval(starts, splat)
     begin = dr.gather(types.UInt, starts, dr.arange(types.UInt, grid.tiles))
@@ -276,5 +276,5 @@ def _descending(length: Any) -> Any:
 def _sorted(keys: Any) -> Any:
     """Sort integers; NumPy's vectorised sort is 7 times as fast as `drjit.sort` on the CPU."""
     if dr.backend_v(keys) == dr.JitBackend.LLVM:
-        return type(keys)(np.sort(keys.numpy()))
+        return upload(type(keys), np.sort(keys.numpy()))
     return dr.sort(keys)

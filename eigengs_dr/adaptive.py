@@ -1,0 +1,2 @@
+"""placeholder"""
+from .place import grid as adaptive

@@ -1,0 +1,106 @@
+"""The variables that an optimiser moves, and the Gaussians they stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import drjit as dr
+
+from .arrays import types_of
+from .gaussians import Gaussians
+
+
+class Coordinates(NamedTuple):
+    """A change of variables, differentiable by Dr.Jit.
+
+    Attributes
+    ----------
+    of : callable
+        ``of(gaussians) -> dict`` of named arrays.
+    to : callable
+        ``to(fixed, variables) -> Gaussians``; what is not among the variables is taken from `fixed`.
+    bounded : callable
+        ``bounded(fixed, variables) -> dict``: the variables, moved where a step left their bounds.
+    """
+
+    of: Callable[[Gaussians], dict[str, Any]]
+    to: Callable[[Gaussians, dict[str, Any]], Gaussians]
+    bounded: Callable[[Gaussians, dict[str, Any]], dict[str, Any]]
+
+
+# ---------------------------------------------------------------------------------------------
+#  The parameters as they are
+# ---------------------------------------------------------------------------------------------
+
+
+def _natural_of(g: Gaussians) -> dict[str, Any]:
+    return {"mean": g.mean, "factor": g.factor, "color": g.color, "background": g.background}
+
+
+def _natural_to(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
+    return replace(fixed, **variables)
+
+
+def _natural_bounded(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, Any]:
+    bounded = replace(fixed, **variables).bounded()
+    return {name: getattr(bounded, name) for name in variables}
+
+
+NATURAL = Coordinates(_natural_of, _natural_to, _natural_bounded)
+"""Mean, factor, colour and background themselves."""
+
+
+# ---------------------------------------------------------------------------------------------
+#  Those of GaussianImage (Zhang et al., ECCV 2024)
+# ---------------------------------------------------------------------------------------------
+
+CHOLESKY_BOUND = 0.5
+"""Added to the diagonal of the Cholesky factor, in pixels: no splat is narrower."""
+
+
+def _cholesky_of(g: Gaussians) -> dict[str, Any]:
+    types = types_of(g.mean)
+    x, y = g.mean
+    a, b, c = g.factor
+    # Sigma = F^-1 F^-T = [[1 / a^2 + b^2 / (a c)^2, -b / (a c^2)], [., 1 / c^2]] = L L^T
+    l1 = dr.sqrt(dr.square(1 / a) + dr.square(b / (a * c)))
+    l2 = -b / (a * c * c * l1)
+    l3 = 1 / (a * c * l1)
+    return {
+        "mean": types.Float2(_atanh(2 * x / g.width - 1), _atanh(2 * y / g.height - 1)),
+        "cholesky": types.Float3(l1 - CHOLESKY_BOUND, l2, l3 - CHOLESKY_BOUND),
+        "color": g.color,
+    }
+
+
+def _atanh(x: Any) -> Any:
+    return dr.atanh(dr.clip(x, -0.999999, 0.999999))
+
+
+def _cholesky_to(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
+    types = types_of(fixed.mean)
+    x, y = variables["mean"]
+    l1, l2, l3 = variables["cholesky"]
+    l1, l3 = l1 + CHOLESKY_BOUND, l3 + CHOLESKY_BOUND
+    # Sigma = [[l1^2, l1 l2], [l1 l2, l2^2 + l3^2]]; F as in `eigengs_dr.place.inverse_factor`.
+    yy = dr.square(l2) + dr.square(l3)
+    c = dr.rsqrt(yy)
+    a = dr.sqrt(yy) / dr.abs(l1 * l3)
+    return replace(
+        fixed,
+        mean=types.Float2(
+            (dr.tanh(x) + 1) * (0.5 * fixed.width), (dr.tanh(y) + 1) * (0.5 * fixed.height)
+        ),
+        factor=types.Float3(a, -l1 * l2 / yy * a, c),
+        color=variables["color"],
+    )
+
+
+def _cholesky_bounded(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, Any]:
+    return variables
+
+
+CHOLESKY = Coordinates(_cholesky_of, _cholesky_to, _cholesky_bounded)
+"""atanh of the mean in [-1, 1], Cholesky factor of the covariance in pixels, colour."""

@@ -1,0 +1,221 @@
+"""Refinement: gradient descent on all parameters of one image's Gaussians."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from .arrays import types_of
+from .coordinates import NATURAL, Coordinates
+from .gaussians import Gaussians
+from .metrics import psnr
+from .rendering import CUTOFF, lists_for, render, splat, to_tiles
+from .splat import UNIT
+from .tiles import Grid, TileLists
+
+Progress = Callable[[int, int, dict[str, Any]], None]
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How an image is refined; the numbers of a preset.
+
+    Attributes
+    ----------
+    optimizer : callable
+        ``optimizer(lr) -> drjit.opt.Optimizer``.
+    rates : dict of str to float
+        Learning rate of every coordinate at the start; in `NATURAL` coordinates of mean (pixels),
+        factor (1 / pixels) and color (1 is white). What has no rate stays as it is.
+    coordinates : Coordinates
+        The variables that the optimiser moves.
+    decay : float
+        What is left of the rates at the end, along half a cosine.
+    rebuild : int
+        Steps between two builds of the tile lists.
+    pad : float
+        Pixels by which splats are enlarged when lists are built, so that they last `rebuild` steps.
+    patience : int
+        Stop when this many steps gained less than `least_gain`.
+    least_gain : float
+        Decibels.
+    """
+
+    optimizer: Callable[[float], Any]
+    rates: dict[str, float]
+    coordinates: Coordinates = NATURAL
+    decay: float = 0.03
+    rebuild: int = 8
+    pad: float = 1.0
+    patience: int = 300
+    least_gain: float = 0.01
+
+
+class Refined(NamedTuple):
+    """Result of `refine`.
+
+    Attributes
+    ----------
+    gaussians : Gaussians
+        The best set that a row of the trace saw, by psnr_ycbcr.
+    trace : list of dict
+        Rows with iteration, seconds, psnr_ycbcr, psnr_rgb.
+    iterations : int
+        Steps taken.
+    stopped : str
+        "iterations", "plateau" or "interrupted".
+    """
+
+    gaussians: Gaussians
+    trace: list[dict[str, Any]]
+    iterations: int
+    stopped: str
+
+
+def refine(
+    gaussians: Gaussians,
+    target: NDArray[np.float32],
+    image: NDArray[np.float32],
+    schedule: Schedule,
+    iterations: int,
+    *,
+    cutoff: float = CUTOFF,
+    started: float | None = None,
+    progress: Progress | None = None,
+) -> Refined:
+    """Minimise the squared error over all parameters.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Where to start.
+    target : ndarray of float32, shape (H, W, C)
+        The image in the space of the set, at its native size.
+    image : ndarray of float32, shape (H, W, 3)
+        The image in RGB, for the trace.
+    schedule : Schedule
+    iterations : int
+        Most steps to take.
+    cutoff : float, optional
+        See `eigengs_dr.render`.
+    started : float, optional
+        `time.perf_counter()` from which the seconds of the trace count; now by default.
+    progress : callable, optional
+        ``progress(iteration, iterations, row)`` after every row of the trace.
+
+    Returns
+    -------
+    Refined
+        Never worse than the start; Ctrl-C ends the loop and returns the best so far.
+    """
+    started = time.perf_counter() if started is None else started
+    marks, trace = rows_at(iterations), list[dict[str, Any]]()
+    best, highest = gaussians, -math.inf
+    stopped, step = "iterations", 0
+    try:
+        for step, current in enumerate(descend(gaussians, target, schedule, iterations, cutoff)):
+            if step not in marks:
+                continue
+            row = _row(current, image, step, started, cutoff)
+            trace.append(row)
+            if row["psnr_ycbcr"] > highest:
+                best, highest = current, row["psnr_ycbcr"]
+            if progress:
+                progress(step, iterations, row)
+            if _is_plateau(trace, schedule):
+                stopped = "plateau"
+                break
+    except KeyboardInterrupt:
+        stopped = "interrupted"
+    return Refined(dr.detach(best), trace, step, stopped)
+
+
+def descend(
+    gaussians: Gaussians,
+    target: NDArray[np.float32],
+    schedule: Schedule,
+    iterations: int,
+    cutoff: float = CUTOFF,
+) -> Iterator[Gaussians]:
+    """Yield the set before the first step and after every step of gradient descent.
+
+    Parameters are those of `refine`. Steps run asynchronously: what is yielded may not be computed
+    yet. Between two builds the tile lists are of where the splats were, enlarged by `schedule.pad`.
+    """
+    types = types_of(gaussians.mean)
+    coordinates = schedule.coordinates
+    start = coordinates.of(gaussians)
+    optimizer = schedule.optimizer(1.0)
+    optimizer.update({name: start[name] for name in schedule.rates})
+    current = gaussians
+    grid = Grid(gaussians.width, gaussians.height)
+    tiles = to_tiles(types, target, grid)
+    inside = to_tiles(types, np.ones_like(target), grid)
+    yield current
+    for step in range(iterations):
+        if step % schedule.rebuild == 0:
+            lists = lists_for(current, cutoff, schedule.pad)
+        along = 0.5 * (1 + math.cos(math.pi * step / iterations))
+        left = schedule.decay + (1 - schedule.decay) * along
+        optimizer.set_learning_rate(
+            {name: dr.opaque(types.Float, rate * left) for name, rate in schedule.rates.items()}
+        )
+        _step(optimizer, gaussians, tiles, inside, lists, coordinates, cutoff)
+        current = coordinates.to(gaussians, dict(optimizer))
+        yield current
+
+
+@dr.freeze
+def _step(
+    optimizer: Any,
+    fixed: Gaussians,
+    target: Any,
+    inside: Any,
+    lists: TileLists,
+    coordinates: Coordinates,
+    cutoff: float,
+) -> None:
+    """One step on the mean squared error; parameters are brought back inside their bounds."""
+    current = coordinates.to(fixed, dict(optimizer))
+    values = [*current.mean, *[f * UNIT for f in current.factor], *current.color]
+    rendered = splat(values, list(current.background), lists, cutoff)
+    loss = dr.mean(dr.square((rendered - target) * inside))
+    dr.backward(loss)
+    optimizer.step(eval=False)
+    optimizer.update(coordinates.bounded(fixed, dict(optimizer)))
+
+
+def _row(
+    gaussians: Gaussians,
+    image: NDArray[np.float32],
+    iteration: int,
+    started: float,
+    cutoff: float,
+) -> dict[str, Any]:
+    rendered = render(dr.detach(gaussians), cutoff=cutoff).numpy()
+    return {
+        "iteration": iteration,
+        "seconds": time.perf_counter() - started,
+        "psnr_ycbcr": psnr(rendered, image, space="ycbcr"),
+        "psnr_rgb": psnr(rendered, image, space="rgb"),
+    }
+
+
+def _is_plateau(trace: list[dict[str, Any]], schedule: Schedule) -> bool:
+    """Tell whether the last `patience` steps gained less than `least_gain` decibels."""
+    last = trace[-1]
+    old = [r for r in trace if r["iteration"] <= last["iteration"] - schedule.patience]
+    return bool(old) and last["psnr_ycbcr"] - old[-1]["psnr_ycbcr"] < schedule.least_gain
+
+
+def rows_at(iterations: int) -> set[int]:
+    """Steps after which the trace has a row: 0, 10, 20, 50, 100, then every 100, and the last."""
+    marks = {0, 10, 20, 50, iterations} | set(range(100, iterations, 100))
+    return {m for m in marks if m <= iterations}
