@@ -1,2 +1,185 @@
-"""placeholder"""
-from .place import grid as adaptive
+"""Splats placed and shaped by the image: many, small and stretched where it bends the most.
+
+A Gaussian follows an image where that is nearly linear; what it misses is the second derivative. So
+the density of splats follows the squared Hessian (`bending`), their centres cut a space-filling
+curve into pieces of equal mass and take one Lloyd step, and each is stretched along the direction
+that bends the least. The constants were chosen on training images of faces and of ImageNet classes
+by the error after 10 steps of the colour solve.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .place import inverse_factor
+
+Array = NDArray[np.floating]
+
+BLUR = 0.18
+"""Standard deviation, in splat spacings, of what no splat can follow."""
+
+POOL = 0.14
+"""Over how many spacings the bending is averaged for the density."""
+
+ALIGN = 0.4
+"""Over how many spacings it is averaged for the direction."""
+
+NOISE = 0.2
+"""Change of slope across a spacing that counts as noise, without direction; the pixels' unit."""
+
+POWER = 2 / 3
+"""Density is the squared Hessian to this power."""
+
+SIZE = 0.7
+"""Geometric mean of both standard deviations over ``1 / sqrt(density)``."""
+
+STRETCH = 3.0
+"""Ratio of the standard deviations along and across a straight edge."""
+
+
+def adaptive(
+    image: Array, count: int, generator: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Place and shape splats by the second derivatives of an image.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W, C)
+        In the space whose squared error counts.
+    count : int
+        Number of splats, from 1 to H W.
+    generator : numpy.random.Generator
+        Not used: the result is a function of the image.
+
+    Returns
+    -------
+    mean : ndarray, shape (count, 2)
+        In pixels, centres at +0.5.
+    factor : ndarray, shape (count, 3)
+        a, b, c in 1 / pixels; see `eigengs_dr.Gaussians`.
+    """
+    height, width = image.shape[:2]
+    spacing = float(np.sqrt(height * width / count))
+    bend = bending(image, spacing)
+    density = density_of(bend, spacing, count)
+    mean = relaxed(pieces(density, count), density)
+    return mean, factors(mean, density, bend, spacing)
+
+
+def bending(image: Array, spacing: float) -> NDArray[np.float32]:
+    """Squared Hessian ``sum_c H_c H_c`` of a blurred image plus isotropic noise.
+
+    Returns
+    -------
+    ndarray of float32, shape (3, H, W)
+        Its entries xx, yy and xy.
+    """
+    from scipy.ndimage import correlate1d, gaussian_filter
+
+    channels = np.moveaxis(image, 2, 0).astype(np.float32)
+    channels = gaussian_filter(channels, (0, BLUR * spacing, BLUR * spacing))
+    slope, bend = [-0.5, 0.0, 0.5], [1.0, -2.0, 1.0]
+    xx = correlate1d(channels, bend, axis=2, mode="nearest")
+    yy = correlate1d(channels, bend, axis=1, mode="nearest")
+    xy = correlate1d(correlate1d(channels, slope, 2, mode="nearest"), slope, 1, mode="nearest")
+    noise = (NOISE / spacing**2) ** 2 / 2
+    squared = np.stack([xx * xx + xy * xy, yy * yy + xy * xy, xy * (xx + yy)]).sum(axis=1)
+    return squared + np.float32([noise, noise, 0])[:, None, None]
+
+
+def density_of(bend: Array, spacing: float, count: int) -> NDArray[np.float64]:
+    """Splats a pixel, shape (H, W): they sum to `count`, and no pixel has more than one."""
+    from scipy.ndimage import gaussian_filter
+
+    density = gaussian_filter(bend[0] + bend[1], POOL * spacing).astype(np.float64) ** POWER
+    for _ in range(5):  # what is cut off above goes to the rest
+        density = np.minimum(density * (count / density.sum()), 1.0)
+    return density
+
+
+def pieces(density: Array, count: int) -> NDArray[np.float64]:
+    """Cut a Hilbert curve through the pixels into pieces of equal mass.
+
+    Returns
+    -------
+    ndarray, shape (count, 2)
+        Their centroids, in the order of the curve: neighbours in memory are neighbours in space.
+    """
+    height, width = density.shape
+    order = hilbert_order(height, width)
+    mass = density.ravel()[order]
+    total = np.concatenate([[0.0], np.cumsum(mass)])
+    cuts = np.linspace(0, total[-1], count + 1)
+
+    def centroid(position: Array) -> Array:
+        moment = np.concatenate([[0.0], np.cumsum(mass * position)])
+        return np.diff(np.interp(cuts, total, moment)) * (count / total[-1])
+
+    return np.stack([centroid(order % width + 0.5), centroid(order // width + 0.5)], axis=1)
+
+
+def hilbert_order(height: int, width: int) -> NDArray[np.int64]:
+    """Pixel indices ``row * width + column`` in the order of a Hilbert curve over the image.
+
+    The curve over the next power of two is followed, and what lies outside the image left out.
+    """
+    y, x = (v.ravel() for v in np.indices((height, width), dtype=np.int32))
+    key = np.zeros(x.shape, np.int64)
+    side = 1 << max(height - 1, width - 1).bit_length()
+    while side > 1:
+        side >>= 1
+        right, low = (x & side) > 0, (y & side) > 0
+        key = 4 * key + ((3 * right) ^ low)
+        x, y = x & (side - 1), y & (side - 1)
+        mirror, swap = right & ~low, ~low
+        x, y = np.where(mirror, side - 1 - x, x), np.where(mirror, side - 1 - y, y)
+        x, y = np.where(swap, y, x), np.where(swap, x, y)
+    return np.argsort(key)
+
+
+def relaxed(mean: Array, density: Array) -> NDArray[np.float64]:
+    """One Lloyd step: each centre moves to the centroid of the pixels nearest to it."""
+    from scipy.ndimage import distance_transform_edt
+
+    height, width = density.shape
+    count = len(mean)
+    column, row = _pixels(mean, density.shape)
+    owner = np.full(height * width, -1)
+    owner[row * width + column] = np.arange(count)  # of several in one pixel only the last moves
+    y, x = distance_transform_edt(
+        (owner < 0).reshape(height, width), return_distances=False, return_indices=True
+    )
+    owner = owner[(y * width + x).ravel()]
+    rows, columns = np.indices((height, width)).reshape(2, -1)
+    mass = np.bincount(owner, density.ravel(), count)
+    moment = [np.bincount(owner, density.ravel() * (v + 0.5), count) for v in (columns, rows)]
+    moves = mass > 0
+    result = np.array(mean, np.float64)
+    result[moves] = np.stack(moment, axis=1)[moves] / mass[moves, None]
+    return result
+
+
+def factors(mean: Array, density: Array, bend: Array, spacing: float) -> NDArray[np.float64]:
+    """Shape the splats: size by the density, ratio and angle of the axes by the bending."""
+    from scipy.ndimage import gaussian_filter
+
+    column, row = _pixels(mean, density.shape)
+    xx, yy, xy = (gaussian_filter(b, ALIGN * spacing)[row, column].astype(float) for b in bend)
+    split = np.hypot(xx - yy, 2 * xy)
+    ratio = 1 + (STRETCH - 1) * split / (xx + yy)
+    variance = SIZE**2 / density[row, column]
+    along, across = variance * ratio, variance / ratio
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the direction that bends the most
+    cos, sin = np.cos(angle), np.sin(angle)
+    return inverse_factor(
+        across * cos**2 + along * sin**2,
+        (across - along) * cos * sin,
+        across * sin**2 + along * cos**2,
+    )
+
+
+def _pixels(mean: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
+    """Columns and rows of the pixels that centres lie in."""
+    column = np.clip(mean[:, 0].astype(int), 0, shape[1] - 1)
+    return column, np.clip(mean[:, 1].astype(int), 0, shape[0] - 1)

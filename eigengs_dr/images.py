@@ -170,8 +170,11 @@ def save_image(path: str | Path, image: ArrayLike) -> None:
         with replacing(path) as temporary:
             Image.fromarray(pixels).save(temporary, **SAVE_OPTIONS[suffix])
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ImageError(f"{path}: cannot be written ({reason}); choose another path") from error
+        message = str(error)
+        if not message.startswith(f"{path}: "):  # what replacing() refuses, it explains itself
+            reason = getattr(error, "strerror", None) or message
+            message = f"{path}: cannot be written ({reason}); choose another path"
+        raise ImageError(message) from error
 
 
 def to_8bit(image: NDArray[Any]) -> NDArray[Any]:

@@ -343,9 +343,9 @@ def test_unwritable_targets(tmp_path):
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "file").write_bytes(b"")
     for target in ("folder.png", "nowhere/a.png", "file/a.png"):
-        with pytest.raises(ImageError, match="cannot be written") as error:
+        with pytest.raises(ImageError, match=r"cannot be written|is a folder") as error:
             save_image(tmp_path / target, BYTES)
-        one_line(error)
+        assert one_line(error).count("choose another path") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
 
 
