@@ -9,10 +9,10 @@ from drjit.opt import Optimizer
 
 
 class Adan(Optimizer):
-    """Adan of Xie et al., "Adan: Adaptive Nesterov Momentum Algorithm" (2022), without weight decay.
+    """Adan of Xie et al., "Adan: Adaptive Nesterov Momentum Algorithm" (2022), no weight decay.
 
-    With the gradient g, its change ``d_t = g_t - g_{t-1}`` (0 in the first step) and the factors beta
-    of the three moving averages::
+    With the gradient g, its change ``d_t = g_t - g_{t-1}`` (0 in the first step) and the factors
+    beta of three moving averages::
 
         m_t = beta_1 m_{t-1} + (1 - beta_1) g_t
         v_t = beta_2 v_{t-1} + (1 - beta_2) d_t

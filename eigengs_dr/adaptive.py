@@ -85,7 +85,7 @@ def bending(image: Array, spacing: float) -> NDArray[np.float32]:
     xy = correlate1d(correlate1d(channels, slope, 2, mode="nearest"), slope, 1, mode="nearest")
     noise = (NOISE / spacing**2) ** 2 / 2
     squared = np.stack([xx * xx + xy * xy, yy * yy + xy * xy, xy * (xx + yy)]).sum(axis=1)
-    return squared + np.float32([noise, noise, 0])[:, None, None]
+    return squared + np.array([noise, noise, 0], np.float32)[:, None, None]
 
 
 def density_of(bend: Array, spacing: float, count: int) -> NDArray[np.float64]:

@@ -47,7 +47,8 @@ def write(
         If the file cannot be written; an existing one is then as before.
     """
     with replacing(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, format=np.array(name), version=np.array(version), **arrays)  # type: ignore[arg-type]
+        members: dict[str, Any] = {"format": np.array(name), "version": np.array(version), **arrays}
+        np.savez_compressed(file, **members)
 
 
 def read(
@@ -104,15 +105,16 @@ def _member(archive: zipfile.ZipFile, key: str, field: Field) -> NDArray[Any]:
     except KeyError:
         raise BadValue(f"key '{key}' is missing") from None
     with archive.open(entry) as file:
-        major = npy.read_magic(file)  # type: ignore[arg-type]
+        major = npy.read_magic(file)
         read_header = npy.read_array_header_1_0 if major == (1, 0) else npy.read_array_header_2_0
-        shape, fortran, dtype = read_header(file)  # type: ignore[arg-type]
+        shape, fortran, dtype = read_header(file)
         expected = np.dtype(field.kind)
         fits = dtype.kind == "U" if expected.kind == "U" else dtype == expected
         if not fits or len(shape) != field.ndim:
+            kind = "text" if expected.kind == "U" else expected.name
             raise BadValue(
                 f"key '{key}' is {len(shape)}-dimensional {dtype}, "
-                f"expected {field.ndim}-dimensional {expected.name if expected.kind != 'U' else 'text'}"
+                f"expected {field.ndim}-dimensional {kind}"
             )
         count = int(np.prod(shape, dtype=object)) if shape else 1
         if dtype.kind == "U" and dtype.itemsize > 4 * 64:

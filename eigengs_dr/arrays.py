@@ -49,8 +49,8 @@ def types_of(array: Any) -> ArrayTypes:
     module = leaf.__module__
     if module not in ("drjit.llvm.ad", "drjit.cuda.ad") or not dr.is_float_v(leaf):
         raise TypeError(
-            f"expected float arrays of drjit.llvm.ad or drjit.cuda.ad, got {type(array).__module__}."
-            f"{type(array).__name__}"
+            "expected float arrays of drjit.llvm.ad or drjit.cuda.ad, "
+            f"got {type(array).__module__}.{type(array).__name__}"
         )
     return _types(module, 64 if dr.type_v(leaf) == dr.VarType.Float64 else 32)
 
@@ -69,13 +69,13 @@ def _types(module: str, bits: int) -> ArrayTypes:
 
     return ArrayTypes(
         Float=of("Float"),
-        Int=names.Int32,  # type: ignore[attr-defined]
-        UInt=names.UInt32,  # type: ignore[attr-defined]
-        Bool=names.Bool,  # type: ignore[attr-defined]
+        Int=names.Int32,
+        UInt=names.UInt32,
+        Bool=names.Bool,
         Float2=of("Array2f"),
         Float3=of("Array3f"),
         Float4=of("Array4f"),
-        UInt2=names.Array2u,  # type: ignore[attr-defined]
+        UInt2=names.Array2u,
         FloatX=of("ArrayXf"),
         Tensor=of("TensorXf"),
         backend=module.split(".")[1],

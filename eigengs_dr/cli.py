@@ -202,11 +202,22 @@ def bench() -> None:
 
 
 @bench.command()
+@click.option(
+    "--image",
+    type=EXISTING,
+    help="What is refined, 512x512 or larger; by default a photo of scikit-image.",
+)
 @backend_option
 @report_option
 @quiet_option
 @click.pass_context
-def kernels(context: click.Context, backend: str | None, report: Path | None, quiet: bool) -> None:
+def kernels(
+    context: click.Context,
+    image: Path | None,
+    backend: str | None,
+    report: Path | None,
+    quiet: bool,
+) -> None:
     """Time the renderer and its derivatives against plain Dr.Jit and the machine's peak.
 
     \b
@@ -215,10 +226,13 @@ def kernels(context: click.Context, backend: str | None, report: Path | None, qu
     """
     check_outputs([report], [])
     select(backend)
+    import eigengs_dr as eg
+
     from .bench import kernels as benchmark
 
+    picture = eg.load_image(image) if image else None
     with progress_bar("kernels", quiet) as progress:
-        figures = benchmark.run(backend=backend, progress=progress)
+        figures = benchmark.run(picture, backend=backend, progress=progress)
     if report:
         write_report(report, {**_run(context, backend), **figures})
     if not quiet:

@@ -20,7 +20,7 @@ class Coordinates(NamedTuple):
     of : callable
         ``of(gaussians) -> dict`` of named arrays.
     to : callable
-        ``to(fixed, variables) -> Gaussians``; what is not among the variables is taken from `fixed`.
+        ``to(fixed, variables) -> Gaussians``; what is not among the variables is that of `fixed`.
     bounded : callable
         ``bounded(fixed, variables) -> dict``: the variables, moved where a step left their bounds.
     """

@@ -29,8 +29,8 @@ class Fit(NamedTuple):
     ----------
     gaussians : Gaussians
     trace : list of dict
-        Rows with iteration, seconds, psnr_ycbcr, psnr_rgb; row 0 is before refinement. Seconds count
-        from the call of `fit`: placement, upload and colour solve are in them, and so is what it
+        Rows with iteration, seconds, psnr_ycbcr, psnr_rgb; row 0 is before refinement. Seconds
+        count from the call of `fit`: placement, upload and colour solve are in them, and so is what it
         takes to compute the rows.
     image : ndarray of float32, shape (H, W, 3)
         The picture that the set makes: RGB, not clamped.
@@ -89,7 +89,7 @@ def fit(
     backend : {"llvm", "cuda"}, optional
         By default "cuda" where there is a GPU.
     progress : callable, optional
-        ``progress(iteration, iterations, row)`` with the rows of the trace.
+        ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
 
     Returns
     -------

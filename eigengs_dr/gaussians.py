@@ -21,8 +21,8 @@ FORMAT = "eigengs_dr.gaussians"
 VERSION = 1
 
 NARROWEST = 0.25
-"""Smallest standard deviation along an axis of the factor, in pixels: what is narrower falls between
-pixel centres, and its gradient with it."""
+"""Smallest standard deviation along an axis of the factor, in pixels: what is narrower falls
+between pixel centres, and its gradient with it."""
 
 
 @dataclass
@@ -33,7 +33,7 @@ class Gaussians:
     the covariance of a splat is ``(F^T F)^-1``, positive definite for any a, c > 0. x points right
     and y down, and pixel centres are at +0.5.
 
-    A PyTree: `drjit` functions such as `drjit.eval`, `drjit.enable_grad` or `drjit.grad` traverse it.
+    A PyTree: functions such as `drjit.eval`, `drjit.enable_grad` or `drjit.grad` traverse it.
 
     Attributes
     ----------
@@ -150,9 +150,7 @@ class Gaussians:
         def pick(rows: Any) -> Any:
             return type(rows)([dr.gather(types.Float, row, chosen) for row in rows])
 
-        return replace(
-            self, mean=pick(self.mean), factor=pick(self.factor), color=pick(self.color)
-        )
+        return replace(self, mean=pick(self.mean), factor=pick(self.factor), color=pick(self.color))
 
     def scaled(self, width: int, height: int) -> Gaussians:
         """Return the same picture with another native size, in pixels.
@@ -242,12 +240,14 @@ class Gaussians:
         path = Path(path)
         arrays = archive.read(path, FORMAT, VERSION, LAYOUT)
         try:
-            size = tuple(int(v) for v in arrays.pop("size"))
+            size = arrays.pop("size")
             space = str(arrays.pop("space"))
-            _check(arrays, size, space)
+            _check(arrays, tuple(size), space)
         except archive.BadValue as error:
             raise ValueError(f"{path}: {error}") from None
-        return cls.from_arrays(**arrays, size=size, space=space, backend=backend)
+        return cls.from_arrays(
+            **arrays, size=(int(size[0]), int(size[1])), space=space, backend=backend
+        )
 
 
 LAYOUT: dict[str, archive.Field] = {
@@ -332,6 +332,8 @@ def _check(arrays: dict[str, NDArray[Any]], size: tuple[int, ...], space: str) -
     if space not in SPACES:
         raise archive.BadValue(f"space is {space!r}, expected one of {', '.join(SPACES)}")
     if space in ("ycbcr", "rgb", "linear") and color.shape[1] not in (1, 3, 4):
-        raise archive.BadValue(f"color has {color.shape[1]} channels; space {space!r} has 1, 3 or 4")
+        raise archive.BadValue(
+            f"color has {color.shape[1]} channels; space {space!r} has 1, 3 or 4"
+        )
     if space == "ycbcr" and color.shape[1] != 3:
         raise archive.BadValue(f"color has {color.shape[1]} channels; space 'ycbcr' has 3")

@@ -1,9 +1,9 @@
-"""The sum over all splats and its derivatives: one lane a tile forward, one lane a splat in reverse.
+"""The sum over all splats and its derivatives: a lane a tile forward, a lane a splat in reverse.
 
 ``I(x) = background + sum_n c_n w_n(x)`` with the weights of `eigengs_dr.splat`.
 
-Layout of images in this module: tile after tile, in a tile row after row, pixel after pixel, channel
-after channel, so that a lane reads or writes one contiguous piece with packet operations.
+Layout of images in this module: tile after tile, in a tile row after row, pixel after pixel,
+channel after channel, so that a lane reads or writes one contiguous piece with packet operations.
 """
 
 from __future__ import annotations
@@ -93,7 +93,12 @@ def accumulate(
 
 
 def adjoint(
-    packed: Any, delta: Any, channels: int, lists: TileLists, radius: float, color_only: bool = False
+    packed: Any,
+    delta: Any,
+    channels: int,
+    lists: TileLists,
+    radius: float,
+    color_only: bool = False,
 ) -> list:
     """Gradient of ``<delta, accumulate(packed)>`` with respect to the parameters of every splat.
 

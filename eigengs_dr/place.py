@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 GRID_SIZE = 0.8
-"""Standard deviation of a splat on the grid over its distance to its neighbours. Of 0.6 to 1.2, best
-after 10 steps of the colour solve."""
+"""Standard deviation of a splat on the grid over its distance to its neighbours."""
 
 
 def random(
@@ -36,7 +35,7 @@ def random(
     """
     height, width = image.shape[:2]
     mean = generator.uniform(0, [width, height], (count, 2))
-    l1, l2, l3 = (generator.uniform(0, 1, (count, 3)) + [0.5, 0, 0.5]).T
+    l1, l2, l3 = (generator.uniform(0, 1, (count, 3)) + np.array([0.5, 0, 0.5])).T
     return mean, inverse_factor(l1 * l1, l1 * l2, l2 * l2 + l3 * l3)
 
 

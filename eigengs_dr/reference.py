@@ -12,9 +12,7 @@ from .splat import SHAPE, UNIT, weights
 from .tiles import TileLists
 
 
-def render_plain(
-    values: list, background: list, lists: TileLists, cutoff: float = 3.0
-) -> Any:
+def render_plain(values: list, background: list, lists: TileLists, cutoff: float = 3.0) -> Any:
     """Render as a first Dr.Jit program would: one lane a pixel, derivatives by Dr.Jit alone.
 
     Parameters
@@ -32,7 +30,7 @@ def render_plain(
         reverse one atomic addition a parameter.
     """
     types = types_of(values[0])
-    grid, channels = lists.grid, len(background)
+    grid = lists.grid
     pixel = dr.arange(types.UInt, grid.width * grid.height)
     column, row = pixel % grid.width, pixel // grid.width
     x, y = types.Float(column) + 0.5, types.Float(row) + 0.5
@@ -54,9 +52,7 @@ def render_plain(
         label="plain",
         max_iterations=-1,
     )
-    return dr.ravel(
-        types.FloatX([s + b for s, b in zip(sums, background, strict=True)]), order="F"
-    )
+    return dr.ravel(types.FloatX([s + b for s, b in zip(sums, background, strict=True)]), order="F")
 
 
 def _slots(lists: TileLists, UInt: Any, tile: Any) -> Any:

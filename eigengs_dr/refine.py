@@ -108,7 +108,7 @@ def refine(
     started : float, optional
         `time.perf_counter()` from which the seconds of the trace count; now by default.
     progress : callable, optional
-        ``progress(iteration, iterations, row)`` after every row of the trace.
+        ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
 
     Returns
     -------
@@ -122,6 +122,9 @@ def refine(
     try:
         for step, current in enumerate(descend(gaussians, target, schedule, iterations, cutoff)):
             if step not in marks:
+                if progress and step % 10 == 0:
+                    dr.sync_thread()  # steps run asynchronously; the bar tells what is done
+                    progress(step, iterations, trace[-1])
                 continue
             row = _row(current, image, step, started, cutoff)
             trace.append(row)

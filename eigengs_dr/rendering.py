@@ -16,8 +16,8 @@ from .splat import UNIT, gather_run, pack
 from .tiles import Grid, TileLists, build_lists
 
 CUTOFF = 3.0
-"""Default cutoff in standard deviations. What is left out of a splat is below ``exp(-cutoff^2 / 2)``
-of its amplitude at any point: 1.1 % at 3, 0.034 % at 4, 3.7e-6 at 5."""
+"""Default cutoff in standard deviations. What is left out of a splat is at any point below
+``exp(-cutoff^2 / 2)`` of its amplitude: 1.1 % at 3, 0.034 % at 4, 3.7e-6 at 5."""
 
 WIDEST_CUTOFF = 12.0
 """``exp(-72)`` is below the precision of any format here; the fast exponential needs a bound."""
@@ -88,10 +88,13 @@ def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[
 def splat_values(gaussians: Gaussians) -> tuple[list, list]:
     """Parameters as the kernels take them: [mean x, mean y, a, b, c in `UNIT`, RGB...], background.
 
-    Colours are decoded here: the conversion is linear, so that N splats are converted, not H W pixels.
+    Colours are decoded here: the conversion is linear, so that N splats are converted and not
+    H W pixels.
     """
     black = decode(gaussians.space, [0.0] * gaussians.channels)
-    color = [c - k for c, k in zip(decode(gaussians.space, list(gaussians.color)), black, strict=True)]
+    color = [
+        c - k for c, k in zip(decode(gaussians.space, list(gaussians.color)), black, strict=True)
+    ]
     background = decode(gaussians.space, list(gaussians.background))
     return [*gaussians.mean, *[f * UNIT for f in gaussians.factor], *color], background
 
@@ -170,7 +173,7 @@ def to_tensor(image: Any, grid: Grid, channels: int) -> Any:
 
 
 class _Rows(dr.CustomOp):
-    """Permute tile layout to rows; its transpose permutes back. One packet copy of a run of pixels."""
+    """Permute tile layout to rows; its transpose permutes back. Copies runs of pixels."""
 
     def eval(self, image: Any, grid: Grid, channels: int) -> Any:
         types = types_of(image)
@@ -195,13 +198,11 @@ class _Rows(dr.CustomOp):
         return result
 
 
-def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid, padding: float = 0.0) -> Any:
-    """Upload an image (height, width, channels) in tile layout, overhanging pixels set to `padding`."""
+def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
+    """Upload an image (height, width, channels) in tile layout; overhanging pixels are 0."""
     height, width, channels = image.shape
     tile_width, tile_height = grid.tile
-    padded = np.full(
-        (grid.ny * tile_height, grid.nx * tile_width, channels), padding, dtype=image.dtype
-    )
+    padded = np.zeros((grid.ny * tile_height, grid.nx * tile_width, channels), image.dtype)
     padded[:height, :width] = image
     tiled = padded.reshape(grid.ny, tile_height, grid.nx, tile_width, channels)
     flat = tiled.transpose(0, 2, 1, 3, 4).reshape(-1)

@@ -48,8 +48,8 @@ def solve(
 ) -> Solution:
     """Find the colours and the background that fit an image best on fixed shapes.
 
-    Conjugate gradients on the normal equations, preconditioned by their diagonal ``sum_x w_n(x)^2``,
-    each channel on its own. A step costs one rendering and one adjoint with respect to colours.
+    Conjugate gradients on the normal equations, preconditioned by their diagonal
+    ``sum_x w_n(x)^2``, each channel on its own. A step costs one rendering and one adjoint with respect to colours.
 
     Parameters
     ----------
@@ -115,7 +115,9 @@ def _solve(
     return Solution(
         replace(
             gaussians,
-            color=types.FloatX([dr.gather(types.Float, u, dr.arange(types.UInt, n)) for u in unknowns]),
+            color=types.FloatX(
+                [dr.gather(types.Float, u, dr.arange(types.UInt, n)) for u in unknowns]
+            ),
             background=types.FloatX([dr.gather(types.Float, u, types.UInt(n)) for u in unknowns]),
         ),
         [math.sqrt(max(0.0, float(s[0]))) for s in squares],

@@ -15,7 +15,7 @@ import drjit as dr
 from .arrays import ArrayTypes, types_of
 
 UNIT = math.sqrt(0.5 / math.log(2))
-"""``exp(-q / 2) = 2^-(UNIT^2 q)``: kernels take factors in these units and save a product a pixel."""
+"""``exp(-q / 2) = 2^-(UNIT^2 q)``: kernels take factors in these units and save a product."""
 
 SHAPE = 5
 """Parameters of a splat before its colour: mean x, mean y, a, b, c."""
@@ -82,9 +82,7 @@ def weights(shape: list, x: Any, y: Any, tile: tuple[int, int], limit: float) ->
         Weights in [0, 1], row after row. Cost: one `exp2_neg`, a comparison and 2 or 3 more
         operations a point.
     """
-    return [
-        falloff(dr.fma(u, u, v * v), limit) for us, v in _rows(shape, x, y, tile) for u in us
-    ]
+    return [falloff(dr.fma(u, u, v * v), limit) for us, v in _rows(shape, x, y, tile) for u in us]
 
 
 def _rows(shape: list, x: Any, y: Any, tile: tuple[int, int]) -> list[tuple[list, Any]]:
@@ -101,7 +99,12 @@ def _rows(shape: list, x: Any, y: Any, tile: tuple[int, int]) -> list[tuple[list
 
 
 def weights_pullback(
-    shape: list, x: Any, y: Any, tile: tuple[int, int], limit: float, pull: Callable[[int, Any], Any]
+    shape: list,
+    x: Any,
+    y: Any,
+    tile: tuple[int, int],
+    limit: float,
+    pull: Callable[[int, Any], Any],
 ) -> list:
     """Gradient of ``sum_k g_k w_k`` with respect to the shape, where ``g_k = pull(k, w_k)``.
 
@@ -167,7 +170,7 @@ def pack(values: list) -> Any:
 
 
 def gather_run(types: ArrayTypes, source: Any, index: Any, length: int, active: Any) -> list:
-    """Gather ``source[index * length : (index + 1) * length]`` by packets where the length is even."""
+    """Gather ``source[index * length : (index + 1) * length]`` by packets if the length is even."""
     shape = (length, dr.width(index))
     return list(dr.gather(types.FloatX, source, index, active, shape=shape))
 

@@ -23,7 +23,7 @@ pixels in registers and visits 1.7 pixels for one inside the ellipse (8x8: 3.3).
 
 @dataclass(frozen=True)
 class Grid:
-    """A `width` x `height` image cut into `nx` x `ny` tiles of `tile` pixels; the last may overhang."""
+    """A `width` x `height` image cut into `nx` x `ny` tiles of `tile` pixels; the last overhang."""
 
     width: int
     height: int
@@ -192,8 +192,8 @@ def walk(
 def build_lists(shape: list, radius: float, grid: Grid, pad: float = 0.0) -> TileLists:
     """List for every tile the splats whose cutoff ellipse touches it.
 
-    Every splat counts its tiles, then writes one key ``tile * N + splat`` for each; sorting the keys
-    gives the lists. The order is a function of the input alone, so renderings are bit-equal.
+    Every splat counts its tiles, then writes one key ``tile * N + splat`` for each; sorting the
+    keys gives the lists. The order is a function of the input alone, so renderings are bit-equal.
     Cost: O(entries log entries); the splats are walked twice.
 
     Parameters
