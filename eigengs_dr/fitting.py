@@ -30,7 +30,7 @@ class Fit(NamedTuple):
     gaussians : Gaussians
     trace : list of dict
         Rows with iteration, seconds, psnr_ycbcr, psnr_rgb; row 0 is before refinement. Seconds
-        count from the call of `fit`: placement, upload and colour solve are in them, and so is what it
+        count from the call of `fit`: placement, upload and colour solve are in them, and what it
         takes to compute the rows.
     image : ndarray of float32, shape (H, W, 3)
         The picture that the set makes: RGB, not clamped.

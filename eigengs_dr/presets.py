@@ -36,8 +36,8 @@ PRESETS = {
         init="adaptive",
         solves=True,
         schedule=Schedule(
-            optimizer=partial(Adam, beta_2=0.99, epsilon=1e-12),
-            rates={"mean": 0.3, "factor": 0.05, "color": 0.0075},
+            optimizer=partial(Adam, beta_1=0.9, beta_2=0.9, epsilon=1e-12),
+            rates={"mean": 0.3, "factor": 0.05, "color": 0.015},
         ),
     ),
     # GaussianImage's recipe: one rate for all, no colour solve; its rates are halved only after

@@ -52,7 +52,7 @@ class Schedule:
     rates: dict[str, float]
     coordinates: Coordinates = NATURAL
     decay: float = 0.03
-    rebuild: int = 8
+    rebuild: int = 4
     pad: float = 1.0
     patience: int = 300
     least_gain: float = 0.01
@@ -161,6 +161,7 @@ def descend(
     grid = Grid(gaussians.width, gaussians.height)
     tiles = to_tiles(types, target, grid)
     inside = to_tiles(types, np.ones_like(target), grid)
+    take_step = _step_program(gaussians, coordinates, cutoff)
     yield current
     for step in range(iterations):
         if step % schedule.rebuild == 0:
@@ -170,29 +171,33 @@ def descend(
         optimizer.set_learning_rate(
             {name: dr.opaque(types.Float, rate * left) for name, rate in schedule.rates.items()}
         )
-        _step(optimizer, gaussians, tiles, inside, lists, coordinates, cutoff)
+        take_step(optimizer, tiles, inside, lists)
         current = coordinates.to(gaussians, dict(optimizer))
         yield current
 
 
-@dr.freeze
-def _step(
-    optimizer: Any,
-    fixed: Gaussians,
-    target: Any,
-    inside: Any,
-    lists: TileLists,
-    coordinates: Coordinates,
-    cutoff: float,
-) -> None:
-    """One step on the mean squared error; parameters are brought back inside their bounds."""
-    current = coordinates.to(fixed, dict(optimizer))
-    values = [*current.mean, *[f * UNIT for f in current.factor], *current.color]
-    rendered = splat(values, list(current.background), lists, cutoff)
-    loss = dr.mean(dr.square((rendered - target) * inside))
-    dr.backward(loss)
-    optimizer.step(eval=False)
-    optimizer.update(coordinates.bounded(fixed, dict(optimizer)))
+def _step_program(
+    fixed: Gaussians, coordinates: Coordinates, cutoff: float
+) -> Callable[[Any, Any, Any, TileLists], None]:
+    """Make a frozen program for a step: traced once, replayed without Python.
+
+    A program belongs to one run: a replay does not notice that, say, the betas of another optimiser
+    differ.
+    """
+
+    @dr.freeze
+    def step(optimizer: Any, target: Any, inside: Any, lists: TileLists) -> None:
+        """Descend on the mean squared error, then bring the variables back inside their bounds."""
+        current = coordinates.to(fixed, dict(optimizer))
+        values = [*current.mean, *[f * UNIT for f in current.factor], *current.color]
+        rendered = splat(values, list(current.background), lists, cutoff)
+        dr.backward(dr.mean(dr.square((rendered - target) * inside)))
+        # Kept apart from the optimiser's arithmetic, the large kernels serve every preset.
+        dr.eval([dr.grad(v) for v in optimizer.values()])
+        optimizer.step(eval=False)
+        optimizer.update(coordinates.bounded(fixed, dict(optimizer)))
+
+    return step
 
 
 def _row(

@@ -49,7 +49,8 @@ def solve(
     """Find the colours and the background that fit an image best on fixed shapes.
 
     Conjugate gradients on the normal equations, preconditioned by their diagonal
-    ``sum_x w_n(x)^2``, each channel on its own. A step costs one rendering and one adjoint with respect to colours.
+    ``sum_x w_n(x)^2``, each channel on its own. A step costs one rendering and one adjoint with
+    respect to colours.
 
     Parameters
     ----------
@@ -95,7 +96,7 @@ def _solve(
         constant = [types.Float(b) for b in gaussians.background]
     else:
         x = [dr.zeros(types.Float, n) for _ in range(channels)]
-        constant = [types.Float(float(m)) for m in image.mean(axis=(0, 1), dtype=np.float64)]
+        constant = [dr.opaque(types.Float, m) for m in image.mean(axis=(0, 1)).tolist()]
     unknowns = [dr.concat([c, b]) for c, b in zip(x, constant, strict=True)]
     dr.eval(shape, unknowns)
 
@@ -112,16 +113,14 @@ def _solve(
             shape, unknowns, residual, p, rz, inverse, inside, lists, cutoff
         )
         squares.append(square * scale)
-    return Solution(
-        replace(
-            gaussians,
-            color=types.FloatX(
-                [dr.gather(types.Float, u, dr.arange(types.UInt, n)) for u in unknowns]
-            ),
-            background=types.FloatX([dr.gather(types.Float, u, types.UInt(n)) for u in unknowns]),
-        ),
-        [math.sqrt(max(0.0, float(s[0]))) for s in squares],
+    index = dr.arange(types.UInt, n)
+    solved = replace(
+        gaussians,
+        color=types.FloatX([dr.gather(types.Float, u, index) for u in unknowns]),
+        background=types.FloatX([dr.gather(types.Float, u, types.UInt(n)) for u in unknowns]),
     )
+    dr.eval(solved)
+    return Solution(solved, [math.sqrt(max(0.0, float(s[0]))) for s in squares])
 
 
 @dr.freeze

@@ -58,7 +58,7 @@ class TileLists:
     ----------
     grid : Grid
     splat : UInt32, shape (entries,)
-        Indices of splats, tile after tile; padded to a power of two.
+        Indices of splats, tile after tile; what follows the last list is not used.
     begin, end : UInt32, shape (tiles,)
         Where the list of the tile `order[i]` lies in `splat`.
     order : UInt32, shape (tiles,)
@@ -243,15 +243,18 @@ def _lists(
     types: ArrayTypes, grid: Grid, count: int, keys: Any, entries: int, touched: Any
 ) -> TileLists:
     """Turn sorted keys ``tile * N + splat`` into lists."""
-    tile = dr.arange(types.UInt, grid.tiles + 1)
-    needle = type(keys)(tile) * count
+    Key = type(keys)
+    # A power of two: numbers in programs are constants, and few of them keep what is compiled and
+    # what is frozen in use. It is even as well, so that lists can be read in pairs.
+    capacity = 2 << entries.bit_length()
+    padded = dr.full(Key, (1 << 8 * dr.itemsize_v(Key)) - 1, capacity)
+    if entries:
+        dr.scatter(padded, keys, dr.arange(types.UInt, entries))
+    needle = Key(dr.arange(types.UInt, grid.tiles + 1)) * count
     starts = types.UInt(
-        dr.binary_search(0, entries, lambda i: dr.gather(type(keys), keys, types.UInt(i)) < needle)
+        dr.binary_search(0, capacity, lambda i: dr.gather(Key, padded, types.UInt(i)) < needle)
     )
-    # A power of two: few distinct sizes, so that frozen programs are seldom traced again; and even,
-    # to be read in pairs.
-    splat = dr.zeros(types.UInt, 2 << entries.bit_length())
-    dr.scatter(splat, types.UInt(keys % count), dr.arange(types.UInt, len(keys)))
+    splat = types.UInt(padded % count)
     dr.eval(starts, splat)
     begin = dr.gather(types.UInt, starts, dr.arange(types.UInt, grid.tiles))
     end = dr.gather(types.UInt, starts, dr.arange(types.UInt, grid.tiles) + 1)
@@ -269,7 +272,8 @@ def _descending(length: Any) -> Any:
     Key = dr.uint64_array_t(UInt)
     longest = int(dr.max(length)[0])
     Key = UInt if (longest + 1) * count < 2**32 else Key
-    keys = _sorted(Key(longest - length) * count + Key(dr.arange(UInt, count)))
+    shorter = dr.opaque(UInt, longest) - length
+    keys = _sorted(Key(shorter) * count + Key(dr.arange(UInt, count)))
     return UInt(keys % count)
 
 
