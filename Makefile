@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 # A photo inside the scikit-image wheel, so that none has to be downloaded.
-PHOTO := .venv/lib/python3*/site-packages/skimage/data/astronaut.png
+PHOTO := .venv/lib/python3*/site-packages/skimage/data/coffee.png
 
 LLVM_ADVICE := install LLVM 17 or newer and libatomic (as root: Debian, Ubuntu 'apt install \
 libllvm19 libatomic1', Fedora 'dnf install llvm-libs libatomic', macOS 'brew install llvm'), \
@@ -43,8 +43,8 @@ $(READY): pyproject.toml
 
 demo: $(READY)
 	@mkdir -p build/demo
-	$(BIN)/eigengs-dr fit $(PHOTO) -o build/demo/astronaut.npz \
-		--preview build/demo/astronaut.png --report build/demo/astronaut.json
+	$(BIN)/eigengs-dr fit $(PHOTO) -o build/demo/coffee.npz \
+		--preview build/demo/coffee.png --report build/demo/coffee.json
 
 test: $(READY)
 	$(BIN)/ruff check .
