@@ -20,7 +20,8 @@ class Coordinates(NamedTuple):
     of : callable
         ``of(gaussians) -> dict`` of named arrays.
     to : callable
-        ``to(fixed, variables) -> Gaussians``; what is not among the variables is that of `fixed`.
+        ``to(fixed, variables) -> Gaussians``; what is not among the variables is that of `fixed`,
+        the set that was given to `of`.
     bounded : callable
         ``bounded(fixed, variables) -> dict``: the variables, moved where a step left their bounds.
     """
@@ -31,25 +32,40 @@ class Coordinates(NamedTuple):
 
 
 # ---------------------------------------------------------------------------------------------
-#  The parameters as they are
+#  The parameters themselves, in units of each splat's size
 # ---------------------------------------------------------------------------------------------
 
 
+def _size(g: Gaussians) -> Any:
+    """Geometric mean of a splat's standard deviations, in pixels: ``det F = a c``."""
+    return dr.rsqrt(g.factor[0] * g.factor[2])
+
+
 def _natural_of(g: Gaussians) -> dict[str, Any]:
-    return {"mean": g.mean, "factor": g.factor, "color": g.color, "background": g.background}
+    return _in_units(g, _size(g))
+
+
+def _in_units(g: Gaussians, size: Any) -> dict[str, Any]:
+    return {"mean": g.mean / size, "factor": g.factor * size, "color": g.color}
 
 
 def _natural_to(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
-    return replace(fixed, **variables)
+    size = _size(fixed)
+    return replace(
+        fixed,
+        mean=variables["mean"] * size,
+        factor=variables["factor"] / size,
+        color=variables["color"],
+    )
 
 
 def _natural_bounded(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, Any]:
-    bounded = replace(fixed, **variables).bounded()
-    return {name: getattr(bounded, name) for name in variables}
+    return _in_units(_natural_to(fixed, variables).bounded(), _size(fixed))
 
 
 NATURAL = Coordinates(_natural_of, _natural_to, _natural_bounded)
-"""Mean, factor, colour and background themselves."""
+"""Mean over the size that the splat started with, factor times that size, colour: one rate serves
+small and large splats, and pictures of any size."""
 
 
 # ---------------------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ PRESETS = {
         solves=True,
         schedule=Schedule(
             optimizer=partial(Adam, beta_1=0.9, beta_2=0.9, epsilon=1e-12),
-            rates={"mean": 0.3, "factor": 0.05, "color": 0.015},
+            rates={"mean": 0.12, "factor": 0.12, "color": 0.015},
         ),
     ),
     # GaussianImage's recipe: one rate for all, no colour solve; its rates are halved only after
@@ -50,6 +50,7 @@ PRESETS = {
             rates={"mean": 1e-3, "cholesky": 1e-3, "color": 1e-3},
             coordinates=CHOLESKY,
             decay=1.0,
+            warm_up=0,
             patience=10_000,
         ),
     ),

@@ -32,10 +32,13 @@ class Schedule:
     optimizer : callable
         ``optimizer(lr) -> drjit.opt.Optimizer``.
     rates : dict of str to float
-        Learning rate of every coordinate at the start; in `NATURAL` coordinates of mean (pixels),
-        factor (1 / pixels) and color (1 is white). What has no rate stays as it is.
+        Learning rate of every coordinate at the start; in `NATURAL` coordinates of mean and factor
+        (in sizes of the splat) and color (1 is white).
     coordinates : Coordinates
         The variables that the optimiser moves.
+    warm_up : int
+        Steps over which the rates rise: until their averages have settled, steps of Adam are all
+        of full length and would leave the solved start by some decibels.
     decay : float
         What is left of the rates at the end, along half a cosine.
     rebuild : int
@@ -51,6 +54,7 @@ class Schedule:
     optimizer: Callable[[float], Any]
     rates: dict[str, float]
     coordinates: Coordinates = NATURAL
+    warm_up: int = 5
     decay: float = 0.03
     rebuild: int = 4
     pad: float = 1.0
@@ -166,14 +170,20 @@ def descend(
     for step in range(iterations):
         if step % schedule.rebuild == 0:
             lists = lists_for(current, cutoff, schedule.pad)
-        along = 0.5 * (1 + math.cos(math.pi * step / iterations))
-        left = schedule.decay + (1 - schedule.decay) * along
+        left = _rate_left(schedule, step, iterations)
         optimizer.set_learning_rate(
             {name: dr.opaque(types.Float, rate * left) for name, rate in schedule.rates.items()}
         )
         take_step(optimizer, tiles, inside, lists)
         current = coordinates.to(gaussians, dict(optimizer))
         yield current
+
+
+def _rate_left(schedule: Schedule, step: int, iterations: int) -> float:
+    """Factor of the rates: a linear rise, then half a cosine."""
+    along = 0.5 * (1 + math.cos(math.pi * step / iterations))
+    left = schedule.decay + (1 - schedule.decay) * along
+    return left * min(1.0, (step + 1) / max(1, schedule.warm_up))
 
 
 def _step_program(
