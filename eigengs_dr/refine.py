@@ -20,6 +20,9 @@ from .rendering import CUTOFF, lists_for, render, splat, to_tiles
 from .splat import UNIT
 from .tiles import Grid, TileLists
 
+EXACT = 100.0
+"""Decibels above which only rounding is left to fit."""
+
 Progress = Callable[[int, int, dict[str, Any]], None]
 
 
@@ -165,7 +168,7 @@ def descend(
     grid = Grid(gaussians.width, gaussians.height)
     tiles = to_tiles(types, target, grid)
     inside = to_tiles(types, np.ones_like(target), grid)
-    take_step = _step_program(gaussians, coordinates, cutoff)
+    take_step = _step_program(coordinates, cutoff)
     yield current
     for step in range(iterations):
         if step % schedule.rebuild == 0:
@@ -174,7 +177,7 @@ def descend(
         optimizer.set_learning_rate(
             {name: dr.opaque(types.Float, rate * left) for name, rate in schedule.rates.items()}
         )
-        take_step(optimizer, tiles, inside, lists)
+        take_step(optimizer, gaussians, tiles, inside, lists)
         current = coordinates.to(gaussians, dict(optimizer))
         yield current
 
@@ -187,8 +190,8 @@ def _rate_left(schedule: Schedule, step: int, iterations: int) -> float:
 
 
 def _step_program(
-    fixed: Gaussians, coordinates: Coordinates, cutoff: float
-) -> Callable[[Any, Any, Any, TileLists], None]:
+    coordinates: Coordinates, cutoff: float
+) -> Callable[[Any, Gaussians, Any, Any, TileLists], None]:
     """Make a frozen program for a step: traced once, replayed without Python.
 
     A program belongs to one run: a replay does not notice that, say, the betas of another optimiser
@@ -196,7 +199,7 @@ def _step_program(
     """
 
     @dr.freeze
-    def step(optimizer: Any, target: Any, inside: Any, lists: TileLists) -> None:
+    def step(optimizer: Any, fixed: Gaussians, target: Any, inside: Any, lists: TileLists) -> None:
         """Descend on the mean squared error, then bring the variables back inside their bounds."""
         current = coordinates.to(fixed, dict(optimizer))
         values = [*current.mean, *[f * UNIT for f in current.factor], *current.color]
@@ -229,8 +232,10 @@ def _row(
 def _is_plateau(trace: list[dict[str, Any]], schedule: Schedule) -> bool:
     """Tell whether the last `patience` steps gained less than `least_gain` decibels."""
     last = trace[-1]
-    old = [r for r in trace if r["iteration"] <= last["iteration"] - schedule.patience]
-    return bool(old) and last["psnr_ycbcr"] - old[-1]["psnr_ycbcr"] < schedule.least_gain
+    if last["psnr_ycbcr"] > EXACT:
+        return True
+    old = [row for row in trace if row["iteration"] <= last["iteration"] - schedule.patience]
+    return bool(old) and not last["psnr_ycbcr"] - old[-1]["psnr_ycbcr"] >= schedule.least_gain
 
 
 def rows_at(iterations: int) -> set[int]:
