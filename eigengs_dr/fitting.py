@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import place
+from . import place as places
 from .adaptive import adaptive
 from .color import rgb_to_ycbcr
 from .gaussians import Gaussians
 from .images import check_image
-from .presets import PRESETS
+from .interrupt import deferred
+from .presets import PRESETS, Preset
 from .refine import Progress, refine
 from .rendering import render
 from .solve import solve
 
-INITS = {"random": place.random, "grid": place.grid, "adaptive": adaptive}
+INITS = {"random": places.random, "grid": places.grid, "adaptive": adaptive}
 """Initialisers by name."""
 
 
@@ -114,22 +116,20 @@ def fit(
     _check(pixels, gaussians, iterations, init, preset, solve_steps, color)
     method = PRESETS[preset]
     target = rgb_to_ycbcr(pixels) if color == "ycbcr" else pixels
-    generator = np.random.default_rng(seed)
-    mean, factor = INITS[method.init if init == "auto" else init](target, gaussians, generator)
-    start = Gaussians.from_arrays(
-        mean,
-        factor,
-        np.zeros((gaussians, 3)) if method.solves else generator.uniform(0, 1, (gaussians, 3)),
-        size=(pixels.shape[1], pixels.shape[0]),
-        space=color,
-        backend=backend,
-    ).bounded()
-    if method.solves:
-        start = solve(start, target, solve_steps).gaussians
-    seconds_init = time.perf_counter() - started
-    refined = refine(
-        start, target, pixels, method.schedule, iterations, started=started, progress=progress
-    )
+    with deferred() as interrupted:
+        place = INITS[method.init if init == "auto" else init]
+        start = _start(target, gaussians, place, method, solve_steps, color, seed, backend)
+        seconds_init = time.perf_counter() - started
+        refined = refine(
+            start,
+            target,
+            pixels,
+            method.schedule,
+            iterations,
+            started=started,
+            progress=progress,
+            interrupted=interrupted,
+        )
     return Fit(
         gaussians=refined.gaussians,
         trace=refined.trace,
@@ -139,6 +139,26 @@ def fit(
         iterations=refined.iterations,
         stopped=refined.stopped,
     )
+
+
+def _start(
+    target: NDArray[np.float32],
+    gaussians: int,
+    place: Callable[..., Any],
+    method: Preset,
+    solve_steps: int,
+    color: str,
+    seed: int,
+    backend: str | None,
+) -> Gaussians:
+    """Place splats and give them colours."""
+    generator = np.random.default_rng(seed)
+    mean, factor = place(target, gaussians, generator)
+    colors = np.zeros((gaussians, 3)) if method.solves else generator.uniform(0, 1, (gaussians, 3))
+    size = (target.shape[1], target.shape[0])
+    start = Gaussians.from_arrays(mean, factor, colors, size=size, space=color, backend=backend)
+    start = start.bounded()
+    return solve(start, target, solve_steps).gaussians if method.solves else start
 
 
 def _check(

@@ -96,6 +96,7 @@ def refine(
     cutoff: float = CUTOFF,
     started: float | None = None,
     progress: Progress | None = None,
+    interrupted: Callable[[], bool] = lambda: False,
 ) -> Refined:
     """Minimise the squared error over all parameters.
 
@@ -116,11 +117,13 @@ def refine(
         `time.perf_counter()` from which the seconds of the trace count; now by default.
     progress : callable, optional
         ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
+    interrupted : callable, optional
+        Asked before every step whether to stop; see `eigengs_dr.interrupt.deferred`.
 
     Returns
     -------
     Refined
-        Never worse than the start; Ctrl-C ends the loop and returns the best so far.
+        Never worse than the start. `KeyboardInterrupt` from `progress` also ends it with the best.
     """
     started = time.perf_counter() if started is None else started
     marks, trace = rows_at(iterations), list[dict[str, Any]]()
@@ -129,6 +132,8 @@ def refine(
     try:
         for step, current in enumerate(descend(gaussians, target, schedule, iterations, cutoff)):
             if step not in marks:
+                if interrupted():
+                    raise KeyboardInterrupt
                 if progress and step % 10 == 0:
                     dr.sync_thread()  # steps run asynchronously; the bar tells what is done
                     progress(step, iterations, trace[-1])
