@@ -1,0 +1,51 @@
+"""The benchmarks on a scene so small that only their arithmetic is tested."""
+
+import numpy as np
+import pytest
+
+from eigengs_dr.bench import kernels
+
+FIGURES = {
+    "plain_ms",
+    "fast_ms",
+    "step_ratio",
+    "forward_ratio",
+    "peak_evals_per_ns",
+    "forward_peak_fraction",
+    "step_peak_fraction",
+    "growth",
+}
+
+
+@pytest.fixture
+def small(monkeypatch):
+    for name, value in {"SIDE": 64, "COUNT": 300, "ROUNDS": 2, "PEAK_LANES": 1 << 10}.items():
+        monkeypatch.setattr(kernels, name, value)
+
+
+def test_every_figure_is_there_and_positive(small, backend):
+    calls = []
+    figures = kernels.run(backend=backend, progress=lambda done, total, row: calls.append(done))
+    assert set(figures) >= FIGURES
+    assert all(np.isfinite(value) and value > 0 for value in figures.values())
+    assert figures["step_ratio"] == pytest.approx(figures["plain_ms"] / figures["fast_ms"])
+    assert calls == sorted(calls)
+
+
+def test_pixels_inside_are_counted_as_by_hand(small, backend):
+    from eigengs_dr.arrays import types_in
+    from eigengs_dr.backend import select
+
+    scene = kernels._scene(types_in(select(backend)))
+    mean = scene.to_arrays()["mean"].astype(float)
+    rows, columns = np.indices((64, 64)) + 0.5
+    inside = sum(
+        ((columns - x) ** 2 + (rows - y) ** 2 <= (kernels.CUTOFF * kernels.SIGMA) ** 2).sum()
+        for x, y in mean
+    )
+    assert kernels._pixels_inside(scene) == inside
+
+
+def test_a_small_image_is_refused(backend):
+    with pytest.raises(ValueError, match="must be at least 512x512"):
+        kernels.run(np.zeros((100, 600, 3), np.float32), backend=backend)
