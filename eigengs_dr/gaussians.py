@@ -103,7 +103,7 @@ class Gaussians:
         if background is not None:
             arrays["background"] = background
         checked = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
-        checked.setdefault("background", np.zeros(checked["color"].shape[-1], np.float32))
+        checked.setdefault("background", np.zeros(checked["color"].shape[1:], np.float32))
         try:
             _check(checked, size, space)
         except archive.BadValue as error:
@@ -315,10 +315,13 @@ def _check(arrays: dict[str, NDArray[Any]], size: tuple[int, ...], space: str) -
     mean, factor, color = arrays["mean"], arrays["factor"], arrays["color"]
     if mean.ndim != 2 or mean.shape[1] != 2 or len(mean) == 0:
         raise archive.BadValue(f"mean has shape {mean.shape}, expected (N, 2) with N >= 1")
+    channels = color.shape[1] if color.ndim == 2 else 3
+    if channels < 1:
+        raise archive.BadValue("color has no channels, expected at least 1")
     for name, array, expected in (
         ("factor", factor, (len(mean), 3)),
-        ("color", color, (len(mean), color.shape[-1] if color.ndim == 2 else 3)),
-        ("background", arrays["background"], (color.shape[-1],)),
+        ("color", color, (len(mean), channels)),
+        ("background", arrays["background"], (channels,)),
     ):
         if array.shape != expected:
             raise archive.BadValue(f"{name} has shape {array.shape}, expected {expected}")

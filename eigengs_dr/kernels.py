@@ -103,7 +103,7 @@ def adjoint(
     """Gradient of ``<delta, accumulate(packed)>`` with respect to the parameters of every splat.
 
     A lane owns a splat, walks the tiles inside its ellipse, gathers delta there and sums in
-    registers: no atomics, one result on every run. The derivative of a weight is `weights_pullback`.
+    registers: no atomics, one result on every run. Derivatives of weights: `weights_pullback`.
 
     Parameters
     ----------

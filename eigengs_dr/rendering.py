@@ -58,7 +58,8 @@ def render(
     Notes
     -----
     The order of summation is a function of the input: renderings on one machine and backend are
-    bit-equal. A splat with a parameter that is not finite is not drawn.
+    bit-equal. A splat whose mean or factor is not finite is not drawn; a colour that is not finite
+    spoils the tiles that its splat touches.
 
     Examples
     --------

@@ -43,7 +43,7 @@ def exp2_neg(q: Any) -> Any:
         0.05550713274151576,
         0.24022119723882304,
         0.6931469670643609,
-        1.0000000716546715,
+        1.0,
     ):
         power = dr.fma(power, f, coefficient)
     exponent = dr.reinterpret_array(types.UInt, shifted) << 23

@@ -106,7 +106,8 @@ def span(shape: list, radius: Any, grid: Grid, row: Any, pad: float = 0.0) -> tu
     reach = radius * dr.rcp(c) + pad
     low = dr.maximum(top - pad, -reach)
     high = dr.minimum(top + (height - 1) + pad, reach)
-    peak = -radius * b * dr.rcp(c) * dr.rsqrt(dr.fma(b, b, c * c))
+    tilt = b * dr.rcp(c)
+    peak = -radius * tilt * dr.rsqrt(dr.fma(tilt, tilt, 1)) * dr.rcp(c)
 
     def half_width(dy: Any) -> Any:
         return dr.safe_sqrt(radius * radius - dr.square(c * dy))
@@ -209,7 +210,7 @@ def build_lists(shape: list, radius: float, grid: Grid, pad: float = 0.0) -> Til
     Raises
     ------
     ValueError
-        If tiles * splats exceeds 2^64 or there are more than 2^32 entries.
+        If the lists would have 2^31 entries or more.
     """
     types = types_of(shape[0])
     count = dr.width(shape[0])
@@ -223,7 +224,12 @@ def build_lists(shape: list, radius: float, grid: Grid, pad: float = 0.0) -> Til
         label="count tiles",
     )
     dr.eval(touched)
-    entries = int(dr.sum(touched)[0])
+    entries = int(dr.sum(dr.uint64_array_t(types.UInt)(touched))[0])
+    if entries >= 1 << 31:
+        raise ValueError(
+            f"{count} splats touch {entries} tiles in all; at most 2^31 can be listed: "
+            "use fewer or smaller splats, or a smaller image"
+        )
     Key = types.UInt if grid.tiles * count < 2**32 else dr.uint64_array_t(types.UInt)
     keys = dr.empty(Key, max(entries, 1))
     owner = dr.arange(types.UInt, count)

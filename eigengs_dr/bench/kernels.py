@@ -81,7 +81,8 @@ def run(
 def _middle(image: NDArray[np.float32]) -> NDArray[np.float32]:
     top, left = ((side - SIDE) // 2 for side in image.shape[:2])
     if top < 0 or left < 0:
-        raise ValueError(f"image is {image.shape[1]}x{image.shape[0]}; it must be at least {SIDE}x{SIDE}")
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        raise ValueError(f"image is {size}; it must be at least {SIDE}x{SIDE}")
     return image[top : top + SIDE, left : left + SIDE]
 
 
