@@ -89,7 +89,7 @@ def bending(image: Array, spacing: float) -> NDArray[np.float32]:
 
 
 def density_of(bend: Array, spacing: float, count: int) -> NDArray[np.float64]:
-    """Splats a pixel, shape (H, W): they sum to `count`, and no pixel has more than one."""
+    """Splats a pixel, shape (H, W): `count` in all, or a little less where most pixels have one."""
     from scipy.ndimage import gaussian_filter
 
     density = gaussian_filter(bend[0] + bend[1], POOL * spacing).astype(np.float64) ** POWER

@@ -1,7 +1,8 @@
-"""Files of arrays: ``.npz`` without pickle, checked before anything is allocated."""
+"""Files of arrays: ``.npz`` without pickle, checked before an array is read."""
 
 from __future__ import annotations
 
+import math
 import os
 import zipfile
 from pathlib import Path
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from .atomic import replacing
 
-MOST_ENTRIES = 1 << 28
+MOST_ENTRIES = 1 << 26
 """Largest number of elements read for one array: what a file claims is not believed beyond."""
 
 
@@ -91,7 +92,9 @@ def read(
             return {key: _member(archive, key, field) for key, field in layout.items()}
     except BadValue as error:
         raise ValueError(f"{path}: {error}") from None
-    except (zipfile.BadZipFile, EOFError, ValueError, KeyError, NotImplementedError) as error:
+    except OSError:
+        raise
+    except Exception as error:  # zlib, lzma, zipfile and NumPy each raise what they like
         raise ValueError(
             f"{path}: not a readable {name} file ({' '.join(str(error).split())[:80]}); "
             "it may be damaged or something else"
@@ -116,7 +119,9 @@ def _member(archive: zipfile.ZipFile, key: str, field: Field) -> NDArray[Any]:
                 f"key '{key}' is {len(shape)}-dimensional {dtype}, "
                 f"expected {field.ndim}-dimensional {kind}"
             )
-        count = int(np.prod(shape, dtype=object)) if shape else 1
+        if min(shape, default=0) < 0:
+            raise BadValue(f"key '{key}' has the negative shape {shape}")
+        count = math.prod(shape)
         if dtype.kind == "U" and dtype.itemsize > 4 * 64:
             raise BadValue(f"key '{key}' is a text of over 64 characters")
         if count > MOST_ENTRIES or count * dtype.itemsize > entry.file_size:

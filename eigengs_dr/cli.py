@@ -21,8 +21,8 @@ from .report import write_report
 EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
 ANY_PATH = click.Path(path_type=Path)
 
-MOST_PIXELS = 1 << 28
-"""Largest picture that is rendered: its numbers take 3 GiB."""
+MOST_PIXELS = 1 << 26
+"""Largest picture that is rendered, thin ones counted in whole tiles: it takes some 6 GiB."""
 
 backend_option = click.option(
     "--backend",
@@ -296,8 +296,9 @@ def _render_size(width: int, height: int, scale: float | None, size: str | None)
     elif scale is not None:
         if not (math.isfinite(scale) and scale > 0):
             raise click.UsageError(f"--scale {scale}: expected a number above 0, such as 2 or 0.5")
+        scale = min(scale, MOST_PIXELS)
         width, height = max(1, round(width * scale)), max(1, round(height * scale))
-    if not 1 <= width * height <= MOST_PIXELS:
+    if width < 1 or height < 1 or (width + 3) * (height + 3) > MOST_PIXELS:
         raise click.UsageError(f"{width}x{height}: expected 1 to {MOST_PIXELS:,} pixels")
     return width, height
 

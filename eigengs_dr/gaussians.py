@@ -25,6 +25,10 @@ NARROWEST = 0.25
 between pixel centres, and its gradient with it."""
 
 
+MOST_CHANNELS = 64
+"""A program holds the sums of all channels of a tile in registers: it must end somewhere."""
+
+
 @dataclass
 class Gaussians:
     """N two-dimensional Gaussians and a constant background: an image of any size.
@@ -142,13 +146,23 @@ class Gaussians:
         """Select splats by a slice, an integer array or a boolean mask; the background stays.
 
         Differentiable with respect to the parameters of the splats that are kept.
+
+        Raises
+        ------
+        IndexError
+            If the index is out of range or of another kind.
+        ValueError
+            If nothing is selected.
         """
         types = types_of(self.mean)
         kept = np.atleast_1d(np.arange(len(self), dtype=np.uint32)[index])
+        if not kept.size:
+            raise ValueError("Gaussians: the selection is empty; a set has at least one splat")
         chosen = types.UInt(kept)
 
         def pick(rows: Any) -> Any:
-            return type(rows)([dr.gather(types.Float, row, chosen) for row in rows])
+            whole = [_broadcast(row, len(self)) for row in rows]
+            return type(rows)([dr.gather(types.Float, row, chosen) for row in whole])
 
         return replace(self, mean=pick(self.mean), factor=pick(self.factor), color=pick(self.color))
 
@@ -202,7 +216,7 @@ class Gaussians:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the set as an ``.npz`` file, all or nothing.
+        """Write the set as an ``.npz`` file in single precision, all or nothing.
 
         Raises
         ------
@@ -214,7 +228,7 @@ class Gaussians:
             FORMAT,
             VERSION,
             {
-                **self.to_arrays(),
+                **{k: v.astype(np.float32) for k, v in self.to_arrays().items()},
                 "size": np.array([self.width, self.height], np.int64),
                 "space": np.array(self.space),
             },
@@ -242,7 +256,7 @@ class Gaussians:
         try:
             size = arrays.pop("size")
             space = str(arrays.pop("space"))
-            _check(arrays, tuple(size), space)
+            _check(arrays, tuple(size.tolist()), space)
         except archive.BadValue as error:
             raise ValueError(f"{path}: {error}") from None
         return cls.from_arrays(
@@ -288,7 +302,10 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
 
     def join(name: str) -> Any:
         parts = [getattr(g, name) for g in sets]
-        rows = [dr.concat([part[k] for part in parts]) for k in range(len(parts[0]))]
+        rows = [
+            dr.concat([_broadcast(part[k], len(g)) for part, g in zip(parts, sets, strict=True)])
+            for k in range(len(parts[0]))
+        ]
         return type(parts[0])(*rows) if name != "color" else type(parts[0])(rows)
 
     return replace(
@@ -298,6 +315,11 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
         color=join("color"),
         background=sum((g.background for g in sets[1:]), first.background),
     )
+
+
+def _broadcast(row: Any, count: int) -> Any:
+    """Give a row that may be a single number `count` entries."""
+    return row + dr.zeros(type(row), count)
 
 
 def _columns(types: Any, array: NDArray[Any]) -> list:
@@ -316,8 +338,8 @@ def _check(arrays: dict[str, NDArray[Any]], size: tuple[int, ...], space: str) -
     if mean.ndim != 2 or mean.shape[1] != 2 or len(mean) == 0:
         raise archive.BadValue(f"mean has shape {mean.shape}, expected (N, 2) with N >= 1")
     channels = color.shape[1] if color.ndim == 2 else 3
-    if channels < 1:
-        raise archive.BadValue("color has no channels, expected at least 1")
+    if not 1 <= channels <= MOST_CHANNELS:
+        raise archive.BadValue(f"color has {channels} channels, expected 1 to {MOST_CHANNELS}")
     for name, array, expected in (
         ("factor", factor, (len(mean), 3)),
         ("color", color, (len(mean), channels)),

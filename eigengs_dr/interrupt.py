@@ -29,7 +29,10 @@ def deferred() -> Iterator[Callable[[], bool]]:
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
-    previous = signal.getsignal(signal.SIGINT) or signal.SIG_DFL
+    previous = signal.getsignal(signal.SIGINT)
+    if previous in (None, signal.SIG_IGN):  # not Python's to handle, or not wanted
+        yield lambda: False
+        return
     presses = []
 
     def remember(number: int, frame: Any) -> None:

@@ -133,7 +133,7 @@ def refine(
         for step, current in enumerate(descend(gaussians, target, schedule, iterations, cutoff)):
             if step not in marks:
                 if interrupted():
-                    raise KeyboardInterrupt
+                    break
                 if progress and step % 10 == 0:
                     dr.sync_thread()  # steps run asynchronously; the bar tells what is done
                     progress(step, iterations, trace[-1])
@@ -144,9 +144,13 @@ def refine(
                 best, highest = current, row["psnr_ycbcr"]
             if progress:
                 progress(step, iterations, row)
+            if interrupted():
+                break
             if _is_plateau(trace, schedule):
                 stopped = "plateau"
                 break
+        if interrupted():
+            stopped = "interrupted"
     except KeyboardInterrupt:
         stopped = "interrupted"
     return Refined(dr.detach(best), trace, step, stopped)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from .arrays import types_of
 from .gaussians import Gaussians
 from .kernels import accumulate, adjoint, channel_sums
-from .rendering import CUTOFF, lists_for, to_tiles
+from .rendering import CUTOFF, WIDEST_CUTOFF, lists_for, to_tiles
 from .splat import SHAPE, UNIT, pack
 from .tiles import TileLists
 
@@ -108,8 +108,9 @@ def _solve(
     inverse = _inverse_diagonal(shape, inside, channels, lists, cutoff)
     z = [a * b for a, b in zip(r, inverse, strict=True)]
     p, rz = z, [dr.dot(a, b) for a, b in zip(r, z, strict=True)]
+    take_step = dr.freeze(_step)  # of this solve alone: a program does not notice another N
     for _ in range(steps):
-        unknowns, residual, p, rz, square = _step(
+        unknowns, residual, p, rz, square = take_step(
             shape, unknowns, residual, p, rz, inverse, inside, lists, cutoff
         )
         squares.append(square * scale)
@@ -123,7 +124,6 @@ def _solve(
     return Solution(solved, [math.sqrt(max(0.0, float(s[0]))) for s in squares])
 
 
-@dr.freeze
 def _step(
     shape: list,
     x: list,
@@ -182,5 +182,6 @@ def _inverse_diagonal(
     """One over the diagonal of ``A^T A``: ``w^2`` is the weight of a splat narrower by sqrt 2."""
     root = math.sqrt(2)
     narrow = [*shape[:2], *[f * root for f in shape[2:SHAPE]]]
-    diagonal = _apply_transposed(narrow, inside, channels, lists, cutoff * root)
+    reach = min(cutoff * root, WIDEST_CUTOFF)  # beyond, squares are 0 in any precision
+    diagonal = _apply_transposed(narrow, inside, channels, lists, reach)
     return [dr.select(d > 1e-8, dr.rcp(d), 0) for d in diagonal]

@@ -21,6 +21,10 @@ TILE = (4, 4)
 pixels in registers and visits 1.7 pixels for one inside the ellipse (8x8: 3.3)."""
 
 
+MOST_ENTRIES = 1 << 28
+"""Longest lists, all tiles together: sorting them takes 4 GiB."""
+
+
 @dataclass(frozen=True)
 class Grid:
     """A `width` x `height` image cut into `nx` x `ny` tiles of `tile` pixels; the last overhang."""
@@ -210,7 +214,7 @@ def build_lists(shape: list, radius: float, grid: Grid, pad: float = 0.0) -> Til
     Raises
     ------
     ValueError
-        If the lists would have 2^31 entries or more.
+        If the lists would have `MOST_ENTRIES` entries or more.
     """
     types = types_of(shape[0])
     count = dr.width(shape[0])
@@ -225,9 +229,9 @@ def build_lists(shape: list, radius: float, grid: Grid, pad: float = 0.0) -> Til
     )
     dr.eval(touched)
     entries = int(dr.sum(dr.uint64_array_t(types.UInt)(touched))[0])
-    if entries >= 1 << 31:
+    if entries >= MOST_ENTRIES:
         raise ValueError(
-            f"{count} splats touch {entries} tiles in all; at most 2^31 can be listed: "
+            f"{count} splats touch {entries} tiles in all, {MOST_ENTRIES} can be listed: "
             "use fewer or smaller splats, or a smaller image"
         )
     Key = types.UInt if grid.tiles * count < 2**32 else dr.uint64_array_t(types.UInt)
