@@ -59,7 +59,9 @@ def render(
     -----
     The order of summation is a function of the input: renderings on one machine and backend are
     bit-equal. A splat whose mean or factor is not finite is not drawn; a colour that is not finite
-    spoils the tiles that its splat touches.
+    spoils the tiles that its splat touches. Building tile lists reads sizes back, which
+    `drjit.freeze` does not allow: freeze a function that takes `lists_for`'s result and calls
+    `splat`, as `eigengs_dr.refine` does.
 
     Examples
     --------

@@ -35,6 +35,7 @@ def run_python(code, **environment):
         capture_output=True,
         text=True,
         check=False,
+        timeout=100,
     )
 
 
