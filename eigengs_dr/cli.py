@@ -251,7 +251,10 @@ def _fit_one(
     height, width = image.shape[:2]
     settings["gaussians"] = settings["gaussians"] or min(5000, width * height)
     with progress_bar(path.name, quiet) as progress:
-        result = eg.fit(image, progress=progress, **settings)
+        try:
+            result = eg.fit(image, progress=progress, **settings)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
     result.gaussians.save(output)
     if preview:
         eg.save_image(preview, np.concatenate([image, result.image], axis=1))
