@@ -178,17 +178,20 @@ def descend(
     tiles = to_tiles(types, target, grid)
     inside = to_tiles(types, np.ones_like(target), grid)
     take_step = _step_program(coordinates, cutoff)
-    yield current
-    for step in range(iterations):
-        if step % schedule.rebuild == 0:
-            lists = lists_for(current, cutoff, schedule.pad)
-        left = _rate_left(schedule, step, iterations)
-        optimizer.set_learning_rate(
-            {name: dr.opaque(types.Float, rate * left) for name, rate in schedule.rates.items()}
-        )
-        take_step(optimizer, gaussians, tiles, inside, lists)
-        current = coordinates.to(gaussians, dict(optimizer))
+    try:
         yield current
+        for step in range(iterations):
+            if step % schedule.rebuild == 0:
+                lists = lists_for(current, cutoff, schedule.pad)
+            left = _rate_left(schedule, step, iterations)
+            optimizer.set_learning_rate(
+                {name: dr.opaque(types.Float, rate * left) for name, rate in schedule.rates.items()}
+            )
+            take_step(optimizer, gaussians, tiles, inside, lists)
+            current = coordinates.to(gaussians, dict(optimizer))
+            yield current
+    finally:
+        take_step.clear()  # left to the garbage collector, it may be freed while another is traced
 
 
 def _rate_left(schedule: Schedule, step: int, iterations: int) -> float:
@@ -198,9 +201,7 @@ def _rate_left(schedule: Schedule, step: int, iterations: int) -> float:
     return left * min(1.0, (step + 1) / max(1, schedule.warm_up))
 
 
-def _step_program(
-    coordinates: Coordinates, cutoff: float
-) -> Callable[[Any, Gaussians, Any, Any, TileLists], None]:
+def _step_program(coordinates: Coordinates, cutoff: float) -> Any:
     """Make a frozen program for a step: traced once, replayed without Python.
 
     A program belongs to one run: a replay does not notice that, say, the betas of another optimiser

@@ -109,11 +109,14 @@ def _solve(
     z = [a * b for a, b in zip(r, inverse, strict=True)]
     p, rz = z, [dr.dot(a, b) for a, b in zip(r, z, strict=True)]
     take_step = dr.freeze(_step)  # of this solve alone: a program does not notice another N
-    for _ in range(steps):
-        unknowns, residual, p, rz, square = take_step(
-            shape, unknowns, residual, p, rz, inverse, inside, lists, cutoff
-        )
-        squares.append(square * scale)
+    try:
+        for _ in range(steps):
+            unknowns, residual, p, rz, square = take_step(
+                shape, unknowns, residual, p, rz, inverse, inside, lists, cutoff
+            )
+            squares.append(square * scale)
+    finally:
+        take_step.clear()  # left to the garbage collector, it may be freed while another is traced
     index = dr.arange(types.UInt, n)
     solved = replace(
         gaussians,
