@@ -6,7 +6,7 @@ import math
 import os
 import zipfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
@@ -79,8 +79,16 @@ def read(
         If it cannot be opened.
     """
     path = Path(path)
+    with path.open("rb") as file:
+        return _read(file, path, name, version, layout)
+
+
+def _read(
+    file: BinaryIO, path: Path, name: str, version: int, layout: dict[str, Field]
+) -> dict[str, NDArray[Any]]:
+    """Turn whatever goes wrong with an open file into one line."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(file) as archive:
             found = str(_member(archive, "format", Field("U", 0)))
             if found != name:
                 raise BadValue(f"format is {found[:40]!r}, expected {name!r}")
@@ -92,8 +100,6 @@ def read(
             return {key: _member(archive, key, field) for key, field in layout.items()}
     except BadValue as error:
         raise ValueError(f"{path}: {error}") from None
-    except OSError:
-        raise
     except Exception as error:  # zlib, lzma, zipfile and NumPy each raise what they like
         raise ValueError(
             f"{path}: not a readable {name} file ({' '.join(str(error).split())[:80]}); "

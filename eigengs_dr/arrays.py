@@ -103,4 +103,5 @@ def upload(kind: Any, values: NDArray[Any]) -> Any:
     index = dr.arange(dr.uint32_array_t(kind), len(values))
     dr.scatter(target, kind(np.ascontiguousarray(values)), index)
     dr.eval(target)
+    dr.sync_thread()  # the copy may read the caller's memory until then
     return target

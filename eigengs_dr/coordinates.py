@@ -51,16 +51,13 @@ def _in_units(g: Gaussians, size: Any) -> dict[str, Any]:
 
 def _natural_to(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
     size = _size(fixed)
-    return replace(
-        fixed,
-        mean=variables["mean"] * size,
-        factor=variables["factor"] / size,
-        color=variables["color"],
-    )
+    units = {"mean": size, "factor": 1 / size, "color": 1}
+    return replace(fixed, **{name: value * units[name] for name, value in variables.items()})
 
 
 def _natural_bounded(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, Any]:
-    return _in_units(_natural_to(fixed, variables).bounded(), _size(fixed))
+    inside = _in_units(_natural_to(fixed, variables).bounded(), _size(fixed))
+    return {name: inside[name] for name in variables}
 
 
 NATURAL = Coordinates(_natural_of, _natural_to, _natural_bounded)
@@ -96,22 +93,23 @@ def _atanh(x: Any) -> Any:
 
 
 def _cholesky_to(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
-    types = types_of(fixed.mean)
-    x, y = variables["mean"]
-    l1, l2, l3 = variables["cholesky"]
+    parts = {}
+    if "mean" in variables:
+        x, y = (0.5 * (dr.tanh(v) + 1) for v in variables["mean"])
+        parts["mean"] = type(fixed.mean)(x * fixed.width, y * fixed.height)
+    if "cholesky" in variables:
+        parts["factor"] = type(fixed.factor)(_inverse_factor(*variables["cholesky"]))
+    if "color" in variables:
+        parts["color"] = variables["color"]
+    return replace(fixed, **parts)
+
+
+def _inverse_factor(l1: Any, l2: Any, l3: Any) -> tuple[Any, Any, Any]:
+    """``F`` with ``F^T F = (L L^T)^-1``; as `eigengs_dr.place.inverse_factor`."""
     l1, l3 = l1 + CHOLESKY_BOUND, l3 + CHOLESKY_BOUND
-    # Sigma = [[l1^2, l1 l2], [l1 l2, l2^2 + l3^2]]; F as in `eigengs_dr.place.inverse_factor`.
     yy = dr.square(l2) + dr.square(l3)
-    c = dr.rsqrt(yy)
     a = dr.sqrt(yy) / dr.abs(l1 * l3)
-    return replace(
-        fixed,
-        mean=types.Float2(
-            (dr.tanh(x) + 1) * (0.5 * fixed.width), (dr.tanh(y) + 1) * (0.5 * fixed.height)
-        ),
-        factor=types.Float3(a, -l1 * l2 / yy * a, c),
-        color=variables["color"],
-    )
+    return a, -l1 * l2 / yy * a, dr.rsqrt(yy)
 
 
 def _cholesky_bounded(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, Any]:

@@ -113,7 +113,7 @@ def fit(
     """
     started = time.perf_counter()
     pixels = check_image(image)
-    _check(pixels, gaussians, iterations, init, preset, solve_steps, color)
+    _check(pixels, gaussians, iterations, init, preset, solve_steps, color, seed)
     method = PRESETS[preset]
     target = rgb_to_ycbcr(pixels) if color == "ycbcr" else pixels
     with deferred() as interrupted:
@@ -169,16 +169,18 @@ def _check(
     preset: str,
     solve_steps: int,
     color: str,
+    seed: int,
 ) -> None:
     """Raise ValueError for the first argument that is out of range."""
+    counts = {"gaussians": gaussians, "iterations": iterations, "solve_steps": solve_steps}
+    for name, count in {**counts, "seed": seed}.items():
+        if not isinstance(count, (int, np.integer)) or count < 0:
+            raise ValueError(f"{name} is {count!r}; it must be at least 0, and whole")
     height, width = pixels.shape[:2]
     if not 1 <= gaussians <= width * height:
         raise ValueError(
             f"gaussians is {gaussians}; an image of {width}x{height} takes 1 to {width * height}"
         )
-    for name, count in (("iterations", iterations), ("solve_steps", solve_steps)):
-        if count < 0:
-            raise ValueError(f"{name} is {count}; it must be at least 0")
     for name, value, known in (
         ("init", init, ("auto", *INITS)),
         ("preset", preset, tuple(PRESETS)),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -118,8 +119,8 @@ class Gaussians:
             factor=types.Float3(*_columns(types, checked["factor"])),
             color=types.FloatX(_columns(types, checked["color"])),
             background=types.FloatX(_columns(types, checked["background"][None])),
-            width=int(size[0]),
-            height=int(size[1]),
+            width=index(size[0]),
+            height=index(size[1]),
             space=space,
         )
 
@@ -142,7 +143,7 @@ class Gaussians:
         """Number of channels."""
         return len(self.color)
 
-    def __getitem__(self, index: Any) -> Gaussians:
+    def __getitem__(self, selection: Any) -> Gaussians:
         """Select splats by a slice, an integer array or a boolean mask; the background stays.
 
         Differentiable with respect to the parameters of the splats that are kept.
@@ -155,7 +156,7 @@ class Gaussians:
             If nothing is selected.
         """
         types = types_of(self.mean)
-        kept = np.atleast_1d(np.arange(len(self), dtype=np.uint32)[index])
+        kept = np.atleast_1d(np.arange(len(self), dtype=np.uint32)[selection])
         if not kept.size:
             raise ValueError("Gaussians: the selection is empty; a set has at least one splat")
         chosen = types.UInt(kept)
@@ -213,6 +214,7 @@ class Gaussians:
                 inside(a, low, high, high), inside(b, -high, high, 0.0), inside(c, low, high, high)
             ),
             color=dr.select(dr.isfinite(self.color), self.color, 0),
+            background=dr.select(dr.isfinite(self.background), self.background, 0),
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -352,7 +354,7 @@ def _check(arrays: dict[str, NDArray[Any]], size: tuple[int, ...], space: str) -
             raise archive.BadValue(f"{name} holds values that are not finite")
     if not (factor[:, [0, 2]] > 0).all():
         raise archive.BadValue("factor has a or c <= 0; both must be positive")
-    if len(size) != 2 or not all(1 <= side <= 1 << 16 for side in size):
+    if len(size) != 2 or not all(side == int(side) and 1 <= side <= 1 << 16 for side in size):
         raise archive.BadValue(f"size is {size}, expected two sides from 1 to 65536")
     if space not in SPACES:
         raise archive.BadValue(f"space is {space!r}, expected one of {', '.join(SPACES)}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -178,6 +178,7 @@ def descend(
     tiles = to_tiles(types, target, grid)
     inside = to_tiles(types, np.ones_like(target), grid)
     take_step = _step_program(coordinates, cutoff)
+    zero = dr.opaque(types.Float, 0)
     try:
         yield current
         for step in range(iterations):
@@ -189,6 +190,9 @@ def descend(
             )
             take_step(optimizer, gaussians, tiles, inside, lists)
             current = coordinates.to(gaussians, dict(optimizer))
+            # Later steps write into the optimiser's arrays: what is yielded must be a copy.
+            current = replace(current, color=current.color + zero)
+            dr.eval(current)
             yield current
     finally:
         take_step.clear()  # left to the garbage collector, it may be freed while another is traced

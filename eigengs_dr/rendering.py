@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import index
 from typing import Any
 
 import drjit as dr
@@ -72,12 +73,16 @@ def render(
     """
     width, height = _size(gaussians, width, height)
     scaled = gaussians.scaled(width, height)
+    cutoff = float(cutoff)  # a NumPy scalar would promote everything to float64
     values, background = splat_values(scaled)
     lists = lists_for(scaled, cutoff)
     return to_tensor(splat(values, background, lists, cutoff), lists.grid, len(background))
 
 
 def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[int, int]:
+    for name, side in (("width", width), ("height", height)):
+        if side is not None and index(side) < 1:
+            raise ValueError(f"{name} is {side}; it must be at least 1 pixel")
     if width is None and height is None:
         return gaussians.width, gaussians.height
     if width is None:
@@ -85,7 +90,7 @@ def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[
         width = max(1, round(height * gaussians.width / gaussians.height))
     if height is None:
         height = max(1, round(width * gaussians.height / gaussians.width))
-    return width, height
+    return index(width), index(height)
 
 
 def splat_values(gaussians: Gaussians) -> tuple[list, list]:
@@ -180,10 +185,10 @@ class _Rows(dr.CustomOp):
 
     def eval(self, image: Any, grid: Grid, channels: int) -> Any:
         types = types_of(image)
-        index = dr.arange(types.UInt, grid.nx * grid.ny * grid.tile[1])
-        column, row = index % grid.nx, index // grid.nx
+        runs = dr.arange(types.UInt, grid.nx * grid.ny * grid.tile[1])
+        column, row = runs % grid.nx, runs // grid.nx
         tile_row, inner = row // grid.tile[1], row % grid.tile[1]
-        self.by_row = index
+        self.by_row = runs
         self.by_tile = (tile_row * grid.nx + column) * grid.tile[1] + inner
         self.run = grid.tile[0] * channels
         return self._permute(image, self.by_tile, self.by_row)

@@ -22,6 +22,9 @@ from .rendering import CUTOFF, WIDEST_CUTOFF, lists_for, to_tiles
 from .splat import SHAPE, UNIT, pack
 from .tiles import TileLists
 
+ROUNDING = {32: 1e-12, 64: 1e-28}
+"""Share of the first ``r^T z`` below which only rounding is left, by bits of a number."""
+
 
 class Solution(NamedTuple):
     """Result of `solve`.
@@ -96,7 +99,9 @@ def _solve(
         constant = [types.Float(b) for b in gaussians.background]
     else:
         x = [dr.zeros(types.Float, n) for _ in range(channels)]
-        constant = [dr.opaque(types.Float, m) for m in image.mean(axis=(0, 1)).tolist()]
+        constant = [
+            dr.opaque(types.Float, m) for m in image.mean(axis=(0, 1), dtype=np.float64).tolist()
+        ]
     unknowns = [dr.concat([c, b]) for c, b in zip(x, constant, strict=True)]
     dr.eval(shape, unknowns)
 
@@ -108,11 +113,13 @@ def _solve(
     inverse = _inverse_diagonal(shape, inside, channels, lists, cutoff)
     z = [a * b for a, b in zip(r, inverse, strict=True)]
     p, rz = z, [dr.dot(a, b) for a, b in zip(r, z, strict=True)]
+    enough = [ROUNDING[types.bits] * a for a in rz]
+    dr.eval(p, rz, enough)
     take_step = dr.freeze(_step)  # of this solve alone: a program does not notice another N
     try:
         for _ in range(steps):
             unknowns, residual, p, rz, square = take_step(
-                shape, unknowns, residual, p, rz, inverse, inside, lists, cutoff
+                shape, unknowns, residual, p, rz, enough, inverse, inside, lists, cutoff
             )
             squares.append(square * scale)
     finally:
@@ -124,7 +131,7 @@ def _solve(
         background=types.FloatX([dr.gather(types.Float, u, types.UInt(n)) for u in unknowns]),
     )
     dr.eval(solved)
-    return Solution(solved, [math.sqrt(max(0.0, float(s[0]))) for s in squares])
+    return Solution(solved, [math.sqrt(float(s[0])) for s in squares])
 
 
 def _step(
@@ -133,6 +140,7 @@ def _step(
     residual: Any,
     p: list,
     rz: list,
+    enough: list,
     inverse: list,
     inside: Any,
     lists: TileLists,
@@ -144,7 +152,7 @@ def _step(
     q = _apply(shape, p, lists, inside, cutoff)
     dr.eval(q)
     curvature = channel_sums(dr.square(q), channels, lists.grid)
-    # A direction of zero length (all is solved, or nothing is seen) must not divide by zero.
+    # What is solved but for rounding stays as it is: its directions would grow without bound.
     alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, curvature, strict=True)]
     x = [dr.fma(a, d, v) for a, d, v in zip(alpha, p, x, strict=True)]
     spread = dr.tile(dr.concat(alpha), lists.grid.tiles * lists.grid.pixels)
@@ -154,7 +162,10 @@ def _step(
     z = [a * b for a, b in zip(r, inverse, strict=True)]
     new_rz = [dr.dot(a, b) for a, b in zip(r, z, strict=True)]
     beta = [dr.select(a > 0, b / a, Float(0)) for a, b in zip(rz, new_rz, strict=True)]
-    p = [dr.fma(b, d, v) for b, d, v in zip(beta, p, z, strict=True)]
+    p = [
+        dr.select(a > least, dr.fma(b, d, v), 0)
+        for a, least, b, d, v in zip(new_rz, enough, beta, p, z, strict=True)
+    ]
     return x, residual, p, new_rz, dr.sum(dr.square(residual))
 
 

@@ -25,7 +25,7 @@ LN2 = math.log(2)
 
 
 def exp2_neg(q: Any) -> Any:
-    """``2^-q`` for ``0 <= q <= 120``: relative error < 2e-7 at half the cost of `drjit.exp2`.
+    """``2^-q`` for ``0 <= q <= 120``: relative error < 3e-7 at half the cost of `drjit.exp2`.
 
     ``q = n - f`` with integer n and ``|f| <= 1/2``: a polynomial gives ``2^f``, and n is subtracted
     from its exponent bits. Outside the range the result is arbitrary and callers mask it. In double

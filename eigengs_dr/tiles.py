@@ -110,8 +110,9 @@ def span(shape: list, radius: Any, grid: Grid, row: Any, pad: float = 0.0) -> tu
     reach = radius * dr.rcp(c) + pad
     low = dr.maximum(top - pad, -reach)
     high = dr.minimum(top + (height - 1) + pad, reach)
-    tilt = b * dr.rcp(c)
-    peak = -radius * tilt * dr.rsqrt(dr.fma(tilt, tilt, 1)) * dr.rcp(c)
+    larger = dr.rcp(dr.maximum(dr.abs(b), c))  # b^2 + c^2 may leave the range of floats
+    b1, c1 = b * larger, c * larger
+    peak = -radius * b1 * dr.rsqrt(dr.fma(b1, b1, c1 * c1)) * dr.rcp(c)
 
     def half_width(dy: Any) -> Any:
         return dr.safe_sqrt(radius * radius - dr.square(c * dy))

@@ -1,0 +1,272 @@
+"""Where splats start: every initialiser on any image, and what each of them promises."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scenes import covariances, few
+
+from eigengs_dr.adaptive import adaptive, bending, density_of, hilbert_order, pieces, relaxed
+from eigengs_dr.place import GRID_SIZE, grid, inverse_factor, random
+
+INITS = [random, grid, adaptive]
+
+
+def generator(seed=0):
+    return np.random.default_rng(seed)
+
+
+def covariances_of(factor):
+    a, b, c = np.asarray(factor, np.float64).T
+    matrix = np.array([[a, b], [np.zeros_like(a), c]]).transpose(2, 0, 1)
+    return np.linalg.inv(np.einsum("nji,njk->nik", matrix, matrix))
+
+
+def check_placement(mean, factor, count, size):
+    width, height = size
+    assert mean.shape == (count, 2)
+    assert factor.shape == (count, 3)
+    assert np.isfinite(mean).all()
+    assert np.isfinite(factor).all()
+    assert ((mean >= 0) & (mean <= [width, height])).all()
+    assert (factor[:, [0, 2]] > 0).all()
+
+
+@st.composite
+def images_and_counts(draw):
+    """Images down to one pixel, of noise, few values or one value, and any number of splats."""
+    height, width, channels = draw(
+        st.tuples(st.integers(1, 24), st.integers(1, 24), st.sampled_from([1, 3]))
+    )
+    elements = draw(
+        st.sampled_from([st.floats(0, 1, width=32), st.sampled_from([0.0, 1.0]), st.just(0.5)])
+    )
+    image = draw(hnp.arrays(np.float32, (height, width, channels), elements=elements))
+    return image, draw(st.integers(1, height * width))
+
+
+@pytest.mark.parametrize("place", INITS)
+@few
+@given(drawn=images_and_counts())
+def test_any_image_and_any_count(place, drawn):
+    image, count = drawn
+    mean, factor = place(image, count, generator())
+    check_placement(mean, factor, count, image.shape[1::-1])
+
+
+@pytest.mark.parametrize("place", INITS)
+@pytest.mark.parametrize("shape", [(1, 1), (1, 17), (17, 1), (2, 2), (64, 3)])
+@pytest.mark.parametrize("part", [0, 0.5, 1])
+def test_narrow_images(place, shape, part):
+    image = generator().uniform(0, 1, (*shape, 3)).astype(np.float32)
+    count = max(1, round(part * shape[0] * shape[1]))
+    mean, factor = place(image, count, generator())
+    check_placement(mean, factor, count, shape[::-1])
+
+
+@pytest.mark.parametrize("place", INITS)
+def test_one_seed_gives_one_placement(place):
+    image = generator(1).uniform(0, 1, (20, 30, 3)).astype(np.float32)
+    first, second = place(image, 50, generator(7)), place(image, 50, generator(7))
+    np.testing.assert_array_equal(first[0], second[0])
+    np.testing.assert_array_equal(first[1], second[1])
+
+
+@pytest.mark.parametrize("place", [random, grid])
+def test_seeds_differ(place):
+    image = np.zeros((20, 30, 3), np.float32)
+    assert not np.array_equal(place(image, 50, generator(1))[0], place(image, 50, generator(2))[0])
+
+
+# --- Factors and random placement --------------------------------------------------------------
+
+
+def test_inverse_factor():
+    rng = generator()
+    sigma = covariances(rng.uniform(0.1, 100, (200, 2)), rng.uniform(0, np.pi, 200))
+    factor = inverse_factor(sigma[:, 0, 0], sigma[:, 0, 1], sigma[:, 1, 1])
+    np.testing.assert_allclose(covariances_of(factor), sigma, rtol=1e-9, atol=1e-9)
+    assert (factor[:, [0, 2]] > 0).all()
+
+
+def test_random_is_uniform():
+    """Means over the image; Cholesky factors over [0.5, 1.5], [0, 1], [0.5, 1.5]."""
+    count = 20_000
+    mean, factor = random(np.zeros((50, 200, 3)), count, generator())
+    cholesky = np.linalg.cholesky(covariances_of(factor))
+    drawn = [mean[:, 0] / 200, mean[:, 1] / 50]
+    drawn += [cholesky[:, 0, 0] - 0.5, cholesky[:, 1, 0], cholesky[:, 1, 1] - 0.5]
+    for values in drawn:
+        quantiles = np.quantile(values, [0, 0.25, 0.5, 0.75, 1])
+        np.testing.assert_allclose(quantiles, [0, 0.25, 0.5, 0.75, 1], atol=0.02)
+
+
+# --- Grid --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("width", "height", "count"), [(40, 40, 100), (64, 16, 64), (30, 50, 97)])
+def test_grid(width, height, count):
+    """Rows that differ by one splat at most; every splat within the jitter of its place."""
+    mean, factor = grid(np.zeros((height, width, 3)), count, generator())
+    spacing = np.sqrt(width * height / count)
+    rows = max(1, round(height / spacing))
+    distance = height / rows
+    row = np.floor(mean[:, 1] / distance).astype(int)
+    inside = np.abs(mean[:, 1] / distance - row - 0.5) * distance <= 0.25 * spacing + 1e-9
+    assert inside.all()
+    numbers = np.bincount(row, minlength=rows)
+    assert numbers.max() - numbers.min() <= 1
+    for k in range(rows):
+        x = np.sort(mean[row == k, 0])
+        places = (np.arange(len(x)) + 0.5) * width / len(x)
+        assert np.abs(x - places).max() <= 0.25 * spacing + 1e-9
+    np.testing.assert_allclose(
+        factor, np.tile([1 / (GRID_SIZE * spacing), 0, 1 / (GRID_SIZE * spacing)], (count, 1))
+    )
+
+
+# --- Hilbert curve -----------------------------------------------------------------------------
+
+
+@few
+@given(height=st.integers(1, 40), width=st.integers(1, 40))
+def test_hilbert_order_visits_every_pixel_once(height, width):
+    order = hilbert_order(height, width)
+    assert sorted(order) == list(range(height * width))
+
+
+@pytest.mark.parametrize("side", [1, 2, 4, 8, 32])
+def test_hilbert_curve_steps_to_neighbours(side):
+    row, column = np.divmod(hilbert_order(side, side), side)
+    assert (np.abs(np.diff(row)) + np.abs(np.diff(column)) == 1).all()
+
+
+@pytest.mark.parametrize("side", [4, 16])
+def test_hilbert_curve_stays_in_a_quarter(side):
+    """Any quarter of the curve is a quarter of the square, and a quarter of that again."""
+    order = hilbert_order(side, side)
+    block = side
+    while block > 1:
+        block //= 2
+        parts = order.reshape(-1, block * block)
+        row, column = np.divmod(parts, side)
+        assert (np.ptp(row, axis=1) == block - 1).all()
+        assert (np.ptp(column, axis=1) == block - 1).all()
+
+
+# --- Adaptive ----------------------------------------------------------------------------------
+
+
+def test_adaptive_does_not_use_the_generator():
+    image = generator(1).uniform(0, 1, (20, 30, 3)).astype(np.float32)
+    first, second = adaptive(image, 50, generator(1)), adaptive(image, 50, generator(2))
+    np.testing.assert_array_equal(first[0], second[0])
+
+
+@few
+@given(drawn=images_and_counts())
+def test_density_of_any_image(drawn):
+    """No pixel has more than one splat, none has nothing."""
+    image, count = drawn
+    pixels = image.shape[0] * image.shape[1]
+    spacing = float(np.sqrt(pixels / count))
+    density = density_of(bending(image, spacing), spacing, count)
+    assert density.shape == image.shape[:2]
+    assert (density > 0).all()
+    assert density.max() <= 1
+    assert density.sum() <= count * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 10, 100, 400])
+def test_density_sums_to_the_count(count):
+    y, x = np.indices((40, 40)) / 40
+    image = np.stack([np.sin(7 * x * x + y), np.cos(9 * y), x * y], axis=-1).astype(np.float32)
+    spacing = float(np.sqrt(1600 / count))
+    assert density_of(bending(image, spacing), spacing, count).sum() == pytest.approx(count)
+
+
+def test_bending_of_a_parabola():
+    """Second derivatives 2 and 6 along the axes, 1 across: H H, whatever the blur."""
+    y, x = np.indices((30, 40)).astype(np.float32)
+    image = (x * x + 3 * y * y + x * y)[..., None]
+    found = bending(image, 4.0)[:, 10:20, 10:30]
+    hessian = np.array([[2.0, 1], [1, 6]])
+    squared = hessian @ hessian
+    expected = np.array([squared[0, 0], squared[1, 1], squared[0, 1]])[:, None, None]
+    np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=2e-2)
+
+
+def test_straight_ramps_do_not_bend():
+    y, x = np.indices((30, 40)).astype(np.float32)
+    image = np.stack([0.01 * x, 0.02 * y, 0.01 * (x + y)], axis=-1)
+    flat = bending(np.zeros_like(image), 4.0)
+    np.testing.assert_allclose(bending(image, 4.0)[:, 5:-5, 5:-5], flat[:, 5:-5, 5:-5], atol=1e-9)
+
+
+def test_constant_image_is_covered_evenly():
+    mean, factor = adaptive(np.full((64, 64, 3), 0.5, np.float32), 256, generator())
+    quarter = (mean // 32).astype(int)
+    numbers = np.bincount(quarter[:, 0] + 2 * quarter[:, 1], minlength=4)
+    assert np.abs(numbers - 64).max() <= 3
+    sigma = covariances_of(factor)
+    np.testing.assert_allclose(
+        sigma, np.tile(sigma[0, 0, 0] * np.eye(2), (256, 1, 1)), rtol=0.1, atol=0.5
+    )
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_splats_gather_at_an_edge_and_lie_along_it(upright):
+    image = np.zeros((64, 64, 3), np.float32)
+    image[:, 32:] = 1
+    mean, factor = adaptive(image if upright else image.transpose(1, 0, 2), 200, generator())
+    near = np.abs(mean[:, 0 if upright else 1] - 32) < 6
+    assert near.mean() > 2 * 12 / 64
+    sigma = covariances_of(factor[near])
+    across, along = (0, 1) if upright else (1, 0)
+    assert (sigma[:, along, along] > 2 * sigma[:, across, across]).mean() > 0.9
+
+
+def test_splats_lie_along_a_slanted_edge():
+    """At 45 degrees, falling to the right: the covariance of x and y is positive along it."""
+    y, x = np.indices((64, 64))
+    image = np.repeat((x > y)[..., None], 3, axis=2).astype(np.float32)
+    mean, factor = adaptive(image, 200, generator())
+    near = np.abs(mean[:, 0] - mean[:, 1]) < 6
+    sigma = covariances_of(factor[near])
+    along = sigma.sum(axis=(1, 2)) / 2  # variance along (1, 1) / sqrt 2
+    across = along - 2 * sigma[:, 0, 1]
+    assert (along > 2 * across).mean() > 0.9
+
+
+def test_brightness_does_not_move_splats():
+    image = generator(2).uniform(0, 0.5, (32, 32, 3)).astype(np.float32)
+    first, second = (adaptive(image + shift, 80, generator())[0] for shift in (0, 0.25))
+    np.testing.assert_allclose(first, second, atol=0.5)
+
+
+def test_pieces_of_an_even_density_are_squares():
+    """64 splats on 32 x 32 pixels: pieces of the curve are blocks of 4 x 4."""
+    mean = pieces(np.full((32, 32), 64 / 1024), 64)
+    expected = {(4 * i + 2.0, 4 * j + 2.0) for i in range(8) for j in range(8)}
+    assert {tuple(np.round(m, 6)) for m in mean} == expected
+
+
+def test_one_piece_is_the_centroid():
+    density = generator(3).uniform(0.1, 1, (9, 14))
+    y, x = np.indices(density.shape) + 0.5
+    expected = [(density * v).sum() / density.sum() for v in (x, y)]
+    np.testing.assert_allclose(pieces(density, 1)[0], expected)
+
+
+def test_relaxation_moves_to_centroids():
+    """Two centres share the pixels of an even strip: each moves to the middle of its half."""
+    mean = relaxed(np.array([[1.2, 0.5], [8.9, 0.5]]), np.full((1, 10), 0.2))
+    np.testing.assert_allclose(mean, [[2.5, 0.5], [7.5, 0.5]])
+
+
+def test_relaxation_of_centres_in_one_pixel():
+    """The last of them moves, the others stay: none is lost and none is NaN."""
+    start = np.array([[2.5, 0.5], [2.6, 0.5], [2.7, 0.5]])
+    mean = relaxed(start, np.full((1, 10), 0.3))
+    np.testing.assert_allclose(mean, [[2.5, 0.5], [2.6, 0.5], [5, 0.5]])

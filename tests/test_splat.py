@@ -1,0 +1,275 @@
+"""One splat at a block of points: values, both derivatives, and how parameters lie in memory."""
+
+import math
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from eigengs_dr.arrays import _types, types_in, types_of
+from eigengs_dr.backend import select
+from eigengs_dr.splat import (
+    UNIT,
+    exp2_neg,
+    falloff,
+    gather_run,
+    pack,
+    unpack,
+    weights,
+    weights_pullback,
+)
+
+TILE = (4, 3)
+CUTOFF = 3.0
+LIMIT = (UNIT * CUTOFF) ** 2
+COUNT = 256
+
+
+@pytest.fixture(params=[32, 64])
+def types(backend, request):
+    """Types of a backend in single and in double precision."""
+    return _types(select(backend).__name__, request.param)
+
+
+def precision(types, single, double):
+    return single if types.bits == 32 else double
+
+
+def draw(seed=0):
+    """Random parameters (5, N) of splats near the block that starts at (x, y), all float32."""
+    rng = np.random.default_rng(seed)
+    x, y = np.floor(rng.uniform(0, 40, (2, COUNT))) + 0.5
+    mean = np.stack([x, y]) + rng.uniform(-5, 8, (2, COUNT))
+    a, c = np.exp(rng.uniform(math.log(0.1), math.log(2), (2, COUNT)))
+    shape = np.stack([*mean, a, rng.uniform(-1, 1, COUNT), c])
+    return [v.astype(np.float32).astype(np.float64) for v in (shape, x, y)]
+
+
+def squared_distance(shape, x, y):
+    """``|F (x - mean)|^2`` at the points of the block, shape (points, N)."""
+    mx, my, a, b, c = shape
+    j, i = np.indices(TILE[::-1]).reshape(2, -1, 1)
+    dx, dy = x + i - mx, y + j - my
+    return (a * dx + b * dy) ** 2 + (c * dy) ** 2
+
+
+def upload(types, *arrays):
+    return [types.Float(np.ascontiguousarray(v)) for v in arrays]
+
+
+def scaled(types, shape):
+    """Parameters as kernels take them: the factor in units of `UNIT`."""
+    return [v * UNIT if k > 1 else v for k, v in enumerate(upload(types, *shape))]
+
+
+# --- 2^-q --------------------------------------------------------------------------------------
+
+
+def error_of_exp2_neg(types):
+    rng = np.random.default_rng(0)
+    halves, small = np.arange(0, 120.25, 0.25), 2.0 ** -np.arange(99)
+    q = np.concatenate([halves, small, rng.uniform(0, 120, 200_000)])
+    q = q.astype(np.float32).astype(np.float64)
+    value = exp2_neg(types.Float(q)).numpy().astype(np.float64)
+    return np.abs(value / np.exp2(-q) - 1).max()
+
+
+def test_exp2_neg(types):
+    assert error_of_exp2_neg(types) < precision(types, 2.5e-7, 1e-15)
+
+
+def test_exp2_neg_is_as_precise_as_documented(backend):
+    assert error_of_exp2_neg(types_in(select(backend))) < 3e-7
+
+
+def test_weights_are_at_most_one(backend):
+    types = types_in(select(backend))
+    q = np.concatenate([np.linspace(0, 2, 10_001), 2.0 ** -np.arange(99)])
+    assert exp2_neg(types.Float(q)).numpy().max() <= 1
+
+
+def test_falloff_ends_at_the_limit(types):
+    q = types.Float([0, 6, np.nextafter(np.float32(6), np.float32(7)), 1e9, np.inf, np.nan])
+    value = falloff(q, 6.0).numpy()
+    assert value[:2] == pytest.approx([1, 2**-6], rel=2e-7)
+    assert not value[2:].any()
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_derivative_of_falloff(types, mode):
+    points = np.linspace(0, 12, 200)
+    q = types.Float(points)
+    dr.enable_grad(q)
+    value = falloff(q, 6.0)
+    assert dr.allclose(dr.detach(value), falloff(dr.detach(q), 6.0), 0, 0)
+    if mode == "reverse":
+        dr.backward(value)
+        slope = dr.grad(q).numpy()
+    else:
+        dr.forward(q)
+        slope = dr.grad(value).numpy()
+    exact = np.where(points <= 6, -math.log(2) * np.exp2(-points), 0)
+    np.testing.assert_allclose(slope, exact, rtol=precision(types, 1e-6, 1e-13), atol=0)
+
+
+# --- Weights of a block ------------------------------------------------------------------------
+
+
+def test_weights(types):
+    shape, x, y = draw()
+    found = weights(scaled(types, shape), *upload(types, x, y), TILE, LIMIT)
+    assert len(found) == TILE[0] * TILE[1]
+    q = squared_distance(shape, x, y)
+    exact = np.where(q <= CUTOFF**2, np.exp(-0.5 * q), 0)
+    clear = np.abs(q / CUTOFF**2 - 1) > 1e-4  # rounding decides nearer to the edge
+    error = np.abs(np.stack([w.numpy() for w in found]) - exact)[clear]
+    assert clear.mean() > 0.99
+    assert ((exact > 0) & (exact < 1)).mean() > 0.1
+    assert error.max() < precision(types, 3e-6, 1e-13)
+
+
+def test_one_point_is_a_block_of_one(types):
+    shape, x, y = draw()
+    block = weights(scaled(types, shape), *upload(types, x, y), TILE, LIMIT)
+    [single] = weights(scaled(types, shape), *upload(types, x + 2, y + 1), (1, 1), LIMIT)
+    q = squared_distance(shape, x, y)[TILE[0] + 2]
+    clear = np.abs(q / CUTOFF**2 - 1) > 1e-4
+    error = np.abs(single.numpy() - block[TILE[0] + 2].numpy())[clear]
+    assert error.max() < precision(types, 3e-6, 1e-13)
+
+
+@pytest.mark.parametrize("position", range(5))
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_weights_are_never_nan(types, position, value):
+    shape = scaled(types, [[8.0], [8.0], [0.5], [0.1], [0.5]])
+    shape[position] = types.Float(value)
+    found = weights(shape, types.Float(6.5), types.Float(6.5), TILE, LIMIT)
+    assert not any(w.numpy().any() for w in found)
+
+
+# --- Their derivative --------------------------------------------------------------------------
+
+
+def pull_with(upstream):
+    return lambda k, w: upstream[k]
+
+
+def test_pullback_is_the_derivative_of_weights(types):
+    shape, x, y = draw()
+    rng = np.random.default_rng(1)
+    upstream = upload(types, *rng.normal(size=(TILE[0] * TILE[1], COUNT)))
+    parameters, x, y = scaled(types, shape), *upload(types, x, y)
+    by_hand = weights_pullback(parameters, x, y, TILE, LIMIT, pull_with(upstream))
+    dr.enable_grad(parameters)
+    total = sum(
+        g * w for g, w in zip(upstream, weights(parameters, x, y, TILE, LIMIT), strict=True)
+    )
+    dr.backward(total)
+    for ours, theirs in zip(by_hand, dr.grad(parameters), strict=True):
+        size = np.abs(theirs.numpy()).max()
+        error = np.abs(ours.numpy() - theirs.numpy()).max()
+        assert error <= precision(types, 3e-6, 1e-13) * size
+
+
+def test_pullback_against_finite_differences(types):
+    shape, x, y = draw()
+    everywhere = 100.0  # a limit beyond all points, so that no step crosses the edge
+    keep = squared_distance(shape, x, y).max(axis=0) * UNIT**2 < everywhere
+    shape, x, y = shape[:, keep], x[keep], y[keep]
+    assert keep.sum() > COUNT / 4
+    upstream = np.random.default_rng(1).normal(size=(TILE[0] * TILE[1], keep.sum()))
+    found = weights_pullback(
+        scaled(types, shape),
+        *upload(types, x, y),
+        TILE,
+        everywhere,
+        pull_with(upload(types, *upstream)),
+    )
+    step = 1e-5
+    for k, derivative in enumerate(found):
+        moved = np.zeros((5, 1))
+        moved[k] = step
+        up, down = (
+            (upstream * np.exp(-0.5 * squared_distance(shape + s * moved, x, y))).sum(axis=0)
+            for s in (1, -1)
+        )
+        exact = (up - down) / (2 * step)
+        ours = derivative.numpy() * (UNIT if k > 1 else 1)
+        scale = np.abs(exact).max()
+        np.testing.assert_allclose(
+            ours, exact, rtol=1e-4, atol=precision(types, 1e-5, 1e-7) * scale
+        )
+
+
+def test_pullback_asks_with_the_weights(types):
+    shape, x, y = draw()
+    parameters, x, y = scaled(types, shape), *upload(types, x, y)
+    asked = {}
+
+    def pull(k, w):
+        asked[k] = w
+        return types.Float(0)
+
+    gradient = weights_pullback(parameters, x, y, TILE, LIMIT, pull)
+    assert not any(g.numpy().any() for g in gradient)
+    expected = weights(parameters, x, y, TILE, LIMIT)
+    assert sorted(asked) == list(range(len(expected)))
+    for k, w in enumerate(expected):
+        np.testing.assert_allclose(asked[k].numpy(), w.numpy(), rtol=0, atol=1e-6)
+
+
+# --- Memory ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [1, 4, 6, 7, 8, 9])
+def test_unpack_returns_what_pack_stored(types, number):
+    values = np.random.default_rng(0).normal(size=(number, 50)).astype(np.float32)
+    packed = pack(upload(types, *values))
+    assert dr.width(packed) % 4 == 0
+    index = np.array([49, 0, 7, 7, 30])
+    found = unpack(packed, types.UInt(index), number)
+    assert len(found) == number
+    np.testing.assert_array_equal([v.numpy() for v in found], values[:, index])
+
+
+def test_pack_repeats_values_that_all_splats_share(types):
+    packed = pack([types.Float([1, 2, 3]), types.Float(7)])
+    found = unpack(packed, dr.arange(types.UInt, 3), 2)
+    np.testing.assert_array_equal(found[1].numpy(), [7, 7, 7])
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 5, 6, 12])
+def test_gather_run(types, length):
+    source = np.arange(10 * length)
+    runs = gather_run(types, types.Float(source), types.UInt([3, 0, 9]), length, True)
+    np.testing.assert_array_equal(
+        np.stack([r.numpy() for r in runs], 1), source.reshape(10, length)[[3, 0, 9]]
+    )
+
+
+def test_gather_run_reads_nothing_in_inactive_lanes(types):
+    runs = gather_run(
+        types, types.Float(np.ones(8)), types.UInt([0, 1 << 30]), 4, types.Bool([True, False])
+    )
+    np.testing.assert_array_equal([r.numpy() for r in runs], [[1, 0]] * 4)
+
+
+# --- Types -------------------------------------------------------------------------------------
+
+
+def test_types_of(types):
+    for array in (types.Float(1), types.Float3(1), types.FloatX([[1, 2]]), types.Tensor([1.0])):
+        assert types_of(array) == types
+    assert dr.type_v(types.Float) == getattr(dr.VarType, f"Float{types.bits}")
+
+
+@pytest.mark.parametrize("array", [dr.scalar.ArrayXf([1.0]), 1.0, np.ones(3)])
+def test_types_of_refuses_what_has_no_backend(array):
+    with pytest.raises(TypeError):
+        types_of(array)
+
+
+def test_types_of_refuses_integers_and_arrays_without_derivatives(backend):
+    for array in (select(backend).UInt32(1), getattr(dr, backend).Float(1)):
+        with pytest.raises(TypeError, match="expected float arrays"):
+            types_of(array)
