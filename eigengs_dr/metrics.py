@@ -75,7 +75,7 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
     Returns
     -------
     float
-        At most 1, which is reached by equal images only.
+        At most 1, which equal images reach.
 
     Raises
     ------
