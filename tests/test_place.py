@@ -73,10 +73,10 @@ def test_one_seed_gives_one_placement(place):
     np.testing.assert_array_equal(first[1], second[1])
 
 
-@pytest.mark.parametrize("place", [random, grid])
-def test_seeds_differ(place):
+def test_seeds_differ():
     image = np.zeros((20, 30, 3), np.float32)
-    assert not np.array_equal(place(image, 50, generator(1))[0], place(image, 50, generator(2))[0])
+    first, second = (random(image, 50, generator(seed))[0] for seed in (1, 2))
+    assert not np.array_equal(first, second)
 
 
 # --- Factors and random placement --------------------------------------------------------------
@@ -107,23 +107,26 @@ def test_random_is_uniform():
 
 @pytest.mark.parametrize(("width", "height", "count"), [(40, 40, 100), (64, 16, 64), (30, 50, 97)])
 def test_grid(width, height, count):
-    """Rows that differ by one splat at most; every splat within the jitter of its place."""
+    """Rows that differ by one splat at most and are shifted by half a distance; one size."""
     mean, factor = grid(np.zeros((height, width, 3)), count, generator())
     spacing = np.sqrt(width * height / count)
-    rows = max(1, round(height / spacing))
-    distance = height / rows
-    row = np.floor(mean[:, 1] / distance).astype(int)
-    inside = np.abs(mean[:, 1] / distance - row - 0.5) * distance <= 0.25 * spacing + 1e-9
-    assert inside.all()
-    numbers = np.bincount(row, minlength=rows)
-    assert numbers.max() - numbers.min() <= 1
-    for k in range(rows):
-        x = np.sort(mean[row == k, 0])
-        places = (np.arange(len(x)) + 0.5) * width / len(x)
-        assert np.abs(x - places).max() <= 0.25 * spacing + 1e-9
-    np.testing.assert_allclose(
-        factor, np.tile([1 / (GRID_SIZE * spacing), 0, 1 / (GRID_SIZE * spacing)], (count, 1))
-    )
+    heights = np.unique(mean[:, 1])
+    numbers = [int((mean[:, 1] == y).sum()) for y in heights]
+    assert max(numbers) - min(numbers) <= 1
+    np.testing.assert_allclose(heights, (np.arange(len(heights)) + 0.5) * height / len(heights))
+    for k, (y, number) in enumerate(zip(heights, numbers, strict=True)):
+        x = mean[mean[:, 1] == y, 0]
+        np.testing.assert_allclose(x / width * number, np.arange(number) + 0.25 + 0.5 * (k % 2))
+    sharpness = 1 / (GRID_SIZE * spacing)
+    np.testing.assert_allclose(factor, np.tile([sharpness, 0, sharpness], (count, 1)))
+
+
+def test_grid_is_hexagonal():
+    """Six nearest neighbours at one distance, where rows have one length."""
+    mean, _ = grid(np.zeros((300, 300, 3)), 32 * 28, generator())
+    middle = np.argmin(np.abs(mean - 150).sum(axis=1))
+    distances = np.sort(np.linalg.norm(mean - mean[middle], axis=1))[1:8]
+    assert distances[5] < 1.1 * distances[0] < 1.5 * distances[0] < distances[6]
 
 
 # --- Hilbert curve -----------------------------------------------------------------------------
