@@ -10,14 +10,18 @@ from typing import TYPE_CHECKING, Any
 from .backend import BackendError, prepare
 
 if TYPE_CHECKING:
+    from .eigengs import EigenGS
     from .fitting import Fit, fit
     from .gaussians import Gaussians, concatenate
     from .images import load_image, sample, save_image
     from .metrics import ms_ssim, psnr, ssim
+    from .pca import Eigenbasis
     from .rendering import render
 
 __all__ = [
     "BackendError",
+    "EigenGS",
+    "Eigenbasis",
     "Fit",
     "Gaussians",
     "concatenate",
@@ -34,10 +38,12 @@ __all__ = [
 __version__ = "0.1.0"
 
 _HOMES = {
+    "eigengs": ("EigenGS",),
     "fitting": ("Fit", "fit"),
     "gaussians": ("Gaussians", "concatenate"),
     "images": ("load_image", "sample", "save_image"),
     "metrics": ("ms_ssim", "psnr", "ssim"),
+    "pca": ("Eigenbasis",),
     "rendering": ("render",),
 }
 

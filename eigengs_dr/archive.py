@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import os
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
@@ -23,14 +25,19 @@ class BadValue(ValueError):
 
 
 class Field(NamedTuple):
-    """What an array in a file must be: NumPy kind ("f4", "i8", "U") and number of dimensions."""
+    """What an array in a file must be: NumPy kind ("f4", "i8", "U"), dimensions, most elements."""
 
     kind: str
     ndim: int
+    most: int = MOST_ENTRIES
 
 
 def write(
-    path: str | os.PathLike[str], name: str, version: int, arrays: dict[str, NDArray[Any]]
+    path: str | os.PathLike[str],
+    name: str,
+    version: int,
+    arrays: dict[str, NDArray[Any]],
+    compressed: bool = True,
 ) -> None:
     """Write arrays with the name and version of their format, all or nothing.
 
@@ -41,6 +48,8 @@ def write(
         Format, e.g. ``"eigengs_dr.gaussians"``.
     version : int
     arrays : dict of str to ndarray
+    compressed : bool, optional
+        Not worth its time for many single-precision numbers.
 
     Raises
     ------
@@ -49,7 +58,7 @@ def write(
     """
     with replacing(path) as temporary, open(temporary, "wb") as file:
         members: dict[str, Any] = {"format": np.array(name), "version": np.array(version), **arrays}
-        np.savez_compressed(file, **members)
+        (np.savez_compressed if compressed else np.savez)(file, **members)
 
 
 def read(
@@ -78,33 +87,38 @@ def read(
     OSError
         If it cannot be opened.
     """
-    path = Path(path)
+    with _opened(Path(path), name) as archive:
+        found = str(_member(archive, "format", Field("U", 0)))
+        if found != name:
+            raise BadValue(f"format is {found[:40]!r}, expected {name!r}")
+        newest = int(_member(archive, "version", Field("i8", 0)))
+        if not 1 <= newest <= version:
+            raise BadValue(
+                f"version is {newest}, this package reads up to {version}; upgrade eigengs-dr"
+            )
+        return {key: _member(archive, key, field) for key, field in layout.items()}
+
+
+def format_of(path: str | os.PathLike[str]) -> str:
+    """Return the name of the format of a file that `write` wrote; raises what `read` does."""
+    with _opened(Path(path), "eigengs_dr") as archive:
+        return str(_member(archive, "format", Field("U", 0)))
+
+
+@contextmanager
+def _opened(path: Path, name: str) -> Iterator[zipfile.ZipFile]:
+    """Open a file; whatever goes wrong while it is read becomes one line."""
     with path.open("rb") as file:
-        return _read(file, path, name, version, layout)
-
-
-def _read(
-    file: BinaryIO, path: Path, name: str, version: int, layout: dict[str, Field]
-) -> dict[str, NDArray[Any]]:
-    """Turn whatever goes wrong with an open file into one line."""
-    try:
-        with zipfile.ZipFile(file) as archive:
-            found = str(_member(archive, "format", Field("U", 0)))
-            if found != name:
-                raise BadValue(f"format is {found[:40]!r}, expected {name!r}")
-            newest = int(_member(archive, "version", Field("i8", 0)))
-            if not 1 <= newest <= version:
-                raise BadValue(
-                    f"version is {newest}, this package reads up to {version}; upgrade eigengs-dr"
-                )
-            return {key: _member(archive, key, field) for key, field in layout.items()}
-    except BadValue as error:
-        raise ValueError(f"{path}: {error}") from None
-    except Exception as error:  # zlib, lzma, zipfile and NumPy each raise what they like
-        raise ValueError(
-            f"{path}: not a readable {name} file ({' '.join(str(error).split())[:80]}); "
-            "it may be damaged or something else"
-        ) from None
+        try:
+            with zipfile.ZipFile(file) as archive:
+                yield archive
+        except BadValue as error:
+            raise ValueError(f"{path}: {error}") from None
+        except Exception as error:  # zlib, lzma, zipfile and NumPy each raise what they like
+            raise ValueError(
+                f"{path}: not a readable {name} file ({' '.join(str(error).split())[:80]}); "
+                "it may be damaged or something else"
+            ) from None
 
 
 def _member(archive: zipfile.ZipFile, key: str, field: Field) -> NDArray[Any]:
@@ -130,7 +144,7 @@ def _member(archive: zipfile.ZipFile, key: str, field: Field) -> NDArray[Any]:
         count = math.prod(shape)
         if dtype.kind == "U" and dtype.itemsize > 4 * 64:
             raise BadValue(f"key '{key}' is a text of over 64 characters")
-        if count > MOST_ENTRIES or count * dtype.itemsize > entry.file_size:
+        if count > field.most or count * dtype.itemsize > entry.file_size:
             raise BadValue(f"key '{key}' claims shape {shape}, more than the file holds")
         data = file.read(count * dtype.itemsize)
     if len(data) != count * dtype.itemsize:

@@ -57,33 +57,38 @@ def say(text: str) -> None:
 
 
 @contextmanager
-def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int, dict[str, Any]], None]]:
+def progress_bar(quiet: bool) -> Iterator[Callable[..., None]]:
     """Show a bar on standard error while a block runs, where that is a terminal.
 
     Parameters
     ----------
-    label : str
-        What is being worked on.
     quiet : bool
         Show nothing.
 
     Yields
     ------
     callable
-        To be called with the steps done, the steps in all, and a row of figures, of which
-        ``psnr_rgb`` is shown.
+        ``show(label, done, total, row)``: what is being worked on, the steps done, the steps in
+        all, and, if there is one, a row of figures, of which ``psnr_rgb`` is shown. Another label
+        starts the bar anew.
     """
     from tqdm import tqdm
 
-    with tqdm(desc=label, unit="it", leave=False, disable=True if quiet else None) as bar:
+    with tqdm(unit="it", leave=False, disable=True if quiet else None) as bar:
+        current = ""
 
-        def update(done: int, total: int, row: dict[str, Any]) -> None:
+        def show(label: str, done: int, total: int, row: dict[str, Any] | None = None) -> None:
+            nonlocal current
+            if label != current:
+                current = label
+                bar.reset(total)
+                bar.set_description_str(label, refresh=False)
             bar.total = total
-            if "psnr_rgb" in row:
+            if row and "psnr_rgb" in row:
                 bar.set_postfix_str(f"{row['psnr_rgb']:.2f} dB", refresh=False)
             bar.update(done - bar.n)
 
-        yield update
+        yield show
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -11,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import place as places
 from .adaptive import adaptive
-from .color import rgb_to_ycbcr
+from .bases import load_basis
+from .color import decode, rgb_to_ycbcr
+from .eigengs import EigenGS
 from .gaussians import Gaussians
 from .images import check_image
 from .interrupt import deferred
@@ -20,8 +23,14 @@ from .refine import Progress, refine
 from .rendering import render
 from .solve import solve
 
-INITS = {"random": places.random, "grid": places.grid, "adaptive": adaptive}
-"""Initialisers by name."""
+PLACES = {"random": places.random, "grid": places.grid, "adaptive": adaptive}
+"""Initialisers that look at the image alone, by name."""
+
+INITS = ("auto", *PLACES, "eigen")
+"""All names of initialisers."""
+
+GAUSSIANS = 5000
+"""Splats where no number is asked for."""
 
 
 class Fit(NamedTuple):
@@ -42,6 +51,9 @@ class Fit(NamedTuple):
         Steps of refinement taken.
     stopped : str
         Why it ended: "iterations", "plateau" or "interrupted".
+    mean_image : ndarray of float32, shape (H, W, 3), or None
+        What renderings of the set are added to, RGB: the preset "eigengs" keeps the mean image of
+        its basis as pixels. It is in `image` already.
     """
 
     gaussians: Gaussians
@@ -51,13 +63,15 @@ class Fit(NamedTuple):
     seconds_init: float
     iterations: int
     stopped: str
+    mean_image: NDArray[np.float32] | None = None
 
 
 def fit(
     image: ArrayLike,
-    gaussians: int = 5000,
+    gaussians: int | None = None,
     iterations: int = 1000,
     init: str = "auto",
+    basis: str | os.PathLike[str] | EigenGS = "natural",
     preset: str = "default",
     solve_steps: int = 10,
     color: str = "ycbcr",
@@ -75,15 +89,19 @@ def fit(
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
         RGB or grey, float in [0, 1] or unsigned integers.
     gaussians : int, optional
-        Number of splats, at most one a pixel.
+        Number of splats, at most one a pixel. By default that of the basis where it places them,
+        else 5000 or one a pixel if these are fewer.
     iterations : int, optional
         Most steps of refinement; 0 keeps what the colour solve gave.
-    init : {"auto", "adaptive", "grid", "random"}, optional
-        Where splats start. "auto" is what the preset does best with.
-    preset : {"default", "gaussianimage"}, optional
+    init : {"auto", "adaptive", "grid", "random", "eigen"}, optional
+        Where splats start. "auto" is what the preset does best with: "adaptive" for "default".
+    basis : str, path-like or EigenGS, optional
+        What "eigen" starts from: the name of a basis of this package, the file of another, or a
+        model.
+    preset : {"default", "gaussianimage", "eigengs"}, optional
         The method, see `eigengs_dr.presets`.
     solve_steps : int, optional
-        Steps of conjugate gradients in the colour solve.
+        Steps of conjugate gradients in the colour solve; "eigen" needs none at its own size.
     color : {"ycbcr", "rgb"}, optional
         Space of the colours and of the squared error.
     seed : int, optional
@@ -115,10 +133,20 @@ def fit(
     pixels = check_image(image)
     _check(pixels, gaussians, iterations, init, preset, solve_steps, color, seed)
     method = PRESETS[preset]
+    init = method.init if init == "auto" else init
     target = rgb_to_ycbcr(pixels) if color == "ycbcr" else pixels
+    added = None
     with deferred() as interrupted:
-        place = INITS[method.init if init == "auto" else init]
-        start = _start(target, gaussians, place, method, solve_steps, color, seed, backend)
+        if init == "eigen":
+            model = load_basis(basis, backend)
+            _check_basis(model, pixels, gaussians, color)
+            start = _encoded(model, pixels, target, method, solve_steps)
+            if method.mean == "dense":
+                dense = model.dense_mean(start.width, start.height)
+                target, added = target - dense, _picture(dense, color)
+        else:
+            count = gaussians or min(GAUSSIANS, pixels.shape[0] * pixels.shape[1])
+            start = _placed(target, count, PLACES[init], method, solve_steps, color, seed, backend)
         seconds_init = time.perf_counter() - started
         refined = refine(
             start,
@@ -127,23 +155,26 @@ def fit(
             method.schedule,
             iterations,
             started=started,
+            added=added,
             progress=progress,
             interrupted=interrupted,
         )
+    rendered = render(refined.gaussians).numpy()
     return Fit(
         gaussians=refined.gaussians,
         trace=refined.trace,
-        image=render(refined.gaussians).numpy(),
+        image=rendered if added is None else rendered + added,
         seconds=time.perf_counter() - started,
         seconds_init=seconds_init,
         iterations=refined.iterations,
         stopped=refined.stopped,
+        mean_image=added,
     )
 
 
-def _start(
+def _placed(
     target: NDArray[np.float32],
-    gaussians: int,
+    count: int,
     place: Callable[..., Any],
     method: Preset,
     solve_steps: int,
@@ -151,19 +182,62 @@ def _start(
     seed: int,
     backend: str | None,
 ) -> Gaussians:
-    """Place splats and give them colours."""
+    """Place splats by the image alone and give them colours."""
     generator = np.random.default_rng(seed)
-    mean, factor = place(target, gaussians, generator)
-    colors = np.zeros((gaussians, 3)) if method.solves else generator.uniform(0, 1, (gaussians, 3))
+    mean, factor = place(target, count, generator)
+    colors = np.zeros((count, 3)) if method.solves else generator.uniform(0, 1, (count, 3))
     size = (target.shape[1], target.shape[0])
     start = Gaussians.from_arrays(mean, factor, colors, size=size, space=color, backend=backend)
     start = start.bounded()
     return solve(start, target, solve_steps).gaussians if method.solves else start
 
 
+def _encoded(
+    model: EigenGS,
+    pixels: NDArray[np.float32],
+    target: NDArray[np.float32],
+    method: Preset,
+    solve_steps: int,
+) -> Gaussians:
+    """Take shapes and colours from an eigenbasis."""
+    colors = "exact" if method.solves else "projected"
+    start = model.encode(pixels, colors, method.mean).bounded()
+    same = (start.width, start.height) == (model.gaussians.width, model.gaussians.height)
+    # At another size the colours are exact for the resampled image only.
+    if method.solves and not same:
+        return solve(start, target, solve_steps, warm_start=True).gaussians
+    return start
+
+
+def _picture(planes: NDArray[np.float32], color: str) -> NDArray[np.float32]:
+    """RGB that planes add to a rendering; that of zeros is in the rendering already."""
+    shown = np.stack(decode(color, list(np.moveaxis(planes, 2, 0))), axis=2)
+    return shown - np.array(decode(color, [0.0] * planes.shape[2]), np.float32)
+
+
+def _check_basis(
+    model: EigenGS, pixels: NDArray[np.float32], gaussians: int | None, color: str
+) -> None:
+    """Raise ValueError where a basis is not what the other arguments ask for."""
+    count, space = len(model.gaussians), model.gaussians.space
+    if gaussians not in (None, count):
+        raise ValueError(
+            f"gaussians is {gaussians}, but the basis has {count}; leave the number out, use "
+            f"init 'adaptive', or train a basis with --gaussians {gaussians}"
+        )
+    height, width = pixels.shape[:2]
+    if count > width * height:
+        raise ValueError(
+            f"the basis has {count} Gaussians, more than an image of {width}x{height} has pixels; "
+            "use init 'adaptive'"
+        )
+    if color != space:
+        raise ValueError(f"color is {color!r}, but the basis is in {space!r}; use one of both")
+
+
 def _check(
     pixels: NDArray[np.float32],
-    gaussians: int,
+    gaussians: int | None,
     iterations: int,
     init: str,
     preset: str,
@@ -172,17 +246,19 @@ def _check(
     seed: int,
 ) -> None:
     """Raise ValueError for the first argument that is out of range."""
-    counts = {"gaussians": gaussians, "iterations": iterations, "solve_steps": solve_steps}
-    for name, count in {**counts, "seed": seed}.items():
+    counts = {"iterations": iterations, "solve_steps": solve_steps, "seed": seed}
+    if gaussians is not None:
+        counts["gaussians"] = gaussians
+    for name, count in counts.items():
         if not isinstance(count, (int, np.integer)) or count < 0:
             raise ValueError(f"{name} is {count!r}; it must be at least 0, and whole")
     height, width = pixels.shape[:2]
-    if not 1 <= gaussians <= width * height:
+    if gaussians is not None and not 1 <= gaussians <= width * height:
         raise ValueError(
             f"gaussians is {gaussians}; an image of {width}x{height} takes 1 to {width * height}"
         )
     for name, value, known in (
-        ("init", init, ("auto", *INITS)),
+        ("init", init, INITS),
         ("preset", preset, tuple(PRESETS)),
         ("color", color, ("ycbcr", "rgb")),
     ):

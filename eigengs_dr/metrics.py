@@ -56,7 +56,11 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
         error = rgb_to_ycbcr(a) - rgb_to_ycbcr(b)
     else:
         raise ValueError(f"space {space!r} is unknown; use 'rgb' or 'ycbcr'")
-    mse = float(np.mean(np.square(error)))
+    return decibels(float(np.mean(np.square(error))))
+
+
+def decibels(mse: float) -> float:
+    """Return ``10 log10(1 / mse)``, the PSNR of a mean squared error whose peak is 1; inf for 0."""
     return math.inf if mse == 0 else -10 * math.log10(mse)
 
 

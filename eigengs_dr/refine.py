@@ -95,6 +95,7 @@ def refine(
     *,
     cutoff: float = CUTOFF,
     started: float | None = None,
+    added: NDArray[np.float32] | None = None,
     progress: Progress | None = None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Refined:
@@ -115,6 +116,9 @@ def refine(
         See `eigengs_dr.render`.
     started : float, optional
         `time.perf_counter()` from which the seconds of the trace count; now by default.
+    added : ndarray of float32, shape (H, W, 3), optional
+        What a rendering is added to before the trace compares it, RGB: the mean image, where
+        `target` lacks it.
     progress : callable, optional
         ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
     interrupted : callable, optional
@@ -138,7 +142,7 @@ def refine(
                     dr.sync_thread()  # steps run asynchronously; the bar tells what is done
                     progress(step, iterations, trace[-1])
                 continue
-            row = _row(current, image, step, started, cutoff)
+            row = _row(current, image, added, step, started, cutoff)
             trace.append(row)
             if row["psnr_ycbcr"] > highest:
                 best, highest = current, row["psnr_ycbcr"]
@@ -177,14 +181,14 @@ def descend(
     grid = Grid(gaussians.width, gaussians.height)
     tiles = to_tiles(types, target, grid)
     inside = to_tiles(types, np.ones_like(target), grid)
-    take_step = _step_program(coordinates, cutoff)
+    take_step = step_program(coordinates, cutoff)
     zero = dr.opaque(types.Float, 0)
     try:
         yield current
         for step in range(iterations):
             if step % schedule.rebuild == 0:
                 lists = lists_for(current, cutoff, schedule.pad)
-            left = _rate_left(schedule, step, iterations)
+            left = rate_left(schedule, step, iterations)
             optimizer.set_learning_rate(
                 {name: dr.opaque(types.Float, rate * left) for name, rate in schedule.rates.items()}
             )
@@ -198,14 +202,14 @@ def descend(
         take_step.clear()  # left to the garbage collector, it may be freed while another is traced
 
 
-def _rate_left(schedule: Schedule, step: int, iterations: int) -> float:
+def rate_left(schedule: Schedule, step: int, iterations: int) -> float:
     """Factor of the rates: a linear rise, then half a cosine."""
     along = 0.5 * (1 + math.cos(math.pi * step / iterations))
     left = schedule.decay + (1 - schedule.decay) * along
     return left * min(1.0, (step + 1) / max(1, schedule.warm_up))
 
 
-def _step_program(coordinates: Coordinates, cutoff: float) -> Any:
+def step_program(coordinates: Coordinates, cutoff: float) -> Any:
     """Make a frozen program for a step: traced once, replayed without Python.
 
     A program belongs to one run: a replay does not notice that, say, the betas of another optimiser
@@ -230,11 +234,14 @@ def _step_program(coordinates: Coordinates, cutoff: float) -> Any:
 def _row(
     gaussians: Gaussians,
     image: NDArray[np.float32],
+    added: NDArray[np.float32] | None,
     iteration: int,
     started: float,
     cutoff: float,
 ) -> dict[str, Any]:
     rendered = render(dr.detach(gaussians), cutoff=cutoff).numpy()
+    if added is not None:
+        rendered = rendered + added
     return {
         "iteration": iteration,
         "seconds": time.perf_counter() - started,

@@ -1,17 +1,21 @@
-"""Sets of splats that tests share: NumPy arrays, drawn at random or by hypothesis.
+"""Sets of splats, and families of images, that tests share: drawn at random or by hypothesis.
 
 All numbers are rounded to float32, so that what is computed in float64 has the same input.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy.ndimage import gaussian_filter
 
 from eigengs_dr.backend import select
+from eigengs_dr.eigengs import EigenGS
 from eigengs_dr.gaussians import Gaussians
+from eigengs_dr.pca import Eigenbasis
 from eigengs_dr.reference import render_exact
 
 SIZE = (22, 17)
@@ -122,3 +126,22 @@ def scenes(count=COUNT, size=SIZE, channels=3):
     """Strategy for scenes of one size: their values differ."""
     unit = hnp.arrays(np.float64, (count, 5 + channels), elements=st.floats(0, 1, width=32))
     return unit.map(lambda values: scene_of(values, size))
+
+
+def family(count=40, side=32, seed=0):
+    """RGB images of low-pass noise, shape (count, side, side, 3)."""
+    noise = np.random.default_rng(seed).normal(size=(count, side, side, 3))
+    smooth = gaussian_filter(noise, (0, 3, 3, 0.5), mode="wrap")
+    return (0.5 + 0.15 * smooth / smooth.std()).clip(0, 1).astype(np.float32)
+
+
+@cache
+def small_basis(color="ycbcr"):
+    """Components of a family of 32x32 pixels: 12 of the first channel, 6 of the others."""
+    return Eigenbasis.from_images(family(), (32, 32), (12, 6, 6), color=color)
+
+
+@cache
+def small_model(backend, split=False, color="ycbcr"):
+    """A model of `small_basis` with 100 splats."""
+    return EigenGS.fit(small_basis(color), 100, frequency_aware=split, backend=backend)

@@ -1,17 +1,26 @@
 """The command line: results, reports, and one line and exit code 2 for every mistake."""
 
 import json
+import os
 import shutil
-from types import SimpleNamespace
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from PIL import Image
+from test_training import random_fields
 
 import eigengs_dr as eg
+from eigengs_dr import bases, cli_train
 from eigengs_dr.backend import BackendError, select
 from eigengs_dr.cli import main
+from eigengs_dr.color import YCBCR_TO_RGB
+from eigengs_dr.eigengs import EigenGS
+from eigengs_dr.fitting import INITS
 
 
 def run(*arguments):
@@ -151,7 +160,9 @@ def test_doctor():
     assert found["llvm"]["works"] or found["cuda"]["works"]
 
 
-@pytest.mark.parametrize("command", [[], ["fit"], ["render"], ["info"], ["doctor"], ["bench"]])
+@pytest.mark.parametrize(
+    "command", [[], ["fit"], ["train"], ["render"], ["info"], ["doctor"], ["bench"]]
+)
 def test_help_has_an_example(command):
     text = succeeded(run(*command, "--help")).stdout
     assert "Example" in text
@@ -330,9 +341,7 @@ def test_interrupted_fit_is_kept(photo, tmp_path, monkeypatch):
 
     def interrupted(*arguments, **settings):
         result = complete(*arguments, **settings)
-        names = ("gaussians", "trace", "image", "seconds", "seconds_init", "iterations")
-        fields = {name: getattr(result, name) for name in names}
-        return SimpleNamespace(**fields, stopped="interrupted")
+        return result._replace(stopped="interrupted")
 
     monkeypatch.setattr(eg, "fit", interrupted)
     settings = ["--gaussians", 20, "--iterations", 1, "--report", tmp_path / "r.json"]
@@ -352,3 +361,256 @@ def test_interrupted_before_there_is_a_fit(photo, existing, monkeypatch):
     result = run("fit", photo, "-o", existing)
     assert result.exit_code == 130
     assert result.stderr.strip() == "eigengs-dr: interrupted"
+
+
+SMALL = ["--size", "32x32", "--components", 6, "--gaussians", 60]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A folder with images, a model of them and all that was said of it; tests read them only."""
+    folder = tmp_path_factory.mktemp("trained")
+    random_fields(folder / "photos", 12)
+    outputs = ["-o", folder / "m.npz", "--report", folder / "m.json", "--preview", folder / "m.png"]
+    result = run("train", folder / "photos", *outputs, *SMALL, "--frequency-aware", "yes")
+    return folder, succeeded(result)
+
+
+def test_train_says_what_it_did(trained):
+    folder, result = trained
+    words = ("11 images", "6+6+6 components", "60 Gaussians", "psnr_pca", "psnr_init", "m.png")
+    assert all(word in result.stdout for word in words)
+    assert result.stdout.count("\n") == 3
+    assert result.stderr == ""
+    assert not (folder / "m.npz.checkpoint").exists()
+
+
+def test_train_report(trained):
+    folder, _ = trained
+    report = json.loads((folder / "m.json").read_text())
+    expected = {
+        "input": str(folder / "photos"),
+        "output": str(folder / "m.npz"),
+        "size": [32, 32],
+        "components": [6, 6, 6],
+        "most_components": 6,
+        "gaussians": 60,
+        "frequency_aware": True,
+        "energy": None,
+        "preset": "default",
+        "color": "ycbcr",
+        "seed": 0,
+        "resumed": False,
+    }
+    assert {key: report[key] for key in expected} == expected
+    assert report["command"].startswith("eigengs-dr train ")
+    assert report["versions"]["drjit"]
+    for key in ("seconds", "pca_seconds", "shape_seconds", "weight_seconds", "peak_rss_mb"):
+        assert report[key] > 0
+    assert report["psnr_solved"] > report["psnr_init"] > 15
+    assert report["psnr_init"] == pytest.approx(report["psnr_pca"], abs=1.5)
+
+
+def test_train_without_images_to_hold_out(tmp_path):
+    folder = random_fields(tmp_path / "few", 5)
+    outputs = ["-o", tmp_path / "m.npz", "--report", tmp_path / "m.json"]
+    result = succeeded(run("train", folder, *outputs, *SMALL))
+    assert "no image was held out" in result.stdout
+    assert "note: 5 images give at most 4 components" in result.stderr
+    report = json.loads((tmp_path / "m.json").read_text())
+    assert [report[key] for key in ("psnr_pca", "psnr_init", "psnr_solved")] == [None] * 3
+
+
+def test_train_options(trained, tmp_path):
+    folder, _ = trained
+    options = ["--energy", 0.5, "--color", "rgb", "--seed", 3, "--preset", "eigengs", "--steps", 2]
+    size = ["--size", "16x16", "--components", 6, "--quiet"]
+    outputs = ["-o", tmp_path / "m.npz", "--report", tmp_path / "m.json"]
+    result = succeeded(run("train", folder / "photos", *outputs, *size, *options))
+    assert result.stdout == ""
+    report = json.loads((tmp_path / "m.json").read_text())
+    expected = {"energy": 0.5, "color": "rgb", "seed": 3, "preset": "eigengs", "steps": 2}
+    assert {key: report[key] for key in expected} == expected
+    assert report["gaussians"] == 256  # one a pixel
+    assert max(report["components"]) < 6
+
+
+def test_train_interrupted_goes_on(trained, tmp_path, monkeypatch):
+    folder, _ = trained
+
+    @contextmanager
+    def presses(quiet):
+        def show(stage, done, total):
+            if stage == "weights":
+                os.kill(os.getpid(), signal.SIGINT)
+
+        yield show
+
+    command = ["train", folder / "photos", "-o", tmp_path / "m.npz", *SMALL]
+    with monkeypatch.context() as patched:
+        patched.setattr(cli_train, "progress_bar", presses)
+        result = run(*command)
+    assert result.exit_code == 130
+    assert result.stderr == "eigengs-dr: interrupted; the same command goes on from here\n"
+    assert result.stdout == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["m.npz.checkpoint"]
+
+    assert_refused(run(*command, "--seed", 1), "m.npz.checkpoint", "seed 0", "delete")
+    succeeded(run(*command, "--report", tmp_path / "m.json"))
+    assert json.loads((tmp_path / "m.json").read_text())["resumed"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m.json", "m.npz"]
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--gaussians", 1025, "--size", "32x32"], "gaussians is 1025"),
+        (["--gaussians", 0], "gaussians"),
+        (["--components", 0], "components"),
+        (["--energy", 0], "energy"),
+        (["--energy", 1.01], "energy"),
+        (["--size", "32"], "such as 1024x768"),
+        (["--size", "0x32"], "0x32"),
+        (["--size", "99999x99999"], "99999x99999"),
+        (["--steps", -1], "steps"),
+        (["--frequency-aware", "perhaps"], "frequency-aware"),
+        (["--preset", "gaussianimage"], "preset"),
+        (["--color", "lab"], "color"),
+    ],
+)
+def test_train_with_bad_settings(trained, existing, options, word):
+    folder, _ = trained
+    before = sorted(existing.parent.iterdir())
+    assert_refused(run("train", folder / "photos", "-o", existing, *options), word)
+    assert sorted(existing.parent.iterdir()) == before
+
+
+def test_train_with_bad_paths(trained, existing, tmp_path):
+    folder, _ = trained
+    photos = folder / "photos"
+    assert_refused(run("train", tmp_path / "gone", "-o", existing), "gone")
+    assert_refused(run("train", photos / "000.png", "-o", existing), "000.png")
+    (tmp_path / "empty").mkdir()
+    assert_refused(run("train", tmp_path / "empty", "-o", existing), "holds no images")
+    assert_refused(run("train", photos, "-o", tmp_path / "m.png"), ".npz")
+    assert_refused(run("train", photos, "-o", tmp_path / "gone" / "m.npz"), "gone")
+    assert_refused(run("train", photos, "-o", existing, "--report", tmp_path / "gone" / "r"), "r")
+    assert_refused(run("train", photos, "-o", existing, "--preview", tmp_path / "p.txt"), ".png")
+    over = run("train", photos, "-o", existing, "--preview", photos / "000.png")
+    assert_refused(over, "000.png", "is read")
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "x.png").write_bytes(b"no picture")
+    assert_refused(run("train", tmp_path / "bad", "-o", existing, *SMALL), "none of 1", "x.png")
+    assert not (existing.parent / "existing.npz.checkpoint").exists()
+
+
+def test_info_of_a_model(trained, tmp_path):
+    folder, _ = trained
+    preview = tmp_path / "sheet.png"
+    found = json.loads(
+        succeeded(run("info", folder / "m.npz", "--json", "--preview", preview)).stdout
+    )
+    expected = {
+        "kind": "model",
+        "gaussians": 60,
+        "width": 32,
+        "height": 32,
+        "space": "ycbcr",
+        "components": [6, 6, 6],
+        "frequency_aware": True,
+        "low_gaussians": 6,
+        "high_gaussians": 54,
+        "low_components": 3,
+    }
+    assert {key: found[key] for key in expected} == expected
+    assert found["bytes"] == (folder / "m.npz").stat().st_size
+    assert Image.open(preview).width < Image.open(folder / "m.png").width + 1 < 2001
+    assert "low_components   3" in run("info", folder / "m.npz").stdout
+
+
+def test_info_preview_of_an_image(fitted, tmp_path):
+    folder, _ = fitted
+    succeeded(run("info", folder / "fit.npz", "--preview", tmp_path / "info.png"))
+    succeeded(run("render", folder / "fit.npz", "-o", tmp_path / "render.png"))
+    assert (tmp_path / "info.png").read_bytes() == (tmp_path / "render.png").read_bytes()
+    gone = run("info", folder / "fit.npz", "--preview", tmp_path / "gone" / "x.png")
+    assert_refused(gone, "gone")
+
+
+def test_info_of_something_else(trained, tmp_path):
+    folder, _ = trained
+    np.savez(tmp_path / "x.npz", a=np.zeros(3))
+    assert_refused(run("info", tmp_path / "x.npz"), "x.npz", "format")
+    np.savez(tmp_path / "x.npz", format=np.array("something.else"))
+    assert_refused(run("info", tmp_path / "x.npz"), "something.else", "eigengs_dr.model")
+    assert_refused(run("info", folder / "m.png"), "m.png")
+    assert_refused(run("render", folder / "m.npz", "-o", tmp_path / "y.png"), "eigengs_dr.model")
+
+
+def test_fit_from_an_eigenbasis(trained, photo, tmp_path):
+    folder, _ = trained
+    start = ["--init", "eigen", "--basis", folder / "m.npz", "--report", tmp_path / "r.json"]
+    succeeded(run("fit", photo, "-o", tmp_path / "x.npz", *start, "--iterations", 30))
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["gaussians"] == 60
+    assert report["basis"] == str(folder / "m.npz")
+    model = EigenGS.load(folder / "m.npz")
+    image = eg.load_image(photo)
+    encoded = eg.psnr(image, eg.render(model.encode(image)).numpy(), space="ycbcr")
+    assert report["trace"][0]["psnr_ycbcr"] == pytest.approx(encoded, abs=0.1)
+    assert report["psnr_ycbcr"] > encoded
+
+
+def test_the_basis_is_read_once(trained, photo, tmp_path, monkeypatch):
+    folder, _ = trained
+    loaded = []
+    load = EigenGS.load
+    monkeypatch.setattr(EigenGS, "load", lambda *given: loaded.append(given) or load(*given))
+    start = ["--init", "eigen", "--basis", folder / "m.npz", "--iterations", 0]
+    shutil.copy(photo, tmp_path / "other.png")
+    succeeded(run("fit", photo, tmp_path / "other.png", "-o", tmp_path / "fits", *start))
+    assert len(loaded) == 1
+
+
+def test_the_papers_form_lacks_the_mean_image(trained, photo, tmp_path):
+    folder, _ = trained
+    options = ["--preset", "eigengs", "--basis", folder / "m.npz", "--iterations", 2]
+    outputs = ["-o", tmp_path / "x.npz", "--preview", tmp_path / "both.png"]
+    result = succeeded(run("fit", photo, *outputs, *options))
+    assert result.stderr.count("\n") == 1
+    assert "note: " in result.stderr
+    assert "mean image is kept in the basis" in result.stderr
+    fit = np.asarray(Image.open(tmp_path / "both.png")).astype(int)[:, 32:]
+    model = EigenGS.load(folder / "m.npz")
+    added = model.dense_mean(32, 32) @ YCBCR_TO_RGB.T
+    saved = eg.render(eg.Gaussians.load(tmp_path / "x.npz")).numpy()
+    shown = np.clip(saved + added, 0, 1) * 255
+    assert np.abs(shown - fit).max() < 1.5
+
+
+def test_bases_that_do_not_fit(trained, fitted, photo, existing, tmp_path):
+    folder, _ = trained
+    eigen = ["fit", photo, "-o", existing, "--init", "eigen"]
+    model = folder / "m.npz"
+    assert_refused(run(*eigen, "--basis", "nowhere"), "'nowhere'", "natural")
+    assert_refused(run(*eigen, "--basis", fitted[0] / "fit.npz"), "eigengs_dr.gaussians")
+    assert_refused(run(*eigen, "--basis", tmp_path), "basis")
+    assert_refused(run(*eigen, "--basis", model, "--gaussians", 50), photo, "50", "60")
+    assert_refused(run(*eigen, "--basis", model, "--color", "rgb"), photo, "'rgb'", "'ycbcr'")
+
+
+def test_the_names_of_inits_and_bases():
+    [option] = [p for p in main.commands["fit"].params if p.name == "init"]
+    assert tuple(option.type.choices) == INITS
+    [option] = [p for p in main.commands["fit"].params if p.name == "basis"]
+    assert option.default in bases.SHIPPED
+
+
+def test_help_loads_nothing_heavy():
+    script = (
+        "import sys; from eigengs_dr.cli import main\n"
+        "try: main(['train', '--help'])\n"
+        "except SystemExit: print(*(n for n in ('drjit', 'scipy', 'PIL') if n in sys.modules))"
+    )
+    process = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert process.stdout.splitlines()[-1] == ""

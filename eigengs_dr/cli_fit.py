@@ -1,0 +1,157 @@
+"""``eigengs-dr fit``: images to Gaussians."""
+
+from functools import partial
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .backend import select
+from .cli_shared import (
+    ANY_PATH,
+    EXISTING,
+    backend_option,
+    choice,
+    described,
+    quiet_option,
+    report_option,
+    seed_option,
+)
+from .console import INTERRUPTED, progress_bar, say
+from .outputs import check_outputs, name_outputs
+from .report import write_report
+
+
+@click.command()
+@click.argument("images", nargs=-1, required=True, type=EXISTING, metavar="IMAGE...")
+@click.option("-o", "--output", required=True, type=ANY_PATH, help=".npz file; or a folder.")
+@click.option(
+    "--gaussians",
+    type=click.IntRange(min=1),
+    help="How many; by default 5000, one a pixel where the image has fewer pixels, or as many as "
+    "the basis has.",
+)
+@click.option("--iterations", type=click.IntRange(min=0), default=1000, show_default=True)
+@choice("--init", ["auto", "random", "grid", "adaptive", "eigen"], "Where the Gaussians start.")
+@click.option(
+    "--basis",
+    default="natural",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="What --init eigen starts from: a model by name, or as 'train' wrote it.",
+)
+@choice("--preset", ["default", "gaussianimage", "eigengs"], "The method.")
+@choice("--color", ["ycbcr", "rgb"], "Where errors are measured and colours are stored.")
+@seed_option
+@click.option("--preview", type=ANY_PATH, help="Picture of photo and fit; or a folder.")
+@backend_option
+@report_option
+@quiet_option
+@click.pass_context
+def fit(
+    context: click.Context,
+    /,
+    images: tuple[Path, ...],
+    output: Path,
+    backend: str | None,
+    preview: Path | None,
+    report: Path | None,
+    quiet: bool,
+    **settings: Any,
+) -> None:
+    """Fit images by sums of Gaussians.
+
+    For several images OUT and the preview are folders, and the files are named like the images.
+    Ctrl-C keeps the best fit so far: it is written before the command ends with exit code 130.
+
+    With --preset eigengs, the paper's form, the file holds the Gaussians alone, without the mean
+    image, which is kept in the basis.
+
+    \b
+    Examples:
+      eigengs-dr fit photo.jpg -o photo.npz
+      eigengs-dr fit photo.jpg -o photo.npz --gaussians 20000 --report photo.json
+      eigengs-dr fit photo.jpg -o photo.npz --init eigen --iterations 100
+      eigengs-dr fit *.png -o fits/ --preview previews/ --iterations 300
+    """
+    from .images import SAVE_OPTIONS
+
+    outputs = name_outputs(images, output, [".npz"])
+    previews = name_outputs(images, preview, list(SAVE_OPTIONS)) if preview else []
+    check_outputs([*outputs, *previews, report], images)
+    select(backend)
+
+    resolved = settings | {"basis": _basis(backend, **settings), "backend": backend}
+    records: list[dict[str, Any]] = []
+    for image, target, picture in zip_longest(images, outputs, previews):
+        records.append(_fit_one(image, target, picture, quiet, **resolved))
+        if records[-1]["stopped"] == "interrupted":
+            break
+    if report:
+        figures = records[0] if len(images) == 1 else {"images": records}
+        write_report(report, {**described(context, backend), **settings, **figures})
+    if records[-1]["stopped"] == "interrupted":
+        say(f"interrupted; the best fit so far is in {records[-1]['output']}")
+        context.exit(INTERRUPTED)
+
+
+def _basis(backend: str | None, init: str, preset: str, basis: str, **rest: Any) -> Any:
+    """Read the model to start from, once for all images; its name where none is needed."""
+    from .bases import load_basis
+    from .presets import PRESETS
+
+    method = PRESETS[preset]
+    if (method.init if init == "auto" else init) != "eigen":
+        return basis
+    if method.mean == "dense":
+        say("note: the result is the Gaussians alone; the mean image is kept in the basis")
+    return load_basis(basis, backend)
+
+
+def _fit_one(
+    path: Path, output: Path, preview: Path | None, quiet: bool, **settings: Any
+) -> dict[str, Any]:
+    """Fit one image, write what was asked for, and return its figures."""
+    import numpy as np
+
+    import eigengs_dr as eg
+
+    image = eg.load_image(path)
+    with progress_bar(quiet) as show:
+        try:
+            result = eg.fit(image, progress=partial(show, path.name), **settings)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+    result.gaussians.save(output)
+    if preview:
+        eg.save_image(preview, np.concatenate([image, result.image], axis=1))
+    record = {
+        "input": str(path),
+        "output": str(output),
+        "width": image.shape[1],
+        "height": image.shape[0],
+        "gaussians": len(result.gaussians),
+        "iterations": result.iterations,
+        "stopped": result.stopped,
+        "seconds": result.seconds,
+        "seconds_init": result.seconds_init,
+        "psnr_ycbcr": eg.psnr(image, result.image, space="ycbcr"),
+        "psnr_rgb": eg.psnr(image, result.image, space="rgb"),
+        "ssim": eg.ssim(image, result.image),
+        "ms_ssim": eg.ms_ssim(image, result.image),
+        "trace": result.trace,
+    }
+    if not quiet:
+        click.echo(_summary(record, preview))
+    return record
+
+
+def _summary(record: dict[str, Any], preview: Path | None) -> str:
+    """What a fit came to, for a terminal."""
+    text = (
+        "{input}: {width}x{height}, {gaussians} Gaussians, {iterations} iterations "
+        "in {seconds:.1f} s\n  psnr_ycbcr {psnr_ycbcr:.2f} dB, psnr_rgb {psnr_rgb:.2f} dB, "
+        "SSIM {ssim:.4f}, MS-SSIM {ms_ssim:.4f}\n  wrote {output}"
+    ).format(**record)
+    return f"{text}\n  wrote {preview} (photo and fit side by side)" if preview else text

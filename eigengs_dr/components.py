@@ -1,0 +1,306 @@
+"""Shared Gaussians for an eigenbasis: their shapes, and a weight for each splat and component."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .arrays import types_of, upload
+from .gaussians import Gaussians, concatenate
+from .joint import JointState, train_jointly
+from .metrics import decibels
+from .normal import NormalEquations
+from .pca import Eigenbasis
+from .shapes import on_grid, shapes_of, train_shapes
+from .stream import to_planes
+
+LOW_SHARE = 0.1
+"""Share of the splats that serve the low frequencies, where components are split (the paper)."""
+
+LOW_COMPONENTS = 50
+"""Components of each channel that count as low frequencies (the authors' code)."""
+
+SPLIT_FROM = 512
+"""Longer side in pixels from which "auto" considers the split: the paper found that it costs 0.4
+to 0.8 dB at 256 and gains 1 dB at 512."""
+
+SPLIT_COST = 0.2
+"""Decibels of exact colours that "auto" pays for the split."""
+
+STEPS = {"default": 0, "eigengs": 15_000}
+"""Presets, and the steps of training that each takes when none are asked for."""
+
+Planes = NDArray[np.float32]
+State = dict[str, NDArray[Any]]
+
+
+class Fitted(NamedTuple):
+    """Gaussians that render an eigenbasis.
+
+    Attributes
+    ----------
+    gaussians, weights, low, low_components
+        See `eigengs_dr.EigenGS`.
+    figures : dict of str to float
+        ``psnr_components``: fit of the components, weighted by their variances, in dB;
+        ``psnr_untrained``: the same before the shapes were trained, if they were;
+        ``shape_seconds``, ``weight_seconds``: training, and the rest.
+    """
+
+    gaussians: Gaussians
+    weights: tuple[Planes, ...]
+    low: int
+    low_components: int
+    figures: dict[str, float]
+
+
+class Side(NamedTuple):
+    """Splats and components that belong together: all of them, or one side of the split."""
+
+    splats: int
+    components: tuple[Planes, ...]
+    eigenvalues: tuple[NDArray[np.float64], ...]
+
+
+def fit_components(
+    basis: Eigenbasis,
+    count: int,
+    split: bool,
+    method: str,
+    steps: int,
+    seed: int,
+    backend: str | None = None,
+    states: list[State] | None = None,
+    save: Callable[[list[State]], None] = lambda states: None,
+) -> Fitted:
+    """Place, train and weight one set of splats for all components.
+
+    Parameters
+    ----------
+    basis : Eigenbasis
+    count : int
+        Splats, at most one a pixel; at least 2 for the split.
+    split : bool
+        Whether `LOW_SHARE` of the splats serve the first components alone, the rest the others.
+    method : {"default", "eigengs"}
+        "default" solves for the weights, and trains the shapes on random combinations of
+        components; "eigengs" trains shapes and weights together, as the paper does.
+    steps : int
+        Steps of training for each side.
+    seed : int
+    backend : {"llvm", "cuda"}, optional
+    states : list of dict, optional
+        What `save` was given last: training goes on from there.
+    save : callable, optional
+        ``save(states)`` after every round of training; what it raises ends the work.
+    """
+    started = time.perf_counter()
+    sides, states = _sides(basis, count, split), list(states or [])
+    train, result = METHODS[method]
+    for i, side in enumerate(sides):
+        known = states[i] if i < len(states) else None
+        for state in train(side, seed + i, steps, backend, known):
+            states[i:] = [state]
+            save(states)
+    trained = time.perf_counter()
+    parts = [result(state, side, backend) for state, side in zip(states, sides, strict=True)]
+    gaussians = concatenate([shapes for shapes, _ in parts])
+    weights = _joined([w for _, w in parts])
+    equations = NormalEquations(gaussians)
+    mean = equations.solve(equations.correlate(basis.mean))
+    figures = {
+        "shape_seconds": trained - started,
+        "weight_seconds": time.perf_counter() - trained,
+        "psnr_components": psnr_components(equations, basis, weights),
+    }
+    if method == "default" and steps:
+        figures["psnr_untrained"] = fit_components(
+            basis, count, split, method, 0, seed, backend
+        ).figures["psnr_components"]
+    return Fitted(
+        gaussians=colored(gaussians, mean, basis.space),
+        weights=weights,
+        low=sides[0].splats if split else 0,
+        low_components=_low_components(basis) if split else 0,
+        figures=figures,
+    )
+
+
+def check_arguments(
+    size: tuple[int, int],
+    gaussians: int,
+    frequency_aware: bool | str,
+    seed: int,
+    preset: str,
+    steps: int | None,
+) -> int:
+    """Raise ValueError for the first argument of `EigenGS.fit` out of range; return the steps.
+
+    ``size`` is width and height of the basis in pixels; the others are those of `EigenGS.fit`.
+    """
+    if preset not in STEPS:
+        raise ValueError(f"preset {preset!r} is unknown; use one of {', '.join(STEPS)}")
+    steps = STEPS[preset] if steps is None else steps
+    for name, number in (("gaussians", gaussians), ("seed", seed), ("steps", steps)):
+        if not isinstance(number, (int, np.integer)) or number < 0:
+            raise ValueError(f"{name} is {number!r}; it must be at least 0, and whole")
+    most = size[0] * size[1]
+    if not 1 <= gaussians <= most:
+        raise ValueError(
+            f"gaussians is {gaussians}; a basis of {size[0]}x{size[1]} takes 1 to {most}"
+        )
+    if preset == "eigengs" and steps < 1:
+        raise ValueError("steps is 0; the preset 'eigengs' finds weights by training alone")
+    if not isinstance(frequency_aware, bool) and frequency_aware != "auto":
+        raise ValueError(f"frequency_aware is {frequency_aware!r}; use 'auto', True or False")
+    return steps
+
+
+def wants_split(
+    basis: Eigenbasis, count: int, frequency_aware: bool | str, backend: str | None = None
+) -> tuple[bool, dict[str, float]]:
+    """Decide on the frequency-aware split; "auto" measures where the resolution calls for it.
+
+    From `SPLIT_FROM` pixels on, exact colours of the basis' training images on both placements are
+    compared: coarse splats are worth `SPLIT_COST`, because what they carry need not be made of
+    small ones (the paper's "penny-round tiles").
+
+    Returns
+    -------
+    bool
+        Whether to split.
+    dict of str to float
+        ``psnr_whole`` and ``psnr_split`` in dB, if they were measured.
+    """
+    if count < 2 or _low_components(basis) < 1:
+        return False, {}
+    if isinstance(frequency_aware, bool):
+        return frequency_aware, {}
+    if max(basis.width, basis.height) < SPLIT_FROM or not len(basis.examples):
+        return False, {}
+    images = np.stack([to_planes(image, basis.space) for image in basis.examples])
+    planes = images.reshape(-1, basis.height, basis.width)
+    figures = {}
+    for name, split in (("psnr_whole", False), ("psnr_split", True)):
+        counts = [side.splats for side in _sides(basis, count, split)]
+        size = (basis.width, basis.height)
+        sets = [shapes_of(on_grid(size, n), size, 1, backend) for n in counts]
+        equations = NormalEquations(concatenate(sets))
+        correlations = equations.correlate(planes)
+        error = equations.error(equations.solve(correlations), correlations, _squares(planes))
+        figures[name] = decibels(float(error.mean()) / (basis.width * basis.height))
+    return figures["psnr_split"] > figures["psnr_whole"] - SPLIT_COST, figures
+
+
+def psnr_components(
+    equations: NormalEquations, basis: Eigenbasis, weights: tuple[Planes, ...]
+) -> float:
+    """Fit of the components, ``sum_j lambda_j |Psi~_j - Psi_j|^2`` a pixel and channel, in dB."""
+    total = 0.0
+    for planes, values, rows in zip(basis.components, basis.eigenvalues, weights, strict=True):
+        correlations = equations.correlate(planes)
+        error = equations.error(rows.T.astype(np.float64), correlations, _squares(planes))
+        total += float(values @ error)
+    return decibels(total / basis.mean.size)
+
+
+def _low_components(basis: Eigenbasis) -> int:
+    """Components of each channel on the side of the low frequencies."""
+    return min(LOW_COMPONENTS, max(map(len, basis.components)) // 2)
+
+
+def _sides(basis: Eigenbasis, count: int, split: bool) -> list[Side]:
+    """Divide splats and components, N_l before N_h."""
+    if not split:
+        return [Side(count, basis.components, basis.eigenvalues)]
+    few = max(1, round(LOW_SHARE * count))
+
+    def part(number: int, rows: slice) -> Side:
+        planes = tuple(c[rows] for c in basis.components)
+        return Side(number, planes, tuple(e[rows] for e in basis.eigenvalues))
+
+    first = _low_components(basis)
+    return [part(few, slice(first)), part(count - few, slice(first, None))]
+
+
+def _shapes(
+    side: Side, seed: int, steps: int, backend: str | None, state: State | None
+) -> Iterator[State]:
+    return train_shapes(
+        side.components, side.eigenvalues, side.splats, seed, steps, backend=backend, state=state
+    )
+
+
+def _solved(state: State, side: Side, backend: str | None) -> tuple[Gaussians, tuple[Planes, ...]]:
+    """The shapes of a state and the best weights on them."""
+    height, width = side.components[0].shape[1:]
+    shapes = shapes_of(state, (width, height), len(side.components), backend)
+    equations = NormalEquations(shapes)
+    solved = [equations.solve(equations.correlate(planes)) for planes in side.components]
+    return shapes, tuple(weights.T.astype(np.float32) for weights in solved)
+
+
+def _jointly(
+    side: Side, seed: int, steps: int, backend: str | None, state: State | None
+) -> Iterator[State]:
+    known = JointState.from_arrays(state) if state else None
+    for reached in train_jointly(
+        side.components, side.splats, seed, steps, backend=backend, state=known
+    ):
+        yield reached.arrays()
+
+
+def _trained(state: State, side: Side, backend: str | None) -> tuple[Gaussians, tuple[Planes, ...]]:
+    """Shapes and weights of a state, with as many (unused) channels as the components have."""
+    reached = JointState.from_arrays(state)
+    shapes = reached.gaussians(backend)
+    blank = np.zeros((side.splats + 1, len(side.components)))
+    return colored(shapes, blank, "data"), reached.weights()
+
+
+METHODS = {"default": (_shapes, _solved), "eigengs": (_jointly, _trained)}
+"""Presets: what trains one side step by step, and what makes shapes and weights of its state."""
+
+
+def _joined(parts: list[tuple[Planes, ...]]) -> tuple[Planes, ...]:
+    """Weights of all splats and components from those of each side; across, they are 0."""
+    if len(parts) == 1:
+        return parts[0]
+    joined = []
+    for low, high in zip(*parts, strict=True):
+        right, left = high.shape[1] - 1, low.shape[1] - 1
+        above = np.hstack([low[:, :-1], np.zeros((len(low), right), np.float32), low[:, -1:]])
+        below = np.hstack([np.zeros((len(high), left), np.float32), high])
+        joined.append(np.vstack([above, below]))
+    return tuple(joined)
+
+
+def colored(gaussians: Gaussians, coefficients: NDArray[np.float64], space: str) -> Gaussians:
+    """Give shapes the colours of an image.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    coefficients : ndarray, shape (N + 1, C)
+        Colours and, last, the background.
+    space : str
+        What the channels mean.
+    """
+    types = types_of(gaussians.mean)
+    rows = coefficients.astype(np.float32).T
+    return replace(
+        gaussians,
+        color=types.FloatX([upload(types.Float, row[:-1]) for row in rows]),
+        background=types.FloatX([upload(types.Float, row[-1:]) for row in rows]),
+        space=space,
+    )
+
+
+def _squares(planes: Planes) -> NDArray[np.float64]:
+    """``|D|^2`` of every plane."""
+    return np.einsum("nij,nij->n", planes, planes, dtype=np.float64)

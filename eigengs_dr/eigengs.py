@@ -1,0 +1,321 @@
+"""EigenGS: one set of Gaussians for all principal components of a family of images.
+
+A component is rendered as ``Psi~_j(x) = sum_n psi_nj w_n(x) + beta_j``, so an image with the
+coefficients a_j is ``Psi~_0 + sum_j a_j Psi~_j = sum_n (c_n0 + sum_j a_j psi_nj) w_n(x) + const``:
+Gaussians again, whose colours are one matrix product (the paper, eq. 2 and 3).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from . import archive
+from .components import Fitted, State, check_arguments, colored, fit_components, wants_split
+from .gaussians import Gaussians
+from .images import check_image, resampled
+from .modelfile import FORMAT, LAYOUT, VERSION, from_members, to_members
+from .normal import NormalEquations
+from .pca import Eigenbasis
+from .stream import to_planes
+
+Planes = NDArray[np.float32]
+Progress = Callable[[int, int, dict[str, Any]], None]
+
+
+@dataclass(frozen=True)
+class EigenGS:
+    """Gaussians that render the mean image and every principal component of a family of images.
+
+    Attributes
+    ----------
+    gaussians : Gaussians
+        N splats at the size of the training images, with the colours and the background of the
+        mean image, "component 0".
+    weights : tuple of ndarray of float32, shape (k, N + 1)
+        For every channel, the weight ``psi_nj`` of splat n in component j, in the order of falling
+        eigenvalues; the last column is the background ``beta_j``. Channels may differ in k.
+    eigenvalues : tuple of ndarray of float64, shape (k,)
+        Variance along each component.
+    mean_image : ndarray of float32, shape (C, H, W)
+        The mean image as pixels, in the space of the Gaussians.
+    low : int
+        Number of splats N_l, the first ones, that serve the low frequencies alone; 0 where all
+        splats serve all components.
+    low_components : int
+        Components of each channel, the first ones, that these splats serve.
+    figures : dict of str to float
+        What was measured when the model was fitted, see `eigengs_dr.components.Fitted`; not saved.
+    """
+
+    gaussians: Gaussians
+    weights: tuple[Planes, ...]
+    eigenvalues: tuple[NDArray[np.float64], ...]
+    mean_image: Planes
+    low: int = 0
+    low_components: int = 0
+    figures: dict[str, float] = field(default_factory=dict, compare=False)
+
+    @classmethod
+    def fit(
+        cls,
+        basis: Eigenbasis,
+        gaussians: int = 5000,
+        frequency_aware: bool | str = "auto",
+        seed: int = 0,
+        preset: str = "default",
+        steps: int | None = None,
+        backend: str | None = None,
+        progress: Progress | None = None,
+    ) -> EigenGS:
+        """Fit one set of Gaussians to the mean image and all components of an eigenbasis.
+
+        Parameters
+        ----------
+        basis : Eigenbasis
+        gaussians : int, optional
+            Number of splats, at most one a pixel.
+        frequency_aware : {"auto", True, False}, optional
+            Whether a tenth of the splats serve the first 50 components alone, and the others the
+            rest; see `eigengs_dr.components.wants_split`.
+        seed : int, optional
+        preset : {"default", "eigengs"}, optional
+            "default" places splats on a grid and solves for the weights of all components at once,
+            by one factorisation; "eigengs" trains shapes and weights together from a random start,
+            with the settings of the paper.
+        steps : int, optional
+            Steps of training: of the shapes for "default" (0 by default: 300 gain 0.1 dB), of all
+            for "eigengs" (15,000 by default, which takes hours without a GPU).
+        backend : {"llvm", "cuda"}, optional
+        progress : callable, optional
+            ``progress(step, steps, {})`` after every round of training.
+
+        Raises
+        ------
+        ValueError
+            If an argument is out of range; one line.
+        BackendError
+            If the backend is not there.
+        """
+        steps = check_arguments(
+            (basis.width, basis.height), gaussians, frequency_aware, seed, preset, steps
+        )
+        split, compared = wants_split(basis, gaussians, frequency_aware, backend)
+        total = steps * (2 if split else 1)
+
+        def save(states: list[State]) -> None:
+            if progress:
+                progress(sum(int(state["step"]) for state in states), total, {})
+
+        fitted = fit_components(basis, gaussians, split, preset, steps, seed, backend, save=save)
+        return cls.of(basis, fitted, compared)
+
+    @classmethod
+    def of(cls, basis: Eigenbasis, fitted: Fitted, figures: dict[str, float]) -> EigenGS:
+        """Put a model together from what was fitted to a basis, and more figures."""
+        return cls(
+            gaussians=fitted.gaussians,
+            weights=fitted.weights,
+            eigenvalues=basis.eigenvalues,
+            mean_image=basis.mean,
+            low=fitted.low,
+            low_components=fitted.low_components,
+            figures={**fitted.figures, **figures},
+        )
+
+    @property
+    def components(self) -> tuple[int, ...]:
+        """Number of components of every channel."""
+        return tuple(len(w) for w in self.weights)
+
+    def project(self, image: ArrayLike) -> tuple[Planes, ...]:
+        """Find the coefficients of an image: the closest point on the span of the components.
+
+        Least squares on the rendered components, ``min_a |Psi~ a - (I - Psi~_0)|^2``; where they
+        render the principal components well, that is PCA's projection.
+
+        Parameters
+        ----------
+        image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
+            Of any size; resampled to that of the model.
+
+        Returns
+        -------
+        tuple of ndarray of float32, shape (k,)
+            One array a channel.
+
+        Raises
+        ------
+        ValueError
+            If the image is unusable.
+        """
+        correlations = self.equations.correlate(self.planes(image))
+        return self._coefficients(correlations - self._mean_product)
+
+    def reconstruct(
+        self, coefficients: tuple[Planes, ...], size: tuple[int, int] | None = None
+    ) -> Gaussians:
+        """Turn coefficients into Gaussians: one matrix product a channel.
+
+        Parameters
+        ----------
+        coefficients : tuple of array_like, shape (m,)
+            One array a channel, as from `project`; m <= k leaves out the last components.
+        size : (int, int), optional
+            Native width and height of the result; those of the model by default.
+
+        Returns
+        -------
+        Gaussians
+        """
+        return self._colored(self._mean_coefficients + self._sum(coefficients), size)
+
+    def encode(self, image: ArrayLike, colors: str = "exact", mean: str = "gaussians") -> Gaussians:
+        """Give an image its Gaussians at once, without optimisation.
+
+        Parameters
+        ----------
+        image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
+            Of any size and aspect ratio: it is resampled to the size of the model, and the
+            Gaussians are scaled to it.
+        colors : {"exact", "projected"}, optional
+            "exact" are the best colours on these shapes, by back-substitution; "projected" are
+            those of the eigenbasis, of which the result has no more degrees of freedom than there
+            are components.
+        mean : {"gaussians", "dense"}, optional
+            "dense" is the paper's form: the result lacks the mean image, `dense_mean`.
+
+        Returns
+        -------
+        Gaussians
+            At the size of the image.
+
+        Raises
+        ------
+        ValueError
+            If the image is unusable or an option unknown.
+        """
+        for name, value, known in (
+            ("colors", colors, ("exact", "projected")),
+            ("mean", mean, ("gaussians", "dense")),
+        ):
+            if value not in known:
+                raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(known)}")
+        pixels = check_image(image)
+        size = (pixels.shape[1], pixels.shape[0])
+        planes = self.planes(pixels)
+        if mean == "dense":
+            planes = planes - self.mean_image
+        correlations = self.equations.correlate(planes)
+        if colors == "exact":
+            return self._colored(self.equations.solve(correlations), size)
+        if mean == "dense":
+            return self._colored(self._sum(self._coefficients(correlations)), size)
+        return self.reconstruct(self._coefficients(correlations - self._mean_product), size)
+
+    def dense_mean(self, width: int, height: int) -> Planes:
+        """Return the mean image as pixels, shape (height, width, C), in the space of the model."""
+        return resampled(np.moveaxis(self.mean_image, 0, 2), width, height)
+
+    def planes(self, image: ArrayLike) -> Planes:
+        """Bring an image to the size and space of the model, shape (C, H, W)."""
+        width, height = self.gaussians.width, self.gaussians.height
+        pixels = resampled(check_image(image), width, height)
+        return to_planes(pixels, self.gaussians.space).reshape(-1, height, width)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the model as an ``.npz`` file, all or nothing.
+
+        Weights are stored in half precision, each component scaled by its largest weight.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written; an existing one is then as before.
+        """
+        archive.write(path, FORMAT, VERSION, to_members(self))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], backend: str | None = None) -> EigenGS:
+        """Read a model that `save` wrote.
+
+        Parameters
+        ----------
+        path : path-like
+        backend : {"llvm", "cuda"}, optional
+
+        Raises
+        ------
+        ValueError
+            If the file is not one of these, is damaged, newer than this package, or holds values
+            that are not finite or do not fit together: one line that names file and key.
+        OSError
+            If it cannot be opened.
+        """
+        arrays = archive.read(path, FORMAT, VERSION, LAYOUT)
+        try:
+            return cls(**from_members(arrays, backend))
+        except ValueError as error:
+            raise ValueError(f"{Path(path)}: {error}") from None
+
+    def _colored(
+        self, coefficients: NDArray[np.float64], size: tuple[int, int] | None
+    ) -> Gaussians:
+        """The model's shapes with the colours and background given, scaled to a size."""
+        result = colored(self.gaussians, coefficients, self.gaussians.space)
+        return result.scaled(*size) if size else result
+
+    # --- What is computed once a model -----------------------------------------------------------
+
+    @cached_property
+    def equations(self) -> NormalEquations:
+        """The normal equations of all splats, factorised."""
+        return NormalEquations(self.gaussians)
+
+    @cached_property
+    def _mean_coefficients(self) -> NDArray[np.float64]:
+        """Colours and background of the mean image, shape (N + 1, C)."""
+        arrays = self.gaussians.to_arrays()
+        return np.vstack([arrays["color"], arrays["background"]]).astype(np.float64)
+
+    @cached_property
+    def _mean_product(self) -> NDArray[np.float64]:
+        """What the rendered mean image correlates to, shape (N + 1, C)."""
+        return self.equations.product(self._mean_coefficients)
+
+    @cached_property
+    def _component_factors(self) -> list[Any]:
+        """Cholesky factors of ``Psi~^T Psi~``, one a channel."""
+        factors = []
+        for weights in self.weights:
+            gram = weights @ self.equations.product(weights.T.astype(np.float64))
+            # Components that render alike, or to nothing, must not end a factorisation.
+            gram += np.eye(len(gram)) * (1e-9 * np.trace(gram) / max(1, len(gram)) + 1e-30)
+            factors.append(cho_factor(gram.astype(np.float32), lower=True) if len(gram) else None)
+        return factors
+
+    def _coefficients(self, correlations: NDArray[np.float64]) -> tuple[Planes, ...]:
+        """Least squares on the rendered components, from ``[A 1]^T (I - Psi~_0)``."""
+        found = []
+        for c, (weights, factor) in enumerate(
+            zip(self.weights, self._component_factors, strict=True)
+        ):
+            seen = weights @ correlations[:, c].astype(np.float32)
+            found.append(cho_solve(factor, seen, check_finite=False) if len(seen) else seen)
+        return tuple(found)
+
+    def _sum(self, coefficients: tuple[Any, ...]) -> NDArray[np.float64]:
+        """``sum_j a_j psi_nj`` for every channel, shape (N + 1, C)."""
+        columns = []
+        for weights, values in zip(self.weights, coefficients, strict=True):
+            values = np.asarray(values, np.float32)
+            columns.append(values @ weights[: len(values)])
+        return np.stack(columns, axis=1).astype(np.float64)

@@ -1,0 +1,115 @@
+"""What the file of an EigenGS model holds, and the checks before it is believed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .archive import Field
+from .gaussians import Gaussians
+from .stream import SPACES
+
+FORMAT, VERSION = "eigengs_dr.model", 1
+
+LAYOUT: dict[str, Field] = {
+    "mean": Field("f4", 2),
+    "factor": Field("f4", 2),
+    "color": Field("f4", 2),
+    "background": Field("f4", 1),
+    "size": Field("i8", 1),
+    "space": Field("U", 0),
+    "mean_image": Field("f2", 3),
+    "split": Field("i8", 1),
+    **{f"weights{c}": Field("f2", 2) for c in range(3)},
+    **{f"scale{c}": Field("f4", 1) for c in range(3)},
+    **{f"eigenvalues{c}": Field("f8", 1) for c in range(3)},
+}
+"""What a file holds: the kind and the number of dimensions of each array."""
+
+
+def to_members(model: Any) -> dict[str, NDArray[Any]]:
+    """Turn a model into the arrays of its file.
+
+    Weights are in half precision, each component scaled by its largest weight: what rounding adds
+    to an image is 60 dB and more below it.
+
+    Parameters
+    ----------
+    model : EigenGS
+    """
+    arrays = {key: v.astype(np.float32) for key, v in model.gaussians.to_arrays().items()}
+    members: dict[str, NDArray[Any]] = {
+        **arrays,
+        "size": np.array([model.gaussians.width, model.gaussians.height], np.int64),
+        "space": np.array(model.gaussians.space),
+        "mean_image": model.mean_image.astype(np.float16),
+        "split": np.array([model.low, model.low_components], np.int64),
+    }
+    for c, (weights, values) in enumerate(zip(model.weights, model.eigenvalues, strict=True)):
+        scale = np.abs(weights).max(axis=1, initial=1e-30)
+        members[f"weights{c}"] = (weights / scale[:, None]).astype(np.float16)
+        members[f"scale{c}"] = scale.astype(np.float32)
+        members[f"eigenvalues{c}"] = values.astype(np.float64)
+    return members
+
+
+def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[str, Any]:
+    """Turn the arrays of a file into the fields of a model, once all of them fit together.
+
+    Parameters
+    ----------
+    arrays : dict of str to ndarray
+        Of the types and dimensions of `LAYOUT`.
+    backend : {"llvm", "cuda"}, optional
+
+    Returns
+    -------
+    dict of str to object
+        Arguments of `eigengs_dr.EigenGS`.
+
+    Raises
+    ------
+    ValueError
+        One line that names the key and what was expected.
+    """
+    for key, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"{key} holds values that are not finite")
+    if str(arrays["space"]) not in SPACES:
+        raise ValueError(f"space is {str(arrays['space'])!r}, expected {' or '.join(SPACES)}")
+    _require("size", arrays["size"], (2,))
+    gaussians = Gaussians.from_arrays(
+        **{key: arrays[key] for key in ("mean", "factor", "color", "background")},
+        size=tuple(arrays["size"].tolist()),
+        space=str(arrays["space"]),
+        backend=backend,
+    )
+    count = len(gaussians)
+    for c in range(3):
+        components = len(arrays[f"weights{c}"])
+        _require(f"weights{c}", arrays[f"weights{c}"], (components, count + 1))
+        _require(f"scale{c}", arrays[f"scale{c}"], (components,))
+        _require(f"eigenvalues{c}", arrays[f"eigenvalues{c}"], (components,))
+    _require("mean_image", arrays["mean_image"], (3, gaussians.height, gaussians.width))
+    _require("split", arrays["split"], (2,))
+    low, low_components = arrays["split"].tolist()
+    if not 0 <= low < count or low_components < 0:
+        raise ValueError(f"split is {low}, {low_components}; expected 0 to {count - 1} splats")
+    return {
+        "gaussians": gaussians,
+        "weights": tuple(
+            arrays[f"weights{c}"].astype(np.float32) * arrays[f"scale{c}"][:, None]
+            for c in range(3)
+        ),
+        "eigenvalues": tuple(arrays[f"eigenvalues{c}"] for c in range(3)),
+        "mean_image": arrays["mean_image"].astype(np.float32),
+        "low": low,
+        "low_components": low_components,
+    }
+
+
+def _require(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")

@@ -1,0 +1,290 @@
+"""`train`: a folder of images to a model, with checkpoints and figures on images held out."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .checkpoint import Checkpoint
+from .components import State, check_arguments, fit_components, wants_split
+from .eigengs import EigenGS
+from .images import ImageError, cropped, image_files, load_image
+from .incremental import EigenState, block_length, merge, rank_for, start
+from .interrupt import deferred
+from .metrics import psnr
+from .pca import Eigenbasis
+from .rendering import render
+from .stream import batches
+
+HELD_OUT = 10
+"""One image in so many is not trained on, but measured."""
+
+MOST_HELD_OUT = 100
+"""Images measured at most: more would not change the figures much."""
+
+SAVE_SECONDS = 10.0
+"""Time between two checkpoints of the shapes."""
+
+Progress = Callable[[str, int, int], None]
+
+
+class Interrupted(Exception):
+    """Ctrl-C was pressed; the message says what is saved."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides the result of a training, beside the images.
+
+    Attributes
+    ----------
+    size : (int, int)
+        Width and height in pixels.
+    components : int
+        The most kept of each channel.
+    energy : float or None
+        Keep as few components as hold this share of a channel's variance.
+    gaussians, frequency_aware, preset, steps, seed
+        See `eigengs_dr.EigenGS.fit`.
+    color : {"ycbcr", "rgb"}
+        Space of the components.
+    """
+
+    size: tuple[int, int] = (256, 256)
+    components: int = 300
+    energy: float | None = None
+    gaussians: int = 5000
+    frequency_aware: bool | str = "auto"
+    preset: str = "default"
+    steps: int | None = None
+    color: str = "ycbcr"
+    seed: int = 0
+
+
+class Trained(NamedTuple):
+    """Result of `train`.
+
+    Attributes
+    ----------
+    model : EigenGS
+    basis : Eigenbasis
+        The components that the model renders.
+    figures : dict of str to object
+        ``seconds``, ``pca_seconds``, ``shape_seconds``, ``weight_seconds`` (of this run alone, if
+        it went on with another: ``resumed``), ``peak_rss_mb``, ``images``, ``components`` of each
+        channel, ``gaussians``, ``frequency_aware``, ``psnr_components`` and others of
+        `eigengs_dr.components.Fitted`; on the images held out, by psnr_ycbcr in dB, ``psnr_pca``
+        of the components themselves, ``psnr_init`` of projected and ``psnr_solved`` of exact
+        colours.
+    """
+
+    model: EigenGS
+    basis: Eigenbasis
+    figures: dict[str, Any]
+
+
+def train(
+    folder: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    settings: Settings,
+    backend: str | None = None,
+    progress: Progress = lambda stage, done, total: None,
+) -> Trained:
+    """Train a model on a folder of images and write it.
+
+    A folder ``OUTPUT.checkpoint`` keeps what is done; a run that was stopped, by Ctrl-C or harder,
+    goes on from there when it is started again, with the images it began with, to the same result.
+
+    Parameters
+    ----------
+    folder : path-like
+        One image in `HELD_OUT` is held out and measured.
+    output : path-like
+        The model's file.
+    settings : Settings
+    backend : {"llvm", "cuda"}, optional
+    progress : callable, optional
+        ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    Trained
+
+    Raises
+    ------
+    Interrupted
+        After Ctrl-C.
+    ValueError
+        If no image of the folder can be read, or the settings are wrong or not those of the
+        checkpoint.
+    OSError
+        If a file cannot be written.
+    """
+    started = time.perf_counter()
+    steps = check_arguments(
+        settings.size,
+        settings.gaussians,
+        settings.frequency_aware,
+        settings.seed,
+        settings.preset,
+        settings.steps,
+    )
+    folder = Path(folder)
+    names = [path.name for path in image_files(folder)]
+    decisive = {**asdict(settings), "size": list(settings.size), "steps": steps}
+    with Checkpoint(output, {**decisive, "folder": str(folder)}, names) as checkpoint:
+        if names != checkpoint.files:
+            warnings.warn(
+                f"{folder}: its images are others than when this training began; it goes on with "
+                f"the {len(checkpoint.files)} that were there",
+                stacklevel=2,
+            )
+        files = [folder / name for name in checkpoint.files]
+        held_out = files[HELD_OUT - 1 :: HELD_OUT]
+        training = [path for i, path in enumerate(files) if i % HELD_OUT != HELD_OUT - 1]
+        with deferred() as pressed:
+            run = Run(checkpoint, settings, steps, backend, progress, pressed)
+            basis = _basis(training, run)
+            pca_seconds = time.perf_counter() - started
+            model = _model(basis, run)
+        figures = {
+            "resumed": checkpoint.resumed,
+            "images": basis.count,
+            "components": list(model.components),
+            "gaussians": len(model.gaussians),
+            "frequency_aware": model.low > 0,
+            "pca_seconds": pca_seconds,
+            **model.figures,
+            **_measured(model, basis, held_out[:MOST_HELD_OUT], progress),
+            "peak_rss_mb": _peak_rss(),
+            "seconds": time.perf_counter() - started,
+        }
+        model.save(output)
+    return Trained(model, basis, figures)
+
+
+class Run(NamedTuple):
+    """What the stages of a training share."""
+
+    checkpoint: Checkpoint
+    settings: Settings
+    steps: int
+    backend: str | None
+    progress: Progress
+    pressed: Callable[[], bool]
+
+    def stop_if_pressed(self) -> None:
+        """Raise `Interrupted` after Ctrl-C."""
+        if self.pressed():
+            kept = self.checkpoint.holds_work
+            raise Interrupted("the same command goes on from here" if kept else "nothing is saved")
+
+
+def _basis(files: list[Path], run: Run) -> Eigenbasis:
+    """Find the components, block by block, or read them from the checkpoint."""
+    settings, checkpoint = run.settings, run.checkpoint
+    if (path := checkpoint.folder / "basis.npz").exists():
+        return Eigenbasis.load(path)
+    arrays = checkpoint.load("pca")
+    state = EigenState.from_arrays(arrays) if arrays else start(settings.size, settings.seed)
+    first = int(arrays["next"]) if arrays else 0
+    length = block_length(settings.size)
+
+    def advance(done: int, total: int | None, row: dict[str, Any]) -> None:
+        run.progress("components", first + done, len(files))
+        run.stop_if_pressed()
+
+    source = batches(files[first:], settings.size, settings.color, length, advance)
+    with closing(source) as blocks:
+        for number, block in enumerate(blocks, 1):
+            state = merge(state, block, [rank_for(settings.components)] * 3)
+            del block  # before the next is read
+            if (done := first + number * length) < len(files):
+                checkpoint.save("pca", state.arrays() | {"next": np.array(done)})
+    basis = Eigenbasis.from_state(
+        state, settings.size, settings.components, settings.energy, settings.color
+    )
+    basis.save(path)
+    checkpoint.remove("pca")
+    return basis
+
+
+def _model(basis: Eigenbasis, run: Run) -> EigenGS:
+    """Fit Gaussians to the components, saving what training has reached."""
+    settings, checkpoint = run.settings, run.checkpoint
+    run.stop_if_pressed()
+    run.progress("weights", 0, 1)
+    split, compared = wants_split(basis, settings.gaussians, settings.frequency_aware, run.backend)
+    saved = time.perf_counter()
+
+    def save(states: list[State]) -> None:
+        nonlocal saved
+        done = sum(int(state["step"]) for state in states)
+        if run.steps:
+            run.progress("shapes", done, run.steps * (2 if split else 1))
+            if run.pressed() or time.perf_counter() - saved > SAVE_SECONDS:
+                saved = time.perf_counter()
+                flat = {f"{i}.{k}": v for i, state in enumerate(states) for k, v in state.items()}
+                checkpoint.save("shapes", flat)
+        run.stop_if_pressed()
+
+    fitted = fit_components(
+        basis,
+        settings.gaussians,
+        split,
+        settings.preset,
+        run.steps,
+        settings.seed,
+        run.backend,
+        _states(checkpoint.load("shapes") or {}),
+        save,
+    )
+    return EigenGS.of(basis, fitted, compared)
+
+
+def _states(flat: dict[str, Any]) -> list[State]:
+    """Undo the flattening of the states of both sides: "1.step" is the step of the second."""
+    states: dict[str, State] = {}
+    for key, array in flat.items():
+        side, name = key.split(".", 1)
+        states.setdefault(side, {})[name] = array
+    return [states[side] for side in sorted(states)]
+
+
+def _measured(
+    model: EigenGS, basis: Eigenbasis, files: list[Path], progress: Progress
+) -> dict[str, float]:
+    """Mean psnr_ycbcr of images that were not trained on; nothing where there are none."""
+    rows = []
+    for i, path in enumerate(files):
+        progress("measure", i, len(files))
+        try:
+            image = cropped(load_image(path), basis.width, basis.height)
+        except ImageError:
+            continue
+        shown = {
+            "psnr_pca": basis.reconstruct(basis.project(image)),
+            "psnr_init": render(model.encode(image, "projected")).numpy(),
+            "psnr_solved": render(model.encode(image, "exact")).numpy(),
+        }
+        rows.append({name: psnr(image, picture, "ycbcr") for name, picture in shown.items()})
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]} if rows else {}
+
+
+def _peak_rss() -> float | None:
+    """Most memory this process ever held, in MiB; None where the system does not say."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10  # macOS bytes, Linux KiB
