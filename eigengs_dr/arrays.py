@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -99,9 +100,17 @@ def upload(kind: Any, values: NDArray[Any]) -> Any:
     -------
     Dr.Jit array of type `kind`, evaluated
     """
-    target = dr.empty(kind, len(values))
-    index = dr.arange(dr.uint32_array_t(kind), len(values))
-    dr.scatter(target, kind(np.ascontiguousarray(values)), index)
-    dr.eval(target)
+    return upload_rows(kind, [values])[0]
+
+
+def upload_rows(kind: Any, rows: Iterable[NDArray[Any]]) -> list:
+    """Copy flat NumPy arrays as `upload` does, and wait once for all of them."""
+    targets = []
+    for values in rows:
+        target = dr.empty(kind, len(values))
+        index = dr.arange(dr.uint32_array_t(kind), len(values))
+        dr.scatter(target, kind(np.ascontiguousarray(values)), index)
+        targets.append(target)
+    dr.eval(targets)
     dr.sync_thread()  # the copy may read the caller's memory until then
-    return target
+    return targets

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import types_of, upload
+from .arrays import types_of, upload_rows
 from .gaussians import Gaussians, concatenate
 from .joint import JointState, train_jointly
 from .metrics import decibels
@@ -295,8 +295,8 @@ def colored(gaussians: Gaussians, coefficients: NDArray[np.float64], space: str)
     rows = coefficients.astype(np.float32).T
     return replace(
         gaussians,
-        color=types.FloatX([upload(types.Float, row[:-1]) for row in rows]),
-        background=types.FloatX([upload(types.Float, row[-1:]) for row in rows]),
+        color=types.FloatX(upload_rows(types.Float, rows[:, :-1])),
+        background=types.FloatX(upload_rows(types.Float, rows[:, -1:])),
         space=space,
     )
 

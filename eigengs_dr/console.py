@@ -81,8 +81,8 @@ def progress_bar(quiet: bool) -> Iterator[Callable[..., None]]:
             nonlocal current
             if label != current:
                 current = label
-                bar.reset(total)
                 bar.set_description_str(label, refresh=False)
+                bar.reset(total)
             bar.total = total
             if row and "psnr_rgb" in row:
                 bar.set_postfix_str(f"{row['psnr_rgb']:.2f} dB", refresh=False)

@@ -157,7 +157,7 @@ class EigenGS:
         ValueError
             If the image is unusable.
         """
-        correlations = self.equations.correlate(self.planes(image))
+        correlations = self.equations.correlate(self._planes(check_image(image)))
         return self._coefficients(correlations - self._mean_product)
 
     def reconstruct(
@@ -211,7 +211,7 @@ class EigenGS:
                 raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(known)}")
         pixels = check_image(image)
         size = (pixels.shape[1], pixels.shape[0])
-        planes = self.planes(pixels)
+        planes = self._planes(pixels)
         if mean == "dense":
             planes = planes - self.mean_image
         correlations = self.equations.correlate(planes)
@@ -224,12 +224,6 @@ class EigenGS:
     def dense_mean(self, width: int, height: int) -> Planes:
         """Return the mean image as pixels, shape (height, width, C), in the space of the model."""
         return resampled(np.moveaxis(self.mean_image, 0, 2), width, height)
-
-    def planes(self, image: ArrayLike) -> Planes:
-        """Bring an image to the size and space of the model, shape (C, H, W)."""
-        width, height = self.gaussians.width, self.gaussians.height
-        pixels = resampled(check_image(image), width, height)
-        return to_planes(pixels, self.gaussians.space).reshape(-1, height, width)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the model as an ``.npz`` file, all or nothing.
@@ -265,6 +259,13 @@ class EigenGS:
             return cls(**from_members(arrays, backend))
         except ValueError as error:
             raise ValueError(f"{Path(path)}: {error}") from None
+
+    def _planes(self, pixels: Planes) -> Planes:
+        """Bring an RGB image to the size and space of the model, shape (C, H, W)."""
+        width, height = self.gaussians.width, self.gaussians.height
+        if pixels.shape[:2] != (height, width):
+            pixels = resampled(pixels, width, height)
+        return to_planes(pixels, self.gaussians.space).reshape(-1, height, width)
 
     def _colored(
         self, coefficients: NDArray[np.float64], size: tuple[int, int] | None

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import archive
-from .arrays import types_in, types_of, upload
+from .arrays import types_in, types_of, upload_rows
 from .backend import select
 from .color import SPACES
 
@@ -325,7 +325,7 @@ def _broadcast(row: Any, count: int) -> Any:
 
 
 def _columns(types: Any, array: NDArray[Any]) -> list:
-    return [upload(types.Float, column) for column in array.T]
+    return upload_rows(types.Float, array.T)
 
 
 def _rows(rows: Any, count: int) -> NDArray[Any]:

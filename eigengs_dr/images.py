@@ -344,14 +344,13 @@ def _rgb(image: ArrayLike, name: str) -> NDArray[np.float32]:
     if kind not in "bf" and not (kind == "u" and array.itemsize <= 2):
         expected = "expected uint8, uint16 or floats in [0, 1]"
         raise ImageError(f"{name}: pixels are {array.dtype}; {expected}")
-    if kind == "f":
+    if kind == "f" and not np.isfinite(array).all():
         bad = np.argwhere(~np.isfinite(array).all(axis=2))
-        if len(bad):
-            row, column = bad[0].tolist()
-            raise ImageError(
-                f"{name}: {len(bad)} of {array.shape[0] * array.shape[1]} pixels are not finite, "
-                f"the first at [{row}, {column}]; replace them, as with np.nan_to_num"
-            )
+        row, column = bad[0].tolist()
+        raise ImageError(
+            f"{name}: {len(bad)} of {array.shape[0] * array.shape[1]} pixels are not finite, "
+            f"the first at [{row}, {column}]; replace them, as with np.nan_to_num"
+        )
     peak = np.iinfo(array.dtype).max if kind == "u" else 1
     with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite: clamped or refused
         pixels = np.divide(array, peak, dtype=np.float32)
