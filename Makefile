@@ -19,13 +19,14 @@ APT_INSTALL := apt_install() { \
 	{ $$get install $$1 || { $$get update && $$get install $$1; }; } </dev/null >/dev/null 2>&1 \
 	|| { echo "make setup: $$2" >&2; exit 1; }; }
 
-.PHONY: help setup demo test test-slow bench clean
+.PHONY: help setup demo test test-slow bench basis clean
 
 help:
-	@echo "make demo       fit a photo; shows PSNR, time and the picture it wrote"
+	@echo "make demo       fit a photo, at once and well; shows PSNR, time and the pictures it wrote"
 	@echo "make test       linters, type checker, tests"
 	@echo "make test-slow  the tests that take minutes"
 	@echo "make bench      time the renderer"
+	@echo "make basis      train the basis that ships, again"
 	@echo "make setup      only set up .venv, and libLLVM where none works"
 	@echo "make clean      remove what these made"
 
@@ -43,6 +44,8 @@ $(READY): pyproject.toml
 
 demo: $(READY)
 	@mkdir -p build/demo
+	$(BIN)/eigengs-dr fit $(PHOTO) --init eigen --basis natural --iterations 0 \
+		-o build/demo/instant.npz --preview build/demo/instant.png
 	$(BIN)/eigengs-dr fit $(PHOTO) -o build/demo/coffee.npz \
 		--preview build/demo/coffee.png --report build/demo/coffee.json
 
@@ -58,6 +61,9 @@ test-slow: $(READY)
 bench: $(READY)
 	@mkdir -p build/bench
 	$(BIN)/eigengs-dr bench kernels --report build/bench/kernels.json
+
+basis: $(READY)
+	$(BIN)/python -m eigengs_dr.natural eigengs_dr/data/natural.npz
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -97,12 +97,17 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
     low, low_components = arrays["split"].tolist()
     if not 0 <= low < count or low_components < 0:
         raise ValueError(f"split is {low}, {low_components}; expected 0 to {count - 1} splats")
-    return {
-        "gaussians": gaussians,
-        "weights": tuple(
+    with np.errstate(over="ignore"):  # what overflows is refused
+        weights = tuple(
             arrays[f"weights{c}"].astype(np.float32) * arrays[f"scale{c}"][:, None]
             for c in range(3)
-        ),
+        )
+    for c, rows in enumerate(weights):
+        if not np.isfinite(rows).all():
+            raise ValueError(f"weights{c} times scale{c} is beyond single precision")
+    return {
+        "gaussians": gaussians,
+        "weights": weights,
         "eigenvalues": tuple(arrays[f"eigenvalues{c}"] for c in range(3)),
         "mean_image": arrays["mean_image"].astype(np.float32),
         "low": low,
