@@ -20,12 +20,15 @@ FORMAT, VERSION = "eigengs_dr.eigenbasis", 1
 ROUNDING = 1e-5
 """Share of the variance by which sums of eigenvalues may be off."""
 
+MOST_ENTRIES = 1 << 28
+"""Largest of the other arrays: 16 examples of 2,000x2,000 pixels."""
+
 LAYOUT: dict[str, archive.Field] = {
-    "mean": archive.Field("f4", 3),
+    "mean": archive.Field("f4", 3, MOST_ENTRIES),
     "variance": archive.Field("f8", 1),
     "count": archive.Field("i8", 0),
     "space": archive.Field("U", 0),
-    "examples": archive.Field("f4", 4),
+    "examples": archive.Field("f4", 4, MOST_ENTRIES),
     **{f"eigenvalues{c}": archive.Field("f8", 1) for c in range(3)},
 }
 """What a file holds besides the components, whose shapes follow from these."""

@@ -109,7 +109,7 @@ class Checkpoint:
                 for key, (kind, ndim) in json.loads(layout.tobytes()).items()
             }
         except (ValueError, AttributeError, TypeError):
-            raise ValueError(f"{path}: layout is damaged; delete {self.folder}") from None
+            raise ValueError(f"{path}: layout is damaged") from None
         return archive.read(path, FORMAT, VERSION, fields)
 
     def remove(self, name: str) -> None:

@@ -99,6 +99,8 @@ def fit_components(
     save : callable, optional
         ``save(states)`` after every round of training; what it raises ends the work.
     """
+    if method == "eigengs" and not any(map(len, basis.components)):
+        raise ValueError("the images give no components to train on; use preset 'default'")
     started = time.perf_counter()
     sides, states = _sides(basis, count, split), list(states or [])
     train, result = METHODS[method]

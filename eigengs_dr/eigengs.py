@@ -297,10 +297,11 @@ class EigenGS:
         """Cholesky factors of ``Psi~^T Psi~``, one a channel."""
         factors = []
         for weights in self.weights:
-            gram = weights @ self.equations.product(weights.T.astype(np.float64))
-            # Components that render alike, or to nothing, must not end a factorisation.
+            # In double precision: components outnumber splats, or render alike, in some models.
+            rows = weights.astype(np.float64)
+            gram = rows @ self.equations.product(rows.T)
             gram += np.eye(len(gram)) * (1e-9 * np.trace(gram) / max(1, len(gram)) + 1e-30)
-            factors.append(cho_factor(gram.astype(np.float32), lower=True) if len(gram) else None)
+            factors.append(cho_factor(gram, lower=True) if len(gram) else None)
         return factors
 
     def _coefficients(self, correlations: NDArray[np.float64]) -> tuple[Planes, ...]:
@@ -310,7 +311,8 @@ class EigenGS:
             zip(self.weights, self._component_factors, strict=True)
         ):
             seen = weights @ correlations[:, c].astype(np.float32)
-            found.append(cho_solve(factor, seen, check_finite=False) if len(seen) else seen)
+            solved = cho_solve(factor, seen, check_finite=False) if len(seen) else seen
+            found.append(solved.astype(np.float32))
         return tuple(found)
 
     def _sum(self, coefficients: tuple[Any, ...]) -> NDArray[np.float64]:

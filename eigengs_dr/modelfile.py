@@ -13,6 +13,9 @@ from .stream import SPACES
 
 FORMAT, VERSION = "eigengs_dr.model", 1
 
+MOST_ENTRIES = 1 << 28
+"""Largest array: 300 components of a million splats."""
+
 LAYOUT: dict[str, Field] = {
     "mean": Field("f4", 2),
     "factor": Field("f4", 2),
@@ -20,9 +23,9 @@ LAYOUT: dict[str, Field] = {
     "background": Field("f4", 1),
     "size": Field("i8", 1),
     "space": Field("U", 0),
-    "mean_image": Field("f2", 3),
+    "mean_image": Field("f2", 3, MOST_ENTRIES),
     "split": Field("i8", 1),
-    **{f"weights{c}": Field("f2", 2) for c in range(3)},
+    **{f"weights{c}": Field("f2", 2, MOST_ENTRIES) for c in range(3)},
     **{f"scale{c}": Field("f4", 1) for c in range(3)},
     **{f"eigenvalues{c}": Field("f8", 1) for c in range(3)},
 }
@@ -87,6 +90,7 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
         backend=backend,
     )
     count = len(gaussians)
+    _require("color", arrays["color"], (count, 3))
     for c in range(3):
         components = len(arrays[f"weights{c}"])
         _require(f"weights{c}", arrays[f"weights{c}"], (components, count + 1))
@@ -95,8 +99,12 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
     _require("mean_image", arrays["mean_image"], (3, gaussians.height, gaussians.width))
     _require("split", arrays["split"], (2,))
     low, low_components = arrays["split"].tolist()
-    if not 0 <= low < count or low_components < 0:
-        raise ValueError(f"split is {low}, {low_components}; expected 0 to {count - 1} splats")
+    most = max(len(arrays[f"weights{c}"]) for c in range(3))
+    if not (0 <= low < count and 0 <= low_components <= most):
+        raise ValueError(
+            f"split is {low}, {low_components}; expected up to {count - 1} splats and {most} "
+            "components"
+        )
     with np.errstate(over="ignore"):  # what overflows is refused
         weights = tuple(
             arrays[f"weights{c}"].astype(np.float32) * arrays[f"scale{c}"][:, None]

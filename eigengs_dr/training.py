@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import time
@@ -21,9 +22,9 @@ from .images import ImageError, cropped, image_files, load_image
 from .incremental import EigenState, block_length, merge, rank_for, start
 from .interrupt import deferred
 from .metrics import psnr
-from .pca import Eigenbasis
+from .pca import Eigenbasis, checked_components
 from .rendering import render
-from .stream import batches
+from .stream import SPACES, batches, checked_size
 
 HELD_OUT = 10
 """One image in so many is not trained on, but measured."""
@@ -49,7 +50,7 @@ class Settings:
     ----------
     size : (int, int)
         Width and height in pixels.
-    components : int
+    components : int or tuple of 3 ints
         The most kept of each channel.
     energy : float or None
         Keep as few components as hold this share of a channel's variance.
@@ -60,7 +61,7 @@ class Settings:
     """
 
     size: tuple[int, int] = (256, 256)
-    components: int = 300
+    components: int | tuple[int, int, int] = 300
     energy: float | None = None
     gaussians: int = 5000
     frequency_aware: bool | str = "auto"
@@ -130,8 +131,11 @@ def train(
         If a file cannot be written.
     """
     started = time.perf_counter()
+    checked_components(settings.components, settings.energy)
+    if settings.color not in SPACES:
+        raise ValueError(f"color {settings.color!r} is unknown; use one of {', '.join(SPACES)}")
     steps = check_arguments(
-        settings.size,
+        checked_size(settings.size),
         settings.gaussians,
         settings.frequency_aware,
         settings.seed,
@@ -140,8 +144,8 @@ def train(
     )
     folder = Path(folder)
     names = [path.name for path in image_files(folder)]
-    decisive = {**asdict(settings), "size": list(settings.size), "steps": steps}
-    with Checkpoint(output, {**decisive, "folder": str(folder)}, names) as checkpoint:
+    decisive = {**asdict(settings), "steps": steps, "folder": str(folder)}
+    with Checkpoint(output, json.loads(json.dumps(decisive)), names) as checkpoint:
         if names != checkpoint.files:
             warnings.warn(
                 f"{folder}: its images are others than when this training began; it goes on with "
@@ -153,9 +157,16 @@ def train(
         training = [path for i, path in enumerate(files) if i % HELD_OUT != HELD_OUT - 1]
         with deferred() as pressed:
             run = Run(checkpoint, settings, steps, backend, progress, pressed)
-            basis = _basis(training, run)
-            pca_seconds = time.perf_counter() - started
-            model = _model(basis, run)
+            try:
+                basis = _basis(training, run)
+                pca_seconds = time.perf_counter() - started
+                model = _model(basis, run)
+                measured = _measured(model, basis, held_out[:MOST_HELD_OUT], run)
+            except ValueError as error:
+                if not checkpoint.holds_work:
+                    raise
+                advice = f"to start anew, delete {checkpoint.folder}"
+                raise ValueError(f"{error}; {advice}") from None
         figures = {
             "resumed": checkpoint.resumed,
             "images": basis.count,
@@ -164,7 +175,7 @@ def train(
             "frequency_aware": model.low > 0,
             "pca_seconds": pca_seconds,
             **model.figures,
-            **_measured(model, basis, held_out[:MOST_HELD_OUT], progress),
+            **measured,
             "peak_rss_mb": _peak_rss(),
             "seconds": time.perf_counter() - started,
         }
@@ -203,13 +214,19 @@ def _basis(files: list[Path], run: Run) -> Eigenbasis:
         run.progress("components", first + done, len(files))
         run.stop_if_pressed()
 
+    ranks = [rank_for(k) for k in checked_components(settings.components)]
     source = batches(files[first:], settings.size, settings.color, length, advance)
-    with closing(source) as blocks:
-        for number, block in enumerate(blocks, 1):
-            state = merge(state, block, [rank_for(settings.components)] * 3)
-            del block  # before the next is read
-            if (done := first + number * length) < len(files):
-                checkpoint.save("pca", state.arrays() | {"next": np.array(done)})
+    try:
+        with closing(source) as blocks:
+            for number, block in enumerate(blocks, 1):
+                state = merge(state, block, ranks)
+                del block  # before the next is read
+                if (done := first + number * length) < len(files):
+                    checkpoint.save("pca", state.arrays() | {"next": np.array(done)})
+    except ImageError as error:
+        if not state.count:  # of an earlier run that went on here: only what was left is bad
+            raise
+        warnings.warn(f"the rest was skipped: {error}", stacklevel=2)
     basis = Eigenbasis.from_state(
         state, settings.size, settings.components, settings.energy, settings.color
     )
@@ -260,13 +277,12 @@ def _states(flat: dict[str, Any]) -> list[State]:
     return [states[side] for side in sorted(states)]
 
 
-def _measured(
-    model: EigenGS, basis: Eigenbasis, files: list[Path], progress: Progress
-) -> dict[str, float]:
+def _measured(model: EigenGS, basis: Eigenbasis, files: list[Path], run: Run) -> dict[str, float]:
     """Mean psnr_ycbcr of images that were not trained on; nothing where there are none."""
     rows = []
     for i, path in enumerate(files):
-        progress("measure", i, len(files))
+        run.progress("measure", i, len(files))
+        run.stop_if_pressed()
         try:
             image = cropped(load_image(path), basis.width, basis.height)
         except ImageError:
