@@ -41,6 +41,21 @@ class Size(click.ParamType):
         return checked_pixels(int(match[1]), int(match[2]))
 
 
+class Counts(click.ParamType):
+    """A number for every channel, or three with commas, as in "230,60,60"."""
+
+    name = "K"
+
+    def convert(self, value: Any, param: Any, context: Any) -> int | tuple[int, ...]:
+        """Turn the text of an option into one number or three."""
+        if isinstance(value, int):  # the default
+            return value
+        if not re.fullmatch(r"\d+(,\d+,\d+)?", value) or not any(map(int, value.split(","))):
+            self.fail(f"{value}: expected a number above 0, or three such as 230,60,60", param)
+        counts = tuple(map(int, value.split(",")))
+        return counts if len(counts) > 1 else counts[0]
+
+
 def checked_pixels(width: int, height: int) -> tuple[int, int]:
     """Return the sides of a picture; refuse one that is too large to be made."""
     if width < 1 or height < 1 or (width + 3) * (height + 3) > MOST_PIXELS:

@@ -9,6 +9,7 @@ from .backend import select
 from .cli_shared import (
     ANY_PATH,
     FOLDER,
+    Counts,
     Size,
     backend_option,
     choice,
@@ -40,10 +41,10 @@ MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
 )
 @click.option(
     "--components",
-    type=click.IntRange(min=1),
+    type=Counts(),
     default=300,
     show_default=True,
-    help="The most kept of each colour channel.",
+    help="The most kept of each colour channel; one number, or three such as 230,60,60.",
 )
 @click.option(
     "--energy",

@@ -424,7 +424,7 @@ def test_train_without_images_to_hold_out(tmp_path):
 def test_train_options(trained, tmp_path):
     folder, _ = trained
     options = ["--energy", 0.5, "--color", "rgb", "--seed", 3, "--preset", "eigengs", "--steps", 2]
-    size = ["--size", "16x16", "--components", 6, "--quiet"]
+    size = ["--size", "16x16", "--components", "6,5,4", "--quiet"]
     outputs = ["-o", tmp_path / "m.npz", "--report", tmp_path / "m.json"]
     result = succeeded(run("train", folder / "photos", *outputs, *size, *options))
     assert result.stdout == ""
@@ -432,6 +432,7 @@ def test_train_options(trained, tmp_path):
     expected = {"energy": 0.5, "color": "rgb", "seed": 3, "preset": "eigengs", "steps": 2}
     assert {key: report[key] for key in expected} == expected
     assert report["gaussians"] == 256  # one a pixel
+    assert report["most_components"] == [6, 5, 4]
     assert max(report["components"]) < 6
 
 
@@ -466,6 +467,8 @@ def test_train_interrupted_goes_on(trained, tmp_path, monkeypatch):
     [
         (["--gaussians", 1025, "--size", "32x32"], "gaussians is 1025"),
         (["--gaussians", 0], "gaussians"),
+        (["--components", "3,4"], "3,4: expected a number above 0, or three such as 230,60,60"),
+        (["--components", "many"], "many: expected a number"),
         (["--components", 0], "components"),
         (["--energy", 0], "energy"),
         (["--energy", 1.01], "energy"),
