@@ -113,7 +113,8 @@ def fit_components(
     parts = [result(state, side, backend) for state, side in zip(states, sides, strict=True)]
     gaussians = concatenate([shapes for shapes, _ in parts])
     weights = _joined([w for _, w in parts])
-    equations = NormalEquations(gaussians)
+    low = sides[0].splats if split else 0
+    equations = NormalEquations(gaussians, low)
     mean = equations.solve(equations.correlate(basis.mean))
     figures = {
         "shape_seconds": trained - started,
@@ -127,7 +128,7 @@ def fit_components(
     return Fitted(
         gaussians=colored(gaussians, mean, basis.space),
         weights=weights,
-        low=sides[0].splats if split else 0,
+        low=low,
         low_components=_low_components(basis) if split else 0,
         figures=figures,
     )
@@ -192,7 +193,7 @@ def wants_split(
         counts = [side.splats for side in _sides(basis, count, split)]
         size = (basis.width, basis.height)
         sets = [shapes_of(on_grid(size, n), size, 1, backend) for n in counts]
-        equations = NormalEquations(concatenate(sets))
+        equations = NormalEquations(concatenate(sets), counts[0] if split else 0)
         correlations = equations.correlate(planes)
         error = equations.error(equations.solve(correlations), correlations, _squares(planes))
         figures[name] = decibels(float(error.mean()) / (basis.width * basis.height))

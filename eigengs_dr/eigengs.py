@@ -279,7 +279,7 @@ class EigenGS:
     @cached_property
     def equations(self) -> NormalEquations:
         """The normal equations of all splats, factorised."""
-        return NormalEquations(self.gaussians)
+        return NormalEquations(self.gaussians, self.low)
 
     @cached_property
     def _mean_coefficients(self) -> NDArray[np.float64]:

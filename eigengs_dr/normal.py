@@ -8,6 +8,9 @@ back-substitution. For the shapes of one image alone, `eigengs_dr.solve` is chea
 
 from __future__ import annotations
 
+from itertools import pairwise
+from typing import Any, NamedTuple
+
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
@@ -28,17 +31,43 @@ RIDGE = 1e-4
 overlap much, at no visible cost."""
 
 
+class Block(NamedTuple):
+    """Consecutive splats whose colours are solved for together.
+
+    Attributes
+    ----------
+    rows : slice
+    factor : SuperLU
+        Of ``A^T A + ridge``, in single precision: half the memory to read for every image, and
+        what that loses is below the ridge.
+    spread : ndarray of float64, shape (n,)
+        ``h = (A^T A + ridge)^-1 A^T 1``, by which a background moves the colours.
+    """
+
+    rows: slice
+    factor: Any
+    spread: NDArray[np.float64]
+
+    def divide(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
+        """``(A^T A + ridge)^-1`` times columns."""
+        return self.factor.solve(np.asarray(sums, np.float32, order="F")).astype(np.float64)
+
+
 class NormalEquations:
     """``(A^T A + ridge) c = A^T (D - b)`` for any number of images D on fixed shapes, factorised.
 
-    The background, a dense column of ones beside A, stays out of the sparse factor: with
-    ``h = (A^T A)^-1 A^T 1``, block elimination gives it from two sums. A column of coefficients is
-    N colours and, last, the background.
+    The background, a dense column of ones beside A, stays out of the sparse factor: block
+    elimination gives it from two sums. A column of coefficients is N colours and, last, the
+    background.
 
     Parameters
     ----------
     gaussians : Gaussians
         Shapes and native size; colours are not used.
+    low : int, optional
+        So many splats, the first ones, fit an image alone, and the others what is left. With large
+        splats below small ones that loses 0.1 dB against solving for all at once, which lets both
+        cancel each other in large numbers and costs 1 dB after refinement.
     cutoff : float, optional
         See `eigengs_dr.render`.
 
@@ -48,16 +77,27 @@ class NormalEquations:
         If the shapes are so alike that the equations are singular to working precision.
     """
 
-    def __init__(self, gaussians: Gaussians, cutoff: float = CUTOFF) -> None:
+    def __init__(self, gaussians: Gaussians, low: int = 0, cutoff: float = CUTOFF) -> None:
         self.count, self.cutoff = len(gaussians), cutoff
         self.width, self.height = gaussians.width, gaussians.height
         matrix = splat_matrix(gaussians, cutoff)
-        self.gram = (matrix @ matrix.T).tocsc().astype(np.float64)
-        ridge = max(RIDGE * self.gram.diagonal().mean(), 1e-12)
-        system = self.gram + diags_array(np.full(self.count, ridge)).tocsc()
+        self.gram = (matrix @ matrix.T).tocsr().astype(np.float64)
+        self.coverage = np.asarray(matrix.sum(axis=1), np.float64)
+        ends = [0, low, self.count] if low else [0, self.count]
+        self.blocks = [self._block(slice(*pair)) for pair in pairwise(ends)]
+        with dr.suspend_grad():
+            types = types_of(gaussians.mean)
+            shape = [*gaussians.mean, *[f * UNIT for f in gaussians.factor]]
+            self.packed = pack([*shape, *[types.Float(0)] * GROUP])
+            self.lists = lists_for(gaussians, cutoff)
+
+    def _block(self, rows: slice) -> Block:
+        """Factorise the equations of some splats."""
+        gram = self.gram[rows, rows]
+        ridge = max(RIDGE * gram.diagonal().mean(), 1e-12)
+        system = (gram + diags_array(np.full(gram.shape[0], ridge))).tocsc()
         try:
-            # Half the memory to read for every image; what it loses is below the ridge.
-            self.factor = splu(
+            factor = splu(
                 system.astype(np.float32),
                 permc_spec="MMD_AT_PLUS_A",
                 diag_pivot_thresh=0.0,
@@ -65,14 +105,10 @@ class NormalEquations:
             )
         except RuntimeError as error:
             raise ValueError(f"the splats' equations have no solution ({error})") from None
-        self.coverage = np.asarray(matrix.sum(axis=1), np.float64)
-        self.spread = self._divided(self.coverage)
-        self.spread += self._divided(self.coverage - system @ self.spread)
-        with dr.suspend_grad():
-            types = types_of(gaussians.mean)
-            shape = [*gaussians.mean, *[f * UNIT for f in gaussians.factor]]
-            self.packed = pack([*shape, *[types.Float(0)] * GROUP])
-            self.lists = lists_for(gaussians, cutoff)
+        coverage = self.coverage[rows]
+        block = Block(rows, factor, 0 * coverage)
+        spread = block.divide(coverage)
+        return block._replace(spread=spread + block.divide(coverage - system @ spread))
 
     def correlate(self, images: NDArray[np.float32]) -> NDArray[np.float64]:
         """``A^T D`` and, last, ``1^T D``.
@@ -104,18 +140,19 @@ class NormalEquations:
 
     def solve(self, correlations: NDArray[np.float64]) -> NDArray[np.float64]:
         """Coefficients of least squares from what `correlate` gave; both of shape (N + 1, M)."""
-        sums, total = correlations[:-1], correlations[-1]
-        colors = self._divided(sums)
         pixels = self.width * self.height
-        left = pixels - self.spread @ self.coverage
-        # Splats that make a constant by themselves leave nothing for the background.
-        background = (total - self.spread @ sums) / left if left > 1e-6 * pixels else 0 * total
-        colors -= np.outer(self.spread, background)
-        return np.vstack([colors, background])
-
-    def _divided(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
-        """``(A^T A + ridge)^-1`` times columns."""
-        return self.factor.solve(np.asarray(sums, np.float32, order="F")).astype(np.float64)
+        solved = np.zeros(correlations.shape)
+        left = correlations
+        for block in self.blocks:
+            if block is not self.blocks[0]:
+                left = correlations - self.product(solved)
+            sums, total = left[block.rows], left[-1]
+            free = pixels - block.spread @ self.coverage[block.rows]
+            # Splats that make a constant by themselves leave nothing for the background.
+            background = (total - block.spread @ sums) / free if free > 1e-6 * pixels else 0 * total
+            solved[block.rows] = block.divide(sums) - np.outer(block.spread, background)
+            solved[-1] += background
+        return solved
 
     def product(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
         """``[A 1]^T [A 1] x`` for coefficients x of shape (N + 1, M)."""

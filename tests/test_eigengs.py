@@ -228,8 +228,8 @@ def test_exact_colours_are_those_of_conjugate_gradients(backend, split, others):
     target = np.moveaxis(to_planes(others[0], "ycbcr").reshape(3, SIDE, SIDE), 0, 2)
     iterated = solve(encoded, target, 100).gaussians
     exact, slow = (eg.psnr(eg.render(g), others[0], "ycbcr") for g in (encoded, iterated))
-    assert exact > slow - 0.02
-    assert split or exact < slow + 0.1  # large splats below small ones: slow to iterate
+    # With the split, small splats fit what large ones leave: on so smooth an image, that costs.
+    assert slow - (3 if split else 0.02) < exact < slow + 0.1
     assert fidelity(rendered(model, others), others) > fidelity(
         rendered(model, others, "projected"), others
     )

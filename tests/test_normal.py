@@ -140,3 +140,21 @@ def test_a_constant_needs_the_background_alone(backend):
     solved = equations.solve(equations.correlate(flat))
     np.testing.assert_allclose(solved[-1], 0.4, atol=1e-3)
     np.testing.assert_allclose(solved[:-1], 0, atol=1e-2)
+
+
+def test_blocks_fit_what_is_left(backend):
+    """First splats fit the image alone, the others the difference, each with a background."""
+    scene, low = random_scene(8), 9
+    both = NormalEquations(scene.on(backend), low)
+    first, rest = (
+        NormalEquations(scene.permuted(order).on(backend))
+        for order in (slice(low), slice(low, None))
+    )
+    found = both.solve(both.correlate(images()))
+    coarse = first.solve(first.correlate(images()))
+    np.testing.assert_allclose(found[:low], coarse[:-1], atol=1e-4)
+    matrix = splat_matrix(scene.permuted(slice(low)).on(backend))
+    shown = (matrix.T @ coarse[:-1] + coarse[-1]).T.reshape(images().shape)
+    fine = rest.solve(rest.correlate((images() - shown).astype(np.float32)))
+    np.testing.assert_allclose(found[low:-1], fine[:-1], atol=2e-3)
+    np.testing.assert_allclose(found[-1], coarse[-1] + fine[-1], atol=2e-3)
