@@ -65,9 +65,9 @@ class NormalEquations:
     gaussians : Gaussians
         Shapes and native size; colours are not used.
     low : int, optional
-        So many splats, the first ones, fit an image alone, and the others what is left. With large
-        splats below small ones that loses 0.1 dB against solving for all at once, which lets both
-        cancel each other in large numbers and costs 1 dB after refinement.
+        So many splats, the first ones, fit an image with the background, and the others what is
+        left. With large splats below small ones that loses 0.1 dB against solving for all at once,
+        which lets both cancel each other in large numbers and costs 1 dB after refinement.
     cutoff : float, optional
         See `eigengs_dr.render`.
 
@@ -140,18 +140,18 @@ class NormalEquations:
 
     def solve(self, correlations: NDArray[np.float64]) -> NDArray[np.float64]:
         """Coefficients of least squares from what `correlate` gave; both of shape (N + 1, M)."""
+        first, *others = self.blocks
+        sums, total = correlations[first.rows], correlations[-1]
         pixels = self.width * self.height
+        free = pixels - first.spread @ self.coverage[first.rows]
+        # Splats that make a constant by themselves leave nothing for the background.
+        background = (total - first.spread @ sums) / free if free > 1e-6 * pixels else 0 * total
         solved = np.zeros(correlations.shape)
-        left = correlations
-        for block in self.blocks:
-            if block is not self.blocks[0]:
-                left = correlations - self.product(solved)
-            sums, total = left[block.rows], left[-1]
-            free = pixels - block.spread @ self.coverage[block.rows]
-            # Splats that make a constant by themselves leave nothing for the background.
-            background = (total - block.spread @ sums) / free if free > 1e-6 * pixels else 0 * total
-            solved[block.rows] = block.divide(sums) - np.outer(block.spread, background)
-            solved[-1] += background
+        solved[-1] = background
+        solved[first.rows] = first.divide(sums) - np.outer(first.spread, background)
+        for block in others:
+            left = correlations - self.product(solved)
+            solved[block.rows] = block.divide(left[block.rows])
         return solved
 
     def product(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
