@@ -82,14 +82,21 @@ def _check(head: dict[str, NDArray[Any]]) -> None:
             raise archive.BadValue(f"{name} holds values that are not finite")
     for c in range(3):
         values = head[f"eigenvalues{c}"]
-        if (values < 0).any() or (np.diff(values) > 0).any():
-            raise archive.BadValue(f"eigenvalues{c} must descend and not be negative")
+        require_descending(f"eigenvalues{c}", values)
+        if len(values) > mean[0].size:
+            raise archive.BadValue(f"eigenvalues{c} has {len(values)} values, more than pixels")
         if values.sum() > variance[c] * (1 + ROUNDING):
             raise archive.BadValue(f"eigenvalues{c} add up to more than variance {c}")
     if head["count"] < 1:
         raise archive.BadValue(f"count is {head['count']}, expected at least 1")
     if head["space"] not in SPACES:
         raise archive.BadValue(f"space is '{head['space']}', expected one of {', '.join(SPACES)}")
+
+
+def require_descending(name: str, values: NDArray[np.float64]) -> None:
+    """Raise `archive.BadValue` unless eigenvalues descend and are not negative."""
+    if (values < 0).any() or (np.diff(values) > 0).any():
+        raise archive.BadValue(f"{name} must descend and not be negative")
 
 
 def _components(

@@ -23,7 +23,8 @@ LOW_SHARE = 0.1
 """Share of the splats that serve the low frequencies, where components are split (the paper)."""
 
 LOW_COMPONENTS = 50
-"""Components of each channel that count as low frequencies (the authors' code)."""
+"""Components of each channel that count as low frequencies (the authors' code); half of them where
+there are fewer than twice as many."""
 
 SPLIT_FROM = 512
 """Longer side in pixels from which "auto" considers the split: the paper found that it costs 0.4
@@ -110,11 +111,7 @@ def fit_components(
             states[i:] = [state]
             save(states)
     trained = time.perf_counter()
-    parts = [result(state, side, backend) for state, side in zip(states, sides, strict=True)]
-    gaussians = concatenate([shapes for shapes, _ in parts])
-    weights = _joined([w for _, w in parts])
-    low = sides[0].splats if split else 0
-    equations = NormalEquations(gaussians, low)
+    equations, gaussians, weights = _assembled(states, sides, result, backend)
     mean = equations.solve(equations.correlate(basis.mean))
     figures = {
         "shape_seconds": trained - started,
@@ -122,16 +119,27 @@ def fit_components(
         "psnr_components": psnr_components(equations, basis, weights),
     }
     if method == "default" and steps:
-        figures["psnr_untrained"] = fit_components(
-            basis, count, split, method, 0, seed, backend
-        ).figures["psnr_components"]
+        size = (basis.width, basis.height)
+        grids = [on_grid(size, side.splats) for side in sides]
+        equations, _, untrained = _assembled(grids, sides, result, backend)
+        figures["psnr_untrained"] = psnr_components(equations, basis, untrained)
     return Fitted(
         gaussians=colored(gaussians, mean, basis.space),
         weights=weights,
-        low=low,
+        low=sides[0].splats if split else 0,
         low_components=_low_components(basis) if split else 0,
         figures=figures,
     )
+
+
+def _assembled(
+    states: list[State], sides: list[Side], result: Any, backend: str | None
+) -> tuple[NormalEquations, Gaussians, tuple[Planes, ...]]:
+    """Shapes and weights of all sides, and the equations of all splats."""
+    parts = [result(state, side, backend) for state, side in zip(states, sides, strict=True)]
+    gaussians = concatenate([shapes for shapes, _ in parts])
+    low = sides[0].splats if len(sides) > 1 else 0
+    return NormalEquations(gaussians, low), gaussians, _joined([w for _, w in parts])
 
 
 def check_arguments(

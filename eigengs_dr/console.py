@@ -42,6 +42,12 @@ class Program(click.Group):
             say(f"error: {error.filename}: {error.strerror}" if told else f"error: {error}")
         except (ValueError, BackendError) as error:
             say(f"error: {error}")
+        except RuntimeError as error:
+            # What Dr.Jit makes of a second Ctrl-C, inside a program that is being traced.
+            if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
+                raise
+            say("interrupted")
+            sys.exit(INTERRUPTED)
         sys.exit(2)
 
 

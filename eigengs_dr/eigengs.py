@@ -31,7 +31,7 @@ Planes = NDArray[np.float32]
 Progress = Callable[[int, int, dict[str, Any]], None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EigenGS:
     """Gaussians that render the mean image and every principal component of a family of images.
 
@@ -62,7 +62,7 @@ class EigenGS:
     mean_image: Planes
     low: int = 0
     low_components: int = 0
-    figures: dict[str, float] = field(default_factory=dict, compare=False)
+    figures: dict[str, float] = field(default_factory=dict)
 
     @classmethod
     def fit(
@@ -140,7 +140,9 @@ class EigenGS:
         """Find the coefficients of an image: the closest point on the span of the components.
 
         Least squares on the rendered components, ``min_a |Psi~ a - (I - Psi~_0)|^2``; where they
-        render the principal components well, that is PCA's projection.
+        render the principal components well, that is PCA's projection. Where there are nearly as
+        many components as splats, these are not independent, and coefficients are large and mean
+        little one by one, though their rendering is right.
 
         Parameters
         ----------
@@ -175,7 +177,18 @@ class EigenGS:
         Returns
         -------
         Gaussians
+
+        Raises
+        ------
+        ValueError
+            If there is not one array a channel, or one has more coefficients than components.
         """
+        given = [np.shape(values) for values in coefficients]
+        if len(given) != len(self.weights) or not all(
+            len(shape) == 1 and shape[0] <= k
+            for shape, k in zip(given, self.components, strict=True)
+        ):
+            raise ValueError(f"coefficients have shapes {given}; expected up to {self.components}")
         return self._colored(self._mean_coefficients + self._sum(coefficients), size)
 
     def encode(self, image: ArrayLike, colors: str = "exact", mean: str = "gaussians") -> Gaussians:
@@ -187,9 +200,9 @@ class EigenGS:
             Of any size and aspect ratio: it is resampled to the size of the model, and the
             Gaussians are scaled to it.
         colors : {"exact", "projected"}, optional
-            "exact" are the best colours on these shapes, by back-substitution; "projected" are
-            those of the eigenbasis, of which the result has no more degrees of freedom than there
-            are components.
+            "exact" are the best colours on these shapes, by back-substitution (where the splats
+            are split, the best of N_l, and of N_h for what is left); "projected" are those of the
+            eigenbasis, which have no more degrees of freedom than there are components.
         mean : {"gaussians", "dense"}, optional
             "dense" is the paper's form: the result lacks the mean image, `dense_mean`.
 

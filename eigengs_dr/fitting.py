@@ -232,7 +232,10 @@ def _check_basis(
             "use init 'adaptive'"
         )
     if color != space:
-        raise ValueError(f"color is {color!r}, but the basis is in {space!r}; use one of both")
+        raise ValueError(
+            f"color is {color!r}, but the basis is in {space!r}; use color {space!r}, or train a "
+            f"basis with --color {color}"
+        )
 
 
 def _check(
@@ -264,3 +267,5 @@ def _check(
     ):
         if value not in known:
             raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(known)}")
+    if PRESETS[preset].mean == "dense" and init not in ("auto", "eigen"):
+        raise ValueError(f"preset {preset!r} starts from a basis; use init 'auto', not {init!r}")

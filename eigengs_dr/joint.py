@@ -71,11 +71,6 @@ class JointState(NamedTuple):
     counts: tuple[int, ...]
     rows: NDArray[np.float32]
 
-    @property
-    def psnr(self) -> float:
-        """Decibels of the scaled components, from `loss`; the peak is 1."""
-        return -10 * math.log10(self.loss) if self.loss else math.inf
-
     def gaussians(self, backend: str | None = None) -> Gaussians:
         """Return the N shapes; they have one channel of zeros, in the space "data"."""
         types = types_in(select(backend))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .archive import Field
+from .basisfile import require_descending
 from .gaussians import Gaussians
 from .stream import SPACES
 
@@ -15,6 +16,9 @@ FORMAT, VERSION = "eigengs_dr.model", 1
 
 MOST_ENTRIES = 1 << 28
 """Largest array: 300 components of a million splats."""
+
+LARGEST = 1e6
+"""Largest colour or weight that is believed; 1 is white."""
 
 LAYOUT: dict[str, Field] = {
     "mean": Field("f4", 2),
@@ -93,9 +97,12 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
     _require("color", arrays["color"], (count, 3))
     for c in range(3):
         components = len(arrays[f"weights{c}"])
+        if components > gaussians.width * gaussians.height:
+            raise ValueError(f"weights{c} has {components} components, more than there are pixels")
         _require(f"weights{c}", arrays[f"weights{c}"], (components, count + 1))
         _require(f"scale{c}", arrays[f"scale{c}"], (components,))
         _require(f"eigenvalues{c}", arrays[f"eigenvalues{c}"], (components,))
+        require_descending(f"eigenvalues{c}", arrays[f"eigenvalues{c}"])
     _require("mean_image", arrays["mean_image"], (3, gaussians.height, gaussians.width))
     _require("split", arrays["split"], (2,))
     low, low_components = arrays["split"].tolist()
@@ -110,9 +117,11 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
             arrays[f"weights{c}"].astype(np.float32) * arrays[f"scale{c}"][:, None]
             for c in range(3)
         )
-    for c, rows in enumerate(weights):
-        if not np.isfinite(rows).all():
-            raise ValueError(f"weights{c} times scale{c} is beyond single precision")
+    values = {f"weights{c} times scale{c}": rows for c, rows in enumerate(weights)}
+    values |= {key: arrays[key] for key in ("color", "background")}
+    for name, rows in values.items():
+        if not np.abs(rows).max(initial=0) <= LARGEST:
+            raise ValueError(f"{name} exceeds {LARGEST:g}, which no image needs")
     return {
         "gaussians": gaussians,
         "weights": weights,

@@ -76,4 +76,6 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: python -m eigengs_dr.natural FILE.npz")
     main(sys.argv[1])

@@ -26,6 +26,9 @@ from .splat import SHAPE, UNIT, pack, unpack, weights
 GROUP = 3
 """Images that are correlated at once: an image's channels, so that one program serves all."""
 
+MOST_WEIGHTS = 1 << 28
+"""Largest number of weights that a matrix may have: they and their places take 6 GiB."""
+
 RIDGE = 1e-4
 """Added to the diagonal of ``A^T A``, as a share of its mean: bounds the colours of splats that
 overlap much, at no visible cost."""
@@ -56,6 +59,8 @@ class Block(NamedTuple):
 class NormalEquations:
     """``(A^T A + ridge) c = A^T (D - b)`` for any number of images D on fixed shapes, factorised.
 
+    Solved exactly, or, with `low`, for two blocks of splats one after the other.
+
     The background, a dense column of ones beside A, stays out of the sparse factor: block
     elimination gives it from two sums. A column of coefficients is N colours and, last, the
     background.
@@ -66,8 +71,8 @@ class NormalEquations:
         Shapes and native size; colours are not used.
     low : int, optional
         So many splats, the first ones, fit an image with the background, and the others what is
-        left. With large splats below small ones that loses 0.1 dB against solving for all at once,
-        which lets both cancel each other in large numbers and costs 1 dB after refinement.
+        left. With large splats below small ones that starts some 0.1 dB below the solution for all
+        at once, in which both cancel each other in large numbers: it ends 1 dB lower when refined.
     cutoff : float, optional
         See `eigengs_dr.render`.
 
@@ -81,7 +86,8 @@ class NormalEquations:
         self.count, self.cutoff = len(gaussians), cutoff
         self.width, self.height = gaussians.width, gaussians.height
         matrix = splat_matrix(gaussians, cutoff)
-        self.gram = (matrix @ matrix.T).tocsr().astype(np.float64)
+        double = matrix.astype(np.float64)
+        self.gram = (double @ double.T).tocsr()
         self.coverage = np.asarray(matrix.sum(axis=1), np.float64)
         ends = [0, low, self.count] if low else [0, self.count]
         self.blocks = [self._block(slice(*pair)) for pair in pairwise(ends)]
@@ -128,9 +134,9 @@ class NormalEquations:
         with dr.suspend_grad():
             for first in range(0, len(images), GROUP):
                 planes = images[first : first + GROUP]
-                padded = np.zeros((self.height, self.width, GROUP), np.float32)
-                padded[..., : len(planes)] = np.moveaxis(planes, 0, 2)
-                delta = to_tiles(types, padded, self.lists.grid)
+                missing = [(0, GROUP - len(planes)), (0, 0), (0, 0)]
+                padded = np.pad(planes, missing) if len(planes) < GROUP else planes
+                delta = to_tiles(types, np.moveaxis(padded, 0, 2), self.lists.grid)
                 rows = adjoint(self.packed, delta, GROUP, self.lists, UNIT * self.cutoff, True)
                 dr.eval(rows)
                 for column, row in zip(range(first, first + len(planes)), rows, strict=False):
@@ -139,7 +145,10 @@ class NormalEquations:
         return result
 
     def solve(self, correlations: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Coefficients of least squares from what `correlate` gave; both of shape (N + 1, M)."""
+        """Coefficients of least squares from what `correlate` gave; both of shape (N + 1, M).
+
+        With two blocks those of the first, and then those of the second for what is left.
+        """
         first, *others = self.blocks
         sums, total = correlations[first.rows], correlations[-1]
         pixels = self.width * self.height
@@ -202,7 +211,12 @@ def splat_matrix(gaussians: Gaussians, cutoff: float = CUTOFF) -> csr_array:
     -------
     csr_array of float32, shape (N, H * W)
         Row n holds the weights of splat n, by `eigengs_dr.splat.weights`. Cost and size: the number
-        of pixels inside all ellipses, some 12 bytes each.
+        of pixels inside all ellipses; 8 bytes each, and 30 while it is made.
+
+    Raises
+    ------
+    ValueError
+        If these are more than `MOST_WEIGHTS`.
     """
     arrays = gaussians.to_arrays()
     splat, x, y = _pixels_inside(
@@ -257,6 +271,9 @@ def _expand(
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """All integers of the ranges [low, high), each with the index of its range."""
     count = high - low
+    total = int(count.sum(dtype=np.int64))
+    if total > MOST_WEIGHTS:
+        raise ValueError(f"the splats cover {total:,} pixels in all, over {MOST_WEIGHTS:,}")
     which = np.repeat(np.arange(len(low)), count)
     before = np.repeat(np.cumsum(count) - count, count)
     return which, (np.arange(len(which)) - before + low[which]).astype(np.int32)

@@ -282,7 +282,9 @@ def _sufficient(basis: Eigenbasis, most: Sequence[int], energy: float) -> Eigenb
     enough = []
     for name, shares, cap in zip(CHANNELS[basis.space], basis.energy(), most, strict=True):
         enough.append(int(np.searchsorted(shares, energy)) + 1)
-        if len(shares) == cap and (share := shares[-1] if cap else 0.0) < energy - ROUNDING:
+        varies = basis.variance[len(enough) - 1] > 0
+        share = shares[-1] if len(shares) else 0.0
+        if varies and len(shares) == cap and share < energy - ROUNDING:
             warnings.warn(
                 f"channel {name}: {cap} components hold {share:.2%} of the variance, "
                 f"less than {energy:.2%}; raise components",

@@ -210,8 +210,8 @@ def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
     """Upload an image (height, width, channels) in tile layout; overhanging pixels are 0."""
     height, width, channels = image.shape
     tile_width, tile_height = grid.tile
-    padded = np.zeros((grid.ny * tile_height, grid.nx * tile_width, channels), image.dtype)
-    padded[:height, :width] = image
+    over = (grid.ny * tile_height - height, grid.nx * tile_width - width)
+    padded = np.pad(image, [(0, over[0]), (0, over[1]), (0, 0)]) if any(over) else image
     tiled = padded.reshape(grid.ny, tile_height, grid.nx, tile_width, channels)
     flat = tiled.transpose(0, 2, 1, 3, 4).reshape(-1)
     return upload(types.Float, flat)

@@ -173,6 +173,7 @@ def train(
             "components": list(model.components),
             "gaussians": len(model.gaussians),
             "frequency_aware": model.low > 0,
+            "steps": steps,
             "pca_seconds": pca_seconds,
             **model.figures,
             **measured,
@@ -279,13 +280,14 @@ def _states(flat: dict[str, Any]) -> list[State]:
 
 def _measured(model: EigenGS, basis: Eigenbasis, files: list[Path], run: Run) -> dict[str, float]:
     """Mean psnr_ycbcr of images that were not trained on; nothing where there are none."""
-    rows = []
+    rows, bad = [], []
     for i, path in enumerate(files):
         run.progress("measure", i, len(files))
         run.stop_if_pressed()
         try:
             image = cropped(load_image(path), basis.width, basis.height)
-        except ImageError:
+        except ImageError as error:
+            bad.append(str(error))
             continue
         shown = {
             "psnr_pca": basis.reconstruct(basis.project(image)),
@@ -293,6 +295,9 @@ def _measured(model: EigenGS, basis: Eigenbasis, files: list[Path], run: Run) ->
             "psnr_solved": render(model.encode(image, "exact")).numpy(),
         }
         rows.append({name: psnr(image, picture, "ycbcr") for name, picture in shown.items()})
+    if bad:
+        told = f"{len(bad)} of {len(files)} images held out were skipped, as {bad[0]}"
+        warnings.warn(told, stacklevel=2)
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]} if rows else {}
 
 

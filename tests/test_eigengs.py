@@ -140,6 +140,41 @@ def test_paper_preset(backend):
     assert not split.weights[0][6:, :10].any()
 
 
+def test_a_tenth_of_the_splats_is_low(backend):
+    assert eg.EigenGS.fit(small_basis(), 17, True, backend=backend).low == 2
+    assert eg.EigenGS.fit(small_basis(), 1, True, backend=backend).low == 0
+
+
+@pytest.mark.parametrize(("split", "expected"), [(30.0, True), (29.9, True), (29.7, False)])
+def test_what_the_split_may_cost(backend, monkeypatch, split, expected):
+    figures = iter([30.0, split])
+    monkeypatch.setattr("eigengs_dr.components.SPLIT_FROM", SIDE)
+    monkeypatch.setattr("eigengs_dr.components.decibels", lambda mse: next(figures))
+    assert wants_split(small_basis(), SPLATS, "auto", backend)[0] == expected
+
+
+def test_sides_start_apart(backend):
+    """Each side of the paper's training draws a start of its own."""
+    seen = []
+    fit_components(
+        small_basis(), 20, True, "eigengs", 1, 0, backend, save=lambda s: seen.append(s[-1])
+    )
+    assert not np.array_equal(seen[0]["rows"][0, :5, :2], seen[1]["rows"][0, :5, :2])
+
+
+def test_oblong_family(backend):
+    """Width and height are not exchanged anywhere."""
+    images = family(20, 48)[:, 10:30]
+    basis = eg.Eigenbasis.from_images(images, (48, 20), 8)
+    for split in (False, True):
+        model = eg.EigenGS.fit(basis, SPLATS, split, backend=backend)
+        pca = fidelity([basis.reconstruct(basis.project(image)) for image in images], images)
+        allowed = 3 if split else 0.5  # 10 splats for 4 components a channel
+        assert fidelity(rendered(model, images, "projected"), images) > pca - allowed
+        assert fidelity(rendered(model, images), images) > 32
+        assert model.dense_mean(7, 9).shape == (9, 7, 3)
+
+
 # --- Training of shapes ------------------------------------------------------------------------
 
 
@@ -152,6 +187,10 @@ def test_samples_are_those_of_the_pca_model():
         found = np.tensordot(drawn[..., c], planes, ((1, 2), (1, 2)))
         np.testing.assert_allclose(found.var(axis=0), values, rtol=0.25)
         np.testing.assert_allclose(found.mean(axis=0), 0, atol=0.15 * np.sqrt(values.max()))
+    first = np.tensordot(drawn[..., 0], basis.components[0][0])
+    for c in (1, 2):  # channels are independent
+        other = np.tensordot(drawn[..., c], basis.components[c][0])
+        assert abs(np.corrcoef(first, other)[0, 1]) < 0.15
     np.testing.assert_array_equal(samples(basis.components, basis.eigenvalues, 0, 7, 9), drawn[7:9])
 
 
@@ -280,6 +319,10 @@ def test_grey_and_bytes(backend):
 
 def test_wrong_arguments(backend):
     model = small_model(backend)
+    with pytest.raises(ValueError, match="coefficients have shapes"):
+        model.reconstruct(model.project(family(1)[0])[:2])
+    with pytest.raises(ValueError, match="coefficients have shapes"):
+        model.reconstruct([np.zeros(13)] * 3)
     with pytest.raises(ValueError, match="colors 'best' is unknown; use one of exact, projected"):
         model.encode(family(1)[0], "best")
     with pytest.raises(ValueError, match="mean 'none' is unknown"):
@@ -366,7 +409,7 @@ def test_save_and_load(backend, split, others, tmp_path):
 def test_half_precision_of_extreme_weights(backend, tmp_path):
     """Scaled by component: neither tiny nor huge ones are lost."""
     basis, model = small_basis(), small_model(backend)
-    weights = tuple(w * s for w, s in zip(model.weights, (1e-9, 1e9, 0), strict=True))
+    weights = tuple(w * s for w, s in zip(model.weights, (1e-9, 1e3, 0), strict=True))
     odd = eg.EigenGS(model.gaussians, weights, basis.eigenvalues, basis.mean)
     odd.save(tmp_path / "odd.npz")
     for one, two in zip(eg.EigenGS.load(tmp_path / "odd.npz").weights, weights, strict=True):
@@ -447,12 +490,13 @@ def test_fit_by_the_paper(backend, others):
         ({"color": "rgb"}, "color is 'rgb', but the basis is in 'ycbcr'"),
         ({"basis": "nothing"}, "basis 'nothing' is neither a file nor one of: natural"),
         ({"basis": "natural"}, "more than an image of 32x32 has pixels"),
+        ({"preset": "eigengs", "init": "grid"}, "preset 'eigengs' starts from a basis"),
     ],
 )
 def test_fit_refuses_another_basis(backend, options, words, others):
-    options = {"basis": small_model(backend), **options}
+    options = {"basis": small_model(backend), "init": "eigen", **options}
     with pytest.raises(ValueError, match=words):
-        eg.fit(others[0], init="eigen", backend=backend, **options)
+        eg.fit(others[0], backend=backend, **options)
 
 
 def test_fit_components_default_state(backend):

@@ -157,3 +157,9 @@ def test_blocks_fit_what_is_left(backend):
     gram = (matrix @ matrix.T).toarray()
     gram += RIDGE * gram.diagonal().mean() * np.eye(len(gram))
     np.testing.assert_allclose(found[low:-1], np.linalg.solve(gram, matrix @ left), atol=2e-3)
+
+
+def test_a_matrix_too_large_is_refused(backend, monkeypatch):
+    monkeypatch.setattr("eigengs_dr.normal.MOST_WEIGHTS", 100)
+    with pytest.raises(ValueError, match=r"the splats cover [\d,]+ pixels in all, over 100"):
+        NormalEquations(random_scene().on(backend))
