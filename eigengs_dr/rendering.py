@@ -212,6 +212,7 @@ def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
     tile_width, tile_height = grid.tile
     over = (grid.ny * tile_height - height, grid.nx * tile_width - width)
     padded = np.pad(image, [(0, over[0]), (0, over[1]), (0, 0)]) if any(over) else image
-    tiled = padded.reshape(grid.ny, tile_height, grid.nx, tile_width, channels)
-    flat = tiled.transpose(0, 2, 1, 3, 4).reshape(-1)
+    # A row of a tile is copied as one run.
+    tiled = padded.reshape(grid.ny, tile_height, grid.nx, tile_width * channels)
+    flat = tiled.transpose(0, 2, 1, 3).reshape(-1)
     return upload(types.Float, flat)
