@@ -92,7 +92,7 @@ class EigenGS:
             by one factorisation; "eigengs" trains shapes and weights together from a random start,
             with the settings of the paper.
         steps : int, optional
-            Steps of training: of the shapes for "default" (0 by default: 300 gain 0.1 dB), of all
+            Steps of training: of the shapes for "default" (0 by default: 300 gain 0.3 dB), of all
             for "eigengs" (15,000 by default, which takes hours without a GPU).
         backend : {"llvm", "cuda"}, optional
         progress : callable, optional
