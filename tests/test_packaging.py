@@ -50,4 +50,5 @@ def test_wheel(tmp_path):
         "eigengs_dr/" + path.relative_to(ROOT).as_posix() for path in ROOT.glob("plugins/*.py")
     }
     assert modules | plugins <= set(names)
+    assert "eigengs_dr/data/natural.npz" in names
     assert find_plugins(tmp_path, wheel) == [str(wheel / "eigengs_dr/plugins/__init__.py"), "None"]
