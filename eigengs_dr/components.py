@@ -38,6 +38,8 @@ STEPS = {"default": 0, "eigengs": 15_000}
 
 Planes = NDArray[np.float32]
 State = dict[str, NDArray[Any]]
+Part = tuple[NormalEquations, Gaussians, tuple[Planes, ...]]
+"""Equations of splats, their shapes, and their weights in the components of each channel."""
 
 
 class Fitted(NamedTuple):
@@ -132,14 +134,15 @@ def fit_components(
     )
 
 
-def _assembled(
-    states: list[State], sides: list[Side], result: Any, backend: str | None
-) -> tuple[NormalEquations, Gaussians, tuple[Planes, ...]]:
-    """Shapes and weights of all sides, and the equations of all splats."""
+def _assembled(states: list[State], sides: list[Side], result: Any, backend: str | None) -> Part:
+    """The equations of all splats, and shapes and weights of all sides."""
     parts = [result(state, side, backend) for state, side in zip(states, sides, strict=True)]
-    gaussians = concatenate([shapes for shapes, _ in parts])
-    low = sides[0].splats if len(sides) > 1 else 0
-    return NormalEquations(gaussians, low), gaussians, _joined([w for _, w in parts])
+    equations, gaussians, weights = parts[0]
+    if len(parts) > 1:
+        gaussians = concatenate([part[1] for part in parts])
+        equations = NormalEquations(gaussians, sides[0].splats)
+        weights = _joined(weights, parts[1][2])
+    return equations, gaussians, weights
 
 
 def check_arguments(
@@ -247,13 +250,13 @@ def _shapes(
     )
 
 
-def _solved(state: State, side: Side, backend: str | None) -> tuple[Gaussians, tuple[Planes, ...]]:
+def _solved(state: State, side: Side, backend: str | None) -> Part:
     """The shapes of a state and the best weights on them."""
     height, width = side.components[0].shape[1:]
     shapes = shapes_of(state, (width, height), len(side.components), backend)
     equations = NormalEquations(shapes)
     solved = [equations.solve(equations.correlate(planes)) for planes in side.components]
-    return shapes, tuple(weights.T.astype(np.float32) for weights in solved)
+    return equations, shapes, tuple(weights.T.astype(np.float32) for weights in solved)
 
 
 def _jointly(
@@ -266,24 +269,22 @@ def _jointly(
         yield reached.arrays()
 
 
-def _trained(state: State, side: Side, backend: str | None) -> tuple[Gaussians, tuple[Planes, ...]]:
+def _trained(state: State, side: Side, backend: str | None) -> Part:
     """Shapes and weights of a state, with as many (unused) channels as the components have."""
     reached = JointState.from_arrays(state)
-    shapes = reached.gaussians(backend)
     blank = np.zeros((side.splats + 1, len(side.components)))
-    return colored(shapes, blank, "data"), reached.weights()
+    shapes = colored(reached.gaussians(backend), blank, "data")
+    return NormalEquations(shapes), shapes, reached.weights()
 
 
 METHODS = {"default": (_shapes, _solved), "eigengs": (_jointly, _trained)}
 """Presets: what trains one side step by step, and what makes shapes and weights of its state."""
 
 
-def _joined(parts: list[tuple[Planes, ...]]) -> tuple[Planes, ...]:
-    """Weights of all splats and components from those of each side; across, they are 0."""
-    if len(parts) == 1:
-        return parts[0]
+def _joined(first: tuple[Planes, ...], second: tuple[Planes, ...]) -> tuple[Planes, ...]:
+    """Weights of all splats and components from those of both sides; across, they are 0."""
     joined = []
-    for low, high in zip(*parts, strict=True):
+    for low, high in zip(first, second, strict=True):
         right, left = high.shape[1] - 1, low.shape[1] - 1
         above = np.hstack([low[:, :-1], np.zeros((len(low), right), np.float32), low[:, -1:]])
         below = np.hstack([np.zeros((len(high), left), np.float32), high])

@@ -40,8 +40,12 @@ third."""
 SCHEDULE = Schedule(
     optimizer=partial(Adam, beta_1=0.9, beta_2=0.99, epsilon=1e-12),
     rates={"mean": 0.02, "factor": 0.02},
+    warm_up=0,
 )
 """Every step sees another sample: rates are a sixth of those that refine one image."""
+
+WARM_UP = 5
+"""Steps over which the rates rise in every round."""
 
 
 def train_shapes(
@@ -126,19 +130,19 @@ def _round(
     optimizer = SCHEDULE.optimizer(1.0)
     optimizer.update({name: variables[name] for name in SCHEDULE.rates})
     grid = Grid(gaussians.width, gaussians.height)
+    whole = np.ones((gaussians.height, gaussians.width, len(components)), np.float32)
+    inside = to_tiles(types, whole, grid)
     take_step = step_program(coordinates, CUTOFF)
     current = gaussians
     try:
         for step, image in enumerate(samples(components, eigenvalues, seed, first, last), first):
             solved = solve(current, image, SOLVE_STEPS).gaussians
             fixed = replace(gaussians, color=solved.color, background=solved.background)
-            warm = min(1.0, (step - first + 1) / SCHEDULE.warm_up) if first else 1.0
-            left = rate_left(SCHEDULE, step, steps) * warm
+            left = rate_left(SCHEDULE, step, steps) * min(1.0, (step - first + 1) / WARM_UP)
             optimizer.set_learning_rate(
                 {name: dr.opaque(types.Float, rate * left) for name, rate in SCHEDULE.rates.items()}
             )
             target = to_tiles(types, image, grid)
-            inside = to_tiles(types, np.ones_like(image), grid)
             take_step(optimizer, fixed, target, inside, lists_for(current, CUTOFF))
             current = coordinates.to(fixed, dict(optimizer))
             dr.eval(current)

@@ -2,8 +2,12 @@
 
 import numpy as np
 import pytest
+from scenes import family, small_model
 
-from eigengs_dr.bench import kernels
+from eigengs_dr.bench import eigen, kernels
+from eigengs_dr.fitting import fit
+from eigengs_dr.metrics import psnr
+from eigengs_dr.rendering import render
 
 FIGURES = {
     "plain_ms",
@@ -49,3 +53,22 @@ def test_pixels_inside_are_counted_as_by_hand(small, backend):
 def test_a_small_image_is_refused(backend):
     with pytest.raises(ValueError, match="must be at least 512x512"):
         kernels.run(np.zeros((100, 600, 3), np.float32), backend=backend)
+
+
+@pytest.mark.parametrize("iterations", [0, 10])
+def test_starts_are_compared(backend, iterations):
+    """Figures are those of the functions they are named after."""
+    model, images, seen = small_model(backend), list(family(2, seed=3)), []
+    figures = eigen.run(model, images, iterations, lambda *done: seen.append(done))
+    assert seen == [(1, 2), (2, 2)]
+    for start in ("projected", "exact", "solved", "grid", "adaptive"):
+        assert figures[f"{start}_seconds"] > 0
+        assert figures[f"{start}_psnr_ycbcr"] > figures[f"{start}_psnr_rgb"] > 15
+    grids = [fit(image, 100, iterations, init="grid", backend=backend).image for image in images]
+    expected = np.mean([psnr(*pair) for pair in zip(grids, images, strict=True)])
+    assert figures["grid_psnr_rgb"] == pytest.approx(expected)
+    if iterations == 0:
+        shown = [render(model.encode(image, "projected")) for image in images]
+        expected = np.mean([psnr(*pair) for pair in zip(shown, images, strict=True)])
+        assert figures["projected_psnr_rgb"] == pytest.approx(expected)
+    assert figures["encode_exact_ms"] > 0
