@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .images import load_image, sample, save_image
     from .metrics import ms_ssim, psnr, ssim
     from .pca import Eigenbasis
+    from .plugins import register_plugins
     from .rendering import render
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "load_image",
     "ms_ssim",
     "psnr",
+    "register_plugins",
     "render",
     "sample",
     "save_image",
@@ -44,6 +46,7 @@ _HOMES = {
     "images": ("load_image", "sample", "save_image"),
     "metrics": ("ms_ssim", "psnr", "ssim"),
     "pca": ("Eigenbasis",),
+    "plugins": ("register_plugins",),
     "rendering": ("render",),
 }
 

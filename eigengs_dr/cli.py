@@ -62,6 +62,8 @@ def render(
 ) -> None:
     """Render a fitted image, at its native size or at any other.
 
+    Linear light is written as sRGB, data as it is: grey where it has one channel.
+
     \b
     Examples:
       eigengs-dr render photo.npz -o photo.png
@@ -77,9 +79,11 @@ def render(
     select(backend)
     import eigengs_dr as eg
 
+    from .rendering import picture_of
+
     gaussians = eg.Gaussians.load(file, backend=backend)
     width, height = size or _scaled(gaussians.width, gaussians.height, scale)
-    eg.save_image(output, eg.render(gaussians, width=width, height=height).numpy())
+    eg.save_image(output, picture_of(gaussians, width, height))
 
 
 @main.command()

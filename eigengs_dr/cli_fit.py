@@ -42,7 +42,12 @@ from .report import write_report
     help="What --init eigen starts from: a model by name, or as 'train' wrote it.",
 )
 @choice("--preset", ["default", "gaussianimage", "eigengs"], "The method.")
-@choice("--color", ["ycbcr", "rgb"], "Where errors are measured and colours are stored.")
+@choice(
+    "--color",
+    ["ycbcr", "rgb", "linear", "data"],
+    "Where errors are measured and colours are stored: linear for textures, data for normals and "
+    "roughness, as they are.",
+)
 @seed_option
 @click.option("--preview", type=ANY_PATH, help="Picture of photo and fit; or a folder.")
 @backend_option
@@ -68,12 +73,16 @@ def fit(
     With --preset eigengs, the paper's form, the file holds the Gaussians alone, without the mean
     image, which is kept in the basis.
 
+    With --color data a grey file gives one channel, any other three; psnr_ycbcr in the report is
+    then the PSNR of the data as it is, and psnr_rgb that of 8 bits.
+
     \b
     Examples:
       eigengs-dr fit photo.jpg -o photo.npz
       eigengs-dr fit photo.jpg -o photo.npz --gaussians 20000 --report photo.json
       eigengs-dr fit photo.jpg -o photo.npz --init eigen --iterations 100
       eigengs-dr fit *.png -o fits/ --preview previews/ --iterations 300
+      eigengs-dr fit roughness.png -o roughness.npz --color data
     """
     from .images import SAVE_OPTIONS
 
@@ -117,7 +126,10 @@ def _fit_one(
 
     import eigengs_dr as eg
 
-    image = eg.load_image(path)
+    from .metrics import unclamped
+
+    color = settings["color"]
+    image = eg.load_image(path, keep_grey=color == "data")
     with progress_bar(quiet) as show:
         try:
             result = eg.fit(image, progress=partial(show, path.name), **settings)
@@ -136,22 +148,22 @@ def _fit_one(
         "stopped": result.stopped,
         "seconds": result.seconds,
         "seconds_init": result.seconds_init,
-        "psnr_ycbcr": eg.psnr(image, result.image, space="ycbcr"),
+        "psnr_ycbcr": eg.psnr(image, result.image, space=unclamped(color)),
         "psnr_rgb": eg.psnr(image, result.image, space="rgb"),
         "ssim": eg.ssim(image, result.image),
-        "ms_ssim": eg.ms_ssim(image, result.image),
+        "ms_ssim": eg.ms_ssim(image, result.image, space=unclamped(color)),
         "trace": result.trace,
     }
     if not quiet:
-        click.echo(_summary(record, preview))
+        click.echo(_summary(record, preview, unclamped(color)))
     return record
 
 
-def _summary(record: dict[str, Any], preview: Path | None) -> str:
+def _summary(record: dict[str, Any], preview: Path | None, space: str) -> str:
     """What a fit came to, for a terminal."""
     text = (
         "{input}: {width}x{height}, {gaussians} Gaussians, {iterations} iterations "
-        "in {seconds:.1f} s\n  psnr_ycbcr {psnr_ycbcr:.2f} dB, psnr_rgb {psnr_rgb:.2f} dB, "
+        "in {seconds:.1f} s\n  psnr_{space} {psnr_ycbcr:.2f} dB, psnr_rgb {psnr_rgb:.2f} dB, "
         "SSIM {ssim:.4f}, MS-SSIM {ms_ssim:.4f}\n  wrote {output}"
-    ).format(**record)
+    ).format(**record, space=space)
     return f"{text}\n  wrote {preview} (photo and fit side by side)" if preview else text

@@ -76,7 +76,7 @@ def _describe_model(model: Any) -> dict[str, Any]:
 
 
 def _rendered(gaussians: Any) -> Any:
-    from .rendering import render
+    from .rendering import picture_of
 
     checked_pixels(gaussians.width, gaussians.height)
-    return render(gaussians).numpy()
+    return picture_of(gaussians)

@@ -1,4 +1,4 @@
-"""Colour spaces: RGB to the studio-range YCbCr of ITU-R BT.601 and back."""
+"""Colour spaces: RGB to the studio-range YCbCr of ITU-R BT.601 or to linear light, and back."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -84,6 +84,70 @@ def ycbcr_to_rgb(image: NDArray[Any]) -> NDArray[Any]:
     return (image - YCBCR_OFFSET.astype(image.dtype)) @ YCBCR_TO_RGB.T.astype(image.dtype)
 
 
+def to_linear(coded: Any) -> Any:
+    """Decode sRGB to linear light: ``x / 12.92``, above 0.04045 ``((x + 0.055) / 1.055)^2.4``.
+
+    Elementwise on NumPy and Dr.Jit arrays (vectors, colours and tensors too), in their precision.
+    Both parts continue beyond [0, 1], so that values and derivatives are finite everywhere, also
+    where the other part applies.
+
+    Parameters
+    ----------
+    coded : array of floats, any shape
+        sRGB, 1 is white.
+
+    Returns
+    -------
+    array, same shape and type
+        Linear light, 1 is white.
+
+    Raises
+    ------
+    ValueError
+        If a NumPy array is not float32 or float64.
+
+    References
+    ----------
+    IEC 61966-2-1:1999, section 5.2.
+
+    Examples
+    --------
+    >>> to_linear(np.array([0.0, 0.5, 1.0])).round(4)
+    array([0.   , 0.214, 1.   ])
+    """
+    select, maximum, power = _functions(coded)
+    # The power sees no argument where its slope is infinite or its value is NaN: in reverse mode
+    # even zero times that would be NaN.
+    curved = power((maximum(coded, 0.04045) + 0.055) * (1 / 1.055), 2.4)
+    return select(coded <= 0.04045, coded * (1 / 12.92), curved)
+
+
+def to_coded(linear: Any) -> Any:
+    """Code linear light as sRGB: ``12.92 x``, above 0.0031308 ``1.055 x^(1 / 2.4) - 0.055``.
+
+    The inverse of `to_linear`, of which the rest holds here too; only where both parts meet do the
+    constants of the standard leave a step of 3e-8.
+
+    Parameters
+    ----------
+    linear : array of floats, any shape
+        Linear light, 1 is white.
+
+    Returns
+    -------
+    array, same shape and type
+        sRGB, 1 is white, not clamped: light below 0 gives codes below 0.
+
+    Raises
+    ------
+    ValueError
+        If a NumPy array is not float32 or float64.
+    """
+    select, maximum, power = _functions(linear)
+    curved = power(maximum(linear, 0.0031308), 1 / 2.4) * 1.055 - 0.055
+    return select(linear <= 0.0031308, linear * 12.92, curved)
+
+
 def decode(space: str, channels: Sequence[Any]) -> list[Any]:
     """Turn the channels of a render into what is shown: RGB, or data as it is.
 
@@ -118,6 +182,17 @@ def decode(space: str, channels: Sequence[Any]) -> list[Any]:
     matrix = YCBCR_TO_RGB.tolist()
     black = (-YCBCR_TO_RGB @ YCBCR_OFFSET).tolist()
     return [a * y + b * cb + c * cr + d for (a, b, c), d in zip(matrix, black, strict=True)]
+
+
+def _functions(array: Any) -> tuple[Any, Any, Any]:
+    """Select, maximum and power for a NumPy or a Dr.Jit array."""
+    if not isinstance(array, np.ndarray | np.generic | float):
+        import drjit as dr  # loads libLLVM, which must be found first
+
+        return dr.select, dr.maximum, dr.power
+    if isinstance(array, np.ndarray | np.generic) and array.dtype not in (np.float32, np.float64):
+        raise ValueError(f"array is {array.dtype}; convert to float32 or float64 in [0, 1] first")
+    return np.where, np.maximum, np.power
 
 
 def _checked(image: NDArray[Any]) -> NDArray[Any]:

@@ -13,18 +13,24 @@ from numpy.typing import ArrayLike, NDArray
 from . import place as places
 from .adaptive import adaptive
 from .bases import load_basis
-from .color import decode, rgb_to_ycbcr
+from .color import SPACES, decode, rgb_to_ycbcr, to_linear
 from .eigengs import EigenGS
 from .gaussians import Gaussians
 from .images import check_image
 from .interrupt import deferred
 from .presets import PRESETS, Preset
 from .refine import Progress, refine
-from .rendering import render
+from .rendering import picture_of
 from .solve import solve
+from .stream import SPACES as BASIS_SPACES
 
 PLACES = {"random": places.random, "grid": places.grid, "adaptive": adaptive}
 """Initialisers that look at the image alone, by name."""
+
+DARKNESS, BLACK = 0.3, 0.003
+"""Errors of light I weigh ``max(I, BLACK)^-DARKNESS``: by the root of the slope of the sRGB curve,
+between errors of light, which spare the dark, and errors of codes. At 5000 splats and 300 steps
+that gains 0.7 dB of psnr_rgb over no weights, on 12 training images of ImageNet classes."""
 
 INITS = ("auto", *PLACES, "eigen")
 """All names of initialisers."""
@@ -42,9 +48,11 @@ class Fit(NamedTuple):
     trace : list of dict
         Rows with iteration, seconds, psnr_ycbcr, psnr_rgb; row 0 is before refinement. Seconds
         count from the call of `fit`: placement, upload and colour solve are in them, and what it
-        takes to compute the rows.
-    image : ndarray of float32, shape (H, W, 3)
-        The picture that the set makes: RGB, not clamped.
+        takes to compute the rows. For color "data" psnr_rgb is that of the data, clamped and
+        rounded to 8 bits, and psnr_ycbcr that of the data as it is: no YCbCr is in it.
+    image : ndarray of float32, shape (H, W, 3), or (H, W, 1) for data of one channel
+        The picture that the set makes: RGB, not clamped; of linear light coded as sRGB, its light
+        clamped at 0; or the data.
     seconds, seconds_init : float
         All of it, and the part before refinement.
     iterations : int
@@ -102,8 +110,10 @@ def fit(
         The method, see `eigengs_dr.presets`.
     solve_steps : int, optional
         Steps of conjugate gradients in the colour solve; "eigen" needs none at its own size.
-    color : {"ycbcr", "rgb"}, optional
-        Space of the colours and of the squared error.
+    color : {"ycbcr", "rgb", "linear", "data"}, optional
+        Space of the colours and of the squared error. "linear" decodes sRGB, so that the Gaussians
+        sum to linear light, as textures need it; errors weigh more in the dark. "data" takes the
+        channels as they are, one or three (roughness, normals, heights).
     seed : int, optional
         Of the random numbers; one seed gives one result on one machine and backend.
     backend : {"llvm", "cuda"}, optional
@@ -130,11 +140,11 @@ def fit(
     (300, (64, 64, 3))
     """
     started = time.perf_counter()
-    pixels = check_image(image)
+    pixels = check_image(image, keep_grey=color == "data")
     _check(pixels, gaussians, iterations, init, preset, solve_steps, color, seed)
     method = PRESETS[preset]
     init = method.init if init == "auto" else init
-    target = rgb_to_ycbcr(pixels) if color == "ycbcr" else pixels
+    target, weight = _target(pixels, color)
     added = None
     with deferred() as interrupted:
         if init == "eigen":
@@ -146,7 +156,9 @@ def fit(
                 target, added = target - dense, _picture(dense, color)
         else:
             count = gaussians or min(GAUSSIANS, pixels.shape[0] * pixels.shape[1])
-            start = _placed(target, count, PLACES[init], method, solve_steps, color, seed, backend)
+            start = _placed(
+                pixels, target, count, PLACES[init], method, solve_steps, color, seed, backend
+            )
         seconds_init = time.perf_counter() - started
         refined = refine(
             start,
@@ -156,10 +168,11 @@ def fit(
             iterations,
             started=started,
             added=added,
+            weight=weight,
             progress=progress,
             interrupted=interrupted,
         )
-    rendered = render(refined.gaussians).numpy()
+    rendered = picture_of(refined.gaussians)
     return Fit(
         gaussians=refined.gaussians,
         trace=refined.trace,
@@ -172,7 +185,20 @@ def fit(
     )
 
 
+def _target(
+    pixels: NDArray[np.float32], color: str
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Bring pixels to the space of the colours, and weigh errors there."""
+    if color == "ycbcr":
+        return rgb_to_ycbcr(pixels), None
+    if color == "linear":
+        light = to_linear(pixels)
+        return light, np.maximum(light, BLACK) ** -DARKNESS
+    return pixels, None
+
+
 def _placed(
+    pixels: NDArray[np.float32],
     target: NDArray[np.float32],
     count: int,
     place: Callable[..., Any],
@@ -184,8 +210,10 @@ def _placed(
 ) -> Gaussians:
     """Place splats by the image alone and give them colours."""
     generator = np.random.default_rng(seed)
-    mean, factor = place(target, count, generator)
-    colors = np.zeros((count, 3)) if method.solves else generator.uniform(0, 1, (count, 3))
+    # Light would draw too few splats to the dark.
+    mean, factor = place(pixels if color == "linear" else target, count, generator)
+    shape = (count, target.shape[2])
+    colors = np.zeros(shape) if method.solves else generator.uniform(0, 1, shape)
     size = (target.shape[1], target.shape[0])
     start = Gaussians.from_arrays(mean, factor, colors, size=size, space=color, backend=backend)
     start = start.bounded()
@@ -232,9 +260,9 @@ def _check_basis(
             "use init 'adaptive'"
         )
     if color != space:
+        trained = f"train a basis with --color {color}" if color in BASIS_SPACES else "another init"
         raise ValueError(
-            f"color is {color!r}, but the basis is in {space!r}; use color {space!r}, or train a "
-            f"basis with --color {color}"
+            f"color is {color!r}, but the basis is in {space!r}; use color {space!r}, or {trained}"
         )
 
 
@@ -263,7 +291,7 @@ def _check(
     for name, value, known in (
         ("init", init, INITS),
         ("preset", preset, tuple(PRESETS)),
-        ("color", color, ("ycbcr", "rgb")),
+        ("color", color, SPACES),
     ):
         if value not in known:
             raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(known)}")

@@ -50,7 +50,7 @@ class ImageError(ValueError):
     """An image that cannot be used: one line that says which, why and what to do."""
 
 
-def load_image(path: str | Path) -> NDArray[np.float32]:
+def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]:
     """Read an image file as RGB.
 
     Grey is replicated, palette, CMYK and YCbCr are converted, and the orientation of the EXIF
@@ -61,10 +61,12 @@ def load_image(path: str | Path) -> NDArray[np.float32]:
     ----------
     path : str or Path
         Anything that Pillow reads.
+    keep_grey : bool, optional
+        Return one channel where the file is opaque grey.
 
     Returns
     -------
-    ndarray of float32, shape (H, W, 3)
+    ndarray of float32, shape (H, W, 3), or (H, W, 1)
         RGB in [0, 1] as stored in the file (colour profiles are ignored); float files as they are.
 
     Warns
@@ -110,10 +112,10 @@ def load_image(path: str | Path) -> NDArray[np.float32]:
         warnings.warn(f"{path}: transparent pixels are shown over white", stacklevel=2)
     if frames > 1:
         warnings.warn(f"{path}: holds {frames} frames, the first is used", stacklevel=2)
-    return _in_range(_rgb(pixels, str(path)), str(path))
+    return _in_range(_rgb(pixels, str(path), keep_grey), str(path))
 
 
-def check_image(image: ArrayLike) -> NDArray[np.float32]:
+def check_image(image: ArrayLike, keep_grey: bool = False) -> NDArray[np.float32]:
     """Bring an array that should be an image into the form that everything else expects.
 
     Parameters
@@ -121,10 +123,12 @@ def check_image(image: ArrayLike) -> NDArray[np.float32]:
     image : array_like, shape (H, W), (H, W, 1) or (H, W, 3)
         Grey or RGB: uint8 or uint16 (scaled to [0, 1]), bool, or floats, where 1 is white. Floats
         may overshoot [0, 1] by 0.5, as resampled images do, and are not clamped.
+    keep_grey : bool, optional
+        Leave grey at one channel.
 
     Returns
     -------
-    ndarray of float32, shape (H, W, 3)
+    ndarray of float32, shape (H, W, 3), or (H, W, 1)
         RGB, C-contiguous, never sharing memory with the argument.
 
     Raises
@@ -138,7 +142,7 @@ def check_image(image: ArrayLike) -> NDArray[np.float32]:
     array([[0. , 0.2],
            [0.4, 1. ]], dtype=float32)
     """
-    return _in_range(_rgb(image, "image"), "image")
+    return _in_range(_rgb(image, "image", keep_grey), "image")
 
 
 def save_image(path: str | Path, image: ArrayLike) -> None:
@@ -150,7 +154,8 @@ def save_image(path: str | Path, image: ArrayLike) -> None:
         The suffix chooses the format and is one of `SAVE_OPTIONS`; a file that is there is
         replaced. PNG, TIFF, BMP and PPM are lossless; JPEG and WebP are written with quality 95.
     image : array_like, shape (H, W), (H, W, 1) or (H, W, 3)
-        As for `check_image`, but floats of any finite value are clamped to [0, 1].
+        As for `check_image`, but floats of any finite value are clamped to [0, 1]. One channel is
+        written as grey.
 
     Raises
     ------
@@ -165,7 +170,8 @@ def save_image(path: str | Path, image: ArrayLike) -> None:
     if suffix not in SAVE_OPTIONS:
         known = " ".join(SAVE_OPTIONS)
         raise ImageError(f"{path}: image suffix {suffix!r} is unknown; use one of {known}")
-    pixels = to_8bit(_rgb(image, "image")).astype(np.uint8)
+    pixels = to_8bit(_rgb(image, "image", keep_grey=True)).astype(np.uint8)
+    pixels = pixels[..., 0] if pixels.shape[2] == 1 else pixels
     try:
         with replacing(path) as temporary:
             Image.fromarray(pixels).save(temporary, **SAVE_OPTIONS[suffix])
@@ -319,14 +325,14 @@ def _pixels(image: "Image") -> tuple[NDArray[Any], bool]:
     if image.mode == "F" or image.mode.startswith("I;16"):
         return np.asarray(image), False
     if not image.has_transparency_data:
-        return np.asarray(image.convert("RGB")), False
+        return np.asarray(image if image.mode in ("1", "L") else image.convert("RGB")), False
     pixels = np.asarray(image.convert("RGBA")).astype(np.float32) / 255
     color, alpha = pixels[..., :3], pixels[..., 3:]
     return 1 - alpha * (1 - color), bool(alpha.min() < 1)
 
 
-def _rgb(image: ArrayLike, name: str) -> NDArray[np.float32]:
-    """Scale and replicate to float32 (H, W, 3); `name` is what errors call the image."""
+def _rgb(image: ArrayLike, name: str, keep_grey: bool = False) -> NDArray[np.float32]:
+    """Scale to float32 and replicate grey to RGB; `name` is what errors call the image."""
     try:
         array = np.asarray(image)
     except ValueError:  # rows of unequal length
@@ -354,7 +360,8 @@ def _rgb(image: ArrayLike, name: str) -> NDArray[np.float32]:
     peak = np.iinfo(array.dtype).max if kind == "u" else 1
     with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite: clamped or refused
         pixels = np.divide(array, peak, dtype=np.float32)
-    return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3)))
+    channels = pixels.shape[2] if keep_grey else 3
+    return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], channels)))
 
 
 def _in_range(pixels: NDArray[np.float32], name: str) -> NDArray[np.float32]:

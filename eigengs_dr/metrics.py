@@ -26,13 +26,14 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     ``"ycbcr"`` compares studio-range YCbCr / 255, neither clamped nor rounded, with peak 1, as the
     official EigenGS code does. That range spans 219/255 of the peak, so that for the same pictures
     it reads higher than ``"rgb"``: 4.94 dB for white noise, 6.09 dB for an error in grey.
+    ``"data"`` compares the channels as they are, neither clamped nor rounded, with peak 1.
 
     Parameters
     ----------
-    a, b : array_like of float, shape (H, W, 3)
-        RGB, 1 is white. The result does not depend on their order.
-    space : {"rgb", "ycbcr"}
-        Where the mean squared error is taken, over all pixels and all three channels.
+    a, b : array_like of float, shape (H, W, 3) or (H, W, 1)
+        RGB or grey, 1 is white. The result does not depend on their order.
+    space : {"rgb", "ycbcr", "data"}
+        Where the mean squared error is taken, over all pixels and all channels.
 
     Returns
     -------
@@ -42,7 +43,7 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     Raises
     ------
     ValueError
-        If the images are not both of one shape (H, W, 3), or the space is unknown.
+        If the images are not both of one such shape, or the space is unknown.
 
     Examples
     --------
@@ -54,9 +55,16 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
         error = (to_8bit(a) - to_8bit(b)) / 255
     elif space == "ycbcr":
         error = rgb_to_ycbcr(a) - rgb_to_ycbcr(b)
+    elif space == "data":
+        error = a - b
     else:
-        raise ValueError(f"space {space!r} is unknown; use 'rgb' or 'ycbcr'")
+        raise ValueError(f"space {space!r} is unknown; use 'rgb', 'ycbcr' or 'data'")
     return decibels(float(np.mean(np.square(error))))
+
+
+def unclamped(color: str) -> str:
+    """Space of the PSNR that is called psnr_ycbcr: data has no YCbCr and is compared as it is."""
+    return "data" if color == "data" else "ycbcr"
 
 
 def decibels(mse: float) -> float:
@@ -73,8 +81,8 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
 
     Parameters
     ----------
-    a, b : array_like of float, shape (H, W, 3)
-        RGB, 1 is white. The result does not depend on their order.
+    a, b : array_like of float, shape (H, W, 3) or (H, W, 1)
+        RGB or grey, 1 is white. The result does not depend on their order.
 
     Returns
     -------
@@ -84,7 +92,7 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
     Raises
     ------
     ValueError
-        If the images are not both of one shape (H, W, 3).
+        If the images are not both of one such shape.
 
     References
     ----------
@@ -108,7 +116,7 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
     return float(similarity)
 
 
-def ms_ssim(a: ArrayLike, b: ArrayLike) -> float:
+def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     r"""Multi-scale structural similarity of two RGB images over YCbCr (Wang et al. 2003).
 
     With :math:`c_j` the mean contrast-structure term of scale j and :math:`s_J` the mean SSIM of
@@ -127,8 +135,10 @@ def ms_ssim(a: ArrayLike, b: ArrayLike) -> float:
 
     Parameters
     ----------
-    a, b : array_like of float, shape (H, W, 3)
-        RGB, 1 is white. The result does not depend on their order.
+    a, b : array_like of float, shape (H, W, 3) or (H, W, 1)
+        RGB or grey, 1 is white. The result does not depend on their order.
+    space : {"ycbcr", "data"}
+        "data" averages over the channels as they are.
 
     Returns
     -------
@@ -138,7 +148,7 @@ def ms_ssim(a: ArrayLike, b: ArrayLike) -> float:
     Raises
     ------
     ValueError
-        If the images are not both of one shape (H, W, 3).
+        If the images are not both of one such shape, or the space is unknown.
 
     References
     ----------
@@ -146,7 +156,11 @@ def ms_ssim(a: ArrayLike, b: ArrayLike) -> float:
     Asilomar Conference on Signals, Systems and Computers, 2003. The variant is that of
     https://github.com/VainF/pytorch-msssim.
     """
-    x, y = (np.moveaxis(rgb_to_ycbcr(image), 2, 0) for image in _pair(a, b))
+    if space not in ("ycbcr", "data"):
+        raise ValueError(f"space {space!r} is unknown; use 'ycbcr' or 'data'")
+    a, b = _pair(a, b)
+    planes = [rgb_to_ycbcr(image) if space == "ycbcr" else image for image in (a, b)]
+    x, y = (np.moveaxis(image, 2, 0) for image in planes)
     side = min(x.shape[1:])
     scales = max(1, sum(side >> j >= WINDOW for j in range(len(SCALE_WEIGHTS))))
     weights = np.array(SCALE_WEIGHTS[:scales]) * (sum(SCALE_WEIGHTS) / sum(SCALE_WEIGHTS[:scales]))
@@ -160,13 +174,16 @@ def ms_ssim(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Both images as float64, of one shape (H, W, 3)."""
+    """Both images as float64, of one shape (H, W, 3); grey is the RGB that looks like it."""
     x, y = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     if x.shape != y.shape:
         raise ValueError(f"images have shapes {x.shape} and {y.shape}; crop or scale one of them")
-    if x.ndim != 3 or x.shape[2] != 3 or x.size == 0:
-        raise ValueError(f"images have shape {x.shape}; expected (H, W, 3) with pixels in it")
-    return x, y
+    if x.ndim != 3 or x.shape[2] not in (1, 3) or x.size == 0:
+        raise ValueError(
+            f"images have shape {x.shape}; expected (H, W, 3) or (H, W, 1) with pixels in it"
+        )
+    shape = (*x.shape[:2], 3)
+    return np.broadcast_to(x, shape), np.broadcast_to(y, shape)
 
 
 def _window_size(sides: tuple[int, ...]) -> int:

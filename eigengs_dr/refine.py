@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from .arrays import types_of
 from .coordinates import NATURAL, Coordinates
 from .gaussians import Gaussians
-from .metrics import psnr
-from .rendering import CUTOFF, lists_for, render, splat, to_tiles
+from .metrics import psnr, unclamped
+from .rendering import CUTOFF, lists_for, picture_of, splat, to_tiles
 from .splat import UNIT
 from .tiles import Grid, TileLists
 
@@ -96,6 +96,7 @@ def refine(
     cutoff: float = CUTOFF,
     started: float | None = None,
     added: NDArray[np.float32] | None = None,
+    weight: NDArray[np.float32] | None = None,
     progress: Progress | None = None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Refined:
@@ -107,8 +108,8 @@ def refine(
         Where to start.
     target : ndarray of float32, shape (H, W, C)
         The image in the space of the set, at its native size.
-    image : ndarray of float32, shape (H, W, 3)
-        The image in RGB, for the trace.
+    image : ndarray of float32, shape (H, W, 3) or (H, W, 1)
+        The image in RGB, or the data, for the trace.
     schedule : Schedule
     iterations : int
         Most steps to take.
@@ -119,6 +120,8 @@ def refine(
     added : ndarray of float32, shape (H, W, 3), optional
         What a rendering is added to before the trace compares it, RGB: the mean image, where
         `target` lacks it.
+    weight : ndarray of float32, shape (H, W, C), optional
+        What errors are multiplied by before they are squared.
     progress : callable, optional
         ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
     interrupted : callable, optional
@@ -134,7 +137,8 @@ def refine(
     best, highest = gaussians, -math.inf
     stopped, step = "iterations", 0
     try:
-        for step, current in enumerate(descend(gaussians, target, schedule, iterations, cutoff)):
+        sets = descend(gaussians, target, schedule, iterations, cutoff, weight)
+        for step, current in enumerate(sets):
             if step not in marks:
                 if interrupted():
                     break
@@ -166,6 +170,7 @@ def descend(
     schedule: Schedule,
     iterations: int,
     cutoff: float = CUTOFF,
+    weight: NDArray[np.float32] | None = None,
 ) -> Iterator[Gaussians]:
     """Yield the set before the first step and after every step of gradient descent.
 
@@ -180,7 +185,7 @@ def descend(
     current = gaussians
     grid = Grid(gaussians.width, gaussians.height)
     tiles = to_tiles(types, target, grid)
-    inside = to_tiles(types, np.ones_like(target), grid)
+    weights = to_tiles(types, np.ones_like(target) if weight is None else weight, grid)
     take_step = step_program(coordinates, cutoff)
     zero = dr.opaque(types.Float, 0)
     try:
@@ -192,7 +197,7 @@ def descend(
             optimizer.set_learning_rate(
                 {name: dr.opaque(types.Float, rate * left) for name, rate in schedule.rates.items()}
             )
-            take_step(optimizer, gaussians, tiles, inside, lists)
+            take_step(optimizer, gaussians, tiles, weights, lists)
             current = coordinates.to(gaussians, dict(optimizer))
             # Later steps write into the optimiser's arrays: what is yielded must be a copy.
             current = replace(current, color=current.color + zero)
@@ -217,12 +222,15 @@ def step_program(coordinates: Coordinates, cutoff: float) -> Any:
     """
 
     @dr.freeze
-    def step(optimizer: Any, fixed: Gaussians, target: Any, inside: Any, lists: TileLists) -> None:
-        """Descend on the mean squared error, then bring the variables back inside their bounds."""
+    def step(optimizer: Any, fixed: Gaussians, target: Any, weights: Any, lists: TileLists) -> None:
+        """Descend on the mean squared error, then bring the variables back inside their bounds.
+
+        The weights are 0 where tiles overhang the image.
+        """
         current = coordinates.to(fixed, dict(optimizer))
         values = [*current.mean, *[f * UNIT for f in current.factor], *current.color]
         rendered = splat(values, list(current.background), lists, cutoff)
-        dr.backward(dr.mean(dr.square((rendered - target) * inside)))
+        dr.backward(dr.mean(dr.square((rendered - target) * weights)))
         # Kept apart from the optimiser's arithmetic, the large kernels serve every preset.
         dr.eval([dr.grad(v) for v in optimizer.values()])
         optimizer.step(eval=False)
@@ -239,13 +247,13 @@ def _row(
     started: float,
     cutoff: float,
 ) -> dict[str, Any]:
-    rendered = render(dr.detach(gaussians), cutoff=cutoff).numpy()
+    rendered = picture_of(gaussians, cutoff=cutoff)
     if added is not None:
         rendered = rendered + added
     return {
         "iteration": iteration,
         "seconds": time.perf_counter() - started,
-        "psnr_ycbcr": psnr(rendered, image, space="ycbcr"),
+        "psnr_ycbcr": psnr(rendered, image, space=unclamped(gaussians.space)),
         "psnr_rgb": psnr(rendered, image, space="rgb"),
     }
 

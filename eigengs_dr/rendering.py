@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import ArrayTypes, types_of, upload
-from .color import decode
+from .color import decode, to_coded
 from .gaussians import Gaussians
 from .kernels import accumulate, adjoint, channel_sums
 from .splat import UNIT, gather_run, pack
@@ -33,7 +33,8 @@ def render(
     """Render a set of Gaussians at any size.
 
     Differentiable with respect to mean, factor, color and background, in forward and reverse mode.
-    Sets in YCbCr come out as RGB; nothing is clamped.
+    Sets in YCbCr come out as RGB, sets in linear light in linear light (`picture_of` codes them as
+    sRGB), data as it is; nothing is clamped.
 
     Parameters
     ----------
@@ -77,6 +78,25 @@ def render(
     values, background = splat_values(scaled)
     lists = lists_for(scaled, cutoff)
     return to_tensor(splat(values, background, lists, cutoff), lists.grid, len(background))
+
+
+def picture_of(
+    gaussians: Gaussians,
+    width: int | None = None,
+    height: int | None = None,
+    cutoff: float = CUTOFF,
+) -> NDArray[Any]:
+    """Render what is looked at and compared: `render`, but linear light coded as sRGB.
+
+    Parameters and errors as for `render`.
+
+    Returns
+    -------
+    ndarray, shape (height, width, C)
+        1 is white. Light below 0 is black; nothing else is clamped.
+    """
+    image = render(dr.detach(gaussians), width, height, cutoff).numpy()
+    return to_coded(np.maximum(image, 0)) if gaussians.space == "linear" else image
 
 
 def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[int, int]:

@@ -178,3 +178,41 @@ def gather_run(types: ArrayTypes, source: Any, index: Any, length: int, active: 
 def unpack(packed: Any, index: Any, number: int, active: Any = True) -> list:
     """Gather the first `number` parameters of the splats `index` from the array `pack` made."""
     return gather_run(types_of(packed), packed, index, -(-number // 4) * 4, active)[:number]
+
+
+def list_entry(types: ArrayTypes, splat: Any, i: Any, active: Any) -> Any:
+    """``splat[i]`` through a gather of a pair, 8 times as fast as a single one on the CPU."""
+    pair = dr.gather(types.UInt2, splat, i >> 1, active)
+    return dr.select((i & 1) == 0, pair[0], pair[1])
+
+
+def widen(shape: list, footprint: list) -> tuple[list, Any]:
+    """Convolve a splat with a Gaussian of unit integral: a filter, or what a pixel sees.
+
+    ``Sigma' = Sigma + Sigma_f``, with the amplitude ``sqrt(det Sigma / det Sigma')`` that keeps the
+    integral (Heckbert, "Fundamentals of Texture Mapping and Image Warping", 1989).
+
+    Parameters
+    ----------
+    shape : list of 5 Float
+        As in `weights`.
+    footprint : list of 3 Float
+        xx, xy, yy of ``Sigma_f`` over `UNIT` squared.
+
+    Returns
+    -------
+    shape : list of 5 Float
+        The same mean and the factor of ``Sigma'``.
+    amplitude : Float
+        In (0, 1].
+    """
+    mean_x, mean_y, a, b, c = shape
+    ia, ic = dr.rcp(a), dr.rcp(c)
+    t = -b * ia * ic  # F^-1 = [[1/a, t], [0, 1/c]]
+    xx = dr.fma(ia, ia, dr.fma(t, t, footprint[0]))
+    xy = dr.fma(t, ic, footprint[1])
+    yy = dr.fma(ic, ic, footprint[2])
+    new_c = dr.rsqrt(yy)
+    scale = dr.rsqrt(dr.fma(xx, yy, -(xy * xy)))
+    scaled = new_c * scale
+    return [mean_x, mean_y, yy * scaled, -xy * scaled, new_c], ia * ic * scale

@@ -18,7 +18,7 @@ import eigengs_dr as eg
 from eigengs_dr import bases, cli_train
 from eigengs_dr.backend import BackendError, select
 from eigengs_dr.cli import main
-from eigengs_dr.color import YCBCR_TO_RGB
+from eigengs_dr.color import SPACES, YCBCR_TO_RGB
 from eigengs_dr.eigengs import EigenGS
 from eigengs_dr.fitting import INITS
 
@@ -142,6 +142,40 @@ def test_render_is_what_was_fitted(fitted, tmp_path):
     succeeded(run("render", folder / "fit.npz", "-o", tmp_path / "y.png"))
     fit = np.asarray(Image.open(folder / "both.png")).astype(int)[:, 32:]
     assert np.abs(fit - np.asarray(Image.open(tmp_path / "y.png"))).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("color", "channels", "modes"),
+    [
+        ("linear", 3, ("RGB", "RGB")),
+        ("linear", 1, ("L", "RGB")),
+        ("data", 3, ("RGB", "RGB")),
+        ("data", 1, ("L", "L")),
+    ],
+)
+def test_spaces_of_textures(tmp_path, color, channels, modes):
+    """What `render` and `info` draw is the fit of the preview, as the report has it."""
+    pixels = smooth_pixels(32, 32, channels)
+    Image.fromarray(pixels if channels == 3 else pixels[..., 0]).save(tmp_path / "a.png")
+    assert Image.open(tmp_path / "a.png").mode == modes[0]
+    outputs = ["-o", tmp_path / "a.npz", "--preview", tmp_path / "both.png"]
+    settings = ["--gaussians", 100, "--iterations", 20, "--report", tmp_path / "a.json"]
+    result = succeeded(run("fit", tmp_path / "a.png", "--color", color, *outputs, *settings))
+    report = json.loads((tmp_path / "a.json").read_text())
+    assert report["color"] == color
+    assert ("psnr_data" if color == "data" else "psnr_ycbcr") in result.stdout
+    assert report["psnr_rgb"] > 25 and 0.9 < report["ms_ssim"] <= 1
+    info = json.loads(run("info", tmp_path / "a.npz", "--json").stdout)
+    assert (info["space"], info["channels"]) == (color, 1 if modes[1] == "L" else 3)
+    succeeded(run("info", tmp_path / "a.npz", "--preview", tmp_path / "info.png"))
+    succeeded(run("render", tmp_path / "a.npz", "-o", tmp_path / "y.png"))
+    both, drawn, shown = (Image.open(tmp_path / n) for n in ("both.png", "y.png", "info.png"))
+    assert {image.mode for image in (both, drawn, shown)} == {modes[1]}
+    fit = np.asarray(both)[:, 32:]
+    np.testing.assert_array_equal(fit, np.asarray(drawn))
+    np.testing.assert_array_equal(fit, np.asarray(shown))
+    error = (fit.astype(float) - (pixels if modes[1] == "RGB" else pixels[..., 0])) / 255
+    assert -10 * np.log10(np.mean(error**2)) == pytest.approx(report["psnr_rgb"], abs=0.02)
 
 
 def test_info(fitted):
@@ -605,6 +639,8 @@ def test_bases_that_do_not_fit(trained, fitted, photo, existing, tmp_path):
 def test_the_names_of_inits_and_bases():
     [option] = [p for p in main.commands["fit"].params if p.name == "init"]
     assert tuple(option.type.choices) == INITS
+    [option] = [p for p in main.commands["fit"].params if p.name == "color"]
+    assert tuple(option.type.choices) == SPACES
     [option] = [p for p in main.commands["fit"].params if p.name == "basis"]
     assert option.default in bases.SHIPPED
 

@@ -1,5 +1,8 @@
 """Colour spaces against scikit-image, and the same formula on NumPy and Dr.Jit arrays."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +10,16 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from skimage.color import rgb2ycbcr
 
-from eigengs_dr.color import SPACES, YCBCR_OFFSET, decode, rgb_to_ycbcr, ycbcr_to_rgb
+from eigengs_dr.backend import select
+from eigengs_dr.color import (
+    SPACES,
+    YCBCR_OFFSET,
+    decode,
+    rgb_to_ycbcr,
+    to_coded,
+    to_linear,
+    ycbcr_to_rgb,
+)
 
 PRECISION = {np.float32: 2e-6, np.float64: 1e-14}
 
@@ -16,6 +28,9 @@ images = hnp.arrays(
     hnp.array_shapes(min_dims=0, max_dims=2, max_side=4).map(lambda shape: (*shape, 3)),
     elements=st.floats(-2, 2),
 )
+
+
+# --- YCbCr -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", PRECISION)
@@ -64,6 +79,88 @@ def test_decode_equals_the_image_conversion(dtype):
     np.testing.assert_allclose(
         np.stack(channels, axis=-1), ycbcr_to_rgb(image), atol=5 * PRECISION[dtype]
     )
+
+
+# --- sRGB and linear light ---------------------------------------------------------------------
+
+
+def test_srgb_of_the_standard():
+    """Ends, the grey of half the light, and the powers themselves."""
+    np.testing.assert_allclose(to_linear(np.array([0.0, 0.04045, 1.0])), [0, 0.04045 / 12.92, 1])
+    assert to_coded(0.5) == pytest.approx(0.735357, abs=1e-6)
+    assert to_linear(188 / 255) == pytest.approx(0.50289, abs=1e-5)
+    codes = np.linspace(0.05, 1.5, 30)
+    np.testing.assert_allclose(to_linear(codes), ((codes + 0.055) / 1.055) ** 2.4, rtol=1e-14)
+    np.testing.assert_allclose(to_linear(-codes), -codes / 12.92, rtol=1e-14)
+
+
+@given(hnp.arrays(np.float64, 16, elements=st.floats(-1, 2)))
+def test_srgb_round_trip(values):
+    for dtype, precision in {np.float32: 2e-6, np.float64: 1e-7}.items():
+        for there, back in ((to_linear, to_coded), (to_coded, to_linear)):
+            result = back(there(values.astype(dtype)))
+            assert result.dtype == dtype
+            np.testing.assert_allclose(result, values, atol=precision)
+
+
+@pytest.mark.parametrize("convert", [to_linear, to_coded])
+def test_srgb_rises_without_a_step(convert):
+    values = convert(np.linspace(-0.1, 1.1, 120_001))
+    steps = np.diff(values)
+    assert steps.min() > 0 and steps.max() < 1.3e-4
+
+
+def test_srgb_refuses_bytes_and_keeps_nan():
+    for convert in (to_linear, to_coded):
+        with pytest.raises(ValueError, match="uint8; convert to float32"):
+            convert(np.zeros(3, np.uint8))
+        assert np.isnan(convert(np.array([np.nan, 1.0]))).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("convert", [to_linear, to_coded])
+def test_srgb_in_drjit_equals_numpy(backend, convert):
+    module = select(backend)
+    values = np.linspace(-0.5, 1.5, 24)
+    expected = convert(values)
+    single = values.astype(np.float32)
+    for array, precision in (
+        (module.Float64(values), 1e-12),
+        (module.Float(single), 2e-6),
+        (module.TensorXf(single.reshape(2, 4, 3)), 2e-6),
+        (module.Array3f(single.reshape(3, 8)), 2e-6),
+    ):
+        result = convert(array)
+        assert type(result) is type(array)
+        np.testing.assert_allclose(np.ravel(result.numpy()), expected, atol=precision)
+
+
+@pytest.mark.parametrize(
+    ("convert", "slopes"),
+    [(to_linear, [1 / 12.92] * 3 + [2.4 / 1.055]), (to_coded, [12.92] * 3 + [1.055 / 2.4])],
+)
+def test_slopes_of_srgb_are_finite_everywhere(backend, convert, slopes):
+    """Also where the power of the other part has none: at -0.055, at 0 and below."""
+    dr = pytest.importorskip("drjit")
+    Float = select(backend).Float64
+    for mode in ("backward", "forward"):
+        x = Float(-0.055, -1, 0, 1)
+        dr.enable_grad(x)
+        y = convert(x)
+        if mode == "backward":
+            dr.backward(y)
+            found = dr.grad(x)
+        else:
+            dr.forward(x)
+            found = dr.grad(y)
+        np.testing.assert_allclose(found.numpy(), slopes, rtol=1e-12)
+
+
+def test_importing_the_colours_loads_no_drjit():
+    script = "import sys, eigengs_dr.color; sys.exit('drjit' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+
+
+# --- What a render holds -----------------------------------------------------------------------
 
 
 def test_decode_leaves_other_spaces_alone():

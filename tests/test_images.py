@@ -86,6 +86,9 @@ def test_every_mode_of_an_opaque_file(tmp_path, mode):
     assert result.shape == (2, 3, 3)
     expected = np.repeat(grey[..., None], 3, axis=2) / 255
     np.testing.assert_allclose(result, expected, atol=0.005 if mode == "YCbCr" else 0)
+    kept = load_image(path, keep_grey=True)
+    channels = 1 if mode in ("1", "L", "I;16", "F") else 3
+    np.testing.assert_array_equal(kept, result[..., :channels])
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".pgm"])
@@ -367,6 +370,16 @@ def test_every_suffix_is_written_in_its_format(tmp_path, suffix):
     np.testing.assert_allclose(load_image(path), image, atol=0.02)
     kind = {".jpg": "JPEG", ".tif": "TIFF"}.get(suffix, suffix[1:].upper())
     assert property_of(path, "format") == kind
+
+
+@pytest.mark.parametrize(("channels", "mode"), [(1, "L"), (3, "RGB")])
+def test_grey_stays_grey(tmp_path, channels, mode):
+    image = np.random.default_rng(0).integers(0, 256, (5, 4, channels), np.uint8)
+    save_image(tmp_path / "a.png", image)
+    assert property_of(tmp_path / "a.png", "mode") == mode
+    kept = load_image(tmp_path / "a.png", keep_grey=True)
+    np.testing.assert_array_equal(kept, check_image(image, keep_grey=True))
+    assert kept.shape == image.shape and kept.flags.c_contiguous
 
 
 def test_saving_clamps_and_rounds(tmp_path):

@@ -135,14 +135,37 @@ def test_refuses_images_that_do_not_fit(metric):
     image = np.zeros((4, 4, 3))
     with pytest.raises(ValueError, match=r"shapes \(4, 4, 3\) and \(4, 5, 3\)"):
         metric(image, np.zeros((4, 5, 3)))
-    for shape in ((4, 4), (4, 4, 1), (0, 4, 3)):
+    for shape in ((4, 4), (4, 4, 2), (0, 4, 3)):
         with pytest.raises(ValueError, match="expected"):
             metric(np.zeros(shape), np.zeros(shape))
 
 
 def test_refuses_an_unknown_space():
-    with pytest.raises(ValueError, match="use 'rgb' or 'ycbcr'"):
-        psnr(np.zeros((1, 1, 3)), np.zeros((1, 1, 3)), space="lab")
+    pair = np.zeros((2, 1, 1, 3))
+    with pytest.raises(ValueError, match="use 'rgb', 'ycbcr' or 'data'"):
+        psnr(*pair, space="lab")
+    with pytest.raises(ValueError, match="use 'ycbcr' or 'data'"):
+        ms_ssim(*pair, space="rgb")
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_psnr_of_data_clamps_and_rounds_nothing(channels):
+    a, b = np.random.default_rng(0).normal(size=(2, 9, 7, channels))
+    expected = -10 * np.log10(np.mean((a - b) ** 2))
+    assert psnr(a, b, "data") == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim, ms_ssim])
+def test_one_channel_is_grey(metric):
+    grey = np.random.default_rng(0).uniform(0, 1, (2, 24, 24, 1))
+    assert metric(*grey) == pytest.approx(metric(*np.repeat(grey, 3, axis=3)))
+
+
+def test_ms_ssim_of_data_is_that_of_its_channels():
+    a, b = np.random.default_rng(0).uniform(0, 1, (2, 48, 48, 3))
+    each = [ms_ssim(a[..., [k]], b[..., [k]], "data") for k in range(3)]
+    assert ms_ssim(a, b, "data") == pytest.approx(np.mean(each))
+    assert ms_ssim(a, a, "data") == 1
 
 
 def gaussian_window(size):

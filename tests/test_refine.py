@@ -18,7 +18,7 @@ from scenes import COUNT, SIZE, Scene, few, random_scene, scenes, small_model
 from eigengs_dr import fitting
 from eigengs_dr.adan import Adan
 from eigengs_dr.backend import select
-from eigengs_dr.color import rgb_to_ycbcr
+from eigengs_dr.color import rgb_to_ycbcr, to_coded, to_linear
 from eigengs_dr.coordinates import CHOLESKY, CHOLESKY_BOUND, NATURAL
 from eigengs_dr.fitting import fit
 from eigengs_dr.gaussians import NARROWEST
@@ -26,7 +26,7 @@ from eigengs_dr.metrics import psnr
 from eigengs_dr.place import grid
 from eigengs_dr.presets import PRESETS
 from eigengs_dr.refine import Schedule, descend, refine, rows_at
-from eigengs_dr.rendering import render
+from eigengs_dr.rendering import picture_of, render
 
 SIDE, SPLATS = 32, 100
 """Size of the pictures that are fitted, and splats in a fit: one set of kernels."""
@@ -51,7 +51,7 @@ def check_sound(result, image):
     """All numbers are finite, and the result is the best row and not worse than the start."""
     assert np.isfinite(result.image).all()
     assert all(np.isfinite(v).all() for v in result.gaussians.to_arrays().values())
-    rendered = render(result.gaussians).numpy()
+    rendered = picture_of(result.gaussians)
     added = 0 if result.mean_image is None else result.mean_image
     np.testing.assert_array_equal(result.image, rendered + added)
     reached = psnr(image, result.image, space="ycbcr")
@@ -491,6 +491,85 @@ def test_colour_spaces(backend, color):
     assert result.trace[-1]["psnr_rgb"] > 25
 
 
+def test_fit_in_linear_light(backend):
+    """The sum is linear light, and its picture sRGB."""
+    result = fit(picture(), SPLATS, 60, color="linear", backend=backend)
+    check_sound(result, picture())
+    assert result.gaussians.space == "linear"
+    light = render(result.gaussians).numpy()
+    np.testing.assert_allclose(result.image, to_coded(np.maximum(light, 0)), atol=1e-6)
+    close = -10 * np.log10(np.mean((light - to_linear(picture())) ** 2))
+    coded = -10 * np.log10(np.mean((light - picture()) ** 2))
+    assert close > 25 > coded
+    assert result.trace[-1]["psnr_rgb"] > 25
+
+
+def test_a_ramp_of_light_needs_no_more_than_a_few_splats(backend):
+    """In sRGB it is bent; the light of the fit rises in equal steps."""
+    light = np.broadcast_to(np.linspace(0.2, 0.8, SIDE)[:, None], (SIDE, SIDE, 3))
+    result = fit(to_coded(light), SPLATS, 60, color="linear", backend=backend)
+    columns = render(result.gaussians).numpy().mean(axis=(0, 2))
+    np.testing.assert_allclose(columns, light[0, :, 0], atol=4e-3)
+
+
+def test_negative_light_is_black(backend):
+    scene = random_scene(0, SPLATS, (SIDE, SIDE))
+    gaussians = scene._replace(background=np.full(3, -0.5)).on(backend, space="linear")
+    light, shown = render(gaussians).numpy(), picture_of(gaussians)
+    assert (light < 0).any()
+    assert (shown[light <= 0] == 0).all()
+    assert np.isfinite(shown).all()
+
+
+def test_weights(backend):
+    """What weighs nothing may be anything; ones are no weights."""
+    gaussians, target = start(backend)
+    weight, other = np.ones_like(target), target.copy()
+    weight[:, SIDE // 2 :], other[:, SIDE // 2 :] = 0, 7
+
+    def colors(*arguments):
+        *_, last = descend(gaussians, *arguments)
+        return last.to_arrays()["color"]
+
+    left, plain = (colors(target, default(), 10, 3.0, w) for w in (weight, np.ones_like(target)))
+    np.testing.assert_array_equal(colors(other, default(), 10, 3.0, weight), left)
+    np.testing.assert_array_equal(colors(target, default(), 10), plain)
+    assert not np.array_equal(left, plain)
+
+
+@presets
+@pytest.mark.parametrize("channels", [1, 3])
+def test_data_is_taken_as_it_is(backend, preset, channels):
+    data = picture()[..., :channels]
+    if preset == "eigengs":
+        with pytest.raises(ValueError, match="color is 'data', but the basis is in 'ycbcr'; use"):
+            fit(data, SPLATS, 3, preset=preset, basis=small_model(backend), color="data")
+        return
+    result = fit(data, SPLATS, 60, preset=preset, color="data", backend=backend)
+    assert result.gaussians.space == "data"
+    assert result.gaussians.channels == channels
+    assert result.image.shape == data.shape
+    np.testing.assert_array_equal(result.image, render(result.gaussians).numpy())
+    best = max(result.trace, key=lambda row: row["psnr_ycbcr"])
+    error = result.image.astype(np.float64) - data
+    assert best["psnr_ycbcr"] == pytest.approx(-10 * np.log10(np.mean(error**2)), abs=1e-6)
+    levels = [np.rint(np.clip(image, 0, 1) * 255) / 255 for image in (result.image, data)]
+    rounded = -10 * np.log10(np.mean((levels[0] - levels[1]) ** 2, dtype=np.float64))
+    assert best["psnr_rgb"] == pytest.approx(rounded, abs=1e-4)
+    assert figures(result)[-1] > figures(result)[0] + 1
+
+
+@pytest.mark.parametrize("init", ["adaptive", "grid", "random"])
+def test_data_of_one_channel(backend, init):
+    """Of two axes or of three; what three equal channels give, if one is enough."""
+    data = picture()[..., 0]
+    one = fit(data, SPLATS, 20, init=init, color="data", backend=backend)
+    same = fit(data[..., None], SPLATS, 20, init=init, color="data", backend=backend)
+    assert one.gaussians.channels == same.gaussians.channels == 1
+    np.testing.assert_array_equal(one.image, same.image)
+    assert figures(one)[-1] > 20
+
+
 def test_kinds_of_images(backend):
     """Grey of two and of three axes, bytes, double precision, lists: one picture, one result."""
     image = np.round(picture() * 255).astype(np.uint8)
@@ -624,7 +703,7 @@ def test_rates_far_too_high(backend, preset, factor):
         ("solve_steps", -1, "solve_steps is -1"),
         ("init", "eigen2", "init 'eigen2' is unknown; use one of auto, random, grid, adaptive"),
         ("preset", "best", "preset 'best' is unknown; use one of default, gaussianimage"),
-        ("color", "hsv", "color 'hsv' is unknown; use one of ycbcr, rgb"),
+        ("color", "hsv", "color 'hsv' is unknown; use one of ycbcr, rgb, linear, data"),
         ("backend", "opencl", "backend 'opencl' is unknown"),
         ("image", np.zeros((0, 4, 3)), "image"),
         ("image", np.full((4, 4, 3), np.nan), "image"),
@@ -639,6 +718,12 @@ def test_arguments_out_of_range(name, value, words):
         fit(**arguments)
     assert words in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("color", "hint"), [("linear", "another init"), ("rgb", "train a basis")])
+def test_a_basis_of_another_space(backend, color, hint):
+    with pytest.raises(ValueError, match=f"color is '{color}', but the basis .* or {hint}"):
+        fit(picture(), init="eigen", basis=small_model(backend), color=color, backend=backend)
 
 
 @pytest.mark.parametrize(("name", "value"), [("seed", -1), ("gaussians", 2.5), ("iterations", 2.5)])

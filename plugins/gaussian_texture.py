@@ -1,0 +1,330 @@
+"""The Mitsuba texture ``gaussian_texture``: a sum of 2D Gaussians, differentiable and prefiltered.
+
+Dr.Jit takes `self` for loop state, which silently loses gradients, and knows no custom derivatives
+inside a virtual call: the class below only hands arrays to the functions of `eigengs_dr.points` and
+`eigengs_dr.filtered`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from eigengs_dr.color import to_linear
+from eigengs_dr.filtered import bounded_covariance, integrals, sort_by_size, sum_filtered
+from eigengs_dr.points import (
+    cell_side,
+    fold,
+    list_cells,
+    sum_near,
+    values,
+    values_and_slopes,
+)
+from eigengs_dr.rendering import CUTOFF, WIDEST_CUTOFF, splat_values
+from eigengs_dr.splat import SHAPE, UNIT, pack
+
+from .footprint import metric
+from .parameters import source_of
+from .spectrum import upload_table, upsample
+
+WRAPS = ("repeat", "mirror", "clamp")
+"""What lies outside of the image."""
+
+SURVEY = 128
+"""Points along a side at which brightness is looked up: for sampling of emission, and its mean."""
+
+DARKEST = 0.02
+"""Least density with which a point is sampled, relative to the mean."""
+
+
+def gaussian_texture() -> type:
+    """Make the class for the variant in use, whose `mitsuba.Texture` it extends."""
+    if mi.variant().startswith("scalar"):
+        return _Refusal
+
+    class GaussianTexture(mi.Texture):
+        """A sum of Gaussians over uv, ``(u, v) = (x / width, y / height)``, row 0 at v = 0.
+
+        Properties
+        ----------
+        filename : str
+            A set that ``eigengs-dr fit`` or `Gaussians.save` wrote. Or a set's arrays, as
+            `eigengs_dr.plugins.properties_of` writes them; or
+        model, coefficients
+            A saved `EigenGS` model and, optionally, coefficients (C, k).
+        to_uv : transform
+            Of uv before the lookup.
+        wrap_mode : {"repeat", "mirror", "clamp"}
+        raw : bool
+            Values as they are: neither decoded nor clamped.
+        prefilter : float
+            Angle of a pixel in radians (see `eigengs_dr.plugins.pixel_angle`): lookups then see
+            the texture through the pixel's footprint. 0, the default, looks at points.
+        cutoff : float
+            Standard deviations after which a splat ends; 3 by default, as for `fit`.
+        """
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            self.source = source_of(props)
+            self.raw = bool(props.get("raw", False))
+            self.cutoff = _cutoff(props)
+            self.angle = _angle(props)
+            self.wrap = _wrap(props)
+            self.to_uv, self.from_uv = _affine(props)
+            self.width, self.height = self.source.start.width, self.source.start.height
+            self.space, self.channels = self.source.start.space, self.source.start.channels
+            self.spectra = upload_table() if mi.is_spectral else None
+            self.parameters_changed([])
+
+        def traverse(self, callback: Any) -> None:
+            self.source.put(callback)
+
+        def parameters_changed(self, keys: list[str]) -> None:
+            gaussians = self.source.gaussians()
+            rows, background = splat_values(gaussians)
+            shape, color = rows[:SHAPE], [_finite(c) for c in rows[SHAPE:]]
+            self.background = [_finite(b) for b in background]
+            self.packed = pack([*shape, *color])
+            dr.eval(self.packed, self.background)
+            if not keys or any(key in self.source.shaping for key in keys):
+                self._list([dr.detach(s) for s in shape])
+            if self.angle:
+                share = integrals(shape, self.width, self.height, self.cutoff)
+                share = dr.select(dr.isfinite(share), share, 0)
+                self.average = [
+                    b + dr.sum(share * c) for c, b in zip(color, self.background, strict=True)
+                ]
+                dr.eval(self.average)
+            self._survey()
+
+        def _list(self, shape: list) -> None:
+            """List the splats near every cell."""
+            size = (self.width, self.height)
+            radius = UNIT * self.cutoff
+            self.cells = list_cells(shape, *size, radius, cell_side(*size, dr.width(shape)))
+            if self.angle:
+                self.sizes = sort_by_size(shape, *size, self.cutoff, self.wrap)
+
+        # --- Lookups -----------------------------------------------------------------------------
+
+        def eval(self, si: Any, active: Any = True) -> Any:
+            color = self._color(si, active)
+            if len(color) == 1 or mi.is_monochromatic:
+                return mi.UnpolarizedSpectrum(_luminance(color))
+            if not mi.is_spectral:
+                return mi.Color3f(*color)
+            if self.raw or self.space == "data":
+                raise ValueError(
+                    f"{self.id()}: a reflectance or radiance is asked of a gaussian_texture that "
+                    "holds raw data; use a set in a colour space, and raw = false"
+                )
+            return upsample(mi.Color3f(*color), si.wavelengths, self.spectra)
+
+        def eval_1(self, si: Any, active: Any = True) -> Any:
+            return _luminance(self._color(si, active))
+
+        def eval_3(self, si: Any, active: Any = True) -> Any:
+            if self.channels != 3:
+                raise ValueError(
+                    f"{self.id()}: three channels are asked of a gaussian_texture that has one; "
+                    "normal maps need a set of a colour picture"
+                )
+            return mi.Color3f(*self._color(si, active))
+
+        def eval_1_grad(self, si: Any, active: Any = True) -> Any:
+            (x, sx), (y, sy), active = self._point(si, active)
+            terms = values_and_slopes((UNIT * self.cutoff) ** 2)
+            number = SHAPE + self.channels
+            sums = sum_near(self.cells, self.packed, number, x, y, active, terms, 3 * self.channels)
+            coded = [s + b for s, b in zip(sums[::3], self.background, strict=True)]
+            slope = [dr.select((c >= 0) & (c <= 1) | self.raw, _slope(self, c), 0) for c in coded]
+            du = _luminance([s * k for s, k in zip(slope, sums[1::3], strict=True)])
+            dv = _luminance([s * k for s, k in zip(slope, sums[2::3], strict=True)])
+            du, dv = du * sx * self.width, dv * sy * self.height
+            (a, b, _), (c, d, _) = self.to_uv
+            return mi.Vector2f(a * du + c * dv, b * du + d * dv)
+
+        def _color(self, si: Any, active: Any) -> list:
+            """Look the channels up, decoded and clamped unless `raw`."""
+            (x, sx), (y, sy), active = self._point(si, active)
+            number = SHAPE + self.channels
+            if self.angle:
+                inverse, valid = metric(si, self.from_uv, self.angle)
+                footprint, blind = bounded_covariance(inverse)
+                w, h = self.width, self.height
+                sizes = (w * w, w * h * (sx * sy), h * h)
+                footprint = [
+                    dr.select(valid, f * s, 0) for f, s in zip(footprint, sizes, strict=True)
+                ]
+                blind &= valid
+                sums = sum_filtered(
+                    self.sizes,
+                    self.packed,
+                    number,
+                    x,
+                    y,
+                    footprint,
+                    active & ~blind,
+                    self.cutoff,
+                )
+                sums = [s + b for s, b in zip(sums, self.background, strict=True)]
+                sums = [dr.select(blind, m, s) for m, s in zip(self.average, sums, strict=True)]
+            else:
+                terms = values((UNIT * self.cutoff) ** 2)
+                sums = sum_near(self.cells, self.packed, number, x, y, active, terms, self.channels)
+                sums = [s + b for s, b in zip(sums, self.background, strict=True)]
+            return [dr.select(active, _shown(self, s), 0) for s in sums]
+
+        def _point(self, si: Any, active: Any) -> tuple:
+            """Fold uv into the image: x, y in pixels with their derivatives; where uv is finite."""
+            (a, b, tu), (c, d, tv) = self.to_uv
+            u = a * si.uv.x + b * si.uv.y + tu
+            v = c * si.uv.x + d * si.uv.y + tv
+            active = mi.Bool(active) & dr.isfinite(u) & dr.isfinite(v)
+            x = fold(u * self.width, self.width, self.wrap)
+            y = fold(v * self.height, self.height, self.wrap)
+            return x, y, active
+
+        # --- Sampling ----------------------------------------------------------------------------
+
+        def sample_position(self, sample: Any, active: Any = True) -> tuple:
+            cell, density, rest = self._sampled().sample(sample, active)
+            return mi.Point2f((mi.Point2f(cell) + rest) / SURVEY), density * SURVEY**2
+
+        def pdf_position(self, p: Any, active: Any = True) -> Any:
+            inside = (p.x >= 0) & (p.x <= 1) & (p.y >= 0) & (p.y <= 1)
+            cell = dr.minimum(mi.Point2u(dr.select(inside, p, 0) * SURVEY), SURVEY - 1)
+            density = self._sampled().pdf(cell, active) * SURVEY**2
+            return dr.select(inside, density, 0)
+
+        def mean(self) -> Any:
+            return mi.Float(float(self.brightness.numpy().mean()))
+
+        def max(self) -> float:
+            return float(self.brightness.numpy().max())
+
+        def _survey(self) -> None:
+            """Look brightness up on a grid over uv: here, as no lookup of a scene can wait."""
+            with dr.suspend_grad():
+                i = dr.arange(mi.UInt32, SURVEY**2)
+                si = dr.zeros(mi.SurfaceInteraction3f, SURVEY**2)
+                si.uv = (mi.Point2f(i % SURVEY, i // SURVEY) + 0.5) / SURVEY
+                self.brightness = _luminance(self._color(si, mi.Bool(True)))
+                dr.eval(self.brightness)
+            self.distribution = None
+
+        def _sampled(self) -> Any:
+            """Distribution of emission over uv, made when it is first asked for."""
+            if self.distribution is None:
+                density = self.brightness.numpy().reshape(SURVEY, SURVEY)
+                density = np.maximum(density, 0)
+                floor = DARKEST * density.mean() or 1.0
+                self.distribution = mi.DiscreteDistribution2D(np.maximum(density, floor))
+            return self.distribution
+
+        # --- What it is --------------------------------------------------------------------------
+
+        def resolution(self) -> Any:
+            return mi.ScalarVector2i(self.width, self.height)
+
+        def is_spatially_varying(self) -> bool:
+            return True
+
+        def to_string(self) -> str:
+            return (
+                f"GaussianTexture[\n  splats = {dr.width(self.packed) // 8},\n  resolution = "
+                f"[{self.width}, {self.height}],\n  space = {self.space},\n  raw = {self.raw},\n"
+                f"  wrap_mode = {self.wrap},\n  prefilter = {self.angle:g},\n"
+                f"  cutoff = {self.cutoff:g}\n]"
+            )
+
+    return GaussianTexture
+
+
+# --- Values --------------------------------------------------------------------------------------
+
+
+def _shown(texture: Any, value: Any) -> Any:
+    """Clamp and decode a channel, unless raw.
+
+    The clamp conserves energy and lets gradients pass as if it were not there: else a colour that
+    a step took beyond the range would never come back.
+    """
+    if texture.raw:
+        return value
+    value = dr.replace_grad(dr.clip(value, 0, 1), value)
+    return to_linear(value) if texture.space in ("ycbcr", "rgb") else value
+
+
+def _slope(texture: Any, value: Any) -> Any:
+    """Derivative of what `_shown` does to a channel inside of [0, 1]."""
+    if texture.raw or texture.space not in ("ycbcr", "rgb"):
+        return type(value)(1)
+    curved = 2.4 / 1.055 * dr.power((dr.maximum(value, 0.04045) + 0.055) * (1 / 1.055), 1.4)
+    return dr.select(value <= 0.04045, 1 / 12.92, curved)
+
+
+def _luminance(color: list) -> Any:
+    return color[0] if len(color) == 1 else mi.luminance(mi.Color3f(*color))
+
+
+def _finite(x: Any) -> Any:
+    """Without what is not finite, which an optimiser's step may leave behind."""
+    return dr.select(dr.isfinite(x), x, 0)
+
+
+# --- Properties ----------------------------------------------------------------------------------
+
+
+class _Refusal:
+    """What scalar variants get: one line."""
+
+    def __init__(self, props: Any) -> None:
+        raise RuntimeError(
+            f"gaussian_texture does not work in the variant {mi.variant()}; "
+            "use mi.set_variant('llvm_ad_rgb') or another llvm or cuda variant"
+        )
+
+
+def _cutoff(props: Any) -> float:
+    cutoff = float(props.get("cutoff", CUTOFF))
+    if not 0 < cutoff <= WIDEST_CUTOFF:
+        raise ValueError(
+            f"gaussian_texture: cutoff is {cutoff}; it must be above 0 and at most "
+            f"{WIDEST_CUTOFF:g}"
+        )
+    return cutoff
+
+
+def _angle(props: Any) -> float:
+    angle = float(props.get("prefilter", 0.0))
+    if not 0 <= angle < 1:
+        raise ValueError(
+            f"gaussian_texture: prefilter is {angle}; it is the angle of a pixel in radians, "
+            "at least 0 and below 1"
+        )
+    return angle
+
+
+def _wrap(props: Any) -> str:
+    wrap = str(props.get("wrap_mode", "repeat"))
+    if wrap not in WRAPS:
+        raise ValueError(
+            f"gaussian_texture: wrap_mode {wrap!r} is unknown; use one of {', '.join(WRAPS)}"
+        )
+    return wrap
+
+
+def _affine(props: Any) -> tuple[tuple, tuple]:
+    """Rows of ``to_uv`` as (m00, m01, translation), and the inverse of its linear part."""
+    transform = props["to_uv"] if "to_uv" in props else mi.ScalarTransform4f()
+    matrix = np.array(transform.matrix, np.float64)
+    linear = matrix[:2, :2]
+    if not np.isfinite(matrix).all() or abs(np.linalg.det(linear)) < 1e-12:
+        raise ValueError("gaussian_texture: to_uv maps the plane to a line; it must be invertible")
+    rows = [[*row[:2], row[-1]] for row in matrix[:2].tolist()]
+    return (tuple(rows[0]), tuple(rows[1])), tuple(np.linalg.inv(linear).ravel().tolist())

@@ -1,0 +1,45 @@
+"""Make the plugins known to Mitsuba, for the variant in use and for those set later."""
+
+from __future__ import annotations
+
+import eigengs_dr  # noqa: F401  finds a libLLVM that works before Mitsuba imports Dr.Jit
+
+try:
+    import mitsuba as mi
+except ImportError as error:
+    raise ImportError(
+        f"the plugins need Mitsuba ({error}): pip install 'eigengs-dr[plugins]'"
+    ) from error
+
+from .gaussian_texture import gaussian_texture
+
+_registered: set[str] = set()
+
+
+def register_plugins() -> None:
+    """Make ``gaussian_texture`` known to Mitsuba.
+
+    For the variant in use, if one is set, and for every variant set later; calling it again
+    changes nothing. Scalar variants learn the name as well, and refuse it when a scene uses it.
+
+    Raises
+    ------
+    ImportError
+        If Mitsuba is not installed.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg, mitsuba as mi
+    >>> mi.set_variant("llvm_ad_rgb")
+    >>> eg.register_plugins()
+    """
+    if not _registered:
+        mi.detail.add_variant_callback(lambda old, new: _register(new))
+        _registered.add("")
+    _register(mi.variant())
+
+
+def _register(variant: str | None) -> None:
+    if variant and variant not in _registered:
+        mi.register_texture("gaussian_texture", gaussian_texture())
+        _registered.add(variant)
