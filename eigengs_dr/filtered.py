@@ -108,8 +108,9 @@ def sort_by_size(shape: list, width: int, height: int, cutoff: float, wrap: str)
         counts.append(np.bincount(cell, minlength=columns * rows))
         table.append([largest**2, first, columns, rows, 1 / side, origin, 0, 0])
         first += columns * rows
-    starts = np.concatenate([[0], *map(np.cumsum, [np.concatenate(counts)])]) if counts else [0, 0]
-    splat = np.concatenate([*order, [0, 0]])  # pairs are read, one of them beyond the end
+    starts = np.cumsum(np.concatenate([[0], *counts] if counts else [[0, 0]]))
+    found = np.concatenate([*order, [0]])  # never empty, and even: it is read in pairs
+    splat = np.pad(found, (0, len(found) % 2))
     return Sizes(
         width,
         height,

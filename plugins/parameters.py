@@ -227,10 +227,12 @@ def _from_arrays(props: Any, backend: str) -> Gaussians:
         raise ValueError(f"gaussian_texture: {missing[0]} is missing; see properties_of")
     if props["space"] not in SPACES:
         raise ValueError(f"gaussian_texture: space {props['space']!r} is not in {SPACES}")
-    arrays = [np.array(props[key]) for key in ARRAYS]
+    means, factors, colors, background = (np.array(props[key]) for key in ARRAYS)
     return Gaussians.from_arrays(
-        *arrays[:3],
-        arrays[3].ravel(),
+        means,
+        factors,
+        colors,
+        background.ravel(),
         size=(props["width"], props["height"]),
         space=props["space"],
         backend=backend,
