@@ -1,6 +1,6 @@
 """Mitsuba plugins; `register_plugins` makes them known to the variant in use and to later ones."""
 
-from .footprint import pixel_angle
+from .cone import pixel_angle
 from .parameters import bound_parameters, properties_of
 from .registration import register_plugins
 

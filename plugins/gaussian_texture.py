@@ -14,7 +14,8 @@ import mitsuba as mi
 import numpy as np
 
 from eigengs_dr.color import to_linear
-from eigengs_dr.filtered import bounded_covariance, integrals, sort_by_size, sum_filtered
+from eigengs_dr.filtered import sum_filtered
+from eigengs_dr.footprints import bounded_covariance, integrals
 from eigengs_dr.points import (
     cell_side,
     fold,
@@ -23,15 +24,13 @@ from eigengs_dr.points import (
     values,
     values_and_slopes,
 )
-from eigengs_dr.rendering import CUTOFF, WIDEST_CUTOFF, splat_values
+from eigengs_dr.rendering import splat_values
+from eigengs_dr.sizes import sort_by_size
 from eigengs_dr.splat import SHAPE, UNIT, pack
 
-from .footprint import metric
-from .parameters import source_of
+from .cone import metric
+from .properties import affine, angle, cutoff, source_of, wrap_mode
 from .spectrum import upload_table, upsample
-
-WRAPS = ("repeat", "mirror", "clamp")
-"""What lies outside of the image."""
 
 SURVEY = 128
 """Points along a side at which brightness is looked up: for sampling of emission, and its mean."""
@@ -71,10 +70,10 @@ def gaussian_texture() -> type:
             super().__init__(props)
             self.source = source_of(props)
             self.raw = bool(props.get("raw", False))
-            self.cutoff = _cutoff(props)
-            self.angle = _angle(props)
-            self.wrap = _wrap(props)
-            self.to_uv, self.from_uv = _affine(props)
+            self.cutoff = cutoff(props)
+            self.angle = angle(props)
+            self.wrap = wrap_mode(props)
+            self.to_uv, self.from_uv = affine(props)
             self.width, self.height = self.source.start.width, self.source.start.height
             self.space, self.channels = self.source.start.space, self.source.start.channels
             self.spectra = upload_table() if mi.is_spectral else None
@@ -277,9 +276,6 @@ def _finite(x: Any) -> Any:
     return dr.select(dr.isfinite(x), x, 0)
 
 
-# --- Properties ----------------------------------------------------------------------------------
-
-
 class _Refusal:
     """What scalar variants get: one line."""
 
@@ -288,43 +284,3 @@ class _Refusal:
             f"gaussian_texture does not work in the variant {mi.variant()}; "
             "use mi.set_variant('llvm_ad_rgb') or another llvm or cuda variant"
         )
-
-
-def _cutoff(props: Any) -> float:
-    cutoff = float(props.get("cutoff", CUTOFF))
-    if not 0 < cutoff <= WIDEST_CUTOFF:
-        raise ValueError(
-            f"gaussian_texture: cutoff is {cutoff}; it must be above 0 and at most "
-            f"{WIDEST_CUTOFF:g}"
-        )
-    return cutoff
-
-
-def _angle(props: Any) -> float:
-    angle = float(props.get("prefilter", 0.0))
-    if not 0 <= angle < 1:
-        raise ValueError(
-            f"gaussian_texture: prefilter is {angle}; it is the angle of a pixel in radians, "
-            "at least 0 and below 1"
-        )
-    return angle
-
-
-def _wrap(props: Any) -> str:
-    wrap = str(props.get("wrap_mode", "repeat"))
-    if wrap not in WRAPS:
-        raise ValueError(
-            f"gaussian_texture: wrap_mode {wrap!r} is unknown; use one of {', '.join(WRAPS)}"
-        )
-    return wrap
-
-
-def _affine(props: Any) -> tuple[tuple, tuple]:
-    """Rows of ``to_uv`` as (m00, m01, translation), and the inverse of its linear part."""
-    transform = props["to_uv"] if "to_uv" in props else mi.ScalarTransform4f()
-    matrix = np.array(transform.matrix, np.float64)
-    linear = matrix[:2, :2]
-    if not np.isfinite(matrix).all() or abs(np.linalg.det(linear)) < 1e-12:
-        raise ValueError("gaussian_texture: to_uv maps the plane to a line; it must be invertible")
-    rows = [[*row[:2], row[-1]] for row in matrix[:2].tolist()]
-    return (tuple(rows[0]), tuple(rows[1])), tuple(np.linalg.inv(linear).ravel().tolist())

@@ -10,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 
 from eigengs_dr.arrays import types_of
-from eigengs_dr.color import SPACES
 from eigengs_dr.eigengs import EigenGS
 from eigengs_dr.gaussians import Gaussians
 
@@ -188,60 +187,6 @@ class FromModel:
             colors.append(start.color[c] + dr.gather(types.Float, change, splat))
             background.append(start.background[c] + dr.gather(types.Float, change, last))
         return replace(start, color=types.FloatX(colors), background=types.FloatX(background))
-
-
-def source_of(props: Any) -> FromSet | FromModel:
-    """Read the properties that say where the Gaussians come from.
-
-    Raises
-    ------
-    ValueError
-        If there is none or more than one such property, a file is not what is asked for, or its
-        channels are no texture's.
-    """
-    given = [key for key in ("filename", "model", "means") if key in props]
-    if len(given) != 1:
-        raise ValueError(
-            "gaussian_texture: give one of filename (a saved set), model (a saved EigenGS) or "
-            f"means, factors, colors, ... (see properties_of); got {' and '.join(given) or 'none'}"
-        )
-    backend = "cuda" if "cuda" in mi.variant() else "llvm"
-    if given[0] == "model":
-        model = EigenGS.load(_path(props, "model"), backend)
-        return FromModel(model, props.get("coefficients", None))
-    if given[0] == "filename":
-        gaussians = Gaussians.load(_path(props, "filename"), backend)
-    else:
-        gaussians = _from_arrays(props, backend)
-    if gaussians.channels not in (1, 3):
-        raise ValueError(
-            f"gaussian_texture: the set has {gaussians.channels} channels; a texture has 1 or 3"
-        )
-    return FromSet(gaussians)
-
-
-def _from_arrays(props: Any, backend: str) -> Gaussians:
-    """Read a set from the properties that `properties_of` wrote."""
-    missing = [key for key in (*ARRAYS, "width", "height", "space") if key not in props]
-    if missing:
-        raise ValueError(f"gaussian_texture: {missing[0]} is missing; see properties_of")
-    if props["space"] not in SPACES:
-        raise ValueError(f"gaussian_texture: space {props['space']!r} is not in {SPACES}")
-    means, factors, colors, background = (np.array(props[key]) for key in ARRAYS)
-    return Gaussians.from_arrays(
-        means,
-        factors,
-        colors,
-        background.ravel(),
-        size=(props["width"], props["height"]),
-        space=props["space"],
-        backend=backend,
-    )
-
-
-def _path(props: Any, key: str) -> str:
-    """Where a file lies: beside the scene, or where Mitsuba's resolver finds it."""
-    return str(mi.file_resolver().resolve(props[key]))
 
 
 def _run(row: int, length: int) -> Any:

@@ -10,16 +10,11 @@ from scipy.special import erf
 
 from eigengs_dr.arrays import types_in, types_of
 from eigengs_dr.backend import select
-from eigengs_dr.filtered import (
-    WIDEST,
-    bounded_covariance,
-    integrals,
-    quick_erf,
-    sort_by_size,
-    sum_filtered,
-)
+from eigengs_dr.filtered import sum_filtered
+from eigengs_dr.footprints import WIDEST, bounded_covariance, integrals, quick_erf
 from eigengs_dr.reference import render_exact
 from eigengs_dr.rendering import splat_values
+from eigengs_dr.sizes import sort_by_size
 from eigengs_dr.splat import SHAPE, UNIT, pack, widen
 
 CUTOFF = 5.0

@@ -1,0 +1,114 @@
+"""Properties of ``gaussian_texture``: read, checked, refused in one line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from eigengs_dr.color import SPACES
+from eigengs_dr.eigengs import EigenGS
+from eigengs_dr.gaussians import Gaussians
+from eigengs_dr.rendering import CUTOFF, WIDEST_CUTOFF
+
+from .parameters import ARRAYS, FromModel, FromSet
+
+WRAPS = ("repeat", "mirror", "clamp")
+"""What lies outside of the image."""
+
+
+def source_of(props: Any) -> FromSet | FromModel:
+    """Read the properties that say where the Gaussians come from.
+
+    Raises
+    ------
+    ValueError
+        If there is none or more than one such property, a file is not what is asked for, or its
+        channels are no texture's.
+    """
+    given = [key for key in ("filename", "model", "means") if key in props]
+    if len(given) != 1:
+        raise ValueError(
+            "gaussian_texture: give one of filename (a saved set), model (a saved EigenGS) or "
+            f"means, factors, colors, ... (see properties_of); got {' and '.join(given) or 'none'}"
+        )
+    backend = "cuda" if "cuda" in mi.variant() else "llvm"
+    if given[0] == "model":
+        model = EigenGS.load(_path(props, "model"), backend)
+        return FromModel(model, props.get("coefficients", None))
+    if given[0] == "filename":
+        gaussians = Gaussians.load(_path(props, "filename"), backend)
+    else:
+        gaussians = _from_arrays(props, backend)
+    if gaussians.channels not in (1, 3):
+        raise ValueError(
+            f"gaussian_texture: the set has {gaussians.channels} channels; a texture has 1 or 3"
+        )
+    return FromSet(gaussians)
+
+
+def _from_arrays(props: Any, backend: str) -> Gaussians:
+    """Read a set from the properties that `properties_of` wrote."""
+    missing = [key for key in (*ARRAYS, "width", "height", "space") if key not in props]
+    if missing:
+        raise ValueError(f"gaussian_texture: {missing[0]} is missing; see properties_of")
+    if props["space"] not in SPACES:
+        raise ValueError(f"gaussian_texture: space {props['space']!r} is not in {SPACES}")
+    means, factors, colors, background = (np.array(props[key]) for key in ARRAYS)
+    return Gaussians.from_arrays(
+        means,
+        factors,
+        colors,
+        background.ravel(),
+        size=(props["width"], props["height"]),
+        space=props["space"],
+        backend=backend,
+    )
+
+
+def _path(props: Any, key: str) -> str:
+    """Where a file lies: beside the scene, or where Mitsuba's resolver finds it."""
+    return str(mi.file_resolver().resolve(props[key]))
+
+
+def cutoff(props: Any) -> float:
+    """Read ``cutoff``: standard deviations after which a splat ends."""
+    value = float(props.get("cutoff", CUTOFF))
+    if not 0 < value <= WIDEST_CUTOFF:
+        raise ValueError(
+            f"gaussian_texture: cutoff is {value}; it must be above 0 and at most {WIDEST_CUTOFF:g}"
+        )
+    return value
+
+
+def angle(props: Any) -> float:
+    """Read ``prefilter``: the angle of a pixel in radians, 0 for none."""
+    value = float(props.get("prefilter", 0.0))
+    if not 0 <= value < 1:
+        raise ValueError(
+            f"gaussian_texture: prefilter is {value}; it is the angle of a pixel in radians, "
+            "at least 0 and below 1"
+        )
+    return value
+
+
+def wrap_mode(props: Any) -> str:
+    """Read ``wrap_mode``, one of `WRAPS`."""
+    wrap = str(props.get("wrap_mode", "repeat"))
+    if wrap not in WRAPS:
+        raise ValueError(
+            f"gaussian_texture: wrap_mode {wrap!r} is unknown; use one of {', '.join(WRAPS)}"
+        )
+    return wrap
+
+
+def affine(props: Any) -> tuple[tuple, tuple]:
+    """Read ``to_uv``: its rows (m00, m01, translation), and the inverse of its linear part."""
+    transform = props["to_uv"] if "to_uv" in props else mi.ScalarTransform4f()
+    matrix = np.array(transform.matrix, np.float64)
+    linear = matrix[:2, :2]
+    if not np.isfinite(matrix).all() or abs(np.linalg.det(linear)) < 1e-12:
+        raise ValueError("gaussian_texture: to_uv maps the plane to a line; it must be invertible")
+    rows = [[*row[:2], row[-1]] for row in matrix[:2].tolist()]
+    return (tuple(rows[0]), tuple(rows[1])), tuple(np.linalg.inv(linear).ravel().tolist())
