@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from .metrics import ms_ssim, psnr, ssim
     from .pca import Eigenbasis
     from .plugins import register_plugins
-    from .rendering import render
+    from .rendering import picture_of, render
+    from .tensors import from_tensors, to_tensors
 
 __all__ = [
     "BackendError",
@@ -27,14 +28,17 @@ __all__ = [
     "Gaussians",
     "concatenate",
     "fit",
+    "from_tensors",
     "load_image",
     "ms_ssim",
+    "picture_of",
     "psnr",
     "register_plugins",
     "render",
     "sample",
     "save_image",
     "ssim",
+    "to_tensors",
 ]
 
 __version__ = "0.1.0"
@@ -47,7 +51,8 @@ _HOMES = {
     "metrics": ("ms_ssim", "psnr", "ssim"),
     "pca": ("Eigenbasis",),
     "plugins": ("register_plugins",),
-    "rendering": ("render",),
+    "rendering": ("picture_of", "render"),
+    "tensors": ("from_tensors", "to_tensors"),
 }
 
 prepare()  # before anything imports Dr.Jit, which looks for libLLVM once

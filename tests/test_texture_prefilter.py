@@ -128,7 +128,7 @@ class TestPlane:
             scene = plane({**tex, "prefilter": prefilter})
             images = [np.array(mi.render(scene, spp=1, seed=s)) for s in range(4)]
             errors.append(np.square(images - reference).mean())
-        assert errors[0] < 0.25 * errors[1]
+        assert errors[0] < 0.35 * errors[1]
 
     def test_mirror_and_repeat_agree_on_a_picture_that_is_its_own_mirror(self):
         """All splats twice, so that the picture is symmetric."""
