@@ -200,6 +200,14 @@ def gaussian_texture() -> type:
             density = self._sampled().pdf(cell, active) * SURVEY**2
             return dr.select(inside, density, 0)
 
+        def sample_spectrum(self, si: Any, sample: Any, active: Any = True) -> tuple:
+            if not mi.is_spectral:
+                return mi.Color0f(), self.eval(si, active)
+            width = mi.MI_CIE_MAX - mi.MI_CIE_MIN
+            si = mi.SurfaceInteraction3f(si)
+            si.wavelengths = mi.MI_CIE_MIN + width * sample
+            return si.wavelengths, self.eval(si, active) * width
+
         def mean(self) -> Any:
             return mi.Float(float(self.brightness.numpy().mean()))
 

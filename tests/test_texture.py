@@ -327,6 +327,17 @@ class TestSlots:
         dr.backward(dr.mean(image))
         assert np.abs(np.array(dr.grad(parameters[key]))).max() > 0
 
+    @in_variants
+    def test_particles_leave_it_as_paths_find_it(self, variant):
+        """Light traced from the emitter, which samples positions and wavelengths of the texture."""
+        emitter = {"type": "area", "radiance": properties_of(gaussians("linear", quiet=False))}
+        scene = small_scene(None, emitter=emitter)
+        means = [
+            np.array(mi.render(scene, integrator=mi.load_dict({"type": t, "max_depth": 3}), spp=64))
+            for t in ("path", "ptracer")
+        ]
+        np.testing.assert_allclose(*(m.mean(axis=(0, 1)) for m in means), rtol=0.05)
+
     def test_a_lamp_lights_as_a_bitmap_of_the_same_picture_does(self):
         g = gaussians("linear", quiet=False)
         data = mi.TensorXf(np.clip(eg.render(g, SIZE[0] * 8).numpy(), 0, 1))
