@@ -6,7 +6,8 @@ from pathlib import Path
 import eigengs_dr as eg  # isort: skip  (before Mitsuba: it names a libLLVM that works)
 import drjit as dr
 import mitsuba as mi
-from eigengs_dr.plugins import pixel_angle, properties_of
+
+from eigengs_dr.plugins import pixel_angle, texture_of
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "build/examples")
 folder.mkdir(parents=True, exist_ok=True)
@@ -30,12 +31,9 @@ camera = mi.load_dict(
 
 def floor(prefilter):
     """Make a scene: a floor of 40 x 40 pictures in the sun."""
-    texture = {
-        **properties_of(cups),  # the type and the Gaussians; a saved set needs "filename" instead
-        "to_uv": mi.ScalarTransform4f().scale([40, 40, 1]),
-        "wrap_mode": "repeat",
-        "prefilter": prefilter,
-    }
+    tiles = mi.ScalarTransform4f().scale([40, 40, 1])
+    # Of a saved set: {"type": "gaussian_texture", "filename": "cups.npz", "to_uv": tiles, ...}
+    texture = texture_of(cups, to_uv=tiles, wrap_mode="repeat", prefilter=prefilter)
     return mi.load_dict(
         {
             "type": "scene",

@@ -7,9 +7,8 @@ import eigengs_dr as eg  # isort: skip  (before Mitsuba: it names a libLLVM that
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from eigengs_dr.plugins import bound_parameters, properties_of
 
-from eigengs_dr.rendering import picture_of
+from eigengs_dr.plugins import gaussians_of, keep_in_bounds, texture_of
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "build/examples")
 folder.mkdir(parents=True, exist_ok=True)
@@ -50,13 +49,13 @@ target = mi.render(room({"type": "bitmap", "filename": str(folder / "poster.png"
 # What we begin with: a grid of Gaussians without colour, on a grey ground.
 grey = np.full_like(photo, 0.5)
 start = eg.fit(grey, gaussians=1600, init="grid", iterations=0, color="linear").gaussians
-scene = room(properties_of(start))
+scene = room(texture_of(start))
 
 # The parameters of the texture, and about how far one step moves them: in units of light, in
 # pixels, and in 1 / pixels.
 parameters = mi.traverse(scene)
 name = "poster.bsdf.reflectance"
-rates = {f"{name}.colors": 0.03, f"{name}.means": 0.1, f"{name}.factors": 0.005}
+rates = {f"{name}.color": 0.03, f"{name}.mean": 0.1, f"{name}.factor": 0.005}
 optimizer = mi.ad.Adam(lr=0.03, params={key: parameters[key] for key in rates})
 optimizer.set_learning_rate(rates)
 parameters.update(optimizer)
@@ -69,18 +68,17 @@ for step in range(60):
     dr.backward(loss)
     optimizer.step()
     # A step may take a Gaussian out of the picture, or make it a spike.
-    bound_parameters(optimizer, name, start.width, start.height)
+    keep_in_bounds(optimizer, name, start)
     parameters.update(optimizer)
     losses.append(loss.item())
 print(f"the loss went from {losses[0]:.5f} to {losses[-1]:.5f} in {len(losses)} steps")
 
 # The poster itself, which nobody showed us: a set like any other, in linear light, which
 # `picture_of` codes as sRGB.
-arrays = [parameters[f"{name}.{key}"] for key in ("means", "factors", "colors", "background")]
-found = eg.Gaussians.from_arrays(*arrays, size=(start.width, start.height), space="linear")
+found = gaussians_of(parameters, name, start)
 found.save(folder / "poster_found.npz")
-eg.save_image(folder / "poster_found.png", picture_of(found))
-print(f"PSNR of the poster that was found: {eg.psnr(photo, picture_of(found)):.1f} dB")
+eg.save_image(folder / "poster_found.png", eg.picture_of(found))
+print(f"PSNR of the poster that was found: {eg.psnr(photo, eg.picture_of(found)):.1f} dB")
 
 for key, image in (("target", target), ("rendered", mi.render(scene, spp=16))):
     mi.util.write_bitmap(str(folder / f"poster_{key}.png"), image, write_async=False)

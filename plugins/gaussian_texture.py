@@ -51,7 +51,7 @@ def gaussian_texture() -> type:
         ----------
         filename : str
             A set that ``eigengs-dr fit`` or `Gaussians.save` wrote. Or a set's arrays, as
-            `eigengs_dr.plugins.properties_of` writes them; or
+            `eigengs_dr.plugins.texture_of` writes them; or
         model, coefficients
             A saved `EigenGS` model and, optionally, coefficients (C, k).
         to_uv : transform

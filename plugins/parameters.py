@@ -12,100 +12,102 @@ import numpy as np
 from eigengs_dr.arrays import types_of
 from eigengs_dr.eigengs import EigenGS
 from eigengs_dr.gaussians import Gaussians
-
-ARRAYS = ("means", "factors", "colors", "background")
-"""Parameters of a texture from a set; without the first three, one from a model has others."""
+from eigengs_dr.tensors import FIELDS, from_tensors, to_tensors
 
 
-def properties_of(gaussians: Gaussians) -> dict[str, Any]:
-    """Write a set as the properties of a ``gaussian_texture``, for `mitsuba.load_dict`.
+def texture_of(gaussians: Gaussians, **properties: Any) -> dict[str, Any]:
+    """Write a set as a ``gaussian_texture``, for `mitsuba.load_dict`.
 
     Parameters
     ----------
     gaussians : Gaussians
+    **properties
+        Others of the texture: ``wrap_mode``, ``to_uv``, ``raw``, ``prefilter``, ``cutoff``.
 
     Returns
     -------
     dict
-        ``type``, and the set's arrays, size and space; add ``wrap_mode`` and others as you like.
+        The set's tensors, size and space, and what was given.
 
     Examples
     --------
     >>> import eigengs_dr as eg, mitsuba as mi
-    >>> from eigengs_dr.plugins import properties_of
+    >>> from eigengs_dr.plugins import texture_of
     >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
-    >>> mi.load_dict({"type": "diffuse", "reflectance": properties_of(g)}).id()
-    ''
+    >>> bsdf = mi.load_dict({"type": "diffuse", "reflectance": texture_of(g, wrap_mode="clamp")})
     """
-    arrays = gaussians.to_arrays()
-    named = zip(ARRAYS, ("mean", "factor", "color", "background"), strict=True)
+    tensors = to_tensors(gaussians)
+    # A flat tensor of three would make Mitsuba try, and complain, to read it as a colour.
+    tensors["background"] = tensors["background"][None]
     return {
         "type": "gaussian_texture",
-        # A flat tensor of three would make Mitsuba try, and complain, to read it as a colour.
-        **{name: mi.TensorXf(np.atleast_2d(arrays[key])) for name, key in named},
+        **tensors,
         "width": gaussians.width,
         "height": gaussians.height,
         "space": gaussians.space,
+        **properties,
     }
 
 
-def bound_parameters(parameters: Any, texture: str, width: int, height: int) -> None:
-    """Bring the parameters of a texture back inside their bounds after a step of an optimiser.
+def gaussians_of(parameters: Any, texture: str, like: Gaussians) -> Gaussians:
+    """Read a set back from the parameters of a texture, differentiably.
+
+    Parameters
+    ----------
+    parameters : dict-like
+        A `mitsuba.SceneParameters`, or an optimiser.
+    texture : str
+        Name of the texture in it, such as ``"poster.bsdf.reflectance"``.
+    like : Gaussians
+        What the texture was made of: gives the size, the space and what `parameters` lacks.
+
+    Raises
+    ------
+    ValueError
+        If tensors do not fit each other.
+    """
+    return from_tensors(_found(parameters, texture), like)
+
+
+def keep_in_bounds(parameters: Any, texture: str, like: Gaussians) -> None:
+    """Bring the parameters of a texture back inside their bounds, after a step of an optimiser.
 
     What `eigengs_dr.Gaussians.bounded` does: means stay in the image, factors where a splat is
     neither a spike nor a sheet, and what is not finite is replaced.
 
     Parameters
     ----------
-    parameters : dict-like
-        A `mitsuba.ad.Optimizer` or `mitsuba.SceneParameters`; entries it lacks are left alone.
-    texture : str
-        Name of the texture in it, such as ``"poster.bsdf.reflectance"``.
-    width, height : int
-        Native size of the set.
+    parameters, texture, like
+        As for `gaussians_of`; entries that `parameters` lacks are left alone.
     """
-    keys = {name: f"{texture}.{name}" for name in ARRAYS if f"{texture}.{name}" in parameters}
-    found = {name: dr.detach(parameters[key]) for name, key in keys.items()}
-    types = types_of(mi.Float)
-    whole = Gaussians(
-        mean=types.Float2(*_columns(found["means"])) if "means" in found else types.Float2(0),
-        factor=types.Float3(*_columns(found["factors"])) if "factors" in found else types.Float3(1),
-        color=found["colors"].array if "colors" in found else types.Float(0),
-        background=found["background"].array if "background" in found else types.Float(0),
-        width=width,
-        height=height,
-    ).bounded()
-    flat = {
-        "means": lambda: dr.ravel(whole.mean, order="F"),
-        "factors": lambda: dr.ravel(whole.factor, order="F"),
-        "colors": lambda: whole.color,
-        "background": lambda: whole.background,
-    }
-    for name, key in keys.items():
-        parameters[key] = mi.TensorXf(flat[name](), found[name].shape)
+    found = _found(parameters, texture)
+    bounded = to_tensors(dr.detach(from_tensors(found, like)).bounded())
+    for name in found:
+        parameters[f"{texture}.{name}"] = bounded[name]
+
+
+def _found(parameters: Any, texture: str) -> dict[str, Any]:
+    keys = {name: f"{texture}.{name}" for name in FIELDS}
+    return {name: parameters[key] for name, key in keys.items() if key in parameters}
 
 
 class FromSet:
-    """Means (N, 2), factors (N, 3), colors (N, C) and background (C,) are the parameters.
+    """mean (N, 2), factor (N, 3), color (N, C) and background (C,) are the parameters.
 
     In native pixels, and in the space of the set, as in `eigengs_dr.Gaussians`.
     """
 
-    shaping = ("means", "factors")
+    shaping = ("mean", "factor")
     """Parameters after whose change splats must be listed anew."""
 
     def __init__(self, gaussians: Gaussians) -> None:
-        arrays = gaussians.to_arrays()
-        self.means = mi.TensorXf(arrays["mean"])
-        self.factors = mi.TensorXf(arrays["factor"])
-        self.colors = mi.TensorXf(arrays["color"])
-        self.background = mi.TensorXf(arrays["background"])
         self.start = gaussians
+        self.tensors = to_tensors(gaussians)
 
     def put(self, callback: Any) -> None:
         """Show the parameters to `mitsuba.traverse`."""
-        for name in ARRAYS:
-            callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+        for name, tensor in self.tensors.items():
+            callback.put(name, tensor, mi.ParamFlags.Differentiable)
 
     def gaussians(self) -> Gaussians:
         """Put the parameters together; gradients flow back to them.
@@ -115,25 +117,7 @@ class FromSet:
         ValueError
             If they do not fit each other.
         """
-        start = self.start
-        types = types_of(start.mean)
-        count, channels = self.means.shape[0], start.channels
-        for name, shape in (
-            ("means", (count, 2)),
-            ("factors", (count, 3)),
-            ("colors", (count, channels)),
-            ("background", (channels,)),
-        ):
-            found = tuple(getattr(self, name).shape)
-            if found != shape or not count:
-                raise ValueError(f"gaussian_texture: {name} has shape {found}, expected {shape}")
-        return replace(
-            start,
-            mean=types.Float2(*_columns(self.means)),
-            factor=types.Float3(*_columns(self.factors)),
-            color=types.FloatX(_columns(self.colors)),
-            background=types.FloatX(_entries(self.background)),
-        )
+        return from_tensors(self.tensors, self.start)
 
 
 class FromModel:
@@ -191,15 +175,3 @@ class FromModel:
 
 def _run(row: int, length: int) -> Any:
     return dr.arange(mi.UInt32, length) + row * length
-
-
-def _columns(tensor: Any) -> list:
-    """Columns of a tensor (N, k)."""
-    count, number = tensor.shape
-    rows = dr.arange(mi.UInt32, count) * number
-    return [dr.gather(mi.Float, tensor.array, rows + k) for k in range(number)]
-
-
-def _entries(tensor: Any) -> list:
-    """Entries of a tensor (C,), one array each."""
-    return [dr.gather(mi.Float, tensor.array, mi.UInt32(k)) for k in range(tensor.shape[0])]

@@ -11,8 +11,9 @@ from eigengs_dr.color import SPACES
 from eigengs_dr.eigengs import EigenGS
 from eigengs_dr.gaussians import Gaussians
 from eigengs_dr.rendering import CUTOFF, WIDEST_CUTOFF
+from eigengs_dr.tensors import FIELDS
 
-from .parameters import ARRAYS, FromModel, FromSet
+from .parameters import FromModel, FromSet
 
 WRAPS = ("repeat", "mirror", "clamp")
 """What lies outside of the image."""
@@ -27,11 +28,11 @@ def source_of(props: Any) -> FromSet | FromModel:
         If there is none or more than one such property, a file is not what is asked for, or its
         channels are no texture's.
     """
-    given = [key for key in ("filename", "model", "means") if key in props]
+    given = [key for key in ("filename", "model", "mean") if key in props]
     if len(given) != 1:
         raise ValueError(
             "gaussian_texture: give one of filename (a saved set), model (a saved EigenGS) or "
-            f"means, factors, colors, ... (see properties_of); got {' and '.join(given) or 'none'}"
+            f"mean, factor, color, ... (see texture_of); got {' and '.join(given) or 'none'}"
         )
     backend = "cuda" if "cuda" in mi.variant() else "llvm"
     if given[0] == "model":
@@ -49,17 +50,17 @@ def source_of(props: Any) -> FromSet | FromModel:
 
 
 def _from_arrays(props: Any, backend: str) -> Gaussians:
-    """Read a set from the properties that `properties_of` wrote."""
-    missing = [key for key in (*ARRAYS, "width", "height", "space") if key not in props]
+    """Read a set from the properties that `texture_of` wrote."""
+    missing = [key for key in (*FIELDS, "width", "height", "space") if key not in props]
     if missing:
-        raise ValueError(f"gaussian_texture: {missing[0]} is missing; see properties_of")
+        raise ValueError(f"gaussian_texture: {missing[0]} is missing; see texture_of")
     if props["space"] not in SPACES:
         raise ValueError(f"gaussian_texture: space {props['space']!r} is not in {SPACES}")
-    means, factors, colors, background = (np.array(props[key]) for key in ARRAYS)
+    mean, factor, color, background = (np.array(props[key]) for key in FIELDS)
     return Gaussians.from_arrays(
-        means,
-        factors,
-        colors,
+        mean,
+        factor,
+        color,
         background.ravel(),
         size=(props["width"], props["height"]),
         space=props["space"],

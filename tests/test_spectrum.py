@@ -9,6 +9,7 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 
 import drjit as dr  # noqa: E402
+
 from eigengs_dr.plugins import spectrum  # noqa: E402
 
 

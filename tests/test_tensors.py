@@ -3,10 +3,10 @@
 import drjit as dr
 import numpy as np
 import pytest
+from scenes import random_scene
 
 import eigengs_dr as eg
 from eigengs_dr.arrays import types_of
-from scenes import random_scene
 
 NAMES = ["mean", "factor", "color", "background"]
 

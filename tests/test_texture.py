@@ -3,15 +3,13 @@
 import drjit as dr
 import numpy as np
 import pytest
-
 from scenes import SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 
-from eigengs_dr.plugins import properties_of  # noqa: E402
-
 import eigengs_dr as eg  # noqa: E402
 from eigengs_dr.color import to_linear  # noqa: E402
+from eigengs_dr.plugins import texture_of  # noqa: E402
 from eigengs_dr.rendering import picture_of  # noqa: E402
 
 VARIANTS = ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral"]
@@ -46,7 +44,7 @@ def gaussians(space="rgb", channels=3, seed=0, quiet=True):
 
 
 def texture(g, **properties):
-    return mi.load_dict({**properties_of(g), **properties})
+    return mi.load_dict({**texture_of(g), **properties})
 
 
 def at(u, v, count=1):
@@ -120,7 +118,7 @@ class TestValues:
                 "type": "rectangle",
                 "bsdf": {
                     "type": "diffuse",
-                    "reflectance": {**properties_of(g), "to_uv": flat_middle()},
+                    "reflectance": {**texture_of(g), "to_uv": flat_middle()},
                 },
             },
             "light": {"type": "constant"},
@@ -230,7 +228,7 @@ SLOTS += ["blend", "mask", "normalmap", "bumpmap"]
 
 def slots(g):
     """BSDFs with a texture in every kind of place that Mitsuba has for one, by name."""
-    colour, number = properties_of(g), properties_of(gaussians("data", channels=1))
+    colour, number = texture_of(g), texture_of(gaussians("data", channels=1))
     diffuse = {"type": "diffuse"}
     return {
         "diffuse": {"type": "diffuse", "reflectance": colour},
@@ -248,7 +246,7 @@ def slots(g):
         "mask": {"type": "mask", "opacity": number, "inner": diffuse},
         "normalmap": {
             "type": "normalmap",
-            "normalmap": properties_of(gaussians("data")),
+            "normalmap": texture_of(gaussians("data")),
             "inner": diffuse,
         },
         "bumpmap": {"type": "bumpmap", "bump": number, "scale": 3.0, "inner": diffuse},
@@ -298,7 +296,7 @@ class TestSlots:
         """In every slot the picture is finite, changes with the texture, and has a gradient."""
         scene = small_scene(slots(gaussians())[name], "direct")
         parameters = mi.traverse(scene)
-        keys = [k for k, _ in parameters if k.endswith((".colors", ".means"))]
+        keys = [k for k, _ in parameters if k.endswith((".color", ".mean"))]
         assert keys
         for key in keys:
             dr.enable_grad(parameters[key])
@@ -313,13 +311,13 @@ class TestSlots:
 
     @in_variants
     def test_lights(self, variant):
-        radiance = properties_of(gaussians("linear"))
+        radiance = texture_of(gaussians("linear"))
         if variant == "llvm_ad_spectral":
             radiance = {"type": "d65", "of": radiance}  # else it glows at equal energy
         emitter = {"type": "area", "radiance": radiance}
         scene = small_scene(None, "path", emitter=emitter)
         parameters = mi.traverse(scene)
-        key = next(k for k, _ in parameters if k.endswith(".colors"))
+        key = next(k for k, _ in parameters if k.endswith(".color"))
         dr.enable_grad(parameters[key])
         parameters.update()
         image = mi.render(scene, params=parameters, spp=4)
@@ -330,7 +328,7 @@ class TestSlots:
     @in_variants
     def test_particles_leave_it_as_paths_find_it(self, variant):
         """Light traced from the emitter, which samples positions and wavelengths of the texture."""
-        emitter = {"type": "area", "radiance": properties_of(gaussians("linear", quiet=False))}
+        emitter = {"type": "area", "radiance": texture_of(gaussians("linear", quiet=False))}
         scene = small_scene(None, emitter=emitter)
         means = [
             np.array(mi.render(scene, integrator=mi.load_dict({"type": t, "max_depth": 3}), spp=64))
@@ -343,7 +341,7 @@ class TestSlots:
         data = mi.TensorXf(np.clip(eg.render(g, SIZE[0] * 8).numpy(), 0, 1))
         means = []
         for radiance in (
-            properties_of(g),
+            texture_of(g),
             {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"},
         ):
             scene = small_scene(None, emitter={"type": "area", "radiance": radiance})
@@ -429,9 +427,9 @@ class TestMistakes:
             texture(gaussians("data", channels=channels))
 
     def test_an_array_that_is_missing(self):
-        properties = properties_of(gaussians())
-        del properties["colors"]
-        with pytest.raises(RuntimeError, match="colors is missing"):
+        properties = texture_of(gaussians())
+        del properties["color"]
+        with pytest.raises(RuntimeError, match="color is missing"):
             mi.load_dict(properties)
 
     def test_a_file_that_is_no_set(self, tmp_path):
@@ -458,8 +456,8 @@ class TestMistakes:
     def test_parameters_of_another_shape(self):
         tex = texture(gaussians())
         parameters = mi.traverse(tex)
-        parameters["colors"] = mi.TensorXf(np.zeros((3, 3), np.float32))
-        with pytest.raises(Exception, match=r"colors has shape \(3, 3\), expected \(24, 3\)"):
+        parameters["color"] = mi.TensorXf(np.zeros((3, 3), np.float32))
+        with pytest.raises(Exception, match=r"color has shape \(3, 3\), expected \(24, 3\)"):
             parameters.update()
 
 

@@ -3,19 +3,18 @@
 import drjit as dr
 import numpy as np
 import pytest
-
 from scenes import SIZE, random_scene, small_model
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 
-from eigengs_dr.plugins import bound_parameters, properties_of  # noqa: E402
 from test_texture import at, gaussians, picture, small_scene, texel_centres, texture  # noqa: E402
 from test_texture import variant as variant  # noqa: E402
 
 import eigengs_dr as eg  # noqa: E402
 from eigengs_dr.gaussians import NARROWEST  # noqa: E402
+from eigengs_dr.plugins import gaussians_of, keep_in_bounds, texture_of  # noqa: E402
 
-PARAMETERS = ["means", "factors", "colors", "background"]
+PARAMETERS = ["mean", "factor", "color", "background"]
 TEXTURE = "wall.bsdf.reflectance"
 SIDE, SPP, SEED = 12, 32, 3
 
@@ -27,7 +26,7 @@ def of_texture(scene):
 
 
 def wall(g, **properties):
-    return {"type": "diffuse", "reflectance": {**properties_of(g), **properties}}
+    return {"type": "diffuse", "reflectance": {**texture_of(g), **properties}}
 
 
 def gradients(scene, weight):
@@ -75,7 +74,7 @@ class TestIntegrators:
         assert list(found) == PARAMETERS
         for name, gradient in found.items():
             direction = direction_like(gradient)
-            step = {"means": 2e-2, "factors": 1e-3}.get(name, 2e-3)
+            step = {"mean": 2e-2, "factor": 1e-3}.get(name, 2e-3)
             expected = difference(scene, name, step, direction, weight)
             assert abs(expected) > 1e-2
             assert (gradient * direction).sum() == pytest.approx(expected, rel=0.01), name
@@ -97,10 +96,10 @@ class TestIntegrators:
         """Not of "path", whose loop Dr.Jit cannot carry derivatives of another loop into."""
         expected = gradients(
             small_scene(wall(gaussians()), integrator, SIDE, SPP), mi.TensorXf(upstream())
-        )["colors"]
+        )["color"]
         scene = small_scene(wall(gaussians()), integrator, SIDE, SPP)
         parameters = of_texture(scene)
-        key, along = f"{TEXTURE}.colors", mi.Float(0)
+        key, along = f"{TEXTURE}.color", mi.Float(0)
         dr.enable_grad(along)
         direction = direction_like(expected)
         parameters[key] = mi.TensorXf(parameters[key]) + along * mi.TensorXf(direction)
@@ -167,7 +166,7 @@ class TestBroken:
         kept = scene.permuted(np.setdiff1d(np.arange(len(broken)), 5))
         tex = texture(gaussians(), raw=True)
         parameters = mi.traverse(tex)
-        parameters["factors"] = mi.TensorXf(broken.astype(np.float32))
+        parameters["factor"] = mi.TensorXf(broken.astype(np.float32))
         parameters.update()
         g = kept._replace(color=0.04 * kept.color, background=np.full(3, 0.5)).on("llvm")
         np.testing.assert_allclose(
@@ -176,18 +175,30 @@ class TestBroken:
 
     def test_bounds(self):
         optimizer = mi.ad.Adam(lr=0.1)
-        optimizer["t.means"] = mi.TensorXf(np.float32([[1, 2], [np.nan, 99], [-3, 4]]))
-        optimizer["t.factors"] = mi.TensorXf(np.float32([[1, 2, 3], [np.nan, 99, -1], [1, 0, 1]]))
-        optimizer["t.colors"] = mi.TensorXf(np.float32([[1, 2, 3], [np.nan, 99, -1], [1, 0, 1]]))
-        bound_parameters(optimizer, "t", 10, 20)
-        high, low = 1 / NARROWEST, 1 / 40
-        np.testing.assert_allclose(np.array(optimizer["t.means"]), [[1, 2], [5, 20], [0, 4]])
+        optimizer["t.mean"] = mi.TensorXf(np.float32([[1, 2], [np.nan, 99], [-3, 4]]))
+        optimizer["t.factor"] = mi.TensorXf(np.float32([[1, 2, 3], [np.nan, 99, -1], [1, 0, 1]]))
+        optimizer["t.color"] = mi.TensorXf(np.float32([[1, 2, 3], [np.nan, 99, -1], [1, 0, 1]]))
+        keep_in_bounds(optimizer, "t", gaussians())
+        high, low = 1 / NARROWEST, 1 / (2 * max(SIZE))
         np.testing.assert_allclose(
-            np.array(optimizer["t.factors"]), [[1, 2, 3], [high, high, low], [1, 0, 1]]
+            np.array(optimizer["t.mean"]), [[1, 2], [SIZE[0] / 2, SIZE[1]], [0, 4]]
         )
         np.testing.assert_allclose(
-            np.array(optimizer["t.colors"]), [[1, 2, 3], [0, 99, -1], [1, 0, 1]]
+            np.array(optimizer["t.factor"]), [[1, 2, 3], [high, high, low], [1, 0, 1]]
         )
+        np.testing.assert_allclose(
+            np.array(optimizer["t.color"]), [[1, 2, 3], [0, 99, -1], [1, 0, 1]]
+        )
+
+    def test_a_set_is_read_back(self):
+        g = gaussians("linear")
+        scene = small_scene(wall(g), "direct", SIDE, 1)
+        parameters = mi.traverse(scene)
+        parameters[f"{TEXTURE}.color"] = 2 * parameters[f"{TEXTURE}.color"]
+        found = gaussians_of(parameters, TEXTURE, g)
+        assert (found.width, found.height, found.space) == (*SIZE, "linear")
+        np.testing.assert_array_equal(found.to_arrays()["mean"], g.to_arrays()["mean"])
+        np.testing.assert_array_equal(found.to_arrays()["color"], 2 * g.to_arrays()["color"])
 
 
 class TestModel:
@@ -260,14 +271,14 @@ def test_optimising_colours_finds_a_picture():
     target = mi.render(small_scene(wall(truth), "prb", SIDE), spp=256)
     scene = small_scene(wall(start), "prb", SIDE)
     parameters = of_texture(scene)
-    key = f"{TEXTURE}.colors"
+    key = f"{TEXTURE}.color"
     optimizer = mi.ad.Adam(lr=0.02, params={key: parameters[key]})
     for seed in range(40):
         parameters.update(optimizer)
         image = mi.render(scene, params=parameters, spp=16, seed=seed)
         dr.backward(dr.mean(dr.square(image - target), axis=None))
         optimizer.step()
-        bound_parameters(optimizer, TEXTURE, *SIZE)
-    start.color = type(start.color)(np.array(optimizer[key]).T)
-    truth, grey, found = (eg.render(g).numpy() for g in (truth, gaussians("linear")[:1], start))
+        keep_in_bounds(optimizer, TEXTURE, start)
+    found = gaussians_of(optimizer, TEXTURE, start)
+    truth, grey, found = (eg.render(g).numpy() for g in (truth, gaussians("linear")[:1], found))
     assert np.square(found - truth).mean() < 0.3 * np.square(grey - truth).mean()

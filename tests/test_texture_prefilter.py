@@ -3,17 +3,16 @@
 import drjit as dr
 import numpy as np
 import pytest
-
 from scenes import SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 
-from eigengs_dr.plugins import pixel_angle, properties_of  # noqa: E402
-from eigengs_dr.plugins.cone import PIXEL, metric  # noqa: E402
 from test_texture import gaussians, texture  # noqa: E402
 from test_texture import variant as variant  # noqa: E402
 
 from eigengs_dr.footprints import WIDEST, bounded_covariance  # noqa: E402
+from eigengs_dr.plugins import pixel_angle, texture_of  # noqa: E402
+from eigengs_dr.plugins.cone import PIXEL, metric  # noqa: E402
 
 
 def plane(tex, tiles=60, side=48):
@@ -107,7 +106,7 @@ class TestCone:
         np.testing.assert_allclose(filtered, point, atol=1e-5)
 
     def test_pixel_angle(self):
-        sensor = plane(properties_of(gaussians())).sensors()[0]
+        sensor = plane(texture_of(gaussians())).sensors()[0]
         assert pixel_angle(sensor) == pytest.approx(2 * np.tan(np.radians(25)) / 48)
 
     def test_of_a_sensor_without_a_field_of_view(self):
@@ -120,7 +119,7 @@ class TestPlane:
     def test_one_filtered_sample_is_closer_to_the_mean_of_many(self, wrap):
         g = gaussians("linear")
         g.color *= 4
-        tex = {**properties_of(g), "wrap_mode": wrap}
+        tex = {**texture_of(g), "wrap_mode": wrap}
         angle = pixel_angle(plane(tex).sensors()[0])
         reference = np.array(mi.render(plane(tex), spp=512, seed=9))
         errors = []
