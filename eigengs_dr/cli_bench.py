@@ -110,6 +110,27 @@ def eigen(
     _tell(context, backend, report, quiet, figures, **settings)
 
 
+@bench.command()
+@click.option("--variant", default="llvm_ad_rgb", show_default=True, help="Of Mitsuba.")
+@report_option
+@quiet_option
+@click.pass_context
+def texture(context: click.Context, variant: str, report: Path | None, quiet: bool) -> None:
+    """Time a material ball with textures of Gaussians against one with a bitmap, in Mitsuba.
+
+    \b
+    Example:
+      eigengs-dr bench texture --report texture.json
+    """
+    check_outputs([report], [])
+    from .bench import texture as benchmark
+
+    with progress_bar(quiet) as show:
+        figures = benchmark.run(variant, progress=partial(show, "texture"))
+    backend = "cuda" if "cuda" in variant else "llvm"
+    _tell(context, backend, report, quiet, figures, variant=variant)
+
+
 def _tell(
     context: click.Context,
     backend: str | None,

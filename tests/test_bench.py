@@ -72,3 +72,20 @@ def test_starts_are_compared(backend, iterations):
         expected = np.mean([psnr(*pair) for pair in zip(shown, images, strict=True)])
         assert figures["projected_psnr_rgb"] == pytest.approx(expected)
     assert figures["encode_exact_ms"] > 0
+
+
+def test_textures_are_timed_against_a_bitmap(monkeypatch):
+    mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
+    from eigengs_dr.bench import texture
+
+    small = {"SIDE": 16, "TEXELS": 32, "SPP": 1, "COUNTS": (50, 100), "SETTLED": 100}
+    for name, value in {**small, "STEPS": 2, "ROUNDS": 1}.items():
+        monkeypatch.setattr(texture, name, value)
+    before, calls = mi.variant(), []
+    figures = texture.run(progress=lambda done, total, row: calls.append((done, total)))
+    if before:
+        mi.set_variant(before)
+    assert {"ratio_50", "ratio_100", "ratio_prefiltered", "ratio_step", "change_ms"} <= set(figures)
+    assert all(value > 0 for value in figures.values())
+    assert figures["difference"] <= 1e-4
+    assert calls[-1][0] == calls[-1][1]

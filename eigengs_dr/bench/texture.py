@@ -76,8 +76,8 @@ def run(variant: str = "llvm_ad_rgb", progress: Progress | None = None) -> dict[
         "bitmap": lambda: mi.render(plain),
         **{name: (lambda s=s: mi.render(s)) for name, s in scenes.items()},
         "prefiltered": lambda: mi.render(filtered),
-        "step_bitmap": _step(mi, plain, "data"),
-        "step_gaussians": _step(mi, settled, "color"),
+        "step_bitmap": _step(mi, plain),
+        "step_gaussians": _step(mi, settled),
         "change": lambda: _change(mi, settled),
     }
     ms = _interleaved(variants, progress)
@@ -123,13 +123,11 @@ def ball(mi: Any, texture: dict[str, Any]) -> Any:
     )
 
 
-def _step(mi: Any, scene: Any, last: str) -> Callable[[], Any]:
+def _step(mi: Any, scene: Any) -> Callable[[], Any]:
     """Render and differentiate with respect to the texture, as a step of a descent does."""
     integrator = mi.load_dict({"type": "prb", "max_depth": 5})
     parameters = mi.traverse(scene)
-    key = next(key for key, _ in parameters if key.endswith(f"base_color.{last}"))
-    names = [name for name, _ in parameters if name.startswith(key.rsplit(".", 1)[0])]
-    parameters.keep([name for name in names if not name.endswith("to_uv")])
+    parameters.keep(r".*base_color\.(data|mean|factor|color|background)")
 
     def step() -> Any:
         for name, value in parameters:
@@ -145,8 +143,9 @@ def _step(mi: Any, scene: Any, last: str) -> Callable[[], Any]:
 def _change(mi: Any, scene: Any) -> Any:
     """Tell the texture that its shapes have changed."""
     parameters = mi.traverse(scene)
-    key = next(key for key, _ in parameters if key.endswith("base_color.factor"))
-    parameters[key] = dr.detach(parameters[key]) + 0
+    parameters.keep(r".*base_color\.factor")
+    ((key, factor),) = parameters
+    parameters[key] = dr.detach(factor) + 0
     parameters.update()
     return parameters[key]
 
