@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -72,13 +73,13 @@ def run(variant: str = "llvm_ad_rgb", progress: Progress | None = None) -> dict[
     scenes = {f"gaussians_{count}": ball(mi, texture_of(g)) for count, g in sets.items()}
     filtered = ball(mi, texture_of(sets[SETTLED], prefilter=angle))
     settled = scenes[f"gaussians_{SETTLED}"]
-    variants = {
-        "bitmap": lambda: mi.render(plain),
-        **{name: (lambda s=s: mi.render(s)) for name, s in scenes.items()},
-        "prefiltered": lambda: mi.render(filtered),
+    variants: dict[str, Callable[[], Any]] = {
+        "bitmap": partial(mi.render, plain),
+        **{name: partial(mi.render, scene) for name, scene in scenes.items()},
+        "prefiltered": partial(mi.render, filtered),
         "step_bitmap": _step(mi, plain),
         "step_gaussians": _step(mi, settled),
-        "change": lambda: _change(mi, settled),
+        "change": partial(_change, mi, settled),
     }
     ms = _interleaved(variants, progress)
     ratios = {f"ratio_{count}": ms[f"gaussians_{count}_ms"] / ms["bitmap_ms"] for count in COUNTS}
