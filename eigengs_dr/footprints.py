@@ -87,22 +87,3 @@ def quick_erf(x: Any) -> Any:
     q = x * x
     p = dr.fma(dr.fma(dr.fma(-0.00595457, q, 0.07127595), q, -0.34688831), q, 1.12823041)
     return x * p
-
-
-def integrals(shape: list, width: int, height: int, cutoff: float) -> Any:
-    """Share of the mean that each splat of unit colour has: its integral over the image's area.
-
-    A splat that leaves the image counts with the product of the shares of its two marginals, and
-    with ``1 - exp(-cutoff^2 / 2)``, what the cutoff leaves of it.
-    """
-    mean_x, mean_y, a, b, c = shape
-    ia, ic = dr.rcp(a), dr.rcp(c)
-    t = -b * ia * ic
-
-    def inside(mean: Any, variance: Any, side: int) -> Any:
-        steep = dr.rsqrt(variance) * (math.sqrt(0.5) / UNIT)
-        return 0.5 * (dr.erf((side - mean) * steep) + dr.erf(mean * steep))
-
-    area = (2 * math.pi * UNIT**2) * ia * ic * -math.expm1(-0.5 * cutoff**2)
-    strips = inside(mean_x, dr.fma(ia, ia, t * t), width) * inside(mean_y, ic * ic, height)
-    return area * strips * (1 / (width * height))

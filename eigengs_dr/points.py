@@ -42,12 +42,13 @@ class Cells:
 
 
 def cell_side(width: int, height: int, count: int) -> int:
-    """Side of cells in pixels: half the spacing of the splats, as a power of two.
+    """Side of cells in pixels: 0.8 of the spacing of the splats, as a power of two.
 
-    Smaller ones hold fewer splats that miss the point, larger ones are listed faster.
+    Half of it lists fewer splats that miss the point, saves 3 % of a rendering, and takes three
+    times as long to list.
     """
     spacing = math.sqrt(width * height / count)
-    return max(1, 1 << max(0, round(math.log2(spacing / 2))))
+    return 1 << max(0, round(math.log2(0.8 * spacing)))
 
 
 def list_cells(

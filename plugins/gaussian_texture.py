@@ -15,7 +15,8 @@ import numpy as np
 
 from eigengs_dr.color import to_linear
 from eigengs_dr.filtered import sum_filtered
-from eigengs_dr.footprints import bounded_covariance, integrals
+from eigengs_dr.footprints import bounded_covariance
+from eigengs_dr.lattice import build_lattice, is_distant, mean_of, sum_lattice
 from eigengs_dr.points import (
     cell_side,
     fold,
@@ -92,11 +93,9 @@ def gaussian_texture() -> type:
             if not keys or any(key in self.source.shaping for key in keys):
                 self._list([dr.detach(s) for s in shape])
             if self.angle:
-                share = integrals(shape, self.width, self.height, self.cutoff)
-                share = dr.select(dr.isfinite(share), share, 0)
-                self.average = [
-                    b + dr.sum(share * c) for c, b in zip(color, self.background, strict=True)
-                ]
+                number = SHAPE + self.channels
+                self.lattice = build_lattice(self.sizes, self.packed, number, self.cutoff)
+                self.average = mean_of(self.lattice)
                 dr.eval(self.average)
             self._survey()
 
@@ -150,33 +149,36 @@ def gaussian_texture() -> type:
         def _color(self, si: Any, active: Any) -> list:
             """Look the channels up, decoded and clamped unless `raw`."""
             (x, sx), (y, sy), active = self._point(si, active)
-            number = SHAPE + self.channels
             if self.angle:
-                inverse, valid = metric(si, self.from_uv, self.angle)
-                footprint, blind = bounded_covariance(inverse)
-                w, h = self.width, self.height
-                sizes = (w * w, w * h * (sx * sy), h * h)
-                footprint = [
-                    dr.select(valid, f * s, 0) for f, s in zip(footprint, sizes, strict=True)
-                ]
-                blind &= valid
-                sums = sum_filtered(
-                    self.sizes,
-                    self.packed,
-                    number,
-                    x,
-                    y,
-                    footprint,
-                    active & ~blind,
-                    self.cutoff,
-                )
-                sums = [s + b for s, b in zip(sums, self.background, strict=True)]
-                sums = [dr.select(blind, m, s) for m, s in zip(self.average, sums, strict=True)]
+                sums = self._filtered(si, x, y, sx * sy, active)
             else:
-                terms = values((UNIT * self.cutoff) ** 2)
+                number, terms = SHAPE + self.channels, values((UNIT * self.cutoff) ** 2)
                 sums = sum_near(self.cells, self.packed, number, x, y, active, terms, self.channels)
-                sums = [s + b for s, b in zip(sums, self.background, strict=True)]
+            sums = [s + b for s, b in zip(sums, self.background, strict=True)]
             return [dr.select(active, _shown(self, s), 0) for s in sums]
+
+        def _filtered(self, si: Any, x: Any, y: Any, turn: Any, active: Any) -> list:
+            """Sum what the footprint of the pixel sees; `turn` is the sign that folding gives."""
+            w, h = self.width, self.height
+            inverse, valid = metric(si, self.from_uv, self.angle)
+            unit, blind = bounded_covariance(inverse)
+            sizes = (w * w, w * h * turn, h * h)
+            footprint = [dr.select(valid, f * s, 0) for f, s in zip(unit, sizes, strict=True)]
+            blind &= valid
+            distant = is_distant(self.lattice, footprint)
+            near = sum_filtered(
+                self.sizes,
+                self.packed,
+                SHAPE + self.channels,
+                x,
+                y,
+                footprint,
+                active & ~distant,
+                self.cutoff,
+            )
+            far = sum_lattice(self.lattice, x, y, footprint, active & distant & ~blind)
+            seen = [dr.select(distant, f, n) for f, n in zip(far, near, strict=True)]
+            return [dr.select(blind, m, s) for m, s in zip(self.average, seen, strict=True)]
 
         def _point(self, si: Any, active: Any) -> tuple:
             """Fold uv into the image: x, y in pixels with their derivatives; where uv is finite."""

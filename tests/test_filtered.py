@@ -11,7 +11,7 @@ from scipy.special import erf
 from eigengs_dr.arrays import types_in, types_of
 from eigengs_dr.backend import select
 from eigengs_dr.filtered import sum_filtered
-from eigengs_dr.footprints import WIDEST, bounded_covariance, integrals, quick_erf
+from eigengs_dr.footprints import WIDEST, bounded_covariance, quick_erf
 from eigengs_dr.reference import render_exact
 from eigengs_dr.rendering import splat_values
 from eigengs_dr.sizes import sort_by_size
@@ -236,18 +236,6 @@ class TestBoundedCovariance:
         )
         assert blind.all()
         assert np.isfinite(found).all()
-
-
-@pytest.mark.parametrize(("shrink", "atol"), [(1, 0.03), (3, 0.001)])
-def test_the_mean_is_that_of_a_fine_picture(backend, shrink, atol):
-    """Better for small splats, of which fewer hang over corners."""
-    scene = random_scene(7, 60)
-    mean = 0.2 * np.array(SIZE) + 0.6 * scene.mean
-    scene = scene._replace(mean=mean, factor=scene.factor * shrink)
-    fine = tiled(scene, "repeat", copies=0)[0].mean(axis=(0, 1))
-    rows, _ = splat_values(scene.on(backend))
-    share = np.array(integrals(rows[:SHAPE], *SIZE, CUTOFF))
-    np.testing.assert_allclose(scene.background + share @ scene.color, fine, atol=atol)
 
 
 def test_quick_erf_is_close(backend):
