@@ -19,10 +19,11 @@ APT_INSTALL := apt_install() { \
 	{ $$get install $$1 || { $$get update && $$get install $$1; }; } </dev/null >/dev/null 2>&1 \
 	|| { echo "make setup: $$2" >&2; exit 1; }; }
 
-.PHONY: help setup demo test test-slow bench basis clean
+.PHONY: help setup demo scenes test test-slow bench basis clean
 
 help:
 	@echo "make demo       fit a photo, at once and well; shows PSNR, time and the pictures it wrote"
+	@echo "make scenes     render the Mitsuba scenes in scenes/, in 2 minutes"
 	@echo "make test       linters, type checker, tests"
 	@echo "make test-slow  the tests that take minutes"
 	@echo "make bench      time the renderer"
@@ -48,6 +49,10 @@ demo: $(READY)
 		-o build/demo/instant.npz --preview build/demo/instant.png
 	$(BIN)/eigengs-dr fit $(PHOTO) -o build/demo/coffee.npz \
 		--preview build/demo/coffee.png --report build/demo/coffee.json
+
+scenes: $(READY)
+	$(BIN)/python scenes/assets.py
+	$(BIN)/eigengs-dr scene scenes/*.xml -o build/scenes
 
 test: $(READY)
 	$(BIN)/ruff check .

@@ -13,6 +13,7 @@ from .backend import select
 from .cli_bench import bench
 from .cli_fit import fit
 from .cli_info import info
+from .cli_scene import scene
 from .cli_shared import (
     ANY_PATH,
     EXISTING,
@@ -45,6 +46,7 @@ main.add_command(fit)
 main.add_command(train)
 main.add_command(info)
 main.add_command(bench)
+main.add_command(scene)
 
 
 @main.command()

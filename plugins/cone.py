@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
 PIXEL = 0.4
 """Standard deviation of a footprint in pixels. Samples fall anywhere in a pixel, which blurs by
@@ -32,8 +33,6 @@ def pixel_angle(sensor: Any) -> float:
     ValueError
         If the sensor has no field of view.
     """
-    import mitsuba as mi
-
     parameters = mi.traverse(sensor)
     if "x_fov" not in parameters:
         raise ValueError(

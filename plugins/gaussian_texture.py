@@ -117,7 +117,7 @@ def gaussian_texture() -> type:
                 return mi.Color3f(*color)
             if self.raw or self.space == "data":
                 raise ValueError(
-                    f"{self.id()}: a reflectance or radiance is asked of a gaussian_texture that "
+                    f"{_name(self)}: a reflectance or radiance is asked of a texture that "
                     "holds raw data; use a set in a colour space, and raw = false"
                 )
             return upsample(mi.Color3f(*color), si.wavelengths, self.spectra)
@@ -128,7 +128,7 @@ def gaussian_texture() -> type:
         def eval_3(self, si: Any, active: Any = True) -> Any:
             if self.channels != 3:
                 raise ValueError(
-                    f"{self.id()}: three channels are asked of a gaussian_texture that has one; "
+                    f"{_name(self)}: three channels are asked of a texture that has one; "
                     "normal maps need a set of a colour picture"
                 )
             return mi.Color3f(*self._color(si, active))
@@ -275,6 +275,10 @@ def _slope(texture: Any, value: Any) -> Any:
         return type(value)(1)
     curved = 2.4 / 1.055 * dr.power((dr.maximum(value, 0.04045) + 0.055) * (1 / 1.055), 1.4)
     return dr.select(value <= 0.04045, 1 / 12.92, curved)
+
+
+def _name(texture: Any) -> str:
+    return f"gaussian_texture {texture.id()!r}" if texture.id() else "gaussian_texture"
 
 
 def _luminance(color: list) -> Any:

@@ -2,14 +2,7 @@
 
 from __future__ import annotations
 
-import eigengs_dr  # noqa: F401  finds a libLLVM that works before Mitsuba imports Dr.Jit
-
-try:
-    import mitsuba as mi
-except ImportError as error:
-    raise ImportError(
-        f"the plugins need Mitsuba ({error}): pip install 'eigengs-dr[plugins]'"
-    ) from error
+import mitsuba as mi
 
 from .gaussian_texture import gaussian_texture
 
