@@ -8,6 +8,7 @@ import click
 
 from .backend import select
 from .cli_shared import (
+    ANY_PATH,
     EXISTING,
     FOLDER,
     backend_option,
@@ -129,6 +130,84 @@ def texture(context: click.Context, variant: str, report: Path | None, quiet: bo
         figures = benchmark.run(variant, progress=partial(show, "texture"))
     backend = "cuda" if "cuda" in variant else "llvm"
     _tell(context, backend, report, quiet, figures, variant=variant)
+
+
+@bench.command()
+@click.argument("image", type=EXISTING, metavar="IMAGE")
+@click.option("--basis", default="natural", show_default=True, metavar="NAME|FILE")
+@click.option(
+    "--condition",
+    "conditions",
+    multiple=True,
+    type=click.Choice(["cameras", "grazing", "hidden", "noise"]),
+    help="What the photos are like; may be repeated. By default all.",
+)
+@click.option("--steps", type=click.IntRange(min=2), default=200, show_default=True)
+@backend_option
+@report_option
+@click.option("--chart", type=ANY_PATH, help=".png, .svg or .pdf: PSNR over steps and seconds.")
+@click.option(
+    "--strip",
+    type=ANY_PATH,
+    metavar="S.png",
+    help="Film strips, one a condition: S-cameras.png and so on.",
+)
+@quiet_option
+@click.pass_context
+def inverse(
+    context: click.Context,
+    image: Path,
+    basis: str,
+    conditions: tuple[str, ...],
+    steps: int,
+    backend: str | None,
+    report: Path | None,
+    chart: Path | None,
+    strip: Path | None,
+    quiet: bool,
+) -> None:
+    """Recover a poster from photos by texels, Gaussians, coefficients of a basis, and the last two.
+
+    The image hangs on a wall in Mitsuba, and every method gets as many steps of gradient descent.
+    All conditions take some ten minutes.
+
+    \b
+    Examples:
+      eigengs-dr bench inverse photo.jpg --condition hidden --strip strip.png
+      eigengs-dr bench inverse cat.jpg --basis cats.npz --report inverse.json --chart inverse.png
+    """
+    from .images import SAVE_OPTIONS, load_image, save_image
+
+    names = tuple(dict.fromkeys(conditions)) or ("cameras", "grazing", "hidden", "noise")
+    strips = {name: strip.with_stem(f"{strip.stem}-{name}") for name in names} if strip else {}
+    check_outputs([report, chart, *strips.values()], [image])
+    for path, known in ((chart, (".png", ".svg", ".pdf")), (strip, tuple(SAVE_OPTIONS))):
+        if path and path.suffix.lower() not in known:
+            raise ValueError(f"{path}: the name must end in {' or '.join(known)}")
+    select(backend)
+    try:
+        from .bench import inverse as benchmark
+        from .bench import inverse_pictures as pictures
+
+        if chart:
+            import matplotlib.figure  # noqa: F401  asked for now, not after ten minutes
+    except ImportError as error:
+        raise ValueError(
+            f"bench inverse: {error}; pip install 'eigengs-dr[plugins,charts]'"
+        ) from error
+    with progress_bar(quiet) as show:
+        results = benchmark.run(basis, load_image(image), names, steps, backend, show)
+    for name, path in strips.items():
+        save_image(path, pictures.strip(results[name]))
+    if chart:
+        pictures.save_chart(chart, results)
+    settings = {"image": str(image), "basis": basis, "steps": steps}
+    if report:
+        traces = benchmark.traces_of(results)
+        figures = {**settings, **benchmark.figures_of(results), "traces": traces}
+        write_report(report, {**described(context, backend), **figures})
+    if not quiet:
+        click.echo(benchmark.table(results))
 
 
 def _tell(

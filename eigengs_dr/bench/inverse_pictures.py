@@ -1,0 +1,129 @@
+"""Charts and film strips of what `inverse` measured."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..atomic import replacing
+from ..color import to_coded
+from ..images import resampled
+
+if TYPE_CHECKING:
+    from .inverse import Image, Result
+
+TITLES = {
+    "texels1024": "1,024² texels",
+    "texels256": "256² texels",
+    "gaussians": "Gaussians from grey",
+    "coefficients": "coefficients",
+    "both": "coefficients, then Gaussians",
+}
+
+CAPTIONS = {
+    "cameras": "three cameras",
+    "grazing": "one grazing, blurred camera",
+    "hidden": "right half hidden",
+    "noise": "noise: 4 samples a pixel",
+}
+
+CELL = 112
+"""Side of a picture in a strip, in pixels."""
+
+LINE = 14
+"""Height of a line of text."""
+
+GAP = 4
+
+
+def save_chart(path: str | os.PathLike[str], results: dict[str, Result]) -> None:
+    """Draw PSNR over steps and over seconds, a column a condition.
+
+    Parameters
+    ----------
+    path : path-like
+        Ends in .png, .svg or .pdf.
+    results : dict of str to Result
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    from matplotlib.figure import Figure  # not pyplot, which looks for a screen
+
+    figure = Figure(figsize=(3.2 * len(results), 5.6), layout="constrained")
+    axes = figure.subplots(2, len(results), squeeze=False, sharey=True)
+    for column, (name, result) in zip(axes.T, results.items(), strict=True):
+        for method, trace in result.traces.items():
+            column[0].plot(trace.steps, trace.psnr_ycbcr, label=TITLES[method])
+            column[1].plot(trace.seconds, trace.psnr_ycbcr)
+        column[0].set_title(CAPTIONS[name], fontsize=10)
+        column[0].set_xscale("symlog", linthresh=1)
+        column[0].set_xlabel("steps")
+        column[1].set_xscale("log")
+        column[1].set_xlabel("seconds")
+        for axis in column:
+            axis.grid(alpha=0.3)
+    for row in axes:
+        row[0].set_ylabel("PSNR (YCbCr) / dB")
+    figure.legend(loc="outside lower center", ncols=len(TITLES), fontsize=9)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format=Path(path).suffix[1:], dpi=90)
+
+
+def strip(result: Result) -> Image:
+    """Draw a condition's film strip: the photos, then a row a method, a column a step.
+
+    Parameters
+    ----------
+    result : Result
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W, 3)
+        RGB; every picture above its PSNR in YCbCr, the truth in a last column.
+    """
+    rows = [_photos(result)]
+    for method, trace in result.traces.items():
+        by_step = dict(zip(trace.steps, trace.psnr_ycbcr, strict=True))
+        cells = [
+            _captioned(f"{step}: {by_step[step]:.1f} dB", picture)
+            for step, picture in trace.pictures.items()
+        ]
+        cells.append(_captioned("truth", result.truth))
+        rows.append(_titled(TITLES[method], np.concatenate(cells, axis=1)))
+    width = max(row.shape[1] for row in rows)
+    padded = [
+        np.pad(row, [(0, GAP), (0, width - row.shape[1]), (0, 0)], constant_values=1)
+        for row in rows
+    ]
+    return np.concatenate(padded).astype(np.float32)
+
+
+def _photos(result: Result) -> Any:
+    height, width = result.photos.shape[:2]
+    coded = to_coded(result.photos.clip(0, 1))
+    return _titled("photos", resampled(coded, round(CELL * width / height), CELL))
+
+
+def _captioned(text: str, picture: Any) -> Any:
+    """A picture of a strip above a line of text."""
+    scaled = resampled(picture, CELL, CELL)
+    cell = np.concatenate([scaled, _text(text, CELL)])
+    return np.pad(cell, [(0, 0), (0, GAP), (0, 0)], constant_values=1)
+
+
+def _titled(text: str, row: Any) -> Any:
+    return np.concatenate([_text(text, row.shape[1]), row])
+
+
+def _text(text: str, width: int) -> Any:
+    from PIL import Image, ImageDraw
+
+    line = Image.new("RGB", (width, LINE), "white")
+    ImageDraw.Draw(line).text((1, 1), text, fill="black")
+    return np.asarray(line).astype(np.float32) / 255
