@@ -207,12 +207,17 @@ def widen(shape: list, footprint: list) -> tuple[list, Any]:
         In (0, 1].
     """
     mean_x, mean_y, a, b, c = shape
+    fxx, fxy, fyy = footprint
     ia, ic = dr.rcp(a), dr.rcp(c)
     t = -b * ia * ic  # F^-1 = [[1/a, t], [0, 1/c]]
-    xx = dr.fma(ia, ia, dr.fma(t, t, footprint[0]))
-    xy = dr.fma(t, ic, footprint[1])
-    yy = dr.fma(ic, ic, footprint[2])
+    xy = dr.fma(t, ic, fxy)
+    yy = dr.fma(ic, ic, fyy)
+    # det(S + F) = det S + tr(adj(S) F) + det F, a sum of squares: the plain determinant loses all
+    # its digits for needles.
+    across = dr.fma(ic * ic, fxx, t * dr.fma(t, fyy, -2 * ic * fxy))
+    whole = ia * ic
+    added = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0) + dr.maximum(across, 0)
+    scale = dr.rsqrt(dr.fma(whole, whole, dr.fma(ia * ia, fyy, added)))
     new_c = dr.rsqrt(yy)
-    scale = dr.rsqrt(dr.fma(xx, yy, -(xy * xy)))
     scaled = new_c * scale
-    return [mean_x, mean_y, yy * scaled, -xy * scaled, new_c], ia * ic * scale
+    return [mean_x, mean_y, yy * scaled, -xy * scaled, new_c], whole * scale

@@ -7,6 +7,9 @@ inside a virtual call: the class below only hands arrays to the functions of `ei
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import drjit as dr
@@ -109,6 +112,7 @@ def gaussian_texture() -> type:
 
         # --- Lookups -----------------------------------------------------------------------------
 
+        @uncollected
         def eval(self, si: Any, active: Any = True) -> Any:
             color = self._color(si, active)
             if len(color) == 1 or mi.is_monochromatic:
@@ -122,9 +126,11 @@ def gaussian_texture() -> type:
                 )
             return upsample(mi.Color3f(*color), si.wavelengths, self.spectra)
 
+        @uncollected
         def eval_1(self, si: Any, active: Any = True) -> Any:
             return _luminance(self._color(si, active))
 
+        @uncollected
         def eval_3(self, si: Any, active: Any = True) -> Any:
             if self.channels != 3:
                 raise ValueError(
@@ -133,6 +139,7 @@ def gaussian_texture() -> type:
                 )
             return mi.Color3f(*self._color(si, active))
 
+        @uncollected
         def eval_1_grad(self, si: Any, active: Any = True) -> Any:
             (x, sx), (y, sy), active = self._point(si, active)
             terms = values_and_slopes((UNIT * self.cutoff) ** 2)
@@ -192,16 +199,19 @@ def gaussian_texture() -> type:
 
         # --- Sampling ----------------------------------------------------------------------------
 
+        @uncollected
         def sample_position(self, sample: Any, active: Any = True) -> tuple:
             cell, density, rest = self._sampled().sample(sample, active)
             return mi.Point2f((mi.Point2f(cell) + rest) / SURVEY), density * SURVEY**2
 
+        @uncollected
         def pdf_position(self, p: Any, active: Any = True) -> Any:
             inside = (p.x >= 0) & (p.x <= 1) & (p.y >= 0) & (p.y <= 1)
             cell = dr.minimum(mi.Point2u(dr.select(inside, p, 0) * SURVEY), SURVEY - 1)
             density = self._sampled().pdf(cell, active) * SURVEY**2
             return dr.select(inside, density, 0)
 
+        @uncollected
         def sample_spectrum(self, si: Any, sample: Any, active: Any = True) -> tuple:
             if not mi.is_spectral:
                 return mi.Color0f(), self.eval(si, active)
@@ -252,6 +262,26 @@ def gaussian_texture() -> type:
             )
 
     return GaussianTexture
+
+
+def uncollected(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Keep Python's garbage collector out of a lookup.
+
+    Mitsuba calls lookups while it records a program. Another scene that is freed in the midst of
+    that takes its textures out of the program, which then ends the process or reads freed memory.
+    """
+
+    @wraps(method)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return method(*args, **kwargs)
+        finally:
+            if collects:
+                gc.enable()
+
+    return call
 
 
 # --- Values --------------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import SIZE, covariances, few, random_scene
 from scipy.special import erf
 
 from eigengs_dr.arrays import types_in, types_of
@@ -16,6 +15,7 @@ from eigengs_dr.reference import render_exact
 from eigengs_dr.rendering import splat_values
 from eigengs_dr.sizes import sort_by_size
 from eigengs_dr.splat import SHAPE, UNIT, pack, widen
+from scenes import SIZE, covariances, few, random_scene
 
 CUTOFF = 5.0
 FINE = 4
@@ -146,6 +146,26 @@ class TestSumFiltered:
             # Where footprints reach over a border a share is missing: more than any lost splat.
             assert np.abs(found - total).max() < 0.1 * np.abs(scene.color).max()
 
+    @pytest.mark.parametrize("sign", [1, -1])
+    def test_runs_of_cells_follow_a_leaning_footprint(self, backend, sign):
+        """Far from borders every splat that a long, turned footprint reaches is found."""
+        size = (128, 96)
+        rng = np.random.default_rng(4)
+        scene = random_scene(4, 400, size)
+        scene = scene._replace(
+            mean=rng.uniform(0.3, 0.7, (400, 2)) * size, factor=np.tile([1.2, 0.3, 0.9], (400, 1))
+        )
+        covariance = np.array([[30.0, 27.0 * sign], [27.0 * sign, 30.0]])
+        points = some_points(60, size) * 0.2 + 0.4 * np.array(size)
+        spread = matrices(*scene.factor.T) + covariance
+        delta = points[:, None] - scene.mean
+        q = np.einsum("pni,nij,pnj->pn", delta, np.linalg.inv(spread), delta)
+        scale = np.sqrt(np.linalg.det(spread - covariance) / np.linalg.det(spread))
+        exact = (np.where(q <= 9, np.exp(-0.5 * q), 0) * scale) @ scene.color
+        for wrap in ("repeat", "mirror"):
+            found = stacked(filtered(scene.on(backend), wrap, points, covariance, 3.0))
+            np.testing.assert_allclose(found, exact, atol=2e-3)
+
     @pytest.mark.parametrize("k", [1, 3])
     def test_gradients_are_finite_differences(self, backend, k):
         """Points inside and at borders, so that both ways of summing are seen; in float64."""
@@ -195,6 +215,22 @@ class TestWiden:
         np.testing.assert_allclose(after, before + spread, rtol=1e-9, atol=1e-9)
         integrals_before, integrals_after = (np.sqrt(np.linalg.det(m)) for m in (before, after))
         np.testing.assert_allclose(np.array(amplitude) * integrals_after, integrals_before)
+
+    @pytest.mark.parametrize("spread", [(0, 0, 0), (0.05, 0.01, 0.08), (1, 0.3, 2)])
+    def test_needles_keep_their_digits(self, backend, spread):
+        """Lengths of up to 1,000 times the width, at any angle, in single precision."""
+        rng = np.random.default_rng(0)
+        a, c = np.exp(rng.uniform(np.log(1 / 2048), np.log(4), (2, 10_000)))
+        b = rng.uniform(-4, 4, 10_000)
+        shape = [np.zeros(10_000), np.zeros(10_000), a, b, c]
+        found = {}
+        for bits in ("", "64"):
+            Float = getattr(select(backend), "Float" + bits)
+            rows = [Float(np.asarray(v, np.float32)) for v in shape]
+            (*_, a1, b1, c1), amplitude = widen(rows, [Float(v) for v in spread])
+            found[bits] = [np.array(v) for v in (a1, b1, c1, amplitude)]
+        for single, double in zip(found[""], found["64"], strict=True):
+            np.testing.assert_allclose(single, double, rtol=1e-3, atol=1e-6)
 
 
 def matrices(a, b, c):

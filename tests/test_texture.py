@@ -3,6 +3,7 @@
 import drjit as dr
 import numpy as np
 import pytest
+
 from scenes import SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
@@ -378,6 +379,35 @@ class TestSampling:
         agree = np.isclose(found, np.array(density), rtol=1e-4)
         assert agree.mean() > 0.99  # some samples round to the edge of a cell
         assert (np.array(density) > 0).all()
+
+    def test_follows_the_parameters(self):
+        tex = texture(gaussians("linear"))
+        point = mi.Point2f(0.2, 0.2)
+        assert np.array(tex.pdf_position(point)) == pytest.approx(1, abs=0.3)
+        parameters = mi.traverse(tex)
+        bright = np.array(parameters["color"])
+        near = np.argsort(np.hypot(*(np.array(parameters["mean"]) - 0.8 * np.array(SIZE)).T))[:4]
+        bright[near] = 1
+        parameters["color"] = mi.TensorXf(bright)
+        parameters["background"] = mi.TensorXf(np.zeros(3, np.float32))
+        parameters.update()
+        assert np.array(tex.pdf_position(point)) < 0.5
+
+    def test_what_is_below_zero_is_not_sampled(self):
+        """Of a raw texture, whose values are not clamped."""
+        g = gaussians("linear")
+        g.color *= 0
+        g.background *= -1
+        density = np.array(texture(g, raw=True).pdf_position(mi.Point2f(0.3, 0.7)))
+        assert density == pytest.approx(1)
+        g = gaussians("linear", quiet=False)
+        g.background *= 0
+        g.color *= 2
+        tex = texture(g, raw=True)
+        dark = np.array(tex.eval_1(texel_centres())) < -0.5
+        density = np.array(tex.pdf_position(texel_centres().uv))
+        assert dark.any()
+        assert density[dark].max() < 0.1 * density.max()
 
     def test_outside_there_is_no_density(self):
         tex = texture(gaussians("linear"))

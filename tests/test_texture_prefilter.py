@@ -1,8 +1,11 @@
 """The prefilter in Mitsuba: footprints of the camera, against many samples a pixel."""
 
+import gc
+
 import drjit as dr
 import numpy as np
 import pytest
+
 from scenes import SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
@@ -162,3 +165,26 @@ class TestPlane:
         si = facing(t=1e4)
         si.uv = mi.Point2f(0.7, 0.1)
         np.testing.assert_allclose(np.array(tex.eval_1(si)), np.array(tex.mean()), atol=2e-3)
+
+
+def test_the_collector_stays_out_of_lookups():
+    """Scenes that are freed while another one is recorded end the process: see `uncollected`."""
+    seen = []
+    tex = texture(gaussians())
+    look = type(tex)._color
+
+    def spy(self, si, active):
+        seen.append(gc.isenabled())
+        return look(self, si, active)
+
+    type(tex)._color = spy
+    try:
+        assert gc.isenabled()
+        tex.eval(facing())
+        tex.eval_3(facing())
+        with pytest.raises(ValueError, match="three channels"):
+            texture(gaussians("data", channels=1)).eval_3(facing())
+        assert gc.isenabled()
+    finally:
+        type(tex)._color = look
+    assert seen.count(False) == 2
