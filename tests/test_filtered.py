@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import SIZE, covariances, few, random_scene
 from scipy.special import erf
 
 from eigengs_dr.arrays import types_in, types_of
@@ -15,7 +16,6 @@ from eigengs_dr.reference import render_exact
 from eigengs_dr.rendering import splat_values
 from eigengs_dr.sizes import sort_by_size
 from eigengs_dr.splat import SHAPE, UNIT, pack, widen
-from scenes import SIZE, covariances, few, random_scene
 
 CUTOFF = 5.0
 FINE = 4

@@ -6,7 +6,6 @@ import drjit as dr
 import numpy as np
 import pytest
 from click.testing import CliRunner
-
 from scenes import family, small_model
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")

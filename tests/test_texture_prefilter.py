@@ -5,7 +5,6 @@ import gc
 import drjit as dr
 import numpy as np
 import pytest
-
 from scenes import SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")

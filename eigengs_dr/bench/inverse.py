@@ -188,7 +188,7 @@ def recover(
             values.set_learning_rate({key: r * falling for key, r in unknown.rates.items()})
             shown = mi.render(scene, params=parameters, spp=SAMPLES, seed=step)
             error = dr.sum(dr.square(shown - photos), axis=None)
-            dr.backward(error + unknown.prior(values))
+            dr.backward(error + unknown.prior(values, dr.width(photos)))
             values.step()
             unknown.bound(values)
             unknown.put(values, parameters)

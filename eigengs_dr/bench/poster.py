@@ -41,6 +41,8 @@ class Condition(NamedTuple):
         Whether a board covers the right half of the poster.
     aperture : float
         Radius of the lens. Above 0, all of the poster is out of focus.
+    fov : float
+        Field of view in degrees.
     """
 
     cameras: tuple[tuple[float, float, float], ...] = (LEFT, FRONT, RIGHT)
@@ -48,11 +50,12 @@ class Condition(NamedTuple):
     samples: int = PHOTO_SAMPLES
     hidden: bool = False
     aperture: float = 0.0
+    fov: float = 36.0
 
 
 CONDITIONS = {
     "cameras": Condition(),
-    "grazing": Condition(cameras=(GRAZING,), side=96, aperture=0.08),
+    "grazing": Condition(cameras=(GRAZING,), side=72, aperture=0.08, fov=27.0),
     "hidden": Condition(hidden=True),
     "noise": Condition(samples=4),
 }
@@ -146,7 +149,7 @@ def _cameras(condition: Condition) -> dict[str, Any]:
     for number, place in enumerate(condition.cameras):
         batch[f"camera{number}"] = {
             "type": "thinlens" if condition.aperture else "perspective",
-            "fov": 36.0,
+            "fov": condition.fov,
             "to_world": mi.ScalarTransform4f().look_at(place, [0, 0, 0], [0, 1, 0]),
             "film": _film(side, side),
         }

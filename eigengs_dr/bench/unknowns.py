@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -41,9 +40,11 @@ ADAM_COEFFICIENTS = {"beta_2": 0.99, "beta_1": 0.7, "uniform": True}
 """Components are orthonormal, so that one rate fits all coefficients; a problem so well
 conditioned needs less momentum than 0.9, which overshoots."""
 
-PRIOR = 0.01
-"""Variance of what the components cannot show, in the photos: the weight of ``sum a^2 / lambda``
-against the sum of squared errors."""
+DAMPING = 5e-4
+"""Variance, of that of the first component, below which components count less and less."""
+
+PRIOR = 7e-7
+"""Weight of ``sum a^2 / lambda`` against the mean squared error of the photos."""
 
 PULL = 0.5
 """Weight of the squared distance of colours from those of the first stage."""
@@ -77,8 +78,8 @@ class Unknown:
         for key in self.rates:
             parameters[key] = values[key]
 
-    def prior(self, values: Any) -> Any:
-        """What is added to the sum of squared errors."""
+    def prior(self, values: Any, count: int) -> Any:
+        """What is added to the sum of squared errors of so many numbers."""
         return 0
 
     def bound(self, values: Any) -> None:
@@ -120,7 +121,7 @@ class Splats(Unknown):
         self.color = to_tensors(gaussians)["color"]
         self.rates = {f"{POSTER}.{name}": rate for name, rate in SPLAT_RATES.items()}
 
-    def prior(self, values: Any) -> Any:
+    def prior(self, values: Any, count: int) -> Any:
         """Squares of how far the colours went."""
         change = values[f"{POSTER}.color"] - self.color
         return self.pull * dr.sum(dr.square(change), axis=None)
@@ -141,22 +142,23 @@ class Coefficients(Unknown):
     def __init__(self, model: EigenGS, file: str | os.PathLike[str]) -> None:
         self.model = model
         self.texture = mi.load_dict({"type": "gaussian_texture", "model": str(file)})
-        largest = max(values.max() for values in model.eigenvalues)
-        # Relative to the first; what a channel lacks in components stays 0 whatever is here.
-        precisions = np.ones((len(model.components), max(model.components)), np.float32)
-        for row, values in zip(precisions, model.eigenvalues, strict=True):
-            row[: len(values)] = largest / np.maximum(values, 1e-6 * largest)
-        self.unit, self.precisions = math.sqrt(largest), mi.TensorXf(precisions)
+        variances = np.zeros((len(model.components), max(model.components)))
+        for row, values in zip(variances, model.eigenvalues, strict=True):
+            row[: len(values)] = values
+        largest = variances.max()
+        damped = variances + DAMPING * largest
+        self.scale = mi.TensorXf(np.sqrt(largest * variances / damped))
+        self.precisions = mi.TensorXf(largest / damped)
         self.key = f"{POSTER}.coefficients"
         self.rates = {self.key: COEFFICIENT_RATE}
 
     def put(self, values: Any, parameters: Any) -> None:
         """Write the coefficients into the scene; gradients flow back to the values."""
-        parameters[self.key] = values[self.key] * self.unit
+        parameters[self.key] = values[self.key] * self.scale
 
-    def prior(self, values: Any) -> Any:
+    def prior(self, values: Any, count: int) -> Any:
         """Minus the logarithm of the probability of the coefficients, up to a factor."""
-        return PRIOR * dr.sum(self.precisions * dr.square(values[self.key]), axis=None)
+        return PRIOR * count * dr.sum(self.precisions * dr.square(values[self.key]), axis=None)
 
     def gaussians(self) -> Gaussians:
         """The Gaussians that the coefficients stand for now."""
