@@ -35,7 +35,7 @@ def run_python(code, **environment):
         capture_output=True,
         text=True,
         check=False,
-        timeout=100,
+        timeout=250,  # a library that is read for the first time may take minutes
     )
 
 
