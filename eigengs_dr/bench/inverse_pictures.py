@@ -30,7 +30,7 @@ CAPTIONS = {
     "noise": "noise: 4 samples a pixel",
 }
 
-CELL = 112
+CELL = 96
 """Side of a picture in a strip, in pixels."""
 
 LINE = 14
@@ -60,7 +60,8 @@ def save_chart(path: str | os.PathLike[str], results: dict[str, Result]) -> None
     for column, (name, result) in zip(axes.T, results.items(), strict=True):
         for method, trace in result.traces.items():
             column[0].plot(trace.steps, trace.psnr_ycbcr, label=TITLES[method])
-            column[1].plot(trace.seconds, trace.psnr_ycbcr)
+            # The start, at 0 seconds, has no place on a logarithmic scale.
+            column[1].plot(trace.seconds[1:], trace.psnr_ycbcr[1:])
         column[0].set_title(CAPTIONS[name], fontsize=10)
         column[0].set_xscale("symlog", linthresh=1)
         column[0].set_xlabel("steps")
@@ -70,7 +71,8 @@ def save_chart(path: str | os.PathLike[str], results: dict[str, Result]) -> None
             axis.grid(alpha=0.3)
     for row in axes:
         row[0].set_ylabel("PSNR (YCbCr) / dB")
-    figure.legend(loc="outside lower center", ncols=len(TITLES), fontsize=9)
+    lines = axes[0, 0].get_lines()
+    figure.legend(handles=lines, loc="outside lower center", ncols=len(lines), fontsize=9)
     with replacing(path) as temporary:
         figure.savefig(temporary, format=Path(path).suffix[1:], dpi=90)
 

@@ -36,14 +36,14 @@ that no photo shows well."""
 ADAM_SPLATS = {"beta_2": 0.99, "epsilon": 0.03}
 """Splats do best with a rate for each, but one for which smaller gradients than this are noise."""
 
-ADAM_COEFFICIENTS = {"beta_2": 0.99, "beta_1": 0.7, "uniform": True}
+ADAM_COEFFICIENTS = {"beta_1": 0.7, "uniform": True}
 """Components are orthonormal, so that one rate fits all coefficients; a problem so well
 conditioned needs less momentum than 0.9, which overshoots."""
 
 DAMPING = 5e-4
 """Variance, of that of the first component, below which components count less and less."""
 
-PRIOR = 7e-7
+PRIOR = 2e-6
 """Weight of ``sum a^2 / lambda`` against the mean squared error of the photos."""
 
 PULL = 0.5
@@ -118,12 +118,12 @@ class Splats(Unknown):
     def __init__(self, gaussians: Gaussians, pull: float = 0.0) -> None:
         self.texture = mi.load_dict(texture_of(gaussians))
         self.start, self.pull = gaussians, pull
-        self.color = to_tensors(gaussians)["color"]
+        self.colors = mi.TensorXf(gaussians.to_arrays()["color"])
         self.rates = {f"{POSTER}.{name}": rate for name, rate in SPLAT_RATES.items()}
 
     def prior(self, values: Any, count: int) -> Any:
         """Squares of how far the colours went."""
-        change = values[f"{POSTER}.color"] - self.color
+        change = values[f"{POSTER}.color"] - self.colors
         return self.pull * dr.sum(dr.square(change), axis=None)
 
     def bound(self, values: Any) -> None:
