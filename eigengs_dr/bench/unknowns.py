@@ -14,7 +14,6 @@ from ..color import rgb_to_ycbcr, to_linear
 from ..eigengs import EigenGS
 from ..gaussians import Gaussians
 from ..plugins import keep_in_bounds, texture_of
-from ..tensors import to_tensors
 from .poster import POSTER, bitmap
 
 GREY = 0.5
