@@ -82,7 +82,7 @@ def sort_by_size(shape: list, width: int, height: int, cutoff: float, wrap: str)
     order, counts, table, first = [], [], [], 0
     for k in np.unique(rank[drawn]):
         own = np.flatnonzero(drawn & (rank == k))
-        largest = float(size[own].max())
+        largest = min(float(size[own].max()), 1e12)  # its square has to be a number
         # What is farther from the image leaves nothing in it.
         side = max(largest, max(width, height) / 1024)
         origin = -cutoff * largest

@@ -74,8 +74,9 @@ def from_tensors(tensors: Mapping[str, Any], like: Gaussians) -> Gaussians:
     >>> brighter = eg.from_tensors({"color": 2 * eg.to_tensors(g)["color"]}, like=g)
     """
     given = {name: tensors[name] for name in FIELDS if name in tensors}
-    counts = {given[n].shape[0] for n in given if n != "background" and len(given[n].shape)}
-    count = max(counts, default=len(like))
+    counts = [given[name].shape[0] for name in ("mean", "factor", "color") if name in given]
+    # Splats may be more or fewer than in `like` where nothing of it is left.
+    count = max(counts) if len(counts) == 3 else len(like)
     for name, tensor in given.items():
         columns = FIELDS[name] or like.channels
         expected = (columns,) if name == "background" else (count, columns)

@@ -90,11 +90,12 @@ def gaussian_texture() -> type:
             gaussians = self.source.gaussians()
             rows, background = splat_values(gaussians)
             shape, color = rows[:SHAPE], [_finite(c) for c in rows[SHAPE:]]
+            # First what may refuse: old lists of new splats would read beyond their end.
+            if not keys or any(key in self.source.shaping for key in keys):
+                self._list([dr.detach(s) for s in shape])
             self.background = [_finite(b) for b in background]
             self.packed = pack([*shape, *color])
             dr.eval(self.packed, self.background)
-            if not keys or any(key in self.source.shaping for key in keys):
-                self._list([dr.detach(s) for s in shape])
             if self.angle:
                 number = SHAPE + self.channels
                 self.lattice = build_lattice(self.sizes, self.packed, number, self.cutoff)
@@ -106,9 +107,11 @@ def gaussian_texture() -> type:
             """List the splats near every cell."""
             size = (self.width, self.height)
             radius = UNIT * self.cutoff
-            self.cells = list_cells(shape, *size, radius, cell_side(*size, dr.width(shape)))
+            side = cell_side(*size, dr.width(shape))
+            cells = list_cells(shape, *size, radius, side)
             if self.angle:
                 self.sizes = sort_by_size(shape, *size, self.cutoff, self.wrap)
+            self.cells = cells
 
         # --- Lookups -----------------------------------------------------------------------------
 

@@ -264,7 +264,7 @@ class TestBoundedCovariance:
         elif min(long, short) < WIDEST / 1.001:
             assert not blind[0]
             keys = ((0, 0), (0, 1), (1, 1))
-            np.testing.assert_allclose(found[0], [expected[k] for k in keys], atol=1e-5)
+            np.testing.assert_allclose(found[0], [expected[k] for k in keys], atol=2e-3)
 
     def test_what_is_not_finite_is_blind(self, backend):
         found, blind = self.bounded(

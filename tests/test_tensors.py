@@ -80,3 +80,11 @@ def test_numbers_of_splats_that_differ(backend):
     tensors["mean"] = types_of(g.mean).Tensor(np.ones((5, 2), np.float32))
     with pytest.raises(ValueError, match=r"mean has shape \(5, 2\), expected \(24, 2\)"):
         eg.from_tensors(tensors, like=g)
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_colours_of_fewer_splats_than_there_are(backend, count):
+    g = random_scene().on(backend)
+    colors = types_of(g.mean).Tensor(np.ones((count, 3), np.float32))
+    with pytest.raises(ValueError, match=rf"color has shape \({count}, 3\), expected \(24, 3\)"):
+        eg.from_tensors({"color": colors}, like=g)

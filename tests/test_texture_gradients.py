@@ -141,7 +141,7 @@ class TestClamp:
 
 class TestBroken:
     @pytest.mark.parametrize("name", PARAMETERS)
-    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, -5.0, 1e30])
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, -5.0, 1e30, 1e-20])
     @pytest.mark.parametrize("prefilter", [0.0, 0.01])
     def test_parameters_leave_a_finite_picture(self, name, value, prefilter):
         tex = texture(gaussians(), prefilter=prefilter)
@@ -158,6 +158,13 @@ class TestBroken:
         assert np.isfinite(found).all()
         assert found.min() >= 0
         assert found.max() <= 1
+
+    @pytest.mark.parametrize("factor", [[1e-20, 0, 1], [1e-30, 0, 1e-30], [1, 1e20, 1]])
+    def test_a_set_of_giants_loads(self, factor):
+        g = eg.Gaussians.from_arrays(
+            [[8, 8]], [factor], [[0.5] * 3], size=(16, 16), space="linear", backend="llvm"
+        )
+        assert np.isfinite(np.array(texture(g, prefilter=0.01).eval(at(0.3, 0.4)))).all()
 
     def test_one_broken_splat_is_as_none(self):
         scene = random_scene(0)
