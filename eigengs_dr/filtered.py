@@ -177,7 +177,8 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
         n = n + 1
         ran = n >= end
         row = dr.select(ran, row + 1, row)
-        k, i, j, fresh = _advance(ran & (row > stop), k, i, j, sizes.count, left, right)
+        fresh = ran & (row > stop)
+        k, i, j = _advance(fresh, k, i, j, sizes.count, left, right)
         first, last = rows(i, j, k)
         row, stop = dr.select(fresh, first, row), dr.select(fresh, last, stop)
         begin, new_end = run(i, j, k, row, ran & (row <= stop) & (j <= bottom))
@@ -207,9 +208,10 @@ def _advance(go: Any, k: Any, i: Any, j: Any, sizes: int, left: Any, right: Any)
     over = k >= sizes
     k, i = dr.select(over, 0, k), dr.select(over, i + 1, i)
     over = i > right
-    return k, dr.select(over, left, i), dr.select(over, j + 1, j), go
+    return k, dr.select(over, left, i), dr.select(over, j + 1, j)
 
 
 def _row_of(types: Any, sizes: Sizes, k: Any) -> list:
     """Row k of the table of sizes."""
-    return gather_run(types, sizes.table, types.UInt(k), 8, True)[:6]
+    row = gather_run(types, sizes.table, types.UInt(k), 8, True)  # 8: packets of a power of two
+    return row[:6]

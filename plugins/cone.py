@@ -16,7 +16,8 @@ PIXEL = 0.4
 def pixel_angle(sensor: Any) -> float:
     """Angle that a pixel in the middle of a perspective sensor's image subtends.
 
-    It is what the property ``prefilter`` of a texture takes: ``2 tan(x_fov / 2) / width``.
+    It is what the property ``prefilter`` of a texture takes: ``2 tan(x_fov / 2) / width``. Rays
+    start at the near clip plane, so keep ``near_clip`` small against the distance of the texture.
 
     Parameters
     ----------
@@ -48,7 +49,8 @@ def metric(si: Any, inverse: tuple, angle: float) -> tuple[list, Any]:
 
     Around a ray along d a pixel's cone has the radius ``r = PIXEL angle t``. A step ``J (du, dv)``,
     ``J = [dp_du dp_dv]``, is seen as ``P J (du, dv)`` with ``P = 1 - d d^T``, so the inverse
-    covariance is ``J^T P J / r^2``.
+    covariance is ``J^T P J / r^2``. t counts from where the ray starts: the near clip plane, or the
+    last bounce, behind which a texture is seen sharper than it has to be.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ from eigengs_dr.sizes import sort_by_size
 from eigengs_dr.splat import SHAPE, UNIT, pack
 
 from .cone import metric
-from .properties import affine, angle, cutoff, source_of, wrap_mode
+from .properties import affine, angle, cutoff, raw, source_of, wrap_mode
 from .spectrum import upload_table, upsample
 
 SURVEY = 128
@@ -41,6 +41,9 @@ SURVEY = 128
 
 DARKEST = 0.02
 """Least density with which a point is sampled, relative to the mean."""
+
+INSIDE = 0.01
+"""Pixels by which clamped points stay away from the border."""
 
 
 def gaussian_texture() -> type:
@@ -65,7 +68,8 @@ def gaussian_texture() -> type:
             Values as they are: neither decoded nor clamped.
         prefilter : float
             Angle of a pixel in radians (see `eigengs_dr.plugins.pixel_angle`): lookups then see
-            the texture through the pixel's footprint. 0, the default, looks at points.
+            the texture through the pixel's footprint. 0, the default, looks at points. Slopes
+            of bump maps (`eval_1_grad`) are those at points.
         cutoff : float
             Standard deviations after which a splat ends; 3 by default, as for `fit`.
         """
@@ -73,7 +77,7 @@ def gaussian_texture() -> type:
         def __init__(self, props: Any) -> None:
             super().__init__(props)
             self.source = source_of(props)
-            self.raw = bool(props.get("raw", False))
+            self.raw = raw(props)
             self.cutoff = cutoff(props)
             self.angle = angle(props)
             self.wrap = wrap_mode(props)
@@ -160,21 +164,26 @@ def gaussian_texture() -> type:
             """Look the channels up, decoded and clamped unless `raw`."""
             (x, sx), (y, sy), active = self._point(si, active)
             if self.angle:
-                sums = self._filtered(si, x, y, sx * sy, active)
+                sums = self._filtered(si, (x, sx), (y, sy), active)
             else:
                 number, terms = SHAPE + self.channels, values((UNIT * self.cutoff) ** 2)
                 sums = sum_near(self.cells, self.packed, number, x, y, active, terms, self.channels)
             sums = [s + b for s, b in zip(sums, self.background, strict=True)]
             return [dr.select(active, _shown(self, s), 0) for s in sums]
 
-        def _filtered(self, si: Any, x: Any, y: Any, turn: Any, active: Any) -> list:
-            """Sum what the footprint of the pixel sees; `turn` is the sign that folding gives."""
-            w, h = self.width, self.height
+        def _filtered(self, si: Any, column: tuple, row: tuple, active: Any) -> list:
+            """Sum what the footprint of the pixel sees around a point, given as by `fold`."""
+            # With the slopes of folding, a footprint turns where the image is mirrored, and has no
+            # width along the axis on which what lies outside is all like the border.
+            (x, sx), (y, sy) = column, row
+            sx, sy = sx * self.width, sy * self.height
+            if self.wrap == "clamp":  # one without width would count half on a border
+                x, y = dr.clip(x, INSIDE, self.width - INSIDE), dr.clip(y, INSIDE, self.height - INSIDE)
             inverse, valid = metric(si, self.from_uv, self.angle)
             unit, blind = bounded_covariance(inverse)
-            sizes = (w * w, w * h * turn, h * h)
+            sizes = (sx * sx, sx * sy, sy * sy)
             footprint = [dr.select(valid, f * s, 0) for f, s in zip(unit, sizes, strict=True)]
-            blind &= valid
+            blind &= valid & (sx * sy != 0)
             distant = is_distant(self.lattice, footprint)
             near = sum_filtered(
                 self.sizes,
@@ -258,7 +267,7 @@ def gaussian_texture() -> type:
 
         def to_string(self) -> str:
             return (
-                f"GaussianTexture[\n  splats = {dr.width(self.packed) // 8},\n  resolution = "
+                f"GaussianTexture[\n  splats = {len(self.source.start)},\n  resolution = "
                 f"[{self.width}, {self.height}],\n  space = {self.space},\n  raw = {self.raw},\n"
                 f"  wrap_mode = {self.wrap},\n  prefilter = {self.angle:g},\n"
                 f"  cutoff = {self.cutoff:g}\n]"

@@ -117,7 +117,10 @@ class FromSet:
         ValueError
             If they do not fit each other.
         """
-        return from_tensors(self.tensors, self.start)
+        try:
+            return from_tensors(self.tensors, self.start)
+        except ValueError as error:
+            raise ValueError(f"gaussian_texture: {error}") from error
 
 
 class FromModel:
@@ -163,10 +166,9 @@ class FromModel:
         colors, background = [], []
         splat, last = dr.arange(types.UInt, count), types.UInt(count)
         for c, weights in enumerate(self.weights):
-            row = mi.TensorXf(
-                dr.gather(types.Float, self.coefficients.array, _run(c, expected[1])),
-                (expected[1], 1),
-            )
+            row = dr.gather(types.Float, self.coefficients.array, _run(c, expected[1]))
+            # As a step may leave what is not finite, which would also come through zero weights.
+            row = mi.TensorXf(dr.select(dr.isfinite(row), row, 0), (expected[1], 1))
             change = (weights @ row).array
             colors.append(start.color[c] + dr.gather(types.Float, change, splat))
             background.append(start.background[c] + dr.gather(types.Float, change, last))

@@ -37,7 +37,7 @@ def source_of(props: Any) -> FromSet | FromModel:
     backend = "cuda" if "cuda" in mi.variant() else "llvm"
     if given[0] == "model":
         model = EigenGS.load(_path(props, "model"), backend)
-        return FromModel(model, props.get("coefficients", None))
+        return FromModel(model, _coefficients(props))
     if given[0] == "filename":
         gaussians = Gaussians.load(_path(props, "filename"), backend)
     else:
@@ -49,11 +49,24 @@ def source_of(props: Any) -> FromSet | FromModel:
     return FromSet(gaussians)
 
 
+def _coefficients(props: Any) -> Any:
+    """Read ``coefficients``; None, for those of the mean image, where there are none."""
+    if "coefficients" not in props:
+        return None
+    found = np.array(props["coefficients"])
+    if found.dtype.kind not in "fiu" or not np.isfinite(found).all():
+        raise ValueError("gaussian_texture: coefficients has values that are not finite")
+    return found.astype(np.float32)
+
+
 def _from_arrays(props: Any, backend: str) -> Gaussians:
     """Read a set from the properties that `texture_of` wrote."""
     missing = [key for key in (*FIELDS, "width", "height", "space") if key not in props]
     if missing:
         raise ValueError(f"gaussian_texture: {missing[0]} is missing; see texture_of")
+    for key in ("width", "height"):
+        if not isinstance(props[key], int):
+            raise ValueError(f"gaussian_texture: {key} is {props[key]!r}; it must be an integer")
     if props["space"] not in SPACES:
         raise ValueError(f"gaussian_texture: space {props['space']!r} is not in {SPACES}")
     mean, factor, color, background = (np.array(props[key]) for key in FIELDS)
@@ -73,9 +86,24 @@ def _path(props: Any, key: str) -> str:
     return str(mi.file_resolver().resolve(props[key]))
 
 
+def raw(props: Any) -> bool:
+    """Read ``raw``: whether values are given as they are."""
+    value = props.get("raw", False)
+    if not isinstance(value, bool):
+        raise ValueError(f"gaussian_texture: raw is {value!r}; it must be a boolean")
+    return value
+
+
+def _number(props: Any, key: str, default: float) -> float:
+    value = props.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"gaussian_texture: {key} is {value!r}; it must be a number")
+    return float(value)
+
+
 def cutoff(props: Any) -> float:
     """Read ``cutoff``: standard deviations after which a splat ends."""
-    value = float(props.get("cutoff", CUTOFF))
+    value = _number(props, "cutoff", CUTOFF)
     if not 0 < value <= WIDEST_CUTOFF:
         raise ValueError(
             f"gaussian_texture: cutoff is {value}; it must be above 0 and at most {WIDEST_CUTOFF:g}"
@@ -85,7 +113,7 @@ def cutoff(props: Any) -> float:
 
 def angle(props: Any) -> float:
     """Read ``prefilter``: the angle of a pixel in radians, 0 for none."""
-    value = float(props.get("prefilter", 0.0))
+    value = _number(props, "prefilter", 0.0)
     if not 0 <= value < 1:
         raise ValueError(
             f"gaussian_texture: prefilter is {value}; it is the angle of a pixel in radians, "
@@ -107,9 +135,12 @@ def wrap_mode(props: Any) -> str:
 def affine(props: Any) -> tuple[tuple, tuple]:
     """Read ``to_uv``: its rows (m00, m01, translation), and the inverse of its linear part."""
     transform = props["to_uv"] if "to_uv" in props else mi.ScalarTransform4f()
+    if not hasattr(transform, "matrix"):
+        raise ValueError(f"gaussian_texture: to_uv is {transform!r}; it must be a transform")
     matrix = np.array(transform.matrix, np.float64)
     linear = matrix[:2, :2]
-    if not np.isfinite(matrix).all() or abs(np.linalg.det(linear)) < 1e-12:
+    area, size = abs(np.linalg.det(linear)), np.square(linear).sum()
+    if not (np.isfinite(matrix).all() and area > 1e-9 * size):
         raise ValueError("gaussian_texture: to_uv maps the plane to a line; it must be invertible")
     rows = [[*row[:2], row[-1]] for row in matrix[:2].tolist()]
     return (tuple(rows[0]), tuple(rows[1])), tuple(np.linalg.inv(linear).ravel().tolist())

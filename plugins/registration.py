@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import mitsuba as mi
 
 from .gaussian_texture import gaussian_texture
-
-_registered: set[str] = set()
 
 
 def register_plugins() -> None:
@@ -26,13 +26,16 @@ def register_plugins() -> None:
     >>> mi.set_variant("llvm_ad_rgb")
     >>> eg.register_plugins()
     """
-    if not _registered:
-        mi.detail.add_variant_callback(lambda old, new: _register(new))
-        _registered.add("")
-    _register(mi.variant())
+    _follow()
+    if mi.variant():
+        _register(mi.variant())
 
 
-def _register(variant: str | None) -> None:
-    if variant and variant not in _registered:
-        mi.register_texture("gaussian_texture", gaussian_texture())
-        _registered.add(variant)
+@cache
+def _follow() -> None:
+    mi.detail.add_variant_callback(lambda old, new: _register(new))
+
+
+@cache
+def _register(variant: str) -> None:
+    mi.register_texture("gaussian_texture", gaussian_texture())

@@ -98,6 +98,38 @@ class TestSumFiltered:
         assert error[~corner].max() < 0.03
         assert error.mean() < 0.005
 
+    @pytest.mark.parametrize("lean", [1, -1])
+    def test_lists_turn_with_the_mirror(self, backend, lean):
+        """Small splats, seen over a border through a footprint that is long, thin and slanted."""
+        scene = random_scene(5, 200)
+        scene = scene._replace(factor=np.tile([1.2, 0.0, 1.2], (200, 1)))
+        covariance = np.array([[9.0, 8.7 * lean], [8.7 * lean, 9.0]])
+        points = some_points()
+        points[:, 0] = np.where(points[:, 0] < SIZE[0] / 2, 0.5, SIZE[0] - 0.5)
+        points[:, 1] = 8 + (points[:, 1] - 8) % (SIZE[1] - 16)
+        exact = brute_force(scene, "mirror", points, covariance)
+        found = stacked(filtered(scene.on(backend), "mirror", points, covariance))
+        error = np.abs(found + scene.background - exact)
+        assert np.abs(exact - exact.mean(axis=0)).max() > 0.05
+        assert error.mean() < 0.005
+        assert error.max() < 0.03
+
+    def test_splats_outside_of_the_image_are_seen_over_its_border(self, backend):
+        """Up to the last cells of the table; a footprint next to nothing sees the sum itself."""
+        scene, rng = random_scene(6, 60), np.random.default_rng(1)
+        mean = scene.mean.copy()
+        mean[:30, 0] = SIZE[0] + rng.uniform(2, 9, 30)
+        mean[30:, 1] = SIZE[1] + rng.uniform(2, 9, 30)
+        scene = scene._replace(mean=mean, factor=np.tile([0.5, 0.0, 0.5], (60, 1)))
+        points = some_points()
+        points[:30, 0], points[30:, 1] = SIZE[0] - 0.05, SIZE[1] - 0.05
+        delta = points[:, None] - scene.mean
+        distance = 0.5 * np.hypot(delta[..., 0], delta[..., 1])
+        exact = np.where(distance <= CUTOFF, np.exp(-0.5 * distance**2), 0) @ scene.color
+        found = stacked(filtered(scene.on(backend), "mirror", points, np.diag([0.01, 0.01])))
+        assert np.abs(exact).max() > 0.1
+        np.testing.assert_allclose(found, exact, atol=0.05 * np.abs(exact).max())
+
     def test_far_from_borders_it_is_exact(self, backend):
         scene = random_scene(2)
         scene = scene._replace(mean=scene.mean % np.array(SIZE) * 0.2 + 0.4 * np.array(SIZE))

@@ -512,6 +512,27 @@ def test_a_ramp_of_light_needs_no_more_than_a_few_splats(backend):
     np.testing.assert_allclose(columns, light[0, :, 0], atol=4e-3)
 
 
+def test_linear_light_places_by_what_one_sees(backend):
+    """As many splats in the dark as a fit of the coded picture has there."""
+    placed = [
+        fit(picture(), SPLATS, 0, color=color, backend=backend).gaussians.to_arrays()
+        for color in ("linear", "rgb")
+    ]
+    np.testing.assert_array_equal(placed[0]["mean"], placed[1]["mean"])
+    np.testing.assert_array_equal(placed[0]["factor"], placed[1]["factor"])
+
+
+def test_linear_light_weighs_errors_in_the_dark(backend, monkeypatch):
+    """Without weights, what shows there after coding would be worse."""
+    dark = picture() * np.linspace(0.05, 1, SIDE, dtype=np.float32)[:, None]
+    shown = []
+    for darkness in (fitting.DARKNESS, 0.0):
+        monkeypatch.setattr(fitting, "DARKNESS", darkness)
+        image = fit(dark, SPLATS, 60, color="linear", backend=backend).image
+        shown.append(np.square(image - dark)[: SIDE // 3].mean())
+    assert shown[0] < 0.85 * shown[1]
+
+
 def test_negative_light_is_black(backend):
     scene = random_scene(0, SPLATS, (SIDE, SIDE))
     gaussians = scene._replace(background=np.full(3, -0.5)).on(backend, space="linear")

@@ -1,5 +1,8 @@
 """The texture in Mitsuba: values, wrapping, colour, slots of scenes, sampling, mistakes."""
 
+import subprocess
+import sys
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -440,6 +443,11 @@ class TestMistakes:
             ({"prefilter": -1.0}, "prefilter is -1.0; it is the angle of a pixel"),
             ({"prefiltre": 1.0}, "prefiltre"),
             ({"space": "cmyk"}, "space 'cmyk'"),
+            ({"raw": "false"}, "raw is 'false'; it must be a boolean"),
+            ({"cutoff": "wide"}, "cutoff is 'wide'; it must be a number"),
+            ({"prefilter": True}, "prefilter is True; it must be a number"),
+            ({"width": 31.5}, "width is 31.5; it must be an integer"),
+            ({"to_uv": 2.0}, "to_uv is 2.0; it must be a transform"),
         ],
     )
     def test_of_properties(self, properties, message):
@@ -449,6 +457,11 @@ class TestMistakes:
     def test_a_transform_that_is_flat(self):
         with pytest.raises(RuntimeError, match="to_uv maps the plane to a line"):
             texture(gaussians(), to_uv=mi.ScalarTransform4f(np.diag([1.0, 0, 1, 1])))
+
+    def test_a_small_transform_is_not_flat(self):
+        tiny = mi.ScalarTransform4f().scale([1e-7, 1e-7, 1])
+        found = texture(gaussians(), to_uv=tiny).eval(at(0.5, 0.5))
+        np.testing.assert_allclose(found, texture(gaussians()).eval(at(5e-8, 5e-8)), atol=1e-5)
 
     @pytest.mark.parametrize("channels", [2, 4])
     def test_a_set_of_other_channels(self, channels):
@@ -490,7 +503,33 @@ class TestMistakes:
             parameters.update()
 
 
-def test_registering_again_changes_nothing():
-    eg.register_plugins()
-    eg.register_plugins()
-    texture(gaussians())
+class TestFound:
+    def test_a_file_beside_the_scene(self, tmp_path, monkeypatch):
+        gaussians().save(tmp_path / "x.npz")
+        (tmp_path / "scene.xml").write_text(
+            '<scene version="3.0.0"><shape type="rectangle"><bsdf type="diffuse">'
+            '<texture type="gaussian_texture" name="reflectance">'
+            '<string name="filename" value="x.npz"/></texture></bsdf></shape></scene>'
+        )
+        monkeypatch.chdir("/")
+        scene = mi.load_file(str(tmp_path / "scene.xml"))
+        assert any(key.endswith("reflectance.mean") for key, _ in mi.traverse(scene))
+
+    def test_registering_again_keeps_the_class(self):
+        before = type(texture(gaussians()))
+        eg.register_plugins()
+        assert type(texture(gaussians())) is before
+
+    def test_registered_before_there_is_a_variant(self):
+        """In a process of its own, in which none was set yet."""
+        program = (
+            "import eigengs_dr as eg, mitsuba as mi\n"
+            "eg.register_plugins()\n"
+            "mi.set_variant('llvm_ad_rgb')\n"
+            "try:\n"
+            "    mi.load_dict({'type': 'gaussian_texture'})\n"
+            "except RuntimeError as error:\n"
+            "    print(error)\n"
+        )
+        found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+        assert "give one of filename" in found.stdout, found.stderr

@@ -264,6 +264,21 @@ class TestModel:
                 }
             )
 
+    @pytest.mark.parametrize("value", [np.nan, np.inf])
+    def test_coefficients_that_are_not_finite(self, saved, value):
+        path, model = saved
+        given = {"type": "gaussian_texture", "model": path}
+        broken = np.zeros((3, max(model.components)), np.float32)
+        broken[:, -1] = value
+        with pytest.raises(RuntimeError, match="coefficients has values that are not finite"):
+            mi.load_dict({**given, "coefficients": mi.TensorXf(broken)})
+        tex = mi.load_dict(given)
+        expected = np.array(tex.eval(texel_centres()))
+        parameters = mi.traverse(tex)
+        parameters["coefficients"] = mi.TensorXf(broken)  # as a step of an optimiser may leave
+        parameters.update()
+        np.testing.assert_array_equal(np.array(tex.eval(texel_centres())), expected)
+
     def test_a_set_is_no_model(self, tmp_path):
         gaussians().save(tmp_path / "x.npz")
         with pytest.raises(RuntimeError, match=r"x\.npz"):

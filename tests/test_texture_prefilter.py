@@ -9,7 +9,7 @@ from scenes import SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 
-from test_texture import gaussians, texture  # noqa: E402
+from test_texture import at, gaussians, texture  # noqa: E402
 from test_texture import variant as variant  # noqa: E402
 
 from eigengs_dr.footprints import WIDEST, bounded_covariance  # noqa: E402
@@ -82,6 +82,14 @@ class TestCone:
     def test_follows_to_uv(self):
         width, _, _ = seen(facing(), 0.001, (1 / 3, 0.0, 0.0, 1.0))
         np.testing.assert_allclose(width.ravel(), [PIXEL * 0.03, PIXEL * 0.01], rtol=1e-2)
+
+    def test_follows_a_turn_of_to_uv(self):
+        """Against the plain product of matrices, for a transform that is no scale."""
+        si, linear = facing(0.8), np.array([[0.6, 0.9], [-0.3, 1.1]])
+        rows, _ = metric(si, tuple(np.linalg.inv(linear).ravel()), 0.01)
+        covariance = linear @ np.diag([1, 1 / np.cos(0.8)]) ** 2 @ linear.T * (PIXEL * 0.1) ** 2
+        expected = np.linalg.inv(covariance)[[0, 0, 1], [0, 1, 1]]
+        np.testing.assert_allclose(np.ravel(rows), expected, rtol=1e-3)
 
     def test_at_grazing_angles_it_stays_bounded(self):
         width, valid, _ = seen(facing(np.pi / 2 - 1e-6), 0.001)
@@ -157,6 +165,24 @@ class TestPlane:
         ]
         inside = np.abs(v.ravel() - 0.5) < 0.4
         np.testing.assert_allclose(found[0][:, inside], found[1][:, inside], atol=2e-3)
+
+    @pytest.mark.parametrize("angle", [0.05, 0.3, 0.9])
+    @pytest.mark.parametrize("outside", ["v", "both"])
+    def test_clamped_outside_it_sees_the_border(self, angle, outside):
+        """Blurred along the border, not with what lies inside of it."""
+        g = gaussians("linear")
+        g.color *= 3
+        width = PIXEL * angle / 3
+        along = 0.5 + width * np.linspace(-3, 3, 61) if outside == "v" else np.array([1.7])
+        weight = np.exp(-0.5 * np.linspace(-3, 3, len(along)) ** 2)
+        mirrored = 1 - np.abs(1 - along % 2) if outside == "v" else along
+        border = texture(g, wrap_mode="clamp").eval(at(mi.Float(np.float32(mirrored)), 1.4))
+        expected = np.average(np.array(border), axis=1, weights=weight)
+        si = facing(t=1.0)
+        si.dp_du, si.dp_dv = mi.Vector3f(3, 0, 0), mi.Vector3f(0, 3, 0)
+        si.uv = mi.Point2f(0.5 if outside == "v" else 1.7, 1.4)
+        found = texture(g, wrap_mode="clamp", prefilter=angle).eval(si)
+        np.testing.assert_allclose(np.ravel(found), expected, atol=0.01)
 
     def test_a_footprint_that_sees_all_sees_the_mean(self):
         g = gaussians("linear")

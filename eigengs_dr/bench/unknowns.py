@@ -22,33 +22,35 @@ GREY = 0.5
 TEXEL_RATES = {256: 0.05, 1024: 0.2}
 """Linear light a step, by the side of the bitmap, for the texel with the largest gradient."""
 
-SPLAT_RATES = {"mean": 0.1, "factor": 0.015, "color": 0.005, "background": 0.0025}
+SPLAT_RATES = {"mean": 0.15, "factor": 0.02, "color": 0.008, "background": 0.004}
 """Pixels, 1 / pixels and coded values a step."""
 
-COEFFICIENT_RATE = 0.6
+COEFFICIENT_RATE = 0.4
 """Standard deviations of the first component a step, for the largest gradient."""
 
 ADAM_TEXELS = {"uniform": True}
 """Steps in proportion to gradients (Nicolet et al. 2021): with a rate for each, noise moves texels
 that no photo shows well."""
 
-ADAM_SPLATS = {"beta_2": 0.99, "epsilon": 0.03}
-"""Splats do best with a rate for each, but one for which smaller gradients than this are noise."""
+ADAM_SPLATS = {"beta_2": 0.99, "epsilon": 0.01}
+"""Splats do best with a rate for each, in which much smaller gradients than this do not count:
+without, what a blurred photo hardly tells of is made up."""
 
-ADAM_COEFFICIENTS = {"beta_1": 0.7, "uniform": True}
+ADAM_COEFFICIENTS = {"beta_1": 0.5, "uniform": True}
 """Components are orthonormal, so that one rate fits all coefficients; a problem so well
 conditioned needs less momentum than 0.9, which overshoots."""
 
-DAMPING = 5e-4
-"""Variance, of that of the first component, below which components count less and less."""
+DAMPING = 0.05
+"""Variance, of that of the first component, below which components move less and less: so few
+steps find what the first ones say of hidden parts, and the last ones are left to the splats."""
 
-PRIOR = 2e-6
+PRIOR = 1e-5
 """Weight of ``sum a^2 / lambda`` against the mean squared error of the photos."""
 
 PULL = 0.5
 """Weight of the squared distance of colours from those of the first stage."""
 
-FIRST_STAGE = 0.2
+FIRST_STAGE = 0.05
 """Share of the steps that the coefficients get before all Gaussians are freed."""
 
 
