@@ -178,7 +178,10 @@ def gaussian_texture() -> type:
             (x, sx), (y, sy) = column, row
             sx, sy = sx * self.width, sy * self.height
             if self.wrap == "clamp":  # one without width would count half on a border
-                x, y = dr.clip(x, INSIDE, self.width - INSIDE), dr.clip(y, INSIDE, self.height - INSIDE)
+                x, y = (
+                    dr.clip(x, INSIDE, self.width - INSIDE),
+                    dr.clip(y, INSIDE, self.height - INSIDE),
+                )
             inverse, valid = metric(si, self.from_uv, self.angle)
             unit, blind = bounded_covariance(inverse)
             sizes = (sx * sx, sx * sy, sy * sy)

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from .inverse import Image, Result
 
 TITLES = {
-    "texels1024": "1,024² texels",
-    "texels256": "256² texels",
+    "texels1024": "1,024 x 1,024 texels",
+    "texels256": "256 x 256 texels",
     "gaussians": "Gaussians from grey",
     "coefficients": "coefficients",
     "both": "coefficients, then Gaussians",

@@ -19,10 +19,10 @@ from .poster import POSTER, bitmap
 GREY = 0.5
 """What texels and Gaussians start from, coded."""
 
-TEXEL_RATES = {256: 0.05, 1024: 0.2}
+TEXEL_RATES = {256: 0.08, 1024: 0.3}
 """Linear light a step, by the side of the bitmap, for the texel with the largest gradient."""
 
-SPLAT_RATES = {"mean": 0.15, "factor": 0.02, "color": 0.008, "background": 0.004}
+SPLAT_RATES = {"mean": 0.2, "factor": 0.03, "color": 0.01, "background": 0.005}
 """Pixels, 1 / pixels and coded values a step."""
 
 COEFFICIENT_RATE = 0.4
@@ -50,7 +50,7 @@ PRIOR = 1e-5
 PULL = 0.5
 """Weight of the squared distance of colours from those of the first stage."""
 
-FIRST_STAGE = 0.05
+FIRST_STAGE = 0.04
 """Share of the steps that the coefficients get before all Gaussians are freed."""
 
 
