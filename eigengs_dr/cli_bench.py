@@ -20,6 +20,9 @@ from .console import progress_bar
 from .outputs import check_outputs
 from .report import write_report
 
+CONDITIONS = ("cameras", "grazing", "hidden", "noise")
+"""Of `inverse`, without importing Mitsuba, which their module does."""
+
 
 @click.group()
 def bench() -> None:
@@ -139,7 +142,7 @@ def texture(context: click.Context, variant: str, report: Path | None, quiet: bo
     "--condition",
     "conditions",
     multiple=True,
-    type=click.Choice(["cameras", "grazing", "hidden", "noise"]),
+    type=click.Choice(CONDITIONS),
     help="What the photos are like; may be repeated. By default all.",
 )
 @click.option("--steps", type=click.IntRange(min=2), default=200, show_default=True)
@@ -178,7 +181,7 @@ def inverse(
     """
     from .images import SAVE_OPTIONS, load_image, save_image
 
-    names = tuple(dict.fromkeys(conditions)) or ("cameras", "grazing", "hidden", "noise")
+    names = tuple(dict.fromkeys(conditions)) or CONDITIONS
     strips = {name: strip.with_stem(f"{strip.stem}-{name}") for name in names} if strip else {}
     check_outputs([report, chart, *strips.values()], [image])
     for path, known in ((chart, (".png", ".svg", ".pdf")), (strip, tuple(SAVE_OPTIONS))):

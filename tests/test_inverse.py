@@ -11,7 +11,7 @@ from scenes import family, small_model
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 
 import eigengs_dr as eg  # noqa: E402
-from eigengs_dr.bench import inverse, poster  # noqa: E402
+from eigengs_dr.bench import inverse, poster, unknowns  # noqa: E402
 from eigengs_dr.bench.unknowns import METHODS, Coefficients  # noqa: E402
 from eigengs_dr.cli import main  # noqa: E402
 from eigengs_dr.rendering import picture_of  # noqa: E402
@@ -92,11 +92,14 @@ def test_coefficients_find_a_member_of_the_family(basis):
     assert found[-1] > found[0] + 6
 
 
-def test_gaussians_go_on_from_the_coefficients(basis):
+def test_gaussians_go_on_from_the_coefficients(basis, monkeypatch):
+    monkeypatch.setattr(unknowns, "FIRST_STAGE", 0.2)  # 4 of 20 steps
     trace = recovered(basis, "both", 20)
     first = trace.psnr_ycbcr[trace.steps.index(4)]
     assert trace.steps[-1] == 20
     assert trace.psnr_ycbcr[-1] > first > trace.psnr_ycbcr[0] + 3
+    # They start as what the coefficients stand for.
+    assert trace.psnr_ycbcr[trace.steps.index(5)] > first - 2
 
 
 def test_what_is_hidden_stays(basis):

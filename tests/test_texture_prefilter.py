@@ -166,20 +166,20 @@ class TestPlane:
         inside = np.abs(v.ravel() - 0.5) < 0.4
         np.testing.assert_allclose(found[0][:, inside], found[1][:, inside], atol=2e-3)
 
-    @pytest.mark.parametrize("angle", [0.05, 0.3, 0.9])
+    @pytest.mark.parametrize(("angle", "scale"), [(0.05, 3), (0.3, 3), (0.9, 3), (0.5, 1)])
     @pytest.mark.parametrize("outside", ["v", "both"])
-    def test_clamped_outside_it_sees_the_border(self, angle, outside):
+    def test_clamped_outside_it_sees_the_border(self, angle, scale, outside):
         """Blurred along the border, not with what lies inside of it."""
         g = gaussians("linear")
         g.color *= 3
-        width = PIXEL * angle / 3
+        width = PIXEL * angle / scale
         along = 0.5 + width * np.linspace(-3, 3, 61) if outside == "v" else np.array([1.7])
         weight = np.exp(-0.5 * np.linspace(-3, 3, len(along)) ** 2)
         mirrored = 1 - np.abs(1 - along % 2) if outside == "v" else along
         border = texture(g, wrap_mode="clamp").eval(at(mi.Float(np.float32(mirrored)), 1.4))
         expected = np.average(np.array(border), axis=1, weights=weight)
         si = facing(t=1.0)
-        si.dp_du, si.dp_dv = mi.Vector3f(3, 0, 0), mi.Vector3f(0, 3, 0)
+        si.dp_du, si.dp_dv = mi.Vector3f(scale, 0, 0), mi.Vector3f(0, scale, 0)
         si.uv = mi.Point2f(0.5 if outside == "v" else 1.7, 1.4)
         found = texture(g, wrap_mode="clamp", prefilter=angle).eval(si)
         np.testing.assert_allclose(np.ravel(found), expected, atol=0.01)
