@@ -123,7 +123,7 @@ def train(
 
 def _settings(gaussians: int | None, frequency_aware: str, **options: Any) -> Any:
     """Turn options into the settings of a training."""
-    from .fitting import GAUSSIANS
+    from .starting import GAUSSIANS
     from .training import Settings
 
     width, height = options["size"]

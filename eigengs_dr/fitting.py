@@ -4,39 +4,20 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import place as places
-from .adaptive import adaptive
-from .bases import load_basis
-from .color import SPACES, decode, rgb_to_ycbcr, to_linear
+from .color import SPACES
 from .eigengs import EigenGS
 from .gaussians import Gaussians
 from .images import check_image
 from .interrupt import deferred
-from .presets import PRESETS, Preset
+from .presets import PRESETS
 from .refine import Progress, refine
 from .rendering import picture_of
-from .solve import solve
-from .stream import SPACES as BASIS_SPACES
-
-PLACES = {"random": places.random, "grid": places.grid, "adaptive": adaptive}
-"""Initialisers that look at the image alone, by name."""
-
-DARKNESS, BLACK = 0.3, 0.003
-"""Errors of light I weigh ``max(I, BLACK)^-DARKNESS``: by the root of the slope of the sRGB curve,
-between errors of light, which spare the dark, and errors of codes. At 5000 splats and 300 steps
-that gains 0.7 dB of psnr_rgb over no weights, on 12 training images of ImageNet classes."""
-
-INITS = ("auto", *PLACES, "eigen")
-"""All names of initialisers."""
-
-GAUSSIANS = 5000
-"""Splats where no number is asked for."""
+from .starting import INITS, begin
 
 
 class Fit(NamedTuple):
@@ -143,32 +124,20 @@ def fit(
     pixels = check_image(image, keep_grey=color == "data")
     _check(pixels, gaussians, iterations, init, preset, solve_steps, color, seed)
     method = PRESETS[preset]
-    init = method.init if init == "auto" else init
-    target, weight = _target(pixels, color)
-    added = None
     with deferred() as interrupted:
-        if init == "eigen":
-            model = load_basis(basis, backend)
-            _check_basis(model, pixels, gaussians, color)
-            start = _encoded(model, pixels, target, method, solve_steps)
-            if method.mean == "dense":
-                dense = model.dense_mean(start.width, start.height)
-                target, added = target - dense, _picture(dense, color)
-        else:
-            count = gaussians or min(GAUSSIANS, pixels.shape[0] * pixels.shape[1])
-            start = _placed(
-                pixels, target, count, PLACES[init], method, solve_steps, color, seed, backend
-            )
+        start = begin(
+            pixels, gaussians, init, basis, method, solve_steps, color, seed, backend=backend
+        )
         seconds_init = time.perf_counter() - started
         refined = refine(
-            start,
-            target,
+            start.gaussians,
+            start.target,
             pixels,
             method.schedule,
             iterations,
             started=started,
-            added=added,
-            weight=weight,
+            added=start.added,
+            weight=start.weight,
             progress=progress,
             interrupted=interrupted,
         )
@@ -176,94 +145,13 @@ def fit(
     return Fit(
         gaussians=refined.gaussians,
         trace=refined.trace,
-        image=rendered if added is None else rendered + added,
+        image=rendered if start.added is None else rendered + start.added,
         seconds=time.perf_counter() - started,
         seconds_init=seconds_init,
         iterations=refined.iterations,
         stopped=refined.stopped,
-        mean_image=added,
+        mean_image=start.added,
     )
-
-
-def _target(
-    pixels: NDArray[np.float32], color: str
-) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Bring pixels to the space of the colours, and weigh errors there."""
-    if color == "ycbcr":
-        return rgb_to_ycbcr(pixels), None
-    if color == "linear":
-        light = to_linear(pixels)
-        return light, np.maximum(light, BLACK) ** -DARKNESS
-    return pixels, None
-
-
-def _placed(
-    pixels: NDArray[np.float32],
-    target: NDArray[np.float32],
-    count: int,
-    place: Callable[..., Any],
-    method: Preset,
-    solve_steps: int,
-    color: str,
-    seed: int,
-    backend: str | None,
-) -> Gaussians:
-    """Place splats by the image alone and give them colours."""
-    generator = np.random.default_rng(seed)
-    # Light would draw too few splats to the dark.
-    mean, factor = place(pixels if color == "linear" else target, count, generator)
-    shape = (count, target.shape[2])
-    colors = np.zeros(shape) if method.solves else generator.uniform(0, 1, shape)
-    size = (target.shape[1], target.shape[0])
-    start = Gaussians.from_arrays(mean, factor, colors, size=size, space=color, backend=backend)
-    start = start.bounded()
-    return solve(start, target, solve_steps).gaussians if method.solves else start
-
-
-def _encoded(
-    model: EigenGS,
-    pixels: NDArray[np.float32],
-    target: NDArray[np.float32],
-    method: Preset,
-    solve_steps: int,
-) -> Gaussians:
-    """Take shapes and colours from an eigenbasis."""
-    colors = "exact" if method.solves else "projected"
-    start = model.encode(pixels, colors, method.mean).bounded()
-    same = (start.width, start.height) == (model.gaussians.width, model.gaussians.height)
-    # At another size the colours are exact for the resampled image only.
-    if method.solves and not same:
-        return solve(start, target, solve_steps, warm_start=True).gaussians
-    return start
-
-
-def _picture(planes: NDArray[np.float32], color: str) -> NDArray[np.float32]:
-    """RGB that planes add to a rendering; that of zeros is in the rendering already."""
-    shown = np.stack(decode(color, list(np.moveaxis(planes, 2, 0))), axis=2)
-    return shown - np.array(decode(color, [0.0] * planes.shape[2]), np.float32)
-
-
-def _check_basis(
-    model: EigenGS, pixels: NDArray[np.float32], gaussians: int | None, color: str
-) -> None:
-    """Raise ValueError where a basis is not what the other arguments ask for."""
-    count, space = len(model.gaussians), model.gaussians.space
-    if gaussians not in (None, count):
-        raise ValueError(
-            f"gaussians is {gaussians}, but the basis has {count}; leave the number out, use "
-            f"init 'adaptive', or train a basis with --gaussians {gaussians}"
-        )
-    height, width = pixels.shape[:2]
-    if count > width * height:
-        raise ValueError(
-            f"the basis has {count} Gaussians, more than an image of {width}x{height} has pixels; "
-            "use init 'adaptive'"
-        )
-    if color != space:
-        trained = f"train a basis with --color {color}" if color in BASIS_SPACES else "another init"
-        raise ValueError(
-            f"color is {color!r}, but the basis is in {space!r}; use color {space!r}, or {trained}"
-        )
 
 
 def _check(

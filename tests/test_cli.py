@@ -20,7 +20,7 @@ from eigengs_dr.backend import BackendError, select
 from eigengs_dr.cli import main
 from eigengs_dr.color import SPACES, YCBCR_TO_RGB
 from eigengs_dr.eigengs import EigenGS
-from eigengs_dr.fitting import INITS
+from eigengs_dr.starting import INITS
 
 
 def run(*arguments):

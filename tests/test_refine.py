@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scenes import COUNT, SIZE, Scene, few, random_scene, scenes, small_model
 
-from eigengs_dr import fitting
+from eigengs_dr import fitting, starting
 from eigengs_dr.adan import Adan
 from eigengs_dr.backend import select
 from eigengs_dr.color import rgb_to_ycbcr, to_coded, to_linear
@@ -378,7 +378,7 @@ def test_rows_of_the_trace(iterations):
 # --- Fit ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("init", fitting.INITS)
+@pytest.mark.parametrize("init", starting.INITS)
 def test_fit_improves_on_its_start(backend, init):
     result = fit(picture(), SPLATS, 60, init=init, basis=small_model(backend), backend=backend)
     check_sound(result, picture())
@@ -526,8 +526,8 @@ def test_linear_light_weighs_errors_in_the_dark(backend, monkeypatch):
     """Without weights, what shows there after coding would be worse."""
     dark = picture() * np.linspace(0.05, 1, SIDE, dtype=np.float32)[:, None]
     shown = []
-    for darkness in (fitting.DARKNESS, 0.0):
-        monkeypatch.setattr(fitting, "DARKNESS", darkness)
+    for darkness in (starting.DARKNESS, 0.0):
+        monkeypatch.setattr(starting, "DARKNESS", darkness)
         image = fit(dark, SPLATS, 60, color="linear", backend=backend).image
         shown.append(np.square(image - dark)[: SIDE // 3].mean())
     assert shown[0] < 0.85 * shown[1]
@@ -658,7 +658,7 @@ def place_and_press(image, count, generator):
 @pytest.mark.parametrize("iterations", [0, 1, 60])
 def test_ctrl_c_before_refinement(backend, iterations):
     """The start is returned, and the caller told."""
-    with patch.dict(fitting.PLACES, grid=place_and_press):
+    with patch.dict(starting.PLACES, grid=place_and_press):
         result = fit(picture(), SPLATS, iterations, init="grid", backend=backend)
     check_sound(result, picture())
     assert len(result.trace) == 1
@@ -667,7 +667,7 @@ def test_ctrl_c_before_refinement(backend, iterations):
 
 def test_ctrl_c_is_the_callers_after_an_error(backend):
     before = signal.getsignal(signal.SIGINT)
-    with patch.dict(fitting.PLACES, grid=lambda *a: 1 / 0), pytest.raises(ZeroDivisionError):
+    with patch.dict(starting.PLACES, grid=lambda *a: 1 / 0), pytest.raises(ZeroDivisionError):
         fit(picture(), SPLATS, 10, init="grid", backend=backend)
     assert signal.getsignal(signal.SIGINT) is before
 
