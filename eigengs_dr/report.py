@@ -24,19 +24,19 @@ def write_report(path: str | os.PathLike[str], figures: dict[str, Any]) -> None:
     OSError
         If the file cannot be written; one that was there is then unchanged.
     """
-    text = json.dumps(_plain(figures), indent=2, allow_nan=False)
+    text = json.dumps(plain(figures), indent=2, allow_nan=False)
     with replacing(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
-def _plain(value: Any) -> Any:
-    """Turn a value into one that JSON has."""
+def plain(value: Any) -> Any:
+    """Turn a value into one that JSON has: NumPy to lists, infinity and NaN to None."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if hasattr(value, "tolist"):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

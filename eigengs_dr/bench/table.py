@@ -1,0 +1,72 @@
+"""Tables of results: one form for the terminal, for Markdown and for a web page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+MISSING = "-"
+"""Cell of a figure that is not there."""
+
+
+class Table(NamedTuple):
+    """Cells as they are read.
+
+    Attributes
+    ----------
+    caption : str
+        What the cells are, with their unit, and what they were measured on.
+    columns : tuple of str
+        Headings.
+    rows : list of tuple of str
+        One cell a column. A cell that is a figure begins with it: "46.3 ± 2.1".
+    """
+
+    caption: str
+    columns: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+
+
+def number(value: float | None, decimals: int = 1) -> str:
+    """Write a figure; `MISSING` for None and NaN, "inf" for what is not finite."""
+    if value is None or math.isnan(value):
+        return MISSING
+    return f"{value:,.{decimals}f}"
+
+
+def spread(values: Sequence[float | None], decimals: int = 1) -> str:
+    """Write mean and standard deviation of the figures that are there, "46.3 ± 2.1"."""
+    known = [value for value in values if value is not None and math.isfinite(value)]
+    if not known:
+        return MISSING
+    mean = number(float(np.mean(known)), decimals)
+    return f"{mean} ± {number(float(np.std(known)), decimals)}" if len(known) > 1 else mean
+
+
+def median(values: Sequence[float], decimals: int = 2) -> str:
+    """Write the median of times and the range of the middle half: "2.80 (2.71-2.95)"."""
+    if not values:
+        return MISSING
+    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
+    if len(values) == 1:
+        return number(middle, decimals)
+    return f"{number(middle, decimals)} ({number(low, decimals)}-{number(high, decimals)})"
+
+
+def as_text(table: Table) -> str:
+    """Lay a table out for a terminal, columns under their headings."""
+    lines = [table.columns, *table.rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    laid = [
+        "  ".join(
+            cell.rjust(width) if k else cell.ljust(width)
+            for k, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    ]
+    return "\n".join(
+        [table.caption, "", laid[0], "-" * sum(widths, 2 * len(widths) - 2), *laid[1:]]
+    )

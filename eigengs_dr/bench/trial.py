@@ -1,0 +1,92 @@
+"""One measured descent: pictures on the way, and a clock that stops while they are judged."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Iterator
+from typing import Any, NamedTuple
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from ..gaussians import Gaussians
+from ..metrics import ms_ssim, psnr, ssim
+from ..refine import Schedule, descend
+from ..rendering import CUTOFF, picture_of
+from ..starting import Start
+
+Image = NDArray[np.float32]
+
+ITERATIONS = (0, 10, 100, 500, 1000, 5000, 10000)
+"""Where the paper's tables look, and 0 and 10 beside."""
+
+
+class Moment(NamedTuple):
+    """What a descent had come to.
+
+    Attributes
+    ----------
+    iteration : int
+        Steps taken.
+    seconds : float
+        Since before the start was made, without the time that the observer took.
+    gaussians : Gaussians
+    picture : ndarray of float32, shape (H, W, 3)
+        RGB, not clamped.
+    """
+
+    iteration: int
+    seconds: float
+    gaussians: Gaussians
+    picture: Image
+
+
+def follow(
+    begin: Callable[[], Start],
+    schedule: Schedule,
+    iterations: int,
+    marks: Collection[int],
+    cutoff: float = CUTOFF,
+) -> Iterator[Moment]:
+    """Run a descent to its last step and yield what it has come to at some of them.
+
+    Unlike `eigengs_dr.fit` it takes all steps, also where nothing is gained any more, and shows the
+    set as it is, not the best so far. What runs between two moments is not counted.
+
+    Parameters
+    ----------
+    begin : callable
+        Makes the start; its time counts.
+    schedule : Schedule
+    iterations : int
+    marks : collection of int
+        Steps after which to yield; 0 is the start.
+    cutoff : float, optional
+    """
+    spent, resumed = 0.0, time.perf_counter()
+    start = begin()
+    sets = descend(start.gaussians, start.target, schedule, iterations, cutoff, start.weight)
+    for iteration, current in enumerate(sets):
+        if iteration not in marks:
+            continue
+        dr.eval(current)
+        dr.sync_thread()  # steps run asynchronously
+        spent += time.perf_counter() - resumed
+        picture = picture_of(current, cutoff=cutoff)
+        yield Moment(
+            iteration, spent, current, picture if start.added is None else picture + start.added
+        )
+        resumed = time.perf_counter()
+
+
+def judged(moment: Moment, image: Image) -> dict[str, Any]:
+    """Turn a moment into a row: iteration, seconds, psnr_ycbcr, psnr_rgb, ssim, ms_ssim."""
+    return {
+        "iteration": moment.iteration,
+        "seconds": moment.seconds,
+        "psnr_ycbcr": psnr(moment.picture, image, "ycbcr"),
+        "psnr_rgb": psnr(moment.picture, image, "rgb"),
+        "ssim": ssim(moment.picture, image),
+        "ms_ssim": ms_ssim(moment.picture, image),
+    }
