@@ -58,7 +58,7 @@ def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(f"{path}: the name must end in {', '.join(SUFFIXES)}")
-    settings = {"svg.hashsalt": "eigengs_dr", "svg.fonttype": "none"}
+    # Names in an SVG file are else drawn at random.
     metadata: dict[str, Any] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-    with replacing(path) as temporary, matplotlib.rc_context(settings):
+    with replacing(path) as temporary, matplotlib.rc_context({"svg.hashsalt": "eigengs_dr"}):
         figure.savefig(temporary, format=suffix[1:], dpi=90, metadata=metadata.get(suffix))

@@ -67,6 +67,5 @@ def as_text(table: Table) -> str:
         ).rstrip()
         for line in lines
     ]
-    return "\n".join(
-        [table.caption, "", laid[0], "-" * sum(widths, 2 * len(widths) - 2), *laid[1:]]
-    )
+    ruler = "-" * max(map(len, laid))
+    return "\n".join([table.caption, "", laid[0], ruler, *laid[1:]])
