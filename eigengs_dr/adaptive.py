@@ -119,23 +119,30 @@ def pieces(density: Array, count: int) -> NDArray[np.float64]:
     return np.stack([centroid(order % width + 0.5), centroid(order // width + 0.5)], axis=1)
 
 
+# A Hilbert curve through a square visits its quarters in this order, the plain way (state 0) or
+# with columns and rows swapped (1), with both counted from the other side (2), or both (3).
+_RIGHT = np.array([[0, 0, 1, 1], [0, 1, 1, 0], [1, 1, 0, 0], [1, 0, 0, 1]], np.int32)
+_LOW = _RIGHT[[1, 0, 3, 2]]
+_STATE = np.arange(4, dtype=np.int8)[:, None] ^ np.array([1, 0, 0, 3], np.int8)
+
+
 def hilbert_order(height: int, width: int) -> NDArray[np.int64]:
     """Pixel indices ``row * width + column`` in the order of a Hilbert curve over the image.
 
     The curve over the next power of two is followed, and what lies outside the image left out.
+    Each square is replaced by its quarters, level by level: O(height * width), nothing is sorted.
     """
-    y, x = (v.ravel() for v in np.indices((height, width), dtype=np.int32))
-    key = np.zeros(x.shape, np.int64)
     side = 1 << max(height - 1, width - 1).bit_length()
+    column = row = np.zeros(1, np.int32)
+    state = np.zeros(1, np.int8)
     while side > 1:
         side >>= 1
-        right, low = (x & side) > 0, (y & side) > 0
-        key = 4 * key + ((3 * right) ^ low)
-        x, y = x & (side - 1), y & (side - 1)
-        mirror, swap = right & ~low, ~low
-        x, y = np.where(mirror, side - 1 - x, x), np.where(mirror, side - 1 - y, y)
-        x, y = np.where(swap, y, x), np.where(swap, x, y)
-    return np.argsort(key)
+        column = column[:, None] + side * _RIGHT[state]
+        row = row[:, None] + side * _LOW[state]
+        state = _STATE[state]
+        inside = (column < width) & (row < height)
+        column, row, state = column[inside], row[inside], state[inside]
+    return row.astype(np.int64) * width + column
 
 
 def relaxed(mean: Array, density: Array) -> NDArray[np.float64]:
