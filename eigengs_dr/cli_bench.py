@@ -16,6 +16,7 @@ from .cli_shared import (
     quiet_option,
     report_option,
 )
+from .cli_tables import tables
 from .console import progress_bar
 from .outputs import check_outputs
 from .report import write_report
@@ -32,6 +33,9 @@ def bench() -> None:
     Example:
       eigengs-dr bench kernels --report kernels.json
     """
+
+
+bench.add_command(tables)
 
 
 @bench.command()

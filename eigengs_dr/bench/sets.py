@@ -103,6 +103,7 @@ def model_for(
     color: str = "ycbcr",
     split: bool | str = "auto",
     progress: Progress = lambda label, done, total: None,
+    backend: str | None = None,
 ) -> EigenGS:
     """Load a model of one set's training images at another set's size, or train it first.
 
@@ -123,6 +124,7 @@ def model_for(
         As `frequency_aware` of `EigenGS.fit`.
     progress : callable, optional
         ``progress(label, done, total)``.
+    backend : {"llvm", "cuda"}, optional
 
     Raises
     ------
@@ -137,10 +139,12 @@ def model_for(
         models.mkdir(parents=True, exist_ok=True)
         basis = _basis_for(data, source, (used.width, used.height), models, color, progress)
         progress(path.stem, 0, 1)
-        fitted = EigenGS.fit(basis.truncated(components), used.gaussians, frequency_aware=split)
+        fitted = EigenGS.fit(
+            basis.truncated(components), used.gaussians, frequency_aware=split, backend=backend
+        )
         fitted.save(path)
     # Weights are stored in half precision: the file is used in the first run too.
-    return EigenGS.load(path)
+    return EigenGS.load(path, backend)
 
 
 def _basis_for(

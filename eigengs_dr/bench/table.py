@@ -21,13 +21,13 @@ class Table(NamedTuple):
         What the cells are, with their unit, and what they were measured on.
     columns : tuple of str
         Headings.
-    rows : list of tuple of str
+    rows : sequence of tuple of str
         One cell a column. A cell that is a figure begins with it: "46.3 ± 2.1".
     """
 
     caption: str
     columns: tuple[str, ...]
-    rows: list[tuple[str, ...]]
+    rows: Sequence[tuple[str, ...]]
 
 
 def number(value: float | None, decimals: int = 1) -> str:
