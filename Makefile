@@ -6,6 +6,10 @@ READY := .venv/ready
 # A photo inside the scikit-image wheel, so that none has to be downloaded.
 PHOTO := .venv/lib/python3*/site-packages/skimage/data/coffee.png
 
+# Sets of images to measure on, see 'eigengs-dr bench tables --help'; without them less is measured.
+DATA ?= data
+RESULTS := build/report
+
 LLVM_ADVICE := install LLVM 17 or newer and libatomic (as root: Debian, Ubuntu 'apt install \
 libllvm19 libatomic1', Fedora 'dnf install llvm-libs libatomic', macOS 'brew install llvm'), \
 then make again
@@ -19,7 +23,7 @@ APT_INSTALL := apt_install() { \
 	{ $$get install $$1 || { $$get update && $$get install $$1; }; } </dev/null >/dev/null 2>&1 \
 	|| { echo "make setup: $$2" >&2; exit 1; }; }
 
-.PHONY: help setup demo scenes test test-slow bench basis clean
+.PHONY: help setup demo scenes test test-slow bench report basis clean
 
 help:
 	@echo "make demo       fit a photo, at once and well; shows PSNR, time and the pictures it wrote"
@@ -27,6 +31,7 @@ help:
 	@echo "make test       linters, type checker, tests"
 	@echo "make test-slow  the tests that take minutes"
 	@echo "make bench      time the renderer"
+	@echo "make report     measure all and write docs/results, in half an hour; goes on after a break"
 	@echo "make basis      train the basis that ships, again"
 	@echo "make setup      only set up .venv, and libLLVM where none works"
 	@echo "make clean      remove what these made"
@@ -66,6 +71,15 @@ test-slow: $(READY)
 bench: $(READY)
 	@mkdir -p build/bench
 	$(BIN)/eigengs-dr bench kernels --report build/bench/kernels.json
+
+# The page shows all that is in build/report: measure more with the same commands, then make again.
+report: $(READY)
+	@mkdir -p $(RESULTS)
+	$(BIN)/eigengs-dr bench stability -o $(RESULTS)
+	$(BIN)/eigengs-dr bench pareto $(wildcard $(DATA)) -o $(RESULTS) --images 2
+	$(BIN)/eigengs-dr bench figures $(wildcard $(DATA)) -o $(RESULTS) --images 2
+	$(if $(wildcard $(DATA)),$(BIN)/eigengs-dr bench tables $(DATA) -o $(RESULTS) --images 2)
+	$(BIN)/eigengs-dr bench report $(RESULTS) -o docs/results
 
 basis: $(READY)
 	$(BIN)/python -m eigengs_dr.natural eigengs_dr/data/natural.npz

@@ -7,6 +7,9 @@ from typing import Any
 import click
 
 from .backend import select
+from .cli_figures import figures
+from .cli_pareto import pareto
+from .cli_report import report as make_report
 from .cli_shared import (
     ANY_PATH,
     EXISTING,
@@ -16,6 +19,7 @@ from .cli_shared import (
     quiet_option,
     report_option,
 )
+from .cli_stability import stability
 from .cli_tables import tables
 from .console import progress_bar
 from .outputs import check_outputs
@@ -35,7 +39,8 @@ def bench() -> None:
     """
 
 
-bench.add_command(tables)
+for command in (tables, pareto, stability, figures, make_report):
+    bench.add_command(command)
 
 
 @bench.command()

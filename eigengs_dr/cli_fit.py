@@ -49,7 +49,11 @@ from .report import write_report
     "roughness, as they are.",
 )
 @seed_option
-@click.option("--preview", type=ANY_PATH, help="Picture of photo and fit; or a folder.")
+@click.option(
+    "--preview",
+    type=ANY_PATH,
+    help="Picture of the photo, the fit, and the outlines of its Gaussians; or a folder.",
+)
 @backend_option
 @report_option
 @quiet_option
@@ -67,7 +71,9 @@ def fit(
 ) -> None:
     """Fit images by sums of Gaussians.
 
-    For several images OUT and the preview are folders, and the files are named like the images.
+    For several images OUT and the preview are folders, and the files are named like the images. A
+    preview shows a photo, its fit, and the outlines of at most 2,000 Gaussians at one standard
+    deviation.
     Ctrl-C keeps the best fit so far: it is written before the command ends with exit code 130.
 
     With --preset eigengs, the paper's form, the file holds the Gaussians alone, without the mean
@@ -122,11 +128,10 @@ def _fit_one(
     path: Path, output: Path, preview: Path | None, quiet: bool, **settings: Any
 ) -> dict[str, Any]:
     """Fit one image, write what was asked for, and return its figures."""
-    import numpy as np
-
     import eigengs_dr as eg
 
     from .metrics import unclamped
+    from .pictures import comparison
 
     color = settings["color"]
     image = eg.load_image(path, keep_grey=color == "data")
@@ -137,7 +142,7 @@ def _fit_one(
             raise ValueError(f"{path}: {error}") from None
     result.gaussians.save(output)
     if preview:
-        eg.save_image(preview, np.concatenate([image, result.image], axis=1))
+        eg.save_image(preview, comparison(image, result.image, result.gaussians))
     record = {
         "input": str(path),
         "output": str(output),
@@ -166,4 +171,4 @@ def _summary(record: dict[str, Any], preview: Path | None, space: str) -> str:
         "in {seconds:.1f} s\n  psnr_{space} {psnr_ycbcr:.2f} dB, psnr_rgb {psnr_rgb:.2f} dB, "
         "SSIM {ssim:.4f}, MS-SSIM {ms_ssim:.4f}\n  wrote {output}"
     ).format(**record, space=space)
-    return f"{text}\n  wrote {preview} (photo and fit side by side)" if preview else text
+    return f"{text}\n  wrote {preview} (photo, fit and outlines side by side)" if preview else text

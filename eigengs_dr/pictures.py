@@ -1,4 +1,4 @@
-"""Pictures of models: what the components look like, and where the splats lie."""
+"""Pictures of models and of fits: what the components look like, and where the splats lie."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from .color import decode
 from .components import colored
 from .eigengs import EigenGS
 from .gaussians import Gaussians
-from .images import resampled
+from .images import resampled, to_8bit
 from .pca import CHANNELS, Eigenbasis
 from .rendering import render
+from .strips import joined, line
 
 FIRST = (1, 2, 3, 5, 10, 20, 50, 100, 200)
 """Components of the first channel that are shown, counted from 1."""
@@ -27,16 +28,27 @@ CELL = 240
 COLUMNS = 7
 """Pictures side by side in a sheet."""
 
-GAP = 8
-"""White pixels between pictures."""
-
 OUTLINES = 800
 """Longer side of a picture of ellipses, in pixels."""
+
+MOST_OUTLINES = 2000
+"""Outlines over a picture: with more of them, single ones cannot be told apart."""
+
+SMALLEST = 512
+"""A picture whose longer side is shorter is enlarged before outlines are drawn over it."""
+
+LIGHTER = 0.6
+"""How far a picture below outlines is brought to white."""
+
+FARTHEST = 100
+"""Outlines that reach farther than so many pictures are not drawn: in it they are straight lines,
+and Pillow takes no larger numbers."""
 
 LOW_COLOR, HIGH_COLOR = (214, 96, 20), (30, 90, 160)
 """Outlines of the splats for low frequencies, orange, and of all others, blue."""
 
 Picture = NDArray[Any]
+Color = tuple[int, int, int]
 
 
 def component_sheet(model: EigenGS, basis: Eigenbasis | None = None) -> Picture:
@@ -65,12 +77,12 @@ def component_sheet(model: EigenGS, basis: Eigenbasis | None = None) -> Picture:
         _require_same(model, basis)
     columns = [_mean(model, basis), *_components(model, basis)]
     tables = [
-        _joined(columns[first : first + COLUMNS], 1) for first in range(0, len(columns), COLUMNS)
+        joined(columns[first : first + COLUMNS], 1) for first in range(0, len(columns), COLUMNS)
     ]
     outlines = [_captioned("standard deviations", ellipses(model.gaussians, model.low))]
     if model.low:
         outlines += _parts_of_mean(model)
-    return _joined([*tables, _joined(outlines, 1)], 0)
+    return joined([*tables, joined(outlines, 1)], 0)
 
 
 def ellipses(gaussians: Gaussians, low: int = 0) -> Picture:
@@ -87,22 +99,90 @@ def ellipses(gaussians: Gaussians, low: int = 0) -> Picture:
     ndarray of float, shape (H, W, 3)
         RGB on white, the longer side 800 pixels.
     """
+    width, height = _within(OUTLINES, gaussians.width, gaussians.height)
+    colors = [LOW_COLOR] * low + [HIGH_COLOR] * (len(gaussians) - low)
+    return _outlined(np.ones((height, width, 3)), gaussians, colors)
+
+
+def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
+    """Draw the outlines of splats at one standard deviation over a lightened picture.
+
+    Of more than 2,000 splats as many are drawn, chosen at random, the same ones each time.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Of any space and native size.
+    picture : ndarray of float, shape (H, W, 3) or (H, W, 1)
+        RGB or grey; clamped.
+
+    Returns
+    -------
+    ndarray of float, shape (H, W, 3)
+        RGB.
+    """
+    # One of every few would draw stripes where splats lie on a grid.
+    chosen = np.random.default_rng(0).permutation(len(gaussians))[:MOST_OUTLINES]
+    under = LIGHTER + (1 - LIGHTER) * np.clip(picture, 0, 1)
+    drawn = gaussians[chosen]
+    return _outlined(under, drawn, [HIGH_COLOR] * len(drawn))
+
+
+def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Picture:
+    """Put an image, its fit, and the outlines of splats over the fit side by side.
+
+    Parameters
+    ----------
+    image, picture : ndarray of float, shape (H, W, 3) or (H, W, 1)
+        RGB or grey, of one size.
+    gaussians : Gaussians
+        Those that make the picture.
+
+    Returns
+    -------
+    ndarray of float, shape (k * H, 3 * k * W, 3)
+        RGB. Every pixel is repeated k times along both axes, so often that the longer side of each
+        part has at least 512 pixels.
+    """
+    times = -(-SMALLEST // max(image.shape[:2]))
+    shape = (*image.shape[:2], 3)
+    parts = [np.broadcast_to(part, shape) for part in (image, picture)]
+    large = [part.repeat(times, axis=0).repeat(times, axis=1) for part in parts]
+    return np.concatenate([*large, overlay(gaussians, large[1])], axis=1)
+
+
+def _outlined(picture: Picture, gaussians: Gaussians, colors: list[Color]) -> Picture:
+    """Draw outlines at one standard deviation in one colour each, the first splats on top."""
     from PIL import Image, ImageDraw
 
-    width, height = _within(OUTLINES, gaussians.width, gaussians.height)
+    height, width = picture.shape[:2]
     # Lines are drawn at twice the size and averaged: Pillow's have jagged edges.
-    arrays = gaussians.scaled(2 * width, 2 * height).to_arrays()
-    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    a, b, c = arrays["factor"].T[:, :, None]
-    y = np.sin(turn) / c
-    x = (np.cos(turn) - b * y) / a
-    points = np.stack([x, y], axis=2) + arrays["mean"][:, None]
-    image = Image.new("RGB", (2 * width, 2 * height), "white")
+    under = np.broadcast_to(to_8bit(picture), (height, width, 3)).astype(np.uint8)
+    image = Image.fromarray(under.repeat(2, axis=0).repeat(2, axis=1))
     draw = ImageDraw.Draw(image)
-    for n in reversed(range(len(points))):
-        outline = LOW_COLOR if n < low else HIGH_COLOR
-        draw.polygon(points[n].ravel().tolist(), outline=outline, width=2)
-    return np.asarray(image.resize((width, height), Image.Resampling.BOX)) / 255
+    points = _outlines(gaussians.scaled(2 * width, 2 * height))
+    for n in reversed(np.flatnonzero(_in_sight(points, image.size))):
+        draw.line(points[n].ravel().tolist(), fill=colors[n], width=2)
+    return np.asarray(image.resize((width, height), Image.Resampling.BOX), np.float32) / 255
+
+
+def _outlines(gaussians: Gaussians) -> Picture:
+    """Points around every splat at one standard deviation, the first one twice, (N, 25, 2)."""
+    arrays = {name: array.astype(np.float64) for name, array in gaussians.to_arrays().items()}
+    turn = np.linspace(0, 2 * np.pi, 25)
+    a, b, c = arrays["factor"].T[:, :, None]
+    with np.errstate(all="ignore"):  # what is not finite is not in sight
+        y = np.sin(turn) / c
+        x = (np.cos(turn) - b * y) / a
+    return np.stack([x, y], axis=2) + arrays["mean"][:, None]
+
+
+def _in_sight(points: Picture, size: tuple[int, int]) -> Picture:
+    """Tell whose outlines may cross a picture, and are small enough for Pillow to draw."""
+    low, high = points.min(axis=1), points.max(axis=1)
+    longest = FARTHEST * max(size)
+    near = (low > -longest) & (high < longest)
+    return (near & (high >= 0) & (low <= size)).all(axis=1)
 
 
 def _require_same(model: EigenGS, basis: Eigenbasis) -> None:
@@ -178,19 +258,4 @@ def _cell(picture: Picture) -> Picture:
 
 def _captioned(text: str, *pictures: Picture) -> Picture:
     """Put pictures on top of each other, below a line of text."""
-    from PIL import Image, ImageDraw
-
-    line = Image.new("RGB", (pictures[0].shape[1], 12), "white")
-    ImageDraw.Draw(line).text((0, 0), text, fill="black")
-    return _joined([np.asarray(line) / 255, *pictures], 0)
-
-
-def _joined(pictures: list[Picture], axis: int) -> Picture:
-    """Put pictures below each other (axis 0) or side by side (axis 1), on white."""
-    most = max(picture.shape[1 - axis] for picture in pictures)
-    padded = []
-    for picture in pictures:
-        room = [(0, 0)] * 3
-        room[axis], room[1 - axis] = (0, GAP), (0, most - picture.shape[1 - axis])
-        padded.append(np.pad(picture, room, constant_values=1))
-    return np.concatenate(padded, axis)
+    return joined([line(text, pictures[0].shape[1]), *pictures], 0)

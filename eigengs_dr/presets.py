@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 
-from drjit.opt import Adam
-
+from .adam import Adam
 from .adan import Adan
 from .coordinates import CHOLESKY
 from .refine import Schedule

@@ -16,9 +16,9 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from drjit.opt import Adam
 from numpy.typing import NDArray
 
+from .adam import Adam
 from .arrays import types_of
 from .gaussians import Gaussians
 from .place import grid

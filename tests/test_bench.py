@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from scenes import family, small_model
 
+from eigengs_dr.arrays import types_in
+from eigengs_dr.backend import select
 from eigengs_dr.bench import eigen, kernels
 from eigengs_dr.fitting import fit
 from eigengs_dr.metrics import psnr
@@ -36,10 +38,21 @@ def test_every_figure_is_there_and_positive(small, backend):
     assert calls == sorted(calls)
 
 
-def test_pixels_inside_are_counted_as_by_hand(small, backend):
-    from eigengs_dr.arrays import types_in
-    from eigengs_dr.backend import select
+def test_both_renderers_draw_the_same(small, backend, monkeypatch):
+    """What is timed against each other makes equal pixels, in another order."""
+    shown = {}
 
+    def called(variants, progress):
+        shown.update({name: variants[f"{name}_forward_ms"]().numpy() for name in ("plain", "fast")})
+        return dict.fromkeys(variants, 1.0)
+
+    monkeypatch.setattr(kernels, "_interleaved", called)
+    types = types_in(select(backend))
+    kernels._kernel_figures(types, kernels._scene(types), None)
+    assert np.allclose(np.sort(shown["plain"]), np.sort(shown["fast"]), atol=1e-4)
+
+
+def test_pixels_inside_are_counted_as_by_hand(small, backend):
     scene = kernels._scene(types_in(select(backend)))
     mean = scene.to_arrays()["mean"].astype(float)
     rows, columns = np.indices((64, 64)) + 0.5

@@ -48,6 +48,11 @@ def smooth_pixels(width, height, channels=3):
     return (127 + 60 * np.sin(x / 5 + c) + 60 * np.cos(y / 7)).astype(np.uint8)
 
 
+def previewed(path):
+    """The parts of a preview of 32 pixels width: one of every 16 pixels, which repeat it."""
+    return np.split(np.asarray(Image.open(path))[::16, ::16], 3, axis=1)
+
+
 @pytest.fixture
 def photo(tmp_path):
     path = tmp_path / "photo.png"
@@ -92,11 +97,14 @@ def test_fit_report(fitted):
     assert {"iteration", "seconds", "psnr_ycbcr", "psnr_rgb"} <= set(report["trace"][-1])
 
 
-def test_fit_preview_is_photo_beside_fit(fitted):
-    folder, _ = fitted
-    preview = np.asarray(Image.open(folder / "both.png"))
-    assert preview.shape == (24, 64, 3)
-    assert np.array_equal(preview[:, :32], smooth_pixels(32, 24))
+def test_fit_preview_is_photo_fit_and_outlines(fitted):
+    folder, result = fitted
+    photo, fit, outlines = previewed(folder / "both.png")
+    assert photo.shape == fit.shape == outlines.shape == (24, 32, 3)
+    assert np.array_equal(photo, smooth_pixels(32, 24))
+    assert np.abs(fit.astype(int) - photo).mean() < 30
+    assert outlines.mean() > fit.mean() + 20
+    assert "both.png (photo, fit and outlines side by side)" in result.stdout
 
 
 def test_quiet(photo, tmp_path):
@@ -140,8 +148,8 @@ def test_render_sizes(fitted, tmp_path, options, size):
 def test_render_is_what_was_fitted(fitted, tmp_path):
     folder, _ = fitted
     succeeded(run("render", folder / "fit.npz", "-o", tmp_path / "y.png"))
-    fit = np.asarray(Image.open(folder / "both.png")).astype(int)[:, 32:]
-    assert np.abs(fit - np.asarray(Image.open(tmp_path / "y.png"))).max() <= 1
+    _, fit, _ = previewed(folder / "both.png")
+    assert np.abs(fit.astype(int) - np.asarray(Image.open(tmp_path / "y.png"))).max() <= 1
 
 
 @pytest.mark.parametrize(
@@ -169,12 +177,12 @@ def test_spaces_of_textures(tmp_path, color, channels, modes):
     assert (info["space"], info["channels"]) == (color, 1 if modes[1] == "L" else 3)
     succeeded(run("info", tmp_path / "a.npz", "--preview", tmp_path / "info.png"))
     succeeded(run("render", tmp_path / "a.npz", "-o", tmp_path / "y.png"))
-    both, drawn, shown = (Image.open(tmp_path / n) for n in ("both.png", "y.png", "info.png"))
-    assert {image.mode for image in (both, drawn, shown)} == {modes[1]}
-    fit = np.asarray(both)[:, 32:]
-    np.testing.assert_array_equal(fit, np.asarray(drawn))
-    np.testing.assert_array_equal(fit, np.asarray(shown))
-    error = (fit.astype(float) - (pixels if modes[1] == "RGB" else pixels[..., 0])) / 255
+    drawn, shown = (Image.open(tmp_path / n) for n in ("y.png", "info.png"))
+    assert {image.mode for image in (drawn, shown)} == {modes[1]}
+    _, fit, _ = previewed(tmp_path / "both.png")
+    np.testing.assert_array_equal(fit, np.asarray(drawn.convert("RGB")))
+    np.testing.assert_array_equal(fit, np.asarray(shown.convert("RGB")))
+    error = (fit.astype(float) - pixels) / 255
     assert -10 * np.log10(np.mean(error**2)) == pytest.approx(report["psnr_rgb"], abs=0.02)
 
 
@@ -617,7 +625,7 @@ def test_the_papers_form_lacks_the_mean_image(trained, photo, tmp_path):
     assert result.stderr.count("\n") == 1
     assert "note: " in result.stderr
     assert "mean image is kept in the basis" in result.stderr
-    fit = np.asarray(Image.open(tmp_path / "both.png")).astype(int)[:, 32:]
+    _, fit, _ = previewed(tmp_path / "both.png")
     model = EigenGS.load(folder / "m.npz")
     added = model.dense_mean(32, 32) @ YCBCR_TO_RGB.T
     saved = eg.render(eg.Gaussians.load(tmp_path / "x.npz")).numpy()

@@ -4,10 +4,19 @@ import numpy as np
 import pytest
 from test_training import SMALL, random_fields
 
+from eigengs_dr import pictures
 from eigengs_dr.gaussians import Gaussians
 from eigengs_dr.images import resampled
-from eigengs_dr.pictures import CELL, GAP, component_sheet, ellipses
+from eigengs_dr.pictures import (
+    CELL,
+    LIGHTER,
+    comparison,
+    component_sheet,
+    ellipses,
+    overlay,
+)
 from eigengs_dr.rendering import render
+from eigengs_dr.strips import GAP, joined, line
 from eigengs_dr.training import Settings, train
 
 CAPTION = 12
@@ -88,3 +97,89 @@ def test_low_splats_have_another_colour():
 def test_a_thin_set_can_be_drawn():
     splat = Gaussians.from_arrays([[1, 9]], [[1, 0, 0.01]], [[1.0]], size=(1, 5000), space="data")
     assert ellipses(splat).shape == (800, 1, 3)
+
+
+def round_splats(means, sigma, size, space="data", channels=1):
+    colors = np.ones((len(means), channels))
+    factors = [[1 / sigma, 0, 1 / sigma]] * len(means)
+    return Gaussians.from_arrays(means, factors, colors, size=size, space=space)
+
+
+def test_an_overlay_is_the_picture_lightened_below_the_outlines():
+    picture = np.random.default_rng(0).uniform(0, 1, (40, 60, 3))
+    drawn = overlay(round_splats([[10, 10]], 2.0, (30, 20)), picture)  # scaled: 4 around (20, 20)
+    assert drawn.shape == picture.shape
+    y, x = np.mgrid[:40, :60] + 0.5
+    away = np.abs(np.hypot(x - 20, y - 20) - 4)
+    expected = LIGHTER + (1 - LIGHTER) * picture
+    np.testing.assert_allclose(drawn[away > 2], expected[away > 2], atol=0.003)
+    assert (drawn[away < 0.3][:, 0] < 0.6).all()
+
+
+@pytest.mark.parametrize(
+    ("space", "channels"), [("ycbcr", 3), ("rgb", 3), ("linear", 3), ("data", 1), ("data", 3)]
+)
+def test_an_overlay_of_every_space(space, channels):
+    splats = round_splats([[10, 10]], 4.0, (30, 20), space, channels)
+    drawn = overlay(splats, np.ones((20, 30, channels)))
+    assert drawn.shape == (20, 30, 3)
+    assert drawn.min() < 0.5 < drawn.max()
+
+
+def test_single_outlines_can_be_told_apart(monkeypatch):
+    """Of many splats some are drawn, always the same, and neither the first nor every third."""
+    monkeypatch.setattr(pictures, "MOST_OUTLINES", 4)
+    splats = round_splats([[30 + 60 * n, 10] for n in range(10)], 5.0, (600, 20))
+    drawn, again = (overlay(splats, np.ones((20, 600, 1)))[..., 0] for _ in range(2))
+    np.testing.assert_array_equal(drawn, again)
+    shown = np.flatnonzero(drawn.reshape(20, 10, 60).min(axis=(0, 2)) < 1)
+    assert len(shown) == 4
+    assert len(set(np.diff(shown))) > 1
+
+
+@pytest.mark.parametrize("mean", [[-1e6, 5], [5, 1e6], [3e38, 3e38]])
+def test_what_lies_outside_is_not_drawn(mean):
+    assert (overlay(round_splats([mean], 4.0, (30, 20)), np.ones((20, 30, 1))) == 1).all()
+
+
+@pytest.mark.parametrize("sigma", [1e6, 1e30])
+def test_what_is_huge_is_not_drawn(sigma):
+    drawn = overlay(round_splats([[sigma, 5]], sigma, (30, 20)), np.ones((20, 30, 1)))
+    assert (drawn == 1).all()
+
+
+def test_a_comparison_repeats_the_pixels_of_small_images():
+    image, fit = np.random.default_rng(0).uniform(0, 1, (2, 20, 100, 3))
+    splats = round_splats([[30, 10]], 4.0, (100, 20))
+    shown = comparison(image, fit, splats)
+    assert shown.shape == (6 * 20, 3 * 600, 3)
+    for k, part in enumerate((image, fit)):
+        for first in (0, 5):
+            np.testing.assert_array_equal(
+                shown[first::6, 600 * k + first : 600 * (k + 1) : 6], part
+            )
+    large = fit.repeat(6, axis=0).repeat(6, axis=1)
+    np.testing.assert_array_equal(shown[:, 1200:], overlay(splats, large))
+
+
+@pytest.mark.parametrize(("height", "width", "times"), [(300, 512, 1), (700, 1, 1), (1, 511, 2)])
+def test_a_comparison_keeps_the_shape(height, width, times):
+    grey = np.full((height, width, 1), 0.5)
+    shown = comparison(grey, grey, round_splats([[0.5, 0.5]], 4.0, (width, height)))
+    assert shown.shape == (times * height, 3 * times * width, 3)
+
+
+def test_pictures_are_joined_on_white():
+    joint = joined([np.zeros((2, 3, 3)), np.zeros((4, 1, 3))], 1, gap=2)
+    assert joint.shape == (4, 3 + 2 + 1 + 2, 3)
+    black = joint.sum(axis=2) == 0
+    assert black[:2, :3].all() and black[:, 5].all() and black.sum() == 10
+    assert (joint[~black] == 1).all()
+
+
+def test_a_line_holds_its_text():
+    written = line("Agjpq", 200, 16)
+    assert written.shape == (20, 200, 3)
+    ink = np.argwhere(written.min(axis=2) < 0.5)
+    assert ink.min() > 0 and ink[:, 0].max() < 19  # nothing is cut off below
+    assert (line("", 200, 16) == 1).all()

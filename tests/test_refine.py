@@ -6,16 +6,17 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import drjit as dr
+import drjit.opt
 import numpy as np
 import pytest
 from drjit import JitFlag
-from drjit.opt import Adam
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scenes import COUNT, SIZE, Scene, few, random_scene, scenes, small_model
 
 from eigengs_dr import fitting, starting
+from eigengs_dr.adam import Adam
 from eigengs_dr.adan import Adan
 from eigengs_dr.backend import select
 from eigengs_dr.color import rgb_to_ycbcr, to_coded, to_linear
@@ -57,6 +58,49 @@ def check_sound(result, image):
     reached = psnr(image, result.image, space="ycbcr")
     assert reached == max(figures(result))
     assert reached >= result.trace[0]["psnr_ycbcr"]
+
+
+# --- Adam --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("betas", [(0.9, 0.9), (0.9, 0.99)])
+def test_adam_is_that_of_drjit_where_that_works(backend, betas):
+    """Equal to the last bit, over the step from which on nothing is debiased."""
+    Float = select(backend).Float
+    settings = {"beta_1": betas[0], "beta_2": betas[1], "epsilon": 1e-12}
+    ours, theirs = (kind(0.1, {"x": Float(1, -2)}, **settings) for kind in (Adam, drjit.opt.Adam))
+    for first in (0, ours.last - 5):
+        for optimizer in (ours, theirs):
+            _, *averages = optimizer.state["x"][-1]
+            optimizer.state["x"] = *optimizer.state["x"][:-1], (UInt(backend, first), *averages)
+        for _ in range(10):
+            for optimizer in (ours, theirs):
+                dr.backward(dr.square(optimizer["x"]) * Float(1, 3))
+                optimizer.step()
+            np.testing.assert_array_equal(ours["x"].numpy(), theirs["x"].numpy())
+
+
+def UInt(backend, value):
+    return dr.opaque(select(backend).UInt32, value)
+
+
+def test_adam_survives_the_steps_at_which_a_power_leaves_the_range_of_doubles(backend):
+    """With a beta of 0.9 the steps 6,734 to 6,736: Dr.Jit's own makes all variables NaN."""
+    Float = select(backend).Float
+    optimizer = Adam(0.1, {"x": Float(1, -2)}, beta_1=0.9, beta_2=0.9, epsilon=1e-12)
+    for t in range(6700, 6760):
+        _, *averages = optimizer.state["x"][-1]
+        optimizer.state["x"] = *optimizer.state["x"][:-1], (UInt(backend, t), *averages)
+        dr.backward(optimizer["x"] * Float(3, -4))
+        optimizer.step()
+    # Averages that start at 0 and are not debiased hold a share of 1 - 0.9^k of a steady gradient.
+    moved = 0.1 * sum(np.sqrt(1 - 0.9**k) for k in range(1, 61))
+    np.testing.assert_allclose(optimizer["x"].numpy(), [1 - moved, -2 + moved], rtol=1e-4)
+
+
+def test_adam_refuses_averages_of_which_one_outlives_the_range_of_the_other():
+    with pytest.raises(ValueError, match="closer to each other"):
+        Adam(0.1, beta_1=0.9, beta_2=0.999)
 
 
 # --- Adan --------------------------------------------------------------------------------------
@@ -338,7 +382,7 @@ def test_plateau(backend):
     assert result.trace[-1]["iteration"] == 10
 
 
-class Spy(Adam):
+class Spy(drjit.opt.Adam):
     """Adam that remembers its rates."""
 
     def set_learning_rate(self, value=None, /, **named):

@@ -11,6 +11,7 @@ import numpy as np
 from ..atomic import replacing
 from ..color import to_coded
 from ..images import resampled
+from ..strips import joined, line
 
 if TYPE_CHECKING:
     from .inverse import Image, Result
@@ -33,10 +34,8 @@ CAPTIONS = {
 CELL = 96
 """Side of a picture in a strip, in pixels."""
 
-LINE = 14
-"""Height of a line of text."""
-
 GAP = 4
+"""White pixels between pictures."""
 
 
 def save_chart(path: str | os.PathLike[str], results: dict[str, Result]) -> None:
@@ -97,13 +96,8 @@ def strip(result: Result) -> Image:
             for step, picture in trace.pictures.items()
         ]
         cells.append(_captioned("truth", result.truth))
-        rows.append(_titled(TITLES[method], np.concatenate(cells, axis=1)))
-    width = max(row.shape[1] for row in rows)
-    padded = [
-        np.pad(row, [(0, GAP), (0, width - row.shape[1]), (0, 0)], constant_values=1)
-        for row in rows
-    ]
-    return np.concatenate(padded).astype(np.float32)
+        rows.append(_titled(TITLES[method], joined(cells, 1, GAP)))
+    return joined(rows, 0, GAP).astype(np.float32)
 
 
 def _photos(result: Result) -> Any:
@@ -114,18 +108,8 @@ def _photos(result: Result) -> Any:
 
 def _captioned(text: str, picture: Any) -> Any:
     """A picture of a strip above a line of text."""
-    scaled = resampled(picture, CELL, CELL)
-    cell = np.concatenate([scaled, _text(text, CELL)])
-    return np.pad(cell, [(0, 0), (0, GAP), (0, 0)], constant_values=1)
+    return joined([resampled(picture, CELL, CELL), line(text, CELL)], 0, 0)
 
 
 def _titled(text: str, row: Any) -> Any:
-    return np.concatenate([_text(text, row.shape[1]), row])
-
-
-def _text(text: str, width: int) -> Any:
-    from PIL import Image, ImageDraw
-
-    line = Image.new("RGB", (width, LINE), "white")
-    ImageDraw.Draw(line).text((1, 1), text, fill="black")
-    return np.asarray(line).astype(np.float32) / 255
+    return joined([line(text, row.shape[1]), row], 0, 0)

@@ -105,13 +105,14 @@ def _kernel_figures(
     dr.eval(values)
     lists = lists_for(scene, CUTOFF)
     plain_lists = build_lists(values[:SHAPE], UNIT * CUTOFF, Grid(SIDE, SIDE, PLAIN_TILE))
+    plain_values = [*values[:2], *scene.factor, *values[SHAPE:]]  # not in `UNIT`
     delta = upload(types.Float, np.random.default_rng(1).normal(size=SIDE * SIDE * 3))
     seeds = dr.linspace(types.Float, 0, 1, PEAK_LANES)
     dr.eval(seeds)
     variants: dict[str, Callable[[], Any]] = {
-        "plain_ms": lambda: _plain_step(values, background, plain_lists, delta),
+        "plain_ms": lambda: _plain_step(plain_values, background, plain_lists, delta),
         "fast_ms": lambda: _fast_step(values, background, lists, delta),
-        "plain_forward_ms": lambda: _plain_forward(values, background, plain_lists),
+        "plain_forward_ms": lambda: _plain_forward(plain_values, background, plain_lists),
         "fast_forward_ms": lambda: _fast_forward(values, background, lists),
         "lists_ms": lambda: lists_for(scene, CUTOFF),
         "peak_ms": lambda: _peak(seeds),

@@ -1,0 +1,138 @@
+"""The page of all that benchmarks left in a folder: tables, charts and pictures, with sources."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from . import pareto_tables, stability, summary
+from .page import Page, Picture, Section
+from .rows import Row, read
+from .table import Table
+
+TITLE = "eigengs_dr, measured"
+
+INTRO = """
+What the methods of eigengs_dr reach, in what time, and where they fail, as measured by the commands
+that stand below each section; they draw all of it again.
+
+**How it was measured.** Clocks start before the first splat is placed, and stop while pictures are
+judged. Methods take turns image by image in one run, on the same kernels; programs are compiled,
+and bases trained, before the clock starts. Seconds are medians over images, with the range of the
+middle half; other figures are means with standard deviations. `psnr_ycbcr` is the PSNR of the
+paper's code, in studio-range YCbCr / 255, unclamped; of the same pictures it reads 5 to 6 dB more
+than `psnr_rgb`, which is that of 8-bit RGB. Nothing was trained or tuned on the images of a test
+folder.
+
+**The methods.** `default` is this package's own. `gaussianimage` is the recipe of GaussianImage
+(Zhang et al., ECCV 2024): a random start, Adan, one rate. `eigengs` is that of the paper (Tai et
+al., CVPR 2025): the same descent from the projection on an eigenbasis, its mean image kept as
+pixels. Their bases are fitted here by one factorisation, not by 15,000 steps of training.
+"""
+
+METHODS = """
+Columns are steps of descent; column 0 is the start. `default` lets its rates fall over the run, so
+a longer run is not a shorter one continued.
+"""
+
+SPEED = """
+Every point is a fit that differs from the default one in one setting; up and to the left is better,
+and the line is the front that nothing measured is ahead of.
+"""
+
+FAILURE = """
+Every case is made by code. PSNR above 100 dB is rounding and counts as exact. A set is not finite
+if a parameter or a pixel was not, at any moment that was looked at. "Drop" is what was lost from
+the best moment to the last, the condition number is the highest of a splat's covariance, and half
+precision is what storing the last set in 16 bits costs.
+"""
+
+PICTURES = """
+Of the pictures that may be shown: photos of scikit-image, of Kodak, and cats of AFHQ.
+"""
+
+
+def page(folder: Path) -> Page:
+    """Put a page together from what the commands ``bench tables``, ... left in a folder.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Returns
+    -------
+    Page
+        A section a command; what was not run has none.
+
+    Raises
+    ------
+    ValueError
+        If the folder holds no results, or damaged ones.
+    """
+    parts: tuple[Callable[[Path], Section | None], ...] = (_methods, _speed, _failure, _pictures)
+    sections = [section for part in parts if (section := part(folder))]
+    if not sections:
+        raise ValueError(
+            f"{folder}: holds no results; run bench tables, pareto, stability or figures first"
+        )
+    return Page(TITLE, INTRO, sections)
+
+
+def source(rows: Sequence[Row]) -> str:
+    """Say what made some rows: each command with its days, then each machine with its versions."""
+    days: dict[str, list[str]] = {}
+    machines: dict[str, None] = {}
+    for row in rows:
+        run = row["run"]
+        days.setdefault(run["command"], []).append(run["date"])
+        machines[_machine(run)] = None
+    lines = [
+        f"`{command}` ({' to '.join(dict.fromkeys((min(dates), max(dates))))})"
+        for command, dates in days.items()
+    ]
+    return "\n".join([*lines, *machines])
+
+
+def _machine(run: Row) -> str:
+    versions = {k: v for k, v in run["versions"].items() if v and not k.endswith("_path")}
+    told = ", ".join(f"{name} {version}" for name, version in versions.items())
+    return f"{run['cpu']}, {run['threads']} threads, backend {run['backend']}; {told}"
+
+
+def _section(
+    title: str, text: str, tables: list[Table], pictures: list[Picture], rows: list[Row]
+) -> Section:
+    return Section(title, text, tables, pictures, source(rows))
+
+
+def _methods(folder: Path) -> Section | None:
+    rows = read(folder / "tables.jsonl")
+    return _section("The methods", METHODS, summary.tables(rows), [], rows) if rows else None
+
+
+def _speed(folder: Path) -> Section | None:
+    rows = read(folder / "pareto.jsonl")
+    if not rows:
+        return None
+    charts = sorted(folder.glob("pareto-*.svg"))
+    pictures = [Picture(chart, chart.stem) for chart in charts]
+    return _section("Speed against accuracy", SPEED, pareto_tables.tables(rows), pictures, rows)
+
+
+def _failure(folder: Path) -> Section | None:
+    rows = read(folder / "stability.jsonl")
+    if not rows:
+        return None
+    tiles = folder / "stability-tiles.png"
+    pictures = [Picture(tiles, "Tiles")] if tiles.exists() else []
+    return _section("Where methods fail", FAILURE, stability.tables(rows), pictures, rows)
+
+
+def _pictures(folder: Path) -> Section | None:
+    index = folder / "figures.json"
+    if not index.exists():
+        return None
+    found = json.loads(index.read_text(encoding="utf-8"))
+    pictures = [Picture(folder / f["path"], f["caption"], f["credit"]) for f in found["figures"]]
+    return _section("Pictures", PICTURES, [], pictures, [found])
