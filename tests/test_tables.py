@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 from scenes import family, small_model
 
-from eigengs_dr.bench import rows, sets, summary, tables, trial
+from eigengs_dr.bench import losses, rows, sets, summary, tables, trial
 from eigengs_dr.bench.table import Table, as_text, median, number, spread
 from eigengs_dr.cli import main
 from eigengs_dr.fitting import fit
@@ -311,6 +311,49 @@ def test_what_is_never_reached_is_said():
     [table] = summary.tables(found)
     assert table.rows == [
         ("faces256", "1,000", "3 of 4", "0.040 (0.040-0.040)", "0.0200 (0.0150-0.0300)", "0.0400")
+    ]
+
+
+# --- Where default loses -------------------------------------------------------------------------
+
+
+def cell(case, preset, end):
+    return {"job": {"case": case, "preset": preset, "iterations": 100, "seed": 0}, "end_ycbcr": end}
+
+
+def test_losses_after_as_many_steps_and_after_as_much_time():
+    """The other starts sooner, is ahead after 10 steps, and is overtaken."""
+    ours = [(0, 2.0, 30.0), (10, 3.0, 34.0), (100, 9.0, 45.0)]
+    theirs = [(0, 1.0, 25.0), (10, 2.5, 36.0), (100, 8.0, 40.0)]
+    fits = [
+        row(image, [moment(i, p, seconds=t) for i, t, p in moments], preset=preset, iterations=100)
+        for image in "ab"
+        for preset, moments in (("default", ours), ("gaussianimage", theirs))
+    ]
+    found = losses.table(fits, []).rows
+    where = "faces256, 100 steps in all"
+    assert list(found) == [
+        (where, "1.000 s", "gaussianimage", "25.0", "- (has not started)"),
+        (where, "10 steps", "gaussianimage", "36.0", "34.0"),
+        (where, "2.500 s", "gaussianimage", "36.0", "30.0"),
+        (where, "8.000 s", "gaussianimage", "40.0", "34.0"),
+    ]
+    assert not losses.table(fits[:-1], []).rows  # not the same images
+    assert not losses.table(fits[1:], []).rows
+
+
+def test_losses_in_hard_cases():
+    cells = [
+        cell("black", "default", 50.0),
+        cell("black", "eigengs", 50.0),
+        cell("noise", "default", 20.0),
+        cell("noise", "eigengs", 21.5),
+        cell("lines", "default", 20.0),
+        {"job": cell("lines", "eigengs", 0)["job"], "needs": "a basis"},
+        cell("smooth", "eigengs", 60.0),
+    ]
+    assert list(losses.table([], cells).rows) == [
+        ("case noise", "100 steps", "eigengs", "21.5", "20.0")
     ]
 
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from . import pareto_tables, stability, summary
+from . import losses, pareto_tables, stability, summary
 from .page import Page, Picture, Section
 from .rows import Row, read
 from .table import Table
@@ -41,11 +41,33 @@ Every point is a fit that differs from the default one in one setting; up and to
 and the line is the front that nothing measured is ahead of.
 """
 
+OF_A_SET = """
+All fits of one set of images, and below the same by setting. The grey band is the front of all, the
+dashed line that of fits with as many Gaussians.
+"""
+
+CAPTIONS = {
+    "pareto-kernels": "The renderer: what a cutoff saves in time, and leaves out of a picture.",
+    "pareto-storage": "A finished set of Gaussians, stored in fewer bits a parameter.",
+}
+"""Of the charts that are not of a set."""
+
+TILES = """
+The case "smooth": what tiling looks like, and what is measured of it. Above the middle of the
+picture, below its errors.
+"""
+
 FAILURE = """
 Every case is made by code. PSNR above 100 dB is rounding and counts as exact. A set is not finite
 if a parameter or a pixel was not, at any moment that was looked at. "Drop" is what was lost from
 the best moment to the last, the condition number is the highest of a splat's covariance, and half
 precision is what storing the last set in 16 bits costs.
+"""
+
+LOSSES = """
+Every place, of those measured above, where another preset has a higher PSNR than `default` after as
+many steps, after as much time, or at the end of a hard case. `eigengs` starts from a model that was
+trained before; that time is not counted.
 """
 
 PICTURES = """
@@ -70,7 +92,13 @@ def page(folder: Path) -> Page:
     ValueError
         If the folder holds no results, or damaged ones.
     """
-    parts: tuple[Callable[[Path], Section | None], ...] = (_methods, _speed, _failure, _pictures)
+    parts: tuple[Callable[[Path], Section | None], ...] = (
+        _methods,
+        _speed,
+        _failure,
+        _losses,
+        _pictures,
+    )
     sections = [section for part in parts if (section := part(folder))]
     if not sections:
         raise ValueError(
@@ -116,7 +144,7 @@ def _speed(folder: Path) -> Section | None:
     if not rows:
         return None
     charts = sorted(folder.glob("pareto-*.svg"))
-    pictures = [Picture(chart, chart.stem) for chart in charts]
+    pictures = [Picture(chart, CAPTIONS.get(chart.stem, OF_A_SET)) for chart in charts]
     return _section("Speed against accuracy", SPEED, pareto_tables.tables(rows), pictures, rows)
 
 
@@ -125,8 +153,15 @@ def _failure(folder: Path) -> Section | None:
     if not rows:
         return None
     tiles = folder / "stability-tiles.png"
-    pictures = [Picture(tiles, "Tiles")] if tiles.exists() else []
+    pictures = [Picture(tiles, TILES)] if tiles.exists() else []
     return _section("Where methods fail", FAILURE, stability.tables(rows), pictures, rows)
+
+
+def _losses(folder: Path) -> Section | None:
+    fits, cells = read(folder / "tables.jsonl"), read(folder / "stability.jsonl")
+    if not fits and not cells:
+        return None
+    return _section("Where default loses", LOSSES, [losses.table(fits, cells)], [], fits + cells)
 
 
 def _pictures(folder: Path) -> Section | None:
@@ -136,3 +171,13 @@ def _pictures(folder: Path) -> Section | None:
     found = json.loads(index.read_text(encoding="utf-8"))
     pictures = [Picture(folder / f["path"], f["caption"], f["credit"]) for f in found["figures"]]
     return _section("Pictures", PICTURES, [], pictures, [found])
+
+
+PARTS: tuple[Callable[[Path], Section | None], ...] = (
+    _methods,
+    _speed,
+    _failure,
+    _losses,
+    _pictures,
+)
+"""What makes the sections, in their order."""

@@ -43,14 +43,10 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         A set and a number of steps each: the methods, then bases of other sets; then the ablation
         of all sets, and how soon "default" has what "gaussianimage" has at the end.
     """
-    groups: dict[tuple[str, int], list[Row]] = defaultdict(list)
-    for row in rows:
-        groups[row["job"]["set"], row["job"]["iterations"]].append(row)
+    groups = dict(by_set(rows))
     made = []
-    for (name, iterations), group in sorted(
-        groups.items(), key=lambda item: (list(SETS).index(item[0][0]), item[0][1])
-    ):
-        fits = _by_method(group)
+    for (name, iterations), group in groups.items():
+        fits = by_method(group)
         where = f"{_images(name, fits)}, {iterations:,} steps"
         for table, title in (("main", "Methods"), ("cross", "Bases of other images")):
             shown = [m for m in methods(name, table, list(SETS)) if m in fits]
@@ -73,7 +69,16 @@ def label(method: Method, name: str) -> str:
     return f"{method.preset}, {method.components} components, {basis} basis"
 
 
-def _by_method(rows: Iterable[Row]) -> dict[Method, list[Row]]:
+def by_set(rows: Iterable[Row]) -> list[tuple[tuple[str, int], list[Row]]]:
+    """Gather the rows of each set and number of steps, in the order of `SETS`."""
+    groups: dict[tuple[str, int], list[Row]] = defaultdict(list)
+    for row in rows:
+        groups[row["job"]["set"], row["job"]["iterations"]].append(row)
+    return sorted(groups.items(), key=lambda item: (list(SETS).index(item[0][0]), item[0][1]))
+
+
+def by_method(rows: Iterable[Row]) -> dict[Method, list[Row]]:
+    """Gather the fits of each method."""
     found: dict[Method, list[Row]] = defaultdict(list)
     for row in rows:
         if "moments" in row:
@@ -137,7 +142,7 @@ def _ablations(groups: dict[tuple[str, int], list[Row]]) -> list[Table]:
         cells = []
         for (name, steps), rows in groups.items():
             own = {
-                m: r for m, r in _by_method(rows).items() if m in methods(name, "ablation", [name])
+                m: r for m, r in by_method(rows).items() if m in methods(name, "ablation", [name])
             }
             if steps == iterations and len(own) == 4:
                 cells += _ablation(name, iterations, own)
