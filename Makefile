@@ -78,7 +78,7 @@ report: $(READY)
 	$(BIN)/eigengs-dr bench stability -o $(RESULTS)
 	$(BIN)/eigengs-dr bench pareto $(wildcard $(DATA)) -o $(RESULTS) --set samples --images 2
 	$(BIN)/eigengs-dr bench figures $(wildcard $(DATA)) -o $(RESULTS) --images 2
-	$(if $(wildcard $(DATA)),$(BIN)/eigengs-dr bench tables $(DATA) -o $(RESULTS) --images 2 \
+	$(if $(wildcard $(DATA)),$(BIN)/eigengs-dr bench tables $(DATA) -o $(RESULTS) --images 4 \
 		--set faces256 --set cats256 --set cars256 --set natural256)
 	$(BIN)/eigengs-dr bench report $(RESULTS) -o docs/results
 

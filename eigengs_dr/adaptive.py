@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from .images import resampled
 from .place import inverse_factor
 
 Array = NDArray[np.floating]
@@ -37,6 +38,10 @@ SIZE = 0.7
 STRETCH = 3.0
 """Ratio of the standard deviations along and across a straight edge."""
 
+FINEST = 8.0
+"""Pixels between splats that are enough to place them: larger images are shrunk first, for the
+constants above were chosen at such a spacing, and filters of large images take long."""
+
 
 def adaptive(
     image: Array, count: int, generator: np.random.Generator
@@ -61,6 +66,12 @@ def adaptive(
     """
     height, width = image.shape[:2]
     spacing = float(np.sqrt(height * width / count))
+    if spacing >= 2 * FINEST:
+        times = int(spacing / FINEST)
+        small = resampled(image.astype(np.float32), -(-width // times), -(-height // times))
+        mean, factor = adaptive(small, count, generator)
+        x, y = width / small.shape[1], height / small.shape[0]
+        return mean * (x, y), factor / (x, y, y)
     bend = bending(image, spacing)
     density = density_of(bend, spacing, count)
     mean = relaxed(pieces(density, count), density)

@@ -48,7 +48,6 @@ def small():
         patch.setattr(sets, "MOST_COMPONENTS", 10)
         patch.setattr(figure_task, "COMPONENTS", 8)
         patch.setattr(figure_charts, "EVERY", 2)
-        patch.setattr(figure_strips, "SHOWN", 1)
         panels = {name: figure_charts.PANELS[name] for name in ("faces256", "cats256", "kodak")}
         patch.setattr(figure_charts, "PANELS", panels)
         for module in (figure_charts, figure_strips):
@@ -88,7 +87,7 @@ def models(drawn, kind):
 
 def test_every_figure_is_drawn_and_listed(drawn):
     assert [figure.name for figure in drawn.made] == [
-        *["iterations"] * 4,  # of two photos, one of Kodak, one cat
+        *["iterations"] * 3,  # of a photo, one of Kodak, one cat
         *["colors", "curves", "radii", "split", "cross"],
     ]
     listed = json.loads((drawn.folder / "figures.json").read_text())
@@ -109,7 +108,7 @@ def test_cats_are_credited(drawn):
         shown = figure.name in ("split", "cross") or figure.caption.startswith("A cat")
         assert figure.path.startswith("cats-") == shown
         assert figure.credit == ("AFHQ, NAVER Corp., CC BY-NC 4.0" if shown else "")
-    for figure, arguments in zip(drawn.made[:4], drawn.seen["strip"], strict=False):
+    for figure, arguments in zip(drawn.made[:3], drawn.seen["strip"], strict=False):
         assert arguments[1] == figure.credit
     for arguments in drawn.seen["strip"][-2:]:
         assert "AFHQ" in arguments[1]
@@ -123,7 +122,7 @@ def test_what_is_missing_is_said_once(drawn):
 
 def test_iterations_are_those_of_the_presets(drawn, data):
     """The start and the end of each row are what `fit` gives."""
-    [rows, _] = drawn.seen["strip"][3]
+    [rows, _] = drawn.seen["strip"][2]
     [(_, image)] = sets.test_images(data, "cats256", 1)
     assert [row.heading.split(":")[0] for row in rows] == ["gaussianimage", "eigengs", "default"]
     for row in rows:
@@ -139,7 +138,7 @@ def test_iterations_are_those_of_the_presets(drawn, data):
 
 
 def test_colors_have_both_psnrs_and_the_error(drawn):
-    [rows, *_] = drawn.seen["strip"][4]
+    [rows, *_] = drawn.seen["strip"][3]
     assert ["YCbCr;" in rows[0].heading, "RGB;" in rows[1].heading] == [True, True]
     for row in rows:
         photo, fit, error = row.cells
@@ -207,7 +206,7 @@ def test_the_radius_is_the_geometric_mean():
 
 
 def test_both_parts_of_a_split_make_the_whole(drawn, data):
-    [[top, bottom], _, _] = drawn.seen["strip"][5]
+    [[top, bottom], _, _] = drawn.seen["strip"][4]
     photo, low, high = (cell.picture for cell in top.cells)
     encoded = models(drawn, "split").encode(photo)
     np.testing.assert_array_equal(photo, sets.test_images(data, "cats256", 1)[0][1])
@@ -221,7 +220,7 @@ def test_both_parts_of_a_split_make_the_whole(drawn, data):
 
 
 def test_cats_are_projected_on_every_basis(drawn, data):
-    rows, _ = drawn.seen["strip"][6]
+    rows, _ = drawn.seen["strip"][5]
     images = [image for _, image in sets.test_images(data, "cats256", 3)]
     natural = eg.EigenGS.load(drawn.folder / "models" / "natural256-32x32-ycbcr-8-60-auto.npz")
     bases = [models(drawn, "auto"), natural, small_model("llvm")]
@@ -254,7 +253,7 @@ def test_without_data_photos_are_fitted(tmp_path):
         assert word in result.stderr
     listed = json.loads((folder / "figures.json").read_text())
     paths = [figure["path"] for figure in listed["figures"]]
-    assert paths == ["iterations-coffee.jpg", "iterations-rocket.jpg", "colors.jpg"]
+    assert paths == ["iterations-coffee.jpg", "colors.jpg"]
     assert "--iterations 1" in listed["run"]["command"]
     for path in paths:
         assert str(folder / path) in result.stdout

@@ -8,6 +8,7 @@ from hypothesis.extra import numpy as hnp
 from scenes import covariances, few
 
 from eigengs_dr.adaptive import adaptive, bending, density_of, hilbert_order, pieces, relaxed
+from eigengs_dr.images import resampled
 from eigengs_dr.place import GRID_SIZE, grid, inverse_factor, random
 
 INITS = [random, grid, adaptive]
@@ -273,3 +274,16 @@ def test_relaxation_of_centres_in_one_pixel():
     start = np.array([[2.5, 0.5], [2.6, 0.5], [2.7, 0.5]])
     mean = relaxed(start, np.full((1, 10), 0.3))
     np.testing.assert_allclose(mean, [[2.5, 0.5], [2.6, 0.5], [5, 0.5]])
+
+
+def test_splats_far_apart_are_placed_on_a_smaller_image():
+    """Their means and covariances are those of the small one, stretched along both axes."""
+    image = np.random.default_rng(0).uniform(0, 1, (97, 160, 3)).astype(np.float32)
+    small = resampled(image, 54, 33)  # splats lie 27 pixels apart: a third
+    mean, factor = adaptive(image, 21, generator())
+    expected_mean, expected_factor = adaptive(small, 21, generator())
+    stretch = np.array([160 / 54, 97 / 33])
+    np.testing.assert_allclose(mean, expected_mean * stretch)
+    covariance = covariances_of(expected_factor) * stretch * stretch[:, None]
+    np.testing.assert_allclose(covariances_of(factor), covariance)
+    check_placement(mean, factor, 21, (160, 97))

@@ -66,7 +66,7 @@ def test_a_section_stands_for_every_command_that_was_run(folder):
     titles = [section.title for section in page.sections]
     assert titles == ["The methods", "Where default loses", "Pictures"]
     methods, _, pictures = page.sections
-    assert "41.2 ± 0.0" in methods.tables[0].rows[0]
+    assert "41.2 ± 0.0" in methods.tables[1].rows[0]
     assert [picture.path.name for picture in pictures.pictures] == ["coffee.png", "curves.svg"]
     assert pictures.pictures[0].credit == "Somebody"
 

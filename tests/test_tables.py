@@ -271,7 +271,11 @@ def test_cells_are_means_over_images():
         for preset in ("default", "gaussianimage")
         for k, value in enumerate((34.0, 36.0, None, 42.0))
     ]
-    [table, printed] = summary.tables(found)
+    [glance, table, printed] = summary.tables(found)
+    assert glance.rows == [
+        ("faces256", preset, "33.0", "-", "-", "-", "37.3", "1.00 (1.00-1.00)")
+        for preset in ("gaussianimage", "default")
+    ]
     assert table.columns == ("method", "figure", "0", "1,000")
     cells = {line[:2]: line[2:] for line in table.rows}
     assert cells["default", "PSNR YCbCr / dB"] == ("33.0 ± 2.2", "37.3 ± 3.4")

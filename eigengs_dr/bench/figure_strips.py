@@ -35,13 +35,10 @@ from .trial import Moment
 CREDIT = "AFHQ, NAVER Corp., CC BY-NC 4.0"
 """Of all pictures of cats."""
 
-PHOTOS = {
-    "coffee": "",
-    "rocket": " The basis was trained on crops of this photo, among others.",
-}
-"""Photos of scikit-image, and what their captions add."""
+PHOTO = "coffee"
+"""Photo of scikit-image that the basis "natural" was not trained on."""
 
-SHOWN = 2
+SHOWN = 1
 """Images of a set that are shown."""
 
 MAGNIFIED = 8
@@ -84,7 +81,7 @@ def iterations(task: Task) -> Iterator[Figure]:
 def colors(task: Task) -> Iterator[Figure]:
     """Compare fits in YCbCr and in RGB: the paper's figures of colour spaces."""
     model = load_basis("natural", task.backend)
-    image = to_size(sample("coffee"), model)
+    image = to_size(sample(PHOTO), model)
     marks, table = sorted({min(10, task.iterations), task.iterations}), []
     for done, (color, heading) in enumerate({"ycbcr": "YCbCr", "rgb": "RGB"}.items()):
         task.progress("colors", done, 2)
@@ -163,9 +160,8 @@ def cross(task: Task) -> Iterator[Figure]:
 def _subjects(task: Task) -> Iterator[Subject]:
     """Images whose first iterations are shown."""
     shipped = load_basis("natural", task.backend)
-    for name, added in PHOTOS.items():
-        words = f'A photo of scikit-image and the basis "natural".{added}'
-        yield Subject(f"iterations-{name}.jpg", to_size(sample(name), shipped), shipped, words)
+    words = 'A photo of scikit-image and the basis "natural".'
+    yield Subject(f"iterations-{PHOTO}.jpg", to_size(sample(PHOTO), shipped), shipped, words)
     if "kodak" in task.present:
         words = 'A Kodak photo and the basis "natural".'
         for file, image in sets.test_images(task.data, "kodak", SHOWN):

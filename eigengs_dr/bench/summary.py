@@ -12,6 +12,7 @@ from .rows import Row
 from .sets import SETS, UNIVERSAL
 from .table import MISSING, Table, median, number, spread
 from .tables import PAPERS_COMPONENTS, Method, methods
+from .trial import ITERATIONS
 
 THRESHOLDS = (35, 40)
 """Decibels of psnr_ycbcr: the paper counts the images above."""
@@ -44,7 +45,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         of all sets, and how soon "default" has what "gaussianimage" has at the end.
     """
     groups = dict(by_set(rows))
-    made = []
+    made = [_glance(steps, groups) for steps in sorted({steps for _, steps in groups})]
+    made = [table for table in made if table.rows]
     for (name, iterations), group in groups.items():
         fits = by_method(group)
         where = f"{_images(name, fits)}, {iterations:,} steps"
@@ -67,6 +69,31 @@ def label(method: Method, name: str) -> str:
     if method.source not in (name, UNIVERSAL):
         basis = method.source
     return f"{method.preset}, {method.components} components, {basis} basis"
+
+
+def _glance(iterations: int, groups: dict[tuple[str, int], list[Row]]) -> Table:
+    """One line a set and method: means of the PSNR over steps, and the time of all of them."""
+    steps = [step for step in ITERATIONS if step < iterations] + [iterations]
+    lines: list[tuple[str, ...]] = []
+    for (name, length), group in groups.items():
+        fits = by_method(group) if length == iterations else {}
+        for method in (m for m in methods(name, "main", list(SETS)) if m in fits):
+            means = (_mean(_moments(fits[method], step), "psnr_ycbcr") for step in steps)
+            seconds = _seconds(_moments(fits[method], iterations))
+            lines.append((name, label(method, name), *means, seconds))
+    caption = f"PSNR YCbCr / dB by steps, means over images, and seconds of {iterations:,} steps"
+    return Table(caption, ("set", "method", *(f"{s:,}" for s in steps), "seconds"), lines)
+
+
+def _seconds(moments: Sequence[Row]) -> str:
+    """Median of the time, to the millisecond where it is short."""
+    taken = [moment["seconds"] for moment in moments]
+    return median(taken, 3 if taken and max(taken) < 0.1 else 2)
+
+
+def _mean(moments: Sequence[Row], figure: str) -> str:
+    known = [moment[figure] for moment in moments if moment[figure] is not None]
+    return number(float(np.mean(known))) if known else MISSING
 
 
 def by_set(rows: Iterable[Row]) -> list[tuple[tuple[str, int], list[Row]]]:
@@ -114,7 +141,7 @@ def _cell(line: str, moments: Sequence[Row]) -> str:
     if not moments:
         return MISSING
     if line == "seconds":
-        return median([moment[line] for moment in moments])
+        return _seconds(moments)
     if line in map(str, THRESHOLDS):
         # The PSNR of equal images is null in the file.
         above = [m["psnr_ycbcr"] is None or m["psnr_ycbcr"] > float(line) for m in moments]

@@ -93,7 +93,7 @@ def _fine(plane: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def save_pictures(
-    path: str | os.PathLike[str], image: Image, pictures: dict[str, Image], side: int = 256
+    path: str | os.PathLike[str], image: Image, pictures: dict[str, Image], side: int = 128
 ) -> None:
     """Show the middle of pictures of one image, and below their errors magnified around mid-grey.
 
@@ -115,12 +115,12 @@ def save_pictures(
     height, width = (min(side, length) for length in image.shape[:2])
     top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
     part = np.s_[top : top + height, left : left + width]
-    figure = new_figure(5 * len(pictures), 10.5)
+    figure = new_figure(3.6 * len(pictures), 7.7)
     axes = figure.subplots(2, len(pictures), squeeze=False)
     for column, (name, picture) in zip(axes.T, pictures.items(), strict=True):
         error = 0.5 + MAGNIFIED * (picture - image)
         levels = tiling(picture, image)
-        column[0].set_title(f"{name}: {levels:.2f} levels of tiling")
+        column[0].set_title(f"{name}:\n{levels:.2f} levels of tiling")
         column[1].set_title(f"its errors times {MAGNIFIED}")
         for axis, shown in zip(column, (picture, error), strict=True):
             axis.imshow(np.clip(shown[part], 0, 1), interpolation="nearest")
