@@ -199,7 +199,7 @@ def test_tables_tell_what_is_on_the_front():
     (table,) = pareto_tables.tables(made_rows())
     assert table.rows[0] == (
         "preset default",
-        "2.00 (1.50-2.50)",
+        "2.000 (1.500-2.500)",
         "31.0 ± 1.0",
         "5.00 (3.50-6.50)",
         "42.0 ± 2.0",

@@ -1,7 +1,9 @@
 """The page of all results: what is found in a folder, and what its sections say."""
 
 import json
+import re
 import shutil
+from pathlib import Path
 
 import browser
 import numpy as np
@@ -104,3 +106,21 @@ def test_the_command_writes_a_page_that_browsers_open(folder, tmp_path):
     assert not found["errors"] and not found["blocked"]
     assert len(found["images"]) == 1 and found["images"][0]["loaded"]
     assert len(found["charts"]) == 1 and found["charts"][0]["paths"] > 0
+
+
+def test_the_committed_page_is_whole():
+    """In a browser every picture and chart is there that the Markdown beside it shows."""
+    folder = Path(__file__).parents[1] / "docs" / "results"
+    shown = re.findall(r"\]\((pictures/[^)]+)\)", (folder / "README.md").read_text())
+    assert all((folder / name).is_file() for name in shown)
+    assert {(folder / name).name for name in shown} == {
+        path.name for path in (folder / "pictures").iterdir()
+    }
+    charts = sum(name.endswith(".svg") for name in shown)
+    assert charts >= 5 and len(shown) - charts >= 5
+    found = browser.probe(folder / "index.html")
+    assert not found["errors"] and not found["blocked"]
+    assert len(found["charts"]) == charts and len(found["images"]) == len(shown) - charts
+    assert all(image["loaded"] and min(image["size"]) > 50 for image in found["images"])
+    assert all(chart["paths"] > 0 and min(chart["size"]) > 50 for chart in found["charts"])
+    assert len(found["tables"]) > 10

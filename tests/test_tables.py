@@ -335,9 +335,9 @@ def test_losses_after_as_many_steps_and_after_as_much_time():
         for preset, moments in (("default", ours), ("gaussianimage", theirs))
     ]
     found = losses.table(fits, []).rows
-    where = "faces256, 100 steps in all"
+    where = "faces256, 100 steps"
     assert list(found) == [
-        (where, "1.000 s", "gaussianimage", "25.0", "- (has not started)"),
+        (where, "until 2.000 s", "gaussianimage", "25.0", "-"),
         (where, "10 steps", "gaussianimage", "36.0", "34.0"),
         (where, "2.500 s", "gaussianimage", "36.0", "30.0"),
         (where, "8.000 s", "gaussianimage", "40.0", "34.0"),

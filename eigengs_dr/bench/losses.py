@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from .rows import Row
+from .sets import SETS
 from .summary import by_method, by_set, label
 from .table import MISSING, Table, number
-from .tables import Method
+from .tables import Method, methods
 
 DEFAULT = Method("default")
 
@@ -22,9 +23,10 @@ def table(fits: Sequence[Row], cells: Sequence[Row]) -> Table:
     Parameters
     ----------
     fits : sequence of dict
-        Of `eigengs_dr.bench.tables.run`. Means over images are compared, of a method with the same
-        images: after as many steps, and after as many seconds (medians), when default has its best
-        of all steps that it has taken by then.
+        Of `eigengs_dr.bench.tables.run`. Means over images are compared, of the methods of the main
+        table with the same images: after as many steps, and after as many seconds (medians), when
+        default has its best of all steps that it has taken by then. Before its first set is there,
+        it has none.
     cells : sequence of dict
         Of `eigengs_dr.bench.stability.jobs`: ends are compared.
 
@@ -40,20 +42,24 @@ def table(fits: Sequence[Row], cells: Sequence[Row]) -> Table:
 
 
 def _of_set(name: str, iterations: int, rows: Sequence[Row]) -> Iterator[Line]:
-    methods = by_method(rows)
-    images = {row["job"]["image"] for row in methods.get(DEFAULT, [])}
-    ours = _course(methods.get(DEFAULT, []))
-    for method, fits in methods.items():
-        if method.preset == "default" or {row["job"]["image"] for row in fits} != images:
+    fits = by_method(rows)
+    images = {row["job"]["image"] for row in fits.get(DEFAULT, [])}
+    ours = _course(fits.get(DEFAULT, []))
+    first = min((seconds for seconds, _ in ours.values()), default=0.0)
+    for method in (m for m in methods(name, "main", list(SETS)) if m in fits and m != DEFAULT):
+        if {row["job"]["image"] for row in fits[method]} != images:
             continue
-        where, who = f"{name}, {iterations:,} steps in all", label(method, name)
-        for step, (seconds, theirs) in _course(fits).items():
+        course, said = _course(fits[method]), (f"{name}, {iterations:,} steps", label(method, name))
+        early = [psnr for seconds, psnr in course.values() if seconds < first]
+        if early:
+            yield said[0], f"until {number(first, 3)} s", said[1], number(max(early)), MISSING
+        for step, (seconds, theirs) in course.items():
             if theirs > ours[step][1]:
-                yield where, f"{step:,} steps", who, number(theirs), number(ours[step][1])
+                yield said[0], f"{step:,} steps", said[1], number(theirs), number(ours[step][1])
             reached = [psnr for taken, psnr in ours.values() if taken <= seconds]
-            if theirs > max(reached, default=-np.inf):
-                best = number(max(reached)) if reached else f"{MISSING} (has not started)"
-                yield where, f"{number(seconds, 3)} s", who, number(theirs), best
+            if reached and theirs > max(reached):
+                best = number(max(reached))
+                yield said[0], f"{number(seconds, 3)} s", said[1], number(theirs), best
 
 
 def _course(fits: Sequence[Row]) -> dict[int, tuple[float, float]]:

@@ -135,7 +135,7 @@ def _variants_table(rows: list[Row], name: str) -> Table:
         lines.append(
             (
                 f"{last.knob} {text_of(last.value)}",
-                median(first.seconds),
+                median(first.seconds, 3),
                 spread(first.psnr_ycbcr),
                 median(last.seconds),
                 spread(last.psnr_ycbcr),
