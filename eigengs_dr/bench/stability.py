@@ -263,6 +263,10 @@ def _decibels(value: float | None) -> str:
     return "exact" if value == EXACT else number(value)
 
 
+def _ratio(value: float | None) -> str:
+    return number(value, 0) if value is None or value < 1e5 else f"{value:.1e}"
+
+
 def _of(key: str, write: Callable[[float | None], str]) -> Callable[[Row], str]:
     """Make the writer of a figure that may be missing."""
     return lambda row: write(row.get(key))
@@ -285,7 +289,7 @@ FIGURES: tuple[tuple[str, Callable[[Row], str]], ...] = (
     ("PSNR in dB, 8-bit RGB, at the end", _of("end_rgb", _decibels)),
     ("dB from the best moment to the last, YCbCr", _of("drop_ycbcr", partial(number, decimals=2))),
     ("dB that half precision takes, 8-bit RGB", _stored),
-    ("Highest condition number of a covariance", _of("condition", partial(number, decimals=0))),
+    ("Highest condition number of a covariance", _of("condition", _ratio)),
     ("Tiling, 8-bit levels", _of("tiling", partial(number, decimals=2))),
     ("Seconds, and the peak of memory", _cost),
 )
