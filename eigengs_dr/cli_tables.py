@@ -65,7 +65,7 @@ def tables(
     Every fit adds a line to tables.jsonl in the folder: the same command goes on where one was
     broken off, and one with more sets or steps adds to what is there. Clocks start before the first
     splat is placed; judging pictures is not counted. Trained bases and models are kept in models/
-    of the folder: about half a gigabyte a set, at 512x512 some gigabytes.
+    of the folder: about a gigabyte a set, at 512x512 some gigabytes.
 
     \b
     Examples:
