@@ -6,14 +6,19 @@ from pathlib import Path
 import click
 
 from .backend import select
-from .cli_shared import ANY_PATH, FOLDER, backend_option, described, quiet_option, seed_option
+from .cli_shared import (
+    ANY_PATH,
+    FOLDER,
+    SETS,
+    backend_option,
+    described,
+    quiet_option,
+    seed_option,
+)
 from .console import progress_bar
 from .outputs import check_outputs
 
 SAMPLES = "samples"
-
-SETS = ("faces256", "cats256", "cars256", "natural256", "cats512", "kodak")
-"""Of `eigengs_dr.bench.sets`, without importing what fits images, which that module does."""
 
 
 @click.command()

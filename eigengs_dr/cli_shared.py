@@ -14,6 +14,9 @@ EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 ANY_PATH = click.Path(path_type=Path)
 
+SETS = ("faces256", "cats256", "cars256", "natural256", "cats512", "kodak")
+"""Of benchmarks, without importing their module, which imports Dr.Jit."""
+
 MOST_PIXELS = 1 << 26
 """Largest picture that is rendered, thin ones counted in whole tiles: it takes some 6 GiB."""
 

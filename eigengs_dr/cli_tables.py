@@ -5,14 +5,23 @@ from pathlib import Path
 import click
 
 from .backend import select
-from .cli_shared import ANY_PATH, FOLDER, backend_option, described, quiet_option, seed_option
+from .cli_shared import (
+    ANY_PATH,
+    FOLDER,
+    SETS,
+    backend_option,
+    described,
+    quiet_option,
+    seed_option,
+)
 from .console import progress_bar
 from .outputs import check_outputs
 
-SETS = ("faces256", "cats256", "cars256", "natural256", "cats512")
-"""The paper's kinds of images, without importing their module, which imports Dr.Jit."""
+PAPERS = SETS[:-1]
+"""The paper's kinds of images: all but Kodak's photos."""
 
 TABLES = ("main", "ablation", "cross", "reach")
+"""Of `eigengs_dr.bench.tables`, without importing it."""
 
 
 @click.command()
@@ -22,7 +31,7 @@ TABLES = ("main", "ablation", "cross", "reach")
     "--set",
     "names",
     multiple=True,
-    type=click.Choice([*SETS, "kodak"]),
+    type=click.Choice(SETS),
     help="Which images; may be repeated. By default all but kodak.",
 )
 @click.option(
@@ -83,7 +92,7 @@ def tables(
         found = benchmark.run(
             data,
             output,
-            names or SETS,
+            tuple(dict.fromkeys(names)) or PAPERS,
             tables or TABLES,
             images,
             iterations,

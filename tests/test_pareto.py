@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scenes import family, few, small_model
 
 import eigengs_dr as eg
-from eigengs_dr import cli_pareto
+from eigengs_dr import cli_pareto, cli_shared
 from eigengs_dr.arrays import types_in
 from eigengs_dr.backend import select
 from eigengs_dr.bench import kernels, pareto, pareto_kernels, pareto_tables, sets
@@ -294,6 +294,6 @@ def test_mistakes_are_told_before_the_work(small, monkeypatch, tmp_path):
 
 
 def test_the_command_knows_all_sets():
-    assert tuple(sets.SETS) == cli_pareto.SETS
+    assert tuple(sets.SETS) == cli_shared.SETS
     assert pareto.SAMPLES == cli_pareto.SAMPLES
     assert "Examples" in bench("--help").output

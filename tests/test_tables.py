@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 from scenes import family, small_model
 
+from eigengs_dr import cli_tables
 from eigengs_dr.bench import losses, rows, sets, summary, tables, trial
 from eigengs_dr.bench.table import Table, as_text, median, number, spread
 from eigengs_dr.cli import main
@@ -389,7 +390,7 @@ def test_the_command_prints_tables_and_goes_on(data, tmp_path, backend):
     arguments += ["--set", "faces256", "--table", "main", "--images", "1", "--iterations", "3"]
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 0
-    assert "Methods: faces256, 1 images of 32x32, 60 Gaussians, 3 steps" in result.stdout
+    assert "Methods: faces256, 1 image of 32x32, 60 Gaussians, 3 steps" in result.stdout
     assert "eigengs, 8 components, universal basis" in result.stdout
     lines = (output / "tables.jsonl").read_text().splitlines()
     assert len(lines) == 6
@@ -398,6 +399,18 @@ def test_the_command_prints_tables_and_goes_on(data, tmp_path, backend):
     result = CliRunner().invoke(main, [*arguments, "--quiet"])
     assert result.exit_code == 0 and not result.stdout
     assert (output / "tables.jsonl").read_text().splitlines() == lines
+
+
+def test_the_command_knows_the_tables_and_the_papers_sets():
+    assert cli_tables.TABLES == tables.TABLES
+    assert "kodak" not in cli_tables.PAPERS and len(cli_tables.PAPERS) == len(sets.SETS) - 1
+
+
+def test_a_set_that_is_named_twice_is_measured_once(data, tmp_path, backend):
+    arguments = ["bench", "tables", str(data), "-o", str(tmp_path / "r"), "--backend", backend]
+    arguments += ["--table", "main", "--images", "1", "--iterations", "2"]
+    result = CliRunner().invoke(main, [*arguments, *["--set", "faces256"] * 2])
+    assert "Methods: faces256, 1 image of 32x32" in result.stdout
 
 
 def test_a_set_that_is_not_there_is_named(tmp_path):

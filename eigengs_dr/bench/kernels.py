@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -19,7 +21,7 @@ from ..images import check_image, sample
 from ..presets import PRESETS
 from ..reference import render_plain
 from ..refine import Progress, descend
-from ..rendering import lists_for, splat, splat_values
+from ..rendering import lists_for, splat, splat_values, to_tensor
 from ..solve import solve
 from ..splat import SHAPE, UNIT
 from ..tiles import Grid, TileLists, build_lists
@@ -101,23 +103,21 @@ def _scene(types: ArrayTypes) -> Gaussians:
 def _kernel_figures(
     types: ArrayTypes, scene: Gaussians, progress: Progress | None
 ) -> dict[str, float]:
-    values, background = splat_values(scene)
-    dr.eval(values)
-    lists = lists_for(scene, CUTOFF)
-    plain_lists = build_lists(values[:SHAPE], UNIT * CUTOFF, Grid(SIDE, SIDE, PLAIN_TILE))
-    plain_values = [*values[:2], *scene.factor, *values[SHAPE:]]  # not in `UNIT`
-    delta = upload(types.Float, np.random.default_rng(1).normal(size=SIDE * SIDE * 3))
+    plain_forward, plain_step, _ = programs(scene, CUTOFF, plain=True)
+    fast_forward, fast_step, _ = programs(scene, CUTOFF, plain=False)
     seeds = dr.linspace(types.Float, 0, 1, PEAK_LANES)
     dr.eval(seeds)
     variants: dict[str, Callable[[], Any]] = {
-        "plain_ms": lambda: _plain_step(plain_values, background, plain_lists, delta),
-        "fast_ms": lambda: _fast_step(values, background, lists, delta),
-        "plain_forward_ms": lambda: _plain_forward(plain_values, background, plain_lists),
-        "fast_forward_ms": lambda: _fast_forward(values, background, lists),
+        "plain_ms": plain_step,
+        "fast_ms": fast_step,
+        "plain_forward_ms": plain_forward,
+        "fast_forward_ms": fast_forward,
         "lists_ms": lambda: lists_for(scene, CUTOFF),
         "peak_ms": lambda: _peak(seeds),
     }
     ms = _interleaved(variants, progress)
+    for program in (plain_forward, plain_step, fast_forward, fast_step):
+        program.func.clear()  # left to the garbage collector, it may go while another is traced
     useful = _pixels_inside(scene)
     peak = PEAK_LANES * PEAK_LOOPS * PEAK_UNROLL / (ms.pop("peak_ms") * 1e6)
     return {
@@ -130,28 +130,57 @@ def _kernel_figures(
     }
 
 
-@dr.freeze
-def _plain_forward(values: list, background: list, lists: TileLists) -> Any:
-    return render_plain(values, background, lists, CUTOFF)
+def programs(
+    scene: Gaussians, cutoff: float, plain: bool
+) -> tuple[Any, Any, Callable[[], NDArray[Any]]]:
+    """Make frozen programs that draw a scene, forward and with reverse, and what shows it.
 
+    Parameters
+    ----------
+    scene : Gaussians
+    cutoff : float
+        In standard deviations.
+    plain : bool
+        By `render_plain` instead of `splat`; tile lists are built here in both cases.
 
-@dr.freeze
-def _fast_forward(values: list, background: list, lists: TileLists) -> Any:
-    return splat(values, background, lists, CUTOFF)
+    Returns
+    -------
+    forward, step : functools.partial
+        Called without arguments; ``func.clear()`` frees the program.
+    shown : callable
+        ``shown()`` is the picture, ndarray of shape (H, W, C).
+    """
+    values, background = splat_values(scene)
+    dr.eval(values)
+    if plain:
+        grid, draw = Grid(scene.width, scene.height, PLAIN_TILE), render_plain
+        lists = build_lists(values[:SHAPE], UNIT * cutoff, grid)
+        values = [*values[:2], *scene.factor, *values[SHAPE:]]  # not in `UNIT`
+    else:
+        draw, lists = splat, lists_for(scene, cutoff)
+    shape = (scene.height, scene.width, scene.channels)
+    delta = upload(type(values[0]), np.random.default_rng(1).normal(size=math.prod(shape)))
 
+    @dr.freeze
+    def forward(values: list, background: list, lists: TileLists) -> Any:
+        return draw(values, background, lists, cutoff)
 
-@dr.freeze
-def _plain_step(values: list, background: list, lists: TileLists, delta: Any) -> list:
-    dr.enable_grad(values)
-    dr.backward(dr.dot(render_plain(values, background, lists, CUTOFF), delta))
-    return dr.grad(values)
+    @dr.freeze
+    def step(values: list, background: list, lists: TileLists, delta: Any) -> list:
+        dr.enable_grad(values)
+        dr.backward(dr.dot(draw(values, background, lists, cutoff), delta))
+        return dr.grad(values)
 
+    def shown() -> NDArray[Any]:
+        image = draw(values, background, lists, cutoff)
+        return (
+            image.numpy().reshape(shape)
+            if plain
+            else to_tensor(image, lists.grid, shape[2]).numpy()
+        )
 
-@dr.freeze
-def _fast_step(values: list, background: list, lists: TileLists, delta: Any) -> list:
-    dr.enable_grad(values)
-    dr.backward(dr.dot(splat(values, background, lists, CUTOFF), delta))
-    return dr.grad(values)
+    frozen = partial(step, values, background, lists, delta)
+    return partial(forward, values, background, lists), frozen, shown
 
 
 def _interleaved(

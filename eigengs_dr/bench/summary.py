@@ -118,7 +118,8 @@ def _images(name: str, fits: dict[Method, list[Row]]) -> str:
     chosen, counts = SETS[name], sorted({len(rows) for rows in fits.values()})
     many = " to ".join(map(str, dict.fromkeys([counts[0], counts[-1]]))) if counts else "0"
     size = f"{chosen.width}x{chosen.height}"
-    return f"{name}, {many} images of {size}, {chosen.gaussians:,} Gaussians"
+    images = "image" if many == "1" else "images"
+    return f"{name}, {many} {images} of {size}, {chosen.gaussians:,} Gaussians"
 
 
 def _moments(rows: Sequence[Row], step: int) -> list[Row]:
