@@ -9,6 +9,8 @@ by the error after 10 steps of the colour solve.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +18,7 @@ from .images import resampled
 from .place import inverse_factor
 
 Array = NDArray[np.floating]
+Density = Callable[[Array, float], Array]
 
 BLUR = 0.18
 """Standard deviation, in splat spacings, of what no splat can follow."""
@@ -44,7 +47,10 @@ constants above were chosen at such a spacing, and filters of large images take 
 
 
 def adaptive(
-    image: Array, count: int, generator: np.random.Generator
+    image: Array,
+    count: int,
+    generator: np.random.Generator | None = None,
+    density: Density | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Place and shape splats by the second derivatives of an image.
 
@@ -54,8 +60,11 @@ def adaptive(
         In the space whose squared error counts.
     count : int
         Number of splats, from 1 to H W.
-    generator : numpy.random.Generator
+    generator : numpy.random.Generator, optional
         Not used: the result is a function of the image.
+    density : callable, optional
+        ``density(bend, spacing)`` returns splats a pixel, up to a factor, of the shape of the image
+        or of a smaller one; by default `bent`.
 
     Returns
     -------
@@ -68,14 +77,15 @@ def adaptive(
     spacing = float(np.sqrt(height * width / count))
     if spacing >= 2 * FINEST:
         times = int(spacing / FINEST)
-        small = resampled(image.astype(np.float32), -(-width // times), -(-height // times))
-        mean, factor = adaptive(small, count, generator)
+        size = -(-width // times), -(-height // times)
+        small = resampled(image.astype(np.float32), *size)
+        mean, factor = adaptive(small, count, density=density)
         x, y = width / small.shape[1], height / small.shape[0]
         return mean * (x, y), factor / (x, y, y)
     bend = bending(image, spacing)
-    density = density_of(bend, spacing, count)
-    mean = relaxed(pieces(density, count), density)
-    return mean, factors(mean, density, bend, spacing)
+    splats = capped((density or bent)(bend, spacing), count)
+    mean = relaxed(pieces(splats, count), splats)
+    return mean, factors(mean, splats, bend, spacing)
 
 
 def bending(image: Array, spacing: float) -> NDArray[np.float32]:
@@ -99,11 +109,17 @@ def bending(image: Array, spacing: float) -> NDArray[np.float32]:
     return squared + np.array([noise, noise, 0], np.float32)[:, None, None]
 
 
-def density_of(bend: Array, spacing: float, count: int) -> NDArray[np.float64]:
-    """Splats a pixel, shape (H, W): `count` in all, or a little less where most pixels have one."""
+def bent(bend: Array, spacing: float) -> NDArray[np.float64]:
+    """Density that the bending asks for, shape (H, W), up to a factor."""
     from scipy.ndimage import gaussian_filter
 
-    density = gaussian_filter(bend[0] + bend[1], POOL * spacing).astype(np.float64) ** POWER
+    mean = gaussian_filter(bend[0] + bend[1], POOL * spacing)
+    return np.asarray(mean, np.float64) ** POWER
+
+
+def capped(density: Array, count: int) -> NDArray[np.float64]:
+    """Scale a density to `count` splats in all, or a little less where most pixels have one."""
+    density = density.astype(np.float64)
     for _ in range(5):  # what is cut off above goes to the rest
         density = np.minimum(density * (count / density.sum()), 1.0)
     return density
@@ -158,24 +174,26 @@ def hilbert_order(height: int, width: int) -> NDArray[np.int64]:
 
 def relaxed(mean: Array, density: Array) -> NDArray[np.float64]:
     """One Lloyd step: each centre moves to the centroid of the pixels nearest to it."""
-    from scipy.ndimage import distance_transform_edt
-
-    height, width = density.shape
     count = len(mean)
-    column, row = _pixels(mean, density.shape)
-    owner = np.full(height * width, -1)
-    owner[row * width + column] = np.arange(count)  # of several in one pixel only the last moves
-    y, x = distance_transform_edt(
-        (owner < 0).reshape(height, width), return_distances=False, return_indices=True
-    )
-    owner = owner[(y * width + x).ravel()]
-    rows, columns = np.indices((height, width)).reshape(2, -1)
+    owner = owners(mean, density.shape)
+    rows, columns = np.indices(density.shape).reshape(2, -1)
     mass = np.bincount(owner, density.ravel(), count)
     moment = [np.bincount(owner, density.ravel() * (v + 0.5), count) for v in (columns, rows)]
     moves = mass > 0
     result = np.array(mean, np.float64)
     result[moves] = np.stack(moment, axis=1)[moves] / mass[moves, None]
     return result
+
+
+def owners(mean: Array, shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """Index of the centre nearest to each pixel, shape (H W,); of several in one pixel the last."""
+    from scipy.ndimage import distance_transform_edt
+
+    column, row = _pixels(mean, shape)
+    owner = np.full(shape, -1)
+    owner[row, column] = np.arange(len(mean))
+    y, x = distance_transform_edt(owner < 0, return_distances=False, return_indices=True)
+    return owner[y, x].ravel()
 
 
 def factors(mean: Array, density: Array, bend: Array, spacing: float) -> NDArray[np.float64]:
@@ -197,7 +215,7 @@ def factors(mean: Array, density: Array, bend: Array, spacing: float) -> NDArray
     )
 
 
-def _pixels(mean: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
+def _pixels(mean: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
     """Columns and rows of the pixels that centres lie in."""
     column = np.clip(mean[:, 0].astype(int), 0, shape[1] - 1)
     return column, np.clip(mean[:, 1].astype(int), 0, shape[0] - 1)

@@ -22,6 +22,9 @@ from .console import INTERRUPTED, progress_bar, say
 from .outputs import check_outputs, name_outputs
 from .report import write_report
 
+MISSED = 1
+"""Exit code where a PSNR that was asked for is out of reach."""
+
 
 @click.command()
 @click.argument("images", nargs=-1, required=True, type=EXISTING, metavar="IMAGE...")
@@ -31,6 +34,18 @@ from .report import write_report
     type=click.IntRange(min=1),
     help="How many; by default 5000, one a pixel where the image has fewer pixels, or as many as "
     "the basis has.",
+)
+@click.option(
+    "--target-psnr",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="DB",
+    help="As few Gaussians as reach it, instead of a given number.",
+)
+@choice("--target-space", ["ycbcr", "rgb"], "Where --target-psnr is measured.")
+@click.option(
+    "--max-gaussians",
+    type=click.IntRange(min=1),
+    help="Most for --target-psnr; by default 3 for 8 pixels, which have as many numbers.",
 )
 @click.option("--iterations", type=click.IntRange(min=0), default=1000, show_default=True)
 @choice("--init", ["auto", "random", "grid", "adaptive", "eigen"], "Where the Gaussians start.")
@@ -76,6 +91,9 @@ def fit(
     deviation.
     Ctrl-C keeps the best fit so far: it is written before the command ends with exit code 130.
 
+    --target-psnr searches for the smallest number of Gaussians, in up to twice the iterations. A
+    target that is out of reach is said so, the best fit is written, and the exit code is 1.
+
     With --preset eigengs, the paper's form, the file holds the Gaussians alone, without the mean
     image, which is kept in the basis.
 
@@ -86,6 +104,7 @@ def fit(
     Examples:
       eigengs-dr fit photo.jpg -o photo.npz
       eigengs-dr fit photo.jpg -o photo.npz --gaussians 20000 --report photo.json
+      eigengs-dr fit photo.jpg -o photo.npz --target-psnr 38
       eigengs-dr fit photo.jpg -o photo.npz --init eigen --iterations 100
       eigengs-dr fit *.png -o fits/ --preview previews/ --iterations 300
       eigengs-dr fit roughness.png -o roughness.npz --color data
@@ -109,6 +128,11 @@ def fit(
     if records[-1]["stopped"] == "interrupted":
         say(f"interrupted; the best fit so far is in {records[-1]['output']}")
         context.exit(INTERRUPTED)
+    missed = [record for record in records if record["stopped"] == "out of reach"]
+    for record in missed:
+        say(_out_of_reach(record, **settings))
+    if missed:
+        context.exit(MISSED)
 
 
 def _basis(backend: str | None, init: str, preset: str, basis: str, **rest: Any) -> Any:
@@ -162,6 +186,17 @@ def _fit_one(
     if not quiet:
         click.echo(_summary(record, preview, unclamped(color)))
     return record
+
+
+def _out_of_reach(
+    record: dict[str, Any], target_psnr: float, target_space: str, **rest: Any
+) -> str:
+    """What to do where no number of Gaussians was enough."""
+    return (
+        f"{record['input']}: {target_psnr:g} dB are out of reach: {record['gaussians']} Gaussians "
+        f"have {record['psnr_' + target_space]:.2f}; lower --target-psnr, or allow more by "
+        "--max-gaussians or --iterations"
+    )
 
 
 def _summary(record: dict[str, Any], preview: Path | None, space: str) -> str:

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import os
 import time
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .budget import fewest
 from .color import SPACES
 from .eigengs import EigenGS
 from .gaussians import Gaussians
 from .images import check_image
 from .interrupt import deferred
 from .presets import PRESETS
-from .refine import Progress, refine
+from .refine import EXACT, Progress, figures, refine
 from .rendering import picture_of
+from .splat import SHAPE
 from .starting import INITS, begin
+
+FIRST = 64
+"""Pixels a splat of the first try, where the number of splats is searched for."""
 
 
 class Fit(NamedTuple):
@@ -27,7 +33,8 @@ class Fit(NamedTuple):
     ----------
     gaussians : Gaussians
     trace : list of dict
-        Rows with iteration, seconds, psnr_ycbcr, psnr_rgb; row 0 is before refinement. Seconds
+        Rows with iteration, seconds, psnr_ycbcr, psnr_rgb, and gaussians where their number was
+        searched for; row 0 is before refinement. Seconds
         count from the call of `fit`: placement, upload and colour solve are in them, and what it
         takes to compute the rows. For color "data" psnr_rgb is that of the data, clamped and
         rounded to 8 bits, and psnr_ycbcr that of the data as it is: no YCbCr is in it.
@@ -39,7 +46,8 @@ class Fit(NamedTuple):
     iterations : int
         Steps of refinement taken.
     stopped : str
-        Why it ended: "iterations", "plateau" or "interrupted".
+        Why it ended: "iterations", "plateau", "interrupted"; or, where a PSNR was asked for, "met"
+        or "out of reach".
     mean_image : ndarray of float32, shape (H, W, 3), or None
         What renderings of the set are added to, RGB: the preset "eigengs" keeps the mean image of
         its basis as pixels. It is in `image` already.
@@ -67,8 +75,11 @@ def fit(
     seed: int = 0,
     backend: str | None = None,
     progress: Progress | None = None,
+    target_psnr: float | None = None,
+    target_space: str = "ycbcr",
+    max_gaussians: int | None = None,
 ) -> Fit:
-    """Fit Gaussians to an image.
+    """Fit Gaussians to an image: so many, or the fewest that reach a quality.
 
     Splats are placed, their colours solved for, and all parameters refined by gradient descent on
     the squared error.
@@ -101,6 +112,15 @@ def fit(
         By default "cuda" where there is a GPU.
     progress : callable, optional
         ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
+    target_psnr : float, optional
+        Instead of `gaussians`: decibels to reach with as few splats as possible, see
+        `eigengs_dr.budget`. `iterations` are then those of a fit of a known number; the search
+        takes up to twice as many.
+    target_space : {"ycbcr", "rgb"}, optional
+        Where `target_psnr` is measured, as psnr_ycbcr or as psnr_rgb.
+    max_gaussians : int, optional
+        Most splats for `target_psnr`; by default as many as have as many parameters as the image
+        has numbers, 3 for 8 pixels in colour.
 
     Returns
     -------
@@ -124,23 +144,41 @@ def fit(
     pixels = check_image(image, keep_grey=color == "data")
     _check(pixels, gaussians, iterations, init, preset, solve_steps, color, seed)
     method = PRESETS[preset]
+    if target_psnr is not None:
+        _check_target(gaussians, init, preset, target_psnr, target_space, pixels, max_gaussians)
+        most = max_gaussians or most_gaussians(pixels)
+        gaussians = min(most, max(1, pixels.shape[0] * pixels.shape[1] // FIRST))
     with deferred() as interrupted:
         start = begin(
             pixels, gaussians, init, basis, method, solve_steps, color, seed, backend=backend
         )
         seconds_init = time.perf_counter() - started
-        refined = refine(
-            start.gaussians,
-            start.target,
-            pixels,
-            method.schedule,
-            iterations,
-            started=started,
-            added=start.added,
-            weight=start.weight,
-            progress=progress,
-            interrupted=interrupted,
-        )
+        if target_psnr is None:
+            refined = refine(
+                start.gaussians,
+                start.target,
+                pixels,
+                method.schedule,
+                iterations,
+                started=started,
+                added=start.added,
+                weight=start.weight,
+                rearrange=start.rearrange,
+                progress=progress,
+                interrupted=interrupted,
+            )
+        else:
+            refined = fewest(
+                start,
+                partial(figures, image=pixels, started=started),
+                f"psnr_{target_space}",
+                target_psnr,
+                most,
+                method.schedule,
+                iterations,
+                progress=progress,
+                interrupted=interrupted,
+            )
     rendered = picture_of(refined.gaussians)
     return Fit(
         gaussians=refined.gaussians,
@@ -185,3 +223,38 @@ def _check(
             raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(known)}")
     if PRESETS[preset].mean == "dense" and init not in ("auto", "eigen"):
         raise ValueError(f"preset {preset!r} starts from a basis; use init 'auto', not {init!r}")
+
+
+def most_gaussians(pixels: NDArray[np.float32]) -> int:
+    """Splats that have as many parameters as an image has numbers; at least one."""
+    channels = pixels.shape[2]
+    return max(1, pixels.size // (SHAPE + channels))
+
+
+def _check_target(
+    gaussians: int | None,
+    init: str,
+    preset: str,
+    target_psnr: float,
+    target_space: str,
+    pixels: NDArray[np.float32],
+    max_gaussians: int | None,
+) -> None:
+    """Raise ValueError where a search for the fewest splats is asked for what it cannot do."""
+    if gaussians is not None:
+        raise ValueError("gaussians and target_psnr exclude each other; give one of them")
+    if preset != "default" or init not in ("auto", "adaptive"):
+        raise ValueError(
+            f"target_psnr works with preset 'default' and init 'adaptive', not with {preset!r} and "
+            f"{init!r}"
+        )
+    if not 0 < target_psnr <= EXACT:
+        raise ValueError(f"target_psnr is {target_psnr}; it must be above 0 and at most {EXACT:g}")
+    if target_space not in ("ycbcr", "rgb"):
+        raise ValueError(f"target_space {target_space!r} is unknown; use ycbcr or rgb")
+    height, width = pixels.shape[:2]
+    if max_gaussians is not None and not 1 <= max_gaussians <= width * height:
+        raise ValueError(
+            f"max_gaussians is {max_gaussians}; an image of {width}x{height} takes 1 to "
+            f"{width * height}"
+        )

@@ -85,6 +85,38 @@ def solve(
         return _solve(gaussians, image, steps, cutoff, warm_start)
 
 
+def correlations(
+    gaussians: Gaussians, image: NDArray[Any], cutoff: float = CUTOFF, squared: bool = False
+) -> NDArray[Any]:
+    """Inner products of every splat's weights with an image.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Its colours do not count.
+    image : ndarray, shape (H, W, C)
+        At the native size.
+    cutoff : float, optional
+        See `eigengs_dr.render`.
+    squared : bool, optional
+        Of the squares of the weights.
+
+    Returns
+    -------
+    ndarray, shape (N, C)
+        ``sum_x w_n(x) image(x)``. Cost: one adjoint with respect to colours.
+    """
+    with dr.suspend_grad():
+        types = types_of(gaussians.mean)
+        n = len(gaussians)
+        lists = lists_for(gaussians, cutoff)
+        delta = to_tiles(types, np.asarray(image, np.float32), lists.grid)
+        shape = _shape(gaussians)
+        product = _of_squares if squared else _apply_transposed
+        rows = product(shape, delta, image.shape[2], lists, cutoff)
+        return np.stack([row.numpy()[:n] for row in rows], axis=1)
+
+
 def _solve(
     gaussians: Gaussians, image: NDArray[Any], steps: int, cutoff: float, warm_start: bool
 ) -> Solution:
@@ -92,8 +124,7 @@ def _solve(
     n, channels = len(gaussians), gaussians.channels
     lists = lists_for(gaussians, cutoff)
     inside = to_tiles(types, np.ones(image.shape, np.float32), lists.grid)
-    shape = [*gaussians.mean, *[f * UNIT for f in gaussians.factor]]
-    shape = [dr.detach(v) + dr.zeros(types.Float, n) for v in shape]
+    shape = _shape(gaussians)
     if warm_start:
         x = [types.Float(c) + dr.zeros(types.Float, n) for c in gaussians.color]
         constant = [types.Float(b) for b in gaussians.background]
@@ -193,9 +224,21 @@ def _apply_transposed(
 def _inverse_diagonal(
     shape: list, inside: Any, channels: int, lists: TileLists, cutoff: float
 ) -> list:
-    """One over the diagonal of ``A^T A``: ``w^2`` is the weight of a splat narrower by sqrt 2."""
+    """One over the diagonal of ``A^T A``."""
+    diagonal = _of_squares(shape, inside, channels, lists, cutoff)
+    return [dr.select(d > 1e-8, dr.rcp(d), 0) for d in diagonal]
+
+
+def _of_squares(shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float) -> list:
+    """`_apply_transposed` for ``w^2``, the weight of a splat narrower by sqrt 2."""
     root = math.sqrt(2)
     narrow = [*shape[:2], *[f * root for f in shape[2:SHAPE]]]
     reach = min(cutoff * root, WIDEST_CUTOFF)  # beyond, squares are 0 in any precision
-    diagonal = _apply_transposed(narrow, inside, channels, lists, reach)
-    return [dr.select(d > 1e-8, dr.rcp(d), 0) for d in diagonal]
+    return _apply_transposed(narrow, delta, channels, lists, reach)
+
+
+def _shape(gaussians: Gaussians) -> list:
+    """Mean and factor as the kernels take them, every row of full length."""
+    zeros = dr.zeros(types_of(gaussians.mean).Float, len(gaussians))
+    shape = [*gaussians.mean, *[f * UNIT for f in gaussians.factor]]
+    return [dr.detach(v) + zeros for v in shape]

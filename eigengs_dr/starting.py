@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from .color import decode, rgb_to_ycbcr, to_linear
 from .eigengs import EigenGS
 from .gaussians import Gaussians
 from .presets import Preset
+from .rearrange import rearranged
 from .rendering import CUTOFF
 from .solve import solve
 from .stream import SPACES as BASIS_SPACES
@@ -47,12 +49,16 @@ class Start(NamedTuple):
         What errors are multiplied by before they are squared.
     added : ndarray of float32, shape (H, W, 3), or None
         What renderings of the set are added to, RGB: the mean image, where it stays pixels.
+    rearrange : callable, or None
+        ``rearrange(gaussians, count)`` places splats anew where a fitted set left much error; None
+        where not the image alone places them.
     """
 
     gaussians: Gaussians
     target: NDArray[np.float32]
     weight: NDArray[np.float32] | None = None
     added: NDArray[np.float32] | None = None
+    rearrange: Callable[[Gaussians, int], Gaussians] | None = None
 
 
 def begin(
@@ -81,10 +87,22 @@ def begin(
     init = method.init if init == "auto" else init
     if init != "eigen":
         count = gaussians or min(GAUSSIANS, pixels.shape[0] * pixels.shape[1])
+        # Light would draw too few splats to the dark.
+        shown = pixels if color == "linear" else target
         placed = _placed(
-            pixels, target, count, PLACES[init], method, solve_steps, color, seed, cutoff, backend
+            shown, target, count, PLACES[init], method, solve_steps, color, seed, cutoff, backend
         )
-        return Start(placed, target, weight)
+        rearrange = None
+        if init == "adaptive" and method.solves:
+            rearrange = partial(
+                rearranged,
+                image=shown,
+                target=target,
+                weight=weight,
+                solve_steps=solve_steps,
+                cutoff=cutoff,
+            )
+        return Start(placed, target, weight, rearrange=rearrange)
     model = load_basis(basis, backend)
     _check_basis(model, pixels, gaussians, color)
     encoded = _encoded(model, pixels, target, method, solve_steps, cutoff)
@@ -107,7 +125,7 @@ def _target(
 
 
 def _placed(
-    pixels: NDArray[np.float32],
+    shown: NDArray[np.float32],
     target: NDArray[np.float32],
     count: int,
     place: Callable[..., Any],
@@ -120,8 +138,7 @@ def _placed(
 ) -> Gaussians:
     """Place splats by the image alone and give them colours."""
     generator = np.random.default_rng(seed)
-    # Light would draw too few splats to the dark.
-    mean, factor = place(pixels if color == "linear" else target, count, generator)
+    mean, factor = place(shown, count, generator)
     shape = (count, target.shape[2])
     colors = np.zeros(shape) if method.solves else generator.uniform(0, 1, shape)
     size = (target.shape[1], target.shape[0])

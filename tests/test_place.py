@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scenes import covariances, few
 
-from eigengs_dr.adaptive import adaptive, bending, density_of, hilbert_order, pieces, relaxed
+from eigengs_dr.adaptive import adaptive, bending, bent, capped, hilbert_order, pieces, relaxed
 from eigengs_dr.images import resampled
 from eigengs_dr.place import GRID_SIZE, grid, inverse_factor, random
 
@@ -175,7 +175,7 @@ def test_density_of_any_image(drawn):
     image, count = drawn
     pixels = image.shape[0] * image.shape[1]
     spacing = float(np.sqrt(pixels / count))
-    density = density_of(bending(image, spacing), spacing, count)
+    density = capped(bent(bending(image, spacing), spacing), count)
     assert density.shape == image.shape[:2]
     assert (density > 0).all()
     assert density.max() <= 1
@@ -187,7 +187,7 @@ def test_density_sums_to_the_count(count):
     y, x = np.indices((40, 40)) / 40
     image = np.stack([np.sin(7 * x * x + y), np.cos(9 * y), x * y], axis=-1).astype(np.float32)
     spacing = float(np.sqrt(1600 / count))
-    assert density_of(bending(image, spacing), spacing, count).sum() == pytest.approx(count)
+    assert capped(bent(bending(image, spacing), spacing), count).sum() == pytest.approx(count)
 
 
 def test_bending_of_a_parabola():

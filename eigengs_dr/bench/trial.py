@@ -66,7 +66,9 @@ def follow(
     """
     spent, resumed = 0.0, time.perf_counter()
     start = begin()
-    sets = descend(start.gaussians, start.target, schedule, iterations, cutoff, start.weight)
+    sets = descend(
+        start.gaussians, start.target, schedule, iterations, cutoff, start.weight, start.rearrange
+    )
     for iteration, current in enumerate(sets):
         if iteration not in marks:
             continue
