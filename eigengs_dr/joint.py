@@ -20,6 +20,7 @@ from .adan import Adan
 from .arrays import ArrayTypes, types_in, types_of, upload
 from .backend import select
 from .coordinates import CHOLESKY
+from .freezing import frozen
 from .gaussians import Gaussians
 from .kernels import accumulate, adjoint
 from .place import random
@@ -199,8 +200,7 @@ def _train(
     # The derivative of the loss is the error times this; nothing where tiles overhang.
     share = np.full((*state.size[::-1], GROUP), 2 / number, np.float32)
     share = to_tiles(types, share, Grid(*state.size))
-    descend = _group_program()
-    try:
+    with frozen(_move_group) as move:
         for step in range(state.step, steps):
             rate = dr.opaque(types.Float, RATE * 0.5 ** (step // HALVED))
             for optimizer in (shape, *groups):
@@ -212,7 +212,7 @@ def _train(
             sums = [dr.opaque(types.Float, 0, dr.width(v)) for v in (*values, 0.0)]
             yields = (step + 1) % ROUND == 0 or step + 1 == steps
             for optimizer, target in zip(groups, targets, strict=True):
-                sums = descend(optimizer, target, common, sums, yields)
+                sums = move(optimizer, target, common, sums, yields)
             # From the values, whose gradient all groups added to, back to the variables.
             dr.backward(sum(v * g for v, g in zip(values, sums, strict=False)))
             shape.step()
@@ -221,31 +221,23 @@ def _train(
                 rows = np.concatenate([_rows(o) for o in (shape, *groups)], axis=1)
                 rows = rows[:, : state.rows.shape[1]]  # without what fills the last group
                 yield state._replace(step=step + 1, loss=loss, rows=rows)
-    finally:
-        descend.clear()  # left to the garbage collector, it may be freed while another is traced
 
 
-def _group_program() -> Any:
-    """Make a frozen program that every group of every step of one run replays."""
-
-    @dr.freeze
-    def descend(optimizer: Adan, target: Any, common: tuple, sums: list, told: bool) -> list:
-        """Move weights of a group; add its gradients of shapes, and squares if told, to `sums`."""
-        shape, share, lists = common
-        Float, radius = type(target), UNIT * CUTOFF
-        packed = pack([*shape, *optimizer["rows"]])
-        rendered = accumulate(packed, [Float(0)] * GROUP, lists, radius * radius)
-        delta = (rendered - target) * share
-        # By hand: backward mode would sum delta over all pixels too, for the backgrounds.
-        gradient = adjoint(packed, delta, GROUP, lists, radius)
-        squares = dr.squared_norm(delta) if told else Float(0)
-        added = [s + g for s, g in zip(sums, [*gradient[:SHAPE], squares], strict=True)]
-        dr.set_grad(optimizer["rows"], gradient[SHAPE:])
-        dr.eval(added, dr.grad(optimizer["rows"]))
-        optimizer.step()
-        return added
-
-    return descend
+def _move_group(optimizer: Adan, target: Any, common: tuple, sums: list, told: bool) -> list:
+    """Move weights of a group; add its gradients of shapes, and squares if told, to `sums`."""
+    shape, share, lists = common
+    Float, radius = type(target), UNIT * CUTOFF
+    packed = pack([*shape, *optimizer["rows"]])
+    rendered = accumulate(packed, [Float(0)] * GROUP, lists, radius * radius)
+    delta = (rendered - target) * share
+    # By hand: backward mode would sum delta over all pixels too, for the backgrounds.
+    gradient = adjoint(packed, delta, GROUP, lists, radius)
+    squares = dr.squared_norm(delta) if told else Float(0)
+    added = [s + g for s, g in zip(sums, [*gradient[:SHAPE], squares], strict=True)]
+    dr.set_grad(optimizer["rows"], gradient[SHAPE:])
+    dr.eval(added, dr.grad(optimizer["rows"]))
+    optimizer.step()
+    return added
 
 
 def _optimizer(types: ArrayTypes, rows: Planes, step: int) -> Adan:

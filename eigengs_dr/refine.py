@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from .arrays import types_of
 from .coordinates import NATURAL, Coordinates
+from .freezing import frozen
 from .gaussians import Gaussians
 from .metrics import psnr, unclamped
 from .rendering import CUTOFF, lists_for, picture_of, splat, to_tiles
@@ -220,9 +221,8 @@ def _stretch(
     grid = Grid(gaussians.width, gaussians.height)
     tiles = to_tiles(types, target, grid)
     weights = to_tiles(types, np.ones_like(target) if weight is None else weight, grid)
-    take_step = step_program(coordinates, cutoff)
     zero = dr.opaque(types.Float, 0)
-    try:
+    with frozen(step_program(coordinates, cutoff)) as take_step:
         for step in range(iterations):
             if step % schedule.rebuild == 0:
                 lists = lists_for(current, cutoff, schedule.pad)
@@ -236,8 +236,6 @@ def _stretch(
             current = replace(current, color=current.color + zero)
             dr.eval(current)
             yield current
-    finally:
-        take_step.clear()  # left to the garbage collector, it may be freed while another is traced
 
 
 def rate_left(schedule: Schedule, step: int, iterations: int) -> float:
@@ -248,13 +246,12 @@ def rate_left(schedule: Schedule, step: int, iterations: int) -> float:
 
 
 def step_program(coordinates: Coordinates, cutoff: float) -> Any:
-    """Make a frozen program for a step: traced once, replayed without Python.
+    """Make the function of a step, to be frozen: traced once, replayed without Python.
 
     A program belongs to one run: a replay does not notice that, say, the betas of another optimiser
     differ.
     """
 
-    @dr.freeze
     def step(optimizer: Any, fixed: Gaussians, target: Any, weights: Any, lists: TileLists) -> None:
         """Descend on the mean squared error, then bring the variables back inside their bounds.
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from .adam import Adam
 from .arrays import types_of
+from .freezing import frozen
 from .gaussians import Gaussians
 from .place import grid
 from .refine import Schedule, rate_left, step_program
@@ -132,9 +133,8 @@ def _round(
     grid = Grid(gaussians.width, gaussians.height)
     whole = np.ones((gaussians.height, gaussians.width, len(components)), np.float32)
     inside = to_tiles(types, whole, grid)
-    take_step = step_program(coordinates, CUTOFF)
     current = gaussians
-    try:
+    with frozen(step_program(coordinates, CUTOFF)) as take_step:
         for step, image in enumerate(samples(components, eigenvalues, seed, first, last), first):
             solved = solve(current, image, SOLVE_STEPS).gaussians
             fixed = replace(gaussians, color=solved.color, background=solved.background)
@@ -146,8 +146,6 @@ def _round(
             take_step(optimizer, fixed, target, inside, lists_for(current, CUTOFF))
             current = coordinates.to(fixed, dict(optimizer))
             dr.eval(current)
-    finally:
-        take_step.clear()  # left to the garbage collector, it may be freed while another is traced
     return dr.detach(current)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import types_of
+from .freezing import frozen
 from .gaussians import Gaussians
 from .kernels import accumulate, adjoint, channel_sums
 from .rendering import CUTOFF, WIDEST_CUTOFF, lists_for, to_tiles
@@ -146,15 +147,12 @@ def _solve(
     p, rz = z, [dr.dot(a, b) for a, b in zip(r, z, strict=True)]
     enough = [ROUNDING[types.bits] * a for a in rz]
     dr.eval(p, rz, enough)
-    take_step = dr.freeze(_step)  # of this solve alone: a program does not notice another N
-    try:
+    with frozen(_step) as take_step:  # for this solve alone: a program does not notice another N
         for _ in range(steps):
             unknowns, residual, p, rz, square = take_step(
                 shape, unknowns, residual, p, rz, enough, inverse, inside, lists, cutoff
             )
             squares.append(square * scale)
-    finally:
-        take_step.clear()  # left to the garbage collector, it may be freed while another is traced
     index = dr.arange(types.UInt, n)
     solved = replace(
         gaussians,

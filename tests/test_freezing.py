@@ -1,0 +1,72 @@
+"""Frozen programs, and what the garbage collector must not do while they are recorded."""
+
+import gc
+import subprocess
+import sys
+
+import drjit as dr
+import pytest
+
+from eigengs_dr.backend import select
+from eigengs_dr.freezing import frozen
+
+LITTER = """
+import gc
+
+import numpy as np
+
+from eigengs_dr.backend import select
+from eigengs_dr.freezing import frozen
+
+class Node:
+    pass
+
+def program(x):
+    made = [[] for _ in range(200_000)]  # wakes the collector up
+    return 2 * x + len(made) * 0 + 1
+
+Float = select("llvm").Float
+gc.collect()
+node = Node()
+node.cycle, node.array = node, Float(np.ones(1_000_000, np.float32))
+del node
+with frozen(program) as call:
+    print(call(Float(1, 2, 3)), gc.isenabled())
+"""
+
+
+def test_arrays_of_numpy_in_cycles_do_not_end_the_process():
+    done = subprocess.run([sys.executable, "-c", LITTER], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "[3, 5, 7] True\n"), done.stderr
+
+
+def test_results_are_those_of_the_function(backend):
+    Float = select(backend).Float
+
+    def program(x, y):
+        return x * y + 1
+
+    with frozen(program) as call:
+        for start in (0, 1, 5):
+            x, y = dr.arange(Float, 4) + start, dr.arange(Float, 4) - start
+            dr.eval(x, y)
+            assert dr.all(call(x, y) == program(x, y))
+
+
+def test_the_collector_is_left_as_it_was(backend):
+    Float = select(backend).Float
+
+    def refuse(x):
+        assert not gc.isenabled()
+        raise ValueError("no")
+
+    with frozen(refuse) as call, pytest.raises(RuntimeError):
+        call(Float(1))
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        with frozen(lambda x: x + 1) as call:
+            call(Float(1))
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
