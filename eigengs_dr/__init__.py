@@ -15,9 +15,11 @@ if TYPE_CHECKING:
     from .gaussians import Gaussians, concatenate
     from .images import load_image, sample, save_image
     from .metrics import ms_ssim, psnr, ssim
+    from .packing import Receipt, pack
     from .pca import Eigenbasis
     from .plugins import register_plugins
     from .rendering import picture_of, render
+    from .scenefit import fit_for_scene
     from .tensors import from_tensors, to_tensors
 
 __all__ = [
@@ -26,11 +28,14 @@ __all__ = [
     "Eigenbasis",
     "Fit",
     "Gaussians",
+    "Receipt",
     "concatenate",
     "fit",
+    "fit_for_scene",
     "from_tensors",
     "load_image",
     "ms_ssim",
+    "pack",
     "picture_of",
     "psnr",
     "register_plugins",
@@ -49,9 +54,11 @@ _HOMES = {
     "gaussians": ("Gaussians", "concatenate"),
     "images": ("load_image", "sample", "save_image"),
     "metrics": ("ms_ssim", "psnr", "ssim"),
+    "packing": ("Receipt", "pack"),
     "pca": ("Eigenbasis",),
     "plugins": ("register_plugins",),
     "rendering": ("picture_of", "render"),
+    "scenefit": ("fit_for_scene",),
     "tensors": ("from_tensors", "to_tensors"),
 }
 

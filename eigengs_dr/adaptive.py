@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from .curve import hilbert_order
 from .images import resampled
 from .place import inverse_factor
 
@@ -109,20 +110,20 @@ def bending(image: Array, spacing: float) -> NDArray[np.float32]:
     return squared + np.array([noise, noise, 0], np.float32)[:, None, None]
 
 
-def bent(bend: Array, spacing: float) -> NDArray[np.float64]:
+def bent(bend: Array, spacing: float) -> Array:
     """Density that the bending asks for, shape (H, W), up to a factor."""
     from scipy.ndimage import gaussian_filter
 
     mean = gaussian_filter(bend[0] + bend[1], POOL * spacing)
-    return np.asarray(mean, np.float64) ** POWER
+    return np.power(mean, POWER, dtype=np.float64)
 
 
 def capped(density: Array, count: int) -> NDArray[np.float64]:
     """Scale a density to `count` splats in all, or a little less where most pixels have one."""
-    density = density.astype(np.float64)
+    splats: NDArray[np.float64] = density.astype(np.float64)
     for _ in range(5):  # what is cut off above goes to the rest
-        density = np.minimum(density * (count / density.sum()), 1.0)
-    return density
+        splats = np.minimum(splats * (count / splats.sum()), 1.0)
+    return splats
 
 
 def pieces(density: Array, count: int) -> NDArray[np.float64]:
@@ -144,32 +145,6 @@ def pieces(density: Array, count: int) -> NDArray[np.float64]:
         return np.diff(np.interp(cuts, total, moment)) * (count / total[-1])
 
     return np.stack([centroid(order % width + 0.5), centroid(order // width + 0.5)], axis=1)
-
-
-# A Hilbert curve through a square visits its quarters in this order, the plain way (state 0) or
-# with columns and rows swapped (1), with both counted from the other side (2), or both (3).
-_RIGHT = np.array([[0, 0, 1, 1], [0, 1, 1, 0], [1, 1, 0, 0], [1, 0, 0, 1]], np.int32)
-_LOW = _RIGHT[[1, 0, 3, 2]]
-_STATE = np.arange(4, dtype=np.int8)[:, None] ^ np.array([1, 0, 0, 3], np.int8)
-
-
-def hilbert_order(height: int, width: int) -> NDArray[np.int64]:
-    """Pixel indices ``row * width + column`` in the order of a Hilbert curve over the image.
-
-    The curve over the next power of two is followed, and what lies outside the image left out.
-    Each square is replaced by its quarters, level by level: O(height * width), nothing is sorted.
-    """
-    side = 1 << max(height - 1, width - 1).bit_length()
-    column = row = np.zeros(1, np.int32)
-    state = np.zeros(1, np.int8)
-    while side > 1:
-        side >>= 1
-        column = column[:, None] + side * _RIGHT[state]
-        row = row[:, None] + side * _LOW[state]
-        state = _STATE[state]
-        inside = (column < width) & (row < height)
-        column, row, state = column[inside], row[inside], state[inside]
-    return row.astype(np.int64) * width + column
 
 
 def relaxed(mean: Array, density: Array) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ from .backend import select
 from .cli_bench import bench
 from .cli_fit import fit
 from .cli_info import info
+from .cli_pack import pack
 from .cli_scene import scene
 from .cli_shared import (
     ANY_PATH,
@@ -37,6 +38,7 @@ def main() -> None:
     Examples:
       eigengs-dr fit photo.jpg -o photo.npz --preview photo-fit.png
       eigengs-dr render photo.npz -o large.png --scale 2
+      eigengs-dr pack photo.npz -o photo.egs --image photo.jpg
       eigengs-dr train photos/ -o photos.npz
       eigengs-dr doctor
     """
@@ -45,6 +47,7 @@ def main() -> None:
 main.add_command(fit)
 main.add_command(train)
 main.add_command(info)
+main.add_command(pack)
 main.add_command(bench)
 main.add_command(scene)
 

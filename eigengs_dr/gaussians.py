@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import archive
+from . import archive, packed
 from .arrays import types_in, types_of, upload_rows
 from .backend import select
 from .color import SPACES
@@ -237,28 +237,42 @@ class Gaussians:
         )
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], backend: str | None = None) -> Gaussians:
-        """Read a set that `save` wrote.
+    def load(
+        cls,
+        path: str | os.PathLike[str],
+        backend: str | None = None,
+        sections: int | None = None,
+    ) -> Gaussians:
+        """Read a set that `save` or `eigengs_dr.pack` wrote.
 
         Parameters
         ----------
         path : path-like
         backend : {"llvm", "cuda"}, optional
+        sections : int, optional
+            Read so many sections of a packed file, from the first; what follows them may be
+            missing. By default all.
 
         Raises
         ------
         ValueError
             If the file is not one of these, is damaged, newer than this package, or holds values
-            that are not finite or do not fit together: one line that names file and key.
+            that are not finite or do not fit together: one line that names file and key. If it
+            has not so many sections.
         OSError
             If it cannot be opened.
         """
         path = Path(path)
-        arrays = archive.read(path, FORMAT, VERSION, LAYOUT)
+        if packed.is_packed(path):
+            content = packed.read(path, sections)
+            arrays, size, space = content.arrays(), content.size, content.space
+        elif sections is not None:
+            raise ValueError(f"{path}: has no sections, which only packed files have; leave it out")
+        else:
+            arrays = archive.read(path, FORMAT, VERSION, LAYOUT)
+            size, space = tuple(arrays.pop("size").tolist()), str(arrays.pop("space"))
         try:
-            size = arrays.pop("size")
-            space = str(arrays.pop("space"))
-            _check(arrays, tuple(size.tolist()), space)
+            _check(arrays, size, space)
         except archive.BadValue as error:
             raise ValueError(f"{path}: {error}") from None
         return cls.from_arrays(

@@ -106,6 +106,16 @@ def test_texture_gradients(run, tmp_path):
     assert eg.Gaussians.load(tmp_path / "poster_found.npz").space == "linear"
 
 
+def test_fit_for_scene(run, tmp_path):
+    pytest.importorskip("mitsuba")
+    out = run("fit_for_scene.py", tmp_path)
+    found = re.findall(r"(\d+) Gaussians; PSNR (\d+\.\d) dB on the poster", out)
+    far, middle, near = (int(count) for count, _ in found)
+    assert 2 * far < middle and 1.5 * middle < near
+    assert min(float(psnr) for _, psnr in found) >= 40
+    check_pictures(tmp_path, "budget", "budget_photo")
+
+
 def test_all_are_listed_and_tested():
     scripts = {path.name for path in FOLDER.glob("*.py")}
     listed = re.findall(r"^\| \[`(\w+\.py)`\]\(\1\) \|", (FOLDER / "README.md").read_text(), re.M)

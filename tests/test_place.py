@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scenes import covariances, few
 
-from eigengs_dr.adaptive import adaptive, bending, bent, capped, hilbert_order, pieces, relaxed
+from eigengs_dr.adaptive import adaptive, bending, bent, capped, pieces, relaxed
+from eigengs_dr.curve import hilbert_order
 from eigengs_dr.images import resampled
 from eigengs_dr.place import GRID_SIZE, grid, inverse_factor, random
 

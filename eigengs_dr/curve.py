@@ -1,0 +1,91 @@
+"""A Hilbert curve through points with whole coordinates: neighbours on it are neighbours in space.
+
+N points in the order of the curve need no order of their own: of all the ways to list them one is
+left, which saves ``log2(N!)`` bits where the steps along the curve are stored.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Whole = NDArray[np.int64]
+
+MOST_LEVELS = 24
+"""Of squares within squares: places along the curve then fit 48 bits."""
+
+
+def along_curve(points: Whole, levels: int) -> Whole:
+    """Find where on the curve points lie.
+
+    Parameters
+    ----------
+    points : ndarray of int64, shape (N, 2)
+        x, y from 0 to ``2^levels - 1``.
+    levels : int
+        At most `MOST_LEVELS`.
+
+    Returns
+    -------
+    ndarray of int64, shape (N,)
+        From 0 to ``4^levels - 1``, one for every point of the square.
+
+    Examples
+    --------
+    >>> along_curve(np.array([[0, 0], [0, 1], [1, 1], [1, 0]]), 1)
+    array([0, 1, 2, 3])
+    """
+    x, y = np.asarray(points, np.int64).T
+    place = np.zeros_like(x)
+    for level in reversed(range(levels)):
+        right, low = x >> level & 1, y >> level & 1
+        place = place * 4 + (3 * right ^ low)
+        x, y = _turned(x, y, right, low, (1 << level) - 1)
+    return place
+
+
+def on_curve(places: Whole, levels: int) -> Whole:
+    """Find the points, shape (N, 2), at places along the curve: the inverse of `along_curve`."""
+    x = y = np.zeros_like(places)
+    for level in range(levels):
+        quarter = places >> 2 * level & 3
+        right = quarter >> 1
+        low = quarter & 1 ^ right
+        x, y = _turned(x, y, right, low, (1 << level) - 1)
+        x, y = x + (right << level), y + (low << level)
+    return np.stack([x, y], axis=1)
+
+
+def _turned(x: Whole, y: Whole, right: Whole, low: Whole, last: int) -> tuple[Whole, Whole]:
+    """Coordinates inside a quarter, as the curve runs there; turning back is the same."""
+    x, y = x & last, y & last
+    mirrored = (low == 0) & (right == 1)
+    x, y = np.where(mirrored, last - x, x), np.where(mirrored, last - y, y)
+    swapped = low == 0
+    return np.where(swapped, y, x), np.where(swapped, x, y)
+
+
+# A Hilbert curve through a square visits its quarters in this order, the plain way (state 0) or
+# with columns and rows swapped (1), with both counted from the other side (2), or both (3).
+_RIGHT = np.array([[0, 0, 1, 1], [0, 1, 1, 0], [1, 1, 0, 0], [1, 0, 0, 1]], np.int32)
+_LOW = _RIGHT[[1, 0, 3, 2]]
+_STATE = np.arange(4, dtype=np.int8)[:, None] ^ np.array([1, 0, 0, 3], np.int8)
+
+
+def hilbert_order(height: int, width: int) -> NDArray[np.int64]:
+    """Pixel indices ``row * width + column`` in the order of a Hilbert curve over the image.
+
+    The curve over the next power of two is followed, and what lies outside the image left out.
+    Each square is replaced by its quarters, level by level: O(height * width), nothing is sorted.
+    """
+    side = 1 << max(height - 1, width - 1).bit_length()
+    column = row = np.zeros(1, np.int32)
+    state = np.zeros(1, np.int8)
+    while side > 1:
+        side >>= 1
+        column = column[:, None] + side * _RIGHT[state]
+        row = row[:, None] + side * _LOW[state]
+        state = _STATE[state]
+        inside = (column < width) & (row < height)
+        column, row, state = column[inside], row[inside], state[inside]
+    return row.astype(np.int64) * width + column

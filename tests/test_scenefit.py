@@ -1,0 +1,229 @@
+"""No more Gaussians than cameras resolve: the target, the search, and what a renderer then sees."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scenes import few
+from scipy.ndimage import gaussian_filter, laplace
+from scipy.sparse import csr_array
+
+mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
+
+from test_resolution import NAME, albedo, bitmap, board, camera, scene_of  # noqa: E402
+from test_resolution import variant as variant  # noqa: E402
+
+import eigengs_dr as eg  # noqa: E402
+from eigengs_dr import scenefit  # noqa: E402
+from eigengs_dr.color import to_coded, to_linear  # noqa: E402
+from eigengs_dr.plugins import texture_of  # noqa: E402
+from eigengs_dr.resolution import Resolution  # noqa: E402
+from eigengs_dr.smoothest import _blur_by, filled, smoothest  # noqa: E402
+
+BOUND, STEPS = 33.0, 30
+
+
+def photo(side=48):
+    return eg.sample("astronaut")[: 8 * side : 8, : 8 * side : 8]
+
+
+def blocks(side, times):
+    """Cameras that see means of blocks of texels."""
+    count = side // times
+    y, x = np.mgrid[:side, :side] // times
+    shares = np.full(side * side, 1 / times**2, np.float32)
+    index = ((y * count + x).ravel(), np.arange(side * side))
+    return csr_array((shares, index), shape=(count * count, side * side))
+
+
+class TestTarget:
+    @few
+    @given(st.integers(0, 100), st.floats(0, 0.9))
+    def test_what_is_not_seen_is_filled_from_what_is(self, seed, hidden):
+        generator = np.random.default_rng(seed)
+        values = generator.uniform(0.2, 0.8, (20, 13, 3)).astype(np.float32)
+        seen = generator.uniform(size=(20, 13)) >= hidden
+        seen[3, 4] = True
+        found = filled(np.where(seen[..., None], values, np.float32(1e6)), seen)
+        np.testing.assert_array_equal(found[seen], values[seen])
+        low, high = values[seen].min(axis=0), values[seen].max(axis=0)
+        assert (found >= low - 1e-3).all() and (found <= high + 1e-3).all()
+
+    def test_filling_is_smooth(self):
+        values = photo(64)
+        seen = np.zeros((64, 64), bool)
+        seen[:, :20] = True
+        bend = np.abs(laplace(filled(values, seen).mean(axis=2)))
+        assert bend[:, 24:].max() < 0.05 < np.abs(laplace(values.mean(axis=2)))[:, 24:].max()
+
+    def test_an_even_blur_is_gaussian(self):
+        image = photo()
+        expected = gaussian_filter(image, (2.0, 2.0, 0), mode="nearest")
+        found = _blur_by(np.full((48, 48), 2.0))(image)
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+
+    def test_an_uneven_blur_is_each_in_its_place(self):
+        image, deviation = photo(), np.full((48, 48), np.inf)
+        deviation[:, :16], deviation[:, 16:32] = 1.0, 5.0
+        found = _blur_by(deviation)(image)
+        for columns, sigma in ((slice(0, 16), 1.0), (slice(32, 48), 5.0)):
+            expected = gaussian_filter(image, (sigma, sigma, 0), mode="nearest")
+            np.testing.assert_allclose(found[:, columns], expected[:, columns], atol=0.01)
+        np.testing.assert_allclose(_blur_by(deviation)(np.ones_like(image)), 1, atol=1e-5)
+
+    def test_cameras_take_it_for_the_image(self):
+        image = photo()
+        rows = blocks(48, 6)
+        found = Resolution(np.full((48, 48), 2.4, np.float32), [rows])
+        target = smoothest(image, found, 1.0)
+        blurred = gaussian_filter(image, (2.4, 2.4, 0), mode="nearest")
+
+        def missed(t):
+            return np.sqrt(np.mean((rows @ (t - image).reshape(-1, 3)) ** 2))
+
+        def bend(t):
+            return np.sqrt(np.mean(laplace(t.mean(axis=2)) ** 2))
+
+        assert missed(target) < 0.2 * missed(blurred)
+        assert bend(target) < 0.2 * bend(image)
+        assert target.min() >= 0 and target.max() <= 1
+
+    def test_is_the_smoothest_that_is_close_enough(self):
+        image, found = photo(), Resolution(np.full((48, 48), 2.4, np.float32), [blocks(48, 6)])
+        asked = []
+
+        def is_close(target, after):
+            asked.append(target)
+            return len(asked) > after
+
+        assert scenefit._target(image, found, lambda t: is_close(t, 1)) is asked[1]
+        assert len(asked) == 2
+        np.testing.assert_array_equal(
+            scenefit._target(image, found, lambda t: is_close(t, np.inf)), image
+        )
+        bends = [np.square(laplace(t.mean(axis=2))).sum() for t in asked[2:]]
+        assert len(bends) == len(scenefit.BLURS) and bends == sorted(bends)
+
+    def test_errors_count_by_the_root_of_the_pixels(self):
+        times, side = np.array([1, 4]), 40
+        counts = np.repeat(times, side // 2)[None].repeat(side, axis=0)
+        texel = np.repeat(np.arange(side * side), counts.ravel())
+        shares = np.ones(len(texel), np.float32)
+        rows = csr_array((shares, (np.arange(len(texel)), texel)), (len(texel), side * side))
+        footprint = np.full((side, side), 0.4, np.float32)
+        footprint[30:] = np.inf
+        grey = np.full((side, side, 3), 0.5, np.float32)
+        weight = scenefit._weights(Resolution(footprint, [rows]), grey, "data")
+        assert (weight[30:] == 0).all() and weight.shape == grey.shape
+        np.testing.assert_allclose(weight[10, 35] / weight[10, 5], 2, rtol=1e-3)
+
+    def test_splats_that_touch_nothing_seen_are_left_out(self):
+        seen = np.zeros((40, 40), bool)
+        seen[:, :10] = True
+        mean = np.array([[5, 5], [12, 5], [20, 5], [20, 5], [60, 5]], float)
+        factor = np.array([[1, 0, 1], [1, 0, 1], [1, 0, 1], [0.2, 0.1, 1], [1, 0, 1]])
+        kept = scenefit._touching(mean, factor, seen)
+        np.testing.assert_array_equal(kept, [True, True, False, True, False])
+        np.testing.assert_array_equal(
+            scenefit._touching(mean[[2, 4]], factor[[2, 4]], seen), [1, 0]
+        )
+
+
+class TestSearch:
+    @given(st.integers(1, 5000), st.integers(1, 5000))
+    def test_finds_what_is_enough(self, threshold, start):
+        def attempt(count):
+            return range(count), (50.0, 30.0 + (count >= threshold))
+
+        best, reached, tried = scenefit._fewest(attempt, 31.0, start, 8000)
+        assert reached == (50.0, 31.0)
+        assert threshold <= len(best) <= max(threshold * scenefit.CLOSE, threshold)
+        counts = [count for count, _ in tried]
+        assert len(set(counts)) == len(counts) < 30
+
+    def test_the_most_may_be_too_few(self):
+        with pytest.raises(ValueError, match=r"^70 Gaussians reach 20\.0 dB where .* see 31;"):
+            scenefit._fewest(lambda count: (range(count), (20.0, 40.0)), 31.0, 3, 70)
+
+
+def seen_by_a_renderer(found, scene, place, image):
+    """PSNR of the albedo, as Mitsuba renders it, of the set against the image."""
+    gaussians = texture_of(found.gaussians, wrap_mode="clamp")
+    full = bitmap(to_linear(image))
+    a, b = (albedo(scene(camera(place), texture=t)) for t in (gaussians, full))
+    return eg.psnr(to_coded(a.clip(0, 1)), to_coded(b.clip(0, 1)))
+
+
+class TestFit:
+    @pytest.mark.parametrize("distance", [1.0, 2.7])
+    def test_a_renderer_sees_what_was_asked_for(self, distance):
+        # The poster fills the picture, or nearly: what is around it is the same for both.
+        image = photo()
+        found = eg.fit_for_scene(
+            scene_of(camera([0, 0, distance])), NAME, image, psnr=BOUND, iterations=STEPS
+        )
+        assert min(found.psnr) >= BOUND
+        rendered = seen_by_a_renderer(found, scene_of, [0, 0, distance], image)
+        assert rendered > BOUND - 1
+        assert (found.gaussians.width, found.gaussians.height) == (48, 48)
+        assert found.gaussians.space == "linear"
+
+    def test_far_away_fewer_are_enough(self):
+        counts = [
+            len(
+                eg.fit_for_scene(
+                    scene_of(camera([0, 0, distance])), NAME, photo(), psnr=BOUND, iterations=STEPS
+                ).gaussians
+            )
+            for distance in (2.7, 7.0, 20.0)
+        ]
+        assert counts[0] > 2 * counts[1] > 4 * counts[2]
+
+    def test_none_is_spent_on_what_is_hidden(self):
+        arguments = (NAME, photo(), BOUND)
+        whole = eg.fit_for_scene(scene_of(camera([0, 0, 5.0])), *arguments, iterations=STEPS)
+        half = eg.fit_for_scene(
+            scene_of(camera([0, 0, 5.0]), board=board(0.0, 1.5)), *arguments, iterations=STEPS
+        )
+        assert len(half.gaussians) < 0.75 * len(whole.gaussians)
+        assert half.gaussians.to_arrays()["mean"][:, 0].max() < 30
+        assert half.resolution.seen.shape == (48, 48)
+
+    def test_every_camera_is_content(self):
+        scene = scene_of(camera([0, 0, 5.0]), camera([3, 0, 4.0]))
+        found = eg.fit_for_scene(scene, NAME, photo(), psnr=BOUND, iterations=STEPS)
+        assert len(found.psnr) == 2 and min(found.psnr) >= BOUND
+        counts = [count for count, reached in found.tried if reached >= BOUND]
+        assert min(counts) == len(found.gaussians)
+
+    def test_data_of_one_channel(self):
+        data = photo()[..., :1]
+        found = eg.fit_for_scene(
+            scene_of(camera([0, 0, 5.0])), NAME, data, psnr=BOUND, color="data", iterations=STEPS
+        )
+        assert found.gaussians.space == "data" and found.gaussians.channels == 1
+        rows = found.resolution.lookups[0]
+        shown = (rows @ p.reshape(-1, 1) for p in (eg.render(found.gaussians).numpy(), data))
+        assert eg.psnr(*(s[:, None] for s in shown), space="data") > BOUND - 0.5
+
+
+class TestMistakes:
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            ({"color": "ycbcr"}, ["color 'ycbcr'", "linear"]),
+            ({"psnr": 80.0}, ["psnr is 80"]),
+            ({"psnr": float("nan")}, ["psnr is nan"]),
+            ({"iterations": -1}, ["iterations"]),
+            ({"most": 0}, ["most"]),
+            ({"most": 2, "iterations": 0}, ["2 Gaussians reach"]),
+            ({"texture": "poster"}, ["not in the scene", NAME]),
+            ({"image": np.zeros((4, 4, 2), np.float32)}, ["shape"]),
+        ],
+    )
+    def test_cost_a_line(self, arguments, words):
+        arguments = {"texture": NAME, "image": photo(), **arguments}
+        with pytest.raises(ValueError) as error:
+            eg.fit_for_scene(scene_of(camera([0, 0, 5.0])), **arguments)
+        assert "\n" not in str(error.value)
+        assert all(word in str(error.value) for word in words)
