@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .fitting import Fit, fit
     from .gaussians import Gaussians, concatenate
     from .images import load_image, sample, save_image
+    from .levels import fit_levels, level_counts
     from .metrics import ms_ssim, psnr, ssim
     from .packing import Receipt, pack
     from .pca import Eigenbasis
@@ -32,7 +33,9 @@ __all__ = [
     "concatenate",
     "fit",
     "fit_for_scene",
+    "fit_levels",
     "from_tensors",
+    "level_counts",
     "load_image",
     "ms_ssim",
     "pack",
@@ -53,6 +56,7 @@ _HOMES = {
     "fitting": ("Fit", "fit"),
     "gaussians": ("Gaussians", "concatenate"),
     "images": ("load_image", "sample", "save_image"),
+    "levels": ("fit_levels", "level_counts"),
     "metrics": ("ms_ssim", "psnr", "ssim"),
     "packing": ("Receipt", "pack"),
     "pca": ("Eigenbasis",),

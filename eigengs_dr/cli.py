@@ -57,12 +57,19 @@ main.add_command(scene)
 @click.option("-o", "--output", required=True, type=ANY_PATH, metavar="Y.png")
 @click.option("--scale", type=float, metavar="S", help="Times the native size, such as 2 or 0.5.")
 @click.option("--size", type=Size(), help="Width and height in pixels, such as 1024x768.")
+@click.option(
+    "--first",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Draw the first N Gaussians alone; for sets that were fitted in --levels.",
+)
 @backend_option
 def render(
     file: Path,
     output: Path,
     scale: float | None,
     size: tuple[int, int] | None,
+    first: int | None,
     backend: str | None,
 ) -> None:
     """Render a fitted image, at its native size or at any other.
@@ -73,7 +80,7 @@ def render(
     Examples:
       eigengs-dr render photo.npz -o photo.png
       eigengs-dr render photo.npz -o large.png --scale 4
-      eigengs-dr render photo.npz -o icon.png --size 64x48
+      eigengs-dr render photo.npz -o icon.png --size 64x48 --first 500
     """
     if scale is not None and size is not None:
         raise click.UsageError("--scale and --size exclude each other; give one of them")
@@ -86,7 +93,7 @@ def render(
 
     from .rendering import picture_of
 
-    gaussians = eg.Gaussians.load(file, backend=backend)
+    gaussians = eg.Gaussians.load(file, backend=backend)[:first]
     width, height = size or _scaled(gaussians.width, gaussians.height, scale)
     eg.save_image(output, picture_of(gaussians, width, height))
 

@@ -7,8 +7,10 @@ from typing import Any
 import click
 
 from .backend import select
+from .cli_budget import budget
 from .cli_figures import figures
 from .cli_pareto import pareto
+from .cli_rate import rate
 from .cli_report import report as make_report
 from .cli_shared import (
     ANY_PATH,
@@ -39,7 +41,7 @@ def bench() -> None:
     """
 
 
-for command in (tables, pareto, stability, figures, make_report):
+for command in (tables, pareto, rate, budget, stability, figures, make_report):
     bench.add_command(command)
 
 

@@ -47,6 +47,11 @@ MISSED = 1
     type=click.IntRange(min=1),
     help="Most for --target-psnr; by default 3 for 8 pixels, which have as many numbers.",
 )
+@click.option(
+    "--levels",
+    type=click.IntRange(min=1),
+    help="Levels of detail: the first quarter of the Gaussians makes the image too, and so on.",
+)
 @click.option("--iterations", type=click.IntRange(min=0), default=1000, show_default=True)
 @choice("--init", ["auto", "random", "grid", "adaptive", "eigen"], "Where the Gaussians start.")
 @click.option(
@@ -105,6 +110,7 @@ def fit(
       eigengs-dr fit photo.jpg -o photo.npz
       eigengs-dr fit photo.jpg -o photo.npz --gaussians 20000 --report photo.json
       eigengs-dr fit photo.jpg -o photo.npz --target-psnr 38
+      eigengs-dr fit photo.jpg -o photo.npz --gaussians 5000 --levels 4
       eigengs-dr fit photo.jpg -o photo.npz --init eigen --iterations 100
       eigengs-dr fit *.png -o fits/ --preview previews/ --iterations 300
       eigengs-dr fit roughness.png -o roughness.npz --color data
@@ -148,6 +154,23 @@ def _basis(backend: str | None, init: str, preset: str, basis: str, **rest: Any)
     return load_basis(basis, backend)
 
 
+def _fitted(image: Any, levels: int | None, progress: Any, **settings: Any) -> Any:
+    """Fit an image in one way or the other."""
+    import eigengs_dr as eg
+
+    from .starting import GAUSSIANS
+
+    if levels is None:
+        return eg.fit(image, progress=progress, **settings)
+    if settings["target_psnr"] is not None:
+        raise ValueError("levels and target_psnr exclude each other; give one of them")
+    if settings["preset"] != "default" or settings["init"] not in ("auto", "adaptive"):
+        raise ValueError("levels work with preset 'default' and init 'adaptive' alone")
+    kept = {key: settings[key] for key in ("iterations", "color", "seed", "backend")}
+    count = settings["gaussians"] or min(GAUSSIANS, image.shape[0] * image.shape[1])
+    return eg.fit_levels(image, count, levels, progress=progress, **kept)
+
+
 def _fit_one(
     path: Path, output: Path, preview: Path | None, quiet: bool, **settings: Any
 ) -> dict[str, Any]:
@@ -161,7 +184,7 @@ def _fit_one(
     image = eg.load_image(path, keep_grey=color == "data")
     with progress_bar(quiet) as show:
         try:
-            result = eg.fit(image, progress=partial(show, path.name), **settings)
+            result = _fitted(image, progress=partial(show, path.name), **settings)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
     result.gaussians.save(output)

@@ -25,6 +25,12 @@ SUFFIX, BUDGET = ".egs", 0.5
     metavar="DB",
     help="Decibels of PSNR that may be lost.",
 )
+@click.option(
+    "--levels",
+    type=click.IntRange(min=1),
+    default=1,
+    help="Those that the set was fitted with: readers may stop after each of them.",
+)
 @backend_option
 @report_option
 @quiet_option
@@ -35,6 +41,7 @@ def pack(
     output: Path,
     image: Path | None,
     budget: float,
+    levels: int,
     backend: str | None,
     report: Path | None,
     quiet: bool,
@@ -57,7 +64,9 @@ def pack(
     gaussians = eg.Gaussians.load(file, backend=backend)
     pixels = eg.load_image(image, keep_grey=gaussians.channels == 1) if image else None
     try:
-        receipt = eg.pack(gaussians, target, pixels, budget)
+        counts = eg.level_counts(len(gaussians), levels)
+        sections = [n - before for before, n in zip([0, *counts], counts, strict=False)]
+        receipt = eg.pack(gaussians, target, pixels, budget, sections)
     except ValueError as error:
         raise ValueError(f"{image or file}: {error}") from None
     figures = {

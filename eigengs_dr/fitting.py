@@ -142,7 +142,7 @@ def fit(
     """
     started = time.perf_counter()
     pixels = check_image(image, keep_grey=color == "data")
-    _check(pixels, gaussians, iterations, init, preset, solve_steps, color, seed)
+    check(pixels, gaussians, iterations, init, preset, solve_steps, color, seed)
     method = PRESETS[preset]
     if target_psnr is not None:
         _check_target(gaussians, init, preset, target_psnr, target_space, pixels, max_gaussians)
@@ -192,17 +192,17 @@ def fit(
     )
 
 
-def _check(
+def check(
     pixels: NDArray[np.float32],
     gaussians: int | None,
     iterations: int,
-    init: str,
-    preset: str,
-    solve_steps: int,
-    color: str,
-    seed: int,
+    init: str = "auto",
+    preset: str = "default",
+    solve_steps: int = 0,
+    color: str = "ycbcr",
+    seed: int = 0,
 ) -> None:
-    """Raise ValueError for the first argument that is out of range."""
+    """Raise ValueError for the first argument of `fit` that is out of range."""
     counts = {"iterations": iterations, "solve_steps": solve_steps, "seed": seed}
     if gaussians is not None:
         counts["gaussians"] = gaussians

@@ -19,7 +19,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .adaptive import adaptive, bent, owners
+from .adaptive import Density, adaptive, bent, owners
 from .arrays import types_of, upload_rows
 from .gaussians import Gaussians
 from .images import resampled
@@ -82,6 +82,22 @@ def rearranged(
         here = np.maximum(resampled(error[..., None], width, height)[..., 0], 0)
         return wanted(there, here, bent(bend, spacing))
 
+    return placed_like(gaussians, image, target, count, density, solve_steps, cutoff)
+
+
+def placed_like(
+    gaussians: Gaussians,
+    image: Array,
+    target: NDArray[np.float32],
+    count: int,
+    density: Density | None = None,
+    solve_steps: int = 10,
+    cutoff: float = CUTOFF,
+) -> Gaussians:
+    """Place splats by an image and solve for their colours, in the space and size of another set.
+
+    Parameters are those of `rearranged`; see `eigengs_dr.adaptive` for the density.
+    """
     mean, factor = adaptive(image, count, density=density)
     types = types_of(gaussians.mean)
     black = np.zeros((gaussians.channels, count), np.float32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -23,6 +23,9 @@ from .tiles import Grid, TileLists
 
 EXACT = 100.0
 """Decibels above which only rounding is left to fit."""
+
+ROUNDING = 1e-10
+"""Mean squared error that is not told from none."""
 
 LONG = 10
 """Splats are placed anew only where so many times as many steps are to be taken as before it: of
@@ -107,6 +110,7 @@ def refine(
     added: NDArray[np.float32] | None = None,
     weight: NDArray[np.float32] | None = None,
     rearrange: Rearrange | None = None,
+    levels: Sequence[int] = (),
     progress: Progress | None = None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Refined:
@@ -134,6 +138,8 @@ def refine(
         What errors are multiplied by before they are squared.
     rearrange : callable, optional
         See `descend`.
+    levels : sequence of int, optional
+        Numbers of splats, from the first, that shall make the image too; see `descend`.
     progress : callable, optional
         ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
     interrupted : callable, optional
@@ -149,7 +155,7 @@ def refine(
     best, highest = gaussians, -math.inf
     stopped, step = "iterations", 0
     try:
-        sets = descend(gaussians, target, schedule, iterations, cutoff, weight, rearrange)
+        sets = descend(gaussians, target, schedule, iterations, cutoff, weight, rearrange, levels)
         for step, current in enumerate(sets):
             if step not in marks:
                 if interrupted():
@@ -184,12 +190,14 @@ def descend(
     cutoff: float = CUTOFF,
     weight: NDArray[np.float32] | None = None,
     rearrange: Rearrange | None = None,
+    levels: Sequence[int] = (),
 ) -> Iterator[Gaussians]:
     """Yield the set before the first step and after every step of gradient descent.
 
     Parameters are those of `refine`. From what `rearrange` makes of the set after
     `Schedule.rearrange` steps, a descent of its own goes on: splats are placed anew where they left
-    much error. Steps run asynchronously: what is yielded may not be computed yet.
+    much error. The first so many splats of each of the `levels` make the image too, as well as they
+    can. Steps run asynchronously: what is yielded may not be computed yet.
     """
     yield gaussians
     tried = schedule.rearrange if rearrange and iterations >= LONG * schedule.rearrange else 0
@@ -197,7 +205,7 @@ def descend(
         for current in _stretch(gaussians, target, schedule, tried, cutoff, weight):
             yield current
         gaussians = rearrange(dr.detach(current), len(current))
-    yield from _stretch(gaussians, target, schedule, iterations - tried, cutoff, weight)
+    yield from _stretch(gaussians, target, schedule, iterations - tried, cutoff, weight, levels)
 
 
 def _stretch(
@@ -207,6 +215,7 @@ def _stretch(
     iterations: int,
     cutoff: float,
     weight: NDArray[np.float32] | None,
+    levels: Sequence[int] = (),
 ) -> Iterator[Gaussians]:
     """Yield the set after every step of one descent.
 
@@ -222,10 +231,13 @@ def _stretch(
     tiles = to_tiles(types, target, grid)
     weights = to_tiles(types, np.ones_like(target) if weight is None else weight, grid)
     zero = dr.opaque(types.Float, 0)
-    with frozen(step_program(coordinates, cutoff)) as take_step:
+    with frozen(step_program(coordinates, cutoff, levels)) as take_step:
         for step in range(iterations):
             if step % schedule.rebuild == 0:
-                lists = lists_for(current, cutoff, schedule.pad)
+                lists = [
+                    lists_for(first(current, count), cutoff, schedule.pad)
+                    for count in (*levels, len(current))
+                ]
             left = rate_left(schedule, step, iterations)
             optimizer.set_learning_rate(
                 {name: dr.opaque(types.Float, rate * left) for name, rate in schedule.rates.items()}
@@ -245,28 +257,58 @@ def rate_left(schedule: Schedule, step: int, iterations: int) -> float:
     return left * min(1.0, (step + 1) / max(1, schedule.warm_up))
 
 
-def step_program(coordinates: Coordinates, cutoff: float) -> Any:
+def step_program(coordinates: Coordinates, cutoff: float, levels: Sequence[int] = ()) -> Any:
     """Make the function of a step, to be frozen: traced once, replayed without Python.
 
     A program belongs to one run: a replay does not notice that, say, the betas of another optimiser
     differ.
     """
 
-    def step(optimizer: Any, fixed: Gaussians, target: Any, weights: Any, lists: TileLists) -> None:
+    def step(
+        optimizer: Any, fixed: Gaussians, target: Any, weights: Any, lists: list[TileLists]
+    ) -> None:
         """Descend on the mean squared error, then bring the variables back inside their bounds.
 
         The weights are 0 where tiles overhang the image.
         """
         current = coordinates.to(fixed, dict(optimizer))
-        values = [*current.mean, *[f * UNIT for f in current.factor], *current.color]
-        rendered = splat(values, list(current.background), lists, cutoff)
-        dr.backward(dr.mean(dr.square((rendered - target) * weights)))
+        errors = [
+            _error(first(current, count), target, weights, listed, cutoff)
+            for count, listed in zip((*levels, len(fixed)), lists, strict=True)
+        ]
+        # Of several, the sum of their decibels: none is sacrificed for another.
+        loss = sum(dr.log(e + ROUNDING) for e in errors) if levels else errors[0]
+        dr.backward(loss)
         # Kept apart from the optimiser's arithmetic, the large kernels serve every preset.
         dr.eval([dr.grad(v) for v in optimizer.values()])
         optimizer.step(eval=False)
         optimizer.update(coordinates.bounded(fixed, dict(optimizer)))
 
     return step
+
+
+def _error(gaussians: Gaussians, target: Any, weights: Any, lists: TileLists, cutoff: float) -> Any:
+    values = [*gaussians.mean, *[f * UNIT for f in gaussians.factor], *gaussians.color]
+    rendered = splat(values, list(gaussians.background), lists, cutoff)
+    return dr.mean(dr.square((rendered - target) * weights))
+
+
+def first(gaussians: Gaussians, count: int) -> Gaussians:
+    """The first splats of a set; differentiable, also in a frozen program."""
+    if count == len(gaussians):
+        return gaussians
+    types = types_of(gaussians.mean)
+    index = dr.arange(types.UInt, count)
+
+    def taken(rows: Any) -> Any:
+        return type(rows)([dr.gather(types.Float, row, index) for row in rows])
+
+    return replace(
+        gaussians,
+        mean=taken(gaussians.mean),
+        factor=taken(gaussians.factor),
+        color=taken(gaussians.color),
+    )
 
 
 def figures(

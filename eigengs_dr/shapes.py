@@ -143,7 +143,7 @@ def _round(
                 {name: dr.opaque(types.Float, rate * left) for name, rate in SCHEDULE.rates.items()}
             )
             target = to_tiles(types, image, grid)
-            take_step(optimizer, fixed, target, inside, lists_for(current, CUTOFF))
+            take_step(optimizer, fixed, target, inside, [lists_for(current, CUTOFF)])
             current = coordinates.to(fixed, dict(optimizer))
             dr.eval(current)
     return dr.detach(current)

@@ -59,6 +59,9 @@ def gaussian_texture() -> type:
         filename : str
             A set that ``eigengs-dr fit`` or `Gaussians.save` wrote. Or a set's arrays, as
             `eigengs_dr.plugins.texture_of` writes them; or
+        first : int
+            With `filename`: use so many Gaussians, from the first. Sets that were fitted in levels
+            make a texture of any number.
         model, coefficients
             A saved `EigenGS` model and, optionally, coefficients (C, k).
         to_uv : transform

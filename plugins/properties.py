@@ -39,7 +39,7 @@ def source_of(props: Any) -> FromSet | FromModel:
         model = EigenGS.load(_path(props, "model"), backend)
         return FromModel(model, _coefficients(props))
     if given[0] == "filename":
-        gaussians = Gaussians.load(_path(props, "filename"), backend)
+        gaussians = Gaussians.load(_path(props, "filename"), backend)[: _first(props)]
     else:
         gaussians = _from_arrays(props, backend)
     if gaussians.channels not in (1, 3):
@@ -47,6 +47,14 @@ def source_of(props: Any) -> FromSet | FromModel:
             f"gaussian_texture: the set has {gaussians.channels} channels; a texture has 1 or 3"
         )
     return FromSet(gaussians)
+
+
+def _first(props: Any) -> int | None:
+    """Read ``first``: how many Gaussians of a file are used; None for all."""
+    value = props.get("first", 0)
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise ValueError(f"gaussian_texture: first is {value!r}; it must be a number of Gaussians")
+    return value or None
 
 
 def _coefficients(props: Any) -> Any:

@@ -6,7 +6,7 @@ import sys
 import drjit as dr
 import numpy as np
 import pytest
-from scenes import SIZE, random_scene
+from scenes import COUNT, SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 
@@ -48,6 +48,16 @@ def gaussians(space="rgb", channels=3, seed=0, quiet=True):
 
 def texture(g, **properties):
     return mi.load_dict({**texture_of(g), **properties})
+
+
+def test_first_so_many_of_a_file(tmp_path):
+    gaussians().save(tmp_path / "x.npz")
+    plain = {"type": "gaussian_texture", "filename": str(tmp_path / "x.npz")}
+    assert mi.traverse(mi.load_dict({**plain, "first": 7}))["mean"].shape == (7, 2)
+    assert mi.traverse(mi.load_dict(plain))["mean"].shape == (COUNT, 2)
+    for wrong in (-1, True, 2.5):
+        with pytest.raises(RuntimeError, match="must be a number of Gaussians"):
+            mi.load_dict({**plain, "first": wrong})
 
 
 def at(u, v, count=1):
