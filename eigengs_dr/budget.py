@@ -15,9 +15,10 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 
+from .descent import Schedule, descend
 from .gaussians import Gaussians
 from .growth import grown, pruned
-from .refine import Progress, Refined, Schedule, descend
+from .refine import Progress, Refined
 from .rendering import CUTOFF
 from .starting import Start
 

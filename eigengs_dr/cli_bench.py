@@ -9,6 +9,7 @@ import click
 from .backend import select
 from .cli_budget import budget
 from .cli_figures import figures
+from .cli_levels import levels
 from .cli_pareto import pareto
 from .cli_rate import rate
 from .cli_report import report as make_report
@@ -41,7 +42,7 @@ def bench() -> None:
     """
 
 
-for command in (tables, pareto, rate, budget, stability, figures, make_report):
+for command in (tables, pareto, rate, budget, levels, stability, figures, make_report):
     bench.add_command(command)
 
 

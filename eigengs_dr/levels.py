@@ -15,6 +15,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .descent import Schedule, descend
 from .fitting import Fit, check
 from .gaussians import Gaussians, concatenate
 from .growth import worth
@@ -22,7 +23,7 @@ from .images import check_image
 from .interrupt import deferred
 from .presets import PRESETS
 from .rearrange import placed_like, residual
-from .refine import Progress, Schedule, descend, refine
+from .refine import Progress, refine
 from .rendering import picture_of
 from .starting import GAUSSIANS, Start, begin
 

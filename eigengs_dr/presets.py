@@ -8,7 +8,7 @@ from functools import partial
 from .adam import Adam
 from .adan import Adan
 from .coordinates import CHOLESKY
-from .refine import Schedule
+from .descent import Schedule
 
 
 @dataclass(frozen=True)

@@ -1,80 +1,25 @@
-"""Refinement: gradient descent on all parameters of one image's Gaussians."""
+"""Refinement: a descent with a trace, that keeps the best set and ends where nothing is gained."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import types_of
-from .coordinates import NATURAL, Coordinates
-from .freezing import frozen
+from .descent import Rearrange, Schedule, descend
 from .gaussians import Gaussians
 from .metrics import psnr, unclamped
-from .rendering import CUTOFF, lists_for, picture_of, splat, to_tiles
-from .splat import UNIT
-from .tiles import Grid, TileLists
+from .rendering import CUTOFF, picture_of
 
 EXACT = 100.0
 """Decibels above which only rounding is left to fit."""
 
-ROUNDING = 1e-10
-"""Mean squared error that is not told from none."""
-
-LONG = 10
-"""Splats are placed anew only where so many times as many steps are to be taken as before it: of
-1,000 steps that gains 0.8 dB, of 200 0.5, and of 100 nothing (5,000 splats, ImageNet classes)."""
-
 Progress = Callable[[int, int, dict[str, Any]], None]
-Rearrange = Callable[[Gaussians, int], Gaussians]
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """How an image is refined; the numbers of a preset.
-
-    Attributes
-    ----------
-    optimizer : callable
-        ``optimizer(lr) -> drjit.opt.Optimizer``.
-    rates : dict of str to float
-        Learning rate of every coordinate at the start; in `NATURAL` coordinates of mean and factor
-        (in sizes of the splat) and color (1 is white).
-    coordinates : Coordinates
-        The variables that the optimiser moves.
-    warm_up : int
-        Steps over which the rates rise: until their averages have settled, steps of Adam are all
-        of full length and would leave the solved start by some decibels.
-    decay : float
-        What is left of the rates at the end, along half a cosine.
-    rebuild : int
-        Steps between two builds of the tile lists.
-    pad : float
-        Pixels by which splats are enlarged when lists are built, so that they last `rebuild` steps.
-    rearrange : int
-        Steps after which splats may be placed anew, see `descend`.
-    patience : int
-        Stop when this many steps gained less than `least_gain`.
-    least_gain : float
-        Decibels.
-    """
-
-    optimizer: Callable[[float], Any]
-    rates: dict[str, float]
-    coordinates: Coordinates = NATURAL
-    warm_up: int = 5
-    decay: float = 0.03
-    rebuild: int = 4
-    pad: float = 1.0
-    rearrange: int = 20
-    patience: int = 300
-    least_gain: float = 0.01
 
 
 class Refined(NamedTuple):
@@ -180,135 +125,6 @@ def refine(
     except KeyboardInterrupt:
         stopped = "interrupted"
     return Refined(dr.detach(best), trace, step, stopped)
-
-
-def descend(
-    gaussians: Gaussians,
-    target: NDArray[np.float32],
-    schedule: Schedule,
-    iterations: int,
-    cutoff: float = CUTOFF,
-    weight: NDArray[np.float32] | None = None,
-    rearrange: Rearrange | None = None,
-    levels: Sequence[int] = (),
-) -> Iterator[Gaussians]:
-    """Yield the set before the first step and after every step of gradient descent.
-
-    Parameters are those of `refine`. From what `rearrange` makes of the set after
-    `Schedule.rearrange` steps, a descent of its own goes on: splats are placed anew where they left
-    much error. The first so many splats of each of the `levels` make the image too, as well as they
-    can. Steps run asynchronously: what is yielded may not be computed yet.
-    """
-    yield gaussians
-    tried = schedule.rearrange if rearrange and iterations >= LONG * schedule.rearrange else 0
-    if rearrange and tried:
-        for current in _stretch(gaussians, target, schedule, tried, cutoff, weight):
-            yield current
-        gaussians = rearrange(dr.detach(current), len(current))
-    yield from _stretch(gaussians, target, schedule, iterations - tried, cutoff, weight, levels)
-
-
-def _stretch(
-    gaussians: Gaussians,
-    target: NDArray[np.float32],
-    schedule: Schedule,
-    iterations: int,
-    cutoff: float,
-    weight: NDArray[np.float32] | None,
-    levels: Sequence[int] = (),
-) -> Iterator[Gaussians]:
-    """Yield the set after every step of one descent.
-
-    Between two builds the tile lists are of where the splats were, enlarged by `schedule.pad`.
-    """
-    types = types_of(gaussians.mean)
-    coordinates = schedule.coordinates
-    start = coordinates.of(gaussians)
-    optimizer = schedule.optimizer(1.0)
-    optimizer.update({name: start[name] for name in schedule.rates})
-    current = gaussians
-    grid = Grid(gaussians.width, gaussians.height)
-    tiles = to_tiles(types, target, grid)
-    weights = to_tiles(types, np.ones_like(target) if weight is None else weight, grid)
-    zero = dr.opaque(types.Float, 0)
-    with frozen(step_program(coordinates, cutoff, levels)) as take_step:
-        for step in range(iterations):
-            if step % schedule.rebuild == 0:
-                lists = [
-                    lists_for(first(current, count), cutoff, schedule.pad)
-                    for count in (*levels, len(current))
-                ]
-            left = rate_left(schedule, step, iterations)
-            optimizer.set_learning_rate(
-                {name: dr.opaque(types.Float, rate * left) for name, rate in schedule.rates.items()}
-            )
-            take_step(optimizer, gaussians, tiles, weights, lists)
-            current = coordinates.to(gaussians, dict(optimizer))
-            # Later steps write into the optimiser's arrays: what is yielded must be a copy.
-            current = replace(current, color=current.color + zero)
-            dr.eval(current)
-            yield current
-
-
-def rate_left(schedule: Schedule, step: int, iterations: int) -> float:
-    """Factor of the rates: a linear rise, then half a cosine."""
-    along = 0.5 * (1 + math.cos(math.pi * step / iterations))
-    left = schedule.decay + (1 - schedule.decay) * along
-    return left * min(1.0, (step + 1) / max(1, schedule.warm_up))
-
-
-def step_program(coordinates: Coordinates, cutoff: float, levels: Sequence[int] = ()) -> Any:
-    """Make the function of a step, to be frozen: traced once, replayed without Python.
-
-    A program belongs to one run: a replay does not notice that, say, the betas of another optimiser
-    differ.
-    """
-
-    def step(
-        optimizer: Any, fixed: Gaussians, target: Any, weights: Any, lists: list[TileLists]
-    ) -> None:
-        """Descend on the mean squared error, then bring the variables back inside their bounds.
-
-        The weights are 0 where tiles overhang the image.
-        """
-        current = coordinates.to(fixed, dict(optimizer))
-        errors = [
-            _error(first(current, count), target, weights, listed, cutoff)
-            for count, listed in zip((*levels, len(fixed)), lists, strict=True)
-        ]
-        # Of several, the sum of their decibels: none is sacrificed for another.
-        loss = sum(dr.log(e + ROUNDING) for e in errors) if levels else errors[0]
-        dr.backward(loss)
-        # Kept apart from the optimiser's arithmetic, the large kernels serve every preset.
-        dr.eval([dr.grad(v) for v in optimizer.values()])
-        optimizer.step(eval=False)
-        optimizer.update(coordinates.bounded(fixed, dict(optimizer)))
-
-    return step
-
-
-def _error(gaussians: Gaussians, target: Any, weights: Any, lists: TileLists, cutoff: float) -> Any:
-    values = [*gaussians.mean, *[f * UNIT for f in gaussians.factor], *gaussians.color]
-    rendered = splat(values, list(gaussians.background), lists, cutoff)
-    return dr.mean(dr.square((rendered - target) * weights))
-
-
-def first(gaussians: Gaussians, count: int) -> Gaussians:
-    """The first splats of a set; differentiable, also in a frozen program."""
-    if count == len(gaussians):
-        return gaussians
-    types = types_of(gaussians.mean)
-    index = dr.arange(types.UInt, count)
-
-    def taken(rows: Any) -> Any:
-        return type(rows)([dr.gather(types.Float, row, index) for row in rows])
-
-    return replace(
-        gaussians,
-        mean=taken(gaussians.mean),
-        factor=taken(gaussians.factor),
-        color=taken(gaussians.color),
-    )
 
 
 def figures(

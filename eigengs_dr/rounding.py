@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import types_of
+from .descent import descend
 from .gaussians import Gaussians
 from .packed import Packed
 from .presets import PRESETS
 from .quantising import Steps, shapes_of, symbols_of, values_of
-from .refine import descend
 from .rendering import render
 from .solve import solve
 

@@ -19,12 +19,12 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
 
 from .adaptive import adaptive
 from .color import to_coded, to_linear
+from .descent import descend
 from .gaussians import Gaussians
 from .images import check_image
 from .metrics import psnr as psnr_of
 from .plugins.cone import PIXEL
 from .presets import PRESETS
-from .refine import descend
 from .rendering import CUTOFF, render
 from .resolution import Resolution, resolution
 from .smoothest import filled, smoothest

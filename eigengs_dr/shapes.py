@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from .adam import Adam
 from .arrays import types_of
+from .descent import Schedule, rate_left, step_program
 from .freezing import frozen
 from .gaussians import Gaussians
 from .place import grid
-from .refine import Schedule, rate_left, step_program
 from .rendering import CUTOFF, lists_for, to_tiles
 from .solve import solve
 from .tiles import Grid

@@ -19,9 +19,10 @@ from eigengs_dr import cli_budget
 from eigengs_dr.bench import budget, budget_tables, rate, rows
 from eigengs_dr.cli_bench import bench as group
 from eigengs_dr.console import Program
+from eigengs_dr.descent import descend
 from eigengs_dr.fitting import most_gaussians
 from eigengs_dr.presets import PRESETS
-from eigengs_dr.refine import EXACT, descend
+from eigengs_dr.refine import EXACT
 from eigengs_dr.rendering import picture_of
 from eigengs_dr.starting import begin
 

@@ -127,7 +127,7 @@ def test_fits_that_are_long_enough_rearrange_once():
         calls.append(count)
         return start.rearrange(gaussians, count)
 
-    from eigengs_dr.refine import LONG, descend
+    from eigengs_dr.descent import LONG, descend
 
     schedule = replace(PRESETS["default"].schedule, rearrange=2)
     for steps, times in ((2 * LONG - 1, 0), (2 * LONG, 1)):

@@ -1,5 +1,6 @@
 """Levels of detail: prefixes of a set that make the image too."""
 
+import csv
 import json
 from dataclasses import replace
 from itertools import pairwise
@@ -13,9 +14,9 @@ from scenes import random_scene
 import eigengs_dr as eg
 from eigengs_dr.cli import main
 from eigengs_dr.color import rgb_to_ycbcr
+from eigengs_dr.descent import first
 from eigengs_dr.growth import worth
 from eigengs_dr.levels import fit_levels, level_counts
-from eigengs_dr.refine import first
 from eigengs_dr.rendering import picture_of, render
 
 SIDE = 48
@@ -149,3 +150,20 @@ def test_levels_keep_the_background(image):
     found = fit_levels(image, 64, 2, iterations=0).gaussians
     alone = replace(found, color=0 * found.color)
     np.testing.assert_allclose(render(alone).numpy(), render(alone[:16]).numpy())
+
+
+def test_bench_draws_what_prefixes_are_worth(image, tmp_path):
+    photo, out = tmp_path / "a.png", tmp_path / "out"
+    eg.save_image(photo, image)
+    settings = ["--gaussians", 64, "--levels", 3, "--iterations", 20]
+    done = run("bench", "levels", photo, "-o", out, *settings)
+    assert done.exit_code == 0, done.stderr
+    lines = list(csv.DictReader((out / "levels.csv").open()))
+    assert [int(line["splats"]) for line in lines] == [4, 8, 16, 32, 64]
+    assert [line["level"] for line in lines] == ["True", "False", "True", "False", "True"]
+    own = reached(eg.fit(image, 8, iterations=20).gaussians, image)
+    assert float(lines[1]["alone"]) == pytest.approx(own, abs=1e-6)
+    # All of a set, in whatever order.
+    assert float(lines[-1]["alone"]) == pytest.approx(float(lines[-1]["sorted"]), abs=1e-4)
+    assert float(lines[0]["levels"]) > float(lines[0]["sorted"])
+    assert "8   " in done.stdout and (out / "levels.svg").stat().st_size > 1000

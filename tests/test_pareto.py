@@ -18,9 +18,9 @@ from eigengs_dr.backend import select
 from eigengs_dr.bench import kernels, pareto, pareto_kernels, pareto_tables, sets
 from eigengs_dr.bench.pareto import Collection, Variant, front
 from eigengs_dr.console import Program
+from eigengs_dr.descent import descend
 from eigengs_dr.presets import PRESETS
 from eigengs_dr.reference import render_exact
-from eigengs_dr.refine import descend
 from eigengs_dr.rendering import picture_of
 from eigengs_dr.starting import begin
 

@@ -21,12 +21,13 @@ from eigengs_dr.adan import Adan
 from eigengs_dr.backend import select
 from eigengs_dr.color import rgb_to_ycbcr, to_coded, to_linear
 from eigengs_dr.coordinates import CHOLESKY, CHOLESKY_BOUND, NATURAL
+from eigengs_dr.descent import Schedule, descend
 from eigengs_dr.fitting import fit
 from eigengs_dr.gaussians import NARROWEST
 from eigengs_dr.metrics import psnr
 from eigengs_dr.place import grid
 from eigengs_dr.presets import PRESETS
-from eigengs_dr.refine import Schedule, descend, refine, rows_at
+from eigengs_dr.refine import refine, rows_at
 from eigengs_dr.rendering import picture_of, render
 
 SIDE, SPLATS = 32, 100

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..descent import LONG
 from ..fitting import fit, most_gaussians
 from ..metrics import psnr
 from ..presets import PRESETS
-from ..refine import EXACT, LONG
+from ..refine import EXACT
 from ..starting import GAUSSIANS, Start, begin
 from . import rows
 from .rate import images_of

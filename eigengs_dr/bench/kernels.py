@@ -16,11 +16,12 @@ from ..adaptive import adaptive
 from ..arrays import ArrayTypes, types_in, types_of, upload
 from ..backend import select
 from ..color import rgb_to_ycbcr
+from ..descent import descend
 from ..gaussians import Gaussians
 from ..images import check_image, sample
 from ..presets import PRESETS
 from ..reference import render_plain
-from ..refine import Progress, descend
+from ..refine import Progress
 from ..rendering import lists_for, splat, splat_values, to_tensor
 from ..solve import solve
 from ..splat import SHAPE, UNIT

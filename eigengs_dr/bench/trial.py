@@ -10,9 +10,9 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..descent import Schedule, descend
 from ..gaussians import Gaussians
 from ..metrics import ms_ssim, psnr, ssim
-from ..refine import Schedule, descend
 from ..rendering import CUTOFF, picture_of
 from ..starting import Start
 
