@@ -52,6 +52,12 @@ MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
     help="Keep as few components as hold this share of a channel's variance, such as 0.99.",
 )
 @click.option(
+    "--target-psnr",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="DB",
+    help="Keep as few components as the images held out need for this mean PSNR of their PCA.",
+)
+@click.option(
     "--gaussians",
     type=click.IntRange(min=1),
     help="How many; by default 5000, or one a pixel where there are fewer pixels.",
@@ -87,13 +93,19 @@ def train(
 ) -> None:
     """Train an eigenbasis of Gaussians on the images of a folder.
 
-    One image in ten is held out, and measured at the end. What is done is kept in the folder
+    One image in ten is held out, and measured at the end. How many components are enough,
+    --energy tells by the images trained on, --target-psnr by those held out: psnr_ycbcr, or with
+    --color rgb the same of these channels. `eigengs-dr info` shows what fewer would reach.
+
+    What is done is kept in the folder
     MODEL.npz.checkpoint: after Ctrl-C or a crash, the same command goes on from there.
 
     \b
     Examples:
       eigengs-dr train photos/ -o photos.npz --preview photos.png --report photos.json
       eigengs-dr train faces/ -o faces.npz --size 128x128 --components 100 --gaussians 2000
+      eigengs-dr train photos/ -o photos.npz --energy 0.95
+      eigengs-dr train photos/ -o photos.npz --target-psnr 24
       eigengs-dr fit photo.jpg -o photo.npz --init eigen --basis photos.npz
     """
     from .images import SAVE_OPTIONS, image_files
@@ -151,7 +163,8 @@ def _summary(record: dict[str, Any], preview: Path | None) -> str:
     components = "+".join(map(str, record["components"]))
     text = (
         f"{record['input']}: {record['images']} images, {components} components, "
-        f"{record['gaussians']} Gaussians in {record['seconds']:.1f} s\n  "
+        f"{record['gaussians']} Gaussians in {record['seconds']:.1f} s; "
+        f"{'split' if record['frequency_aware'] else 'not split'} ({record['split_reason']})\n  "
     )
     if record["psnr_pca"] is None:
         text += "no image was held out, so no psnr was measured; that takes 10 images"

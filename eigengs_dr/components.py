@@ -206,9 +206,25 @@ def wants_split(
         sets = [shapes_of(on_grid(size, n), size, 1, backend) for n in counts]
         equations = NormalEquations(concatenate(sets), counts[0] if split else 0)
         correlations = equations.correlate(planes)
-        error = equations.error(equations.solve(correlations), correlations, _squares(planes))
+        error = equations.error(equations.solve(correlations), correlations, squares(planes))
         figures[name] = decibels(float(error.mean()) / (basis.width * basis.height))
     return figures["psnr_split"] > figures["psnr_whole"] - SPLIT_COST, figures
+
+
+def split_reason(
+    basis: Eigenbasis, count: int, frequency_aware: bool | str, figures: dict[str, float]
+) -> str:
+    """Tell in under 64 characters why `wants_split` decided as it did, from its figures."""
+    if count < 2 or _low_components(basis) < 1:
+        return "too few Gaussians or components to split"
+    if isinstance(frequency_aware, bool):
+        return "as asked"
+    if figures:
+        whole, split = figures["psnr_whole"], figures["psnr_split"]
+        return f"whole {whole:.2f} dB, split {split:.2f} dB, may cost {SPLIT_COST:g}"
+    if (side := max(basis.width, basis.height)) < SPLIT_FROM:
+        return f"{side} pixels a side; auto measures from {SPLIT_FROM} on"
+    return "no training images to compare on"
 
 
 def psnr_components(
@@ -218,7 +234,7 @@ def psnr_components(
     total = 0.0
     for planes, values, rows in zip(basis.components, basis.eigenvalues, weights, strict=True):
         correlations = equations.correlate(planes)
-        error = equations.error(rows.T.astype(np.float64), correlations, _squares(planes))
+        error = equations.error(rows.T.astype(np.float64), correlations, squares(planes))
         total += float(values @ error)
     return decibels(total / basis.mean.size)
 
@@ -313,6 +329,6 @@ def colored(gaussians: Gaussians, coefficients: NDArray[np.float64], space: str)
     )
 
 
-def _squares(planes: Planes) -> NDArray[np.float64]:
+def squares(planes: Planes) -> NDArray[np.float64]:
     """``|D|^2`` of every plane."""
     return np.einsum("nij,nij->n", planes, planes, dtype=np.float64)

@@ -16,15 +16,25 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from . import archive
-from .components import Fitted, State, check_arguments, colored, fit_components, wants_split
+from .components import (
+    Fitted,
+    State,
+    check_arguments,
+    colored,
+    fit_components,
+    split_reason,
+    squares,
+    wants_split,
+)
+from .fewest import Fall, expected
 from .gaussians import Gaussians
 from .images import check_image, resampled
-from .modelfile import FORMAT, LAYOUT, VERSION, from_members, to_members
+from .modelfile import FORMAT, VERSION, from_members, layout_of, to_members
 from .normal import NormalEquations
 from .pca import Eigenbasis
+from .span import Span
 from .stream import to_planes
 
 Planes = NDArray[np.float32]
@@ -52,6 +62,14 @@ class EigenGS:
         splats serve all components.
     low_components : int
         Components of each channel, the first ones, that these splats serve.
+    split_reason : str
+        Why the splats are split or not; empty where an older file does not say.
+    variance : ndarray of float64, shape (C,)
+        Total variance of the training images, see `eigengs_dr.Eigenbasis`; empty, shape (0,), where
+        an older file does not say.
+    held_out : ndarray of float64, shape (n + 1,)
+        The PSNR of `eigengs_dr.fewest.Fall`, in dB, mean over images that were not trained on, of
+        their PCA by the first 0, 1, ..., n components; empty where none were held out.
     figures : dict of str to float
         What was measured when the model was fitted, see `eigengs_dr.components.Fitted`; not saved.
     """
@@ -62,6 +80,9 @@ class EigenGS:
     mean_image: Planes
     low: int = 0
     low_components: int = 0
+    split_reason: str = ""
+    variance: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    held_out: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     figures: dict[str, float] = field(default_factory=dict)
 
     @classmethod
@@ -116,11 +137,14 @@ class EigenGS:
                 progress(sum(int(state["step"]) for state in states), total, {})
 
         fitted = fit_components(basis, gaussians, split, preset, steps, seed, backend, save=save)
-        return cls.of(basis, fitted, compared)
+        reason = split_reason(basis, gaussians, frequency_aware, compared)
+        return cls.of(basis, fitted, compared, split_reason=reason)
 
     @classmethod
-    def of(cls, basis: Eigenbasis, fitted: Fitted, figures: dict[str, float]) -> EigenGS:
-        """Put a model together from what was fitted to a basis, and more figures."""
+    def of(
+        cls, basis: Eigenbasis, fitted: Fitted, figures: dict[str, float], **told: Any
+    ) -> EigenGS:
+        """Put a model together from what was fitted to a basis, more figures and attributes."""
         return cls(
             gaussians=fitted.gaussians,
             weights=fitted.weights,
@@ -128,7 +152,9 @@ class EigenGS:
             mean_image=basis.mean,
             low=fitted.low,
             low_components=fitted.low_components,
+            variance=basis.variance,
             figures={**fitted.figures, **figures},
+            **told,
         )
 
     @property
@@ -136,7 +162,19 @@ class EigenGS:
         """Number of components of every channel."""
         return tuple(len(w) for w in self.weights)
 
-    def project(self, image: ArrayLike) -> tuple[Planes, ...]:
+    def fall(self) -> Fall | None:
+        """Tell how the error of the training images' PCA falls, component by component.
+
+        Returns
+        -------
+        Fall or None
+            See `eigengs_dr.fewest.expected`; None where an older file does not say.
+        """
+        if not len(self.variance):
+            return None
+        return expected(self.eigenvalues, self.variance, self.mean_image.size)
+
+    def project(self, image: ArrayLike, target_psnr: float | None = None) -> tuple[Planes, ...]:
         """Find the coefficients of an image: the closest point on the span of the components.
 
         Least squares on the rendered components, ``min_a |Psi~ a - (I - Psi~_0)|^2``; where they
@@ -148,19 +186,27 @@ class EigenGS:
         ----------
         image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
             Of any size; resampled to that of the model.
+        target_psnr : float, optional
+            Use as few components as reach it for this image at the size of the model, in dB, of the
+            channels as in `eigengs_dr.fewest.Fall`. All by default.
 
         Returns
         -------
-        tuple of ndarray of float32, shape (k,)
-            One array a channel.
+        tuple of ndarray of float32, shape (m,)
+            One array a channel; m <= k, and m = k without a target.
 
         Raises
         ------
         ValueError
-            If the image is unusable.
+            If the image is unusable, or the target no positive number.
+
+        Warns
+        -----
+        UserWarning
+            If all components do not reach the target; they are used.
         """
-        correlations = self.equations.correlate(self._planes(check_image(image)))
-        return self._coefficients(correlations - self._mean_product)
+        planes = self._planes(check_image(image))
+        return self._coefficients(planes, self.equations.correlate(planes), False, target_psnr)
 
     def reconstruct(
         self, coefficients: tuple[Planes, ...], size: tuple[int, int] | None = None
@@ -191,7 +237,13 @@ class EigenGS:
             raise ValueError(f"coefficients have shapes {given}; expected up to {self.components}")
         return self._colored(self._mean_coefficients + self._sum(coefficients), size)
 
-    def encode(self, image: ArrayLike, colors: str = "exact", mean: str = "gaussians") -> Gaussians:
+    def encode(
+        self,
+        image: ArrayLike,
+        colors: str = "exact",
+        mean: str = "gaussians",
+        target_psnr: float | None = None,
+    ) -> Gaussians:
         """Give an image its Gaussians at once, without optimisation.
 
         Parameters
@@ -205,6 +257,8 @@ class EigenGS:
             eigenbasis, which have no more degrees of freedom than there are components.
         mean : {"gaussians", "dense"}, optional
             "dense" is the paper's form: the result lacks the mean image, `dense_mean`.
+        target_psnr : float, optional
+            With "projected" colours: use as few components as reach it, see `project`.
 
         Returns
         -------
@@ -214,7 +268,13 @@ class EigenGS:
         Raises
         ------
         ValueError
-            If the image is unusable or an option unknown.
+            If the image is unusable, an option unknown, or the target no positive number or given
+            for exact colours.
+
+        Warns
+        -----
+        UserWarning
+            If all components do not reach the target; they are used.
         """
         for name, value, known in (
             ("colors", colors, ("exact", "projected")),
@@ -222,6 +282,8 @@ class EigenGS:
         ):
             if value not in known:
                 raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(known)}")
+        if colors == "exact" and target_psnr is not None:
+            raise ValueError("target_psnr chooses components; use it with colors 'projected'")
         pixels = check_image(image)
         size = (pixels.shape[1], pixels.shape[0])
         planes = self._planes(pixels)
@@ -230,9 +292,10 @@ class EigenGS:
         correlations = self.equations.correlate(planes)
         if colors == "exact":
             return self._colored(self.equations.solve(correlations), size)
+        found = self._coefficients(planes, correlations, mean == "dense", target_psnr)
         if mean == "dense":
-            return self._colored(self._sum(self._coefficients(correlations)), size)
-        return self.reconstruct(self._coefficients(correlations - self._mean_product), size)
+            return self._colored(self._sum(found), size)
+        return self.reconstruct(found, size)
 
     def dense_mean(self, width: int, height: int) -> Planes:
         """Return the mean image as pixels, shape (height, width, C), in the space of the model."""
@@ -267,7 +330,10 @@ class EigenGS:
         OSError
             If it cannot be opened.
         """
-        arrays = archive.read(path, FORMAT, VERSION, LAYOUT)
+        version = archive.read(path, FORMAT, VERSION, {"version": archive.Field("i8", 0)})[
+            "version"
+        ]
+        arrays = archive.read(path, FORMAT, VERSION, layout_of(int(version)))
         try:
             return cls(**from_members(arrays, backend))
         except ValueError as error:
@@ -306,28 +372,25 @@ class EigenGS:
         return self.equations.product(self._mean_coefficients)
 
     @cached_property
-    def _component_factors(self) -> list[Any]:
-        """Cholesky factors of ``Psi~^T Psi~``, one a channel."""
-        factors = []
-        for weights in self.weights:
-            # In double precision: components outnumber splats, or render alike, in some models.
-            rows = weights.astype(np.float64)
-            gram = rows @ self.equations.product(rows.T)
-            gram += np.eye(len(gram)) * (1e-9 * np.trace(gram) / max(1, len(gram)) + 1e-30)
-            factors.append(cho_factor(gram, lower=True) if len(gram) else None)
-        return factors
+    def _span(self) -> Span:
+        """The rendered components, with the factors of their least squares."""
+        return Span(self.equations, self.weights)
 
-    def _coefficients(self, correlations: NDArray[np.float64]) -> tuple[Planes, ...]:
-        """Least squares on the rendered components, from ``[A 1]^T (I - Psi~_0)``."""
-        found = []
-        for c, (weights, factor) in enumerate(
-            zip(self.weights, self._component_factors, strict=True)
-        ):
-            # Not a product by BLAS, whose threads and Dr.Jit's wait for each other: twice as slow.
-            seen = np.einsum("jn,n->j", weights, correlations[:, c].astype(np.float32))
-            solved = cho_solve(factor, seen, check_finite=False) if len(seen) else seen
-            found.append(solved.astype(np.float32))
-        return tuple(found)
+    def _coefficients(
+        self,
+        planes: Planes,
+        correlations: NDArray[np.float64],
+        centred: bool,
+        target_psnr: float | None,
+    ) -> tuple[Planes, ...]:
+        """Least squares on the rendered components; `centred` planes lack the mean image."""
+        seen = correlations if centred else correlations - self._mean_product
+        if target_psnr is None:
+            return self._span.coefficients(seen)
+        lengths = squares(planes)
+        if not centred:
+            lengths = self.equations.error(self._mean_coefficients, correlations, lengths)
+        return self._span.fewest(seen, lengths, planes.size, target_psnr)
 
     def _sum(self, coefficients: tuple[Any, ...]) -> NDArray[np.float64]:
         """``sum_j a_j psi_nj`` for every channel, shape (N + 1, C)."""

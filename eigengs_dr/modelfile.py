@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .archive import Field
-from .basisfile import require_descending
+from .basisfile import ROUNDING, require_descending
 from .gaussians import Gaussians
 from .stream import SPACES
 
-FORMAT, VERSION = "eigengs_dr.model", 1
+FORMAT, VERSION = "eigengs_dr.model", 2
 
 MOST_ENTRIES = 1 << 28
 """Largest array: 300 components of a million splats."""
@@ -20,7 +20,10 @@ MOST_ENTRIES = 1 << 28
 LARGEST = 1e6
 """Largest colour or weight that is believed; 1 is white."""
 
-LAYOUT: dict[str, Field] = {
+MOST_DECIBELS = 200.0
+"""Beyond all PSNR, of good and of bad."""
+
+FIRST: dict[str, Field] = {
     "mean": Field("f4", 2),
     "factor": Field("f4", 2),
     "color": Field("f4", 2),
@@ -33,7 +36,20 @@ LAYOUT: dict[str, Field] = {
     **{f"scale{c}": Field("f4", 1) for c in range(3)},
     **{f"eigenvalues{c}": Field("f8", 1) for c in range(3)},
 }
-"""What a file holds: the kind and the number of dimensions of each array."""
+"""What a file of version 1 holds: the kind and the number of dimensions of each array."""
+
+LAYOUT: dict[str, Field] = {
+    **FIRST,
+    "variance": Field("f8", 1),
+    "held_out": Field("f8", 1),
+    "split_reason": Field("U", 0),
+}
+"""What a file holds: since version 2 also how the error falls, and why splats are split."""
+
+
+def layout_of(version: int) -> dict[str, Field]:
+    """Return what a file of a version that can be read holds."""
+    return FIRST if version < 2 else LAYOUT
 
 
 def to_members(model: Any) -> dict[str, NDArray[Any]]:
@@ -53,6 +69,9 @@ def to_members(model: Any) -> dict[str, NDArray[Any]]:
         "space": np.array(model.gaussians.space),
         "mean_image": model.mean_image.astype(np.float16),
         "split": np.array([model.low, model.low_components], np.int64),
+        "split_reason": np.array(model.split_reason),
+        "variance": model.variance.astype(np.float64),
+        "held_out": model.held_out.astype(np.float64),
     }
     for c, (weights, values) in enumerate(zip(model.weights, model.eigenvalues, strict=True)):
         scale = np.abs(weights).max(axis=1, initial=1e-30)
@@ -68,7 +87,7 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
     Parameters
     ----------
     arrays : dict of str to ndarray
-        Of the types and dimensions of `LAYOUT`.
+        Of the types and dimensions of `LAYOUT`, or of `FIRST`.
     backend : {"llvm", "cuda"}, optional
 
     Returns
@@ -129,7 +148,29 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
         "mean_image": arrays["mean_image"].astype(np.float32),
         "low": low,
         "low_components": low_components,
+        **_told(arrays),
     }
+
+
+def _told(arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    """Check what files tell since version 2; nothing of an older one."""
+    if "variance" not in arrays:
+        return {}
+    variance, held_out = arrays["variance"], arrays["held_out"]
+    if len(variance):  # unknown in a model that came from an older file
+        _require("variance", variance, (3,))
+    for c, total in enumerate(variance):
+        if not 0 <= arrays[f"eigenvalues{c}"].sum() <= total * (1 + ROUNDING):
+            raise ValueError(f"eigenvalues{c} add up to more than variance {c}")
+    if len(held_out):  # where images were held out
+        _require("held_out", held_out, (1 + sum(len(arrays[f"scale{c}"]) for c in range(3)),))
+    falls = np.diff(held_out) < -1e-9  # that much is rounding of the logarithm
+    if falls.any() or (np.abs(held_out) > MOST_DECIBELS).any():
+        raise ValueError(f"held_out must ascend, within {MOST_DECIBELS:g} dB")
+    reason = str(arrays["split_reason"])
+    if not (reason.isascii() and reason.isprintable()):
+        raise ValueError("split_reason holds characters that are not printed")
+    return {"variance": variance, "held_out": held_out, "split_reason": reason}
 
 
 def _require(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:

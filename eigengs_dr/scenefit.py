@@ -128,12 +128,11 @@ def fit_for_scene(
 
     Examples
     --------
-    >>> import eigengs_dr as eg, mitsuba as mi
-    >>> from eigengs_dr.plugins import texture_of
-    >>> mi.set_variant("llvm_ad_rgb")
-    >>> room = mi.load_file("room.xml")
-    >>> found = eg.fit_for_scene(room, "poster.bsdf.reflectance", eg.load_image("poster.jpg"))
-    >>> poster = texture_of(found.gaussians)
+    With a scene whose poster holds any texture (`examples/fit_for_scene.py` is a whole one)::
+
+        room = mi.load_file("room.xml")
+        found = eg.fit_for_scene(room, "poster.bsdf.reflectance", eg.load_image("poster.jpg"))
+        poster = texture_of(found.gaussians)
     """
     if color not in COLORS:
         raise ValueError(f"color {color!r} is unknown; textures hold {' or '.join(COLORS)}")

@@ -10,20 +10,21 @@ import warnings
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .checkpoint import Checkpoint
-from .components import State, check_arguments, fit_components, wants_split
+from .components import State, check_arguments, fit_components, split_reason, wants_split
 from .eigengs import EigenGS
-from .images import ImageError, cropped, image_files, load_image
+from .fewest import Fall, check_target
+from .heldout import fall_on, measured
+from .images import ImageError, image_files
 from .incremental import EigenState, block_length, merge, rank_for, start
 from .interrupt import deferred
-from .metrics import psnr
 from .pca import Eigenbasis, checked_components
-from .rendering import render
 from .stream import SPACES, batches, checked_size
 
 HELD_OUT = 10
@@ -54,6 +55,9 @@ class Settings:
         The most kept of each channel.
     energy : float or None
         Keep as few components as hold this share of a channel's variance.
+    target_psnr : float or None
+        Keep as few components as the images held out need for this mean PSNR of their PCA, in dB;
+        see `eigengs_dr.fewest.Fall`.
     gaussians, frequency_aware, preset, steps, seed
         See `eigengs_dr.EigenGS.fit`.
     color : {"ycbcr", "rgb"}
@@ -63,6 +67,7 @@ class Settings:
     size: tuple[int, int] = (256, 256)
     components: int | tuple[int, int, int] = 300
     energy: float | None = None
+    target_psnr: float | None = None
     gaussians: int = 5000
     frequency_aware: bool | str = "auto"
     preset: str = "default"
@@ -82,10 +87,9 @@ class Trained(NamedTuple):
     figures : dict of str to object
         ``seconds``, ``pca_seconds``, ``shape_seconds``, ``weight_seconds`` (of this run alone, if
         it went on with another: ``resumed``), ``peak_rss_mb``, ``images``, ``components`` of each
-        channel, ``gaussians``, ``frequency_aware``, ``psnr_components`` and others of
-        `eigengs_dr.components.Fitted`; on the images held out, by psnr_ycbcr in dB, ``psnr_pca``
-        of the components themselves, ``psnr_init`` of projected and ``psnr_solved`` of exact
-        colours.
+        channel, ``gaussians``, ``frequency_aware`` and ``split_reason``, why;
+        ``psnr_held_out``, the attribute ``held_out`` of the model; ``psnr_components`` and others
+        of `eigengs_dr.components.Fitted`; those of `eigengs_dr.heldout.measured`.
     """
 
     model: EigenGS
@@ -132,6 +136,10 @@ def train(
     """
     started = time.perf_counter()
     checked_components(settings.components, settings.energy)
+    if settings.target_psnr is not None:
+        check_target(settings.target_psnr)
+        if settings.energy is not None:
+            raise ValueError("energy and target_psnr both choose the components; give one of them")
     if settings.color not in SPACES:
         raise ValueError(f"color {settings.color!r} is unknown; use one of {', '.join(SPACES)}")
     steps = check_arguments(
@@ -158,10 +166,11 @@ def train(
         with deferred() as pressed:
             run = Run(checkpoint, settings, steps, backend, progress, pressed)
             try:
-                basis = _basis(training, run)
+                held_out = held_out[:MOST_HELD_OUT]
+                basis = _basis(training, held_out, run)
                 pca_seconds = time.perf_counter() - started
-                model = _model(basis, run)
-                measured = _measured(model, basis, held_out[:MOST_HELD_OUT], run)
+                model = _model(basis, fall_on(basis, held_out, run.stop_if_pressed), run)
+                worth = measured(model, basis, held_out, partial(run.measure, total=len(held_out)))
             except ValueError as error:
                 if not checkpoint.holds_work:
                     raise
@@ -173,10 +182,12 @@ def train(
             "components": list(model.components),
             "gaussians": len(model.gaussians),
             "frequency_aware": model.low > 0,
+            "split_reason": model.split_reason,
+            "psnr_held_out": model.held_out.tolist(),
             "steps": steps,
             "pca_seconds": pca_seconds,
             **model.figures,
-            **measured,
+            **worth,
             "peak_rss_mb": _peak_rss(),
             "seconds": time.perf_counter() - started,
         }
@@ -194,14 +205,19 @@ class Run(NamedTuple):
     progress: Progress
     pressed: Callable[[], bool]
 
-    def stop_if_pressed(self) -> None:
+    def stop_if_pressed(self, *done: int) -> None:
         """Raise `Interrupted` after Ctrl-C."""
         if self.pressed():
             kept = self.checkpoint.holds_work
             raise Interrupted("the same command goes on from here" if kept else "nothing is saved")
 
+    def measure(self, done: int, total: int) -> None:
+        """Tell that images are measured, before the next one."""
+        self.progress("measure", done, total)
+        self.stop_if_pressed()
 
-def _basis(files: list[Path], run: Run) -> Eigenbasis:
+
+def _basis(files: list[Path], held_out: list[Path], run: Run) -> Eigenbasis:
     """Find the components, block by block, or read them from the checkpoint."""
     settings, checkpoint = run.settings, run.checkpoint
     if (path := checkpoint.folder / "basis.npz").exists():
@@ -231,12 +247,19 @@ def _basis(files: list[Path], run: Run) -> Eigenbasis:
     basis = Eigenbasis.from_state(
         state, settings.size, settings.components, settings.energy, settings.color
     )
+    if settings.target_psnr is not None:
+        if (fall := fall_on(basis, held_out, run.stop_if_pressed)) is None:
+            raise ValueError(
+                f"target_psnr needs images that are held out, one in {HELD_OUT}, and there are "
+                "none that can be read; give more images, or use energy"
+            )
+        basis = basis.truncated(fall.fewest(settings.target_psnr))
     basis.save(path)
     checkpoint.remove("pca")
     return basis
 
 
-def _model(basis: Eigenbasis, run: Run) -> EigenGS:
+def _model(basis: Eigenbasis, fall: Fall | None, run: Run) -> EigenGS:
     """Fit Gaussians to the components, saving what training has reached."""
     settings, checkpoint = run.settings, run.checkpoint
     run.stop_if_pressed()
@@ -266,7 +289,13 @@ def _model(basis: Eigenbasis, run: Run) -> EigenGS:
         _states(checkpoint.load("shapes") or {}),
         save,
     )
-    return EigenGS.of(basis, fitted, compared)
+    return EigenGS.of(
+        basis,
+        fitted,
+        compared,
+        split_reason=split_reason(basis, settings.gaussians, settings.frequency_aware, compared),
+        held_out=np.zeros(0) if fall is None else fall.psnr,
+    )
 
 
 def _states(flat: dict[str, Any]) -> list[State]:
@@ -276,29 +305,6 @@ def _states(flat: dict[str, Any]) -> list[State]:
         side, name = key.split(".", 1)
         states.setdefault(side, {})[name] = array
     return [states[side] for side in sorted(states)]
-
-
-def _measured(model: EigenGS, basis: Eigenbasis, files: list[Path], run: Run) -> dict[str, float]:
-    """Mean psnr_ycbcr of images that were not trained on; nothing where there are none."""
-    rows, bad = [], []
-    for i, path in enumerate(files):
-        run.progress("measure", i, len(files))
-        run.stop_if_pressed()
-        try:
-            image = cropped(load_image(path), basis.width, basis.height)
-        except ImageError as error:
-            bad.append(str(error))
-            continue
-        shown = {
-            "psnr_pca": basis.reconstruct(basis.project(image)),
-            "psnr_init": render(model.encode(image, "projected")).numpy(),
-            "psnr_solved": render(model.encode(image, "exact")).numpy(),
-        }
-        rows.append({name: psnr(image, picture, "ycbcr") for name, picture in shown.items()})
-    if bad:
-        told = f"{len(bad)} of {len(files)} images held out were skipped, as {bad[0]}"
-        warnings.warn(told, stacklevel=2)
-    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]} if rows else {}
 
 
 def _peak_rss() -> float | None:
