@@ -81,7 +81,7 @@ def fewest(
         Splats, at most.
     schedule : Schedule
     iterations : int, optional
-        Steps that a fit of a known number would take; the search takes about as many.
+        Steps that a fit of a known number would take; the search takes up to twice as many.
     cutoff : float, optional
         See `eigengs_dr.render`.
     progress : callable, optional

@@ -28,7 +28,7 @@ from .components import (
     squares,
     wants_split,
 )
-from .fewest import Fall, expected
+from .fall import Fall, expected
 from .gaussians import Gaussians
 from .images import check_image, resampled
 from .modelfile import FORMAT, VERSION, from_members, layout_of, to_members
@@ -68,7 +68,7 @@ class EigenGS:
         Total variance of the training images, see `eigengs_dr.Eigenbasis`; empty, shape (0,), where
         an older file does not say.
     held_out : ndarray of float64, shape (n + 1,)
-        The PSNR of `eigengs_dr.fewest.Fall`, in dB, mean over images that were not trained on, of
+        The PSNR of `eigengs_dr.fall.Fall`, in dB, mean over images that were not trained on, of
         their PCA by the first 0, 1, ..., n components; empty where none were held out.
     figures : dict of str to float
         What was measured when the model was fitted, see `eigengs_dr.components.Fitted`; not saved.
@@ -168,7 +168,7 @@ class EigenGS:
         Returns
         -------
         Fall or None
-            See `eigengs_dr.fewest.expected`; None where an older file does not say.
+            See `eigengs_dr.fall.expected`; None where an older file does not say.
         """
         if not len(self.variance):
             return None
@@ -188,7 +188,7 @@ class EigenGS:
             Of any size; resampled to that of the model.
         target_psnr : float, optional
             Use as few components as reach it for this image at the size of the model, in dB, of the
-            channels as in `eigengs_dr.fewest.Fall`. All by default.
+            channels as in `eigengs_dr.fall.Fall`. All by default.
 
         Returns
         -------

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .eigengs import EigenGS
-from .fewest import Fall
+from .fall import Fall
 from .images import ImageError, cropped, load_image
 from .metrics import psnr
 from .pca import Eigenbasis

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .basisfile import ROUNDING, read_basis, write_basis
 from .color import ycbcr_to_rgb
-from .fewest import Fall, expected, falling, remaining
+from .fall import Fall, expected, falling, remaining
 from .images import check_image, resampled
 from .incremental import EigenState, block_length, merge, rank_for, start
 from .stream import Progress, Source, batches, checked_size, to_planes

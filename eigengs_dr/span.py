@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from .fewest import fewest_apart, remaining
+from .fall import fewest_apart, remaining
 from .normal import NormalEquations
 
 Coefficients = tuple[NDArray[np.float32], ...]
@@ -76,7 +76,7 @@ class Span:
         entries : int
             Pixels times channels.
         target_psnr : float
-            See `eigengs_dr.fewest.fewest_apart`. The ridge on the diagonal of ``Psi~^T Psi~``
+            See `eigengs_dr.fall.fewest_apart`. The ridge on the diagonal of ``Psi~^T Psi~``
             only lets the error be smaller than it is taken to be.
 
         Returns

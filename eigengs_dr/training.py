@@ -19,7 +19,7 @@ import numpy as np
 from .checkpoint import Checkpoint
 from .components import State, check_arguments, fit_components, split_reason, wants_split
 from .eigengs import EigenGS
-from .fewest import Fall, check_target
+from .fall import Fall, check_target
 from .heldout import fall_on, measured
 from .images import ImageError, image_files
 from .incremental import EigenState, block_length, merge, rank_for, start
@@ -57,7 +57,7 @@ class Settings:
         Keep as few components as hold this share of a channel's variance.
     target_psnr : float or None
         Keep as few components as the images held out need for this mean PSNR of their PCA, in dB;
-        see `eigengs_dr.fewest.Fall`.
+        see `eigengs_dr.fall.Fall`.
     gaussians, frequency_aware, preset, steps, seed
         See `eigengs_dr.EigenGS.fit`.
     color : {"ycbcr", "rgb"}

@@ -256,6 +256,16 @@ def test_tables_tell_medians_and_ranges():
     assert starts.rows == [("made", "200", "4", "0.75", "-0.25 to 2.00", *seconds)]
 
 
+def test_an_image_that_a_run_was_stopped_at_counts_as_far_as_it_goes():
+    rows = made_rows()
+    whole = budget_tables.points(rows), budget_tables.gains(rows)
+    for kept in range(len(rows)):
+        points, gains = budget_tables.points(rows[:kept]), budget_tables.gains(rows[:kept])
+        assert points == whole[0][: len(points)]
+        assert sum(map(len, gains.values())) <= sum(map(len, whole[1].values()))
+    assert len(budget_tables.points(rows[:-1])) == len(whole[0])
+
+
 def test_charts_show_what_was_met_and_the_diagonal():
     drawn = budget_tables.points(made_rows())
     figure = budget_tables.chart(drawn, "made")

@@ -73,6 +73,22 @@ def test_a_section_stands_for_every_command_that_was_run(folder):
     assert pictures.pictures[0].credit == "Somebody"
 
 
+def test_budgets_and_rates_make_a_section(folder):
+    job = {"set": "natural256", "image": "a.png", "iterations": 9, "seed": 0, "gaussians": 50}
+    fit = {"psnr_ycbcr": 41.25, "seconds": 2.0}
+    rows = [
+        line("eigengs-dr bench budget d -o r", "2026-02-01", {**job, "rearranged": anew}, **fit)
+        for anew in (False, True)
+    ]
+    (folder / "budget.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    shutil.copy(folder / "curves.svg", folder / "budget-natural256.svg")
+    section = results.page(folder).sections[2]
+    assert section.title == "No more than is needed"
+    assert section.tables[-1].rows[0][:4] == ("natural256", "50", "1", "0.00")
+    assert [picture.path.name for picture in section.pictures] == ["budget-natural256.svg"]
+    assert "bench budget" in section.source
+
+
 def test_a_source_names_commands_days_machine_and_versions(folder):
     told = results.page(folder).sections[0].source.split("\n")
     assert told == [

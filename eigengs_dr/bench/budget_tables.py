@@ -83,7 +83,9 @@ def points(rows: Sequence[Row]) -> list[Point]:
             for (name, image, count, rearranged), fitted in fits.items()
             if (name, image, rearranged) == (job["set"], job["image"], False)
         }
-        same = fits[job["set"], job["image"], row["gaussians"], True]
+        same = fits.get((job["set"], job["image"], row["gaussians"], True))
+        if same is None:  # of an image that a run was stopped at
+            continue
         found.append(
             Point(
                 job["set"],
@@ -126,8 +128,10 @@ def gains(rows: Sequence[Row]) -> dict[str, list[tuple[Row, Row]]]:
     for row in rows:
         images.setdefault((row["job"]["set"], row["job"]["image"]), []).append(row)
     found: dict[str, list[tuple[Row, Row]]] = {}
-    for (name, _), (*_, once, anew) in images.items():
-        found.setdefault(name, []).append((once, anew))
+    for (name, _), fits in images.items():
+        once, anew = fits[-2:] if len(fits) > 1 else (fits[0], fits[0])
+        if {**once["job"], "rearranged": True} == anew["job"] != once["job"]:
+            found.setdefault(name, []).append((once, anew))
     return found
 
 

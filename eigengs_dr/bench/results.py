@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from . import losses, pareto_tables, stability, summary
+from . import budget_tables, losses, pareto_tables, rate_tables, stability, summary
 from .page import Page, Picture, Section
 from .rows import Row, read
 from .table import Table
@@ -75,6 +75,18 @@ many steps, after as much time, or at the end of a hard case. `eigengs` starts f
 trained before; that time is not counted.
 """
 
+NEEDED = """
+How many Gaussians a PSNR takes: of fits of fixed numbers whose splats are placed once, and of the
+search `fit --target-psnr`; what placing them anew gains; and how many bits a pixel a packed fit
+takes for a PSNR, beside JPEG and WebP.
+"""
+
+NEEDED_CHARTS = {
+    "budget": "Every point is an image and a target: Gaussians found over the smallest number.",
+    "rate": "Means over the images; fits of several numbers of Gaussians, packed.",
+}
+"""By the first word of the name of a file."""
+
 PICTURES = """
 Of the pictures that may be shown: photos of scikit-image, of Kodak, and cats of AFHQ.
 """
@@ -102,6 +114,7 @@ def page(folder: Path) -> Page:
         _speed,
         _failure,
         _losses,
+        _needed,
         _pictures,
     )
     sections = [section for part in parts if (section := part(folder))]
@@ -171,6 +184,21 @@ def _losses(folder: Path) -> Section | None:
     return _section("Where default loses", LOSSES, [losses.table(fits, cells)], [], fits + cells)
 
 
+def _needed(folder: Path) -> Section | None:
+    searched, packed = read(folder / "budget.jsonl"), read(folder / "rate.jsonl")
+    if not searched and not packed:
+        return None
+    tables = (budget_tables.tables(searched) if searched else []) + (
+        rate_tables.tables(packed) if packed else []
+    )
+    pictures = [
+        Picture(chart, caption)
+        for word, caption in NEEDED_CHARTS.items()
+        for chart in sorted(folder.glob(f"{word}-*.svg"))
+    ]
+    return _section("No more than is needed", NEEDED, tables, pictures, searched + packed)
+
+
 def _pictures(folder: Path) -> Section | None:
     index = folder / "figures.json"
     if not index.exists():
@@ -178,13 +206,3 @@ def _pictures(folder: Path) -> Section | None:
     found = json.loads(index.read_text(encoding="utf-8"))
     pictures = [Picture(folder / f["path"], f["caption"], f["credit"]) for f in found["figures"]]
     return _section("Pictures", PICTURES, [], pictures, [found])
-
-
-PARTS: tuple[Callable[[Path], Section | None], ...] = (
-    _methods,
-    _speed,
-    _failure,
-    _losses,
-    _pictures,
-)
-"""What makes the sections, in their order."""
