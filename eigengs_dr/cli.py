@@ -93,7 +93,10 @@ def render(
 
     from .rendering import picture_of
 
-    gaussians = eg.Gaussians.load(file, backend=backend)[:first]
+    gaussians = eg.Gaussians.load(file, backend=backend)
+    if first is not None and first > len(gaussians):
+        raise ValueError(f"{file}: --first is {first}; the file has {len(gaussians)} Gaussians")
+    gaussians = gaussians[:first]
     width, height = size or _scaled(gaussians.width, gaussians.height, scale)
     eg.save_image(output, picture_of(gaussians, width, height))
 

@@ -136,6 +136,9 @@ def test_commands(image, tmp_path):
     assert told["sections"] == [16, 48]
     out = tmp_path / "b.png"
     assert run("render", fitted, "-o", out, "--first", 16).exit_code == 0
+    refused = run("render", fitted, "-o", out, "--first", 65)
+    assert refused.exit_code == 2
+    assert "--first is 65; the file has 64 Gaussians" in refused.stderr
     expected = picture_of(eg.Gaussians.load(fitted)[:16]).clip(0, 1)
     assert np.abs(eg.load_image(out) - expected).max() < 0.003
 
