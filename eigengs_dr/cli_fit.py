@@ -41,7 +41,14 @@ MISSED = 1
     metavar="DB",
     help="As few Gaussians as reach it, instead of a given number.",
 )
-@choice("--target-space", ["ycbcr", "rgb"], "Where --target-psnr is measured.")
+@click.option(
+    "--space",
+    "target_space",
+    type=click.Choice(["ycbcr", "rgb"]),
+    default="ycbcr",
+    show_default=True,
+    help="Where --target-psnr is measured.",
+)
 @click.option(
     "--max-gaussians",
     type=click.IntRange(min=1),

@@ -361,6 +361,9 @@ def test_command_finds_few_or_says_that_it_cannot(tmp_path):
     assert "60 dB are out of reach: 50 Gaussians have" in result.stderr
     assert len(eg.Gaussians.load(out)) == 50
 
+    assert run(*base, "--target-psnr", 20, "--space", "rgb").exit_code == 0
+    assert json.loads(report.read_text())["psnr_rgb"] >= 20
+
     both = run(*base, "--target-psnr", 30, "--gaussians", 9)
     assert both.exit_code == 2
     assert "exclude each other" in both.stderr
