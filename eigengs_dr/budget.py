@@ -26,7 +26,7 @@ TRY, FIT, SETTLE = 0.1, 0.4, 0.15
 """Shares of the iterations that a try takes, the fit, and each descent that settles."""
 
 TRIES, SETTLING = 4, 4
-"""Most tries, and most descents to settle once the goal was met."""
+"""Most tries, and descents to settle after which a goal that is met is settled enough."""
 
 OCTAVE = 4.0
 """Decibels that twice as many splats gain; see `eigengs_dr.rearrange.FALL`."""
@@ -209,7 +209,7 @@ def _settle(run: _Run, trial: _Trial, most: int, steps: int) -> None:
     least_growth, rounds = 1.02, 0
     while not run.interrupted():
         count, found = len(trial.gaussians), run.best
-        if found.missing <= 0 and rounds == SETTLING:
+        if found.missing <= 0 and rounds >= SETTLING:
             return
         if trial.missing > 0:
             wanted = max(_times(count, trial.missing, most), math.ceil(least_growth * count))
@@ -218,6 +218,8 @@ def _settle(run: _Run, trial: _Trial, most: int, steps: int) -> None:
             if min(wanted, limit) <= count:
                 return
             changed = grown(trial.gaussians, target, min(wanted, limit), weight, run.cutoff)
+            if len(changed) == count:  # no place takes anything from the error
+                return
             least_growth = 2 * least_growth - 1
         else:
             wanted = max(_times(count, trial.missing, count), math.floor((1 - FAR) * count))

@@ -8,16 +8,17 @@ from .backend import select
 from .cli_shared import (
     ANY_PATH,
     FOLDER,
-    SETS,
     backend_option,
+    chosen_sets,
     described,
     quiet_option,
     seed_option,
+    set_option,
 )
 from .console import progress_bar
 from .outputs import check_outputs
 
-SAMPLES, NATURAL = "samples", "natural256"
+NATURAL = "natural256"
 TARGETS, HIGHEST = (32.0, 36.0, 40.0), 100.0
 """Of `eigengs_dr.bench.budget` and `eigengs_dr.refine`, without importing them."""
 
@@ -25,13 +26,7 @@ TARGETS, HIGHEST = (32.0, 36.0, 40.0), 100.0
 @click.command()
 @click.argument("data", type=FOLDER, required=False)
 @click.option("-o", "--output", type=ANY_PATH, required=True, metavar="FOLDER", help="For results.")
-@click.option(
-    "--set",
-    "names",
-    multiple=True,
-    type=click.Choice([SAMPLES, *SETS]),
-    help=f"Images to fit; may be repeated. By default {NATURAL}, or samples without DATA.",
-)
+@set_option(f"Images to fit; may be repeated. By default {NATURAL}, or samples without DATA.")
 @click.option(
     "--images", type=click.IntRange(min=1), default=20, show_default=True, help="Of each set."
 )
@@ -93,9 +88,7 @@ def budget(
     from .bench.charts import new_figure, save_figure
     from .bench.table import as_text
 
-    wanted = tuple(dict.fromkeys(names)) or (SAMPLES if data is None else NATURAL,)
-    if data is None and set(wanted) - {SAMPLES}:
-        raise ValueError("--set needs DATA, the folder that holds the set, for all but samples")
+    wanted = chosen_sets(names, data, NATURAL)
     for target in targets:
         if not 0 < target <= HIGHEST:  # NaN is inside every click.FloatRange
             raise ValueError(f"--target is {target}; it must be above 0 and at most {HIGHEST:g}")

@@ -9,28 +9,21 @@ from .backend import select
 from .cli_shared import (
     ANY_PATH,
     FOLDER,
-    SETS,
     backend_option,
+    chosen_sets,
     described,
     quiet_option,
     seed_option,
+    set_option,
 )
 from .console import progress_bar
 from .outputs import check_outputs
-
-SAMPLES = "samples"
 
 
 @click.command()
 @click.argument("data", type=FOLDER, required=False)
 @click.option("-o", "--output", type=ANY_PATH, required=True, metavar="FOLDER", help="For results.")
-@click.option(
-    "--set",
-    "names",
-    multiple=True,
-    type=click.Choice([SAMPLES, *SETS]),
-    help="Images to code; may be repeated. By default samples, photos of scikit-image.",
-)
+@set_option("Images to code; may be repeated. By default samples, photos of scikit-image.")
 @click.option(
     "--images", type=click.IntRange(min=1), default=3, show_default=True, help="Of each set."
 )
@@ -67,9 +60,7 @@ def rate(
     from .bench.rows import measure
     from .bench.table import as_text
 
-    wanted = tuple(dict.fromkeys(names)) or (SAMPLES,)
-    if data is None and set(wanted) - {SAMPLES}:
-        raise ValueError("--set needs DATA, the folder that holds the set, for all but samples")
+    wanted = chosen_sets(names, data)
     new_figure(1, 1)  # says now, not after an hour, that charts cannot be drawn
     output.mkdir(parents=True, exist_ok=True)
     drawings = {name: output / f"rate-{name}.svg" for name in wanted}

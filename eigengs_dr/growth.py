@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
-import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import types_of, upload_rows
+from .arrays import types_of
 from .gaussians import Gaussians, concatenate
 from .rearrange import residual
 from .rendering import CUTOFF
@@ -92,18 +90,14 @@ def grown(
     mean, size, color = places(missed, count - len(gaussians), _spacing(gaussians), weight)
     if not len(mean):
         return gaussians
-    types = types_of(gaussians.mean)
-
-    def rows(values: Array) -> list:
-        return upload_rows(types.Float, values.T.astype(np.float32))
-
     sharp = 1 / size
-    added = replace(
-        gaussians,
-        mean=types.Float2(*rows(mean)),
-        factor=types.Float3(*rows(np.stack([sharp, 0 * sharp, sharp], axis=1))),
-        color=types.FloatX(rows(color)),
-        background=dr.zeros(types.FloatX, (gaussians.channels, 1)),
+    added = Gaussians.from_arrays(
+        mean,
+        np.stack([sharp, 0 * sharp, sharp], axis=1),
+        color,
+        size=(gaussians.width, gaussians.height),
+        space=gaussians.space,
+        backend=types_of(gaussians.mean).backend,
     )
     return concatenate([gaussians, added.bounded()])
 

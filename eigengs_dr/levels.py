@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import drjit as dr
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .descent import Schedule, descend
 from .fitting import Fit, check
@@ -112,7 +112,7 @@ def fit_levels(
             progress=progress,
             interrupted=interrupted,
         )
-    ordered = _in_order(refined.gaussians, start.target, counts)
+    ordered = _in_order(refined.gaussians, start, counts)
     return Fit(
         gaussians=ordered,
         trace=refined.trace,
@@ -148,11 +148,11 @@ def _raised(
     return gaussians
 
 
-def _in_order(gaussians: Gaussians, target: NDArray[np.float32], counts: list[int]) -> Gaussians:
+def _in_order(gaussians: Gaussians, start: Start, counts: list[int]) -> Gaussians:
     """Sort the splats of each level, those that are worth most to it first."""
     order, before = [], 0
     for count in counts:
-        value = worth(gaussians[:count], target)
+        value = worth(gaussians[:count], start.target, start.weight)
         own = np.arange(before, count)
         order.append(own[np.argsort(-value[own], kind="stable")])
         before = count

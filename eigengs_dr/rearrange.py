@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .adaptive import Density, adaptive, bent, owners
-from .arrays import types_of, upload_rows
+from .arrays import types_of
 from .gaussians import Gaussians
 from .images import resampled
 from .rendering import CUTOFF, render
@@ -99,13 +99,13 @@ def placed_like(
     Parameters are those of `rearranged`; see `eigengs_dr.adaptive` for the density.
     """
     mean, factor = adaptive(image, count, density=density)
-    types = types_of(gaussians.mean)
-    black = np.zeros((gaussians.channels, count), np.float32)
-    placed = replace(
-        gaussians,
-        mean=types.Float2(*upload_rows(types.Float, mean.T.astype(np.float32))),
-        factor=types.Float3(*upload_rows(types.Float, factor.T.astype(np.float32))),
-        color=types.FloatX(upload_rows(types.Float, black)),
+    placed = Gaussians.from_arrays(
+        mean,
+        factor,
+        np.zeros((count, gaussians.channels)),
+        size=(gaussians.width, gaussians.height),
+        space=gaussians.space,
+        backend=types_of(gaussians.mean).backend,
     )
     return solve(placed.bounded(), target, solve_steps, cutoff).gaussians
 

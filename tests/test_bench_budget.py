@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scenes import family
 
 import eigengs_dr as eg
-from eigengs_dr import cli_budget
+from eigengs_dr import cli_budget, cli_shared
 from eigengs_dr.bench import budget, budget_tables, rate, rows
 from eigengs_dr.cli_bench import bench as group
 from eigengs_dr.console import Program
@@ -344,5 +344,5 @@ def test_mistakes_are_told_before_the_work(monkeypatch, tmp_path):
 def test_the_command_is_there_and_says_what_is_so():
     assert group.commands["budget"] is cli_budget.budget
     assert "Examples" in bench("--help").output
-    assert (cli_budget.SAMPLES, cli_budget.TARGETS) == (rate.SAMPLES, budget.TARGETS)
+    assert (cli_shared.SAMPLES, cli_budget.TARGETS) == (rate.SAMPLES, budget.TARGETS)
     assert cli_budget.HIGHEST == EXACT and cli_budget.NATURAL in budget.SETS

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scenes import few, scenes
 
 import eigengs_dr as eg
+from eigengs_dr import budget
 from eigengs_dr.adaptive import adaptive
 from eigengs_dr.budget import fewest
 from eigengs_dr.cli import main
@@ -304,6 +305,14 @@ def test_interrupted_it_returns_what_there_is():
     assert result.stopped == "interrupted"
     assert result.iterations <= 7
     assert len(result.gaussians) <= 100
+
+
+def test_a_search_ends_where_no_place_is_left_to_grow(monkeypatch):
+    start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    monkeypatch.setattr(budget, "grown", lambda gaussians, *rest: gaussians)
+    schedule = PRESETS["default"].schedule
+    result = fewest(start, lambda g: {"decibels": 18.0}, "decibels", 20.0, 1000, schedule, 10)
+    assert result.stopped == "out of reach"
 
 
 @pytest.mark.parametrize(

@@ -170,3 +170,15 @@ def test_bench_draws_what_prefixes_are_worth(image, tmp_path):
     assert float(lines[-1]["alone"]) == pytest.approx(float(lines[-1]["sorted"]), abs=1e-4)
     assert float(lines[0]["levels"]) > float(lines[0]["sorted"])
     assert "8   " in done.stdout and (out / "levels.svg").stat().st_size > 1000
+
+
+def test_bench_ends_with_a_fit_that_was_broken_off(image, tmp_path, monkeypatch):
+    from eigengs_dr.bench import levels
+
+    broken = fit_levels(image, 16, 2, iterations=0)._replace(stopped="interrupted")
+    monkeypatch.setattr(levels, "fit_levels", lambda *rest, **settings: broken)
+    photo, out = tmp_path / "a.png", tmp_path / "out"
+    eg.save_image(photo, image)
+    settings = ["--gaussians", 16, "--levels", 2]
+    assert run("bench", "levels", photo, "-o", out, *settings).exit_code == 130
+    assert not list(out.iterdir())

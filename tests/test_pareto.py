@@ -295,5 +295,5 @@ def test_mistakes_are_told_before_the_work(small, monkeypatch, tmp_path):
 
 def test_the_command_knows_all_sets():
     assert tuple(sets.SETS) == cli_shared.SETS
-    assert pareto.SAMPLES == cli_pareto.SAMPLES
+    assert pareto.SAMPLES == cli_shared.SAMPLES
     assert "Examples" in bench("--help").output

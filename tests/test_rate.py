@@ -12,7 +12,7 @@ from PIL import Image
 from scenes import family
 
 import eigengs_dr as eg
-from eigengs_dr import cli_rate
+from eigengs_dr import cli_rate, cli_shared
 from eigengs_dr.bench import rate, rate_tables
 from eigengs_dr.console import Program
 
@@ -158,5 +158,5 @@ def test_mistakes_are_told_before_the_work(monkeypatch, tmp_path):
     assert told.exit_code == 2
     assert "eigengs-dr[charts]" in told.output
     assert not (tmp_path / "out").exists()
-    assert rate.SAMPLES == cli_rate.SAMPLES
+    assert rate.SAMPLES == cli_shared.SAMPLES
     assert "Examples" in bench("--help").output

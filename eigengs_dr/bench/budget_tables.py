@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from itertools import cycle, pairwise
@@ -11,11 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..atomic import replacing
 from .budget import reached
 from .charts import new_figure
 from .rows import Row
-from .table import MISSING, Table, median, number
+from .table import MISSING, Table, median, number, save_csv
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -209,12 +207,9 @@ def save_points(path: Path, drawn: Sequence[Point]) -> None:
     OSError
         If the file cannot be written.
     """
-    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow([*Point._fields, "saving", "ratio"])
-        for p in drawn:
-            cells = [*p, p.saving, p.ratio]
-            table.writerow(["" if cell != cell else cell for cell in cells])
+    lines = ([*p, p.saving, p.ratio] for p in drawn)
+    known = (["" if cell != cell else cell for cell in line] for line in lines)
+    save_csv(path, [*Point._fields, "saving", "ratio"], known)
 
 
 def chart(drawn: Sequence[Point], name: str) -> Figure:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -10,16 +9,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import replacing
 from ..color import rgb_to_ycbcr
-from ..fitting import fit
+from ..fitting import Fit, fit
 from ..gaussians import Gaussians
 from ..growth import worth
 from ..levels import fit_levels, level_counts
 from ..metrics import psnr
 from ..rendering import picture_of
 from .charts import new_figure
-from .table import Table, number
+from .table import Table, number, save_csv
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,12 +77,17 @@ def measure(
     def told(done: int) -> None:
         progress("fits", done, len(counts) + 1)
 
+    def whole(fitted: Fit) -> Gaussians:
+        if fitted.stopped == "interrupted":  # fits keep what they have; that is no measurement
+            raise KeyboardInterrupt
+        return fitted.gaussians
+
     told(0)
-    nested = fit_levels(image, gaussians, levels, **settings).gaussians
+    nested = whole(fit_levels(image, gaussians, levels, **settings))
     told(1)
     alone = {}
     for done, count in enumerate(counts, 2):
-        alone[count] = fit(image, count, **settings).gaussians
+        alone[count] = whole(fit(image, count, **settings))
         told(done)
     plain = alone[gaussians]
     best = plain[np.argsort(-worth(plain, rgb_to_ycbcr(image)), kind="stable")]
@@ -115,11 +118,8 @@ def table(points: list[Point], name: str) -> Table:
 
 
 def save_points(path: Path, points: list[Point]) -> None:
-    """Write points as CSV, all or nothing."""
-    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        lines = csv.writer(file)
-        lines.writerow(Point._fields)
-        lines.writerows(points)
+    """Write points as CSV; `OSError` if that fails."""
+    save_csv(path, Point._fields, points)
 
 
 def chart(points: list[Point], name: str) -> Figure:

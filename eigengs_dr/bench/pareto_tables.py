@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..atomic import replacing
 from .pareto import WIDE, front
 from .rows import Row
-from .table import MISSING, Table, median, number, spread
+from .table import MISSING, Table, median, number, save_csv, spread
 
 FIGURES = ("seconds", "psnr_ycbcr", "psnr_rgb", "psnr_wide")
 """What is measured of every fit and image."""
@@ -100,13 +98,12 @@ def save_points(path: Path, drawn: list[Point]) -> None:
     OSError
         If the file cannot be written.
     """
-    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow([*Point._fields[:4], *FIGURES, "images", *Point._fields[-2:]])
-        for p in drawn:
-            psnrs = [float(np.mean(getattr(p, column))) for column in FIGURES[1:]]
-            figures = [p.place[0], *psnrs, len(p.seconds), int(p.front), int(p.front_same)]
-            table.writerow([*p[:4], *figures])
+    lines = []
+    for p in drawn:
+        psnrs = [float(np.mean(getattr(p, column))) for column in FIGURES[1:]]
+        figures = [p.place[0], *psnrs, len(p.seconds), int(p.front), int(p.front_same)]
+        lines.append([*p[:4], *figures])
+    save_csv(path, [*Point._fields[:4], *FIGURES, "images", *Point._fields[-2:]], lines)
 
 
 def tables(rows: list[Row]) -> list[Table]:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import csv
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from ..atomic import replacing
 
 MISSING = "-"
 """Cell of a figure that is not there."""
@@ -69,3 +73,17 @@ def as_text(table: Table) -> str:
     ]
     ruler = "-" * max(map(len, laid))
     return "\n".join([table.caption, "", laid[0], ruler, *laid[1:]])
+
+
+def save_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a file of comma-separated values, all or nothing.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        lines = csv.writer(file)
+        lines.writerow(columns)
+        lines.writerows(rows)
