@@ -81,7 +81,7 @@ def fewest(
         Splats, at most.
     schedule : Schedule
     iterations : int, optional
-        Steps that a fit of a known number would take; the search takes up to twice as many.
+        Steps that a fit of a known number would take; the search takes up to about twice as many.
     cutoff : float, optional
         See `eigengs_dr.render`.
     progress : callable, optional
@@ -93,18 +93,21 @@ def fewest(
     -------
     Refined
         The smallest set that meets the goal, or else the best one. The trace has a row for every
-        descent, with iteration, gaussians and the figures; it stopped because the goal was "met",
-        is "out of reach", or it was "interrupted".
+        set that was judged, with iteration, gaussians and the figures; it stopped because the goal
+        was "met", is "out of reach", or it was "interrupted".
     """
     run = _Run(start, measure, figure, goal, schedule, cutoff, progress, interrupted)
     tries, fit, settle = (max(1, round(share * iterations)) for share in (TRY, FIT, SETTLE))
     run.planned = TRIES * tries + fit + SETTLING * settle
-    placed = _estimated(run, most, tries)
-    if run.best.missing > 0 or len(run.best.gaussians) > 1:
-        _settle(run, _fitted(run, placed, most, fit), most, settle)
+    try:
+        placed = _estimated(run, most, tries)
+        if run.best.missing > 0 or len(run.best.gaussians) > 1:
+            _settle(run, _fitted(run, placed, most, fit), most, settle)
+        pressed = interrupted()
+    except KeyboardInterrupt:
+        pressed = True
     met = "met" if run.best.missing <= 0 else "out of reach"
-    stopped = "interrupted" if interrupted() else met
-    return Refined(run.best.gaussians, run.trace, run.step, stopped)
+    return Refined(run.best.gaussians, run.trace, run.step, "interrupted" if pressed else met)
 
 
 class _Trial(NamedTuple):

@@ -103,8 +103,9 @@ def fit(
     deviation.
     Ctrl-C keeps the best fit so far: it is written before the command ends with exit code 130.
 
-    --target-psnr searches for the smallest number of Gaussians, in up to twice the iterations. A
-    target that is out of reach is said so, the best fit is written, and the exit code is 1.
+    --target-psnr searches for the smallest number of Gaussians, in up to about twice the
+    iterations. A target that is out of reach is said so, the best fit is written, and the exit code
+    is 1.
 
     With --preset eigengs, the paper's form, the file holds the Gaussians alone, without the mean
     image, which is kept in the basis.
@@ -124,6 +125,7 @@ def fit(
     """
     from .images import SAVE_OPTIONS
 
+    _check_search(**settings)
     outputs = name_outputs(images, output, [".npz"])
     previews = name_outputs(images, preview, list(SAVE_OPTIONS)) if preview else []
     check_outputs([*outputs, *previews, report], images)
@@ -148,6 +150,14 @@ def fit(
         context.exit(MISSED)
 
 
+def _check_search(
+    target_psnr: float | None, target_space: str, max_gaussians: int | None, **rest: Any
+) -> None:
+    """Refuse options of a search where none is asked for."""
+    if target_psnr is None and (max_gaussians is not None or target_space != "ycbcr"):
+        raise click.UsageError("--max-gaussians and --space belong to --target-psnr; name it, too")
+
+
 def _basis(backend: str | None, init: str, preset: str, basis: str, **rest: Any) -> Any:
     """Read the model to start from, once for all images; its name where none is needed."""
     from .bases import load_basis
@@ -165,17 +175,14 @@ def _fitted(image: Any, levels: int | None, progress: Any, **settings: Any) -> A
     """Fit an image in one way or the other."""
     import eigengs_dr as eg
 
-    from .starting import GAUSSIANS
-
     if levels is None:
         return eg.fit(image, progress=progress, **settings)
     if settings["target_psnr"] is not None:
         raise ValueError("levels and target_psnr exclude each other; give one of them")
     if settings["preset"] != "default" or settings["init"] not in ("auto", "adaptive"):
         raise ValueError("levels work with preset 'default' and init 'adaptive' alone")
-    kept = {key: settings[key] for key in ("iterations", "color", "seed", "backend")}
-    count = settings["gaussians"] or min(GAUSSIANS, image.shape[0] * image.shape[1])
-    return eg.fit_levels(image, count, levels, progress=progress, **kept)
+    kept = {key: settings[key] for key in ("gaussians", "iterations", "color", "seed", "backend")}
+    return eg.fit_levels(image, levels=levels, progress=progress, **kept)
 
 
 def _fit_one(

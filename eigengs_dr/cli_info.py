@@ -39,15 +39,16 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     [picture] = name_outputs([file], preview, list(SAVE_OPTIONS)) if preview else [None]
     check_outputs([picture], [file])
     select()
-    from . import archive, gaussians, modelfile, packed
+    from . import archive, modelfile, packed, setfile
     from .eigengs import EigenGS
+    from .gaussians import Gaussians
     from .pictures import component_sheet
 
     kinds: dict[str, tuple[str, Any, Any, Any]] = {
-        gaussians.FORMAT: ("image", gaussians.Gaussians.load, _describe_image, _rendered),
+        setfile.FORMAT: ("image", Gaussians.load, _describe_image, _rendered),
         modelfile.FORMAT: ("model", EigenGS.load, _describe_model, component_sheet),
     }
-    found = gaussians.FORMAT if packed.is_packed(file) else archive.format_of(file)
+    found = setfile.FORMAT if packed.is_packed(file) else archive.format_of(file)
     if found not in kinds:
         raise ValueError(f"{file}: format is {found[:40]!r}, expected one of {', '.join(kinds)}")
     kind, load, describe, draw = kinds[found]

@@ -16,7 +16,7 @@ SUFFIX, BUDGET = ".egs", 0.5
 @click.command()
 @click.argument("file", type=EXISTING, metavar="X.npz")
 @click.option("-o", "--output", required=True, type=ANY_PATH, metavar="Y.egs")
-@click.option("--image", type=EXISTING, help="What was fitted: colours are solved for again on it.")
+@click.option("--image", type=EXISTING, help="What was fitted: the loss is measured against it.")
 @click.option(
     "--budget",
     type=float,
@@ -29,7 +29,8 @@ SUFFIX, BUDGET = ".egs", 0.5
     "--levels",
     type=click.IntRange(min=1),
     default=1,
-    help="Those that the set was fitted with: readers may stop after each of them.",
+    help="Those that the set was fitted with: readers may stop after each of them, and what they "
+    "read is a picture. Without it the order of the levels is lost.",
 )
 @backend_option
 @report_option
@@ -68,7 +69,7 @@ def pack(
         sections = [n - before for before, n in zip([0, *counts], counts, strict=False)]
         receipt = eg.pack(gaussians, target, pixels, budget, sections)
     except ValueError as error:
-        raise ValueError(f"{image or file}: {error}") from None
+        raise ValueError(f"{file}: {error}") from None
     figures = {
         "input": str(file),
         "output": str(target),
@@ -85,9 +86,10 @@ def pack(
         write_report(report, {**described(context, backend), **figures})
     if not quiet:
         against = "the image" if image else "the rendering before"
+        space = "sRGB" if gaussians.space == "linear" else gaussians.space
         click.echo(
             f"{file}: {len(gaussians):,} Gaussians, {file.stat().st_size:,} bytes\n"
             f"  wrote {target}: {receipt.bytes:,} bytes, {receipt.bits_per_pixel:.3f} bits a pixel"
-            f"\n  lost {receipt.lost:.2f} dB: {receipt.psnr:.2f} dB in {gaussians.space} "
+            f"\n  lost {receipt.lost:.2f} dB: {receipt.psnr:.2f} dB in {space} "
             f"against {against}"
         )

@@ -60,7 +60,7 @@ def pareto(
     from .bench import pareto_tables as laid
     from .bench.charts import new_figure, save_figure
     from .bench.pareto_kernels import kernel_job
-    from .bench.rows import measure
+    from .bench.rows import measure, read
     from .bench.table import as_text
 
     wanted = chosen_sets(names, data)
@@ -83,7 +83,7 @@ def pareto(
         drawn = laid.points(rows, name)
         laid.save_points(path, drawn)
         save_figure(drawings[name], charts.set_chart(drawn, name))
-    save_figure(drawings["storage"], charts.storage_chart(rows))
+    save_figure(drawings["storage"], charts.storage_chart(read(lines)))
     save_figure(drawings["kernels"], charts.kernels_chart(rows[-1]["kernels"]))
     if not quiet:
         click.echo("\n\n".join(map(as_text, laid.tables(rows))))

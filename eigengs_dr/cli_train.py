@@ -135,12 +135,12 @@ def train(
 
 def _settings(gaussians: int | None, frequency_aware: str, **options: Any) -> Any:
     """Turn options into the settings of a training."""
-    from .starting import GAUSSIANS
+    from .starting import usual_count
     from .training import Settings
 
     width, height = options["size"]
     return Settings(
-        gaussians=gaussians or min(GAUSSIANS, width * height),
+        gaussians=gaussians or usual_count(width * height),
         frequency_aware=FREQUENCY_AWARE[frequency_aware],
         **options,
     )

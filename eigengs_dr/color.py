@@ -13,6 +13,9 @@ SPACES = ("ycbcr", "rgb", "linear", "data")
 and ``"data"`` is anything else (roughness, normals, ...), with any number of channels.
 """
 
+MOST_CHANNELS = 64
+"""A program holds the sums of all channels of a tile in registers: it must end somewhere."""
+
 RGB_TO_YCBCR: NDArray[np.float64] = (
     np.array(
         [

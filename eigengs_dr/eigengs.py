@@ -30,10 +30,11 @@ from .components import (
 )
 from .fall import Fall, expected
 from .gaussians import Gaussians
-from .images import check_image, resampled
+from .images import check_image
 from .modelfile import FORMAT, VERSION, from_members, layout_of, to_members
 from .normal import NormalEquations
 from .pca import Eigenbasis
+from .resampling import resampled
 from .span import Span
 from .stream import to_planes
 

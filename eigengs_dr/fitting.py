@@ -115,7 +115,7 @@ def fit(
     target_psnr : float, optional
         Instead of `gaussians`: decibels to reach with as few splats as possible, see
         `eigengs_dr.budget`. `iterations` are then those of a fit of a known number; the search
-        takes up to twice as many.
+        takes up to about twice as many.
     target_space : {"ycbcr", "rgb"}, optional
         Where `target_psnr` is measured, as psnr_ycbcr or as psnr_rgb.
     max_gaussians : int, optional
@@ -144,6 +144,8 @@ def fit(
     pixels = check_image(image, keep_grey=color == "data")
     check(pixels, gaussians, iterations, init, preset, solve_steps, color, seed)
     method = PRESETS[preset]
+    if target_psnr is None and (max_gaussians is not None or target_space != "ycbcr"):
+        raise ValueError("max_gaussians and target_space belong to target_psnr; give it, too")
     if target_psnr is not None:
         _check_target(gaussians, init, preset, target_psnr, target_space, pixels, max_gaussians)
         most = max_gaussians or most_gaussians(pixels)
@@ -253,7 +255,9 @@ def _check_target(
     if target_space not in ("ycbcr", "rgb"):
         raise ValueError(f"target_space {target_space!r} is unknown; use ycbcr or rgb")
     height, width = pixels.shape[:2]
-    if max_gaussians is not None and not 1 <= max_gaussians <= width * height:
+    if max_gaussians is not None and not (
+        isinstance(max_gaussians, (int, np.integer)) and 1 <= max_gaussians <= width * height
+    ):
         raise ValueError(
             f"max_gaussians is {max_gaussians}; an image of {width}x{height} takes 1 to "
             f"{width * height}"

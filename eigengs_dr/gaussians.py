@@ -1,4 +1,4 @@
-"""A set of 2D Gaussians: its parameters, their bounds, files."""
+"""A set of 2D Gaussians: its parameters and their bounds."""
 
 from __future__ import annotations
 
@@ -13,21 +13,14 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import archive, packed
+from . import setfile
+from .archive import BadValue
 from .arrays import types_in, types_of, upload_rows
 from .backend import select
-from .color import SPACES
-
-FORMAT = "eigengs_dr.gaussians"
-VERSION = 1
 
 NARROWEST = 0.25
 """Smallest standard deviation along an axis of the factor, in pixels: what is narrower falls
 between pixel centres, and its gradient with it."""
-
-
-MOST_CHANNELS = 64
-"""A program holds the sums of all channels of a tile in registers: it must end somewhere."""
 
 
 @dataclass
@@ -110,8 +103,8 @@ class Gaussians:
         checked = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
         checked.setdefault("background", np.zeros(checked["color"].shape[1:], np.float32))
         try:
-            _check(checked, size, space)
-        except archive.BadValue as error:
+            setfile.check(checked, size, space)
+        except BadValue as error:
             raise ValueError(f"Gaussians: {error}") from None
         types = types_in(select(backend))
         return cls(
@@ -225,16 +218,7 @@ class Gaussians:
         OSError
             If the file cannot be written; an existing one is then as before.
         """
-        archive.write(
-            path,
-            FORMAT,
-            VERSION,
-            {
-                **{k: v.astype(np.float32) for k, v in self.to_arrays().items()},
-                "size": np.array([self.width, self.height], np.int64),
-                "space": np.array(self.space),
-            },
-        )
+        setfile.write(path, self.to_arrays(), (self.width, self.height), self.space)
 
     @classmethod
     def load(
@@ -262,33 +246,8 @@ class Gaussians:
         OSError
             If it cannot be opened.
         """
-        path = Path(path)
-        if packed.is_packed(path):
-            content = packed.read(path, sections)
-            arrays, size, space = content.arrays(), content.size, content.space
-        elif sections is not None:
-            raise ValueError(f"{path}: has no sections, which only packed files have; leave it out")
-        else:
-            arrays = archive.read(path, FORMAT, VERSION, LAYOUT)
-            size, space = tuple(arrays.pop("size").tolist()), str(arrays.pop("space"))
-        try:
-            _check(arrays, size, space)
-        except archive.BadValue as error:
-            raise ValueError(f"{path}: {error}") from None
-        return cls.from_arrays(
-            **arrays, size=(int(size[0]), int(size[1])), space=space, backend=backend
-        )
-
-
-LAYOUT: dict[str, archive.Field] = {
-    "mean": archive.Field("f4", 2),
-    "factor": archive.Field("f4", 2),
-    "color": archive.Field("f4", 2),
-    "background": archive.Field("f4", 1),
-    "size": archive.Field("i8", 1),
-    "space": archive.Field("U", 0),
-}
-"""What a file holds: the kind and the number of dimensions of each array."""
+        arrays, size, space = setfile.read(Path(path), sections)
+        return cls.from_arrays(**arrays, size=size, space=space, backend=backend)
 
 
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
@@ -346,35 +305,3 @@ def _rows(rows: Any, count: int) -> NDArray[Any]:
     """Stack Dr.Jit rows, some of which may be literals, to a (count, rows) array."""
     columns = [np.broadcast_to(dr.detach(row).numpy(), count) for row in rows]
     return np.stack(columns, axis=1)
-
-
-def _check(arrays: dict[str, NDArray[Any]], size: tuple[int, ...], space: str) -> None:
-    """Raise `archive.BadValue` where arrays, size and space do not make a set."""
-    mean, factor, color = arrays["mean"], arrays["factor"], arrays["color"]
-    if mean.ndim != 2 or mean.shape[1] != 2 or len(mean) == 0:
-        raise archive.BadValue(f"mean has shape {mean.shape}, expected (N, 2) with N >= 1")
-    channels = color.shape[1] if color.ndim == 2 else 3
-    if not 1 <= channels <= MOST_CHANNELS:
-        raise archive.BadValue(f"color has {channels} channels, expected 1 to {MOST_CHANNELS}")
-    for name, array, expected in (
-        ("factor", factor, (len(mean), 3)),
-        ("color", color, (len(mean), channels)),
-        ("background", arrays["background"], (channels,)),
-    ):
-        if array.shape != expected:
-            raise archive.BadValue(f"{name} has shape {array.shape}, expected {expected}")
-    for name, array in arrays.items():
-        if not np.isfinite(array).all():
-            raise archive.BadValue(f"{name} holds values that are not finite")
-    if not (factor[:, [0, 2]] > 0).all():
-        raise archive.BadValue("factor has a or c <= 0; both must be positive")
-    if len(size) != 2 or not all(side == int(side) and 1 <= side <= 1 << 16 for side in size):
-        raise archive.BadValue(f"size is {size}, expected two sides from 1 to 65536")
-    if space not in SPACES:
-        raise archive.BadValue(f"space is {space!r}, expected one of {', '.join(SPACES)}")
-    if space in ("ycbcr", "rgb", "linear") and color.shape[1] not in (1, 3, 4):
-        raise archive.BadValue(
-            f"color has {color.shape[1]} channels; space {space!r} has 1, 3 or 4"
-        )
-    if space == "ycbcr" and color.shape[1] != 3:
-        raise archive.BadValue(f"color has {color.shape[1]} channels; space 'ycbcr' has 3")

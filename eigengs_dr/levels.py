@@ -25,7 +25,7 @@ from .presets import PRESETS
 from .rearrange import placed_like, residual
 from .refine import Progress, refine
 from .rendering import picture_of
-from .starting import GAUSSIANS, Start, begin
+from .starting import Start, begin, usual_count
 
 RATIO = 4
 """Splats of a level over those of the one before: half the distance between them."""
@@ -47,17 +47,17 @@ def level_counts(count: int, levels: int) -> list[int]:
     >>> level_counts(5000, 4)
     [78, 312, 1250, 5000]
     """
-    if levels < 1 or count < RATIO ** (levels - 1):
-        most = 1
-        while count >= RATIO**most:
-            most += 1
+    most = 1
+    while count >= RATIO**most:
+        most += 1
+    if not 1 <= levels <= most:
         raise ValueError(f"levels is {levels}; {count} Gaussians make 1 to {most}")
     return [count // RATIO**k for k in reversed(range(levels))]
 
 
 def fit_levels(
     image: ArrayLike,
-    gaussians: int = GAUSSIANS,
+    gaussians: int | None = None,
     levels: int = 4,
     iterations: int = 1000,
     color: str = "ycbcr",
@@ -70,7 +70,7 @@ def fit_levels(
     Parameters
     ----------
     gaussians : int, optional
-        Number of splats.
+        Number of splats; by default 5000, or one a pixel if these are fewer.
     levels : int, optional
         How often the set is quartered, and the whole: `level_counts` tells the numbers. Splats of
         one level that are worth more come first, so that all numbers between make an image.
@@ -92,7 +92,7 @@ def fit_levels(
     started = time.perf_counter()
     pixels = check_image(image, keep_grey=color == "data")
     check(pixels, gaussians, iterations, color=color, seed=seed)
-    counts = level_counts(gaussians, levels)
+    counts = level_counts(gaussians or usual_count(pixels.shape[0] * pixels.shape[1]), levels)
     method = PRESETS["default"]
     with deferred() as interrupted:
         start = begin(

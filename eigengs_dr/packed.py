@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from .archive import MOST_ENTRIES, BadValue
 from .atomic import replacing
-from .color import SPACES
+from .color import MOST_CHANNELS, SPACES
 from .curve import MOST_LEVELS, along_curve, on_curve
 from .planes import decoded, encoded
 from .quantising import Steps, Symbols, values_of
@@ -187,7 +187,7 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> Packed:
     found: list[Symbols] = []
     for number in range(1, (wanted or count) + 1):
         body, splats = _section(file, size, number, 4 + channels)
-        room = MOST_ENTRIES - sum(len(section.mean) for section in found)
+        room = MOST_ENTRIES // (4 + channels) - sum(len(section.mean) for section in found)
         if splats > room:
             raise BadValue(f"section {number} claims {splats} splats, more than may be read")
         try:
@@ -201,7 +201,7 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> Packed:
 
 def _check_header(space: int, channels: int, levels: int, count: int, steps: Steps) -> None:
     """Refuse what `to_bytes` does not write; size and values are checked with all sets."""
-    if space >= len(SPACES) or channels < 1 or levels > MOST_LEVELS:
+    if space >= len(SPACES) or not 1 <= channels <= MOST_CHANNELS or levels > MOST_LEVELS:
         raise BadValue("the header holds values that are not known; upgrade eigengs-dr")
     if not 1 <= count <= MOST_SECTIONS:
         raise BadValue(f"the header claims {count} sections, expected 1 to {MOST_SECTIONS}")

@@ -9,7 +9,6 @@ measured, and one common factor of the steps is then searched for.
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -26,6 +25,7 @@ from .images import check_image
 from .metrics import decibels
 from .packed import MOST_SECTIONS, Packed, to_bytes, write
 from .quantising import Steps, shapes_of, sizes_of
+from .refine import EXACT
 from .rendering import CUTOFF, render
 from .rounding import rounded, set_of
 
@@ -102,12 +102,14 @@ def pack(
         The image that the set was fitted to, as `fit` takes it. By default the rendering of the
         set.
     budget : float, optional
-        Decibels of PSNR that may be lost, above 0: against the image, in the space of the set
-        (psnr_ycbcr where that is YCbCr; light is coded as sRGB), at its native size. Without the
-        image, what a set of 40 dB loses where the errors add.
+        Decibels of PSNR that the whole set may lose, above 0 and at most 100: against the image, in
+        the space of the set (psnr_ycbcr where that is YCbCr; light is coded as sRGB), at its native
+        size. Without the image, what a set of 40 dB loses where the errors add.
     sections : sequence of int, optional
         Numbers of splats in each part of the file, in the order of the set; readers may stop after
-        any of them. By default all in one.
+        any of them. By default all in one. Inside a section splats lie in the order of the curve,
+        and what is rounded later makes up for earlier sections: these may lose more than the whole
+        set, in our tests up to 3 dB for a budget of 1.
     cutoff : float, optional
         See `eigengs_dr.render`.
 
@@ -127,8 +129,10 @@ def pack(
     The result is a function of the arguments, bit for bit, on one machine and backend.
     """
     rows = _rows(len(gaussians), sections)
-    if not (math.isfinite(budget) and budget > 0):
-        raise ValueError(f"pack: budget is {budget}; it must be above 0 dB, such as 0.5")
+    if not 0 < budget <= EXACT:
+        raise ValueError(
+            f"pack: budget is {budget}; it must be above 0 and at most {EXACT:g} dB, such as 0.5"
+        )
     gaussians = dr.detach(gaussians)
     shown = _shown(gaussians, cutoff) if image is None else _compared(gaussians, image)
     # The best light for an image is not the best picture: a set that has found it is kept.

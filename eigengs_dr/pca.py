@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from .basisfile import ROUNDING, read_basis, write_basis
 from .color import ycbcr_to_rgb
 from .fall import Fall, expected, falling, remaining
-from .images import check_image, resampled
+from .images import check_image
 from .incremental import EigenState, block_length, merge, rank_for, start
+from .resampling import resampled
 from .stream import Progress, Source, batches, checked_size, to_planes
 
 CHANNELS = {"ycbcr": ("Y", "Cb", "Cr"), "rgb": ("R", "G", "B")}

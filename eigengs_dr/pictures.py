@@ -11,9 +11,10 @@ from .color import decode
 from .components import colored
 from .eigengs import EigenGS
 from .gaussians import Gaussians
-from .images import resampled, to_8bit
+from .images import to_8bit
 from .pca import CHANNELS, Eigenbasis
 from .rendering import render
+from .resampling import resampled
 from .strips import joined, line
 
 FIRST = (1, 2, 3, 5, 10, 20, 50, 100, 200)

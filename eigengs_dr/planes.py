@@ -87,22 +87,29 @@ def _coded(folded: Whole, leading: int, signed: bool) -> list[bytes]:
     return [bytes([leading | SIGNED * signed]), packed, low]
 
 
+def _bits(width: Whole) -> tuple[Whole, Whole]:
+    """For every low bit, the number that it belongs to and its power of two, highest first."""
+    owner = np.repeat(np.arange(len(width)), width)
+    start = np.cumsum(width) - width
+    return owner, width[owner] - 1 - (np.arange(len(owner)) - start[owner])
+
+
 def _joined(codes: Whole, low: memoryview, leading: int) -> tuple[Whole, int]:
     """The numbers, and how many bytes their low bits took."""
     width = codes >> leading
     size = -(-int(width.sum()) // 8)
     if size > len(low) or width.max() > WIDEST - leading:
         raise BadValue("a plane of numbers claims more bits than the file holds")
-    owner, shift = _bits(width)
-    bits = np.unpackbits(np.frombuffer(low[:size], np.uint8))[: len(owner)].astype(np.int64)
-    # Sums of powers of two below 2^53 are exact in the float64 of bincount.
-    below = np.bincount(owner, bits << shift, len(codes)).astype(np.int64)
     top = codes - (width << leading) + (1 << leading)
-    return (top << width) + below - (1 << leading), size
+    return (top << width) + _below(bytes(low[:size]), width) - (1 << leading), size
 
 
-def _bits(width: Whole) -> tuple[Whole, Whole]:
-    """For every low bit, the number that it belongs to and its power of two, highest first."""
-    owner = np.repeat(np.arange(len(width)), width)
-    start = np.cumsum(width) - width
-    return owner, width[owner] - 1 - (np.arange(len(owner)) - start[owner])
+def _below(low: bytes, width: Whole) -> Whole:
+    """The low bits of every number; memory does not depend on how many they are."""
+    start, data = np.cumsum(width) - width, np.frombuffer(low + bytes(8), np.uint8)
+    word = np.zeros(len(width), np.uint64)
+    for k in range(8):  # the eight bytes in which the bits begin, of which they take up to 57
+        word = word << np.uint64(8) | data[(start >> 3) + k].astype(np.uint64)
+    word <<= (start & 7).astype(np.uint64)
+    # In two parts: a shift by 64, for a number without low bits, would not be defined.
+    return (word >> (63 - width).astype(np.uint64) >> np.uint64(1)).astype(np.int64)

@@ -19,7 +19,8 @@ Array = NDArray[np.floating]
 Whole = NDArray[np.int64]
 
 LARGEST = 1 << 23
-"""Largest whole number that a parameter may become: steps finer than that are not worth storing."""
+"""Whole numbers of parameters stay below: steps finer than that are not worth storing. Two of them
+differ by less than twice as much, which `eigengs_dr.curve.MOST_LEVELS` holds."""
 
 
 class Steps(NamedTuple):
@@ -103,7 +104,7 @@ def symbols_of(mean: Array, shape: Array, color: Array, steps: Steps) -> Symbols
     Raises
     ------
     ValueError
-        If a number would be larger than `LARGEST`.
+        If a number would be `LARGEST` or more.
     """
     rounded = whole("shape", shape, (steps.scale, steps.stretch, steps.stretch))
     unit = steps.color / sizes_of(rounded * (steps.scale, steps.stretch, steps.stretch))
@@ -132,9 +133,9 @@ def values_of(symbols: Symbols, steps: Steps) -> dict[str, Array]:
 def whole(name: str, values: Array, step: object) -> Whole:
     """Count the steps of each value, to the nearest; raises what `symbols_of` does."""
     counts = np.rint(np.asarray(values, np.float64) / np.asarray(step))
-    if not (np.abs(counts) <= LARGEST).all():
+    if not (np.abs(counts) < LARGEST).all():
         raise ValueError(
-            f"pack: a {name} is more than {LARGEST} steps from zero; call bounded() first, or "
+            f"pack: a {name} is {LARGEST} steps or more from zero; call bounded() first, or "
             "allow a larger error"
         )
     return counts.astype(np.int64)

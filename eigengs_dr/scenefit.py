@@ -29,7 +29,7 @@ from .rendering import CUTOFF, render
 from .resolution import Resolution, resolution
 from .smoothest import filled, smoothest
 from .solve import solve
-from .starting import BLACK, DARKNESS
+from .starting import dark_weight
 
 COLORS = ("linear", "data")
 """What textures hold."""
@@ -211,7 +211,7 @@ def _weights(found: Resolution, target: Image, color: str) -> Image:
     """What errors are multiplied by: the root of how much of the pixels a texel is, 0 unseen."""
     share = gaussian_filter(found.pixels, EVEN) * found.seen
     weight = np.sqrt(share / share.max())[..., None]
-    light = np.maximum(target, BLACK) ** -DARKNESS if color == "linear" else np.ones_like(target)
+    light = dark_weight(target) if color == "linear" else np.ones_like(target)
     return (weight * light).astype(np.float32)
 
 

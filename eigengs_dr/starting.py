@@ -61,6 +61,16 @@ class Start(NamedTuple):
     rearrange: Callable[[Gaussians, int], Gaussians] | None = None
 
 
+def usual_count(pixels: int) -> int:
+    """Splats where no number is asked for: `GAUSSIANS`, or one a pixel if these are fewer."""
+    return min(GAUSSIANS, pixels)
+
+
+def dark_weight(light: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What errors of linear light are multiplied by before they are squared; see `DARKNESS`."""
+    return np.maximum(light, BLACK) ** -DARKNESS
+
+
 def begin(
     pixels: NDArray[np.float32],
     gaussians: int | None,
@@ -86,7 +96,7 @@ def begin(
     target, weight = _target(pixels, color)
     init = method.init if init == "auto" else init
     if init != "eigen":
-        count = gaussians or min(GAUSSIANS, pixels.shape[0] * pixels.shape[1])
+        count = gaussians or usual_count(pixels.shape[0] * pixels.shape[1])
         # Light would draw too few splats to the dark.
         shown = pixels if color == "linear" else target
         placed = _placed(
@@ -120,7 +130,7 @@ def _target(
         return rgb_to_ycbcr(pixels), None
     if color == "linear":
         light = to_linear(pixels)
-        return light, np.maximum(light, BLACK) ** -DARKNESS
+        return light, dark_weight(light)
     return pixels, None
 
 

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .color import RGB_TO_YCBCR, YCBCR_OFFSET
-from .images import ImageError, check_image, cropped, image_files, load_image
+from .images import ImageError, check_image, image_files, load_image
+from .resampling import cropped
 
 SPACES = ("ycbcr", "rgb")
 """Colour spaces that images can be read in."""

@@ -192,9 +192,23 @@ def test_what_no_fixed_number_encloses_is_missing():
     assert math.isnan(budget_tables.smallest({}, 20.0))
 
 
-def test_the_psnr_of_equal_images_is_above_all():
-    assert budget.reached({"psnr_ycbcr": None}) == EXACT
+def test_a_fit_that_has_failed_reaches_nothing():
+    assert math.isnan(budget.reached({"psnr_ycbcr": None}))
     assert budget.reached({"psnr_ycbcr": 30}) == 30.0
+    looked = budget.bisected([1, 2, 4], 20.0, lambda count: {"psnr_ycbcr": None})
+    assert len(looked) == 2  # the largest of all is asked, too
+    assert math.isnan(budget_tables.smallest({4: math.nan, 8: 30.0}, 20.0))
+
+
+def test_gains_are_of_the_number_that_most_images_have():
+    """Also where more was measured of an image afterwards."""
+    later = [
+        {"job": {"set": "made", "image": "a", "target": 28.0}, "gaussians": 300, "stopped": "met"},
+        fit_row("a", 300, True, 29.0),
+    ]
+    (pairs,) = budget_tables.gains(made_rows() + later).values()
+    assert [once["job"]["image"] for once, _ in pairs] == ["a", "b", "c", "d"]
+    assert {row["job"]["gaussians"] for pair in pairs for row in pair} == {200}
 
 
 def fit_row(image, count, rearranged, decibels, seconds=1.0):

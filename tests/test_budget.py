@@ -17,7 +17,7 @@ from eigengs_dr.budget import fewest
 from eigengs_dr.cli import main
 from eigengs_dr.color import rgb_to_ycbcr
 from eigengs_dr.fitting import fit, most_gaussians
-from eigengs_dr.growth import grown, places, pruned, worth
+from eigengs_dr.growth import APART, grown, places, pruned, worth
 from eigengs_dr.presets import PRESETS
 from eigengs_dr.rearrange import FALL, rearranged, residual, wanted
 from eigengs_dr.rendering import render
@@ -225,7 +225,9 @@ def test_places_keep_apart_and_never_exceed(count):
     missed = np.random.default_rng(count).normal(size=(24, 20, 3))
     mean, size, color = places(missed, count, 4.0)
     assert len(mean) == len(size) == len(color) <= count
-    assert len(np.unique(mean, axis=0)) == len(mean)
+    for k in range(len(mean)):
+        away = np.abs(mean[k + 1 :] - mean[k]).max(axis=1)
+        assert (away > np.ceil(APART * size[k])).all()
 
 
 def test_grown_of_a_perfect_set_is_the_set():
@@ -288,6 +290,23 @@ def test_progress_counts_up_to_its_total():
     assert {"gaussians", "psnr_rgb", "psnr_ycbcr", "seconds"} <= seen[-1][2].keys()
 
 
+def test_interrupted_while_it_settles_it_keeps_the_best():
+    """By an error, as in a thread or at a second Ctrl-C, as well as by the question."""
+    whole = fit(picture(), target_psnr=28, iterations=60)
+    assert whole.stopped == "met"
+    best = [row["gaussians"] for row in whole.trace if row["psnr_ycbcr"] >= 28]
+
+    def press(iteration, iterations, row):
+        if row["psnr_ycbcr"] >= 28:  # the search has met its goal, and settles
+            raise KeyboardInterrupt
+
+    found = fit(picture(), target_psnr=28, iterations=60, progress=press)
+    assert found.stopped == "interrupted"
+    assert found.iterations < whole.iterations
+    assert len(found.gaussians) == best[0]
+    assert eg.psnr(picture(), found.image, space="ycbcr") >= 28
+
+
 def test_interrupted_it_returns_what_there_is():
     image = picture()
     start = begin(image, 60, "adaptive", "natural", PRESETS["default"])
@@ -327,6 +346,9 @@ def test_a_search_ends_where_no_place_is_left_to_grow(monkeypatch):
         ({"target_space": "lab"}, "use ycbcr or rgb"),
         ({"max_gaussians": 0}, "takes 1 to 1024"),
         ({"max_gaussians": 2000}, "takes 1 to 1024"),
+        ({"max_gaussians": 50.5}, "takes 1 to 1024"),
+        ({"target_psnr": None, "max_gaussians": 50}, "belong to target_psnr"),
+        ({"target_psnr": None, "target_space": "rgb"}, "belong to target_psnr"),
     ],
 )
 def test_what_cannot_be_searched_for_is_said_in_one_line(settings, told):
@@ -372,6 +394,10 @@ def test_command_finds_few_or_says_that_it_cannot(tmp_path):
 
     assert run(*base, "--target-psnr", 20, "--space", "rgb").exit_code == 0
     assert json.loads(report.read_text())["psnr_rgb"] >= 20
+
+    for option in (("--space", "rgb"), ("--max-gaussians", 50), ("--levels", 2, "--space", "rgb")):
+        alone = run(*base, *option)
+        assert alone.exit_code == 2 and "belong to --target-psnr" in alone.stderr
 
     both = run(*base, "--target-psnr", 30, "--gaussians", 9)
     assert both.exit_code == 2

@@ -91,9 +91,9 @@ def test_every_figure_is_drawn_and_listed(drawn):
         *["colors", "curves", "radii", "split", "cross"],
     ]
     listed = json.loads((drawn.folder / "figures.json").read_text())
-    assert listed["figures"] == [figure._asdict() for figure in drawn.made]
-    assert "UTC" in listed["run"].pop("date")
-    assert listed["run"] == MACHINE
+    for entry, figure in zip(listed["figures"], drawn.made, strict=True):
+        assert "UTC" in entry["run"].pop("date")
+        assert entry == {**figure._asdict(), "run": MACHINE}
     files = {
         path.name for path in drawn.folder.iterdir() if path.suffix in (".jpg", ".png", ".svg")
     }
@@ -182,6 +182,8 @@ def test_a_second_run_measures_nothing_again(drawn, data, monkeypatch):
     monkeypatch.setattr(figure_charts, "descent", fail)
     settings = {"iterations": ITERATIONS, "images": IMAGES}
     figures.run(drawn.folder, data, MACHINE, ["curves"], backend="llvm", **settings)
+    again = figures.read_list(drawn.folder / "figures.json")
+    assert [figure["path"] for figure in again] == [figure.path for figure in drawn.made]
     assert (drawn.folder / "curves.jsonl").read_bytes() == before
     with pytest.raises(AssertionError, match="measured again"):
         figures.run(drawn.folder, data, MACHINE, ["curves"], backend="llvm", seed=1, **settings)
@@ -254,10 +256,17 @@ def test_without_data_photos_are_fitted(tmp_path):
     listed = json.loads((folder / "figures.json").read_text())
     paths = [figure["path"] for figure in listed["figures"]]
     assert paths == ["iterations-coffee.jpg", "colors.jpg"]
-    assert "--iterations 1" in listed["run"]["command"]
+    assert all("--iterations 1" in figure["run"]["command"] for figure in listed["figures"])
     for path in paths:
         assert str(folder / path) in result.stdout
         assert Image.open(folder / path).width > 3 * CELL
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"figures": [{"name": "colors"}]}'])
+def test_a_damaged_list_is_told(tmp_path, text):
+    (tmp_path / "figures.json").write_text(text)
+    with pytest.raises(ValueError, match=r"figures.json: is damaged; delete it"):
+        figures.read_list(tmp_path / "figures.json")
 
 
 def test_one_figure_alone(tmp_path):

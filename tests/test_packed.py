@@ -4,6 +4,7 @@ import math
 import os
 import re
 import struct
+import tracemalloc
 import zlib
 from dataclasses import replace
 
@@ -19,7 +20,7 @@ import eigengs_dr as eg
 from eigengs_dr import cli, cli_pack, packed, packing, planes
 from eigengs_dr.archive import BadValue
 from eigengs_dr.curve import MOST_LEVELS, along_curve, on_curve
-from eigengs_dr.quantising import LARGEST, Steps, Symbols, factors_of, shapes_of, symbols_of
+from eigengs_dr.quantising import LARGEST, Steps, Symbols, factors_of, shapes_of, symbols_of, whole
 from eigengs_dr.rendering import picture_of
 
 STEPS = Steps(0.25, 0.125, 0.0625, 0.03125)
@@ -130,8 +131,12 @@ def test_rounding_moves_by_half_a_step(scene):
 
 
 def test_numbers_beyond_the_largest_are_refused():
-    with pytest.raises(ValueError, match="a mean is more than"):
+    with pytest.raises(ValueError, match="a mean is 8388608 steps or more"):
         symbols_of(np.full((1, 2), 1e9), np.zeros((1, 3)), np.zeros((1, 3)), STEPS)
+    ends = np.array([[-LARGEST + 1.0], [LARGEST - 1.0]])
+    assert int(np.ptp(whole("mean", ends, 1.0))).bit_length() == MOST_LEVELS
+    with pytest.raises(ValueError, match="a mean is"):
+        whole("mean", ends + 1, 1.0)
 
 
 # --- Files -------------------------------------------------------------------------------------
@@ -280,7 +285,8 @@ HOSTILE = {
     "version 0": (header(version=0) + body(), "version is 0"),
     "another space": (header(space=9) + body(), "not known"),
     "no channels": (header(channels=0) + body(), "not known"),
-    "more channels": (header(channels=255) + body(), "claims 24 splats"),
+    "more channels": (header(channels=40) + body(), "claims 24 splats"),
+    "too many channels": (header(channels=65) + body(), "values that are not known"),
     "65 channels": (
         header(channels=65, space=3) + body(data=ways() + 62 * ZEROS),
         "65 channels",
@@ -322,14 +328,34 @@ def test_files_made_by_hand(path):
     assert len(eg.Gaussians.load(path)) == COUNT
 
 
-def test_reading_reserves_no_more_than_the_file_is_long(path, monkeypatch):
+def test_reading_reserves_no_more_than_the_file_is_long(path):
     """A section of a few bytes that inflates to gigabytes, whose checksum is right."""
     bomb = b"\x01\0\0" + zlib.compress(bytes(1 << 26), 9, -15)
-    asked = []
-    original = planes._joined
-    monkeypatch.setattr(planes, "_joined", lambda *a: asked.append(len(a[0])) or original(*a))
-    check_refused(path, header() + body(8 * len(bomb) // 7, bomb), "does not hold")
-    assert asked == []
+    content = header() + body(8 * len(bomb) // 7, bomb)
+    assert peak(lambda: check_refused(path, content, "does not hold")) < 1 << 22
+
+
+def test_low_bits_take_no_more_memory_than_numbers():
+    """Of numbers of 47 bits each, where a number a bit would be forty times as much."""
+    values = np.random.default_rng(0).integers(1 << 46, 1 << 47, 1 << 16)
+    coded = memoryview(planes.encoded(values))
+    assert peak(lambda: planes.decoded(coded, len(values))) < 12 * values.nbytes
+
+
+def test_sections_of_all_planes_are_bounded(path, monkeypatch):
+    """As arrays of other files are: by the numbers in them."""
+    monkeypatch.setattr(packed, "MOST_ENTRIES", 7 * COUNT - 1)
+    check_refused(path, header() + body(), "more than may be read")
+
+
+def peak(work):
+    """Most bytes that Python and NumPy hold at once, beside what they held before."""
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
 
 
 # --- Packing -----------------------------------------------------------------------------------
@@ -473,6 +499,7 @@ def test_mistakes_leave_the_old_file(fitted, path):
     path.write_text("old")
     for words, arguments in {
         "budget is 0": (None, 0),
+        "budget is 10000.*at most 100 dB": (None, 1e4),
         "budget is nan": (None, math.nan),
         r"shape \(16, 32, 3\)": (image[:16],),
         "sections are": (None, 0.5, [50, 49]),
@@ -511,6 +538,8 @@ def test_commands_pack_and_read(fitted, tmp_path):
     one, other = (eg.load_image(tmp_path / f"{suffix}.png") for suffix in ("npz", "egs"))
     assert eg.psnr(one, other) > 30
     assert command("pack", tmp_path / "x.npz", "-o", tmp_path / "y.zip").exit_code == 2
+    told = command("pack", source, "-o", target, "--image", tmp_path / "x.png", "--levels", 9)
+    assert told.exit_code == 2 and "x.npz: levels is 9" in told.output
 
 
 def test_the_command_knows_the_defaults():

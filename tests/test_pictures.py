@@ -6,7 +6,6 @@ from test_training import SMALL, random_fields
 
 from eigengs_dr import pictures
 from eigengs_dr.gaussians import Gaussians
-from eigengs_dr.images import resampled
 from eigengs_dr.pictures import (
     CELL,
     LIGHTER,
@@ -16,6 +15,7 @@ from eigengs_dr.pictures import (
     overlay,
 )
 from eigengs_dr.rendering import render
+from eigengs_dr.resampling import resampled
 from eigengs_dr.strips import GAP, joined, line
 from eigengs_dr.training import Settings, train
 

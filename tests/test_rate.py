@@ -13,8 +13,9 @@ from scenes import family
 
 import eigengs_dr as eg
 from eigengs_dr import cli_rate, cli_shared
-from eigengs_dr.bench import rate, rate_tables
+from eigengs_dr.bench import rate, rate_tables, rows
 from eigengs_dr.console import Program
+from eigengs_dr.refine import EXACT
 
 
 @pytest.fixture
@@ -36,6 +37,33 @@ def test_packed_fits_are_measured_as_they_are_read(small, backend):
     before = eg.psnr(fitted.image, image, "ycbcr")
     assert point["psnr_ycbcr"] >= before - 0.3 - 1e-3
     assert point["seconds"] > point["fit_seconds"] > 0
+
+
+def test_a_fit_that_was_broken_off_is_no_measurement(small, monkeypatch, tmp_path, backend):
+    image = family(1, side=32, seed=5)[0]
+    fitted = eg.fit(image, 32, iterations=0, backend=backend)._replace(stopped="interrupted")
+    monkeypatch.setattr(rate, "fit", lambda *arguments, **settings: fitted)
+    jobs = list(rate.jobs("made", [("one", image)], 20, 0.3, 0, backend))
+    run = {"command": "a command"}
+    with pytest.raises(KeyboardInterrupt):
+        rows.measure(tmp_path / "r.jsonl", jobs, run)
+    assert rows.read(tmp_path / "r.jsonl") == []
+
+
+def test_what_is_exact_can_be_told_and_drawn(small, tmp_path, backend):
+    """JPEG loses nothing of a grey image: its PSNR is the highest that is told, not null."""
+    image = np.full((32, 32, 3), 0.0, np.float32)
+    found = rows.measure(
+        tmp_path / "r.jsonl",
+        rate.jobs("made", [("one", image)], 1, 0.3, 0, backend),
+        {"command": "a command"},
+    )
+    levels = {
+        p["psnr_rgb"] for row in found if row["job"]["codec"] != rate.OURS for p in row["points"]
+    }
+    assert levels == {EXACT}
+    rate_tables.tables(found)
+    rate_tables.chart(found, "made").draw_without_rendering()
 
 
 def test_codecs_are_told_what_they_are_named_for():
@@ -68,7 +96,8 @@ def test_sizes_are_interpolated_in_their_logarithm():
     assert rate_tables.rate_at(curve, 37.0) == pytest.approx(math.sqrt(32))
     assert math.isnan(rate_tables.rate_at(curve, 29.9))
     assert math.isnan(rate_tables.rate_at(curve, 40.1))
-    assert math.isnan(rate_tables.rate_at([point(1.0, None)], 30.0))
+    failed = [point(1.0, None), point(1.0, 20.0), point(2.0, None), point(4.0, 40.0)]
+    assert math.isnan(rate_tables.rate_at(failed, 30.0))
 
 
 def made_rows():
@@ -95,14 +124,14 @@ def made_rows():
 
 def test_tables_tell_ratios_and_where_they_are_missing():
     (table,) = rate_tables.tables(made_rows())
-    rows = {row[0]: row[1:] for row in table.rows}
+    cells = {row[0]: row[1:] for row in table.rows}
     # 32 dB is half way: sqrt(1 * 4) and 3 times that; 2 * 4^(6 / 8) for WebP on the second.
-    assert rows[rate.OURS][1] == "4.00"
-    assert rows["JPEG 4:2:0"][1] == "4.00 (1.00)"
-    assert rows["WebP"][1] == f"{(4 + 2 * 4**0.75) / 2:.2f} ({(4 + 2 * 4**0.75) / 8:.2f})"
-    assert rows["images that all reach"] == ("2", "2", "1", "-")
-    assert rows[rate.OURS][2] == f"{4 ** (10 / 12):.2f}"
-    assert rows[rate.OURS][3].startswith("3.00")
+    assert cells[rate.OURS][1] == "4.00"
+    assert cells["JPEG 4:2:0"][1] == "4.00 (1.00)"
+    assert cells["WebP"][1] == f"{(4 + 2 * 4**0.75) / 2:.2f} ({(4 + 2 * 4**0.75) / 8:.2f})"
+    assert cells["images that all reach"] == ("2", "2", "1", "-")
+    assert cells[rate.OURS][2] == f"{4 ** (10 / 12):.2f}"
+    assert cells[rate.OURS][3].startswith("3.00")
     nothing = [row for row in made_rows() if row["job"]["codec"] != "WebP"]
     with_one = [r | {"points": [point(1.0, 20.0)]} for r in made_rows() if r not in nothing]
     (table,) = rate_tables.tables(nothing + with_one)
@@ -132,9 +161,9 @@ def test_the_command_measures_draws_and_goes_on(small, backend, tmp_path):
     for text in (rate.OURS, *rate.CODECS, "32 dB", "rate-samples.svg"):
         assert text in told.output
     kept = {name: (out / name).read_bytes() for name in ("rate.jsonl", "rate-samples.svg")}
-    rows = [json.loads(line) for line in kept["rate.jsonl"].splitlines()]
-    assert len(rows) == 2 + len(rate.CODECS)
-    assert {row["job"]["budget"] for row in rows[:2]} == {rate.BUDGET}
+    found = [json.loads(line) for line in kept["rate.jsonl"].splitlines()]
+    assert len(found) == 2 + len(rate.CODECS)
+    assert {row["job"]["budget"] for row in found[:2]} == {rate.BUDGET}
     again = bench(*arguments)
     assert again.output == told.output
     assert kept == {name: (out / name).read_bytes() for name in kept}

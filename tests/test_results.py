@@ -59,7 +59,8 @@ def folder(tmp_path):
         {"name": "curves", "path": "curves.svg", "caption": "Curves.", "credit": ""},
     ]
     run = {"date": "2026-01-03 10:00 UTC", "command": "eigengs-dr bench figures -o r", **RUN}
-    (tmp_path / "figures.json").write_text(json.dumps({"run": run, "figures": shown}))
+    listed = {"figures": [{**figure, "run": run} for figure in shown]}
+    (tmp_path / "figures.json").write_text(json.dumps(listed))
     return tmp_path
 
 
@@ -100,6 +101,27 @@ def test_a_source_names_commands_days_machine_and_versions(folder):
     for row, hour in zip(rows, (12, 9, 10, 11), strict=True):
         row["run"] |= {"command": "one", "date": f"2026-01-01 {hour:02} UTC"}
     assert results.source(rows).startswith("`one` (2026-01-01 09 UTC to 2026-01-01 12 UTC)")
+
+
+def test_images_are_not_counted_twice(folder):
+    """Neither by another seed nor, where a page shows one length, by another number of steps."""
+    rows = tables_rows()
+    longer = [{**row, "job": {**row["job"], "iterations": 2000}} for row in rows]
+    lines = "".join(json.dumps(row) + "\n" for row in rows + longer)
+    (folder / "tables.jsonl").write_text(lines)
+    assert len(results.page(folder).sections) == 3
+    again = json.dumps({**rows[0], "job": {**rows[0]["job"], "seed": 1}})
+    (folder / "tables.jsonl").write_text(lines + again + "\n")
+    with pytest.raises(
+        ValueError, match=r"tables.jsonl: has the same measurement .* another folder"
+    ):
+        results.page(folder)
+    (folder / "tables.jsonl").unlink()
+    job = {"case": "noise", "preset": "default", "seed": 0}
+    cells = [line("c", "d", {**job, "iterations": steps}) for steps in (5, 6)]
+    (folder / "stability.jsonl").write_text("".join(json.dumps(row) + "\n" for row in cells))
+    with pytest.raises(ValueError, match=r"stability.jsonl: .* several seed or iterations"):
+        results.page(folder)
 
 
 def test_an_empty_folder_is_refused(tmp_path):

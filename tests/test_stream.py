@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 import eigengs_dr.stream as stream
 from eigengs_dr.color import rgb_to_ycbcr
-from eigengs_dr.images import ImageError, check_image, cropped, image_files, load_image, save_image
+from eigengs_dr.images import ImageError, check_image, image_files, load_image, save_image
+from eigengs_dr.resampling import cropped
 from eigengs_dr.stream import batches, checked_size, to_planes
 
 WIDTH, HEIGHT = SIZE = (6, 5)

@@ -9,7 +9,7 @@ from scenes import family, small_model
 
 from eigengs_dr import cli_tables
 from eigengs_dr.bench import losses, rows, sets, summary, tables, trial
-from eigengs_dr.bench.table import Table, as_text, median, number, spread
+from eigengs_dr.bench.table import Table, as_text, mean, median, number, spread
 from eigengs_dr.cli import main
 from eigengs_dr.fitting import fit
 from eigengs_dr.images import ImageError, save_image
@@ -257,7 +257,8 @@ def test_a_goal_above_the_start_is_reached_by_descent(backend):
 
 
 def moment(iteration, value, **others):
-    figures = {"psnr_ycbcr": value, "psnr_rgb": (value or 60) - 6, "ssim": 0.5, "ms_ssim": 0.75}
+    rgb = None if value is None else value - 6
+    figures = {"psnr_ycbcr": value, "psnr_rgb": rgb, "ssim": 0.5, "ms_ssim": 0.75}
     return {"iteration": iteration, "seconds": 1.0, **figures, **others}
 
 
@@ -274,14 +275,14 @@ def test_cells_are_means_over_images():
     ]
     [glance, table, printed] = summary.tables(found)
     assert glance.rows == [
-        ("faces256", preset, "33.0", "-", "-", "-", "37.3", "1.00 (1.00-1.00)")
+        ("faces256", preset, "4", "33.0", "-", "-", "-", "37.3 (1 failed)", "1.00 (1.00-1.00)")
         for preset in ("gaussianimage", "default")
     ]
     assert table.columns == ("method", "figure", "0", "1,000")
     cells = {line[:2]: line[2:] for line in table.rows}
-    assert cells["default", "PSNR YCbCr / dB"] == ("33.0 ± 2.2", "37.3 ± 3.4")
-    assert cells["default", "% above 35 dB"] == ("25", "75")  # equal images count
-    assert cells["default", "% above 40 dB"] == ("0", "50")
+    assert cells["default", "PSNR YCbCr / dB"] == ("33.0 ± 2.6", "37.3 ± 4.2 (1 failed)")
+    assert cells["default", "% above 35 dB YCbCr"] == ("25", "50")
+    assert cells["default", "% above 40 dB YCbCr"] == ("0", "25")
     assert cells["gaussianimage", "seconds"] == ("1.00 (1.00-1.00)",) * 2
     assert "4 images" in table.caption and "1,000 steps" in table.caption
     assert printed.caption.startswith("What the paper prints")
@@ -347,6 +348,16 @@ def test_losses_after_as_many_steps_and_after_as_much_time():
     assert not losses.table(fits[1:], []).rows
 
 
+def test_a_fit_that_has_failed_is_behind():
+    fits = [
+        row("a", [moment(100, value)], preset=preset, iterations=100)
+        for preset, value in (("default", None), ("gaussianimage", 9.0), ("eigengs", None))
+    ]
+    assert [line[2] for line in losses.table(fits, []).rows] == ["gaussianimage"] * 2
+    cells = [cell("noise", "default", None), cell("noise", "eigengs", 9.0)]
+    assert [line[2] for line in losses.table([], cells).rows] == ["eigengs"]
+
+
 def test_losses_in_hard_cases():
     cells = [
         cell("black", "default", 50.0),
@@ -366,7 +377,9 @@ def test_cells():
     assert number(None) == number(float("nan")) == "-"
     assert number(12345.678, 2) == "12,345.68"
     assert number(float("inf")) == "inf"
-    assert spread([1.0, 3.0, None, float("inf")], 2) == "2.00 ± 1.00"
+    assert spread([1.0, 3.0, None, float("inf")], 2) == "2.00 ± 1.41 (2 failed)"
+    assert spread([1.0, None]) == mean([1.0, None]) == "1.0 (1 failed)"
+    assert spread([None]) == "- (1 failed)" and mean([1.0, 2.0]) == "1.5"
     assert spread([1.0]) == "1.0" and spread([]) == "-"
     assert median([1.0, 2.0, 3.0, 4.0, 5.0]) == "3.00 (2.00-4.00)"
     assert median([1.0], 3) == "1.000" and median([]) == "-"

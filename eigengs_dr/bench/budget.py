@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,15 +12,13 @@ from numpy.typing import NDArray
 
 from ..descent import LONG
 from ..fitting import fit, most_gaussians
-from ..metrics import psnr
 from ..presets import PRESETS
-from ..refine import EXACT
 from ..starting import GAUSSIANS, Start, begin
 from . import rows
 from .rate import images_of
 from .rows import Row
 from .sets import SETS
-from .trial import follow, judged
+from .trial import decibels, follow, judged, warm_up, whole
 
 Image = NDArray[np.float32]
 
@@ -33,10 +30,6 @@ SPARSEST = 1024
 
 STEPS_AN_OCTAVE = 2
 """Fixed numbers from one to twice as many, at least."""
-
-WARM_UP = LONG
-"""Untimed steps before every measurement, that compile its programs; after one of them splats are
-placed anew."""
 
 Fitted = Callable[[int, bool], Row]
 """``fitted(count, rearranged)``: the row of a fit of so many splats, placed anew on the way or
@@ -174,8 +167,8 @@ def bisected(counts: Sequence[int], target: float, fitted: Callable[[int], Row])
 
 
 def reached(row: Row) -> float:
-    """Return psnr_ycbcr of a row; `EXACT` where it is null, which infinity becomes in JSON."""
-    return EXACT if row["psnr_ycbcr"] is None else float(row["psnr_ycbcr"])
+    """Return psnr_ycbcr of a row, NaN of a fit that has failed, which is null in JSON."""
+    return math.nan if row["psnr_ycbcr"] is None else float(row["psnr_ycbcr"])
 
 
 def _measured(
@@ -207,21 +200,19 @@ def _fit(
         begun = begin(image, count, "auto", "natural", method, seed=seed, backend=backend)
         return begun if rearranged else begun._replace(rearrange=None)
 
-    list(follow(start, replace(method.schedule, rearrange=1), WARM_UP, ()))
+    warm_up(start, method.schedule, iterations)
     (moment,) = follow(start, method.schedule, iterations, (iterations,))
     return judged(moment, image)
 
 
 def _search(image: Image, target: float, iterations: int, seed: int, backend: str | None) -> Row:
-    for steps in (min(WARM_UP, iterations), iterations):
-        found = fit(image, iterations=steps, target_psnr=target, seed=seed, backend=backend)
-        if found.stopped == "interrupted":  # `fit` keeps what it has; that is no measurement
-            raise KeyboardInterrupt
+    for steps in (min(LONG, iterations), iterations):  # first untimed, to compile
+        found = whole(fit(image, iterations=steps, target_psnr=target, seed=seed, backend=backend))
     return {
         "gaussians": len(found.gaussians),
         "stopped": found.stopped,
         "iterations": found.iterations,
         "seconds": found.seconds,
-        "psnr_ycbcr": psnr(found.image, image, "ycbcr"),
-        "psnr_rgb": psnr(found.image, image, "rgb"),
+        "psnr_ycbcr": decibels(found.image, image, "ycbcr"),
+        "psnr_rgb": decibels(found.image, image, "rgb"),
     }

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import cycle, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -107,30 +107,34 @@ def _key(row: Row) -> tuple[str, str, int, bool]:
     return job["set"], job["image"], job["gaussians"], job["rearranged"]
 
 
-def smallest(curve: dict[int, float], target: float) -> float:
-    """Interpolate the number of splats at a PSNR, which is linear in the logarithm of the number.
+def smallest(curve: Mapping[Any, float], target: float) -> float:
+    """Interpolate the size at a PSNR, which is taken as linear in the logarithm of the size.
 
-    Between the first two neighbours, by their numbers, that have the PSNR between them; NaN where
-    there are none.
+    Between the first two neighbours, by their sizes (splats, or bits), that have the PSNR between
+    them; NaN where there are none.
     """
     for (few, low), (many, high) in pairwise(sorted(curve.items())):
         if low <= target <= high:
             share = (target - low) / (high - low) if high > low else 0.0
-            return few * (many / few) ** share
+            return float(few * (many / few) ** share)
     return math.nan
 
 
 def gains(rows: Sequence[Row]) -> dict[str, list[tuple[Row, Row]]]:
-    """Pairs of fits of one number, placed once and placed anew, by set: the last two an image."""
-    images: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        images.setdefault((row["job"]["set"], row["job"]["image"]), []).append(row)
-    found: dict[str, list[tuple[Row, Row]]] = {}
-    for (name, _), fits in images.items():
-        once, anew = fits[-2:] if len(fits) > 1 else (fits[0], fits[0])
-        if {**once["job"], "rearranged": True} == anew["job"] != once["job"]:
-            found.setdefault(name, []).append((once, anew))
-    return found
+    """Pairs of fits of one number, placed once and placed anew, by set.
+
+    The number is that which most images of a set have such pairs of.
+    """
+    fits = {_key(row): row for row in rows if "rearranged" in row["job"]}
+    pairs: dict[str, dict[int, list[tuple[Row, Row]]]] = {}
+    for (name, image, count, rearranged), anew in fits.items():
+        once = fits.get((name, image, count, False))
+        if rearranged and once is not None:
+            pairs.setdefault(name, {}).setdefault(count, []).append((once, anew))
+    return {
+        name: max(counts.items(), key=lambda item: (len(item[1]), item[0]))[1]
+        for name, counts in pairs.items()
+    }
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:

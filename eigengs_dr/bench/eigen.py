@@ -18,6 +18,7 @@ from ..presets import PRESETS
 from ..refine import refine
 from ..rendering import render
 from ..solve import solve
+from .trial import whole
 
 SOLVE_STEPS = 10
 """Steps of conjugate gradients, those of `eigengs_dr.fit`."""
@@ -89,11 +90,13 @@ def _measure(model: EigenGS, image: Image, iterations: int) -> Any:
     schedule = PRESETS["default"].schedule
     for name, start in starts.items():
         started = time.perf_counter()
-        refined = refine(start().bounded(), target, image, schedule, iterations, started=started)
+        refined = whole(
+            refine(start().bounded(), target, image, schedule, iterations, started=started)
+        )
         picture = render(refined.gaussians).numpy()
         yield from _row(name, image, picture, time.perf_counter() - started)
     for name in PLACED:
-        fitted = fit(image, len(model.gaussians), iterations, init=name, color=space)
+        fitted = whole(fit(image, len(model.gaussians), iterations, init=name, color=space))
         yield from _row(name, image, fitted.image, fitted.seconds)
 
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import replacing
-from ..images import resampled, to_8bit
+from ..images import to_8bit
+from ..resampling import resampled
 from ..strips import joined, line
 from .charts import COLORS, new_figure, save_figure
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
@@ -47,7 +48,7 @@ def run(
     progress: Progress = lambda label, done, total: None,
     note: Callable[[str], None] = lambda text: None,
 ) -> list[Figure]:
-    """Draw figures into a folder, and list them in its ``figures.json``.
+    """Draw figures into a folder, and add them to the list in its ``figures.json``.
 
     Models are kept in ``models/``, measurements in ``curves.jsonl``: a second run goes on with
     both.
@@ -104,9 +105,37 @@ def run(
         folder, data or Path(), present, machine, iterations, images, seed, backend, progress
     )
     made = [figure for name in drawn for figure in STUDIES[name](task)]
-    run = {"date": rows.today(), **machine}
-    write_report(folder / "figures.json", {"figures": [f._asdict() for f in made], "run": run})
+    _list(folder / "figures.json", made, {"date": rows.today(), **machine})
     return made
+
+
+def read_list(path: Path) -> list[rows.Row]:
+    """Read the figures that runs have listed, each with its "run"; none where there is no list.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged.
+    """
+    if not path.exists():
+        return []
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))["figures"]
+        return [
+            {**Figure(**{k: f[k] for k in Figure._fields})._asdict(), "run": f["run"]}
+            for f in found
+        ]
+    except (ValueError, KeyError, TypeError):
+        raise ValueError(f"{path}: is damaged; delete it, and draw the figures again") from None
+
+
+def _list(path: Path, made: Sequence[Figure], run: rows.Row) -> None:
+    """List figures, with those of earlier runs that show something else."""
+    names = {figure.name for figure in made}
+    listed = [figure for figure in read_list(path) if figure["name"] not in names]
+    listed += [{**figure._asdict(), "run": run} for figure in made]
+    listed.sort(key=lambda figure: list(STUDIES).index(figure["name"]))
+    write_report(path, {"figures": listed})
 
 
 def _present(data: Path) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..atomic import replacing
 from ..color import to_coded
-from ..images import resampled
+from ..resampling import resampled
 from ..strips import joined, line
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..color import rgb_to_ycbcr
-from ..fitting import Fit, fit
+from ..fitting import fit
 from ..gaussians import Gaussians
 from ..growth import worth
 from ..levels import fit_levels, level_counts
@@ -18,6 +18,7 @@ from ..metrics import psnr
 from ..rendering import picture_of
 from .charts import new_figure
 from .table import Table, number, save_csv
+from .trial import whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,17 +78,12 @@ def measure(
     def told(done: int) -> None:
         progress("fits", done, len(counts) + 1)
 
-    def whole(fitted: Fit) -> Gaussians:
-        if fitted.stopped == "interrupted":  # fits keep what they have; that is no measurement
-            raise KeyboardInterrupt
-        return fitted.gaussians
-
     told(0)
-    nested = whole(fit_levels(image, gaussians, levels, **settings))
+    nested = whole(fit_levels(image, gaussians, levels, **settings)).gaussians
     told(1)
     alone = {}
     for done, count in enumerate(counts, 2):
-        alone[count] = whole(fit(image, count, **settings))
+        alone[count] = whole(fit(image, count, **settings)).gaussians
         told(done)
     plain = alone[gaussians]
     best = plain[np.argsort(-worth(plain, rgb_to_ycbcr(image)), kind="stable")]

@@ -71,16 +71,20 @@ def _course(fits: Sequence[Row]) -> dict[int, tuple[float, float]]:
     return {
         step: (
             float(np.median([m["seconds"] for m in moments])),
-            # The PSNR of equal images is null in the file.
-            float(np.mean([np.inf if (p := m["psnr_ycbcr"]) is None else p for m in moments])),
+            float(np.mean([_known(m["psnr_ycbcr"]) for m in moments])),
         )
         for step, moments in steps.items()
     }
 
 
+def _known(decibels: float | None) -> float:
+    """A fit that has failed, null in the file, is behind all others."""
+    return -np.inf if decibels is None else decibels
+
+
 def _of_cases(cells: Sequence[Row]) -> Iterator[Line]:
     ends = {
-        (row["job"]["case"], row["job"]["iterations"], row["job"]["seed"]): row["end_ycbcr"]
+        (row["job"]["case"], row["job"]["iterations"], row["job"]["seed"]): _known(row["end_ycbcr"])
         for row in cells
         if row["job"]["preset"] == "default"
     }

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from ..bases import load_basis
 from ..eigengs import EigenGS
 from ..gaussians import Gaussians
-from ..images import cropped, sample
-from ..metrics import psnr
+from ..images import sample
 from ..presets import PRESETS
 from ..rendering import CUTOFF, picture_of
-from ..starting import GAUSSIANS, begin
+from ..resampling import cropped
+from ..starting import GAUSSIANS, Start, begin
 from .rows import Job, Row
 from .sets import SETS, model_for, test_images
-from .trial import Moment, follow, judged
+from .trial import Moment, decibels, follow, judged, warm_up
 
 Image = NDArray[np.float32]
 
@@ -42,9 +42,6 @@ BITS, FLOATS = (8, 10, 12, 16), ("float16", "float32")
 
 WIDE = 6.0
 """Cutoff that stands for none in single precision: 1.5e-8 of an amplitude is left."""
-
-WARM_UP = 6
-"""Untimed steps before every variant, that compile its programs."""
 
 
 class Collection(NamedTuple):
@@ -163,8 +160,9 @@ def jobs(
 
 def _fitted(fit: Variant, image: Image, iterations: int, seed: int, backend: str | None) -> Row:
     """Run a variant once untimed, then once for every number of steps it is judged at."""
-    _last(fit, image, min(WARM_UP, iterations), seed, backend)
-    falls = PRESETS[fit.preset].schedule.decay < 1
+    schedule = PRESETS[fit.preset].schedule
+    warm_up(_start(fit, image, seed, backend), schedule, iterations, fit.cutoff)
+    falls = schedule.decay < 1
     marks = sorted({n for n in (HORIZONS if falls else MARKS) if n < iterations} | {iterations})
     runs = [(n, (n,)) for n in marks] if falls else [(iterations, tuple(marks))]
     trace, count = [], 0
@@ -175,7 +173,7 @@ def _fitted(fit: Variant, image: Image, iterations: int, seed: int, backend: str
             tails = picture_of(moment.gaussians, cutoff=WIDE) - picture_of(
                 moment.gaussians, cutoff=fit.cutoff
             )
-            wide = psnr(moment.picture + tails, image, "ycbcr")
+            wide = decibels(moment.picture + tails, image, "ycbcr")
             trace.append({**judged(moment, image), "psnr_wide": wide})
     return {"gaussians": count, "trace": trace}
 
@@ -183,12 +181,16 @@ def _fitted(fit: Variant, image: Image, iterations: int, seed: int, backend: str
 def _moments(
     fit: Variant, image: Image, steps: int, marks: Sequence[int], seed: int, backend: str | None
 ) -> Iterator[Moment]:
+    start, schedule = _start(fit, image, seed, backend), PRESETS[fit.preset].schedule
+    return follow(start, schedule, steps, marks, fit.cutoff)
+
+
+def _start(fit: Variant, image: Image, seed: int, backend: str | None) -> Callable[[], Start]:
     method = PRESETS[fit.preset]
     start = partial(
         begin, image, fit.gaussians, fit.init, fit.basis, method, fit.solve_steps, seed=seed
     )
-    begun = partial(start, cutoff=fit.cutoff, backend=backend)
-    return follow(begun, method.schedule, steps, marks, fit.cutoff)
+    return partial(start, cutoff=fit.cutoff, backend=backend)
 
 
 def _last(fit: Variant, image: Image, steps: int, seed: int, backend: str | None) -> Gaussians:
@@ -227,7 +229,7 @@ def stored(gaussians: Gaussians, image: Image, backend: str | None = None) -> li
             **kept, background=background, size=size, space=gaussians.space, backend=backend
         )
         picture, total = picture_of(again), math.ceil(weight) + background.nbytes
-        found = {f"psnr_{space}": psnr(picture, image, space) for space in ("ycbcr", "rgb")}
+        found = {f"psnr_{space}": decibels(picture, image, space) for space in ("ycbcr", "rgb")}
         rows.append({"precision": name, "bytes": total, **found})
     return rows
 
@@ -254,8 +256,8 @@ def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """
     best, kept = -math.inf, []
     known = [point for point in points if not any(map(math.isnan, point))]
-    for seconds, decibels in sorted(known, key=lambda point: (point[0], -point[1])):
-        if decibels > best:
-            best = decibels
-            kept.append((seconds, decibels))
+    for seconds, reached in sorted(known, key=lambda point: (point[0], -point[1])):
+        if reached > best:
+            best = reached
+            kept.append((seconds, reached))
     return kept

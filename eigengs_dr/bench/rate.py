@@ -14,13 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..fitting import fit
-from ..images import cropped, sample, to_8bit
-from ..metrics import psnr, ssim
+from ..images import sample, to_8bit
+from ..metrics import ssim
 from ..packing import pack
 from ..rendering import picture_of
+from ..resampling import cropped
 from .pareto import SAMPLE_NAMES, SAMPLE_SIDE, SAMPLES
 from .rows import Job, Row
 from .sets import test_images
+from .trial import decibels, whole
 
 Image = NDArray[np.float32]
 
@@ -110,16 +112,16 @@ def _packed(
 ) -> Row:
     """Fit, pack, and look at what the file holds."""
     made = partial(fit, image, count, seed=seed, backend=backend)
-    made(iterations=min(WARM_UP, iterations))
+    whole(made(iterations=min(WARM_UP, iterations)))
     started = time.perf_counter()
-    fitted = made(iterations=iterations)
+    fitted = whole(made(iterations=iterations))
     between = time.perf_counter()
     with TemporaryDirectory() as folder:
         receipt = pack(fitted.gaussians, Path(folder) / "fit.egs", image, budget)
     seconds = {
         "seconds": time.perf_counter() - started,
         "fit_seconds": between - started,
-        "unpacked_rgb": psnr(fitted.image, image, "rgb"),
+        "unpacked_rgb": decibels(fitted.image, image, "rgb"),
     }
     return {"points": [_point(count, receipt.bytes, picture_of(receipt.gaussians), image, seconds)]}
 
@@ -146,8 +148,8 @@ def _point(
         "setting": setting,
         "bytes": size,
         "bits_per_pixel": 8 * size / (image.shape[0] * image.shape[1]),
-        "psnr_rgb": psnr(shown, image, "rgb"),
-        "psnr_ycbcr": psnr(shown, image, "ycbcr"),
+        "psnr_rgb": decibels(shown, image, "rgb"),
+        "psnr_ycbcr": decibels(shown, image, "ycbcr"),
         "ssim": ssim(shown, image),
         **more,
     }

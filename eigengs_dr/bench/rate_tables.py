@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .budget_tables import smallest
 from .charts import new_figure
 from .rate import CODECS, OURS
 from .rows import Row
@@ -50,13 +50,12 @@ def rate_at(curve: Curve, level: float) -> float:
     Between the first two neighbours, by their bits, that have the PSNR between them; NaN where the
     curve does not reach it.
     """
-    points = sorted((p["bits_per_pixel"], p["psnr_rgb"]) for p in curve)
-    known = [(bits, decibels) for bits, decibels in points if decibels is not None]
-    for (few, low), (many, high) in pairwise(known):
-        if low <= level <= high:
-            share = (level - low) / (high - low) if high > low else 0.0
-            return math.exp(math.log(few) + share * (math.log(many) - math.log(few)))
-    return math.nan
+    return smallest({p["bits_per_pixel"]: _known(p["psnr_rgb"]) for p in curve}, level)
+
+
+def _known(value: float | None) -> float:
+    """A figure of a picture; NaN, null in the file, where a fit has failed."""
+    return math.nan if value is None else value
 
 
 def tables(rows: list[Row]) -> list[Table]:
@@ -127,7 +126,10 @@ def chart(rows: list[Row], name: str) -> Figure:
             # Fits have other numbers of splats on images of other sizes: the n-th are one point.
             settings = zip(*of_image.values(), strict=True)
             means = [
-                [float(np.mean([p[key] for p in points])) for key in ("bits_per_pixel", what)]
+                [
+                    float(np.mean([_known(p[key]) for p in points]))
+                    for key in ("bits_per_pixel", what)
+                ]
                 for points in settings
             ]
             color, style = STYLES[title]

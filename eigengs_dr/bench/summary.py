@@ -10,7 +10,7 @@ import numpy as np
 from .paper import ABLATION, PRINTED
 from .rows import Row
 from .sets import SETS, UNIVERSAL
-from .table import MISSING, Table, median, number, spread
+from .table import MISSING, Table, mean, median, number, spread
 from .tables import PAPERS_COMPONENTS, Method, methods
 from .trial import ITERATIONS
 
@@ -23,7 +23,7 @@ LINES = {
     "ssim": "SSIM",
     "ms_ssim": "MS-SSIM",
     "seconds": "seconds",
-    **{str(limit): f"% above {limit} dB" for limit in THRESHOLDS},
+    **{str(limit): f"% above {limit} dB YCbCr" for limit in THRESHOLDS},
 }
 """Lines of a method: their names by the keys of moments, and by thresholds."""
 
@@ -78,22 +78,19 @@ def _glance(iterations: int, groups: dict[tuple[str, int], list[Row]]) -> Table:
     for (name, length), group in groups.items():
         fits = by_method(group) if length == iterations else {}
         for method in (m for m in methods(name, "main", list(SETS)) if m in fits):
-            means = (_mean(_moments(fits[method], step), "psnr_ycbcr") for step in steps)
+            moments = (_moments(fits[method], step) for step in steps)
+            means = (mean([m["psnr_ycbcr"] for m in some]) for some in moments)
             seconds = _seconds(_moments(fits[method], iterations))
-            lines.append((name, label(method, name), *means, seconds))
+            images = str(len(fits[method]))
+            lines.append((name, label(method, name), images, *means, seconds))
     caption = f"PSNR YCbCr / dB by steps, means over images, and seconds of {iterations:,} steps"
-    return Table(caption, ("set", "method", *(f"{s:,}" for s in steps), "seconds"), lines)
+    return Table(caption, ("set", "method", "images", *(f"{s:,}" for s in steps), "seconds"), lines)
 
 
 def _seconds(moments: Sequence[Row]) -> str:
     """Median of the time, to the millisecond where it is short."""
     taken = [moment["seconds"] for moment in moments]
     return median(taken, 3 if taken and max(taken) < 0.1 else 2)
-
-
-def _mean(moments: Sequence[Row], figure: str) -> str:
-    known = [moment[figure] for moment in moments if moment[figure] is not None]
-    return number(float(np.mean(known))) if known else MISSING
 
 
 def by_set(rows: Iterable[Row]) -> list[tuple[tuple[str, int], list[Row]]]:
@@ -144,8 +141,7 @@ def _cell(line: str, moments: Sequence[Row]) -> str:
     if line == "seconds":
         return _seconds(moments)
     if line in map(str, THRESHOLDS):
-        # The PSNR of equal images is null in the file.
-        above = [m["psnr_ycbcr"] is None or m["psnr_ycbcr"] > float(line) for m in moments]
+        above = [(m["psnr_ycbcr"] or 0) > float(line) for m in moments]
         return number(100 * float(np.mean(above)), 0)
     return spread([moment[line] for moment in moments], 3 if "ssim" in line else 1)
 

@@ -41,13 +41,29 @@ def number(value: float | None, decimals: int = 1) -> str:
     return f"{value:,.{decimals}f}"
 
 
+def mean(values: Sequence[float | None], decimals: int = 1) -> str:
+    """Write the mean of figures.
+
+    None and what is not finite are of fits that have failed: the cell tells how many, "46.3 (2
+    failed)".
+    """
+    known, failed = _known(values)
+    return (number(float(np.mean(known)), decimals) if known else MISSING) + failed
+
+
 def spread(values: Sequence[float | None], decimals: int = 1) -> str:
-    """Write mean and standard deviation of the figures that are there, "46.3 ± 2.1"."""
+    """Write mean and standard deviation (of a sample) of figures, "46.3 ± 2.1"; see `mean`."""
+    known, failed = _known(values)
+    if len(known) < 2:
+        return mean(values, decimals)
+    deviation = number(float(np.std(known, ddof=1)), decimals)
+    return f"{number(float(np.mean(known)), decimals)} ± {deviation}{failed}"
+
+
+def _known(values: Sequence[float | None]) -> tuple[list[float], str]:
+    """Figures that are there, and how many are not."""
     known = [value for value in values if value is not None and math.isfinite(value)]
-    if not known:
-        return MISSING
-    mean = number(float(np.mean(known)), decimals)
-    return f"{mean} ± {number(float(np.std(known)), decimals)}" if len(known) > 1 else mean
+    return known, f" ({len(values) - len(known)} failed)" if len(known) < len(values) else ""
 
 
 def median(values: Sequence[float], decimals: int = 2) -> str:

@@ -7,6 +7,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..descent import LONG
 from ..eigengs import EigenGS
 from ..metrics import psnr
 from ..presets import PRESETS
@@ -14,7 +15,7 @@ from ..starting import Start, begin
 from . import rows
 from .rows import Job, Row
 from .sets import SETS, UNIVERSAL, Image, ImageSet, model_for, test_images
-from .trial import ITERATIONS, follow, judged
+from .trial import ITERATIONS, follow, judged, warm_up
 
 TABLES = ("main", "ablation", "cross", "reach")
 """What is measured: the methods; colour spaces and the split; bases of other sets; and how soon
@@ -25,9 +26,6 @@ PAPERS_COMPONENTS = (300, 500)
 
 OTHERS = {"faces256": "cats256", "cats256": "faces256"}
 """The sets that lend each other their basis."""
-
-WARM_UP = 3
-"""Steps of a method before its first measurement, which compile its programs."""
 
 SOLVE_STEPS = (1, 2, 3, 5, 10)
 """Depths of the colour solve that are tried for the earliest start that is good enough."""
@@ -202,8 +200,7 @@ def _preparation(
                 backend=backend,
             )
 
-        schedule = PRESETS[method.preset].schedule
-        list(follow(lambda: start(picture, 0), schedule, WARM_UP, (0, WARM_UP)))
+        warm_up(lambda: start(picture, 0), PRESETS[method.preset].schedule, LONG)
         return start
 
     return ready

@@ -15,6 +15,7 @@ from ..fitting import fit
 from ..images import sample
 from ..refine import Progress
 from ..rendering import picture_of, render
+from .trial import whole
 
 SIDE, TEXELS, SPP = 512, 1024, 16
 """Of the picture, of the bitmap, and samples a pixel."""
@@ -59,7 +60,7 @@ def run(variant: str = "llvm_ad_rgb", progress: Progress | None = None) -> dict[
     picture = sample("coffee")[:400, 100:500]
     sets = {}
     for count in COUNTS:
-        sets[count] = fit(picture, count, STEPS).gaussians
+        sets[count] = whole(fit(picture, count, STEPS)).gaussians
         if progress:
             progress(len(sets), len(COUNTS) + WARM_UP + ROUNDS, {})
     coded = np.clip(picture_of(sets[SETTLED], TEXELS, TEXELS), 0, 1)

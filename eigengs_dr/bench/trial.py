@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterator
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeVar
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..descent import Schedule, descend
+from ..descent import LONG, Schedule, descend
+from ..fitting import Fit
 from ..gaussians import Gaussians
 from ..metrics import ms_ssim, psnr, ssim
+from ..refine import EXACT, Refined
 from ..rendering import CUTOFF, picture_of
 from ..starting import Start
 
 Image = NDArray[np.float32]
+
+Fitted = TypeVar("Fitted", Fit, Refined)
 
 ITERATIONS = (0, 10, 100, 500, 1000, 5000, 10000)
 """Where the paper's tables look, and 0 and 10 beside."""
@@ -82,13 +87,42 @@ def follow(
         resumed = time.perf_counter()
 
 
+def warm_up(
+    begin: Callable[[], Start], schedule: Schedule, iterations: int, cutoff: float = CUTOFF
+) -> None:
+    """Compile what a descent of so many steps runs, splats placed anew included.
+
+    Parameters are those of `follow`.
+    """
+    steps = min(LONG, iterations)
+    list(follow(begin, replace(schedule, rearrange=1), steps, (0, steps), cutoff))
+
+
+def whole(fitted: Fitted) -> Fitted:
+    """Return a fit that was not broken off: what is kept on Ctrl-C is no measurement.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If it was.
+    """
+    if fitted.stopped == "interrupted":
+        raise KeyboardInterrupt
+    return fitted
+
+
+def decibels(picture: Image, image: Image, space: str) -> float:
+    """Return a PSNR, at most `EXACT`: what is not finite in a row is of a fit that has failed."""
+    return min(psnr(picture, image, space), EXACT)
+
+
 def judged(moment: Moment, image: Image) -> dict[str, Any]:
     """Turn a moment into a row: iteration, seconds, psnr_ycbcr, psnr_rgb, ssim, ms_ssim."""
     return {
         "iteration": moment.iteration,
         "seconds": moment.seconds,
-        "psnr_ycbcr": psnr(moment.picture, image, "ycbcr"),
-        "psnr_rgb": psnr(moment.picture, image, "rgb"),
+        "psnr_ycbcr": decibels(moment.picture, image, "ycbcr"),
+        "psnr_rgb": decibels(moment.picture, image, "rgb"),
         "ssim": ssim(moment.picture, image),
         "ms_ssim": ms_ssim(moment.picture, image),
     }
