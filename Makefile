@@ -31,7 +31,7 @@ help:
 	@echo "make test       linters, type checker, tests"
 	@echo "make test-slow  the tests that take minutes"
 	@echo "make bench      time the renderer"
-	@echo "make report     measure all and write docs/results, in half an hour; goes on after a break"
+	@echo "make report     measure a part of all and write docs/results, in half an hour; goes on after a break"
 	@echo "make basis      train the basis that ships, again"
 	@echo "make setup      only set up .venv, and libLLVM where none works"
 	@echo "make clean      remove what these made"
@@ -72,7 +72,8 @@ bench: $(READY)
 	@mkdir -p build/bench
 	$(BIN)/eigengs-dr bench kernels --report build/bench/kernels.json
 
-# The page shows all that is in build/report: measure more with the same commands, then make again.
+# The page shows all that is in build/report. To show more, run these commands with more images, sets
+# or steps, and 'bench budget' and 'bench rate', then the last one.
 report: $(READY)
 	@mkdir -p $(RESULTS)
 	$(BIN)/eigengs-dr bench stability -o $(RESULTS)

@@ -201,7 +201,9 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> Packed:
 
 def _check_header(space: int, channels: int, levels: int, count: int, steps: Steps) -> None:
     """Refuse what `to_bytes` does not write; size and values are checked with all sets."""
-    if space >= len(SPACES) or not 1 <= channels <= MOST_CHANNELS or levels > MOST_LEVELS:
+    if not 1 <= channels <= MOST_CHANNELS:
+        raise BadValue(f"the header claims {channels} channels, expected 1 to {MOST_CHANNELS}")
+    if space >= len(SPACES) or levels > MOST_LEVELS:
         raise BadValue("the header holds values that are not known; upgrade eigengs-dr")
     if not 1 <= count <= MOST_SECTIONS:
         raise BadValue(f"the header claims {count} sections, expected 1 to {MOST_SECTIONS}")

@@ -68,7 +68,7 @@ def usual_count(pixels: int) -> int:
 
 def dark_weight(light: NDArray[np.float32]) -> NDArray[np.float32]:
     """What errors of linear light are multiplied by before they are squared; see `DARKNESS`."""
-    return np.maximum(light, BLACK) ** -DARKNESS
+    return np.asarray(np.maximum(light, BLACK) ** -DARKNESS, np.float32)
 
 
 def begin(

@@ -292,7 +292,7 @@ def test_progress_counts_up_to_its_total():
 
 def test_interrupted_while_it_settles_it_keeps_the_best():
     """By an error, as in a thread or at a second Ctrl-C, as well as by the question."""
-    whole = fit(picture(), target_psnr=28, iterations=60)
+    whole = fit(picture(), target_psnr=28, iterations=200)
     assert whole.stopped == "met"
     best = [row["gaussians"] for row in whole.trace if row["psnr_ycbcr"] >= 28]
 
@@ -300,7 +300,7 @@ def test_interrupted_while_it_settles_it_keeps_the_best():
         if row["psnr_ycbcr"] >= 28:  # the search has met its goal, and settles
             raise KeyboardInterrupt
 
-    found = fit(picture(), target_psnr=28, iterations=60, progress=press)
+    found = fit(picture(), target_psnr=28, iterations=200, progress=press)
     assert found.stopped == "interrupted"
     assert found.iterations < whole.iterations
     assert len(found.gaussians) == best[0]

@@ -284,9 +284,8 @@ HOSTILE = {
     "newer": (header(version=2) + body(), "version is 2"),
     "version 0": (header(version=0) + body(), "version is 0"),
     "another space": (header(space=9) + body(), "not known"),
-    "no channels": (header(channels=0) + body(), "not known"),
-    "more channels": (header(channels=40) + body(), "claims 24 splats"),
-    "too many channels": (header(channels=65) + body(), "values that are not known"),
+    "no channels": (header(channels=0) + body(), "claims 0 channels"),
+    "more channels": (header(channels=64) + body(), "does not begin as one"),
     "65 channels": (
         header(channels=65, space=3) + body(data=ways() + 62 * ZEROS),
         "65 channels",

@@ -123,13 +123,18 @@ def smallest(curve: Mapping[Any, float], target: float) -> float:
 def gains(rows: Sequence[Row]) -> dict[str, list[tuple[Row, Row]]]:
     """Pairs of fits of one number, placed once and placed anew, by set.
 
-    The number is that which most images of a set have such pairs of.
+    The number is that which most images of a set have such pairs of, but not for a search.
     """
     fits = {_key(row): row for row in rows if "rearranged" in row["job"]}
+    found = {
+        (row["job"]["set"], row["job"]["image"], row["gaussians"])
+        for row in rows
+        if "target" in row["job"]
+    }
     pairs: dict[str, dict[int, list[tuple[Row, Row]]]] = {}
     for (name, image, count, rearranged), anew in fits.items():
         once = fits.get((name, image, count, False))
-        if rearranged and once is not None:
+        if rearranged and once is not None and (name, image, count) not in found:
             pairs.setdefault(name, {}).setdefault(count, []).append((once, anew))
     return {
         name: max(counts.items(), key=lambda item: (len(item[1]), item[0]))[1]
