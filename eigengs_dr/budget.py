@@ -25,6 +25,9 @@ from .starting import Start
 TRY, FIT, SETTLE = 0.1, 0.4, 0.15
 """Shares of the iterations that a try takes, the fit, and each descent that settles."""
 
+LENGTH = 2
+"""Times the iterations that a search takes at most, if these are not few (some ten)."""
+
 TRIES, SETTLING = 4, 4
 """Most tries, and descents to settle after which a goal that is met is settled enough."""
 
@@ -102,7 +105,10 @@ def fewest(
     try:
         placed = _estimated(run, most, tries)
         if run.best.missing > 0 or len(run.best.gaussians) > 1:
-            _settle(run, _fitted(run, placed, most, fit), most, settle)
+            trial = _fitted(run, placed, most, fit)
+            # Of few iterations the tries have taken all.
+            most_steps = max(LENGTH * iterations, run.step + SETTLING * settle)
+            _settle(run, trial, most, settle, most_steps)
         pressed = interrupted()
     except KeyboardInterrupt:
         pressed = True
@@ -206,11 +212,14 @@ def _times(count: int, missing: float, most: int) -> int:
     return min(most, max(1, round(count * 2**octaves)))
 
 
-def _settle(run: _Run, trial: _Trial, most: int, steps: int) -> None:
-    """Drop splats while the goal is met, add some while it is not; `run` keeps the best set."""
+def _settle(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) -> None:
+    """Drop splats while the goal is met, add some while it is not; `run` keeps the best set.
+
+    Where few splats find a place, there would be no end: the steps of the search are limited.
+    """
     target, weight = run.start.target, run.start.weight
     least_growth, rounds = 1.02, 0
-    while not run.interrupted():
+    while run.step + steps <= most_steps and not run.interrupted():
         count, found = len(trial.gaussians), run.best
         if found.missing <= 0 and rounds >= SETTLING:
             return

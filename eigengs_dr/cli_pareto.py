@@ -79,11 +79,13 @@ def pareto(
         jobs = [job for c in collections for job in benchmark.jobs(c, iterations, seed, backend)]
         jobs.append(kernel_job(backend))
         rows = measure(lines, jobs, described(context, backend), partial(show, "pareto"))
+    settings = {"iterations": iterations, "seed": seed}
+    same = [row for row in read(lines) if settings.items() <= row["job"].items()]
     for name, path in points.items():
         drawn = laid.points(rows, name)
         laid.save_points(path, drawn)
         save_figure(drawings[name], charts.set_chart(drawn, name))
-    save_figure(drawings["storage"], charts.storage_chart(read(lines)))
+    save_figure(drawings["storage"], charts.storage_chart(same))
     save_figure(drawings["kernels"], charts.kernels_chart(rows[-1]["kernels"]))
     if not quiet:
         click.echo("\n\n".join(map(as_text, laid.tables(rows))))

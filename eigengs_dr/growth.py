@@ -18,6 +18,9 @@ Array = NDArray[np.floating]
 SIZES = (0.2, 0.35, 0.6, 1.0, 1.6)
 """Standard deviations of splats that are tried where one is added, in distances of splats."""
 
+REACH = 3.0
+"""Standard deviations within which residuals are blurred."""
+
 APART = 1.5
 """How far, in its standard deviations, a splat that is added keeps others away."""
 
@@ -67,10 +70,13 @@ def pruned(
 ) -> Gaussians:
     """Keep the `count` splats that are worth the most, in their order, and solve for the colours.
 
-    Parameters are those of `worth`.
+    Parameters are those of `worth`. With a weight colours stay: those that are solved for minimise
+    the error without it.
     """
     value = worth(gaussians, target, weight, cutoff)
     kept = np.sort(np.argsort(-value, kind="stable")[:count])
+    if weight is not None:
+        return gaussians[kept]
     return solve(gaussians[kept], target, SOLVE_STEPS, cutoff, warm_start=True).gaussians
 
 
@@ -108,9 +114,11 @@ def places(
     """Find where round splats would take most from a squared error.
 
     A splat ``w`` with the best colour ``<w, r> / <w, w>`` takes ``<w, r>^2 / <w, w>``. With b, the
-    residual r blurred by its standard deviation s, that is a colour of 2 b and a gain of
-    ``4 pi s^2 b^2``. Maxima of that over places and `SIZES` are taken in turn, the largest first,
-    none nearer to one already taken than `APART`.
+    residual r blurred by its standard deviation s, ``<w, r> = S^2 b`` and ``<w, w> = T^2``, where
+    ``S = sum_k exp(-k^2 / (2 s^2))`` and ``T = sum_k exp(-k^2 / s^2)`` over the pixels k away along
+    an axis; for large s that is a colour of 2 b and a gain of ``4 pi s^2 b^2``. Maxima of the gain
+    over places and `SIZES` are taken in turn, the largest first, none nearer to one already taken
+    than `APART`.
 
     Parameters
     ----------
@@ -157,12 +165,16 @@ def _best_sizes(missed: Array, spacing: float, weight: Array | None) -> tuple[Ar
     gain = np.zeros(missed.shape[:2])
     size, color = np.full(gain.shape, spacing), np.zeros(missed.shape)
     for deviation in (s * spacing for s in SIZES):
-        blur = gaussian_filter(missed, (deviation, deviation, 0), mode="constant", truncate=3)
-        own = 4 * math.pi * deviation**2 * (np.square(blur) * counts).sum(axis=2)
+        blur = gaussian_filter(missed, (deviation, deviation, 0), mode="constant", truncate=REACH)
+        radius = int(REACH * deviation + 0.5)  # that of the filter
+        away = np.arange(-radius, radius + 1)
+        taps = np.exp(-0.5 * np.square(away / deviation))
+        projected, own_square = taps.sum() ** 2, np.square(taps).sum() ** 2
+        own = projected**2 / own_square * (np.square(blur) * counts).sum(axis=2)
         better = own > gain
         gain = np.where(better, own, gain)
         size = np.where(better, deviation, size)
-        color = np.where(better[..., None], 2 * blur, color)
+        color = np.where(better[..., None], projected / own_square * blur, color)
     return gain, size, color
 
 

@@ -187,7 +187,7 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> Packed:
     found: list[Symbols] = []
     for number in range(1, (wanted or count) + 1):
         body, splats = _section(file, size, number, 4 + channels)
-        room = MOST_ENTRIES // (4 + channels) - sum(len(section.mean) for section in found)
+        room = MOST_ENTRIES // max(3, channels) - sum(len(section.mean) for section in found)
         if splats > room:
             raise BadValue(f"section {number} claims {splats} splats, more than may be read")
         try:

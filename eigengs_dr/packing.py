@@ -54,6 +54,8 @@ SEARCH = 4
 """Halvings of the interval of the common factor, of which the ends differ by a root of 2: the last
 one is worth 0.04 bits a number."""
 
+TOO_FINE = "pack: no rounding is fine enough for the budget; allow more dB"
+
 _Found = tuple[Packed, float]
 
 
@@ -102,14 +104,13 @@ def pack(
         The image that the set was fitted to, as `fit` takes it. By default the rendering of the
         set.
     budget : float, optional
-        Decibels of PSNR that the whole set may lose, above 0 and at most 100: against the image, in
+        Decibels of PSNR that may be lost, above 0 and at most 100: against the image, in
         the space of the set (psnr_ycbcr where that is YCbCr; light is coded as sRGB), at its native
         size. Without the image, what a set of 40 dB loses where the errors add.
     sections : sequence of int, optional
         Numbers of splats in each part of the file, in the order of the set; readers may stop after
-        any of them. By default all in one. Inside a section splats lie in the order of the curve,
-        and what is rounded later makes up for earlier sections: these may lose more than the whole
-        set, in our tests up to 3 dB for a budget of 1.
+        any of them, and the budget holds for what they have then. By default all in one. Inside a
+        section splats lie in the order of the curve.
     cutoff : float, optional
         See `eigengs_dr.render`.
 
@@ -138,14 +139,26 @@ def pack(
     # The best light for an image is not the best picture: a set that has found it is kept.
     keeps = image is None or gaussians.space == "linear"
     target = _planes_of(gaussians, cutoff) if keeps else shown
-    before = UNSEEN if image is None else _error(gaussians, shown, cutoff)
-    limit = max(before, FINEST) * 10 ** (budget / 10) - (UNSEEN if image is None else 0)
+    unseen = UNSEEN if image is None else 0
+
+    def errors(found: Gaussians) -> list[float]:
+        parts = [*(found[: r.stop] for r in rows[:-1]), found]
+        return [_error(part, shown, cutoff) for part in parts]
+
+    before = [max(error + unseen, FINEST) for error in errors(gaussians)]
+    limits = [error * 10 ** (budget / 10) - unseen for error in before]
+    if min(limits) <= 0:
+        raise ValueError(TOO_FINE)
 
     def attempt(steps: Steps) -> _Found:
         packed = rounded(gaussians, target, steps, rows, cutoff)
-        return packed, _error(set_of(packed, gaussians), shown, cutoff)
+        after = zip(errors(set_of(packed, gaussians)), limits, strict=True)
+        # Of all that a reader may stop at the worst counts, on the scale of the whole.
+        return packed, max(error * (limits[-1] / limit) for error, limit in after)
 
-    packed, error = _search(attempt, _balanced(attempt, gaussians, limit, before), limit)
+    start = _balanced(attempt, gaussians, limits[-1])
+    packed, _ = _search(attempt, start, limits[-1])
+    error = errors(set_of(packed, gaussians))[-1]
     content = to_bytes(packed)
     write(path, content)
     return Receipt(
@@ -153,14 +166,12 @@ def pack(
         bytes=len(content),
         bits_per_pixel=8 * len(content) / (gaussians.width * gaussians.height),
         psnr=decibels(error),
-        lost=decibels(max(before, FINEST)) - decibels(error + (UNSEEN if image is None else 0)),
+        lost=decibels(before[-1]) - decibels(error + unseen),
         steps=packed.steps,
     )
 
 
-def _balanced(
-    attempt: Callable[[Steps], _Found], gaussians: Gaussians, limit: float, before: float
-) -> Steps:
+def _balanced(attempt: Callable[[Steps], _Found], gaussians: Gaussians, limit: float) -> Steps:
     """Steps of equal marginal cost whose errors, were they squares, would reach the limit."""
     arrays = gaussians.to_arrays()
     size = sizes_of(shapes_of(arrays["factor"]))
@@ -190,7 +201,7 @@ def _search(attempt: Callable[[Steps], _Found], steps: Steps, limit: float) -> _
         while best[1] > limit:
             power -= 0.5
             if power < -12:
-                raise ValueError("pack: no rounding is fine enough for the budget; allow more dB")
+                raise ValueError(TOO_FINE)
             best = scaled(power)
     for k in range(SEARCH):
         tried = scaled(power + 0.5 ** (k + 2))

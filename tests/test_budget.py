@@ -210,13 +210,14 @@ def test_grown_adds_where_the_error_is():
     assert squared_error(result, target) < 0.2 * squared_error(empty, target)
 
 
-def test_gain_of_a_place_is_what_a_splat_takes():
-    """For a residual that is one round splat of a tried size, b = c / 2 at its centre."""
+@pytest.mark.parametrize("deviation", [6.0, 1.5, 0.6])
+def test_gain_of_a_place_is_what_a_splat_takes(deviation):
+    """Of a residual that is one round splat of a tried size, also where it is below a pixel."""
     y, x = np.indices((64, 64)) + 0.5
-    splat = 0.7 * np.exp(-((x - 32.5) ** 2 + (y - 30.5) ** 2) / (2 * 6.0**2))
-    mean, size, color = places(splat[..., None], 1, 6.0)
+    splat = 0.7 * np.exp(-((x - 32.5) ** 2 + (y - 30.5) ** 2) / (2 * deviation**2))
+    mean, size, color = places(splat[..., None], 1, deviation)
     np.testing.assert_allclose(mean, [[32.5, 30.5]])
-    np.testing.assert_allclose(size, [6.0])
+    np.testing.assert_allclose(size, [deviation])
     np.testing.assert_allclose(color, [[0.7]], rtol=0.01)
 
 
@@ -291,7 +292,7 @@ def test_progress_counts_up_to_its_total():
 
 
 def test_interrupted_while_it_settles_it_keeps_the_best():
-    """By an error, as in a thread or at a second Ctrl-C, as well as by the question."""
+    """Also by an error, as in a thread or at a second Ctrl-C."""
     whole = fit(picture(), target_psnr=28, iterations=200)
     assert whole.stopped == "met"
     best = [row["gaussians"] for row in whole.trace if row["psnr_ycbcr"] >= 28]
@@ -326,12 +327,38 @@ def test_interrupted_it_returns_what_there_is():
     assert len(result.gaussians) <= 100
 
 
+def test_a_search_whose_goal_is_not_met_ends():
+    """Where every round adds a splat or two, by the steps that it has taken."""
+    start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    result = fewest(
+        start,
+        lambda gaussians: {"decibels": 18.0},
+        "decibels",
+        20.0,
+        10**5,
+        PRESETS["default"].schedule,
+        40,
+    )
+    assert result.stopped == "out of reach" and result.iterations <= 80
+
+
+def test_a_weight_leaves_colours_as_they_are():
+    start, target = fitted(60)
+    gaussians, weight = start.gaussians, np.ones_like(target)
+    kept = pruned(gaussians, target, 30, weight)
+    value = worth(gaussians, target, weight)
+    best = np.sort(np.argsort(-value, kind="stable")[:30])
+    np.testing.assert_array_equal(kept.to_arrays()["color"], gaussians[best].to_arrays()["color"])
+
+
 def test_a_search_ends_where_no_place_is_left_to_grow(monkeypatch):
     start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
-    monkeypatch.setattr(budget, "grown", lambda gaussians, *rest: gaussians)
+    asked = []
+    monkeypatch.setattr(budget, "grown", lambda gaussians, *rest: asked.append(1) or gaussians)
     schedule = PRESETS["default"].schedule
-    result = fewest(start, lambda g: {"decibels": 18.0}, "decibels", 20.0, 1000, schedule, 10)
+    result = fewest(start, lambda g: {"decibels": 18.0}, "decibels", 20.0, 1000, schedule, 40)
     assert result.stopped == "out of reach"
+    assert len(asked) == 1
 
 
 @pytest.mark.parametrize(

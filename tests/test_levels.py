@@ -16,6 +16,7 @@ from eigengs_dr.color import rgb_to_ycbcr
 from eigengs_dr.descent import first
 from eigengs_dr.growth import worth
 from eigengs_dr.levels import fit_levels, level_counts
+from eigengs_dr.packing import UNSEEN
 from eigengs_dr.presets import PRESETS
 from eigengs_dr.rendering import picture_of, render
 from eigengs_dr.starting import begin
@@ -118,8 +119,25 @@ def test_packed_levels_are_read_one_by_one(image, result, tmp_path):
     for k, count in enumerate(counts, 1):
         part = eg.Gaussians.load(tmp_path / "a.egs", sections=k)
         assert len(part) == count
-        assert reached(part, image) > reached(result.gaussians[:count], image) - 3
-    assert receipt.lost <= 1.0
+        lost = reached(result.gaussians[:count], image) - reached(part, image)
+        assert lost <= 1.0 + 1e-3
+    assert receipt.lost == pytest.approx(lost, abs=1e-3)
+    assert receipt.lost > 0.3
+    plain = eg.pack(result.gaussians, tmp_path / "b.egs", image, 1.0)
+    assert plain.bytes < receipt.bytes < 1.5 * plain.bytes
+
+
+def test_packed_levels_without_an_image_keep_what_they_have_of_the_whole(result, tmp_path):
+    counts = level_counts(256, 3)
+    eg.pack(result.gaussians, tmp_path / "a.egs", None, 0.5, np.diff(counts, prepend=0).tolist())
+    whole = rgb_to_ycbcr(picture_of(result.gaussians))
+
+    def error(part):
+        return np.square(rgb_to_ycbcr(picture_of(part)) - whole).mean() + UNSEEN
+
+    for k, count in enumerate(counts, 1):
+        part = eg.Gaussians.load(tmp_path / "a.egs", sections=k)
+        assert error(part) <= 1.001 * 10**0.05 * error(result.gaussians[:count])
 
 
 def run(*arguments):

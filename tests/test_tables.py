@@ -256,6 +256,24 @@ def test_a_goal_above_the_start_is_reached_by_descent(backend):
     assert tables._reach(start, image, goal) == {"share": None}
 
 
+@pytest.mark.parametrize(("iterations", "anew"), [(1000, [10]), (3, [])])
+def test_programs_are_compiled_for_splats_placed_anew_where_a_run_places_them(
+    backend, iterations, anew
+):
+    placed = begin(family(1, seed=3)[0], 10, "auto", "natural", PRESETS["default"], backend=backend)
+    counts = []
+
+    def rearrange(gaussians, count):
+        counts.append(count)
+        return gaussians
+
+    def start():
+        return placed._replace(rearrange=rearrange)
+
+    trial.warm_up(start, PRESETS["default"].schedule, iterations)
+    assert counts == anew
+
+
 def moment(iteration, value, **others):
     rgb = None if value is None else value - 6
     figures = {"psnr_ycbcr": value, "psnr_rgb": rgb, "ssim": 0.5, "ms_ssim": 0.75}
@@ -353,7 +371,10 @@ def test_a_fit_that_has_failed_is_behind():
         row("a", [moment(100, value)], preset=preset, iterations=100)
         for preset, value in (("default", None), ("gaussianimage", 9.0), ("eigengs", None))
     ]
-    assert [line[2] for line in losses.table(fits, []).rows] == ["gaussianimage"] * 2
+    found = losses.table(fits, []).rows
+    assert [line[2:] for line in found] == [("gaussianimage", "9.0", "failed")] * 2
+    early = [moment(0, None, seconds=0.5), moment(100, None)]
+    assert not losses.table([fits[0], row("a", early, preset="eigengs", iterations=100)], []).rows
     cells = [cell("noise", "default", None), cell("noise", "eigengs", 9.0)]
     assert [line[2] for line in losses.table([], cells).rows] == ["eigengs"]
 

@@ -101,6 +101,7 @@ def run(
         charts.new_figure(1, 1)  # asked for now, not after minutes
     folder.mkdir(parents=True, exist_ok=True)
     require_writable(folder / "figures.json")
+    read_list(folder / "figures.json")  # if it is damaged, not told after minutes
     task = Task(
         folder, data or Path(), present, machine, iterations, images, seed, backend, progress
     )

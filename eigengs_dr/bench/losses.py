@@ -50,15 +50,15 @@ def _of_set(name: str, iterations: int, rows: Sequence[Row]) -> Iterator[Line]:
         if {row["job"]["image"] for row in fits[method]} != images:
             continue
         course, said = _course(fits[method]), (f"{name}, {iterations:,} steps", label(method, name))
-        early = [psnr for seconds, psnr in course.values() if seconds < first]
+        early = [psnr for seconds, psnr in course.values() if seconds < first and psnr > -np.inf]
         if early:
             yield said[0], f"until {number(first, 3)} s", said[1], number(max(early)), MISSING
         for step, (seconds, theirs) in course.items():
             if theirs > ours[step][1]:
-                yield said[0], f"{step:,} steps", said[1], number(theirs), number(ours[step][1])
+                yield said[0], f"{step:,} steps", said[1], number(theirs), _told(ours[step][1])
             reached = [psnr for taken, psnr in ours.values() if taken <= seconds]
             if reached and theirs > max(reached):
-                best = number(max(reached))
+                best = _told(max(reached))
                 yield said[0], f"{number(seconds, 3)} s", said[1], number(theirs), best
 
 
@@ -82,6 +82,10 @@ def _known(decibels: float | None) -> float:
     return -np.inf if decibels is None else decibels
 
 
+def _told(decibels: float) -> str:
+    return number(decibels) if decibels > -np.inf else "failed"
+
+
 def _of_cases(cells: Sequence[Row]) -> Iterator[Line]:
     ends = {
         (row["job"]["case"], row["job"]["iterations"], row["job"]["seed"]): _known(row["end_ycbcr"])
@@ -94,4 +98,4 @@ def _of_cases(cells: Sequence[Row]) -> Iterator[Line]:
         theirs = row.get("end_ycbcr")  # a preset that cannot run has none
         if ours is not None and theirs is not None and theirs > ours:
             steps = f"{job['iterations']:,} steps"
-            yield f"case {job['case']}", steps, job["preset"], number(theirs), number(ours)
+            yield f"case {job['case']}", steps, job["preset"], number(theirs), _told(ours)

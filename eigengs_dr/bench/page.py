@@ -189,7 +189,7 @@ def _earlier(readme: Path) -> set[str]:
 def _are_figures(table: Table) -> list[bool]:
     """For each column whether its cells are figures."""
     return [
-        all(row[k] == MISSING or _FIGURE.match(row[k]) for row in table.rows)
+        all(row[k].split(" ")[0] == MISSING or _FIGURE.match(row[k]) for row in table.rows)
         for k in range(len(table.columns))
     ]
 

@@ -20,12 +20,12 @@ that stand below each section; they draw all of it again.
 
 **How it was measured.** Clocks start before the first splat is placed, and stop while pictures are
 judged. Methods take turns image by image in one run, on the same kernels; programs are compiled
-(but for the hard cases), and bases trained, before the clock starts. Seconds are medians over
-images, with the range of the middle half; other figures are means with standard deviations.
-`psnr_ycbcr` is the PSNR of the paper's code, in studio-range YCbCr / 255, unclamped; `psnr_rgb` is
-that of 8-bit RGB. Of the same pictures the first reads some 6 dB more, less where a fit is bad and
-clamping mends it, more where it is so good that 8 bits show. Nothing was trained or tuned on the
-images of a test folder.
+(but for hard cases and packed files), and bases trained, before the clock starts. Seconds are
+medians over images, with the range of the middle half; other figures are means with standard
+deviations. `psnr_ycbcr` is the PSNR of the paper's code, in studio-range YCbCr / 255, unclamped;
+`psnr_rgb` is that of 8-bit RGB. Of the same pictures the first reads some 6 dB more, less where a
+fit is bad and clamping mends it, more where it is so good that 8 bits show. Nothing was trained or
+tuned on the images of a test folder.
 
 **The methods.** `default` is this package's own. `gaussianimage` is the recipe of GaussianImage
 (Zhang et al., ECCV 2024): a random start, Adan, one rate. `eigengs` is that of the paper (Tai et
@@ -36,13 +36,13 @@ pixels. Their bases are fitted here by one factorisation, not by 15,000 steps of
 METHODS = """
 Columns are steps of descent; column 0 is the start. `default` lets its rates fall over the run, so
 a longer run is not a shorter one continued, and a shorter run ends better than the column of its
-steps says. A basis splits its Gaussians by frequency where that renders its components better:
-here that of cats512 from its own images, which is slower for it, and no other of this table.
+steps says. A basis splits its Gaussians by frequency where that renders its components better, and
+is slower for it: of cats512 that of its own images, of the other sets none.
 """
 
 SPEED = """
 Every point is a fit that differs from the default one in one setting; up and to the left is better,
-and the line is the front that nothing measured is ahead of. Seconds of so few images scatter by a
+and the line is the front that nothing measured is ahead of. Seconds of few images scatter by a
 tenth: what is that close to the front may as well be on it. The "samples" are photos of
 scikit-image, and the basis that ships was trained on all of them but coffee: fits that start from
 it are flattered there.
