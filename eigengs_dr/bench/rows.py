@@ -38,7 +38,8 @@ def measure(
     jobs : iterable of Job
         In the order in which they are measured.
     run : dict
-        "command", and beside it what tells machines and versions apart.
+        "command", and beside it what tells machines and versions apart. Nothing else tells rows of
+        another method from those of the present one: where a method changes, so must the version.
     progress : callable, optional
         ``progress(done, total)`` before every job and after the last.
 
