@@ -31,6 +31,15 @@ Arrays = dict[str, NDArray[Any]]
 def write(path: str | os.PathLike[str], arrays: Arrays, size: tuple[int, int], space: str) -> None:
     """Write the arrays of a set, its size and space in single precision, all or nothing.
 
+    Parameters
+    ----------
+    path : path-like
+    arrays : dict of ndarray
+        Mean (N, 2), factor (N, 3), color (N, C) and background (C,); see `eigengs_dr.Gaussians`.
+    size : (int, int)
+        Native width and height in pixels.
+    space : str
+
     Raises
     ------
     OSError
@@ -44,7 +53,8 @@ def write(path: str | os.PathLike[str], arrays: Arrays, size: tuple[int, int], s
 def read(path: Path, sections: int | None = None) -> tuple[Arrays, tuple[int, int], str]:
     """Read and check the arrays of a set, its size and space.
 
-    Parameters and errors are those of `eigengs_dr.Gaussians.load`.
+    Parameters and errors are those of `eigengs_dr.Gaussians.load`, what is read is as `write` takes
+    it.
     """
     if packed.is_packed(path):
         content = packed.read(path, sections)

@@ -67,7 +67,10 @@ def usual_count(pixels: int) -> int:
 
 
 def dark_weight(light: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What errors of linear light are multiplied by before they are squared; see `DARKNESS`."""
+    """What errors of linear light, of any shape, are multiplied by before they are squared.
+
+    ``max(light, BLACK)^-DARKNESS``, where 1 is white; see there.
+    """
     return np.asarray(np.maximum(light, BLACK) ** -DARKNESS, np.float32)
 
 

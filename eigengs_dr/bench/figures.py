@@ -122,10 +122,7 @@ def read_list(path: Path) -> list[rows.Row]:
         return []
     try:
         found = json.loads(path.read_text(encoding="utf-8"))["figures"]
-        return [
-            {**Figure(**{k: f[k] for k in Figure._fields})._asdict(), "run": f["run"]}
-            for f in found
-        ]
+        return [{key: figure[key] for key in (*Figure._fields, "run")} for figure in found]
     except (ValueError, KeyError, TypeError):
         raise ValueError(f"{path}: is damaged; delete it, and draw the figures again") from None
 

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from ..bases import load_basis
 from ..color import rgb_to_ycbcr
 from ..gaussians import Gaussians
-from ..metrics import psnr
 from ..presets import PRESETS, Preset
 from ..refine import EXACT, rows_at
 from ..rendering import picture_of
@@ -28,7 +27,7 @@ from .cases import Case
 from .rows import Job, Row
 from .table import MISSING, Table, number
 from .tiling import tiling
-from .trial import Moment, follow
+from .trial import Moment, decibels, follow
 
 Image = NDArray[np.float32]
 
@@ -160,10 +159,10 @@ def _judged(followed: list[Moment], image: Image) -> Row:
     }
     for space in ("ycbcr", "rgb"):
         # Above EXACT there is rounding only: no drop. NaN stays.
-        seen = [np.minimum(psnr(m.picture, image, space), EXACT) for m in followed]
+        seen = [decibels(m.picture, image, space) for m in followed]
         row[f"start_{space}"], row[f"end_{space}"] = float(seen[0]), float(seen[-1])
         row[f"drop_{space}"] = float(np.max(seen) - seen[-1])
-        row[f"half_{space}"] = float(np.minimum(psnr(half, image, space), EXACT))
+        row[f"half_{space}"] = decibels(half, image, space)
     return row
 
 

@@ -112,7 +112,10 @@ def whole(fitted: Fitted) -> Fitted:
 
 
 def decibels(picture: Image, image: Image, space: str) -> float:
-    """Return a PSNR, at most `EXACT`: what is not finite in a row is of a fit that has failed."""
+    """Return a PSNR for a row, in dB and at most `EXACT`; NaN is left to fits that have failed.
+
+    Parameters are those of `eigengs_dr.psnr`.
+    """
     return min(psnr(picture, image, space), EXACT)
 
 
