@@ -6,11 +6,11 @@ import click
 
 from .backend import select
 from .cli_shared import (
-    ANY_PATH,
     FOLDER,
     backend_option,
     chosen_sets,
     described,
+    folder_option,
     quiet_option,
     seed_option,
     set_option,
@@ -25,7 +25,7 @@ TARGETS, HIGHEST = (32.0, 36.0, 40.0), 100.0
 
 @click.command()
 @click.argument("data", type=FOLDER, required=False)
-@click.option("-o", "--output", type=ANY_PATH, required=True, metavar="FOLDER", help="For results.")
+@folder_option("For results, which are continued")
 @set_option(f"Images to fit; may be repeated. By default {NATURAL}, or samples without DATA.")
 @click.option(
     "--images", type=click.IntRange(min=1), default=20, show_default=True, help="Of each set."

@@ -6,10 +6,10 @@ import click
 
 from .backend import select
 from .cli_shared import (
-    ANY_PATH,
     FOLDER,
     backend_option,
     described,
+    folder_option,
     quiet_option,
     seed_option,
 )
@@ -22,9 +22,7 @@ NAMES = ("iterations", "colors", "curves", "radii", "split", "cross")
 
 @click.command()
 @click.argument("data", required=False, type=FOLDER, metavar="[DATA]")
-@click.option(
-    "-o", "--output", required=True, type=ANY_PATH, metavar="FOLDER", help="Where pictures go."
-)
+@folder_option("For the pictures")
 @click.option(
     "--figure",
     "names",

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from .backend import select
-from .cli_shared import ANY_PATH, EXISTING, backend_option, quiet_option, seed_option
+from .cli_shared import EXISTING, backend_option, folder_option, quiet_option, seed_option
 from .console import progress_bar
 from .outputs import check_outputs
 
@@ -15,7 +15,7 @@ SAMPLE, SIDE = "coffee", 256
 
 @click.command()
 @click.argument("image", type=EXISTING, required=False)
-@click.option("-o", "--output", type=ANY_PATH, required=True, metavar="FOLDER", help="For results.")
+@folder_option("For the results")
 @click.option("--gaussians", type=click.IntRange(min=1), default=5000, show_default=True)
 @click.option("--levels", type=click.IntRange(min=1), default=4, show_default=True)
 @click.option("--iterations", type=click.IntRange(min=1), default=1000, show_default=True)

@@ -7,11 +7,11 @@ import click
 
 from .backend import select
 from .cli_shared import (
-    ANY_PATH,
     FOLDER,
     backend_option,
     chosen_sets,
     described,
+    folder_option,
     quiet_option,
     seed_option,
     set_option,
@@ -22,7 +22,7 @@ from .outputs import check_outputs
 
 @click.command()
 @click.argument("data", type=FOLDER, required=False)
-@click.option("-o", "--output", type=ANY_PATH, required=True, metavar="FOLDER", help="For results.")
+@folder_option("For results, which are continued")
 @set_option("Images to code; may be repeated. By default samples, photos of scikit-image.")
 @click.option(
     "--images", type=click.IntRange(min=1), default=3, show_default=True, help="Of each set."

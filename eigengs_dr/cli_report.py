@@ -4,13 +4,13 @@ from pathlib import Path
 
 import click
 
-from .cli_shared import ANY_PATH, FOLDER, quiet_option
+from .cli_shared import FOLDER, folder_option, quiet_option
 from .outputs import check_outputs
 
 
 @click.command()
 @click.argument("folder", type=FOLDER, metavar="FOLDER")
-@click.option("-o", "--output", required=True, type=ANY_PATH, help="Folder of the page.")
+@folder_option("For the page")
 @quiet_option
 def report(folder: Path, output: Path, quiet: bool) -> None:
     """Write a page of what the other commands of bench left in a folder.

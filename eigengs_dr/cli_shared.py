@@ -80,6 +80,13 @@ def described(context: click.Context, backend: str | None) -> dict[str, Any]:
     return {"command": shlex.join([NAME, *context.obj]), **describe(backend)}
 
 
+def folder_option(text: str) -> Any:
+    """Make the option that names the folder of what a command writes."""
+    kind = click.Path(file_okay=False, path_type=Path)
+    text = f"{text}; made where it is missing."
+    return click.option("-o", "--output", required=True, type=kind, metavar="FOLDER", help=text)
+
+
 def set_option(text: str) -> Any:
     """Make the option that names sets of images."""
     kind = click.Choice([SAMPLES, *SETS])

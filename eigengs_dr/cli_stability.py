@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from .backend import select
-from .cli_shared import backend_option, described, quiet_option, seed_option
+from .cli_shared import backend_option, described, folder_option, quiet_option, seed_option
 from .console import progress_bar
 from .outputs import check_outputs
 
@@ -19,14 +19,7 @@ how many times the steps of the case they take."""
 
 
 @click.command()
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    type=click.Path(file_okay=False, path_type=Path),
-    metavar="FOLDER",
-    help="Made where it is missing. What it holds already is not measured again.",
-)
+@folder_option("For results, which are continued")
 @click.option("--case", "cases", multiple=True, help="May be repeated. By default all.")
 @click.option(
     "--preset",

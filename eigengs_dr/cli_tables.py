@@ -6,11 +6,11 @@ import click
 
 from .backend import select
 from .cli_shared import (
-    ANY_PATH,
     FOLDER,
     SETS,
     backend_option,
     described,
+    folder_option,
     quiet_option,
     seed_option,
 )
@@ -26,7 +26,7 @@ TABLES = ("main", "ablation", "cross", "reach")
 
 @click.command()
 @click.argument("data", type=FOLDER, metavar="DATA")
-@click.option("-o", "--output", required=True, type=ANY_PATH, help="Folder of the results.")
+@folder_option("For results, which are continued")
 @click.option(
     "--set",
     "names",
