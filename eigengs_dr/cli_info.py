@@ -7,16 +7,16 @@ from typing import Any
 import click
 
 from .backend import select
-from .cli_shared import ANY_PATH, EXISTING, checked_pixels, json_option
+from .cli_shared import ANY_PATH, checked_pixels, json_option
 from .outputs import check_outputs, name_outputs
 
 
 @click.command()
-@click.argument("file", type=EXISTING, metavar="FILE")
+@click.argument("file", type=ANY_PATH, metavar="NAME|FILE")
 @json_option
 @click.option("--preview", type=ANY_PATH, help="Picture of what the file holds.")
 def info(file: Path, as_json: bool, preview: Path | None) -> None:
-    """Show what a fitted image or a model holds.
+    """Show what a fitted image or a model holds; NAME is that of a basis that ships.
 
     Of a fitted image also the bits a pixel (bpp) of its file; of a packed one the bits that tell
     the values of a parameter apart, and the steps between them.
@@ -32,6 +32,7 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     Examples:
       eigengs-dr info photo.npz
       eigengs-dr info photo.egs --json
+      eigengs-dr info natural
       eigengs-dr info model.npz --preview components.png
     """
     from .images import SAVE_OPTIONS, save_image
@@ -40,6 +41,7 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     check_outputs([picture], [file])
     select()
     from . import archive, modelfile, packed, setfile
+    from .bases import SHIPPED
     from .eigengs import EigenGS
     from .gaussians import Gaussians
     from .pictures import component_sheet
@@ -48,6 +50,7 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
         setfile.FORMAT: ("image", Gaussians.load, _describe_image, _rendered),
         modelfile.FORMAT: ("model", EigenGS.load, _describe_model, component_sheet),
     }
+    file = SHIPPED.get(str(file), file)
     found = setfile.FORMAT if packed.is_packed(file) else archive.format_of(file)
     if found not in kinds:
         raise ValueError(f"{file}: format is {found[:40]!r}, expected one of {', '.join(kinds)}")

@@ -60,7 +60,7 @@ def crops(count: int = CROPS, seed: int = 0) -> Iterator[NDArray[np.float32]]:
 
 
 def main(path: str) -> None:
-    """Train the basis and write it to a file; it takes two minutes."""
+    """Train the basis and write it to a file; it takes a minute."""
     from .console import progress_bar
     from .eigengs import EigenGS
     from .pca import Eigenbasis

@@ -578,6 +578,15 @@ def test_info_of_a_model(trained, tmp_path):
     assert "low_components   3" in run("info", folder / "m.npz").stdout
 
 
+def test_info_of_the_basis_that_ships(tmp_path):
+    found = json.loads(succeeded(run("info", "natural", "--json")).stdout)
+    assert found["file"] == str(bases.SHIPPED["natural"])
+    assert found["components"] == found["fall"][-1]["components"] == [230, 60, 60]
+    assert found["split_reason"]
+    assert_refused(run("info", tmp_path / "natural"), tmp_path / "natural", "No such file")
+    assert_refused(run("info", tmp_path), tmp_path, "Is a directory")
+
+
 def test_info_preview_of_an_image(fitted, tmp_path):
     folder, _ = fitted
     succeeded(run("info", folder / "fit.npz", "--preview", tmp_path / "info.png"))
