@@ -126,8 +126,8 @@ def test_tables_tell_ratios_and_where_they_are_missing():
     cells = {row[0]: row[1:] for row in table.rows}
     # 32 dB is half way: sqrt(1 * 4) and 3 times that; 2 * 4^(6 / 8) for WebP on the second.
     assert cells[rate.OURS][1] == "4.00"
-    assert cells["JPEG 4:2:0"][1] == "4.00 (1.00)"
-    assert cells["WebP"][1] == f"{(4 + 2 * 4**0.75) / 2:.2f} ({(4 + 2 * 4**0.75) / 8:.2f})"
+    assert cells["JPEG 4:2:0"][1] == "4.00 (1.00, 1)"
+    assert cells["WebP"][1] == f"{(4 + 2 * 4**0.75) / 2:.2f} ({(4 + 2 * 4**0.75) / 8:.2f}, 1)"
     assert cells["images that all reach"] == ("2", "2", "1", "-")
     assert cells[rate.OURS][2] == f"{4 ** (10 / 12):.2f}"
     assert cells[rate.OURS][3].startswith("3.00")

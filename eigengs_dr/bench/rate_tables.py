@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .budget_tables import smallest
 from .charts import new_figure
@@ -29,6 +29,8 @@ STYLES = {
 """Colours and markers of the curves."""
 
 Curve = list[Row]
+
+Sizes = NDArray[np.float64]
 
 
 def curves(rows: list[Row], name: str) -> dict[str, dict[str, Curve]]:
@@ -61,8 +63,8 @@ def _known(value: float | None) -> float:
 def tables(rows: list[Row]) -> list[Table]:
     """Lay out the bits a pixel that each codec takes for as good a picture, a table a set.
 
-    Means over the images that all codecs reach a PSNR on, with the share of ours in brackets;
-    and medians of the seconds to encode a point.
+    Means over the images that all codecs reach a PSNR on, in brackets over ours, and on how many
+    images ours are fewer; and medians of the seconds to encode a point.
     """
     return [_table(rows, name) for name in dict.fromkeys(row["job"]["set"] for row in rows)]
 
@@ -70,36 +72,35 @@ def tables(rows: list[Row]) -> list[Table]:
 def _table(rows: list[Row], name: str) -> Table:
     found = curves(rows, name)
     images = list(found[OURS])
-    means, counts = dict[str, list[float]](), list[str]()
+    cells, counts = {title: list[str]() for title in found}, list[str]()
     for level in LEVELS:
-        sizes = {
-            title: [rate_at(of_image[image], level) for image in images]
+        every = {
+            title: np.array([rate_at(of_image[image], level) for image in images])
             for title, of_image in found.items()
         }
-        reached = np.isfinite(np.array(list(sizes.values()))).all(axis=0)
+        reached = np.isfinite(list(every.values())).all(axis=0)
         counts.append(str(int(reached.sum())))
+        sizes = {title: values[reached] for title, values in every.items()}
         for title, values in sizes.items():
-            mean = float(np.mean(np.array(values)[reached])) if reached.any() else math.nan
-            means.setdefault(title, []).append(mean)
-    lines = [
-        (title, *_compared(means[title], means[OURS]), median(_seconds(found[title])))
-        for title in found
-    ]
+            cells[title].append(_compared(values, sizes[OURS]))
+    lines = [(title, *cells[title], median(_seconds(found[title]))) for title in found]
     lines.append(("images that all reach", *counts, MISSING))
     caption = (
         f"{name}, {len(images)} image{'s'[: len(images) > 1]}: bits a pixel for a PSNR in 8-bit "
-        "RGB, interpolated; in brackets that of JPEG and WebP over ours\n(images that were JPEG "
-        "files once suit JPEG)"
+        "RGB, interpolated; in brackets those of JPEG and WebP over ours, and on how many images "
+        "ours are fewer\n(images that were JPEG files once suit JPEG)"
     )
     return Table(caption, ("codec", *(f"{level:g} dB" for level in LEVELS), "s"), lines)
 
 
-def _compared(values: Sequence[float], ours: Sequence[float]) -> list[str]:
-    """Bits a pixel, and their ratio to ours: below 1 where we lose."""
-    return [
-        number(value, 2) + ("" if value is own or math.isnan(value) else f" ({value / own:.2f})")
-        for value, own in zip(values, ours, strict=True)
-    ]
+def _compared(values: Sizes, ours: Sizes) -> str:
+    """Mean bits a pixel; of another codec also over ours, and how often ours are fewer."""
+    if not len(values):
+        return MISSING
+    mean = number(float(values.mean()), 2)
+    if values is ours:
+        return mean
+    return f"{mean} ({values.mean() / ours.mean():.2f}, {np.sum(ours < values)})"
 
 
 def _seconds(images: dict[str, Curve]) -> list[float]:
