@@ -330,9 +330,12 @@ def test_outputs_of_the_wrong_kind(photo, existing, tmp_path):
     assert_refused(run("fit", photo, "-o", existing, "--preview", tmp_path / "p.txt"), ".png")
 
 
-@pytest.mark.parametrize("name", ["pareto", "rate", "budget", "levels", "stability", "figures"])
-def test_results_into_a_file(photo, name):
-    assert_refused(run("bench", name, "-o", photo), "'-o'", photo, "is a file")
+@pytest.mark.parametrize(
+    "command",
+    ["pareto", "rate", "budget", "levels", "stability", "figures", "tables .", "report ."],
+)
+def test_results_into_a_file(photo, command):
+    assert_refused(run("bench", *command.split(), "-o", photo), "'-o'", photo, "is a file")
 
 
 def test_outputs_that_would_overwrite_each_other(photo, existing, tmp_path):
