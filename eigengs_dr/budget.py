@@ -1,9 +1,9 @@
 """The fewest splats for a quality.
 
-Three stages. *Estimate*: some steps with few splats tell what more would reach, for twice as many
-gain about `OCTAVE` decibels, and each try tells where the splats of the next one belong
-(`eigengs_dr.rearrange`). *Fit* that number. *Settle*: drop what is worth least while the goal is
-met, add where the error is while it is not (`eigengs_dr.growth`), each time with a short descent.
+Three stages. *Estimate*: some steps with few splats tell what more would reach, two tries what
+twice as many gain, and each where the splats of the next one belong (`eigengs_dr.rearrange`).
+*Fit* that number. *Settle*: drop what is worth least while the goal is met, add where the error is
+while it is not (`eigengs_dr.growth`), each time with a short descent.
 """
 
 from __future__ import annotations
@@ -28,11 +28,18 @@ TRY, FIT, SETTLE = 0.1, 0.4, 0.15
 LENGTH = 2
 """Times the iterations that a search takes at most, if these are not few (some ten)."""
 
-TRIES, SETTLING = 4, 4
+TRIES, SETTLING = 4, 5
 """Most tries, and descents to settle after which a goal that is met is settled enough."""
 
 OCTAVE = 4.0
-"""Decibels that twice as many splats gain; see `eigengs_dr.rearrange.FALL`."""
+"""Decibels that twice as many splats gain, see `eigengs_dr.rearrange.FALL`, until two tries of this
+image tell it."""
+
+SLOPES = (2.0, 12.0)
+"""Fewest and most of them that are believed; a training image gained 8, another 1.6."""
+
+APART = 0.25
+"""Octaves between two tries that tell it."""
 
 TO_COME = 0.25
 """What a fit gains after the steps of a try, as a share of what it gained in them: measured with
@@ -49,6 +56,9 @@ CLOSE, FAR = 0.1, 0.15
 
 GENTLE = 0.3
 """Share of the rates in a descent that settles."""
+
+AGAIN = 0.5
+"""Share of what a descent that settles gained, which the next one is believed to gain again."""
 
 SURPLUS = 0.02
 """Decibels above the goal that are not worth another descent."""
@@ -137,6 +147,7 @@ class _Run:
     interrupted: Callable[[], bool]
     planned: int = 0
     step: int = 0
+    octave: float = OCTAVE
     trace: list[Row] = field(default_factory=list)
     best: _Trial = field(init=False)
 
@@ -183,11 +194,13 @@ def _better(a: _Trial, b: _Trial) -> bool:
 def _estimated(run: _Run, most: int, steps: int) -> Gaussians:
     """Place about as many splats as the goal takes, where some steps told that they belong."""
     assert run.start.rearrange is not None
-    placed, before = run.start.gaussians, run.best
+    placed, before, last = run.start.gaussians, run.best, None
     for _ in range(TRIES):
         trial = run.descend(placed, steps)
+        run.octave = _octave(last, trial, run.octave)
+        last = trial
         gain = TO_COME * max(0.0, before.missing - trial.missing)
-        count = _times(len(placed), trial.missing - gain + AIM, most)
+        count = _times(run, len(placed), trial.missing - gain + AIM, most)
         close = abs(count - len(placed)) <= CLOSE * len(placed)
         placed = run.start.rearrange(trial.gaussians, count)
         before = run.judged(placed)
@@ -199,16 +212,26 @@ def _estimated(run: _Run, most: int, steps: int) -> Gaussians:
 def _fitted(run: _Run, placed: Gaussians, most: int, steps: int) -> _Trial:
     """Fit, and once more where the estimate was far off: to place is better than to mend."""
     trial = run.descend(placed, steps)
-    count = _times(len(placed), trial.missing, most)
+    count = _times(run, len(placed), trial.missing, most)
     if run.interrupted() or abs(count - len(placed)) <= FAR * len(placed):
         return trial
     assert run.start.rearrange is not None
     return run.descend(run.start.rearrange(trial.gaussians, count), steps)
 
 
-def _times(count: int, missing: float, most: int) -> int:
+def _octave(last: _Trial | None, trial: _Trial, octave: float) -> float:
+    """Decibels of twice as many splats, by two tries; as known where they are close."""
+    if last is None:
+        return octave
+    apart = math.log2(len(trial.gaussians) / len(last.gaussians))
+    if abs(apart) < APART:
+        return octave
+    return min(max((last.missing - trial.missing) / apart, SLOPES[0]), SLOPES[1])
+
+
+def _times(run: _Run, count: int, missing: float, most: int) -> int:
     """Splats that would gain so many decibels more."""
-    octaves = min(max(missing / OCTAVE, -math.log2(LEAP)), math.log2(LEAP))
+    octaves = min(max(missing / run.octave, -math.log2(LEAP)), math.log2(LEAP))
     return min(most, max(1, round(count * 2**octaves)))
 
 
@@ -218,13 +241,13 @@ def _settle(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
     Where few splats find a place, there would be no end: the steps of the search are limited.
     """
     target, weight = run.start.target, run.start.weight
-    least_growth, rounds = 1.02, 0
+    least_growth, rounds, gained = 1.02, 0, 0.0
     while run.step + steps <= most_steps and not run.interrupted():
         count, found = len(trial.gaussians), run.best
         if found.missing <= 0 and rounds >= SETTLING:
             return
         if trial.missing > 0:
-            wanted = max(_times(count, trial.missing, most), math.ceil(least_growth * count))
+            wanted = max(_times(run, count, trial.missing, most), math.ceil(least_growth * count))
             # Between what failed and what was found lies the answer.
             limit = most if found.missing > 0 else (count + len(found.gaussians)) // 2
             if min(wanted, limit) <= count:
@@ -234,9 +257,12 @@ def _settle(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
                 return
             least_growth = 2 * least_growth - 1
         else:
-            wanted = max(_times(count, trial.missing, count), math.floor((1 - FAR) * count))
-            if wanted == count or -trial.missing < SURPLUS:
+            spare = gained - trial.missing
+            wanted = max(_times(run, count, -spare, count), math.floor((1 - FAR) * count))
+            if wanted == count or spare < SURPLUS:
                 return
             changed = pruned(trial.gaussians, target, wanted, weight, run.cutoff)
         rounds += 1
+        expected = trial.missing + run.octave * math.log2(count / len(changed))
         trial = run.descend(changed, steps, GENTLE)
+        gained = AGAIN * max(0.0, expected - trial.missing)

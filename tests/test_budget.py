@@ -351,12 +351,26 @@ def test_a_weight_leaves_colours_as_they_are():
     np.testing.assert_array_equal(kept.to_arrays()["color"], gaussians[best].to_arrays()["color"])
 
 
+@pytest.mark.parametrize("octave", [2.5, 4.0, 9.0])
+def test_a_search_learns_what_more_splats_gain(octave):
+    """Where only their number counts: the fewest are found at any slope."""
+    start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    schedule = PRESETS["default"].schedule
+
+    def measure(gaussians):
+        return {"decibels": octave * np.log2(len(gaussians) / 150)}
+
+    result = fewest(start, measure, "decibels", 0.0, 1000, schedule, 40)
+    assert result.stopped == "met"
+    assert 150 <= len(result.gaussians) <= 152
+
+
 def test_a_search_ends_where_no_place_is_left_to_grow(monkeypatch):
     start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
     asked = []
     monkeypatch.setattr(budget, "grown", lambda gaussians, *rest: asked.append(1) or gaussians)
     schedule = PRESETS["default"].schedule
-    result = fewest(start, lambda g: {"decibels": 18.0}, "decibels", 20.0, 1000, schedule, 40)
+    result = fewest(start, lambda g: {"decibels": 18.0}, "decibels", 18.5, 1000, schedule, 40)
     assert result.stopped == "out of reach"
     assert len(asked) == 1
 
