@@ -22,7 +22,7 @@ from .refine import Progress, Refined
 from .rendering import CUTOFF
 from .starting import Start
 
-TRY, FIT, SETTLE = 0.1, 0.4, 0.15
+TRY, FIT, SETTLE = 0.1, 0.4, 0.12
 """Shares of the iterations that a try takes, the fit, and each descent that settles."""
 
 LENGTH = 2
@@ -45,14 +45,17 @@ TO_COME = 0.25
 """What a fit gains after the steps of a try, as a share of what it gained in them: measured with
 150 to 2,500 splats on training images of ImageNet classes, to half a decibel."""
 
-AIM = 0.5
-"""Decibels above the goal that the fit aims at: dropping splats settles it better than adding."""
+AIM = 1.09
+"""Times the splats of the estimate that are fitted: dropping some settles it better than adding."""
 
 LEAP = 16
 """Largest factor from one try to the next."""
 
-CLOSE, FAR = 0.1, 0.15
+CLOSE, FAR = 0.1, 0.35
 """Shares by which the last try, and the fit, may miss the number that they tell."""
+
+FALL = 0.15
+"""Largest share of the splats that are dropped at once."""
 
 GENTLE = 0.3
 """Share of the rates in a descent that settles."""
@@ -198,12 +201,12 @@ def _estimated(run: _Run, most: int, steps: int) -> Gaussians:
     for _ in range(TRIES):
         trial = run.descend(placed, steps)
         run.octave = _octave(last, trial, run.octave)
-        last = trial
         gain = TO_COME * max(0.0, before.missing - trial.missing)
-        count = _times(run, len(placed), trial.missing - gain + AIM, most)
-        close = abs(count - len(placed)) <= CLOSE * len(placed)
+        count = min(most, round(AIM * _times(run, len(placed), trial.missing - gain, most)))
+        # The first try stands where the image bends, not yet where error was left.
+        close = last and abs(count - len(placed)) <= CLOSE * len(placed)
         placed = run.start.rearrange(trial.gaussians, count)
-        before = run.judged(placed)
+        last, before = trial, run.judged(placed)
         if close or run.interrupted():
             break
     return placed
@@ -258,7 +261,7 @@ def _settle(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
             least_growth = 2 * least_growth - 1
         else:
             spare = gained - trial.missing
-            wanted = max(_times(run, count, -spare, count), math.floor((1 - FAR) * count))
+            wanted = max(_times(run, count, -spare, count), math.floor((1 - FALL) * count))
             if wanted == count or spare < SURPLUS:
                 return
             changed = pruned(trial.gaussians, target, wanted, weight, run.cutoff)
