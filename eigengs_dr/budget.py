@@ -60,6 +60,9 @@ FALL = 0.15
 GENTLE = 0.3
 """Share of the rates in a descent that settles."""
 
+GAIN = 0.1
+"""Decibels that the first of them is believed to gain; it gains 0.2."""
+
 AGAIN = 0.5
 """Share of what a descent that settles gained, which the next one is believed to gain again."""
 
@@ -244,28 +247,34 @@ def _settle(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
     Where few splats find a place, there would be no end: the steps of the search are limited.
     """
     target, weight = run.start.target, run.start.weight
-    least_growth, rounds, gained = 1.02, 0, 0.0
+    least_growth, rounds, gain = 1.02, 0, GAIN
     while run.step + steps <= most_steps and not run.interrupted():
         count, found = len(trial.gaussians), run.best
         if found.missing <= 0 and rounds >= SETTLING:
             return
-        if trial.missing > 0:
-            wanted = max(_times(run, count, trial.missing, most), math.ceil(least_growth * count))
-            # Between what failed and what was found lies the answer.
-            limit = most if found.missing > 0 else (count + len(found.gaussians)) // 2
-            if min(wanted, limit) <= count:
-                return
-            changed = grown(trial.gaussians, target, min(wanted, limit), weight, run.cutoff)
-            if len(changed) == count:  # no place takes anything from the error
-                return
-            least_growth = 2 * least_growth - 1
-        else:
-            spare = gained - trial.missing
-            wanted = max(_times(run, count, -spare, count), math.floor((1 - FALL) * count))
-            if wanted == count or spare < SURPLUS:
+        missing = trial.missing - gain
+        if trial.missing <= 0:
+            wanted = max(_times(run, count, missing, count), math.floor((1 - FALL) * count))
+            if wanted == count or -missing < SURPLUS:
                 return
             changed = pruned(trial.gaussians, target, wanted, weight, run.cutoff)
+        elif found.missing <= 0:
+            # Between what failed and what was found lies the answer; steps alone may lead there.
+            wanted = max(count, _times(run, count, missing, (count + len(found.gaussians)) // 2))
+            changed = _grown(run, trial, wanted)
+        else:
+            wanted = max(_times(run, count, missing, most), math.ceil(least_growth * count))
+            changed = _grown(run, trial, min(wanted, most))
+            if len(changed) == count:  # no more are allowed, or no place takes from the error
+                return
+            least_growth = 2 * least_growth - 1
         rounds += 1
         expected = trial.missing + run.octave * math.log2(count / len(changed))
         trial = run.descend(changed, steps, GENTLE)
-        gained = AGAIN * max(0.0, expected - trial.missing)
+        gain = AGAIN * max(0.0, expected - trial.missing)
+
+
+def _grown(run: _Run, trial: _Trial, count: int) -> Gaussians:
+    if count <= len(trial.gaussians):
+        return trial.gaussians
+    return grown(trial.gaussians, run.start.target, count, run.start.weight, run.cutoff)

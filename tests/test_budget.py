@@ -365,6 +365,47 @@ def test_a_search_learns_what_more_splats_gain(octave):
     assert 150 <= len(result.gaussians) <= 152
 
 
+@pytest.mark.parametrize("octave", [2.0, 4.0, 9.0])
+@pytest.mark.parametrize("needed", [60, 150])
+def test_a_search_tries_more_than_once_and_fits_once(monkeypatch, octave, needed):
+    """Where only their number counts, of which the search begins with 60."""
+    start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    lengths = []
+
+    def stand(gaussians, target, schedule, steps, *rest):
+        lengths.append(steps)
+        return iter([gaussians] * (steps + 1))
+
+    def measure(gaussians):
+        return {"decibels": octave * np.log2(len(gaussians) / needed)}
+
+    monkeypatch.setattr(budget, "descend", stand)
+    result = fewest(start, measure, "decibels", 0.0, 1000, PRESETS["default"].schedule, 1000)
+    assert result.stopped == "met"
+    assert lengths[:2] == [100, 100]
+    assert lengths.count(400) == 1
+
+
+def test_a_search_adds_nothing_where_steps_lead_to_the_goal(monkeypatch):
+    """Where every step gains a little: a set that has missed the goal by less is not enlarged."""
+    start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    lengths, grew = [], []
+
+    def stand(gaussians, target, schedule, steps, *rest):
+        lengths.append(steps)
+        return iter([gaussians] * (steps + 1))
+
+    def measure(gaussians):
+        return {"decibels": 4 * np.log2(len(gaussians) / 100) + 0.0005 * sum(lengths)}
+
+    monkeypatch.setattr(budget, "descend", stand)
+    monkeypatch.setattr(budget, "grown", lambda *rest: grew.append(1) or grown(*rest))
+    result = fewest(start, measure, "decibels", 0.0, 1000, PRESETS["default"].schedule, 1000)
+    assert result.stopped == "met"
+    assert any(row["decibels"] < 0 and row["iteration"] > 600 for row in result.trace)
+    assert not grew
+
+
 def test_a_search_ends_where_no_place_is_left_to_grow(monkeypatch):
     start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
     asked = []
