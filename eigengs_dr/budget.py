@@ -54,14 +54,14 @@ LEAP = 16
 CLOSE, FAR = 0.1, 0.35
 """Shares by which the last try, and the fit, may miss the number that they tell."""
 
-FALL = 0.15
+DROP = 0.15
 """Largest share of the splats that are dropped at once."""
 
 GENTLE = 0.3
 """Share of the rates in a descent that settles."""
 
 GAIN = 0.1
-"""Decibels that the first of them is believed to gain; it gains 0.2."""
+"""Decibels that the first of them is believed to gain; on training images it gained 0.2."""
 
 AGAIN = 0.5
 """Share of what a descent that settles gained, which the next one is believed to gain again."""
@@ -207,7 +207,7 @@ def _estimated(run: _Run, most: int, steps: int) -> Gaussians:
         gain = TO_COME * max(0.0, before.missing - trial.missing)
         count = min(most, round(AIM * _times(run, len(placed), trial.missing - gain, most)))
         # The first try stands where the image bends, not yet where error was left.
-        close = last and abs(count - len(placed)) <= CLOSE * len(placed)
+        close = last is not None and abs(count - len(placed)) <= CLOSE * len(placed)
         placed = run.start.rearrange(trial.gaussians, count)
         last, before = trial, run.judged(placed)
         if close or run.interrupted():
@@ -254,7 +254,7 @@ def _settle(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
             return
         missing = trial.missing - gain
         if trial.missing <= 0:
-            wanted = max(_times(run, count, missing, count), math.floor((1 - FALL) * count))
+            wanted = max(_times(run, count, missing, count), math.floor((1 - DROP) * count))
             if wanted == count or -missing < SURPLUS:
                 return
             changed = pruned(trial.gaussians, target, wanted, weight, run.cutoff)
@@ -275,6 +275,7 @@ def _settle(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
 
 
 def _grown(run: _Run, trial: _Trial, count: int) -> Gaussians:
+    """Add splats to those of a trial up to a count; none where it has as many."""
     if count <= len(trial.gaussians):
         return trial.gaussians
     return grown(trial.gaussians, run.start.target, count, run.start.weight, run.cutoff)
