@@ -406,6 +406,28 @@ def test_a_search_adds_nothing_where_steps_lead_to_the_goal(monkeypatch):
     assert not grew
 
 
+def test_a_search_goes_on_where_the_fit_just_meets_the_goal(monkeypatch):
+    """Where the fit ends a hair above the goal, and steps after it gain as much as they do."""
+    start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    lengths, fitted = [], []
+
+    def stand(gaussians, target, schedule, steps, *rest):
+        lengths.append(steps)
+        if steps == 400:
+            fitted.append(len(gaussians))
+        return iter([gaussians] * (steps + 1))
+
+    def measure(gaussians):
+        needed = fitted[0] if fitted else 100
+        settled = sum(steps for steps in lengths if steps not in (100, 400))
+        return {"decibels": 4 * np.log2(len(gaussians) / needed) + 0.001 + settled / 600}
+
+    monkeypatch.setattr(budget, "descend", stand)
+    result = fewest(start, measure, "decibels", 0.0, 1000, PRESETS["default"].schedule, 1000)
+    assert result.stopped == "met"
+    assert len(result.gaussians) < fitted[0]
+
+
 def test_a_search_ends_where_no_place_is_left_to_grow(monkeypatch):
     start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
     asked = []
