@@ -261,10 +261,10 @@ def _settle(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
         elif found.missing <= 0:
             # Between what failed and what was found lies the answer; steps alone may lead there.
             wanted = max(count, _times(run, count, missing, (count + len(found.gaussians)) // 2))
-            changed = _grown(run, trial, wanted)
+            changed = grown(trial.gaussians, target, wanted, weight, run.cutoff)
         else:
             wanted = max(_times(run, count, missing, most), math.ceil(least_growth * count))
-            changed = _grown(run, trial, min(wanted, most))
+            changed = grown(trial.gaussians, target, min(wanted, most), weight, run.cutoff)
             if len(changed) == count:  # no more are allowed, or no place takes from the error
                 return
             least_growth = 2 * least_growth - 1
@@ -272,10 +272,3 @@ def _settle(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
         expected = trial.missing + run.octave * math.log2(count / len(changed))
         trial = run.descend(changed, steps, GENTLE)
         gain = AGAIN * max(0.0, expected - trial.missing)
-
-
-def _grown(run: _Run, trial: _Trial, count: int) -> Gaussians:
-    """Add splats to those of a trial up to a count; none where it has as many."""
-    if count <= len(trial.gaussians):
-        return trial.gaussians
-    return grown(trial.gaussians, run.start.target, count, run.start.weight, run.cutoff)

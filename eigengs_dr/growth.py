@@ -90,8 +90,10 @@ def grown(
     """Add round splats where one takes most from the error, until there are `count`.
 
     Parameters are those of `worth`. Fewer are added where the image has no more places, see
-    `places`.
+    `places`; none to a set that has as many.
     """
+    if count <= len(gaussians):
+        return gaussians
     missed = residual(gaussians, target, cutoff)
     mean, size, color = places(missed, count - len(gaussians), _spacing(gaussians), weight)
     if not len(mean):

@@ -231,6 +231,12 @@ def test_places_keep_apart_and_never_exceed(count):
         assert (away > np.ceil(APART * size[k])).all()
 
 
+def test_grown_to_fewer_or_as_many_is_the_set():
+    start, target = fitted()
+    for count in (10, 60):
+        assert grown(start.gaussians, target, count) is start.gaussians
+
+
 def test_grown_of_a_perfect_set_is_the_set():
     start, _ = fitted(20)
     plain = replace(start.gaussians, space="data")
@@ -365,66 +371,65 @@ def test_a_search_learns_what_more_splats_gain(octave):
     assert 150 <= len(result.gaussians) <= 152
 
 
+def searched(monkeypatch, measure):
+    """Search for 0 dB, from 60 splats, with descents that move nothing.
+
+    ``measure(gaussians, steps)`` returns decibels, where `steps` lists those of all descents.
+    """
+    start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    steps = []
+
+    def stand(gaussians, target, schedule, count, *rest):
+        steps.append(count)
+        return iter([gaussians] * (count + 1))
+
+    def judge(gaussians):
+        return {"decibels": measure(gaussians, steps)}
+
+    monkeypatch.setattr(budget, "descend", stand)
+    result = fewest(start, judge, "decibels", 0.0, 1000, PRESETS["default"].schedule, 1000)
+    assert result.stopped == "met"
+    return result, steps
+
+
 @pytest.mark.parametrize("octave", [2.0, 4.0, 9.0])
 @pytest.mark.parametrize("needed", [60, 150])
 def test_a_search_tries_more_than_once_and_fits_once(monkeypatch, octave, needed):
     """Where only their number counts, of which the search begins with 60."""
-    start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
-    lengths = []
-
-    def stand(gaussians, target, schedule, steps, *rest):
-        lengths.append(steps)
-        return iter([gaussians] * (steps + 1))
-
-    def measure(gaussians):
-        return {"decibels": octave * np.log2(len(gaussians) / needed)}
-
-    monkeypatch.setattr(budget, "descend", stand)
-    result = fewest(start, measure, "decibels", 0.0, 1000, PRESETS["default"].schedule, 1000)
-    assert result.stopped == "met"
-    assert lengths[:2] == [100, 100]
-    assert lengths.count(400) == 1
+    _, steps = searched(monkeypatch, lambda g, _: octave * np.log2(len(g) / needed))
+    assert steps[:2] == [100, 100]
+    assert steps.count(400) == 1
 
 
 def test_a_search_adds_nothing_where_steps_lead_to_the_goal(monkeypatch):
     """Where every step gains a little: a set that has missed the goal by less is not enlarged."""
-    start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
-    lengths, grew = [], []
+    added = []
 
-    def stand(gaussians, target, schedule, steps, *rest):
-        lengths.append(steps)
-        return iter([gaussians] * (steps + 1))
+    def counted(gaussians, target, count, *rest):
+        added.append(count - len(gaussians))
+        return grown(gaussians, target, count, *rest)
 
-    def measure(gaussians):
-        return {"decibels": 4 * np.log2(len(gaussians) / 100) + 0.0005 * sum(lengths)}
-
-    monkeypatch.setattr(budget, "descend", stand)
-    monkeypatch.setattr(budget, "grown", lambda *rest: grew.append(1) or grown(*rest))
-    result = fewest(start, measure, "decibels", 0.0, 1000, PRESETS["default"].schedule, 1000)
-    assert result.stopped == "met"
+    monkeypatch.setattr(budget, "grown", counted)
+    result, _ = searched(
+        monkeypatch, lambda g, steps: 4 * np.log2(len(g) / 100) + 0.0005 * sum(steps)
+    )
     assert any(row["decibels"] < 0 and row["iteration"] > 600 for row in result.trace)
-    assert not grew
+    assert added
+    assert not any(added)
 
 
 def test_a_search_goes_on_where_the_fit_just_meets_the_goal(monkeypatch):
     """Where the fit ends a hair above the goal, and steps after it gain as much as they do."""
-    start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
-    lengths, fitted = [], []
+    fitted = []
 
-    def stand(gaussians, target, schedule, steps, *rest):
-        lengths.append(steps)
-        if steps == 400:
+    def measure(gaussians, steps):
+        if steps and steps[-1] == 400:
             fitted.append(len(gaussians))
-        return iter([gaussians] * (steps + 1))
-
-    def measure(gaussians):
         needed = fitted[0] if fitted else 100
-        settled = sum(steps for steps in lengths if steps not in (100, 400))
-        return {"decibels": 4 * np.log2(len(gaussians) / needed) + 0.001 + settled / 600}
+        settled = sum(count for count in steps if count not in (100, 400))
+        return 4 * np.log2(len(gaussians) / needed) + 0.001 + settled / 600
 
-    monkeypatch.setattr(budget, "descend", stand)
-    result = fewest(start, measure, "decibels", 0.0, 1000, PRESETS["default"].schedule, 1000)
-    assert result.stopped == "met"
+    result, _ = searched(monkeypatch, measure)
     assert len(result.gaussians) < fitted[0]
 
 
@@ -433,7 +438,7 @@ def test_a_search_ends_where_no_place_is_left_to_grow(monkeypatch):
     asked = []
     monkeypatch.setattr(budget, "grown", lambda gaussians, *rest: asked.append(1) or gaussians)
     schedule = PRESETS["default"].schedule
-    result = fewest(start, lambda g: {"decibels": 18.0}, "decibels", 18.5, 1000, schedule, 40)
+    result = fewest(start, lambda g: {"decibels": 18.0}, "decibels", 20.0, 1000, schedule, 40)
     assert result.stopped == "out of reach"
     assert len(asked) == 1
 
