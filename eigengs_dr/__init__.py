@@ -7,7 +7,7 @@ it is first used, because Dr.Jit loads libLLVM while it is imported.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .backend import BackendError, prepare
+from .backend.selection import BackendError, prepare
 
 if TYPE_CHECKING:
     from .eigengs import EigenGS

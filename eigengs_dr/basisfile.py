@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import archive
 from .incremental import EXAMPLES
+from .storage import npz as archive
 from .stream import SPACES
 
 FORMAT, VERSION = "eigengs_dr.eigenbasis", 1

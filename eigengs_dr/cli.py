@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from .backend import select
+from .backend.selection import select
 from .cli_bench import bench
 from .cli_fit import fit
 from .cli_info import info
@@ -113,7 +113,7 @@ def doctor(context: click.Context, as_json: bool) -> None:
     Example:
       eigengs-dr doctor
     """
-    from . import doctor as doctor_module
+    from .backend import doctor as doctor_module
 
     found = doctor_module.report()
     click.echo(json.dumps(found, indent=2) if as_json else doctor_module.describe(found))

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from .backend import select
+from .backend.selection import select
 from .cli_budget import budget
 from .cli_figures import figures
 from .cli_levels import levels

@@ -4,15 +4,8 @@ from pathlib import Path
 
 import click
 
-from .backend import select
-from .cli_shared import (
-    FOLDER,
-    backend_option,
-    described,
-    folder_option,
-    quiet_option,
-    seed_option,
-)
+from .backend.selection import select
+from .cli_shared import FOLDER, backend_option, described, folder_option, quiet_option, seed_option
 from .console import progress_bar, say
 from .outputs import check_outputs
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from .backend import select
+from .backend.selection import select
 from .cli_shared import ANY_PATH, checked_pixels, json_option
 from .outputs import check_outputs, name_outputs
 
@@ -40,11 +40,12 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     [picture] = name_outputs([file], preview, list(SAVE_OPTIONS)) if preview else [None]
     check_outputs([picture], [file])
     select()
-    from . import archive, modelfile, packed, setfile
+    from . import modelfile, packed, setfile
     from .bases import SHIPPED
     from .eigengs import EigenGS
     from .gaussians import Gaussians
     from .pictures import component_sheet
+    from .storage import npz as archive
 
     kinds: dict[str, tuple[str, Any, Any, Any]] = {
         setfile.FORMAT: ("image", Gaussians.load, _describe_image, _rendered),

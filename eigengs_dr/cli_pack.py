@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from .backend import select
+from .backend.selection import select
 from .cli_shared import ANY_PATH, EXISTING, backend_option, described, quiet_option, report_option
 from .outputs import check_outputs, name_outputs
 from .report import write_report

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from .backend import select
+from .backend.selection import select
 from .cli_shared import (
     FOLDER,
     backend_option,

@@ -9,11 +9,11 @@ from typing import Any
 
 import click
 
-from .atomic import replacing
-from .backend import select
+from .backend.selection import select
 from .cli_shared import ANY_PATH, EXISTING, quiet_option
 from .console import progress_bar
 from .outputs import check_outputs, name_outputs
+from .storage.atomic import replacing
 
 SUFFIXES = (".png", ".exr")
 """What is written: PNG as sRGB, clamped; EXR as it is."""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from .backend import select
+from .backend.selection import select
 from .cli_shared import backend_option, described, folder_option, quiet_option, seed_option
 from .console import progress_bar
 from .outputs import check_outputs

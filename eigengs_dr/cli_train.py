@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from .backend import select
+from .backend.selection import select
 from .cli_shared import (
     ANY_PATH,
     FOLDER,

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import types_of, upload_rows
+from .backend.arrays import types_of, upload_rows
 from .gaussians import Gaussians, concatenate
 from .joint import JointState, train_jointly
 from .metrics import decibels

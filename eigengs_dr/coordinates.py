@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 
-from .arrays import types_of
+from .backend.arrays import types_of
 from .gaussians import Gaussians
 
 

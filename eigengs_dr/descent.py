@@ -11,9 +11,9 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import types_of
+from .backend.arrays import types_of
+from .backend.recording import frozen
 from .coordinates import NATURAL, Coordinates
-from .freezing import frozen
 from .gaussians import Gaussians
 from .rendering import CUTOFF, lists_for, splat, to_tiles
 from .splat import UNIT

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import archive
 from .components import (
     Fitted,
     State,
@@ -36,6 +35,7 @@ from .normal import NormalEquations
 from .pca import Eigenbasis
 from .resampling import resampled
 from .span import Span
+from .storage import npz as archive
 from .stream import to_planes
 
 Planes = NDArray[np.float32]

@@ -13,7 +13,7 @@ from typing import Any
 
 import drjit as dr
 
-from .arrays import types_of
+from .backend.arrays import types_of
 from .footprints import share
 from .points import sum_near
 from .sizes import Sizes

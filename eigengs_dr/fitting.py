@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .backend.interrupt import deferred
 from .budget import fewest
 from .color import SPACES
 from .eigengs import EigenGS
 from .gaussians import Gaussians
 from .images import check_image
-from .interrupt import deferred
 from .presets import PRESETS
 from .refine import EXACT, Progress, figures, refine
 from .rendering import picture_of

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import setfile
-from .archive import BadValue
-from .arrays import types_in, types_of, upload_rows
-from .backend import select
+from .backend.arrays import types_in, types_of, upload_rows
+from .backend.selection import select
+from .storage.npz import BadValue
 
 NARROWEST = 0.25
 """Smallest standard deviation along an axis of the factor, in pixels: what is narrower falls

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import types_of
+from .backend.arrays import types_of
 from .gaussians import Gaussians, concatenate
 from .rearrange import residual
 from .rendering import CUTOFF

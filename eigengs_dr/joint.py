@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .adan import Adan
-from .arrays import ArrayTypes, types_in, types_of, upload
-from .backend import select
+from .backend.arrays import ArrayTypes, types_in, types_of, upload
+from .backend.recording import frozen
+from .backend.selection import select
 from .coordinates import CHOLESKY
-from .freezing import frozen
 from .gaussians import Gaussians
 from .kernels import accumulate, adjoint
 from .place import random
@@ -145,7 +145,7 @@ def train_jointly(
     JointState
         After every `ROUND` steps and after the last; nothing if `state` is already there. No part
         of a state changes later. Between two of them, `KeyboardInterrupt` may become another
-        error: see `eigengs_dr.interrupt.deferred`.
+        error: see `eigengs_dr.backend.interrupt.deferred`.
 
     Raises
     ------

@@ -12,7 +12,7 @@ from typing import Any
 
 import drjit as dr
 
-from .arrays import ArrayTypes, types_of
+from .backend.arrays import ArrayTypes, types_of
 from .splat import SHAPE, gather_run, list_entry, unpack, weights, weights_pullback
 from .tiles import Grid, TileLists, walk
 

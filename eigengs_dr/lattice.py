@@ -18,7 +18,7 @@ from typing import Any
 
 import drjit as dr
 
-from .arrays import ArrayTypes, types_of
+from .backend.arrays import ArrayTypes, types_of
 from .filtered import sum_filtered
 from .sizes import Sizes
 from .splat import SHAPE, UNIT, falloff, gather_run

@@ -15,12 +15,12 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .backend.interrupt import deferred
 from .descent import Schedule, descend
 from .fitting import Fit, check
 from .gaussians import Gaussians, concatenate
 from .growth import worth
 from .images import check_image
-from .interrupt import deferred
 from .presets import PRESETS
 from .rearrange import placed_like, residual
 from .refine import Progress, refine

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .archive import Field
 from .basisfile import ROUNDING, require_descending
 from .gaussians import Gaussians
+from .storage.npz import Field
 from .stream import SPACES
 
 FORMAT, VERSION = "eigengs_dr.model", 2

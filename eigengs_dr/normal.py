@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
-from .arrays import types_of, upload
+from .backend.arrays import types_of, upload
 from .gaussians import Gaussians
 from .kernels import adjoint
 from .rendering import CUTOFF, lists_for, to_tiles

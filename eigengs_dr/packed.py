@@ -17,12 +17,12 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .archive import MOST_ENTRIES, BadValue
-from .atomic import replacing
 from .color import MOST_CHANNELS, SPACES
 from .curve import MOST_LEVELS, along_curve, on_curve
 from .planes import decoded, encoded
 from .quantising import Steps, Symbols, values_of
+from .storage.atomic import replacing
+from .storage.npz import MOST_ENTRIES, BadValue
 
 SUFFIX = ".egs"
 

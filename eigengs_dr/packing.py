@@ -18,7 +18,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arrays import types_of
+from .backend.arrays import types_of
 from .color import rgb_to_ycbcr, to_coded
 from .gaussians import Gaussians
 from .images import check_image

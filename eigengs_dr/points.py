@@ -15,7 +15,7 @@ from typing import Any
 
 import drjit as dr
 
-from .arrays import types_of
+from .backend.arrays import types_of
 from .splat import LN2, SHAPE, list_entry, unpack, weights
 from .tiles import Grid, build_lists
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .adaptive import Density, adaptive, bent, owners
-from .arrays import types_of
+from .backend.arrays import types_of
 from .gaussians import Gaussians
 from .rendering import CUTOFF, render
 from .resampling import resampled

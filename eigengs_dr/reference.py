@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .arrays import types_of
+from .backend.arrays import types_of
 from .splat import SHAPE, UNIT, weights
 from .tiles import TileLists
 

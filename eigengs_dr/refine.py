@@ -88,7 +88,7 @@ def refine(
     progress : callable, optional
         ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
     interrupted : callable, optional
-        Asked before every step whether to stop; see `eigengs_dr.interrupt.deferred`.
+        Asked before every step whether to stop; see `eigengs_dr.backend.interrupt.deferred`.
 
     Returns
     -------

@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import ArrayTypes, types_of, upload
+from .backend.arrays import ArrayTypes, types_of, upload
 from .color import decode, to_coded
 from .gaussians import Gaussians
 from .kernels import accumulate, adjoint, channel_sums

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import types_of
+from .backend.arrays import types_of
 from .descent import descend
 from .gaussians import Gaussians
 from .packed import Packed

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import archive, packed
+from . import packed
 from .color import MOST_CHANNELS, SPACES
+from .storage import npz as archive
 
 FORMAT = "eigengs_dr.gaussians"
 VERSION = 1

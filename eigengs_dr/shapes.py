@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .adam import Adam
-from .arrays import types_of
+from .backend.arrays import types_of
+from .backend.recording import frozen
 from .descent import Schedule, rate_left, step_program
-from .freezing import frozen
 from .gaussians import Gaussians
 from .place import grid
 from .rendering import CUTOFF, lists_for, to_tiles

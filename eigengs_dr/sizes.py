@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .arrays import types_of, upload
+from .backend.arrays import types_of, upload
 from .points import Cells, cell_side, list_cells
 from .splat import UNIT, widen
 

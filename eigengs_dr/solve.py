@@ -15,8 +15,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import types_of
-from .freezing import frozen
+from .backend.arrays import types_of
+from .backend.recording import frozen
 from .gaussians import Gaussians
 from .kernels import accumulate, adjoint, channel_sums
 from .rendering import CUTOFF, WIDEST_CUTOFF, lists_for, to_tiles

@@ -16,15 +16,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .checkpoint import Checkpoint
+from .backend.interrupt import deferred
 from .components import State, check_arguments, fit_components, split_reason, wants_split
 from .eigengs import EigenGS
 from .fall import Fall, check_target
 from .heldout import fall_on, measured
 from .images import ImageError, image_files
 from .incremental import EigenState, block_length, merge, rank_for, start
-from .interrupt import deferred
 from .pca import Eigenbasis, checked_components
+from .storage.checkpoint import Checkpoint
 from .stream import SPACES, batches, checked_size
 
 HELD_OUT = 10

@@ -16,22 +16,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.color import to_linear
-from eigengs_dr.filtered import sum_filtered
-from eigengs_dr.footprints import bounded_covariance
-from eigengs_dr.lattice import build_lattice, is_distant, mean_of, sum_lattice
-from eigengs_dr.points import (
-    cell_side,
-    fold,
-    list_cells,
-    sum_near,
-    values,
-    values_and_slopes,
-)
-from eigengs_dr.rendering import splat_values
-from eigengs_dr.sizes import sort_by_size
-from eigengs_dr.splat import SHAPE, UNIT, pack
-
+from ..color import to_linear
+from ..filtered import sum_filtered
+from ..footprints import bounded_covariance
+from ..lattice import build_lattice, is_distant, mean_of, sum_lattice
+from ..points import cell_side, fold, list_cells, sum_near, values, values_and_slopes
+from ..rendering import splat_values
+from ..sizes import sort_by_size
+from ..splat import SHAPE, UNIT, pack
 from .cone import metric
 from .properties import affine, angle, cutoff, raw, source_of, wrap_mode
 from .spectrum import upload_table, upsample

@@ -7,12 +7,11 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.color import SPACES
-from eigengs_dr.eigengs import EigenGS
-from eigengs_dr.gaussians import Gaussians
-from eigengs_dr.rendering import CUTOFF, WIDEST_CUTOFF
-from eigengs_dr.tensors import FIELDS
-
+from ..color import SPACES
+from ..eigengs import EigenGS
+from ..gaussians import Gaussians
+from ..rendering import CUTOFF, WIDEST_CUTOFF
+from ..tensors import FIELDS
 from .parameters import FromModel, FromSet
 
 WRAPS = ("repeat", "mirror", "clamp")

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.ndimage import gaussian_filter
 
-from eigengs_dr.backend import select
+from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.eigengs import EigenGS
 from eigengs_dr.gaussians import Gaussians
 from eigengs_dr.pca import Eigenbasis

@@ -8,12 +8,19 @@ from types import SimpleNamespace
 
 import pytest
 
-from eigengs_dr import backend as module
-from eigengs_dr.backend import VARIABLE, BackendError, candidates, describe, prepare, select
+from eigengs_dr.backend.selection.selection import (
+    VARIABLE,
+    BackendError,
+    candidates,
+    describe,
+    prepare,
+    select,
+)
+from eigengs_dr.backend.selectionNone import selection as module
 
 SELECT = """
 import eigengs_dr
-from eigengs_dr.backend import BackendError, select
+from eigengs_dr.backend.selectionNone import BackendError, select
 try:
     types = select("llvm")
 except BackendError as error:

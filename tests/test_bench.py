@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scenes import family, small_model
 
-from eigengs_dr.arrays import types_in
-from eigengs_dr.backend import select
+from eigengs_dr.backend.selection.arrays import types_in
+from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.bench import eigen, kernels
 from eigengs_dr.fitting import fit
 from eigengs_dr.metrics import psnr

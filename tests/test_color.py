@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from skimage.color import rgb2ycbcr
 
-from eigengs_dr.backend import select
+from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.color import (
     SPACES,
     YCBCR_OFFSET,

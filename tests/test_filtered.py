@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scenes import SIZE, covariances, few, random_scene
 from scipy.special import erf
 
-from eigengs_dr.arrays import types_in, types_of
-from eigengs_dr.backend import select
+from eigengs_dr.backend.selection.arrays import types_in, types_of
+from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.filtered import sum_filtered
 from eigengs_dr.footprints import WIDEST, bounded_covariance, quick_erf
 from eigengs_dr.reference import render_exact

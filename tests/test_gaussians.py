@@ -18,10 +18,10 @@ from hypothesis.extra import numpy as hnp
 from scenes import COUNT, SIZE, few, random_scene
 
 import eigengs_dr
-from eigengs_dr import archive
-from eigengs_dr.backend import select
+from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.gaussians import NARROWEST, Gaussians, concatenate
 from eigengs_dr.rendering import render
+from eigengs_dr.storage import npz as archive
 
 NAMES = ("mean", "factor", "color", "background")
 LOW, HIGH = 1 / (2 * max(SIZE)), 1 / NARROWEST

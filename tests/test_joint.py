@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from eigengs_dr import joint
-from eigengs_dr.arrays import types_of
-from eigengs_dr.backend import select
+from eigengs_dr.backend.selection.arrays import types_of
+from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.coordinates import CHOLESKY
 from eigengs_dr.gaussians import Gaussians
 from eigengs_dr.joint import RATE, JointState, train_jointly

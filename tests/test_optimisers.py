@@ -11,7 +11,7 @@ from scenes import COUNT, SIZE, few, random_scene, scenes
 
 from eigengs_dr.adam import Adam
 from eigengs_dr.adan import Adan
-from eigengs_dr.backend import select
+from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.coordinates import CHOLESKY, CHOLESKY_BOUND, NATURAL
 from eigengs_dr.gaussians import NARROWEST
 

@@ -18,10 +18,10 @@ from scenes import COUNT, SIZE, family, few, random_scene, scenes
 
 import eigengs_dr as eg
 from eigengs_dr import cli, cli_pack, packed, packing, planes
-from eigengs_dr.archive import BadValue
 from eigengs_dr.curve import MOST_LEVELS, along_curve, on_curve
 from eigengs_dr.quantising import LARGEST, Steps, Symbols, factors_of, shapes_of, symbols_of, whole
 from eigengs_dr.rendering import picture_of
+from eigengs_dr.storage.npz import BadValue
 
 STEPS = Steps(0.25, 0.125, 0.0625, 0.03125)
 SPACES = [("ycbcr", 3), ("rgb", 1), ("rgb", 4), ("linear", 3), ("data", 2)]

@@ -13,8 +13,8 @@ from scenes import family, few, small_model
 
 import eigengs_dr as eg
 from eigengs_dr import cli_pareto, cli_shared
-from eigengs_dr.arrays import types_in
-from eigengs_dr.backend import select
+from eigengs_dr.backend.selection.arrays import types_in
+from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.bench import kernels, pareto, pareto_kernels, pareto_tables, sets
 from eigengs_dr.bench.pareto import Collection, Variant, front
 from eigengs_dr.console import Program

@@ -6,14 +6,7 @@ from test_training import SMALL, random_fields
 
 from eigengs_dr import pictures
 from eigengs_dr.gaussians import Gaussians
-from eigengs_dr.pictures import (
-    CELL,
-    LIGHTER,
-    comparison,
-    component_sheet,
-    ellipses,
-    overlay,
-)
+from eigengs_dr.pictures import CELL, LIGHTER, comparison, component_sheet, ellipses, overlay
 from eigengs_dr.rendering import render
 from eigengs_dr.resampling import resampled
 from eigengs_dr.strips import GAP, joined, line

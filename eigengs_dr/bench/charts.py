@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..atomic import replacing
+from ..storage.atomic import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

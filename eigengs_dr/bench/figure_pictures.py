@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import replacing
 from ..images import to_8bit
 from ..resampling import resampled
+from ..storage.atomic import replacing
 from ..strips import joined, line
 from .charts import COLORS, new_figure, save_figure
 

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend import select
+from ..backend.selection import select
 from ..bases import SHIPPED, load_basis
 from ..metrics import psnr
 from ..plugins import register_plugins

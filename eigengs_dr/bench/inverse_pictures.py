@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..atomic import replacing
 from ..color import to_coded
 from ..resampling import resampled
+from ..storage.atomic import replacing
 from ..strips import joined, line
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..adaptive import adaptive
-from ..arrays import ArrayTypes, types_in, types_of, upload
-from ..backend import select
+from ..backend.arrays import ArrayTypes, types_in, types_of, upload
+from ..backend.selection import select
 from ..color import rgb_to_ycbcr
 from ..descent import descend
 from ..gaussians import Gaussians

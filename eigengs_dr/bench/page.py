@@ -11,7 +11,7 @@ from pathlib import Path
 from string import Template
 from typing import NamedTuple
 
-from ..atomic import replacing
+from ..storage.atomic import replacing
 from .inline import TYPES, drawing, photo
 from .prose import as_html, as_markdown, bare, lines, literal, paragraphs
 from .table import MISSING, Table

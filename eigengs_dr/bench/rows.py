@@ -9,8 +9,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from ..atomic import replacing
 from ..report import plain
+from ..storage.atomic import replacing
 
 Row = dict[str, Any]
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..atomic import replacing
+from ..storage.atomic import replacing
 
 MISSING = "-"
 """Cell of a figure that is not there."""

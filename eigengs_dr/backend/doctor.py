@@ -11,11 +11,11 @@ import subprocess
 import sys
 from typing import Any
 
-from . import backend
+from . import selection as backend
 
 TRIAL = """
 import json, sys
-from eigengs_dr.backend import describe, select
+from eigengs_dr.backend.selectionNone import describe, select
 try:
     types = select(sys.argv[1])
     import drjit as dr

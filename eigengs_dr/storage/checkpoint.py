@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import archive
+from . import npz as archive
 from .atomic import replacing
 
 FORMAT, VERSION = "eigengs_dr.checkpoint", 1
