@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from .eigengs import EigenGS
     from .fitting import Fit, fit
     from .gaussians import Gaussians, concatenate
-    from .images import load_image, sample, save_image
+    from .image.io import load_image, sample, save_image
+    from .image.metrics import ms_ssim, psnr, ssim
     from .levels import fit_levels, level_counts
-    from .metrics import ms_ssim, psnr, ssim
     from .packing import Receipt, pack
     from .pca import Eigenbasis
     from .plugins import register_plugins

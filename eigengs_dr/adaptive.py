@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .curve import hilbert_order
+from .image.resize import resampled
 from .place import inverse_factor
-from .resampling import resampled
 
 Array = NDArray[np.floating]
 Density = Callable[[Array, float], Array]

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .image.folder import SPACES
 from .incremental import EXAMPLES
 from .storage import npz as archive
-from .stream import SPACES
 
 FORMAT, VERSION = "eigengs_dr.eigenbasis", 1
 

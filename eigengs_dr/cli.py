@@ -84,7 +84,7 @@ def render(
     """
     if scale is not None and size is not None:
         raise click.UsageError("--scale and --size exclude each other; give one of them")
-    from .images import SAVE_OPTIONS
+    from .image.io import SAVE_OPTIONS
 
     [output] = name_outputs([file], output, list(SAVE_OPTIONS))
     check_outputs([output], [file])

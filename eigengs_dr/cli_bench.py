@@ -109,7 +109,7 @@ def eigen(
       eigengs-dr bench eigen natural photos/ --iterations 0
       eigengs-dr bench eigen faces.npz faces-test/ --images 50 --report eigen.json
     """
-    from .images import image_files, load_image
+    from .image.io import image_files, load_image
 
     files = image_files(folder)[:images]
     check_outputs([report], files)
@@ -191,7 +191,7 @@ def inverse(
       eigengs-dr bench inverse photo.jpg --condition hidden --strip strip.png
       eigengs-dr bench inverse cat.jpg --basis cats.npz --report inverse.json --chart inverse.png
     """
-    from .images import SAVE_OPTIONS, load_image, save_image
+    from .image.io import SAVE_OPTIONS, load_image, save_image
 
     names = tuple(dict.fromkeys(conditions)) or CONDITIONS
     strips = {name: strip.with_stem(f"{strip.stem}-{name}") for name in names} if strip else {}

@@ -123,7 +123,7 @@ def fit(
       eigengs-dr fit *.png -o fits/ --preview previews/ --iterations 300
       eigengs-dr fit roughness.png -o roughness.npz --color data
     """
-    from .images import SAVE_OPTIONS
+    from .image.io import SAVE_OPTIONS
 
     _check_search(**settings)
     outputs = name_outputs(images, output, [".npz"])
@@ -191,7 +191,7 @@ def _fit_one(
     """Fit one image, write what was asked for, and return its figures."""
     import eigengs_dr as eg
 
-    from .metrics import unclamped
+    from .image.metrics import unclamped
     from .pictures import comparison
 
     color = settings["color"]

@@ -35,7 +35,7 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
       eigengs-dr info natural
       eigengs-dr info model.npz --preview components.png
     """
-    from .images import SAVE_OPTIONS, save_image
+    from .image.io import SAVE_OPTIONS, save_image
 
     [picture] = name_outputs([file], preview, list(SAVE_OPTIONS)) if preview else [None]
     check_outputs([picture], [file])

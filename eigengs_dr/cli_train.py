@@ -108,7 +108,7 @@ def train(
       eigengs-dr train photos/ -o photos.npz --target-psnr 24
       eigengs-dr fit photo.jpg -o photo.npz --init eigen --basis photos.npz
     """
-    from .images import SAVE_OPTIONS, image_files
+    from .image.io import SAVE_OPTIONS, image_files
 
     [output] = name_outputs([folder], output, [".npz"])
     [picture] = name_outputs([folder], preview, list(SAVE_OPTIONS)) if preview else [None]
@@ -152,7 +152,7 @@ def _figures(figures: dict[str, Any]) -> dict[str, Any]:
 
 
 def _save_sheet(path: Path, trained: Any) -> None:
-    from .images import save_image
+    from .image.io import save_image
     from .pictures import component_sheet
 
     save_image(path, component_sheet(trained.model, trained.basis))

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from .backend.arrays import types_of, upload_rows
 from .gaussians import Gaussians, concatenate
+from .image.folder import to_planes
+from .image.metrics import decibels
 from .joint import JointState, train_jointly
-from .metrics import decibels
 from .normal import NormalEquations
 from .pca import Eigenbasis
 from .shapes import on_grid, shapes_of, train_shapes
-from .stream import to_planes
 
 LOW_SHARE = 0.1
 """Share of the splats that serve the low frequencies, where components are split (the paper)."""

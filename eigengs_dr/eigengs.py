@@ -29,14 +29,14 @@ from .components import (
 )
 from .fall import Fall, expected
 from .gaussians import Gaussians
-from .images import check_image
+from .image.folder import to_planes
+from .image.io import check_image
+from .image.resize import resampled
 from .modelfile import FORMAT, VERSION, from_members, layout_of, to_members
 from .normal import NormalEquations
 from .pca import Eigenbasis
-from .resampling import resampled
 from .span import Span
 from .storage import npz as archive
-from .stream import to_planes
 
 Planes = NDArray[np.float32]
 Progress = Callable[[int, int, dict[str, Any]], None]

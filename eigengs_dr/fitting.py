@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from .backend.interrupt import deferred
 from .budget import fewest
-from .color import SPACES
 from .eigengs import EigenGS
 from .gaussians import Gaussians
-from .images import check_image
+from .image.color import SPACES
+from .image.io import check_image
 from .presets import PRESETS
 from .refine import EXACT, Progress, figures, refine
 from .rendering import picture_of

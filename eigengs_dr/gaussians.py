@@ -46,7 +46,7 @@ class Gaussians:
     width, height : int
         Native size in pixels.
     space : str
-        What the channels mean, one of `eigengs_dr.color.SPACES`.
+        What the channels mean, one of `eigengs_dr.image.color.SPACES`.
 
     Examples
     --------

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from .eigengs import EigenGS
 from .fall import Fall
-from .images import ImageError, load_image
-from .metrics import psnr
+from .image.io import ImageError, load_image
+from .image.metrics import psnr
+from .image.resize import cropped
 from .pca import Eigenbasis
 from .rendering import render
-from .resampling import cropped
 
 Watch = Callable[[int], None]
 """``watch(i)`` before image number i; what it raises ends the work."""

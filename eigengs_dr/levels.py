@@ -20,7 +20,7 @@ from .descent import Schedule, descend
 from .fitting import Fit, check
 from .gaussians import Gaussians, concatenate
 from .growth import worth
-from .images import check_image
+from .image.io import check_image
 from .presets import PRESETS
 from .rearrange import placed_like, residual
 from .refine import Progress, refine

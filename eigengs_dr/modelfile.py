@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from .basisfile import ROUNDING, require_descending
 from .gaussians import Gaussians
+from .image.folder import SPACES
 from .storage.npz import Field
-from .stream import SPACES
 
 FORMAT, VERSION = "eigengs_dr.model", 2
 

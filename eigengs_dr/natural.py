@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .images import SAMPLES, sample
-from .resampling import resampled
+from .image.io import SAMPLES, sample
+from .image.resize import resampled
 
 DEMO = "coffee"
 """The photo of ``make demo``: not trained on, so that the demo shows what others can expect."""

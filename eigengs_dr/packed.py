@@ -17,8 +17,8 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .color import MOST_CHANNELS, SPACES
 from .curve import MOST_LEVELS, along_curve, on_curve
+from .image.color import MOST_CHANNELS, SPACES
 from .planes import decoded, encoded
 from .quantising import Steps, Symbols, values_of
 from .storage.atomic import replacing
@@ -55,7 +55,7 @@ class Packed(NamedTuple):
     size : (int, int)
         Native width and height.
     space : str
-        One of `eigengs_dr.color.SPACES`.
+        One of `eigengs_dr.image.color.SPACES`.
     """
 
     sections: list[Symbols]

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .backend.arrays import types_of
-from .color import rgb_to_ycbcr, to_coded
 from .gaussians import Gaussians
-from .images import check_image
-from .metrics import decibels
+from .image.color import rgb_to_ycbcr, to_coded
+from .image.io import check_image
+from .image.metrics import decibels
 from .packed import MOST_SECTIONS, Packed, to_bytes, write
 from .quantising import Steps, shapes_of, sizes_of
 from .refine import EXACT

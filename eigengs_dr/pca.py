@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .basisfile import ROUNDING, read_basis, write_basis
-from .color import ycbcr_to_rgb
 from .fall import Fall, expected, falling, remaining
-from .images import check_image
+from .image.color import ycbcr_to_rgb
+from .image.folder import Progress, Source, batches, checked_size, to_planes
+from .image.io import check_image
+from .image.resize import resampled
 from .incremental import EigenState, block_length, merge, rank_for, start
-from .resampling import resampled
-from .stream import Progress, Source, batches, checked_size, to_planes
 
 CHANNELS = {"ycbcr": ("Y", "Cb", "Cr"), "rgb": ("R", "G", "B")}
 """What the channels of a space are called in warnings."""
@@ -77,7 +77,7 @@ class Eigenbasis:
         Parameters
         ----------
         source : path, array or iterable
-            See `eigengs_dr.stream.batches`.
+            See `eigengs_dr.image.folder.batches`.
         size : (int, int)
             Width and height of the basis.
         components : int or sequence of 3 ints

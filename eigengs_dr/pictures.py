@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .color import decode
 from .components import colored
 from .eigengs import EigenGS
 from .gaussians import Gaussians
-from .images import to_8bit
+from .image.color import decode
+from .image.io import to_8bit
+from .image.montage import joined, line
+from .image.resize import resampled
 from .pca import CHANNELS, Eigenbasis
 from .rendering import render
-from .resampling import resampled
-from .strips import joined, line
 
 FIRST = (1, 2, 3, 5, 10, 20, 50, 100, 200)
 """Components of the first channel that are shown, counted from 1."""

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from .adaptive import Density, adaptive, bent, owners
 from .backend.arrays import types_of
 from .gaussians import Gaussians
+from .image.resize import resampled
 from .rendering import CUTOFF, render
-from .resampling import resampled
 from .solve import solve
 
 Array = NDArray[np.floating]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .descent import Rearrange, Schedule, descend
 from .gaussians import Gaussians
-from .metrics import psnr, unclamped
+from .image.metrics import psnr, unclamped
 from .rendering import CUTOFF, picture_of
 
 EXACT = 100.0

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend.arrays import ArrayTypes, types_of, upload
-from .color import decode, to_coded
 from .gaussians import Gaussians
+from .image.color import decode, to_coded
 from .kernels import accumulate, adjoint, channel_sums
 from .splat import UNIT, gather_run, pack
 from .tiles import Grid, TileLists, build_lists

@@ -18,11 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
 
 from .adaptive import adaptive
-from .color import to_coded, to_linear
 from .descent import descend
 from .gaussians import Gaussians
-from .images import check_image
-from .metrics import psnr as psnr_of
+from .image.color import to_coded, to_linear
+from .image.io import check_image
+from .image.metrics import psnr as psnr_of
 from .plugins.cone import PIXEL
 from .presets import PRESETS
 from .rendering import CUTOFF, render

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import packed
-from .color import MOST_CHANNELS, SPACES
+from .image.color import MOST_CHANNELS, SPACES
 from .storage import npz as archive
 
 FORMAT = "eigengs_dr.gaussians"
@@ -82,7 +82,7 @@ def check(arrays: Arrays, size: tuple[int, ...], space: str) -> None:
     size : tuple of int
         Width and height, from 1 to 65536 pixels.
     space : str
-        One of `eigengs_dr.color.SPACES`; the number of channels must fit it.
+        One of `eigengs_dr.image.color.SPACES`; the number of channels must fit it.
     """
     mean, factor, color = arrays["mean"], arrays["factor"], arrays["color"]
     if mean.ndim != 2 or mean.shape[1] != 2 or len(mean) == 0:

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from . import place as places
 from .adaptive import adaptive
 from .bases import load_basis
-from .color import decode, rgb_to_ycbcr, to_linear
 from .eigengs import EigenGS
 from .gaussians import Gaussians
+from .image.color import decode, rgb_to_ycbcr, to_linear
+from .image.folder import SPACES as BASIS_SPACES
 from .presets import Preset
 from .rearrange import rearranged
 from .rendering import CUTOFF
 from .solve import solve
-from .stream import SPACES as BASIS_SPACES
 
 PLACES = {"random": places.random, "grid": places.grid, "adaptive": adaptive}
 """Initialisers that look at the image alone, by name."""

@@ -21,11 +21,11 @@ from .components import State, check_arguments, fit_components, split_reason, wa
 from .eigengs import EigenGS
 from .fall import Fall, check_target
 from .heldout import fall_on, measured
-from .images import ImageError, image_files
+from .image.folder import SPACES, batches, checked_size
+from .image.io import ImageError, image_files
 from .incremental import EigenState, block_length, merge, rank_for, start
 from .pca import Eigenbasis, checked_components
 from .storage.checkpoint import Checkpoint
-from .stream import SPACES, batches, checked_size
 
 HELD_OUT = 10
 """One image in so many is not trained on, but measured."""

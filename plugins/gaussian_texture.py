@@ -16,9 +16,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..color import to_linear
 from ..filtered import sum_filtered
 from ..footprints import bounded_covariance
+from ..image.color import to_linear
 from ..lattice import build_lattice, is_distant, mean_of, sum_lattice
 from ..points import cell_side, fold, list_cells, sum_near, values, values_and_slopes
 from ..rendering import splat_values

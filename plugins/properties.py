@@ -7,9 +7,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from ..color import SPACES
 from ..eigengs import EigenGS
 from ..gaussians import Gaussians
+from ..image.color import SPACES
 from ..rendering import CUTOFF, WIDEST_CUTOFF
 from ..tensors import FIELDS
 from .parameters import FromModel, FromSet

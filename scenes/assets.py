@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 import eigengs_dr as eg
-from eigengs_dr.resampling import resampled
+from eigengs_dr.image.resize import resampled
 
 FOLDER = Path(__file__).parent.parent / "build" / "scenes"
 """Where the scenes look for the sets unless told otherwise."""

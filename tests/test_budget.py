@@ -15,9 +15,9 @@ from eigengs_dr import budget
 from eigengs_dr.adaptive import adaptive
 from eigengs_dr.budget import fewest
 from eigengs_dr.cli import main
-from eigengs_dr.color import rgb_to_ycbcr
 from eigengs_dr.fitting import fit, most_gaussians
 from eigengs_dr.growth import APART, grown, places, pruned, worth
+from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.presets import PRESETS
 from eigengs_dr.rearrange import FALL, rearranged, residual, wanted
 from eigengs_dr.rendering import render

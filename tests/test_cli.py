@@ -18,8 +18,8 @@ import eigengs_dr as eg
 from eigengs_dr import bases, cli_train
 from eigengs_dr.backend.selection.selection import BackendError, select
 from eigengs_dr.cli import main
-from eigengs_dr.color import SPACES, YCBCR_TO_RGB
 from eigengs_dr.eigengs import EigenGS
+from eigengs_dr.image.color import SPACES, YCBCR_TO_RGB
 from eigengs_dr.starting import INITS
 
 

@@ -19,8 +19,8 @@ from eigengs_dr import components, modelfile
 from eigengs_dr.cli import main
 from eigengs_dr.components import SPLIT_COST, split_reason, wants_split
 from eigengs_dr.fall import expected, falling, fewest_apart, remaining
+from eigengs_dr.image.folder import to_planes
 from eigengs_dr.storage import npz as archive
-from eigengs_dr.stream import to_planes
 from eigengs_dr.training import Settings, train
 
 SIDE, RANKS = 16, (5, 3, 1)

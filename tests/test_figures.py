@@ -15,9 +15,9 @@ from eigengs_dr import cli_figures, pictures
 from eigengs_dr.bench import figure_charts, figure_strips, figure_task, figures, sets
 from eigengs_dr.bench.figure_pictures import CELL, HEADING, LETTERS, Cell, Row, save_strip, strip
 from eigengs_dr.console import Program
-from eigengs_dr.metrics import psnr
+from eigengs_dr.image.metrics import psnr
+from eigengs_dr.image.montage import GAP
 from eigengs_dr.rendering import picture_of
-from eigengs_dr.strips import GAP
 
 SETS = ("cats512", "natural256", "kodak")
 MACHINE = {"command": "test", "cpu": "any"}

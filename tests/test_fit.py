@@ -12,10 +12,10 @@ from test_refine import SIDE, SPLATS, figures, picture, presets
 
 from eigengs_dr import fitting, starting
 from eigengs_dr.adam import Adam
-from eigengs_dr.color import to_coded, to_linear
 from eigengs_dr.descent import Schedule
 from eigengs_dr.fitting import fit
-from eigengs_dr.metrics import psnr
+from eigengs_dr.image.color import to_coded, to_linear
+from eigengs_dr.image.metrics import psnr
 from eigengs_dr.place import grid
 from eigengs_dr.presets import PRESETS
 from eigengs_dr.rendering import picture_of, render

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from eigengs_dr.images import (
+from eigengs_dr.image.io import (
     SAMPLES,
     SAVE_OPTIONS,
     ImageError,

@@ -12,9 +12,9 @@ from scenes import random_scene
 
 import eigengs_dr as eg
 from eigengs_dr.cli import main
-from eigengs_dr.color import rgb_to_ycbcr
 from eigengs_dr.descent import first
 from eigengs_dr.growth import worth
+from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.levels import fit_levels, level_counts
 from eigengs_dr.packing import UNSEEN
 from eigengs_dr.presets import PRESETS

@@ -11,12 +11,12 @@ from sklearn.decomposition import PCA
 
 import eigengs_dr.pca as pca
 from eigengs_dr import basisfile, incremental
-from eigengs_dr.images import ImageError, check_image, image_files, save_image
+from eigengs_dr.image.folder import batches, to_planes
+from eigengs_dr.image.io import ImageError, check_image, image_files, save_image
+from eigengs_dr.image.resize import resampled
 from eigengs_dr.incremental import EigenState, merge, start
 from eigengs_dr.pca import Eigenbasis
-from eigengs_dr.resampling import resampled
 from eigengs_dr.storage import npz as archive
-from eigengs_dr.stream import batches, to_planes
 
 WIDTH, HEIGHT = SIZE = (14, 11)
 PIXELS = WIDTH * HEIGHT

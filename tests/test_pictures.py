@@ -6,10 +6,10 @@ from test_training import SMALL, random_fields
 
 from eigengs_dr import pictures
 from eigengs_dr.gaussians import Gaussians
+from eigengs_dr.image.montage import GAP, joined, line
+from eigengs_dr.image.resize import resampled
 from eigengs_dr.pictures import CELL, LIGHTER, comparison, component_sheet, ellipses, overlay
 from eigengs_dr.rendering import render
-from eigengs_dr.resampling import resampled
-from eigengs_dr.strips import GAP, joined, line
 from eigengs_dr.training import Settings, train
 
 CAPTION = 12

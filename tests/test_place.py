@@ -9,8 +9,8 @@ from scenes import covariances, few
 
 from eigengs_dr.adaptive import adaptive, bending, bent, capped, pieces, relaxed
 from eigengs_dr.curve import hilbert_order
+from eigengs_dr.image.resize import resampled
 from eigengs_dr.place import GRID_SIZE, grid, inverse_factor, random
-from eigengs_dr.resampling import resampled
 
 INITS = [random, grid, adaptive]
 

@@ -9,8 +9,8 @@ import pytest
 from drjit import JitFlag
 from scenes import Scene, random_scene
 
-from eigengs_dr.color import rgb_to_ycbcr
 from eigengs_dr.descent import descend
+from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.presets import PRESETS
 from eigengs_dr.refine import refine, rows_at
 from eigengs_dr.rendering import render

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eigengs_dr.resampling import cropped, resampled
+from eigengs_dr.image.resize import cropped, resampled
 
 sizes = st.tuples(st.integers(1, 40), st.integers(1, 40))
 

@@ -15,7 +15,7 @@ from test_resolution import variant as variant  # noqa: E402
 
 import eigengs_dr as eg  # noqa: E402
 from eigengs_dr import scenefit  # noqa: E402
-from eigengs_dr.color import to_coded, to_linear  # noqa: E402
+from eigengs_dr.image.color import to_coded, to_linear  # noqa: E402
 from eigengs_dr.plugins import texture_of  # noqa: E402
 from eigengs_dr.resolution import Resolution  # noqa: E402
 from eigengs_dr.smoothest import _blur_by, filled, smoothest  # noqa: E402

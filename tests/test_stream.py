@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import eigengs_dr.stream as stream
-from eigengs_dr.color import rgb_to_ycbcr
-from eigengs_dr.images import ImageError, check_image, image_files, load_image, save_image
-from eigengs_dr.resampling import cropped
-from eigengs_dr.stream import batches, checked_size, to_planes
+import eigengs_dr.image.folder as stream
+from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.image.folder import batches, checked_size, to_planes
+from eigengs_dr.image.io import ImageError, check_image, image_files, load_image, save_image
+from eigengs_dr.image.resize import cropped
 
 WIDTH, HEIGHT = SIZE = (6, 5)
 

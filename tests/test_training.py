@@ -14,8 +14,8 @@ from scipy.ndimage import gaussian_filter
 
 from eigengs_dr import training
 from eigengs_dr.eigengs import EigenGS
-from eigengs_dr.images import ImageError, load_image
-from eigengs_dr.metrics import psnr
+from eigengs_dr.image.io import ImageError, load_image
+from eigengs_dr.image.metrics import psnr
 from eigengs_dr.rendering import render
 from eigengs_dr.training import Interrupted, Settings, train
 

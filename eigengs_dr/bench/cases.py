@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..images import sample
+from ..image.io import sample
+from ..image.resize import cropped
 from ..place import inverse_factor
-from ..resampling import cropped
 
 Image = NDArray[np.float32]
 Shapes = tuple[NDArray[np.float64], NDArray[np.float64]]

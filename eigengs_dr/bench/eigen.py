@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color import rgb_to_ycbcr
 from ..eigengs import EigenGS
 from ..fitting import fit
 from ..gaussians import Gaussians
-from ..metrics import psnr
+from ..image.color import rgb_to_ycbcr
+from ..image.metrics import psnr
 from ..presets import PRESETS
 from ..refine import refine
 from ..rendering import render

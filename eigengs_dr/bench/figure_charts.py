@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..bases import load_basis
 from ..eigengs import EigenGS
 from ..gaussians import Gaussians
-from ..metrics import psnr
+from ..image.metrics import psnr
 from . import rows, sets
 from .figure_pictures import Curve, Radii, save_curves, save_radii
 from .figure_task import CATS, COMPONENTS, METHODS, Figure, Image, Task, descent, model_of, to_size

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..images import to_8bit
-from ..resampling import resampled
+from ..image.io import to_8bit
+from ..image.montage import joined, line
+from ..image.resize import resampled
 from ..storage.atomic import replacing
-from ..strips import joined, line
 from .charts import COLORS, new_figure, save_figure
 
 CELL = 160

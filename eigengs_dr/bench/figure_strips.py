@@ -11,8 +11,8 @@ import numpy as np
 from ..bases import load_basis
 from ..eigengs import EigenGS
 from ..gaussians import Gaussians
-from ..images import sample
-from ..metrics import psnr
+from ..image.io import sample
+from ..image.metrics import psnr
 from ..pictures import overlay
 from ..rendering import picture_of
 from . import sets

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..eigengs import EigenGS
+from ..image.resize import cropped
 from ..presets import PRESETS
-from ..resampling import cropped
 from ..starting import begin
 from . import rows, sets
 from .trial import Moment, follow

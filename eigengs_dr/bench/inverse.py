@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from ..backend.selection import select
 from ..bases import SHIPPED, load_basis
-from ..metrics import psnr
+from ..image.metrics import psnr
+from ..image.resize import cropped
 from ..plugins import register_plugins
-from ..resampling import cropped
 from .poster import CONDITIONS, Condition, head_on, photograph, scene_of
 from .unknowns import METHODS
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..color import to_coded
-from ..resampling import resampled
+from ..image.color import to_coded
+from ..image.montage import joined, line
+from ..image.resize import resampled
 from ..storage.atomic import replacing
-from ..strips import joined, line
 
 if TYPE_CHECKING:
     from .inverse import Image, Result

@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from ..adaptive import adaptive
 from ..backend.arrays import ArrayTypes, types_in, types_of, upload
 from ..backend.selection import select
-from ..color import rgb_to_ycbcr
 from ..descent import descend
 from ..gaussians import Gaussians
-from ..images import check_image, sample
+from ..image.color import rgb_to_ycbcr
+from ..image.io import check_image, sample
 from ..presets import PRESETS
 from ..reference import render_plain
 from ..refine import Progress

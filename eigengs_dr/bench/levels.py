@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color import rgb_to_ycbcr
 from ..fitting import fit
 from ..gaussians import Gaussians
 from ..growth import worth
+from ..image.color import rgb_to_ycbcr
+from ..image.metrics import psnr
 from ..levels import fit_levels, level_counts
-from ..metrics import psnr
 from ..rendering import picture_of
 from .charts import new_figure
 from .table import Table, number, save_csv

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from ..bases import load_basis
 from ..eigengs import EigenGS
 from ..gaussians import Gaussians
-from ..images import sample
+from ..image.io import sample
+from ..image.resize import cropped
 from ..presets import PRESETS
 from ..rendering import CUTOFF, picture_of
-from ..resampling import cropped
 from ..starting import GAUSSIANS, Start, begin
 from .rows import Job, Row
 from .sets import SETS, model_for, test_images

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..fitting import fit
-from ..images import sample, to_8bit
-from ..metrics import ssim
+from ..image.io import sample, to_8bit
+from ..image.metrics import ssim
+from ..image.resize import cropped
 from ..packing import pack
 from ..rendering import picture_of
-from ..resampling import cropped
 from .pareto import SAMPLE_NAMES, SAMPLE_SIDE, SAMPLES
 from .rows import Job, Row
 from .sets import test_images

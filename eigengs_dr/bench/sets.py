@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..eigengs import EigenGS
-from ..images import image_files, load_image
+from ..image.io import image_files, load_image
+from ..image.resize import cropped
 from ..pca import Eigenbasis
-from ..resampling import cropped
 
 Image = NDArray[np.float32]
 Progress = Callable[[str, int, int], None]

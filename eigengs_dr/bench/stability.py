@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bases import load_basis
-from ..color import rgb_to_ycbcr
 from ..gaussians import Gaussians
+from ..image.color import rgb_to_ycbcr
 from ..presets import PRESETS, Preset
 from ..refine import EXACT, rows_at
 from ..rendering import picture_of

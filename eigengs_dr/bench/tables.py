@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from ..descent import LONG
 from ..eigengs import EigenGS
-from ..metrics import psnr
+from ..image.metrics import psnr
 from ..presets import PRESETS
 from ..starting import Start, begin
 from . import rows

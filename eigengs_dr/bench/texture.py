@@ -10,9 +10,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..color import to_linear
 from ..fitting import fit
-from ..images import sample
+from ..image.color import to_linear
+from ..image.io import sample
 from ..refine import Progress
 from ..rendering import picture_of, render
 from .trial import whole

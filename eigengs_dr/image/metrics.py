@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .color import rgb_to_ycbcr
-from .images import to_8bit
+from .io import to_8bit
 
 WINDOW = 11
 """Side of the Gaussian window of SSIM and MS-SSIM, in pixels."""

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .color import RGB_TO_YCBCR, YCBCR_OFFSET
-from .images import ImageError, check_image, image_files, load_image
-from .resampling import cropped
+from .io import ImageError, check_image, image_files, load_image
+from .resize import cropped
 
 SPACES = ("ycbcr", "rgb")
 """Colour spaces that images can be read in."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .storage.atomic import replacing
+from ..storage.atomic import replacing
 
 if TYPE_CHECKING:
     from PIL.Image import Image
