@@ -12,7 +12,8 @@ from .backend.selection import BackendError, prepare
 if TYPE_CHECKING:
     from .eigengs import EigenGS
     from .fitting import Fit, fit
-    from .gaussians import Gaussians, concatenate
+    from .gaussian.gaussians import Gaussians, concatenate
+    from .gaussian.tensors import from_tensors, to_tensors
     from .image.io import load_image, sample, save_image
     from .image.metrics import ms_ssim, psnr, ssim
     from .levels import fit_levels, level_counts
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from .plugins import register_plugins
     from .rendering import picture_of, render
     from .scenefit import fit_for_scene
-    from .tensors import from_tensors, to_tensors
 
 __all__ = [
     "BackendError",

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 
 from .descent import Schedule, descend
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .growth import grown, pruned
 from .refine import Progress, Refined
 from .rendering import CUTOFF

@@ -40,10 +40,11 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     [picture] = name_outputs([file], preview, list(SAVE_OPTIONS)) if preview else [None]
     check_outputs([picture], [file])
     select()
-    from . import modelfile, packed, setfile
+    from . import modelfile, packed
     from .bases import SHIPPED
     from .eigengs import EigenGS
-    from .gaussians import Gaussians
+    from .gaussian import file as setfile
+    from .gaussian.gaussians import Gaussians
     from .pictures import component_sheet
     from .storage import npz as archive
 

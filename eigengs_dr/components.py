@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend.arrays import types_of, upload_rows
-from .gaussians import Gaussians, concatenate
+from .gaussian.gaussians import Gaussians, concatenate
 from .image.folder import to_planes
 from .image.metrics import decibels
 from .joint import JointState, train_jointly

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 
 from .backend.arrays import types_of
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 
 
 class Coordinates(NamedTuple):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .backend.arrays import types_of
 from .backend.recording import frozen
 from .coordinates import NATURAL, Coordinates
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .rendering import CUTOFF, lists_for, splat, to_tiles
 from .splat import UNIT
 from .tiles import Grid, TileLists

@@ -28,7 +28,7 @@ from .components import (
     wants_split,
 )
 from .fall import Fall, expected
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .image.folder import to_planes
 from .image.io import check_image
 from .image.resize import resampled

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from .backend.interrupt import deferred
 from .budget import fewest
 from .eigengs import EigenGS
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .image.color import SPACES
 from .image.io import check_image
 from .presets import PRESETS

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend.arrays import types_of
-from .gaussians import Gaussians, concatenate
+from .gaussian.gaussians import Gaussians, concatenate
 from .rearrange import residual
 from .rendering import CUTOFF
 from .solve import correlations, solve

@@ -21,7 +21,7 @@ from .backend.arrays import ArrayTypes, types_in, types_of, upload
 from .backend.recording import frozen
 from .backend.selection import select
 from .coordinates import CHOLESKY
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .kernels import accumulate, adjoint
 from .place import random
 from .rendering import CUTOFF, lists_for, to_tiles

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from .backend.interrupt import deferred
 from .descent import Schedule, descend
 from .fitting import Fit, check
-from .gaussians import Gaussians, concatenate
+from .gaussian.gaussians import Gaussians, concatenate
 from .growth import worth
 from .image.io import check_image
 from .presets import PRESETS

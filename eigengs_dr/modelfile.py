@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .basisfile import ROUNDING, require_descending
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .image.folder import SPACES
 from .storage.npz import Field
 

@@ -18,7 +18,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
 from .backend.arrays import types_of, upload
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .kernels import adjoint
 from .rendering import CUTOFF, lists_for, to_tiles
 from .splat import SHAPE, UNIT, pack, unpack, weights

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .backend.arrays import types_of
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .image.color import rgb_to_ycbcr, to_coded
 from .image.io import check_image
 from .image.metrics import decibels

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from .components import colored
 from .eigengs import EigenGS
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .image.color import decode
 from .image.io import to_8bit
 from .image.montage import joined, line

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from .adaptive import Density, adaptive, bent, owners
 from .backend.arrays import types_of
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .image.resize import resampled
 from .rendering import CUTOFF, render
 from .solve import solve

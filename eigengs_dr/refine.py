@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .descent import Rearrange, Schedule, descend
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .image.metrics import psnr, unclamped
 from .rendering import CUTOFF, picture_of
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend.arrays import ArrayTypes, types_of, upload
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .image.color import decode, to_coded
 from .kernels import accumulate, adjoint, channel_sums
 from .splat import UNIT, gather_run, pack

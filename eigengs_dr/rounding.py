@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .backend.arrays import types_of
 from .descent import descend
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .packed import Packed
 from .presets import PRESETS
 from .quantising import Steps, shapes_of, symbols_of, values_of

@@ -19,7 +19,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
 
 from .adaptive import adaptive
 from .descent import descend
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .image.color import to_coded, to_linear
 from .image.io import check_image
 from .image.metrics import psnr as psnr_of

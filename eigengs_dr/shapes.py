@@ -22,7 +22,7 @@ from .adam import Adam
 from .backend.arrays import types_of
 from .backend.recording import frozen
 from .descent import Schedule, rate_left, step_program
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .place import grid
 from .rendering import CUTOFF, lists_for, to_tiles
 from .solve import solve

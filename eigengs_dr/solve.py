@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from .backend.arrays import types_of
 from .backend.recording import frozen
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .kernels import accumulate, adjoint, channel_sums
 from .rendering import CUTOFF, WIDEST_CUTOFF, lists_for, to_tiles
 from .splat import SHAPE, UNIT, pack

@@ -14,7 +14,7 @@ from . import place as places
 from .adaptive import adaptive
 from .bases import load_basis
 from .eigengs import EigenGS
-from .gaussians import Gaussians
+from .gaussian.gaussians import Gaussians
 from .image.color import decode, rgb_to_ycbcr, to_linear
 from .image.folder import SPACES as BASIS_SPACES
 from .presets import Preset

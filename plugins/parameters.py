@@ -11,8 +11,8 @@ import numpy as np
 
 from ..backend.arrays import types_of
 from ..eigengs import EigenGS
-from ..gaussians import Gaussians
-from ..tensors import FIELDS, from_tensors, to_tensors
+from ..gaussian.gaussians import Gaussians
+from ..gaussian.tensors import FIELDS, from_tensors, to_tensors
 
 
 def texture_of(gaussians: Gaussians, **properties: Any) -> dict[str, Any]:

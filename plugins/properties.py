@@ -8,10 +8,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..eigengs import EigenGS
-from ..gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians
+from ..gaussian.tensors import FIELDS
 from ..image.color import SPACES
 from ..rendering import CUTOFF, WIDEST_CUTOFF
-from ..tensors import FIELDS
 from .parameters import FromModel, FromSet
 
 WRAPS = ("repeat", "mirror", "clamp")

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 
 from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.eigengs import EigenGS
-from eigengs_dr.gaussians import Gaussians
+from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.pca import Eigenbasis
 from eigengs_dr.reference import render_exact
 

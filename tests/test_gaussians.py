@@ -19,7 +19,7 @@ from scenes import COUNT, SIZE, few, random_scene
 
 import eigengs_dr
 from eigengs_dr.backend.selection.selection import select
-from eigengs_dr.gaussians import NARROWEST, Gaussians, concatenate
+from eigengs_dr.gaussian.gaussians import NARROWEST, Gaussians, concatenate
 from eigengs_dr.rendering import render
 from eigengs_dr.storage import npz as archive
 

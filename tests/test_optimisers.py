@@ -13,7 +13,7 @@ from eigengs_dr.adam import Adam
 from eigengs_dr.adan import Adan
 from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.coordinates import CHOLESKY, CHOLESKY_BOUND, NATURAL
-from eigengs_dr.gaussians import NARROWEST
+from eigengs_dr.gaussian.gaussians import NARROWEST
 
 # --- Adam --------------------------------------------------------------------------------------
 

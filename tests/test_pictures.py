@@ -5,7 +5,7 @@ import pytest
 from test_training import SMALL, random_fields
 
 from eigengs_dr import pictures
-from eigengs_dr.gaussians import Gaussians
+from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.montage import GAP, joined, line
 from eigengs_dr.image.resize import resampled
 from eigengs_dr.pictures import CELL, LIGHTER, comparison, component_sheet, ellipses, overlay

@@ -21,7 +21,7 @@ from scenes import (
 )
 from scipy.ndimage import maximum_filter
 
-from eigengs_dr.gaussians import concatenate
+from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.color import rgb_to_ycbcr, ycbcr_to_rgb
 from eigengs_dr.reference import render_exact, render_plain
 from eigengs_dr.rendering import CUTOFF, WIDEST_CUTOFF, lists_for, render, splat_values, to_tensor

@@ -14,7 +14,7 @@ from eigengs_dr.bench.rows import read
 from eigengs_dr.cli_stability import NAMES
 from eigengs_dr.cli_stability import stability as command
 from eigengs_dr.console import Program
-from eigengs_dr.gaussians import NARROWEST
+from eigengs_dr.gaussian.gaussians import NARROWEST
 from eigengs_dr.place import inverse_factor
 from eigengs_dr.presets import PRESETS
 from eigengs_dr.refine import EXACT

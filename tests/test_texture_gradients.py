@@ -11,7 +11,7 @@ from test_texture import at, gaussians, picture, small_scene, texel_centres, tex
 from test_texture import variant as variant  # noqa: E402
 
 import eigengs_dr as eg  # noqa: E402
-from eigengs_dr.gaussians import NARROWEST  # noqa: E402
+from eigengs_dr.gaussian.gaussians import NARROWEST  # noqa: E402
 from eigengs_dr.plugins import gaussians_of, keep_in_bounds, texture_of  # noqa: E402
 
 PARAMETERS = ["mean", "factor", "color", "background"]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..eigengs import EigenGS
 from ..fitting import fit
-from ..gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr
 from ..image.metrics import psnr
 from ..presets import PRESETS

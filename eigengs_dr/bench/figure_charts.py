@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..bases import load_basis
 from ..eigengs import EigenGS
-from ..gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians
 from ..image.metrics import psnr
 from . import rows, sets
 from .figure_pictures import Curve, Radii, save_curves, save_radii

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..bases import load_basis
 from ..eigengs import EigenGS
-from ..gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians
 from ..image.io import sample
 from ..image.metrics import psnr
 from ..pictures import overlay

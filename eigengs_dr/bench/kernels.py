@@ -16,7 +16,7 @@ from ..adaptive import adaptive
 from ..backend.arrays import ArrayTypes, types_in, types_of, upload
 from ..backend.selection import select
 from ..descent import descend
-from ..gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr
 from ..image.io import check_image, sample
 from ..presets import PRESETS

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..fitting import fit
-from ..gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians
 from ..growth import worth
 from ..image.color import rgb_to_ycbcr
 from ..image.metrics import psnr

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..bases import load_basis
 from ..eigengs import EigenGS
-from ..gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians
 from ..image.io import sample
 from ..image.resize import cropped
 from ..presets import PRESETS

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bases import load_basis
-from ..gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr
 from ..presets import PRESETS, Preset
 from ..refine import EXACT, rows_at

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..descent import LONG, Schedule, descend
 from ..fitting import Fit
-from ..gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians
 from ..image.metrics import ms_ssim, psnr, ssim
 from ..refine import EXACT, Refined
 from ..rendering import CUTOFF, picture_of

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..eigengs import EigenGS
-from ..gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr, to_linear
 from ..plugins import keep_in_bounds, texture_of
 from .poster import POSTER, bitmap

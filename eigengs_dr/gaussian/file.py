@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import packed
-from .image.color import MOST_CHANNELS, SPACES
-from .storage import npz as archive
+from .. import packed
+from ..image.color import MOST_CHANNELS, SPACES
+from ..storage import npz as archive
 
 FORMAT = "eigengs_dr.gaussians"
 VERSION = 1

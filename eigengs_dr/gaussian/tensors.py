@@ -8,7 +8,7 @@ from typing import Any
 
 import drjit as dr
 
-from .backend.arrays import types_of
+from ..backend.arrays import types_of
 from .gaussians import Gaussians
 
 FIELDS = {"mean": 2, "factor": 3, "color": 0, "background": 0}

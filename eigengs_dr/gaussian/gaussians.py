@@ -13,10 +13,10 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import setfile
-from .backend.arrays import types_in, types_of, upload_rows
-from .backend.selection import select
-from .storage.npz import BadValue
+from ..backend.arrays import types_in, types_of, upload_rows
+from ..backend.selection import select
+from ..storage.npz import BadValue
+from . import file as setfile
 
 NARROWEST = 0.25
 """Smallest standard deviation along an axis of the factor, in pixels: what is narrower falls
