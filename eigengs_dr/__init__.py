@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .packing import Receipt, pack
     from .pca import Eigenbasis
     from .plugins import register_plugins
-    from .rendering import picture_of, render
+    from .raster.render import picture_of, render
     from .scenefit import fit_for_scene
 
 __all__ = [

@@ -18,8 +18,8 @@ import drjit as dr
 from .descent import Schedule, descend
 from .gaussian.gaussians import Gaussians
 from .growth import grown, pruned
+from .raster.render import CUTOFF
 from .refine import Progress, Refined
-from .rendering import CUTOFF
 from .starting import Start
 
 TRY, FIT, SETTLE = 0.1, 0.4, 0.12

@@ -91,7 +91,7 @@ def render(
     select(backend)
     import eigengs_dr as eg
 
-    from .rendering import picture_of
+    from .raster.render import picture_of
 
     gaussians = eg.Gaussians.load(file, backend=backend)
     if first is not None and first > len(gaussians):

@@ -138,7 +138,7 @@ def _text(fall: Any = (), **facts: Any) -> str:
 
 
 def _rendered(gaussians: Any) -> Any:
-    from .rendering import picture_of
+    from .raster.render import picture_of
 
     checked_pixels(gaussians.width, gaussians.height)
     return picture_of(gaussians)

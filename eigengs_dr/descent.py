@@ -15,9 +15,9 @@ from .backend.arrays import types_of
 from .backend.recording import frozen
 from .coordinates import NATURAL, Coordinates
 from .gaussian.gaussians import Gaussians
-from .rendering import CUTOFF, lists_for, splat, to_tiles
-from .splat import UNIT
-from .tiles import Grid, TileLists
+from .raster.evaluate import UNIT
+from .raster.render import CUTOFF, lists_for, splat, to_tiles
+from .raster.tiles import Grid, TileLists
 
 ROUNDING = 1e-10
 """Mean squared error that is not told from none."""

@@ -17,9 +17,9 @@ from .gaussian.gaussians import Gaussians
 from .image.color import SPACES
 from .image.io import check_image
 from .presets import PRESETS
+from .raster.evaluate import SHAPE
+from .raster.render import picture_of
 from .refine import EXACT, Progress, figures, refine
-from .rendering import picture_of
-from .splat import SHAPE
 from .starting import INITS, begin
 
 FIRST = 64

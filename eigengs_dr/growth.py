@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from .backend.arrays import types_of
 from .gaussian.gaussians import Gaussians, concatenate
+from .raster.render import CUTOFF
 from .rearrange import residual
-from .rendering import CUTOFF
 from .solve import correlations, solve
 
 Array = NDArray[np.floating]

@@ -16,7 +16,7 @@ from .image.io import ImageError, load_image
 from .image.metrics import psnr
 from .image.resize import cropped
 from .pca import Eigenbasis
-from .rendering import render
+from .raster.render import render
 
 Watch = Callable[[int], None]
 """``watch(i)`` before image number i; what it raises ends the work."""

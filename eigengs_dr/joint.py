@@ -22,11 +22,11 @@ from .backend.recording import frozen
 from .backend.selection import select
 from .coordinates import CHOLESKY
 from .gaussian.gaussians import Gaussians
-from .kernels import accumulate, adjoint
 from .place import random
-from .rendering import CUTOFF, lists_for, to_tiles
-from .splat import SHAPE, UNIT, pack
-from .tiles import Grid
+from .raster.evaluate import SHAPE, UNIT, pack
+from .raster.kernels import accumulate, adjoint
+from .raster.render import CUTOFF, lists_for, to_tiles
+from .raster.tiles import Grid
 
 RATE = 1e-3
 """Learning rate of everything at the start."""

@@ -22,9 +22,9 @@ from .gaussian.gaussians import Gaussians, concatenate
 from .growth import worth
 from .image.io import check_image
 from .presets import PRESETS
+from .raster.render import picture_of
 from .rearrange import placed_like, residual
 from .refine import Progress, refine
-from .rendering import picture_of
 from .starting import Start, begin, usual_count
 
 RATIO = 4

@@ -19,9 +19,9 @@ from scipy.sparse.linalg import splu
 
 from .backend.arrays import types_of, upload
 from .gaussian.gaussians import Gaussians
-from .kernels import adjoint
-from .rendering import CUTOFF, lists_for, to_tiles
-from .splat import SHAPE, UNIT, pack, unpack, weights
+from .raster.evaluate import SHAPE, UNIT, pack, unpack, weights
+from .raster.kernels import adjoint
+from .raster.render import CUTOFF, lists_for, to_tiles
 
 GROUP = 3
 """Images that are correlated at once: an image's channels, so that one program serves all."""
@@ -210,7 +210,7 @@ def splat_matrix(gaussians: Gaussians, cutoff: float = CUTOFF) -> csr_array:
     Returns
     -------
     csr_array of float32, shape (N, H * W)
-        Row n holds the weights of splat n, by `eigengs_dr.splat.weights`. Cost and size: the number
+        Row n holds the weights of splat n, by `eigengs_dr.raster.evaluate.weights`. Cost and size: the number
         of pixels inside all ellipses; 8 bytes each, and 30 while it is made.
 
     Raises

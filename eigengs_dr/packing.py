@@ -25,8 +25,8 @@ from .image.io import check_image
 from .image.metrics import decibels
 from .packed import MOST_SECTIONS, Packed, to_bytes, write
 from .quantising import Steps, shapes_of, sizes_of
+from .raster.render import CUTOFF, render
 from .refine import EXACT
-from .rendering import CUTOFF, render
 from .rounding import rounded, set_of
 
 Array = NDArray[np.floating]

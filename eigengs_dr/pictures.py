@@ -15,7 +15,7 @@ from .image.io import to_8bit
 from .image.montage import joined, line
 from .image.resize import resampled
 from .pca import CHANNELS, Eigenbasis
-from .rendering import render
+from .raster.render import render
 
 FIRST = (1, 2, 3, 5, 10, 20, 50, 100, 200)
 """Components of the first channel that are shown, counted from 1."""

@@ -23,7 +23,7 @@ from .adaptive import Density, adaptive, bent, owners
 from .backend.arrays import types_of
 from .gaussian.gaussians import Gaussians
 from .image.resize import resampled
-from .rendering import CUTOFF, render
+from .raster.render import CUTOFF, render
 from .solve import solve
 
 Array = NDArray[np.floating]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .descent import Rearrange, Schedule, descend
 from .gaussian.gaussians import Gaussians
 from .image.metrics import psnr, unclamped
-from .rendering import CUTOFF, picture_of
+from .raster.render import CUTOFF, picture_of
 
 EXACT = 100.0
 """Decibels above which only rounding is left to fit."""

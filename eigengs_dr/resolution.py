@@ -22,7 +22,7 @@ import mitsuba as mi
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 
-from .points import fold
+from .raster.lookup.points import fold
 
 SPACING = 0.5
 """Texels between two rays that are close enough: each texel is then met by some."""

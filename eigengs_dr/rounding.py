@@ -19,7 +19,7 @@ from .gaussian.gaussians import Gaussians
 from .packed import Packed
 from .presets import PRESETS
 from .quantising import Steps, shapes_of, symbols_of, values_of
-from .rendering import render
+from .raster.render import render
 from .solve import solve
 
 Array = NDArray[np.floating]

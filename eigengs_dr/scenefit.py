@@ -25,7 +25,7 @@ from .image.io import check_image
 from .image.metrics import psnr as psnr_of
 from .plugins.cone import PIXEL
 from .presets import PRESETS
-from .rendering import CUTOFF, render
+from .raster.render import CUTOFF, render
 from .resolution import Resolution, resolution
 from .smoothest import filled, smoothest
 from .solve import solve

@@ -24,9 +24,9 @@ from .backend.recording import frozen
 from .descent import Schedule, rate_left, step_program
 from .gaussian.gaussians import Gaussians
 from .place import grid
-from .rendering import CUTOFF, lists_for, to_tiles
+from .raster.render import CUTOFF, lists_for, to_tiles
+from .raster.tiles import Grid
 from .solve import solve
-from .tiles import Grid
 
 Planes = NDArray[np.float32]
 State = dict[str, NDArray[Any]]

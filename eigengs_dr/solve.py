@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from .backend.arrays import types_of
 from .backend.recording import frozen
 from .gaussian.gaussians import Gaussians
-from .kernels import accumulate, adjoint, channel_sums
-from .rendering import CUTOFF, WIDEST_CUTOFF, lists_for, to_tiles
-from .splat import SHAPE, UNIT, pack
-from .tiles import TileLists
+from .raster.evaluate import SHAPE, UNIT, pack
+from .raster.kernels import accumulate, adjoint, channel_sums
+from .raster.render import CUTOFF, WIDEST_CUTOFF, lists_for, to_tiles
+from .raster.tiles import TileLists
 
 ROUNDING = {32: 1e-12, 64: 1e-28}
 """Share of the first ``r^T z`` below which only rounding is left, by bits of a number."""

@@ -18,8 +18,8 @@ from .gaussian.gaussians import Gaussians
 from .image.color import decode, rgb_to_ycbcr, to_linear
 from .image.folder import SPACES as BASIS_SPACES
 from .presets import Preset
+from .raster.render import CUTOFF
 from .rearrange import rearranged
-from .rendering import CUTOFF
 from .solve import solve
 
 PLACES = {"random": places.random, "grid": places.grid, "adaptive": adaptive}

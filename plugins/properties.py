@@ -11,7 +11,7 @@ from ..eigengs import EigenGS
 from ..gaussian.gaussians import Gaussians
 from ..gaussian.tensors import FIELDS
 from ..image.color import SPACES
-from ..rendering import CUTOFF, WIDEST_CUTOFF
+from ..raster.render import CUTOFF, WIDEST_CUTOFF
 from .parameters import FromModel, FromSet
 
 WRAPS = ("repeat", "mirror", "clamp")

@@ -16,7 +16,7 @@ from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.eigengs import EigenGS
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.pca import Eigenbasis
-from eigengs_dr.reference import render_exact
+from eigengs_dr.raster.reference import render_exact
 
 SIZE = (22, 17)
 """Width and height: no multiples of a tile. The same for all tests, so that kernels are

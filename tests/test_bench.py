@@ -9,7 +9,7 @@ from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.bench import eigen, kernels
 from eigengs_dr.fitting import fit
 from eigengs_dr.image.metrics import psnr
-from eigengs_dr.rendering import render
+from eigengs_dr.raster.render import render
 
 FIGURES = {
     "plain_ms",

@@ -22,8 +22,8 @@ from eigengs_dr.console import Program
 from eigengs_dr.descent import descend
 from eigengs_dr.fitting import most_gaussians
 from eigengs_dr.presets import PRESETS
+from eigengs_dr.raster.render import picture_of
 from eigengs_dr.refine import EXACT
-from eigengs_dr.rendering import picture_of
 from eigengs_dr.starting import begin
 
 RUN = {"command": "eigengs-dr bench budget", "cpu": "a CPU"}

@@ -19,8 +19,8 @@ from eigengs_dr.fitting import fit, most_gaussians
 from eigengs_dr.growth import APART, grown, places, pruned, worth
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.presets import PRESETS
+from eigengs_dr.raster.render import render
 from eigengs_dr.rearrange import FALL, rearranged, residual, wanted
-from eigengs_dr.rendering import render
 from eigengs_dr.solve import correlations
 from eigengs_dr.starting import begin
 

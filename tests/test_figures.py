@@ -17,7 +17,7 @@ from eigengs_dr.bench.figure_pictures import CELL, HEADING, LETTERS, Cell, Row, 
 from eigengs_dr.console import Program
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.image.montage import GAP
-from eigengs_dr.rendering import picture_of
+from eigengs_dr.raster.render import picture_of
 
 SETS = ("cats512", "natural256", "kodak")
 MACHINE = {"command": "test", "cpu": "any"}

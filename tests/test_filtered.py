@@ -10,12 +10,12 @@ from scipy.special import erf
 
 from eigengs_dr.backend.selection.arrays import types_in, types_of
 from eigengs_dr.backend.selection.selection import select
-from eigengs_dr.filtered import sum_filtered
-from eigengs_dr.footprints import WIDEST, bounded_covariance, quick_erf
-from eigengs_dr.reference import render_exact
-from eigengs_dr.rendering import splat_values
-from eigengs_dr.sizes import sort_by_size
-from eigengs_dr.splat import SHAPE, UNIT, pack, widen
+from eigengs_dr.raster.evaluate import SHAPE, UNIT, pack, widen
+from eigengs_dr.raster.lookup.footprint import WIDEST, bounded_covariance, quick_erf
+from eigengs_dr.raster.lookup.prefilter import sum_filtered
+from eigengs_dr.raster.lookup.size_classes import sort_by_size
+from eigengs_dr.raster.reference import render_exact
+from eigengs_dr.raster.render import splat_values
 
 CUTOFF = 5.0
 FINE = 4

@@ -18,7 +18,7 @@ from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.place import grid
 from eigengs_dr.presets import PRESETS
-from eigengs_dr.rendering import picture_of, render
+from eigengs_dr.raster.render import picture_of, render
 
 
 def check_sound(result, image):

@@ -20,7 +20,7 @@ from scenes import COUNT, SIZE, few, random_scene
 import eigengs_dr
 from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.gaussian.gaussians import NARROWEST, Gaussians, concatenate
-from eigengs_dr.rendering import render
+from eigengs_dr.raster.render import render
 from eigengs_dr.storage import npz as archive
 
 NAMES = ("mean", "factor", "color", "background")

@@ -11,8 +11,8 @@ from scenes import SIZE, few, random_scene, scenes
 from eigengs_dr.backend.selection.arrays import types_of
 from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.color import ycbcr_to_rgb
-from eigengs_dr.reference import render_plain
-from eigengs_dr.rendering import CUTOFF, lists_for, render
+from eigengs_dr.raster.reference import render_plain
+from eigengs_dr.raster.render import CUTOFF, lists_for, render
 
 COUNT = 7
 NAMES = ("mean", "factor", "color", "background")

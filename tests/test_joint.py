@@ -12,8 +12,8 @@ from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.coordinates import CHOLESKY
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.joint import RATE, JointState, train_jointly
-from eigengs_dr.reference import render_plain
-from eigengs_dr.rendering import lists_for, render
+from eigengs_dr.raster.reference import render_plain
+from eigengs_dr.raster.render import lists_for, render
 
 WIDTH, HEIGHT = 23, 18
 """No multiples of a tile."""

@@ -6,12 +6,12 @@ import pytest
 from scenes import SIZE, random_scene
 from test_filtered import brute_force, some_points, stacked, tiled
 
-from eigengs_dr import lattice as module
 from eigengs_dr.backend.selection.arrays import types_of
-from eigengs_dr.lattice import build_lattice, is_distant, mean_of, sum_lattice
-from eigengs_dr.rendering import splat_values
-from eigengs_dr.sizes import sort_by_size
-from eigengs_dr.splat import SHAPE, pack
+from eigengs_dr.raster.evaluate import SHAPE, pack
+from eigengs_dr.raster.lookup import pyramid as module
+from eigengs_dr.raster.lookup.pyramid import build_lattice, is_distant, mean_of, sum_lattice
+from eigengs_dr.raster.lookup.size_classes import sort_by_size
+from eigengs_dr.raster.render import splat_values
 
 CUTOFF = 5.0
 FOOTPRINTS = [

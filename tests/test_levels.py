@@ -18,7 +18,7 @@ from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.levels import fit_levels, level_counts
 from eigengs_dr.packing import UNSEEN
 from eigengs_dr.presets import PRESETS
-from eigengs_dr.rendering import picture_of, render
+from eigengs_dr.raster.render import picture_of, render
 from eigengs_dr.starting import begin
 
 SIDE = 48

@@ -6,7 +6,7 @@ from hypothesis import given
 from scenes import COUNT, SIZE, few, random_scene, scenes
 
 from eigengs_dr.normal import RIDGE, NormalEquations, splat_matrix
-from eigengs_dr.rendering import render
+from eigengs_dr.raster.render import render
 from eigengs_dr.solve import solve
 
 

@@ -20,7 +20,7 @@ import eigengs_dr as eg
 from eigengs_dr import cli, cli_pack, packed, packing, planes
 from eigengs_dr.curve import MOST_LEVELS, along_curve, on_curve
 from eigengs_dr.quantising import LARGEST, Steps, Symbols, factors_of, shapes_of, symbols_of, whole
-from eigengs_dr.rendering import picture_of
+from eigengs_dr.raster.render import picture_of
 from eigengs_dr.storage.npz import BadValue
 
 STEPS = Steps(0.25, 0.125, 0.0625, 0.03125)

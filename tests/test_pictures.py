@@ -9,7 +9,7 @@ from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.montage import GAP, joined, line
 from eigengs_dr.image.resize import resampled
 from eigengs_dr.pictures import CELL, LIGHTER, comparison, component_sheet, ellipses, overlay
-from eigengs_dr.rendering import render
+from eigengs_dr.raster.render import render
 from eigengs_dr.training import Settings, train
 
 CAPTION = 12

@@ -11,9 +11,16 @@ from scenes import SIZE, few, random_scene, scenes
 
 from eigengs_dr.backend.selection.arrays import types_in, types_of
 from eigengs_dr.backend.selection.selection import select
-from eigengs_dr.points import cell_side, fold, list_cells, sum_near, values, values_and_slopes
-from eigengs_dr.rendering import render, splat_values
-from eigengs_dr.splat import SHAPE, UNIT, pack
+from eigengs_dr.raster.evaluate import SHAPE, UNIT, pack
+from eigengs_dr.raster.lookup.points import (
+    cell_side,
+    fold,
+    list_cells,
+    sum_near,
+    values,
+    values_and_slopes,
+)
+from eigengs_dr.raster.render import render, splat_values
 
 POINTS = 400
 WIDE = 9.0

@@ -23,10 +23,17 @@ from scipy.ndimage import maximum_filter
 
 from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.color import rgb_to_ycbcr, ycbcr_to_rgb
-from eigengs_dr.reference import render_exact, render_plain
-from eigengs_dr.rendering import CUTOFF, WIDEST_CUTOFF, lists_for, render, splat_values, to_tensor
-from eigengs_dr.rendering import splat as splat_operation
-from eigengs_dr.tiles import TILE
+from eigengs_dr.raster.reference import render_exact, render_plain
+from eigengs_dr.raster.render import (
+    CUTOFF,
+    WIDEST_CUTOFF,
+    lists_for,
+    render,
+    splat_values,
+    to_tensor,
+)
+from eigengs_dr.raster.render import splat as splat_operation
+from eigengs_dr.raster.tiles import TILE
 
 SMOOTH = 6.0
 """A cutoff whose edge, exp(-18), is below rounding: invariants hold at every pixel."""

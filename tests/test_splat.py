@@ -8,7 +8,7 @@ import pytest
 
 from eigengs_dr.backend.selection.arrays import _types, types_in, types_of
 from eigengs_dr.backend.selection.selection import select
-from eigengs_dr.splat import (
+from eigengs_dr.raster.evaluate import (
     UNIT,
     exp2_neg,
     falloff,

@@ -15,7 +15,7 @@ from eigengs_dr.fitting import fit
 from eigengs_dr.image.io import ImageError, save_image
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.presets import PRESETS
-from eigengs_dr.rendering import picture_of
+from eigengs_dr.raster.render import picture_of
 from eigengs_dr.starting import begin
 
 RUN = {"command": "eigengs-dr bench tables", "cpu": "a CPU"}

@@ -12,9 +12,9 @@ mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 from test_texture import at, gaussians, texture  # noqa: E402
 from test_texture import variant as variant  # noqa: E402
 
-from eigengs_dr.footprints import WIDEST, bounded_covariance  # noqa: E402
 from eigengs_dr.plugins import pixel_angle, texture_of  # noqa: E402
 from eigengs_dr.plugins.cone import PIXEL, metric  # noqa: E402
+from eigengs_dr.raster.lookup.footprint import WIDEST, bounded_covariance  # noqa: E402
 
 
 def plane(tex, tiles=60, side=48):

@@ -12,7 +12,7 @@ from scenes import COUNT, SIZE, covariances, distances, factors_of, few, random_
 
 from eigengs_dr.backend.selection.arrays import types_in
 from eigengs_dr.backend.selection.selection import select
-from eigengs_dr.tiles import TILE, Grid, build_lists, walk
+from eigengs_dr.raster.tiles import TILE, Grid, build_lists, walk
 
 RADIUS = 3.0
 GRID = Grid(*SIZE)

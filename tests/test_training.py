@@ -16,7 +16,7 @@ from eigengs_dr import training
 from eigengs_dr.eigengs import EigenGS
 from eigengs_dr.image.io import ImageError, load_image
 from eigengs_dr.image.metrics import psnr
-from eigengs_dr.rendering import render
+from eigengs_dr.raster.render import render
 from eigengs_dr.training import Interrupted, Settings, train
 
 SMALL = {"size": (32, 32), "components": 6, "gaussians": 60}

@@ -15,8 +15,8 @@ from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr
 from ..image.metrics import psnr
 from ..presets import PRESETS
+from ..raster.render import render
 from ..refine import refine
-from ..rendering import render
 from ..solve import solve
 from .trial import whole
 

@@ -14,7 +14,7 @@ from ..gaussian.gaussians import Gaussians
 from ..image.io import sample
 from ..image.metrics import psnr
 from ..pictures import overlay
-from ..rendering import picture_of
+from ..raster.render import picture_of
 from . import sets
 from .figure_pictures import Cell, Picture, Row, save_strip, strip
 from .figure_task import (

@@ -20,12 +20,12 @@ from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr
 from ..image.io import check_image, sample
 from ..presets import PRESETS
-from ..reference import render_plain
+from ..raster.evaluate import SHAPE, UNIT
+from ..raster.reference import render_plain
+from ..raster.render import lists_for, splat, splat_values, to_tensor
+from ..raster.tiles import Grid, TileLists, build_lists
 from ..refine import Progress
-from ..rendering import lists_for, splat, splat_values, to_tensor
 from ..solve import solve
-from ..splat import SHAPE, UNIT
-from ..tiles import Grid, TileLists, build_lists
 
 SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
 """The scene: splats of equal size, spread evenly at random over a square picture."""

@@ -15,7 +15,7 @@ from ..growth import worth
 from ..image.color import rgb_to_ycbcr
 from ..image.metrics import psnr
 from ..levels import fit_levels, level_counts
-from ..rendering import picture_of
+from ..raster.render import picture_of
 from .charts import new_figure
 from .table import Table, number, save_csv
 from .trial import whole

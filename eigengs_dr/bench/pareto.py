@@ -17,7 +17,7 @@ from ..gaussian.gaussians import Gaussians
 from ..image.io import sample
 from ..image.resize import cropped
 from ..presets import PRESETS
-from ..rendering import CUTOFF, picture_of
+from ..raster.render import CUTOFF, picture_of
 from ..starting import GAUSSIANS, Start, begin
 from .rows import Job, Row
 from .sets import SETS, model_for, test_images

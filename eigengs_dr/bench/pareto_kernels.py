@@ -11,7 +11,7 @@ import numpy as np
 
 from ..backend.arrays import types_in
 from ..backend.selection import select
-from ..rendering import render
+from ..raster.render import render
 from . import kernels
 from .rows import Job, Row
 

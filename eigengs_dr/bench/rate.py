@@ -18,7 +18,7 @@ from ..image.io import sample, to_8bit
 from ..image.metrics import ssim
 from ..image.resize import cropped
 from ..packing import pack
-from ..rendering import picture_of
+from ..raster.render import picture_of
 from .pareto import SAMPLE_NAMES, SAMPLE_SIDE, SAMPLES
 from .rows import Job, Row
 from .sets import test_images

@@ -19,8 +19,8 @@ from ..bases import load_basis
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr
 from ..presets import PRESETS, Preset
+from ..raster.render import picture_of
 from ..refine import EXACT, rows_at
-from ..rendering import picture_of
 from ..solve import solve
 from ..starting import Start, begin
 from .cases import Case

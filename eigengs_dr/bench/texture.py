@@ -13,8 +13,8 @@ import numpy as np
 from ..fitting import fit
 from ..image.color import to_linear
 from ..image.io import sample
+from ..raster.render import picture_of, render
 from ..refine import Progress
-from ..rendering import picture_of, render
 from .trial import whole
 
 SIDE, TEXELS, SPP = 512, 1024, 16

@@ -15,8 +15,8 @@ from ..descent import LONG, Schedule, descend
 from ..fitting import Fit
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import ms_ssim, psnr, ssim
+from ..raster.render import CUTOFF, picture_of
 from ..refine import EXACT, Refined
-from ..rendering import CUTOFF, picture_of
 from ..starting import Start
 
 Image = NDArray[np.float32]

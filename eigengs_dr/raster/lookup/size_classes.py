@@ -9,9 +9,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend.arrays import types_of, upload
+from ...backend.arrays import types_of, upload
+from ..evaluate import UNIT, widen
 from .points import Cells, cell_side, list_cells
-from .splat import UNIT, widen
 
 SMALLEST = 1.0
 """Largest standard deviation, in pixels, of the smallest size that splats are sorted by."""
@@ -65,7 +65,7 @@ def sort_by_size(shape: list, width: int, height: int, cutoff: float, wrap: str)
     Parameters
     ----------
     shape : list of 5 Float, shape (N,)
-        Mean x, mean y and the factor a, b, c, as `eigengs_dr.splat.weights` takes them.
+        Mean x, mean y and the factor a, b, c, as `eigengs_dr.raster.evaluate.weights` takes them.
     width, height : int
         Of the image, in pixels.
     cutoff : float

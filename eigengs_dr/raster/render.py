@@ -9,11 +9,11 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .backend.arrays import ArrayTypes, types_of, upload
-from .gaussian.gaussians import Gaussians
-from .image.color import decode, to_coded
+from ..backend.arrays import ArrayTypes, types_of, upload
+from ..gaussian.gaussians import Gaussians
+from ..image.color import decode, to_coded
+from .evaluate import UNIT, gather_run, pack
 from .kernels import accumulate, adjoint, channel_sums
-from .splat import UNIT, gather_run, pack
 from .tiles import Grid, TileLists, build_lists
 
 CUTOFF = 3.0
@@ -128,7 +128,7 @@ def splat_values(gaussians: Gaussians) -> tuple[list, list]:
 
 
 def lists_for(gaussians: Gaussians, cutoff: float = CUTOFF, pad: float = 0.0) -> TileLists:
-    """List the splats of every tile of the image at native size; see `eigengs_dr.tiles`.
+    """List the splats of every tile of the image at native size; see `eigengs_dr.raster.tilesNone`.
 
     Raises
     ------
@@ -159,7 +159,7 @@ def splat(values: list, background: list, lists: TileLists, cutoff: float = CUTO
     Returns
     -------
     Float, shape (tiles * pixels * channels,)
-        See `eigengs_dr.kernels` for the layout, `to_tensor` for an image.
+        See `eigengs_dr.raster.kernelsNone` for the layout, `to_tensor` for an image.
     """
     return dr.custom(_Splat, values, background, lists, UNIT * cutoff)
 

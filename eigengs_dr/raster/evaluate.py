@@ -12,7 +12,7 @@ from typing import Any
 
 import drjit as dr
 
-from .backend.arrays import ArrayTypes, types_of
+from ..backend.arrays import ArrayTypes, types_of
 
 UNIT = math.sqrt(0.5 / math.log(2))
 """``exp(-q / 2) = 2^-(UNIT^2 q)``: kernels take factors in these units and save a product."""

@@ -7,8 +7,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend.arrays import types_of
-from .splat import SHAPE, UNIT, weights
+from ..backend.arrays import types_of
+from .evaluate import SHAPE, UNIT, weights
 from .tiles import TileLists
 
 
@@ -18,7 +18,7 @@ def render_plain(values: list, background: list, lists: TileLists, cutoff: float
     Parameters
     ----------
     values : list of Float, shape (N,)
-        Mean x, mean y, a, b, c (see `eigengs_dr.splat`), then the channels.
+        Mean x, mean y, a, b, c (see `eigengs_dr.raster.evaluateNone`), then the channels.
     background : list of Float
     lists : TileLists
     cutoff : float, optional

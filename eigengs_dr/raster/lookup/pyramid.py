@@ -18,10 +18,10 @@ from typing import Any
 
 import drjit as dr
 
-from .backend.arrays import ArrayTypes, types_of
-from .filtered import sum_filtered
-from .sizes import Sizes
-from .splat import SHAPE, UNIT, falloff, gather_run
+from ...backend.arrays import ArrayTypes, types_of
+from ..evaluate import SHAPE, UNIT, falloff, gather_run
+from .prefilter import sum_filtered
+from .size_classes import Sizes
 
 SIGMA = 0.65
 """Standard deviation of the lattice's Gaussians in units of its spacing."""
@@ -78,7 +78,7 @@ def build_lattice(sizes: Sizes, packed: Any, number: int, cutoff: float) -> Latt
     Parameters
     ----------
     sizes, packed, number, cutoff
-        As in `eigengs_dr.filtered.sum_filtered`.
+        As in `eigengs_dr.raster.lookup.prefilter.sum_filtered`.
     """
     types = types_of(packed)
     width, height = sizes.width, sizes.height

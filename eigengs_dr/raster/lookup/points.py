@@ -15,9 +15,9 @@ from typing import Any
 
 import drjit as dr
 
-from .backend.arrays import types_of
-from .splat import LN2, SHAPE, list_entry, unpack, weights
-from .tiles import Grid, build_lists
+from ...backend.arrays import types_of
+from ..evaluate import LN2, SHAPE, list_entry, unpack, weights
+from ..tiles import Grid, build_lists
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def list_cells(
     Parameters
     ----------
     shape : list of 5 Float, shape (N,)
-        Mean x, mean y and the factor a, b, c, as `eigengs_dr.splat.weights` takes them.
+        Mean x, mean y and the factor a, b, c, as `eigengs_dr.raster.evaluate.weights` takes them.
     width, height : int
         Of the image, in pixels.
     radius : float
@@ -142,7 +142,7 @@ def sum_near(
     ----------
     cells : Cells
     packed : Float
-        Parameters of every splat, from `eigengs_dr.splat.pack`; may carry gradients.
+        Parameters of every splat, from `eigengs_dr.raster.evaluate.pack`; may carry gradients.
     number : int
         Parameters of one splat.
     x, y : Float
@@ -189,7 +189,7 @@ def values(limit: float) -> Callable[[list, Any, Any], list]:
 def values_and_slopes(limit: float) -> Callable[[list, Any, Any], list]:
     """Terms of the sum and of its derivatives along x and y, three for every channel.
 
-    ``grad w = -2 ln(2) w F^T F (x - mu)``, with F in units of `eigengs_dr.splat.UNIT`.
+    ``grad w = -2 ln(2) w F^T F (x - mu)``, with F in units of `eigengs_dr.raster.evaluate.UNIT`.
     """
 
     def terms(splat: list, x: Any, y: Any) -> list:

@@ -7,7 +7,7 @@ from typing import Any
 
 import drjit as dr
 
-from .splat import UNIT
+from ..evaluate import UNIT
 
 WIDEST = 0.4
 """Largest standard deviation of a footprint, in widths and heights of the texture. One that is as

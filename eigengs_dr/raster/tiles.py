@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend.arrays import ArrayTypes, types_of, upload
+from ..backend.arrays import ArrayTypes, types_of, upload
 
 TILE = (4, 4)
 """Width and height of a tile in pixels. Measured on 2 cores with AVX-512: 4x4 holds the sums of 16

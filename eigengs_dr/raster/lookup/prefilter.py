@@ -1,7 +1,7 @@
 """The sum of Gaussians seen through a Gaussian footprint: a prefilter in closed form.
 
 A Gaussian convolved with a Gaussian is one again, so what a pixel sees of a texture is the sum of
-widened splats (`eigengs_dr.splat.widen`): no mip map, no more samples. A texture ends at its
+widened splats (`eigengs_dr.raster.evaluate.widen`): no mip map, no more samples. A texture ends at its
 borders, or repeats: a splat then counts with the share of ``footprint x splat`` that lies in the
 image, and copies of the image that the footprint reaches are summed as well.
 """
@@ -13,11 +13,11 @@ from typing import Any
 
 import drjit as dr
 
-from .backend.arrays import types_of
-from .footprints import share
+from ...backend.arrays import types_of
+from ..evaluate import SHAPE, UNIT, gather_run, list_entry, unpack, weights, widen
+from .footprint import share
 from .points import sum_near
-from .sizes import Sizes
-from .splat import SHAPE, UNIT, gather_run, list_entry, unpack, weights, widen
+from .size_classes import Sizes
 
 REACH = 3.0
 """Standard deviations after which a footprint ends, where copies of the image are looked for."""
@@ -39,9 +39,9 @@ def sum_filtered(
     ----------
     sizes : Sizes
     packed, number
-        As in `eigengs_dr.points.sum_near`.
+        As in `eigengs_dr.raster.lookup.points.sum_near`.
     x, y : Float
-        Centre of the footprint in the image, in pixels, see `eigengs_dr.points.fold`.
+        Centre of the footprint in the image, in pixels, see `eigengs_dr.raster.lookup.points.fold`.
     footprint : list of 3 Float
         xx, xy, yy of its covariance, in pixels squared; not differentiated.
     active : Bool
