@@ -11,12 +11,12 @@ from .backend.selection import BackendError, prepare
 
 if TYPE_CHECKING:
     from .eigengs import EigenGS
-    from .fitting import Fit, fit
+    from .fitting.fit import Fit, fit
+    from .fitting.levels import fit_levels, level_counts
     from .gaussian.gaussians import Gaussians, concatenate
     from .gaussian.tensors import from_tensors, to_tensors
     from .image.io import load_image, sample, save_image
     from .image.metrics import ms_ssim, psnr, ssim
-    from .levels import fit_levels, level_counts
     from .packing import Receipt, pack
     from .pca import Eigenbasis
     from .plugins import register_plugins

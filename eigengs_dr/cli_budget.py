@@ -20,7 +20,7 @@ from .outputs import check_outputs
 
 NATURAL = "natural256"
 TARGETS, HIGHEST = (32.0, 36.0, 40.0), 100.0
-"""Of `eigengs_dr.bench.budget` and `eigengs_dr.refine`, without importing them."""
+"""Of `eigengs_dr.bench.budget` and `eigengs_dr.fitting.refineNone`, without importing them."""
 
 
 @click.command()

@@ -135,7 +135,7 @@ def train(
 
 def _settings(gaussians: int | None, frequency_aware: str, **options: Any) -> Any:
     """Turn options into the settings of a training."""
-    from .starting import usual_count
+    from .fitting.initializers import usual_count
     from .training import Settings
 
     width, height = options["size"]

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend.arrays import types_of, upload_rows
+from .fitting.solvers.normal_equations import NormalEquations
 from .gaussian.gaussians import Gaussians, concatenate
 from .image.folder import to_planes
 from .image.metrics import decibels
 from .joint import JointState, train_jointly
-from .normal import NormalEquations
 from .pca import Eigenbasis
 from .shapes import on_grid, shapes_of, train_shapes
 

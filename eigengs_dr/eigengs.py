@@ -28,12 +28,12 @@ from .components import (
     wants_split,
 )
 from .fall import Fall, expected
+from .fitting.solvers.normal_equations import NormalEquations
 from .gaussian.gaussians import Gaussians
 from .image.folder import to_planes
 from .image.io import check_image
 from .image.resize import resampled
 from .modelfile import FORMAT, VERSION, from_members, layout_of, to_members
-from .normal import NormalEquations
 from .pca import Eigenbasis
 from .span import Span
 from .storage import npz as archive

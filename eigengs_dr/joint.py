@@ -16,13 +16,13 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .adan import Adan
 from .backend.arrays import ArrayTypes, types_in, types_of, upload
 from .backend.recording import frozen
 from .backend.selection import select
-from .coordinates import CHOLESKY
+from .fitting.optimizers.adan import Adan
+from .fitting.optimizers.parameterization import CHOLESKY
+from .fitting.placement.random import random
 from .gaussian.gaussians import Gaussians
-from .place import random
 from .raster.evaluate import SHAPE, UNIT, pack
 from .raster.kernels import accumulate, adjoint
 from .raster.render import CUTOFF, lists_for, to_tiles
@@ -60,7 +60,7 @@ class JointState(NamedTuple):
     counts : tuple of C ints
         Components of each channel.
     rows : ndarray of float32, shape (5, 5 + P, N)
-        Values; then m, v, n and the last gradient of `eigengs_dr.adan.Adan`. Each has 5 rows for
+        Values; then m, v, n and the last gradient of `eigengs_dr.fitting.optimizers.adan.Adan`. Each has 5 rows for
         the mean and the factor in `CHOLESKY` coordinates, then a row of scaled weights for every
         component.
     """

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend.arrays import types_of
-from .descent import descend
+from .fitting.optimizers.descent import descend
+from .fitting.presets import PRESETS
+from .fitting.solvers.conjugate_gradient import solve
 from .gaussian.gaussians import Gaussians
 from .packed import Packed
-from .presets import PRESETS
 from .quantising import Steps, shapes_of, symbols_of, values_of
 from .raster.render import render
-from .solve import solve
 
 Array = NDArray[np.floating]
 

@@ -17,19 +17,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
 
-from .adaptive import adaptive
-from .descent import descend
+from .fitting.initializers import dark_weight
+from .fitting.optimizers.descent import descend
+from .fitting.placement.adaptive import adaptive
+from .fitting.presets import PRESETS
+from .fitting.solvers.conjugate_gradient import solve
 from .gaussian.gaussians import Gaussians
 from .image.color import to_coded, to_linear
 from .image.io import check_image
 from .image.metrics import psnr as psnr_of
 from .plugins.cone import PIXEL
-from .presets import PRESETS
 from .raster.render import CUTOFF, render
 from .resolution import Resolution, resolution
 from .smoothest import filled, smoothest
-from .solve import solve
-from .starting import dark_weight
 
 COLORS = ("linear", "data")
 """What textures hold."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from .fall import fewest_apart, remaining
-from .normal import NormalEquations
+from .fitting.solvers.normal_equations import NormalEquations
 
 Coefficients = tuple[NDArray[np.float32], ...]
 

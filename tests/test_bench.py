@@ -7,7 +7,7 @@ from scenes import family, small_model
 from eigengs_dr.backend.selection.arrays import types_in
 from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.bench import eigen, kernels
-from eigengs_dr.fitting import fit
+from eigengs_dr.fitting.fit.fit import fit
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import render
 

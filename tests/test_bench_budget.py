@@ -19,12 +19,12 @@ from eigengs_dr import cli_budget, cli_shared
 from eigengs_dr.bench import budget, budget_tables, rate, rows
 from eigengs_dr.cli_bench import bench as group
 from eigengs_dr.console import Program
-from eigengs_dr.descent import descend
-from eigengs_dr.fitting import most_gaussians
-from eigengs_dr.presets import PRESETS
+from eigengs_dr.fitting.fit.fit import most_gaussians
+from eigengs_dr.fitting.fit.initializers import begin
+from eigengs_dr.fitting.fit.optimizers.descent import descend
+from eigengs_dr.fitting.fit.presets import PRESETS
+from eigengs_dr.fitting.fit.refine import EXACT
 from eigengs_dr.raster.render import picture_of
-from eigengs_dr.refine import EXACT
-from eigengs_dr.starting import begin
 
 RUN = {"command": "eigengs-dr bench budget", "cpu": "a CPU"}
 

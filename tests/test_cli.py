@@ -19,8 +19,8 @@ from eigengs_dr import bases, cli_train
 from eigengs_dr.backend.selection.selection import BackendError, select
 from eigengs_dr.cli import main
 from eigengs_dr.eigengs import EigenGS
+from eigengs_dr.fitting.fit.initializers import INITS
 from eigengs_dr.image.color import SPACES, YCBCR_TO_RGB
-from eigengs_dr.starting import INITS
 
 
 def run(*arguments):

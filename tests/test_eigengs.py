@@ -9,13 +9,13 @@ from scenes import family, small_basis, small_model
 import eigengs_dr as eg
 from eigengs_dr.bases import load_basis
 from eigengs_dr.components import fit_components, psnr_components, wants_split
+from eigengs_dr.fitting.fit.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.fit.solvers.normal_equations import NormalEquations
 from eigengs_dr.image.folder import to_planes
 from eigengs_dr.image.io import ImageError
 from eigengs_dr.image.resize import resampled
 from eigengs_dr.natural import DEMO, crops
-from eigengs_dr.normal import NormalEquations
 from eigengs_dr.shapes import ROUND, samples, train_shapes
-from eigengs_dr.solve import solve
 
 SIDE, SPLATS = 32, 100
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from scenes import COUNT, SIZE, few, random_scene, scenes
 
-from eigengs_dr.normal import RIDGE, NormalEquations, splat_matrix
+from eigengs_dr.fitting.fit.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.fit.solvers.normal_equations import RIDGE, NormalEquations, splat_matrix
 from eigengs_dr.raster.render import render
-from eigengs_dr.solve import solve
 
 
 def dense_matrix(scene, cutoff=np.inf):
@@ -160,6 +160,6 @@ def test_blocks_fit_what_is_left(backend):
 
 
 def test_a_matrix_too_large_is_refused(backend, monkeypatch):
-    monkeypatch.setattr("eigengs_dr.normal.MOST_WEIGHTS", 100)
+    monkeypatch.setattr("eigengs_dr.fitting.solvers.normal_equations.MOST_WEIGHTS", 100)
     with pytest.raises(ValueError, match=r"the splats cover [\d,]+ pixels in all, over 100"):
         NormalEquations(random_scene().on(backend))

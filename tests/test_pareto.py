@@ -18,11 +18,11 @@ from eigengs_dr.backend.selection.selection import select
 from eigengs_dr.bench import kernels, pareto, pareto_kernels, pareto_tables, sets
 from eigengs_dr.bench.pareto import Collection, Variant, front
 from eigengs_dr.console import Program
-from eigengs_dr.descent import descend
-from eigengs_dr.presets import PRESETS
+from eigengs_dr.fitting.fit.initializers import begin
+from eigengs_dr.fitting.fit.optimizers.descent import descend
+from eigengs_dr.fitting.fit.presets import PRESETS
 from eigengs_dr.raster.reference import render_exact
 from eigengs_dr.raster.render import picture_of
-from eigengs_dr.starting import begin
 
 COORDINATES = st.sampled_from([0.0, 0.5, 1.0, 2.0, 3.0, float("nan")])
 FILES = ["pareto.jsonl", "pareto-samples.csv"]

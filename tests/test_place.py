@@ -7,10 +7,17 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scenes import covariances, few
 
-from eigengs_dr.adaptive import adaptive, bending, bent, capped, pieces, relaxed
 from eigengs_dr.curve import hilbert_order
+from eigengs_dr.fitting.fit.placement.adaptive import (
+    adaptive,
+    bending,
+    bent,
+    capped,
+    pieces,
+    relaxed,
+)
+from eigengs_dr.fitting.fit.placement.random import GRID_SIZE, grid, inverse_factor, random
 from eigengs_dr.image.resize import resampled
-from eigengs_dr.place import GRID_SIZE, grid, inverse_factor, random
 
 INITS = [random, grid, adaptive]
 

@@ -15,7 +15,7 @@ import eigengs_dr as eg
 from eigengs_dr import cli_rate, cli_shared
 from eigengs_dr.bench import rate, rate_tables, rows
 from eigengs_dr.console import Program
-from eigengs_dr.refine import EXACT
+from eigengs_dr.fitting.fit.refine import EXACT
 
 
 @pytest.fixture

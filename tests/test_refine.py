@@ -9,11 +9,11 @@ import pytest
 from drjit import JitFlag
 from scenes import Scene, random_scene
 
-from eigengs_dr.descent import descend
+from eigengs_dr.fitting.fit.optimizers.descent import descend
+from eigengs_dr.fitting.fit.presets import PRESETS
+from eigengs_dr.fitting.fit.refine import refine, rows_at
 from eigengs_dr.image.color import rgb_to_ycbcr
-from eigengs_dr.presets import PRESETS
 from eigengs_dr.raster.render import render
-from eigengs_dr.refine import refine, rows_at
 
 SIDE, SPLATS = 32, 100
 """Size of the pictures that are fitted, and splats in a fit: one set of kernels."""

@@ -14,10 +14,10 @@ from eigengs_dr.bench.rows import read
 from eigengs_dr.cli_stability import NAMES
 from eigengs_dr.cli_stability import stability as command
 from eigengs_dr.console import Program
+from eigengs_dr.fitting.fit.placement.random import inverse_factor
+from eigengs_dr.fitting.fit.presets import PRESETS
+from eigengs_dr.fitting.fit.refine import EXACT
 from eigengs_dr.gaussian.gaussians import NARROWEST
-from eigengs_dr.place import inverse_factor
-from eigengs_dr.presets import PRESETS
-from eigengs_dr.refine import EXACT
 
 
 @click.group(cls=Program)

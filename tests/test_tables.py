@@ -11,12 +11,12 @@ from eigengs_dr import cli_tables
 from eigengs_dr.bench import losses, rows, sets, summary, tables, trial
 from eigengs_dr.bench.table import Table, as_text, mean, median, number, spread
 from eigengs_dr.cli import main
-from eigengs_dr.fitting import fit
+from eigengs_dr.fitting.fit.fit import fit
+from eigengs_dr.fitting.fit.initializers import begin
+from eigengs_dr.fitting.fit.presets import PRESETS
 from eigengs_dr.image.io import ImageError, save_image
 from eigengs_dr.image.metrics import psnr
-from eigengs_dr.presets import PRESETS
 from eigengs_dr.raster.render import picture_of
-from eigengs_dr.starting import begin
 
 RUN = {"command": "eigengs-dr bench tables", "cpu": "a CPU"}
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..descent import LONG
-from ..fitting import fit, most_gaussians
-from ..presets import PRESETS
-from ..starting import GAUSSIANS, Start, begin
+from ..fitting.fit import fit, most_gaussians
+from ..fitting.initializers import GAUSSIANS, Start, begin
+from ..fitting.optimizers.descent import LONG
+from ..fitting.presets import PRESETS
 from . import rows
 from .rate import images_of
 from .rows import Row

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..fitting.placement.random import inverse_factor
 from ..image.io import sample
 from ..image.resize import cropped
-from ..place import inverse_factor
 
 Image = NDArray[np.float32]
 Shapes = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -47,7 +47,7 @@ class Case(NamedTuple):
         Splats; a start from a basis has those of the basis.
     iterations : int
     place : callable or None
-        Means and factors to start from, called as those of `eigengs_dr.place` are and brought
+        Means and factors to start from, called as those of `eigengs_dr.fitting.placement.randomNone` are and brought
         inside their bounds as those are; None for those of the preset.
     rates : float
         What the rates of the preset are multiplied by.
@@ -143,7 +143,7 @@ def _grey(plane: NDArray[np.number]) -> Image:
 
 
 # ---------------------------------------------------------------------------------------------
-#  Starts: mean (N, 2) in pixels and factor (N, 3), as those of `eigengs_dr.place`
+#  Starts: mean (N, 2) in pixels and factor (N, 3), as those of `eigengs_dr.fitting.placement.randomNone`
 # ---------------------------------------------------------------------------------------------
 
 

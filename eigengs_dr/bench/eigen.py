@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..eigengs import EigenGS
-from ..fitting import fit
+from ..fitting.fit import fit
+from ..fitting.presets import PRESETS
+from ..fitting.refine import refine
+from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr
 from ..image.metrics import psnr
-from ..presets import PRESETS
 from ..raster.render import render
-from ..refine import refine
-from ..solve import solve
 from .trial import whole
 
 SOLVE_STEPS = 10

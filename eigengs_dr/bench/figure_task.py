@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..eigengs import EigenGS
+from ..fitting.initializers import begin
+from ..fitting.presets import PRESETS
 from ..image.resize import cropped
-from ..presets import PRESETS
-from ..starting import begin
 from . import rows, sets
 from .trial import Moment, follow
 

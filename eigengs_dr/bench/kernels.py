@@ -12,20 +12,20 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..adaptive import adaptive
 from ..backend.arrays import ArrayTypes, types_in, types_of, upload
 from ..backend.selection import select
-from ..descent import descend
+from ..fitting.optimizers.descent import descend
+from ..fitting.placement.adaptive import adaptive
+from ..fitting.presets import PRESETS
+from ..fitting.refine import Progress
+from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr
 from ..image.io import check_image, sample
-from ..presets import PRESETS
 from ..raster.evaluate import SHAPE, UNIT
 from ..raster.reference import render_plain
 from ..raster.render import lists_for, splat, splat_values, to_tensor
 from ..raster.tiles import Grid, TileLists, build_lists
-from ..refine import Progress
-from ..solve import solve
 
 SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
 """The scene: splats of equal size, spread evenly at random over a square picture."""

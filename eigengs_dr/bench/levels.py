@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fitting import fit
+from ..fitting.density_control import worth
+from ..fitting.fit import fit
+from ..fitting.levels import fit_levels, level_counts
 from ..gaussian.gaussians import Gaussians
-from ..growth import worth
 from ..image.color import rgb_to_ycbcr
 from ..image.metrics import psnr
-from ..levels import fit_levels, level_counts
 from ..raster.render import picture_of
 from .charts import new_figure
 from .table import Table, number, save_csv

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from ..bases import load_basis
 from ..eigengs import EigenGS
+from ..fitting.initializers import GAUSSIANS, Start, begin
+from ..fitting.presets import PRESETS
 from ..gaussian.gaussians import Gaussians
 from ..image.io import sample
 from ..image.resize import cropped
-from ..presets import PRESETS
 from ..raster.render import CUTOFF, picture_of
-from ..starting import GAUSSIANS, Start, begin
 from .rows import Job, Row
 from .sets import SETS, model_for, test_images
 from .trial import Moment, decibels, follow, judged, warm_up

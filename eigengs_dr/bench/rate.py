@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fitting import fit
+from ..fitting.fit import fit
 from ..image.io import sample, to_8bit
 from ..image.metrics import ssim
 from ..image.resize import cropped

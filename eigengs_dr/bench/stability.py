@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bases import load_basis
+from ..fitting.initializers import Start, begin
+from ..fitting.presets import PRESETS, Preset
+from ..fitting.refine import EXACT, rows_at
+from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr
-from ..presets import PRESETS, Preset
 from ..raster.render import picture_of
-from ..refine import EXACT, rows_at
-from ..solve import solve
-from ..starting import Start, begin
 from .cases import Case
 from .rows import Job, Row
 from .table import MISSING, Table, number

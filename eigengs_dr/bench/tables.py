@@ -7,11 +7,11 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..descent import LONG
 from ..eigengs import EigenGS
+from ..fitting.initializers import Start, begin
+from ..fitting.optimizers.descent import LONG
+from ..fitting.presets import PRESETS
 from ..image.metrics import psnr
-from ..presets import PRESETS
-from ..starting import Start, begin
 from . import rows
 from .rows import Job, Row
 from .sets import SETS, UNIVERSAL, Image, ImageSet, model_for, test_images

@@ -10,11 +10,11 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..fitting import fit
+from ..fitting.fit import fit
+from ..fitting.refine import Progress
 from ..image.color import to_linear
 from ..image.io import sample
 from ..raster.render import picture_of, render
-from ..refine import Progress
 from .trial import whole
 
 SIDE, TEXELS, SPP = 512, 1024, 16

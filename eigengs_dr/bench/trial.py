@@ -11,13 +11,13 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..descent import LONG, Schedule, descend
-from ..fitting import Fit
+from ..fitting.fit import Fit
+from ..fitting.initializers import Start
+from ..fitting.optimizers.descent import LONG, Schedule, descend
+from ..fitting.refine import EXACT, Refined
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import ms_ssim, psnr, ssim
 from ..raster.render import CUTOFF, picture_of
-from ..refine import EXACT, Refined
-from ..starting import Start
 
 Image = NDArray[np.float32]
 

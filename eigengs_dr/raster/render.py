@@ -63,7 +63,7 @@ def render(
     bit-equal. A splat whose mean or factor is not finite is not drawn; a colour that is not finite
     spoils the tiles that its splat touches. Building tile lists reads sizes back, which
     `drjit.freeze` does not allow: freeze a function that takes `lists_for`'s result and calls
-    `splat`, as `eigengs_dr.descent` does.
+    `splat`, as `eigengs_dr.fitting.optimizers.descentNone` does.
 
     Examples
     --------

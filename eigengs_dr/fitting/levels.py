@@ -15,17 +15,17 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .backend.interrupt import deferred
-from .descent import Schedule, descend
-from .fitting import Fit, check
-from .gaussian.gaussians import Gaussians, concatenate
-from .growth import worth
-from .image.io import check_image
+from ..backend.interrupt import deferred
+from ..gaussian.gaussians import Gaussians, concatenate
+from ..image.io import check_image
+from ..raster.render import picture_of
+from .density_control import worth
+from .fit import Fit, check
+from .initializers import Start, begin, usual_count
+from .optimizers.descent import Schedule, descend
 from .presets import PRESETS
-from .raster.render import picture_of
-from .rearrange import placed_like, residual
+from .redistribute import placed_like, residual
 from .refine import Progress, refine
-from .starting import Start, begin, usual_count
 
 RATIO = 4
 """Splats of a level over those of the one before: half the distance between them."""

@@ -3,7 +3,7 @@
 With A, whose column n holds the weights of splat n at all pixels, the best colours c and background
 b of an image D minimise ``|A c + b 1 - D|^2``. Shapes that do not change from image to image leave
 ``A^T A`` as it is: it is factorised once, and each image costs one product and one
-back-substitution. For the shapes of one image alone, `eigengs_dr.solve` is cheaper.
+back-substitution. For the shapes of one image alone, `eigengs_dr.fitting.solvers.conjugate_gradientNone` is cheaper.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
-from .backend.arrays import types_of, upload
-from .gaussian.gaussians import Gaussians
-from .raster.evaluate import SHAPE, UNIT, pack, unpack, weights
-from .raster.kernels import adjoint
-from .raster.render import CUTOFF, lists_for, to_tiles
+from ...backend.arrays import types_of, upload
+from ...gaussian.gaussians import Gaussians
+from ...raster.evaluate import SHAPE, UNIT, pack, unpack, weights
+from ...raster.kernels import adjoint
+from ...raster.render import CUTOFF, lists_for, to_tiles
 
 GROUP = 3
 """Images that are correlated at once: an image's channels, so that one program serves all."""

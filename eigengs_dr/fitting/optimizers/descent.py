@@ -11,13 +11,13 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .backend.arrays import types_of
-from .backend.recording import frozen
-from .coordinates import NATURAL, Coordinates
-from .gaussian.gaussians import Gaussians
-from .raster.evaluate import UNIT
-from .raster.render import CUTOFF, lists_for, splat, to_tiles
-from .raster.tiles import Grid, TileLists
+from ...backend.arrays import types_of
+from ...backend.recording import frozen
+from ...gaussian.gaussians import Gaussians
+from ...raster.evaluate import UNIT
+from ...raster.render import CUTOFF, lists_for, splat, to_tiles
+from ...raster.tiles import Grid, TileLists
+from .parameterization import NATURAL, Coordinates
 
 ROUNDING = 1e-10
 """Mean squared error that is not told from none."""
@@ -83,7 +83,7 @@ def descend(
 ) -> Iterator[Gaussians]:
     """Yield the set before the first step and after every step of gradient descent.
 
-    Parameters are those of `eigengs_dr.refine.refine`. From what `rearrange` makes of the set after
+    Parameters are those of `eigengs_dr.fitting.refine.refine`. From what `rearrange` makes of the set after
     `Schedule.rearrange` steps, a descent of its own goes on: splats are placed anew where they left
     much error. The first so many splats of each of the `levels` make the image too, as well as they
     can. Steps run asynchronously: what is yielded may not be computed yet.

@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .backend.interrupt import deferred
-from .budget import fewest
-from .eigengs import EigenGS
-from .gaussian.gaussians import Gaussians
-from .image.color import SPACES
-from .image.io import check_image
+from ..backend.interrupt import deferred
+from ..eigengs import EigenGS
+from ..gaussian.gaussians import Gaussians
+from ..image.color import SPACES
+from ..image.io import check_image
+from ..raster.evaluate import SHAPE
+from ..raster.render import picture_of
+from .initializers import INITS, begin
 from .presets import PRESETS
-from .raster.evaluate import SHAPE
-from .raster.render import picture_of
 from .refine import EXACT, Progress, figures, refine
-from .starting import INITS, begin
+from .search import fewest
 
 FIRST = 64
 """Pixels a splat of the first try, where the number of splats is searched for."""
@@ -99,7 +99,7 @@ def fit(
         What "eigen" starts from: the name of a basis of this package, the file of another, or a
         model.
     preset : {"default", "gaussianimage", "eigengs"}, optional
-        The method, see `eigengs_dr.presets`.
+        The method, see `eigengs_dr.fitting.presetsNone`.
     solve_steps : int, optional
         Steps of conjugate gradients in the colour solve; "eigen" needs none at its own size.
     color : {"ycbcr", "rgb", "linear", "data"}, optional
@@ -114,7 +114,7 @@ def fit(
         ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
     target_psnr : float, optional
         Instead of `gaussians`: decibels to reach with as few splats as possible, see
-        `eigengs_dr.budget`. `iterations` are then those of a fit of a known number; the search
+        `eigengs_dr.fitting.searchNone`. `iterations` are then those of a fit of a known number; the search
         takes up to about twice as many.
     target_space : {"ycbcr", "rgb"}, optional
         Where `target_psnr` is measured, as psnr_ycbcr or as psnr_rgb.

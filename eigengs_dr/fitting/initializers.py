@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from . import place as places
-from .adaptive import adaptive
-from .bases import load_basis
-from .eigengs import EigenGS
-from .gaussian.gaussians import Gaussians
-from .image.color import decode, rgb_to_ycbcr, to_linear
-from .image.folder import SPACES as BASIS_SPACES
+from ..bases import load_basis
+from ..eigengs import EigenGS
+from ..gaussian.gaussians import Gaussians
+from ..image.color import decode, rgb_to_ycbcr, to_linear
+from ..image.folder import SPACES as BASIS_SPACES
+from ..raster.render import CUTOFF
+from .placement import random as places
+from .placement.adaptive import adaptive
 from .presets import Preset
-from .raster.render import CUTOFF
-from .rearrange import rearranged
-from .solve import solve
+from .redistribute import rearranged
+from .solvers.conjugate_gradient import solve
 
 PLACES = {"random": places.random, "grid": places.grid, "adaptive": adaptive}
 """Initialisers that look at the image alone, by name."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 
-from .adam import Adam
-from .adan import Adan
-from .coordinates import CHOLESKY
-from .descent import Schedule
+from .optimizers.adam import Adam
+from .optimizers.adan import Adan
+from .optimizers.descent import Schedule
+from .optimizers.parameterization import CHOLESKY
 
 
 @dataclass(frozen=True)

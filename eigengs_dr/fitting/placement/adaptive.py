@@ -14,9 +14,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .curve import hilbert_order
-from .image.resize import resampled
-from .place import inverse_factor
+from ...curve import hilbert_order
+from ...image.resize import resampled
+from .random import inverse_factor
 
 Array = NDArray[np.floating]
 Density = Callable[[Array, float], Array]

@@ -7,11 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .backend.arrays import types_of
-from .gaussian.gaussians import Gaussians, concatenate
-from .raster.render import CUTOFF
-from .rearrange import residual
-from .solve import correlations, solve
+from ..backend.arrays import types_of
+from ..gaussian.gaussians import Gaussians, concatenate
+from ..raster.render import CUTOFF
+from .redistribute import residual
+from .solvers.conjugate_gradient import correlations, solve
 
 Array = NDArray[np.floating]
 

@@ -11,10 +11,10 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .descent import Rearrange, Schedule, descend
-from .gaussian.gaussians import Gaussians
-from .image.metrics import psnr, unclamped
-from .raster.render import CUTOFF, picture_of
+from ..gaussian.gaussians import Gaussians
+from ..image.metrics import psnr, unclamped
+from ..raster.render import CUTOFF, picture_of
+from .optimizers.descent import Rearrange, Schedule, descend
 
 EXACT = 100.0
 """Decibels above which only rounding is left to fit."""
@@ -34,7 +34,7 @@ class Refined(NamedTuple):
     iterations : int
         Steps taken.
     stopped : str
-        "iterations", "plateau" or "interrupted"; see also `eigengs_dr.budget.fewest`.
+        "iterations", "plateau" or "interrupted"; see also `eigengs_dr.fitting.search.fewest`.
     """
 
     gaussians: Gaussians

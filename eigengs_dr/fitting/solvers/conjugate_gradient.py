@@ -15,13 +15,13 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .backend.arrays import types_of
-from .backend.recording import frozen
-from .gaussian.gaussians import Gaussians
-from .raster.evaluate import SHAPE, UNIT, pack
-from .raster.kernels import accumulate, adjoint, channel_sums
-from .raster.render import CUTOFF, WIDEST_CUTOFF, lists_for, to_tiles
-from .raster.tiles import TileLists
+from ...backend.arrays import types_of
+from ...backend.recording import frozen
+from ...gaussian.gaussians import Gaussians
+from ...raster.evaluate import SHAPE, UNIT, pack
+from ...raster.kernels import accumulate, adjoint, channel_sums
+from ...raster.render import CUTOFF, WIDEST_CUTOFF, lists_for, to_tiles
+from ...raster.tiles import TileLists
 
 ROUNDING = {32: 1e-12, 64: 1e-28}
 """Share of the first ``r^T z`` below which only rounding is left, by bits of a number."""

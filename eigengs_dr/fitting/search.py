@@ -1,9 +1,9 @@
 """The fewest splats for a quality.
 
 Three stages. *Estimate*: some steps with few splats tell what more would reach, two tries what
-twice as many gain, and each where the splats of the next one belong (`eigengs_dr.rearrange`).
+twice as many gain, and each where the splats of the next one belong (`eigengs_dr.fitting.redistributeNone`).
 *Fit* that number. *Settle*: drop what is worth least while the goal is met, add where the error is
-while it is not (`eigengs_dr.growth`), each time with a short descent.
+while it is not (`eigengs_dr.fitting.density_controlNone`), each time with a short descent.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 
-from .descent import Schedule, descend
-from .gaussian.gaussians import Gaussians
-from .growth import grown, pruned
-from .raster.render import CUTOFF
+from ..gaussian.gaussians import Gaussians
+from ..raster.render import CUTOFF
+from .density_control import grown, pruned
+from .initializers import Start
+from .optimizers.descent import Schedule, descend
 from .refine import Progress, Refined
-from .starting import Start
 
 TRY, FIT, SETTLE = 0.1, 0.4, 0.12
 """Shares of the iterations that a try takes, the fit, and each descent that settles."""
@@ -32,7 +32,7 @@ TRIES, SETTLING = 4, 5
 """Most tries, and descents to settle after which a goal that is met is settled enough."""
 
 OCTAVE = 4.0
-"""Decibels that twice as many splats gain, see `eigengs_dr.rearrange.FALL`, until two tries of this
+"""Decibels that twice as many splats gain, see `eigengs_dr.fitting.redistribute.FALL`, until two tries of this
 image tell it."""
 
 SLOPES = (2.0, 12.0)

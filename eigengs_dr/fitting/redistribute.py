@@ -7,7 +7,7 @@ each has the same share of it, ``s = e / rho``; so, from a set that was tried an
     rho' ~ k^(1 / (FALL + 1)) = rho s^(1 / (FALL + 1)).
 
 What is hard to fit and what only bends much is told apart by trying. That is known for some splats
-together; among them, density follows the bending (`eigengs_dr.adaptive`). The constants were chosen
+together; among them, density follows the bending (`eigengs_dr.fitting.placement.adaptiveNone`). The constants were chosen
 on training images of ImageNet classes and of cats, by the error after 1,000 steps.
 """
 
@@ -19,12 +19,12 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .adaptive import Density, adaptive, bent, owners
-from .backend.arrays import types_of
-from .gaussian.gaussians import Gaussians
-from .image.resize import resampled
-from .raster.render import CUTOFF, render
-from .solve import solve
+from ..backend.arrays import types_of
+from ..gaussian.gaussians import Gaussians
+from ..image.resize import resampled
+from ..raster.render import CUTOFF, render
+from .placement.adaptive import Density, adaptive, bent, owners
+from .solvers.conjugate_gradient import solve
 
 Array = NDArray[np.floating]
 
@@ -57,13 +57,13 @@ def rearranged(
     count : int
         Number of splats of the result, from 1 to H W.
     image : ndarray, shape (H, W, C)
-        What shapes splats, see `eigengs_dr.adaptive`.
+        What shapes splats, see `eigengs_dr.fitting.placement.adaptiveNone`.
     target : ndarray of float32, shape (H, W, C)
         The image in the space of the set.
     weight : ndarray, shape (H, W, C), optional
         What errors are multiplied by before they are squared.
     solve_steps : int, optional
-        See `eigengs_dr.solve`.
+        See `eigengs_dr.fitting.solvers.conjugate_gradientNone`.
     cutoff : float, optional
         See `eigengs_dr.render`.
 
@@ -96,7 +96,7 @@ def placed_like(
 ) -> Gaussians:
     """Place splats by an image and solve for their colours, in the space and size of another set.
 
-    Parameters are those of `rearranged`; see `eigengs_dr.adaptive` for the density.
+    Parameters are those of `rearranged`; see `eigengs_dr.fitting.placement.adaptiveNone` for the density.
     """
     mean, factor = adaptive(image, count, density=density)
     placed = Gaussians.from_arrays(
