@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 from .backend.selection import BackendError, prepare
 
 if TYPE_CHECKING:
-    from .eigengs import EigenGS
+    from .eigenbasis.basis import Eigenbasis
+    from .eigenbasis.eigengs import EigenGS
     from .fitting.fit import Fit, fit
     from .fitting.levels import fit_levels, level_counts
     from .gaussian.gaussians import Gaussians, concatenate
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from .image.io import load_image, sample, save_image
     from .image.metrics import ms_ssim, psnr, ssim
     from .packing import Receipt, pack
-    from .pca import Eigenbasis
     from .plugins import register_plugins
     from .raster.render import picture_of, render
     from .scenefit import fit_for_scene

@@ -114,8 +114,8 @@ def eigen(
     files = image_files(folder)[:images]
     check_outputs([report], files)
     select(backend)
-    from .bases import load_basis
     from .bench import eigen as benchmark
+    from .eigenbasis.registry import load_basis
 
     model = load_basis(basis, backend)
     with progress_bar(quiet) as show:

@@ -160,7 +160,7 @@ def _check_search(
 
 def _basis(backend: str | None, init: str, preset: str, basis: str, **rest: Any) -> Any:
     """Read the model to start from, once for all images; its name where none is needed."""
-    from .bases import load_basis
+    from .eigenbasis.registry import load_basis
     from .fitting.presets import PRESETS
 
     method = PRESETS[preset]

@@ -40,9 +40,10 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     [picture] = name_outputs([file], preview, list(SAVE_OPTIONS)) if preview else [None]
     check_outputs([picture], [file])
     select()
-    from . import modelfile, packed
-    from .bases import SHIPPED
-    from .eigengs import EigenGS
+    from . import packed
+    from .eigenbasis import model_file as modelfile
+    from .eigenbasis.eigengs import EigenGS
+    from .eigenbasis.registry import SHIPPED
     from .gaussian import file as setfile
     from .gaussian.gaussians import Gaussians
     from .pictures import component_sheet

@@ -114,7 +114,7 @@ def train(
     [picture] = name_outputs([folder], preview, list(SAVE_OPTIONS)) if preview else [None]
     check_outputs([output, picture, report], image_files(folder))
     select(backend)
-    from . import training
+    from .eigenbasis import training
 
     settings = _settings(**options)
     try:
@@ -135,8 +135,8 @@ def train(
 
 def _settings(gaussians: int | None, frequency_aware: str, **options: Any) -> Any:
     """Turn options into the settings of a training."""
+    from .eigenbasis.training import Settings
     from .fitting.initializers import usual_count
-    from .training import Settings
 
     width, height = options["size"]
     return Settings(

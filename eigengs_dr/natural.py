@@ -62,8 +62,8 @@ def crops(count: int = CROPS, seed: int = 0) -> Iterator[NDArray[np.float32]]:
 def main(path: str) -> None:
     """Train the basis and write it to a file; it takes a minute."""
     from .console import progress_bar
-    from .eigengs import EigenGS
-    from .pca import Eigenbasis
+    from .eigenbasis.basis import Eigenbasis
+    from .eigenbasis.eigengs import EigenGS
 
     with progress_bar(False) as show:
 

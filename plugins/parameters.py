@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..backend.arrays import types_of
-from ..eigengs import EigenGS
+from ..eigenbasis.eigengs import EigenGS
 from ..gaussian.gaussians import Gaussians
 from ..gaussian.tensors import FIELDS, from_tensors, to_tensors
 

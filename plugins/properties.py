@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from ..eigengs import EigenGS
+from ..eigenbasis.eigengs import EigenGS
 from ..gaussian.gaussians import Gaussians
 from ..gaussian.tensors import FIELDS
 from ..image.color import SPACES

@@ -13,9 +13,9 @@ from hypothesis.extra import numpy as hnp
 from scipy.ndimage import gaussian_filter
 
 from eigengs_dr.backend.selection.selection import select
-from eigengs_dr.eigengs import EigenGS
+from eigengs_dr.eigenbasis.basis import Eigenbasis
+from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.gaussians import Gaussians
-from eigengs_dr.pca import Eigenbasis
 from eigengs_dr.raster.reference import render_exact
 
 SIZE = (22, 17)

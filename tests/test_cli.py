@@ -15,10 +15,11 @@ from PIL import Image
 from test_training import random_fields
 
 import eigengs_dr as eg
-from eigengs_dr import bases, cli_train
+from eigengs_dr import cli_train
 from eigengs_dr.backend.selection.selection import BackendError, select
 from eigengs_dr.cli import main
-from eigengs_dr.eigengs import EigenGS
+from eigengs_dr.eigenbasis import registry as bases
+from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting.fit.initializers import INITS
 from eigengs_dr.image.color import SPACES, YCBCR_TO_RGB
 

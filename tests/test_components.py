@@ -15,13 +15,14 @@ from scipy.linalg import cho_factor, cho_solve
 from test_training import SMALL, random_fields
 
 import eigengs_dr as eg
-from eigengs_dr import components, modelfile
 from eigengs_dr.cli import main
-from eigengs_dr.components import SPLIT_COST, split_reason, wants_split
-from eigengs_dr.fall import expected, falling, fewest_apart, remaining
+from eigengs_dr.eigenbasis import model_file as modelfile
+from eigengs_dr.eigenbasis.components import solve as components
+from eigengs_dr.eigenbasis.components.solve import SPLIT_COST, split_reason, wants_split
+from eigengs_dr.eigenbasis.training import Settings, train
+from eigengs_dr.eigenbasis.truncation import expected, falling, fewest_apart, remaining
 from eigengs_dr.image.folder import to_planes
 from eigengs_dr.storage import npz as archive
-from eigengs_dr.training import Settings, train
 
 SIDE, RANKS = 16, (5, 3, 1)
 

@@ -7,15 +7,15 @@ import pytest
 from scenes import family, small_basis, small_model
 
 import eigengs_dr as eg
-from eigengs_dr.bases import load_basis
-from eigengs_dr.components import fit_components, psnr_components, wants_split
+from eigengs_dr.eigenbasis.components.shape_training import ROUND, samples, train_shapes
+from eigengs_dr.eigenbasis.components.solve import fit_components, psnr_components, wants_split
+from eigengs_dr.eigenbasis.registry import load_basis
 from eigengs_dr.fitting.fit.solvers.conjugate_gradient import solve
 from eigengs_dr.fitting.fit.solvers.normal_equations import NormalEquations
 from eigengs_dr.image.folder import to_planes
 from eigengs_dr.image.io import ImageError
 from eigengs_dr.image.resize import resampled
 from eigengs_dr.natural import DEMO, crops
-from eigengs_dr.shapes import ROUND, samples, train_shapes
 
 SIDE, SPLATS = 32, 100
 
@@ -108,7 +108,7 @@ def test_split_keeps_sides_apart(backend, split):
 
 def test_auto_splits_large_images_alone(backend, monkeypatch):
     assert wants_split(small_basis(), SPLATS, "auto", backend) == (False, {})
-    monkeypatch.setattr("eigengs_dr.components.SPLIT_FROM", SIDE)
+    monkeypatch.setattr("eigengs_dr.eigenbasis.components.solve.SPLIT_FROM", SIDE)
     decision, figures = wants_split(small_basis(), SPLATS, "auto", backend)
     assert set(figures) == {"psnr_whole", "psnr_split"}
     assert decision == (figures["psnr_split"] > figures["psnr_whole"] - 0.2)
@@ -151,8 +151,10 @@ def test_a_tenth_of_the_splats_is_low(backend):
 @pytest.mark.parametrize(("split", "expected"), [(30.0, True), (29.9, True), (29.7, False)])
 def test_what_the_split_may_cost(backend, monkeypatch, split, expected):
     figures = iter([30.0, split])
-    monkeypatch.setattr("eigengs_dr.components.SPLIT_FROM", SIDE)
-    monkeypatch.setattr("eigengs_dr.components.decibels", lambda mse: next(figures))
+    monkeypatch.setattr("eigengs_dr.eigenbasis.components.solve.SPLIT_FROM", SIDE)
+    monkeypatch.setattr(
+        "eigengs_dr.eigenbasis.components.solve.decibels", lambda mse: next(figures)
+    )
     assert wants_split(small_basis(), SPLATS, "auto", backend)[0] == expected
 
 
@@ -425,7 +427,7 @@ def test_shipped_basis(backend):
 
 
 def test_shipped_basis_is_small():
-    from eigengs_dr.bases import SHIPPED
+    from eigengs_dr.eigenbasis.registry import SHIPPED
 
     assert SHIPPED["natural"].stat().st_size <= 4_000_000
 

@@ -7,10 +7,10 @@ import pytest
 from numpy.lib import format as npy
 from test_training import SMALL, random_fields
 
-from eigengs_dr import modelfile
-from eigengs_dr.eigengs import EigenGS
+from eigengs_dr.eigenbasis import model_file as modelfile
+from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.eigenbasis.training import Settings, train
 from eigengs_dr.storage import npz as archive
-from eigengs_dr.training import Settings, train
 
 REALS = [key for key, field in modelfile.LAYOUT.items() if field.kind[0] == "f"]
 NUMBERS = [key for key, field in modelfile.LAYOUT.items() if field.kind != "U"]

@@ -9,13 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.decomposition import PCA
 
-import eigengs_dr.pca as pca
-from eigengs_dr import basisfile, incremental
+import eigengs_dr.eigenbasis.basis as pca
+from eigengs_dr.eigenbasis import basis_file as basisfile
+from eigengs_dr.eigenbasis import incremental_pca as incremental
+from eigengs_dr.eigenbasis.basis import Eigenbasis
+from eigengs_dr.eigenbasis.incremental_pca import EigenState, merge, start
 from eigengs_dr.image.folder import batches, to_planes
 from eigengs_dr.image.io import ImageError, check_image, image_files, save_image
 from eigengs_dr.image.resize import resampled
-from eigengs_dr.incremental import EigenState, merge, start
-from eigengs_dr.pca import Eigenbasis
 from eigengs_dr.storage import npz as archive
 
 WIDTH, HEIGHT = SIZE = (14, 11)

@@ -12,12 +12,12 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from eigengs_dr import training
-from eigengs_dr.eigengs import EigenGS
+from eigengs_dr.eigenbasis import training
+from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.eigenbasis.training import Interrupted, Settings, train
 from eigengs_dr.image.io import ImageError, load_image
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import render
-from eigengs_dr.training import Interrupted, Settings, train
 
 SMALL = {"size": (32, 32), "components": 6, "gaussians": 60}
 

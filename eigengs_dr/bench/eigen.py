@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..eigengs import EigenGS
+from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import fit
 from ..fitting.presets import PRESETS
 from ..fitting.refine import refine

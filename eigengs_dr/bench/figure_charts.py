@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bases import load_basis
-from ..eigengs import EigenGS
+from ..eigenbasis.eigengs import EigenGS
+from ..eigenbasis.registry import load_basis
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import psnr
 from . import rows, sets

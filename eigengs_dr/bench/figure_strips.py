@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..bases import load_basis
-from ..eigengs import EigenGS
+from ..eigenbasis.eigengs import EigenGS
+from ..eigenbasis.registry import load_basis
 from ..gaussian.gaussians import Gaussians
 from ..image.io import sample
 from ..image.metrics import psnr

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..eigengs import EigenGS
+from ..eigenbasis.eigengs import EigenGS
 from ..fitting.initializers import begin
 from ..fitting.presets import PRESETS
 from ..image.resize import cropped

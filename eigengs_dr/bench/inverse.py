@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.selection import select
-from ..bases import SHIPPED, load_basis
+from ..eigenbasis.registry import SHIPPED, load_basis
 from ..image.metrics import psnr
 from ..image.resize import cropped
 from ..plugins import register_plugins
@@ -90,7 +90,7 @@ def run(
     Parameters
     ----------
     basis : str or path-like
-        A name of `eigengs_dr.bases.SHIPPED` or a file.
+        A name of `eigengs_dr.eigenbasis.registry.SHIPPED` or a file.
     image : ndarray of float32, shape (H, W, 3)
         RGB; its largest square is hung up.
     conditions : sequence of str, optional

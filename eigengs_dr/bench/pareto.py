@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bases import load_basis
-from ..eigengs import EigenGS
+from ..eigenbasis.eigengs import EigenGS
+from ..eigenbasis.registry import load_basis
 from ..fitting.initializers import GAUSSIANS, Start, begin
 from ..fitting.presets import PRESETS
 from ..gaussian.gaussians import Gaussians

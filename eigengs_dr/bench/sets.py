@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..eigengs import EigenGS
+from ..eigenbasis.basis import Eigenbasis
+from ..eigenbasis.eigengs import EigenGS
 from ..image.io import image_files, load_image
 from ..image.resize import cropped
-from ..pca import Eigenbasis
 
 Image = NDArray[np.float32]
 Progress = Callable[[str, int, int], None]

@@ -15,7 +15,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bases import load_basis
+from ..eigenbasis.registry import load_basis
 from ..fitting.initializers import Start, begin
 from ..fitting.presets import PRESETS, Preset
 from ..fitting.refine import EXACT, rows_at

@@ -7,7 +7,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..eigengs import EigenGS
+from ..eigenbasis.eigengs import EigenGS
 from ..fitting.initializers import Start, begin
 from ..fitting.optimizers.descent import LONG
 from ..fitting.presets import PRESETS

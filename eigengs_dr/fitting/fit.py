@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.interrupt import deferred
-from ..eigengs import EigenGS
+from ..eigenbasis.eigengs import EigenGS
 from ..gaussian.gaussians import Gaussians
 from ..image.color import SPACES
 from ..image.io import check_image

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bases import load_basis
-from ..eigengs import EigenGS
+from ..eigenbasis.eigengs import EigenGS
+from ..eigenbasis.registry import load_basis
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode, rgb_to_ycbcr, to_linear
 from ..image.folder import SPACES as BASIS_SPACES

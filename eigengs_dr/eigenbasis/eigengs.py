@@ -17,7 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .components import (
+from ..fitting.solvers.normal_equations import NormalEquations
+from ..gaussian.gaussians import Gaussians
+from ..image.folder import to_planes
+from ..image.io import check_image
+from ..image.resize import resampled
+from ..storage import npz as archive
+from .basis import Eigenbasis
+from .components.solve import (
     Fitted,
     State,
     check_arguments,
@@ -27,16 +34,9 @@ from .components import (
     squares,
     wants_split,
 )
-from .fall import Fall, expected
-from .fitting.solvers.normal_equations import NormalEquations
-from .gaussian.gaussians import Gaussians
-from .image.folder import to_planes
-from .image.io import check_image
-from .image.resize import resampled
-from .modelfile import FORMAT, VERSION, from_members, layout_of, to_members
-from .pca import Eigenbasis
-from .span import Span
-from .storage import npz as archive
+from .model_file import FORMAT, VERSION, from_members, layout_of, to_members
+from .projection import Span
+from .truncation import Fall, expected
 
 Planes = NDArray[np.float32]
 Progress = Callable[[int, int, dict[str, Any]], None]
@@ -69,10 +69,10 @@ class EigenGS:
         Total variance of the training images, see `eigengs_dr.Eigenbasis`; empty, shape (0,), where
         an older file does not say.
     held_out : ndarray of float64, shape (n + 1,)
-        The PSNR of `eigengs_dr.fall.Fall`, in dB, mean over images that were not trained on, of
+        The PSNR of `eigengs_dr.eigenbasis.truncation.Fall`, in dB, mean over images that were not trained on, of
         their PCA by the first 0, 1, ..., n components; empty where none were held out.
     figures : dict of str to float
-        What was measured when the model was fitted, see `eigengs_dr.components.Fitted`; not saved.
+        What was measured when the model was fitted, see `eigengs_dr.eigenbasis.components.solve.Fitted`; not saved.
     """
 
     gaussians: Gaussians
@@ -107,7 +107,7 @@ class EigenGS:
             Number of splats, at most one a pixel.
         frequency_aware : {"auto", True, False}, optional
             Whether a tenth of the splats serve the first 50 components alone, and the others the
-            rest; see `eigengs_dr.components.wants_split`.
+            rest; see `eigengs_dr.eigenbasis.components.solve.wants_split`.
         seed : int, optional
         preset : {"default", "eigengs"}, optional
             "default" places splats on a grid and solves for the weights of all components at once,
@@ -169,7 +169,7 @@ class EigenGS:
         Returns
         -------
         Fall or None
-            See `eigengs_dr.fall.expected`; None where an older file does not say.
+            See `eigengs_dr.eigenbasis.truncation.expected`; None where an older file does not say.
         """
         if not len(self.variance):
             return None
@@ -189,7 +189,7 @@ class EigenGS:
             Of any size; resampled to that of the model.
         target_psnr : float, optional
             Use as few components as reach it for this image at the size of the model, in dB, of the
-            channels as in `eigengs_dr.fall.Fall`. All by default.
+            channels as in `eigengs_dr.eigenbasis.truncation.Fall`. All by default.
 
         Returns
         -------

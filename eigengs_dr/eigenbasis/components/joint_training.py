@@ -16,17 +16,17 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .backend.arrays import ArrayTypes, types_in, types_of, upload
-from .backend.recording import frozen
-from .backend.selection import select
-from .fitting.optimizers.adan import Adan
-from .fitting.optimizers.parameterization import CHOLESKY
-from .fitting.placement.random import random
-from .gaussian.gaussians import Gaussians
-from .raster.evaluate import SHAPE, UNIT, pack
-from .raster.kernels import accumulate, adjoint
-from .raster.render import CUTOFF, lists_for, to_tiles
-from .raster.tiles import Grid
+from ...backend.arrays import ArrayTypes, types_in, types_of, upload
+from ...backend.recording import frozen
+from ...backend.selection import select
+from ...fitting.optimizers.adan import Adan
+from ...fitting.optimizers.parameterization import CHOLESKY
+from ...fitting.placement.random import random
+from ...gaussian.gaussians import Gaussians
+from ...raster.evaluate import SHAPE, UNIT, pack
+from ...raster.kernels import accumulate, adjoint
+from ...raster.render import CUTOFF, lists_for, to_tiles
+from ...raster.tiles import Grid
 
 RATE = 1e-3
 """Learning rate of everything at the start."""

@@ -12,13 +12,13 @@ from operator import index
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .basisfile import ROUNDING, read_basis, write_basis
-from .fall import Fall, expected, falling, remaining
-from .image.color import ycbcr_to_rgb
-from .image.folder import Progress, Source, batches, checked_size, to_planes
-from .image.io import check_image
-from .image.resize import resampled
-from .incremental import EigenState, block_length, merge, rank_for, start
+from ..image.color import ycbcr_to_rgb
+from ..image.folder import Progress, Source, batches, checked_size, to_planes
+from ..image.io import check_image
+from ..image.resize import resampled
+from .basis_file import ROUNDING, read_basis, write_basis
+from .incremental_pca import EigenState, block_length, merge, rank_for, start
+from .truncation import Fall, expected, falling, remaining
 
 CHANNELS = {"ycbcr": ("Y", "Cb", "Cr"), "rgb": ("R", "G", "B")}
 """What the channels of a space are called in warnings."""

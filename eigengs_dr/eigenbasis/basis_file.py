@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .image.folder import SPACES
-from .incremental import EXAMPLES
-from .storage import npz as archive
+from ..image.folder import SPACES
+from ..storage import npz as archive
+from .incremental_pca import EXAMPLES
 
 FORMAT, VERSION = "eigengs_dr.eigenbasis", 1
 

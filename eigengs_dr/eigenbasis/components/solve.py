@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .backend.arrays import types_of, upload_rows
-from .fitting.solvers.normal_equations import NormalEquations
-from .gaussian.gaussians import Gaussians, concatenate
-from .image.folder import to_planes
-from .image.metrics import decibels
-from .joint import JointState, train_jointly
-from .pca import Eigenbasis
-from .shapes import on_grid, shapes_of, train_shapes
+from ...backend.arrays import types_of, upload_rows
+from ...fitting.solvers.normal_equations import NormalEquations
+from ...gaussian.gaussians import Gaussians, concatenate
+from ...image.folder import to_planes
+from ...image.metrics import decibels
+from ..basis import Eigenbasis
+from .joint_training import JointState, train_jointly
+from .shape_training import on_grid, shapes_of, train_shapes
 
 LOW_SHARE = 0.1
 """Share of the splats that serve the low frequencies, where components are split (the paper)."""

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .basisfile import ROUNDING, require_descending
-from .gaussian.gaussians import Gaussians
-from .image.folder import SPACES
-from .storage.npz import Field
+from ..gaussian.gaussians import Gaussians
+from ..image.folder import SPACES
+from ..storage.npz import Field
+from .basis_file import ROUNDING, require_descending
 
 FORMAT, VERSION = "eigengs_dr.model", 2
 

@@ -16,16 +16,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .backend.interrupt import deferred
-from .components import State, check_arguments, fit_components, split_reason, wants_split
+from ..backend.interrupt import deferred
+from ..image.folder import SPACES, batches, checked_size
+from ..image.io import ImageError, image_files
+from ..storage.checkpoint import Checkpoint
+from .basis import Eigenbasis, checked_components
+from .components.solve import State, check_arguments, fit_components, split_reason, wants_split
 from .eigengs import EigenGS
-from .fall import Fall, check_target
-from .heldout import fall_on, measured
-from .image.folder import SPACES, batches, checked_size
-from .image.io import ImageError, image_files
-from .incremental import EigenState, block_length, merge, rank_for, start
-from .pca import Eigenbasis, checked_components
-from .storage.checkpoint import Checkpoint
+from .evaluation import fall_on, measured
+from .incremental_pca import EigenState, block_length, merge, rank_for, start
+from .truncation import Fall, check_target
 
 HELD_OUT = 10
 """One image in so many is not trained on, but measured."""
@@ -57,7 +57,7 @@ class Settings:
         Keep as few components as hold this share of a channel's variance.
     target_psnr : float or None
         Keep as few components as the images held out need for this mean PSNR of their PCA, in dB;
-        see `eigengs_dr.fall.Fall`.
+        see `eigengs_dr.eigenbasis.truncation.Fall`.
     gaussians, frequency_aware, preset, steps, seed
         See `eigengs_dr.EigenGS.fit`.
     color : {"ycbcr", "rgb"}
@@ -89,7 +89,7 @@ class Trained(NamedTuple):
         it went on with another: ``resumed``), ``peak_rss_mb``, ``images``, ``components`` of each
         channel, ``gaussians``, ``frequency_aware`` and ``split_reason``, why;
         ``psnr_held_out``, the attribute ``held_out`` of the model; ``psnr_components`` and others
-        of `eigengs_dr.components.Fitted`; those of `eigengs_dr.heldout.measured`.
+        of `eigengs_dr.eigenbasis.components.solve.Fitted`; those of `eigengs_dr.eigenbasis.evaluation.measured`.
     """
 
     model: EigenGS

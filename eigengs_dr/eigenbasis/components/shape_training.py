@@ -18,15 +18,15 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .backend.arrays import types_of
-from .backend.recording import frozen
-from .fitting.optimizers.adam import Adam
-from .fitting.optimizers.descent import Schedule, rate_left, step_program
-from .fitting.placement.random import grid
-from .fitting.solvers.conjugate_gradient import solve
-from .gaussian.gaussians import Gaussians
-from .raster.render import CUTOFF, lists_for, to_tiles
-from .raster.tiles import Grid
+from ...backend.arrays import types_of
+from ...backend.recording import frozen
+from ...fitting.optimizers.adam import Adam
+from ...fitting.optimizers.descent import Schedule, rate_left, step_program
+from ...fitting.placement.random import grid
+from ...fitting.solvers.conjugate_gradient import solve
+from ...gaussian.gaussians import Gaussians
+from ...raster.render import CUTOFF, lists_for, to_tiles
+from ...raster.tiles import Grid
 
 Planes = NDArray[np.float32]
 State = dict[str, NDArray[Any]]

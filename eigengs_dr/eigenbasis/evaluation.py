@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..image.io import ImageError, load_image
+from ..image.metrics import psnr
+from ..image.resize import cropped
+from ..raster.render import render
+from .basis import Eigenbasis
 from .eigengs import EigenGS
-from .fall import Fall
-from .image.io import ImageError, load_image
-from .image.metrics import psnr
-from .image.resize import cropped
-from .pca import Eigenbasis
-from .raster.render import render
+from .truncation import Fall
 
 Watch = Callable[[int], None]
 """``watch(i)`` before image number i; what it raises ends the work."""

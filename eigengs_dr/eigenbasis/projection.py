@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from .fall import fewest_apart, remaining
-from .fitting.solvers.normal_equations import NormalEquations
+from ..fitting.solvers.normal_equations import NormalEquations
+from .truncation import fewest_apart, remaining
 
 Coefficients = tuple[NDArray[np.float32], ...]
 
@@ -76,7 +76,7 @@ class Span:
         entries : int
             Pixels times channels.
         target_psnr : float
-            See `eigengs_dr.fall.fewest_apart`. The ridge on the diagonal of ``Psi~^T Psi~``
+            See `eigengs_dr.eigenbasis.truncation.fewest_apart`. The ridge on the diagonal of ``Psi~^T Psi~``
             only lets the error be smaller than it is taken to be.
 
         Returns
