@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from .backend.selection import BackendError, prepare
 
 if TYPE_CHECKING:
+    from .codec.bit_allocation import Receipt, pack
     from .eigenbasis.basis import Eigenbasis
     from .eigenbasis.eigengs import EigenGS
     from .fitting.fit import Fit, fit
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from .gaussian.tensors import from_tensors, to_tensors
     from .image.io import load_image, sample, save_image
     from .image.metrics import ms_ssim, psnr, ssim
-    from .packing import Receipt, pack
     from .plugins import register_plugins
     from .raster.render import picture_of, render
     from .scenefit import fit_for_scene

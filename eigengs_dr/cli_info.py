@@ -40,7 +40,7 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     [picture] = name_outputs([file], preview, list(SAVE_OPTIONS)) if preview else [None]
     check_outputs([picture], [file])
     select()
-    from . import packed
+    from .codec import egs as packed
     from .eigenbasis import model_file as modelfile
     from .eigenbasis.eigengs import EigenGS
     from .eigenbasis.registry import SHIPPED

@@ -10,7 +10,7 @@ from .outputs import check_outputs, name_outputs
 from .report import write_report
 
 SUFFIX, BUDGET = ".egs", 0.5
-"""Those of `eigengs_dr.packed` and `eigengs_dr.packing`, without importing Dr.Jit."""
+"""Those of `eigengs_dr.codec.egsNone` and `eigengs_dr.codec.bit_allocationNone`, without importing Dr.Jit."""
 
 
 @click.command()

@@ -17,9 +17,20 @@ from hypothesis.extra import numpy as hnp
 from scenes import COUNT, SIZE, family, few, random_scene, scenes
 
 import eigengs_dr as eg
-from eigengs_dr import cli, cli_pack, packed, packing, planes
-from eigengs_dr.curve import MOST_LEVELS, along_curve, on_curve
-from eigengs_dr.quantising import LARGEST, Steps, Symbols, factors_of, shapes_of, symbols_of, whole
+from eigengs_dr import cli, cli_pack
+from eigengs_dr.codec import bit_allocation as packing
+from eigengs_dr.codec import egs as packed
+from eigengs_dr.codec import entropy as planes
+from eigengs_dr.codec.hilbert_index import MOST_LEVELS, along_curve, on_curve
+from eigengs_dr.codec.quantization import (
+    LARGEST,
+    Steps,
+    Symbols,
+    factors_of,
+    shapes_of,
+    symbols_of,
+    whole,
+)
 from eigengs_dr.raster.render import picture_of
 from eigengs_dr.storage.npz import BadValue
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scenes import covariances, few
 
-from eigengs_dr.curve import hilbert_order
+from eigengs_dr.codec.hilbert_index import hilbert_order
 from eigengs_dr.fitting.fit.placement.adaptive import (
     adaptive,
     bending,

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..codec.bit_allocation import pack
 from ..fitting.fit import fit
 from ..image.io import sample, to_8bit
 from ..image.metrics import ssim
 from ..image.resize import cropped
-from ..packing import pack
 from ..raster.render import picture_of
 from .pareto import SAMPLE_NAMES, SAMPLE_SIDE, SAMPLES
 from .rows import Job, Row

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import packed
+from ..codec import egs as packed
 from ..image.color import MOST_CHANNELS, SPACES
 from ..storage import npz as archive
 

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ...curve import hilbert_order
+from ...codec.hilbert_index import hilbert_order
 from ...image.resize import resampled
 from .random import inverse_factor
 

@@ -13,14 +13,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .backend.arrays import types_of
-from .fitting.optimizers.descent import descend
-from .fitting.presets import PRESETS
-from .fitting.solvers.conjugate_gradient import solve
-from .gaussian.gaussians import Gaussians
-from .packed import Packed
-from .quantising import Steps, shapes_of, symbols_of, values_of
-from .raster.render import render
+from ..backend.arrays import types_of
+from ..fitting.optimizers.descent import descend
+from ..fitting.presets import PRESETS
+from ..fitting.solvers.conjugate_gradient import solve
+from ..gaussian.gaussians import Gaussians
+from ..raster.render import render
+from .egs import Packed
+from .quantization import Steps, shapes_of, symbols_of, values_of
 
 Array = NDArray[np.floating]
 

@@ -20,7 +20,7 @@ Whole = NDArray[np.int64]
 
 LARGEST = 1 << 23
 """Whole numbers of parameters stay below: steps finer than that are not worth storing. Two of them
-differ by less than twice as much, which `eigengs_dr.curve.MOST_LEVELS` holds."""
+differ by less than twice as much, which `eigengs_dr.codec.hilbert_index.MOST_LEVELS` holds."""
 
 
 class Steps(NamedTuple):

@@ -13,7 +13,7 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-from .storage.npz import BadValue
+from ..storage.npz import BadValue
 
 Whole = NDArray[np.int64]
 

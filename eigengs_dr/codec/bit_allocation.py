@@ -18,16 +18,16 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .backend.arrays import types_of
-from .fitting.refine import EXACT
-from .gaussian.gaussians import Gaussians
-from .image.color import rgb_to_ycbcr, to_coded
-from .image.io import check_image
-from .image.metrics import decibels
-from .packed import MOST_SECTIONS, Packed, to_bytes, write
-from .quantising import Steps, shapes_of, sizes_of
-from .raster.render import CUTOFF, render
-from .rounding import rounded, set_of
+from ..backend.arrays import types_of
+from ..fitting.refine import EXACT
+from ..gaussian.gaussians import Gaussians
+from ..image.color import rgb_to_ycbcr, to_coded
+from ..image.io import check_image
+from ..image.metrics import decibels
+from ..raster.render import CUTOFF, render
+from .egs import MOST_SECTIONS, Packed, to_bytes, write
+from .error_feedback import rounded, set_of
+from .quantization import Steps, shapes_of, sizes_of
 
 Array = NDArray[np.floating]
 

@@ -2,7 +2,7 @@
 
 All numbers are little endian. A header (`_HEADER`) with what all splats share, the background, and
 a checksum; then the sections, each with the number of its splats, its length and its checksum
-(`_SECTION`), and the planes of its numbers (`eigengs_dr.planes`): steps along a Hilbert curve
+(`_SECTION`), and the planes of its numbers (`eigengs_dr.codec.entropyNone`): steps along a Hilbert curve
 through the means, s, u, v, and one plane a channel.
 """
 
@@ -17,12 +17,12 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .curve import MOST_LEVELS, along_curve, on_curve
-from .image.color import MOST_CHANNELS, SPACES
-from .planes import decoded, encoded
-from .quantising import Steps, Symbols, values_of
-from .storage.atomic import replacing
-from .storage.npz import MOST_ENTRIES, BadValue
+from ..image.color import MOST_CHANNELS, SPACES
+from ..storage.atomic import replacing
+from ..storage.npz import MOST_ENTRIES, BadValue
+from .entropy import decoded, encoded
+from .hilbert_index import MOST_LEVELS, along_curve, on_curve
+from .quantization import Steps, Symbols, values_of
 
 SUFFIX = ".egs"
 
