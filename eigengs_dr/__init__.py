@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .image.metrics import ms_ssim, psnr, ssim
     from .plugins import register_plugins
     from .raster.render import picture_of, render
-    from .scenefit import fit_for_scene
+    from .scene.fit_scene import fit_for_scene
 
 __all__ = [
     "BackendError",

@@ -11,7 +11,7 @@ mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
 import eigengs_dr as eg  # noqa: E402
 from eigengs_dr.plugins import texture_of  # noqa: E402
 from eigengs_dr.plugins.cone import PIXEL  # noqa: E402
-from eigengs_dr.resolution import resolution  # noqa: E402
+from eigengs_dr.scene.visibility import resolution  # noqa: E402
 
 FOV, SIDE, TEXELS = 40.0, 24, 32
 NAME = "poster.bsdf.reflectance"

@@ -14,11 +14,11 @@ from test_resolution import NAME, albedo, bitmap, board, camera, scene_of  # noq
 from test_resolution import variant as variant  # noqa: E402
 
 import eigengs_dr as eg  # noqa: E402
-from eigengs_dr import scenefit  # noqa: E402
 from eigengs_dr.image.color import to_coded, to_linear  # noqa: E402
 from eigengs_dr.plugins import texture_of  # noqa: E402
-from eigengs_dr.resolution import Resolution  # noqa: E402
-from eigengs_dr.smoothest import _blur_by, filled, smoothest  # noqa: E402
+from eigengs_dr.scene import fit_scene as scenefit  # noqa: E402
+from eigengs_dr.scene.back_projection import _blur_by, filled, smoothest  # noqa: E402
+from eigengs_dr.scene.visibility import Resolution  # noqa: E402
 
 BOUND, STEPS = 33.0, 30
 

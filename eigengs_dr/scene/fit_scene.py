@@ -1,7 +1,7 @@
 """No more Gaussians than the cameras of a scene can tell from the full image.
 
 The image is replaced by the smoothest texture that the cameras take for it
-(`eigengs_dr.smoothest`). Then the smallest number of Gaussians is sought whose picture, as the
+(`eigengs_dr.scene.back_projectionNone`). Then the smallest number of Gaussians is sought whose picture, as the
 cameras see it, is as close to that of the image as was asked for.
 """
 
@@ -17,19 +17,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
 
-from .fitting.initializers import dark_weight
-from .fitting.optimizers.descent import descend
-from .fitting.placement.adaptive import adaptive
-from .fitting.presets import PRESETS
-from .fitting.solvers.conjugate_gradient import solve
-from .gaussian.gaussians import Gaussians
-from .image.color import to_coded, to_linear
-from .image.io import check_image
-from .image.metrics import psnr as psnr_of
-from .plugins.cone import PIXEL
-from .raster.render import CUTOFF, render
-from .resolution import Resolution, resolution
-from .smoothest import filled, smoothest
+from ..fitting.initializers import dark_weight
+from ..fitting.optimizers.descent import descend
+from ..fitting.placement.adaptive import adaptive
+from ..fitting.presets import PRESETS
+from ..fitting.solvers.conjugate_gradient import solve
+from ..gaussian.gaussians import Gaussians
+from ..image.color import to_coded, to_linear
+from ..image.io import check_image
+from ..image.metrics import psnr as psnr_of
+from ..plugins.cone import PIXEL
+from ..raster.render import CUTOFF, render
+from .back_projection import filled, smoothest
+from .visibility import Resolution, resolution
 
 COLORS = ("linear", "data")
 """What textures hold."""
@@ -114,7 +114,7 @@ def fit_for_scene(
     iterations : int, optional
         Steps of refinement for each number of Gaussians that is tried.
     wrap_mode : {"repeat", "mirror", "clamp"}, optional
-        See `eigengs_dr.resolution.resolution`.
+        See `eigengs_dr.scene.visibility.resolution`.
 
     Returns
     -------

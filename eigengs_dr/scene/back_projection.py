@@ -1,6 +1,6 @@
 """The smoothest texture that cameras take for an image.
 
-Cameras see means over pixels (`eigengs_dr.resolution`): ``R x`` of a texture x. Many textures look
+Cameras see means over pixels (`eigengs_dr.scene.visibilityNone`): ``R x`` of a texture x. Many textures look
 like the image to all of them, and the smoothest takes the fewest Gaussians. It is approached from
 the image blurred by a part of each texel's footprint, B x, by steps of
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from .resolution import Resolution
+from .visibility import Resolution
 
 RETURNS = 20
 """Steps in which a texture gets back what the pixels miss."""

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .plugins.cone import PIXEL  # first, for it says what to install where Mitsuba is missing
+from ..plugins.cone import PIXEL  # first, for it says what to install where Mitsuba is missing
 
 # isort: split
 import drjit as dr
@@ -22,7 +22,7 @@ import mitsuba as mi
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 
-from .raster.lookup.points import fold
+from ..raster.lookup.points import fold
 
 SPACING = 0.5
 """Texels between two rays that are close enough: each texel is then met by some."""
