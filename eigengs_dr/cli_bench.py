@@ -7,13 +7,9 @@ from typing import Any
 import click
 
 from .backend.selection import select
-from .cli_budget import budget
-from .cli_figures import figures
-from .cli_levels import levels
-from .cli_pareto import pareto
-from .cli_rate import rate
-from .cli_report import report as make_report
-from .cli_shared import (
+from .cli.console import progress_bar
+from .cli.levels import levels
+from .cli.options import (
     ANY_PATH,
     EXISTING,
     FOLDER,
@@ -22,11 +18,15 @@ from .cli_shared import (
     quiet_option,
     report_option,
 )
+from .cli.outputs import check_outputs
+from .cli.report import write_report
+from .cli_budget import budget
+from .cli_figures import figures
+from .cli_pareto import pareto
+from .cli_rate import rate
+from .cli_report import report as make_report
 from .cli_stability import stability
 from .cli_tables import tables
-from .console import progress_bar
-from .outputs import check_outputs
-from .report import write_report
 
 CONDITIONS = ("cameras", "grazing", "hidden", "noise")
 """Of `inverse`, without importing Mitsuba, which their module does."""

@@ -5,7 +5,8 @@ from pathlib import Path
 import click
 
 from .backend.selection import select
-from .cli_shared import (
+from .cli.console import progress_bar
+from .cli.options import (
     FOLDER,
     backend_option,
     chosen_sets,
@@ -15,12 +16,11 @@ from .cli_shared import (
     seed_option,
     set_option,
 )
-from .console import progress_bar
-from .outputs import check_outputs
+from .cli.outputs import check_outputs
 
 NATURAL = "natural256"
 TARGETS, HIGHEST = (32.0, 36.0, 40.0), 100.0
-"""Of `eigengs_dr.bench.budget` and `eigengs_dr.fitting.refineNone`, without importing them."""
+"""Of `eigengs_dr.bench.budget` and `eigengs_dr.fitting.refine`, without importing them."""
 
 
 @click.command()

@@ -5,9 +5,9 @@ from pathlib import Path
 import click
 
 from .backend.selection import select
-from .cli_shared import FOLDER, backend_option, described, folder_option, quiet_option, seed_option
-from .console import progress_bar, say
-from .outputs import check_outputs
+from .cli.console import progress_bar, say
+from .cli.options import FOLDER, backend_option, described, folder_option, quiet_option, seed_option
+from .cli.outputs import check_outputs
 
 NAMES = ("iterations", "colors", "curves", "radii", "split", "cross")
 """Of the figures, without importing Dr.Jit, which their module does."""

@@ -6,7 +6,8 @@ from pathlib import Path
 import click
 
 from .backend.selection import select
-from .cli_shared import (
+from .cli.console import progress_bar
+from .cli.options import (
     FOLDER,
     backend_option,
     chosen_sets,
@@ -16,8 +17,7 @@ from .cli_shared import (
     seed_option,
     set_option,
 )
-from .console import progress_bar
-from .outputs import check_outputs
+from .cli.outputs import check_outputs
 
 
 @click.command()

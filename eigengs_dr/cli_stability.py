@@ -6,9 +6,9 @@ from pathlib import Path
 import click
 
 from .backend.selection import select
-from .cli_shared import backend_option, described, folder_option, quiet_option, seed_option
-from .console import progress_bar
-from .outputs import check_outputs
+from .cli.console import progress_bar
+from .cli.options import backend_option, described, folder_option, quiet_option, seed_option
+from .cli.outputs import check_outputs
 
 NAMES = ("default", "gaussianimage", "eigengs")
 """Of the presets, without importing Dr.Jit, which their module does."""

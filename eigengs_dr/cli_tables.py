@@ -5,7 +5,8 @@ from pathlib import Path
 import click
 
 from .backend.selection import select
-from .cli_shared import (
+from .cli.console import progress_bar
+from .cli.options import (
     FOLDER,
     SETS,
     backend_option,
@@ -14,8 +15,7 @@ from .cli_shared import (
     quiet_option,
     seed_option,
 )
-from .console import progress_bar
-from .outputs import check_outputs
+from .cli.outputs import check_outputs
 
 PAPERS = SETS[:-1]
 """The paper's kinds of images: all but Kodak's photos."""

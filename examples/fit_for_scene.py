@@ -7,9 +7,9 @@ import eigengs_dr as eg  # isort: skip  (before Mitsuba: it names a libLLVM that
 import mitsuba as mi
 import numpy as np
 
+from eigengs_dr.cli.pictures import overlay
 from eigengs_dr.image.color import to_coded
 from eigengs_dr.image.montage import joined, line
-from eigengs_dr.pictures import overlay
 from eigengs_dr.plugins import texture_of
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "build/examples")

@@ -1,8 +1,8 @@
 """The Mitsuba texture ``gaussian_texture``: a sum of 2D Gaussians, differentiable and prefiltered.
 
 Dr.Jit takes `self` for loop state, which silently loses gradients, and knows no custom derivatives
-inside a virtual call: the class below only hands arrays to the functions of `eigengs_dr.raster.lookup.pointsNone` and
-`eigengs_dr.raster.lookup.prefilterNone`.
+inside a virtual call: the class below only hands arrays to the functions of
+`eigengs_dr.raster.lookup.points` and `eigengs_dr.raster.lookup.prefilter`.
 """
 
 from __future__ import annotations
@@ -16,14 +16,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..image.color import to_linear
-from ..raster.evaluate import SHAPE, UNIT, pack
-from ..raster.lookup.footprint import bounded_covariance
-from ..raster.lookup.points import cell_side, fold, list_cells, sum_near, values, values_and_slopes
-from ..raster.lookup.prefilter import sum_filtered
-from ..raster.lookup.pyramid import build_lattice, is_distant, mean_of, sum_lattice
-from ..raster.lookup.size_classes import sort_by_size
-from ..raster.render import splat_values
+from eigengs_dr.image.color import to_linear
+from eigengs_dr.raster.evaluate import SHAPE, UNIT, pack
+from eigengs_dr.raster.lookup.footprint import bounded_covariance
+from eigengs_dr.raster.lookup.points import (
+    cell_side,
+    fold,
+    list_cells,
+    sum_near,
+    values,
+    values_and_slopes,
+)
+from eigengs_dr.raster.lookup.prefilter import sum_filtered
+from eigengs_dr.raster.lookup.pyramid import build_lattice, is_distant, mean_of, sum_lattice
+from eigengs_dr.raster.lookup.size_classes import sort_by_size
+from eigengs_dr.raster.render import splat_values
+
 from .cone import metric
 from .properties import affine, angle, cutoff, raw, source_of, wrap_mode
 from .spectrum import upload_table, upsample

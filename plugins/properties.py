@@ -7,11 +7,12 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from ..eigenbasis.eigengs import EigenGS
-from ..gaussian.gaussians import Gaussians
-from ..gaussian.tensors import FIELDS
-from ..image.color import SPACES
-from ..raster.render import CUTOFF, WIDEST_CUTOFF
+from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.gaussian.tensors import FIELDS
+from eigengs_dr.image.color import SPACES
+from eigengs_dr.raster.render import CUTOFF, WIDEST_CUTOFF
+
 from .parameters import FromModel, FromSet
 
 WRAPS = ("repeat", "mirror", "clamp")

@@ -14,7 +14,7 @@ import numpy as np
 from assets import FOLDER, fitted, floor
 
 import eigengs_dr as eg
-from eigengs_dr.backend.selection.selection import select
+from eigengs_dr.backend.selection import select
 from eigengs_dr.image.color import to_coded
 from eigengs_dr.plugins import pixel_angle
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.ndimage import gaussian_filter
 
-from eigengs_dr.backend.selection.selection import select
+from eigengs_dr.backend.selection import select
 from eigengs_dr.eigenbasis.basis import Eigenbasis
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.gaussians import Gaussians

@@ -8,7 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from eigengs_dr.backend.selection.selection import (
+from eigengs_dr.backend import selection as module
+from eigengs_dr.backend.selection import (
     VARIABLE,
     BackendError,
     candidates,
@@ -16,11 +17,10 @@ from eigengs_dr.backend.selection.selection import (
     prepare,
     select,
 )
-from eigengs_dr.backend.selectionNone import selection as module
 
 SELECT = """
 import eigengs_dr
-from eigengs_dr.backend.selectionNone import BackendError, select
+from eigengs_dr.backend.selection import BackendError, select
 try:
     types = select("llvm")
 except BackendError as error:

@@ -15,15 +15,16 @@ from hypothesis import strategies as st
 from scenes import family
 
 import eigengs_dr as eg
-from eigengs_dr import cli_budget, cli_shared
+from eigengs_dr import cli_budget
 from eigengs_dr.bench import budget, budget_tables, rate, rows
+from eigengs_dr.cli import options as cli_shared
+from eigengs_dr.cli.console import Program
 from eigengs_dr.cli_bench import bench as group
-from eigengs_dr.console import Program
-from eigengs_dr.fitting.fit.fit import most_gaussians
-from eigengs_dr.fitting.fit.initializers import begin
-from eigengs_dr.fitting.fit.optimizers.descent import descend
-from eigengs_dr.fitting.fit.presets import PRESETS
-from eigengs_dr.fitting.fit.refine import EXACT
+from eigengs_dr.fitting.fit import most_gaussians
+from eigengs_dr.fitting.initializers import begin
+from eigengs_dr.fitting.optimizers.descent import descend
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.refine import EXACT
 from eigengs_dr.raster.render import picture_of
 
 RUN = {"command": "eigengs-dr bench budget", "cpu": "a CPU"}

@@ -15,7 +15,7 @@ from scipy.linalg import cho_factor, cho_solve
 from test_training import SMALL, random_fields
 
 import eigengs_dr as eg
-from eigengs_dr.cli import main
+from eigengs_dr.cli.main import main
 from eigengs_dr.eigenbasis import model_file as modelfile
 from eigengs_dr.eigenbasis.components import solve as components
 from eigengs_dr.eigenbasis.components.solve import SPLIT_COST, split_reason, wants_split

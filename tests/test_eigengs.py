@@ -5,17 +5,17 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 from scenes import family, small_basis, small_model
+from train_natural import DEMO, crops
 
 import eigengs_dr as eg
 from eigengs_dr.eigenbasis.components.shape_training import ROUND, samples, train_shapes
 from eigengs_dr.eigenbasis.components.solve import fit_components, psnr_components, wants_split
 from eigengs_dr.eigenbasis.registry import load_basis
-from eigengs_dr.fitting.fit.solvers.conjugate_gradient import solve
-from eigengs_dr.fitting.fit.solvers.normal_equations import NormalEquations
+from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.solvers.normal_equations import NormalEquations
 from eigengs_dr.image.folder import to_planes
 from eigengs_dr.image.io import ImageError
 from eigengs_dr.image.resize import resampled
-from eigengs_dr.natural import DEMO, crops
 
 SIDE, SPLATS = 32, 100
 

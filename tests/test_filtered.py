@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scenes import SIZE, covariances, few, random_scene
 from scipy.special import erf
 
-from eigengs_dr.backend.selection.arrays import types_in, types_of
-from eigengs_dr.backend.selection.selection import select
+from eigengs_dr.backend.arrays import types_in, types_of
+from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.evaluate import SHAPE, UNIT, pack, widen
 from eigengs_dr.raster.lookup.footprint import WIDEST, bounded_covariance, quick_erf
 from eigengs_dr.raster.lookup.prefilter import sum_filtered

@@ -10,13 +10,13 @@ import pytest
 from scenes import random_scene, small_model
 from test_refine import SIDE, SPLATS, figures, picture, presets
 
-from eigengs_dr.fitting.fit.fit import fit
-from eigengs_dr.fitting.fit.optimizers.adam import Adam
-from eigengs_dr.fitting.fit.optimizers.descent import Schedule
-from eigengs_dr.fitting.fit.placement.random import grid
-from eigengs_dr.fitting.fit.presets import PRESETS
-from eigengs_dr.fitting.fitNone import fit as fitting
-from eigengs_dr.fitting.fitNone import initializers as starting
+from eigengs_dr.fitting import fit as fitting
+from eigengs_dr.fitting import initializers as starting
+from eigengs_dr.fitting.fit import fit
+from eigengs_dr.fitting.optimizers.adam import Adam
+from eigengs_dr.fitting.optimizers.descent import Schedule
+from eigengs_dr.fitting.placement.random import grid
+from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import picture_of, render

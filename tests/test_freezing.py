@@ -7,16 +7,16 @@ import sys
 import drjit as dr
 import pytest
 
-from eigengs_dr.backend.selection.recording import frozen
-from eigengs_dr.backend.selection.selection import select
+from eigengs_dr.backend.recording import frozen
+from eigengs_dr.backend.selection import select
 
 LITTER = """
 import gc
 
 import numpy as np
 
-from eigengs_dr.backend.selectionNone import select
-from eigengs_dr.backend.recordingNone import frozen
+from eigengs_dr.backend.selection import select
+from eigengs_dr.backend.recording import frozen
 
 class Node:
     pass

@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as hnp
 from scenes import COUNT, SIZE, few, random_scene
 
 import eigengs_dr
-from eigengs_dr.backend.selection.selection import select
+from eigengs_dr.backend.selection import select
 from eigengs_dr.gaussian.gaussians import NARROWEST, Gaussians, concatenate
 from eigengs_dr.raster.render import render
 from eigengs_dr.storage import npz as archive

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from scenes import SIZE, few, random_scene, scenes
 
-from eigengs_dr.backend.selection.arrays import types_of
+from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.color import ycbcr_to_rgb
 from eigengs_dr.raster.reference import render_plain

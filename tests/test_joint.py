@@ -6,11 +6,11 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from eigengs_dr.backend.selection.arrays import types_of
-from eigengs_dr.backend.selection.selection import select
+from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.backend.selection import select
 from eigengs_dr.eigenbasis.components import joint_training as joint
 from eigengs_dr.eigenbasis.components.joint_training import RATE, JointState, train_jointly
-from eigengs_dr.fitting.fit.optimizers.parameterization import CHOLESKY
+from eigengs_dr.fitting.optimizers.parameterization import CHOLESKY
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.raster.reference import render_plain
 from eigengs_dr.raster.render import lists_for, render

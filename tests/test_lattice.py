@@ -6,7 +6,7 @@ import pytest
 from scenes import SIZE, random_scene
 from test_filtered import brute_force, some_points, stacked, tiled
 
-from eigengs_dr.backend.selection.arrays import types_of
+from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.raster.evaluate import SHAPE, pack
 from eigengs_dr.raster.lookup import pyramid as module
 from eigengs_dr.raster.lookup.pyramid import build_lattice, is_distant, mean_of, sum_lattice

@@ -11,13 +11,13 @@ from click.testing import CliRunner
 from scenes import random_scene
 
 import eigengs_dr as eg
-from eigengs_dr.cli import main
+from eigengs_dr.cli.main import main
 from eigengs_dr.codec.bit_allocation import UNSEEN
-from eigengs_dr.fitting.fit.density_control import worth
-from eigengs_dr.fitting.fit.initializers import begin
-from eigengs_dr.fitting.fit.levels import fit_levels, level_counts
-from eigengs_dr.fitting.fit.optimizers.descent import first
-from eigengs_dr.fitting.fit.presets import PRESETS
+from eigengs_dr.fitting.density_control import worth
+from eigengs_dr.fitting.initializers import begin
+from eigengs_dr.fitting.levels import fit_levels, level_counts
+from eigengs_dr.fitting.optimizers.descent import first
+from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import picture_of, render
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from scenes import COUNT, SIZE, few, random_scene, scenes
 
-from eigengs_dr.fitting.fit.solvers.conjugate_gradient import solve
-from eigengs_dr.fitting.fit.solvers.normal_equations import RIDGE, NormalEquations, splat_matrix
+from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.solvers.normal_equations import RIDGE, NormalEquations, splat_matrix
 from eigengs_dr.raster.render import render
 
 

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scenes import COUNT, SIZE, few, random_scene, scenes
 
-from eigengs_dr.backend.selection.selection import select
-from eigengs_dr.fitting.fit.optimizers.adam import Adam
-from eigengs_dr.fitting.fit.optimizers.adan import Adan
-from eigengs_dr.fitting.fit.optimizers.parameterization import CHOLESKY, CHOLESKY_BOUND, NATURAL
+from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.optimizers.adam import Adam
+from eigengs_dr.fitting.optimizers.adan import Adan
+from eigengs_dr.fitting.optimizers.parameterization import CHOLESKY, CHOLESKY_BOUND, NATURAL
 from eigengs_dr.gaussian.gaussians import NARROWEST
 
 # --- Adam --------------------------------------------------------------------------------------

@@ -17,7 +17,8 @@ from hypothesis.extra import numpy as hnp
 from scenes import COUNT, SIZE, family, few, random_scene, scenes
 
 import eigengs_dr as eg
-from eigengs_dr import cli, cli_pack
+from eigengs_dr.cli import main as cli
+from eigengs_dr.cli import pack as cli_pack
 from eigengs_dr.codec import bit_allocation as packing
 from eigengs_dr.codec import egs as packed
 from eigengs_dr.codec import entropy as planes

@@ -12,15 +12,16 @@ from hypothesis import strategies as st
 from scenes import family, few, small_model
 
 import eigengs_dr as eg
-from eigengs_dr import cli_pareto, cli_shared
-from eigengs_dr.backend.selection.arrays import types_in
-from eigengs_dr.backend.selection.selection import select
+from eigengs_dr import cli_pareto
+from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.selection import select
 from eigengs_dr.bench import kernels, pareto, pareto_kernels, pareto_tables, sets
 from eigengs_dr.bench.pareto import Collection, Variant, front
-from eigengs_dr.console import Program
-from eigengs_dr.fitting.fit.initializers import begin
-from eigengs_dr.fitting.fit.optimizers.descent import descend
-from eigengs_dr.fitting.fit.presets import PRESETS
+from eigengs_dr.cli import options as cli_shared
+from eigengs_dr.cli.console import Program
+from eigengs_dr.fitting.initializers import begin
+from eigengs_dr.fitting.optimizers.descent import descend
+from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.raster.reference import render_exact
 from eigengs_dr.raster.render import picture_of
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from test_training import SMALL, random_fields
 
-from eigengs_dr import pictures
+from eigengs_dr.cli import pictures
+from eigengs_dr.cli.pictures import CELL, LIGHTER, comparison, component_sheet, ellipses, overlay
 from eigengs_dr.eigenbasis.training import Settings, train
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.montage import GAP, joined, line
 from eigengs_dr.image.resize import resampled
-from eigengs_dr.pictures import CELL, LIGHTER, comparison, component_sheet, ellipses, overlay
 from eigengs_dr.raster.render import render
 
 CAPTION = 12

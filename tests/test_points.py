@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scenes import SIZE, few, random_scene, scenes
 
-from eigengs_dr.backend.selection.arrays import types_in, types_of
-from eigengs_dr.backend.selection.selection import select
+from eigengs_dr.backend.arrays import types_in, types_of
+from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.evaluate import SHAPE, UNIT, pack
 from eigengs_dr.raster.lookup.points import (
     cell_side,

@@ -12,10 +12,11 @@ from PIL import Image
 from scenes import family
 
 import eigengs_dr as eg
-from eigengs_dr import cli_rate, cli_shared
+from eigengs_dr import cli_rate
 from eigengs_dr.bench import rate, rate_tables, rows
-from eigengs_dr.console import Program
-from eigengs_dr.fitting.fit.refine import EXACT
+from eigengs_dr.cli import options as cli_shared
+from eigengs_dr.cli.console import Program
+from eigengs_dr.fitting.refine import EXACT
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ import pytest
 from drjit import JitFlag
 from scenes import Scene, random_scene
 
-from eigengs_dr.fitting.fit.optimizers.descent import descend
-from eigengs_dr.fitting.fit.presets import PRESETS
-from eigengs_dr.fitting.fit.refine import refine, rows_at
+from eigengs_dr.fitting.optimizers.descent import descend
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.refine import refine, rows_at
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import render
 

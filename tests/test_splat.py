@@ -6,8 +6,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from eigengs_dr.backend.selection.arrays import _types, types_in, types_of
-from eigengs_dr.backend.selection.selection import select
+from eigengs_dr.backend.arrays import _types, types_in, types_of
+from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.evaluate import (
     UNIT,
     exp2_neg,

@@ -11,12 +11,12 @@ import eigengs_dr as eg
 from eigengs_dr.bench import stability, tiling
 from eigengs_dr.bench.cases import CASES, Case, flat, heap, needles, outside, photo, subpixel
 from eigengs_dr.bench.rows import read
+from eigengs_dr.cli.console import Program
 from eigengs_dr.cli_stability import NAMES
 from eigengs_dr.cli_stability import stability as command
-from eigengs_dr.console import Program
-from eigengs_dr.fitting.fit.placement.random import inverse_factor
-from eigengs_dr.fitting.fit.presets import PRESETS
-from eigengs_dr.fitting.fit.refine import EXACT
+from eigengs_dr.fitting.placement.random import inverse_factor
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.refine import EXACT
 from eigengs_dr.gaussian.gaussians import NARROWEST
 
 

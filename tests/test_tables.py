@@ -10,10 +10,10 @@ from scenes import family, small_model
 from eigengs_dr import cli_tables
 from eigengs_dr.bench import losses, rows, sets, summary, tables, trial
 from eigengs_dr.bench.table import Table, as_text, mean, median, number, spread
-from eigengs_dr.cli import main
-from eigengs_dr.fitting.fit.fit import fit
-from eigengs_dr.fitting.fit.initializers import begin
-from eigengs_dr.fitting.fit.presets import PRESETS
+from eigengs_dr.cli.main import main
+from eigengs_dr.fitting.fit import fit
+from eigengs_dr.fitting.initializers import begin
+from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.image.io import ImageError, save_image
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import picture_of

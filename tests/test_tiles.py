@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from scenes import COUNT, SIZE, covariances, distances, factors_of, few, random_scene, scenes
 
-from eigengs_dr.backend.selection.arrays import types_in
-from eigengs_dr.backend.selection.selection import select
+from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.tiles import TILE, Grid, build_lists, walk
 
 RADIUS = 3.0

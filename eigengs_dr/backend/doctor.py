@@ -15,7 +15,7 @@ from . import selection as backend
 
 TRIAL = """
 import json, sys
-from eigengs_dr.backend.selectionNone import describe, select
+from eigengs_dr.backend.selection import describe, select
 try:
     types = select(sys.argv[1])
     import drjit as dr

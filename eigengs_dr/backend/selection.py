@@ -110,7 +110,7 @@ def select(backend: str | None = None) -> ModuleType:
 
     Examples
     --------
-    >>> from eigengs_dr.backend.selectionNone import select
+    >>> from eigengs_dr.backend.selection import select
     >>> select().Float(1, 2).shape
     (2,)
     """

@@ -47,8 +47,8 @@ class Case(NamedTuple):
         Splats; a start from a basis has those of the basis.
     iterations : int
     place : callable or None
-        Means and factors to start from, called as those of `eigengs_dr.fitting.placement.randomNone` are and brought
-        inside their bounds as those are; None for those of the preset.
+        Means and factors to start from, called as those of `eigengs_dr.fitting.placement.random`
+        are and brought inside their bounds as those are; None for those of the preset.
     rates : float
         What the rates of the preset are multiplied by.
     alone : bool
@@ -143,7 +143,8 @@ def _grey(plane: NDArray[np.number]) -> Image:
 
 
 # ---------------------------------------------------------------------------------------------
-#  Starts: mean (N, 2) in pixels and factor (N, 3), as those of `eigengs_dr.fitting.placement.randomNone`
+#  Starts: mean (N, 2) in pixels and factor (N, 3), as those of
+#  `eigengs_dr.fitting.placement.random`
 # ---------------------------------------------------------------------------------------------
 
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
-from ..report import write_report
+from ..cli.report import write_report
 from ..storage.atomic import require_writable
 from . import charts, figure_charts, figure_strips, rows, sets
 from .figure_charts import PANELS

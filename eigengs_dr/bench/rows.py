@@ -9,7 +9,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from ..report import plain
+from ..cli.report import plain
 from ..storage.atomic import replacing
 
 Row = dict[str, Any]

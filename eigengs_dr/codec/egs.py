@@ -2,8 +2,8 @@
 
 All numbers are little endian. A header (`_HEADER`) with what all splats share, the background, and
 a checksum; then the sections, each with the number of its splats, its length and its checksum
-(`_SECTION`), and the planes of its numbers (`eigengs_dr.codec.entropyNone`): steps along a Hilbert curve
-through the means, s, u, v, and one plane a channel.
+(`_SECTION`), and the planes of its numbers (`eigengs_dr.codec.entropy`): steps along a Hilbert
+curve through the means, s, u, v, and one plane a channel.
 """
 
 from __future__ import annotations

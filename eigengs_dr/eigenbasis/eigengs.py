@@ -69,10 +69,12 @@ class EigenGS:
         Total variance of the training images, see `eigengs_dr.Eigenbasis`; empty, shape (0,), where
         an older file does not say.
     held_out : ndarray of float64, shape (n + 1,)
-        The PSNR of `eigengs_dr.eigenbasis.truncation.Fall`, in dB, mean over images that were not trained on, of
-        their PCA by the first 0, 1, ..., n components; empty where none were held out.
+        The PSNR of `eigengs_dr.eigenbasis.truncation.Fall`, in dB, mean over images that were not
+        trained on, of their PCA by the first 0, 1, ..., n components; empty where none were held
+        out.
     figures : dict of str to float
-        What was measured when the model was fitted, see `eigengs_dr.eigenbasis.components.solve.Fitted`; not saved.
+        What was measured when the model was fitted, see
+        `eigengs_dr.eigenbasis.components.solve.Fitted`; not saved.
     """
 
     gaussians: Gaussians

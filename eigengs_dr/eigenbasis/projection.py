@@ -76,8 +76,8 @@ class Span:
         entries : int
             Pixels times channels.
         target_psnr : float
-            See `eigengs_dr.eigenbasis.truncation.fewest_apart`. The ridge on the diagonal of ``Psi~^T Psi~``
-            only lets the error be smaller than it is taken to be.
+            See `eigengs_dr.eigenbasis.truncation.fewest_apart`. The ridge on the diagonal of
+            ``Psi~^T Psi~`` only lets the error be smaller than it is taken to be.
 
         Returns
         -------

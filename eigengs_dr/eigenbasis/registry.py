@@ -8,8 +8,8 @@ from pathlib import Path
 
 from .eigengs import EigenGS
 
-SHIPPED = {"natural": Path(__file__).parent / "data" / "natural.npz"}
-"""Files of the bases that are part of the package, by name; see `eigengs_dr.natural`."""
+SHIPPED = {"natural": Path(__file__).parents[1] / "data" / "natural.npz"}
+"""Files of the bases that are part of the package, by name; see ``tools/train_natural.py``."""
 
 
 def load_basis(basis: str | os.PathLike[str] | EigenGS, backend: str | None = None) -> EigenGS:

@@ -89,7 +89,8 @@ class Trained(NamedTuple):
         it went on with another: ``resumed``), ``peak_rss_mb``, ``images``, ``components`` of each
         channel, ``gaussians``, ``frequency_aware`` and ``split_reason``, why;
         ``psnr_held_out``, the attribute ``held_out`` of the model; ``psnr_components`` and others
-        of `eigengs_dr.eigenbasis.components.solve.Fitted`; those of `eigengs_dr.eigenbasis.evaluation.measured`.
+        of `eigengs_dr.eigenbasis.components.solve.Fitted`; those of
+        `eigengs_dr.eigenbasis.evaluation.measured`.
     """
 
     model: EigenGS

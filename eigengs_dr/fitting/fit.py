@@ -99,7 +99,7 @@ def fit(
         What "eigen" starts from: the name of a basis of this package, the file of another, or a
         model.
     preset : {"default", "gaussianimage", "eigengs"}, optional
-        The method, see `eigengs_dr.fitting.presetsNone`.
+        The method, see `eigengs_dr.fitting.presets`.
     solve_steps : int, optional
         Steps of conjugate gradients in the colour solve; "eigen" needs none at its own size.
     color : {"ycbcr", "rgb", "linear", "data"}, optional
@@ -114,8 +114,8 @@ def fit(
         ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
     target_psnr : float, optional
         Instead of `gaussians`: decibels to reach with as few splats as possible, see
-        `eigengs_dr.fitting.searchNone`. `iterations` are then those of a fit of a known number; the search
-        takes up to about twice as many.
+        `eigengs_dr.fitting.search`. `iterations` are then those of a fit of a known number; the
+        search takes up to about twice as many.
     target_space : {"ycbcr", "rgb"}, optional
         Where `target_psnr` is measured, as psnr_ycbcr or as psnr_rgb.
     max_gaussians : int, optional

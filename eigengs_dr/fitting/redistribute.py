@@ -7,8 +7,9 @@ each has the same share of it, ``s = e / rho``; so, from a set that was tried an
     rho' ~ k^(1 / (FALL + 1)) = rho s^(1 / (FALL + 1)).
 
 What is hard to fit and what only bends much is told apart by trying. That is known for some splats
-together; among them, density follows the bending (`eigengs_dr.fitting.placement.adaptiveNone`). The constants were chosen
-on training images of ImageNet classes and of cats, by the error after 1,000 steps.
+together; among them, density follows the bending (`eigengs_dr.fitting.placement.adaptive`). The
+constants were chosen on training images of ImageNet classes and of cats, by the error after 1,000
+steps.
 """
 
 from __future__ import annotations
@@ -57,13 +58,13 @@ def rearranged(
     count : int
         Number of splats of the result, from 1 to H W.
     image : ndarray, shape (H, W, C)
-        What shapes splats, see `eigengs_dr.fitting.placement.adaptiveNone`.
+        What shapes splats, see `eigengs_dr.fitting.placement.adaptive`.
     target : ndarray of float32, shape (H, W, C)
         The image in the space of the set.
     weight : ndarray, shape (H, W, C), optional
         What errors are multiplied by before they are squared.
     solve_steps : int, optional
-        See `eigengs_dr.fitting.solvers.conjugate_gradientNone`.
+        See `eigengs_dr.fitting.solvers.conjugate_gradient`.
     cutoff : float, optional
         See `eigengs_dr.render`.
 
@@ -96,7 +97,8 @@ def placed_like(
 ) -> Gaussians:
     """Place splats by an image and solve for their colours, in the space and size of another set.
 
-    Parameters are those of `rearranged`; see `eigengs_dr.fitting.placement.adaptiveNone` for the density.
+    Parameters are those of `rearranged`; see `eigengs_dr.fitting.placement.adaptive` for the
+    density.
     """
     mean, factor = adaptive(image, count, density=density)
     placed = Gaussians.from_arrays(

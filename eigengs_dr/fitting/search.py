@@ -1,9 +1,10 @@
 """The fewest splats for a quality.
 
 Three stages. *Estimate*: some steps with few splats tell what more would reach, two tries what
-twice as many gain, and each where the splats of the next one belong (`eigengs_dr.fitting.redistributeNone`).
-*Fit* that number. *Settle*: drop what is worth least while the goal is met, add where the error is
-while it is not (`eigengs_dr.fitting.density_controlNone`), each time with a short descent.
+twice as many gain, and each where the splats of the next one belong
+(`eigengs_dr.fitting.redistribute`). *Fit* that number. *Settle*: drop what is worth least while the
+goal is met, add where the error is while it is not (`eigengs_dr.fitting.density_control`), each
+time with a short descent.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ TRIES, SETTLING = 4, 5
 """Most tries, and descents to settle after which a goal that is met is settled enough."""
 
 OCTAVE = 4.0
-"""Decibels that twice as many splats gain, see `eigengs_dr.fitting.redistribute.FALL`, until two tries of this
+"""Decibels that twice as many splats gain, see `eigengs_dr.fitting.redistribute.FALL`, until two
+tries of this
 image tell it."""
 
 SLOPES = (2.0, 12.0)

@@ -1,6 +1,6 @@
 """The sum over all splats and its derivatives: a lane a tile forward, a lane a splat in reverse.
 
-``I(x) = background + sum_n c_n w_n(x)`` with the weights of `eigengs_dr.raster.evaluateNone`.
+``I(x) = background + sum_n c_n w_n(x)`` with the weights of `eigengs_dr.raster.evaluate`.
 
 Layout of images in this module: tile after tile, in a tile row after row, pixel after pixel,
 channel after channel, so that a lane reads or writes one contiguous piece with packet operations.

@@ -18,7 +18,7 @@ def render_plain(values: list, background: list, lists: TileLists, cutoff: float
     Parameters
     ----------
     values : list of Float, shape (N,)
-        Mean x, mean y, a, b, c (see `eigengs_dr.raster.evaluateNone`), then the channels.
+        Mean x, mean y, a, b, c (see `eigengs_dr.raster.evaluate`), then the channels.
     background : list of Float
     lists : TileLists
     cutoff : float, optional

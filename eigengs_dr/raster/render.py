@@ -63,7 +63,7 @@ def render(
     bit-equal. A splat whose mean or factor is not finite is not drawn; a colour that is not finite
     spoils the tiles that its splat touches. Building tile lists reads sizes back, which
     `drjit.freeze` does not allow: freeze a function that takes `lists_for`'s result and calls
-    `splat`, as `eigengs_dr.fitting.optimizers.descentNone` does.
+    `splat`, as `eigengs_dr.fitting.optimizers.descent` does.
 
     Examples
     --------
@@ -128,7 +128,7 @@ def splat_values(gaussians: Gaussians) -> tuple[list, list]:
 
 
 def lists_for(gaussians: Gaussians, cutoff: float = CUTOFF, pad: float = 0.0) -> TileLists:
-    """List the splats of every tile of the image at native size; see `eigengs_dr.raster.tilesNone`.
+    """List the splats of every tile of the image at native size; see `eigengs_dr.raster.tiles`.
 
     Raises
     ------
@@ -159,7 +159,7 @@ def splat(values: list, background: list, lists: TileLists, cutoff: float = CUTO
     Returns
     -------
     Float, shape (tiles * pixels * channels,)
-        See `eigengs_dr.raster.kernelsNone` for the layout, `to_tensor` for an image.
+        See `eigengs_dr.raster.kernels` for the layout, `to_tensor` for an image.
     """
     return dr.custom(_Splat, values, background, lists, UNIT * cutoff)
 

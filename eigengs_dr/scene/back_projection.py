@@ -1,8 +1,8 @@
 """The smoothest texture that cameras take for an image.
 
-Cameras see means over pixels (`eigengs_dr.scene.visibilityNone`): ``R x`` of a texture x. Many textures look
-like the image to all of them, and the smoothest takes the fewest Gaussians. It is approached from
-the image blurred by a part of each texel's footprint, B x, by steps of
+Cameras see means over pixels (`eigengs_dr.scene.visibility`): ``R x`` of a texture x. Many textures
+look like the image to all of them, and the smoothest takes the fewest Gaussians. It is approached
+from the image blurred by a part of each texel's footprint, B x, by steps of
 
     t <- t + B R+ (R x - R t),
 

@@ -1,8 +1,8 @@
 """No more Gaussians than the cameras of a scene can tell from the full image.
 
 The image is replaced by the smoothest texture that the cameras take for it
-(`eigengs_dr.scene.back_projectionNone`). Then the smallest number of Gaussians is sought whose picture, as the
-cameras see it, is as close to that of the image as was asked for.
+(`eigengs_dr.scene.back_projection`). Then the smallest number of Gaussians is sought whose picture,
+as the cameras see it, is as close to that of the image as was asked for.
 """
 
 from __future__ import annotations

@@ -60,9 +60,9 @@ class JointState(NamedTuple):
     counts : tuple of C ints
         Components of each channel.
     rows : ndarray of float32, shape (5, 5 + P, N)
-        Values; then m, v, n and the last gradient of `eigengs_dr.fitting.optimizers.adan.Adan`. Each has 5 rows for
-        the mean and the factor in `CHOLESKY` coordinates, then a row of scaled weights for every
-        component.
+        Values; then m, v, n and the last gradient of `eigengs_dr.fitting.optimizers.adan.Adan`.
+        Each has 5 rows for the mean and the factor in `CHOLESKY` coordinates, then a row of scaled
+        weights for every component.
     """
 
     step: int

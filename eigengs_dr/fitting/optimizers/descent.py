@@ -83,10 +83,10 @@ def descend(
 ) -> Iterator[Gaussians]:
     """Yield the set before the first step and after every step of gradient descent.
 
-    Parameters are those of `eigengs_dr.fitting.refine.refine`. From what `rearrange` makes of the set after
-    `Schedule.rearrange` steps, a descent of its own goes on: splats are placed anew where they left
-    much error. The first so many splats of each of the `levels` make the image too, as well as they
-    can. Steps run asynchronously: what is yielded may not be computed yet.
+    Parameters are those of `eigengs_dr.fitting.refine.refine`. From what `rearrange` makes of the
+    set after `Schedule.rearrange` steps, a descent of its own goes on: splats are placed anew where
+    they left much error. The first so many splats of each of the `levels` make the image too, as
+    well as they can. Steps run asynchronously: what is yielded may not be computed yet.
     """
     yield gaussians
     tried = schedule.rearrange if rearrange and iterations >= LONG * schedule.rearrange else 0

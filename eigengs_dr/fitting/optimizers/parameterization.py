@@ -105,7 +105,7 @@ def _cholesky_to(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
 
 
 def _inverse_factor(l1: Any, l2: Any, l3: Any) -> tuple[Any, Any, Any]:
-    """``F`` with ``F^T F = (L L^T)^-1``; as `eigengs_dr.fitting.placement.random.inverse_factor`."""
+    """``F`` with ``F^T F = (L L^T)^-1``; see `inverse_factor` of the placement."""
     l1, l3 = l1 + CHOLESKY_BOUND, l3 + CHOLESKY_BOUND
     yy = dr.square(l2) + dr.square(l3)
     a = dr.sqrt(yy) / dr.abs(l1 * l3)

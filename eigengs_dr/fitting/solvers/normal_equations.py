@@ -3,7 +3,8 @@
 With A, whose column n holds the weights of splat n at all pixels, the best colours c and background
 b of an image D minimise ``|A c + b 1 - D|^2``. Shapes that do not change from image to image leave
 ``A^T A`` as it is: it is factorised once, and each image costs one product and one
-back-substitution. For the shapes of one image alone, `eigengs_dr.fitting.solvers.conjugate_gradientNone` is cheaper.
+back-substitution. For the shapes of one image alone,
+`eigengs_dr.fitting.solvers.conjugate_gradient` is cheaper.
 """
 
 from __future__ import annotations
@@ -210,8 +211,8 @@ def splat_matrix(gaussians: Gaussians, cutoff: float = CUTOFF) -> csr_array:
     Returns
     -------
     csr_array of float32, shape (N, H * W)
-        Row n holds the weights of splat n, by `eigengs_dr.raster.evaluate.weights`. Cost and size: the number
-        of pixels inside all ellipses; 8 bytes each, and 30 while it is made.
+        Row n holds the weights of splat n, by `eigengs_dr.raster.evaluate.weights`. Cost and size:
+        the number of pixels inside all ellipses; 8 bytes each, and 30 while it is made.
 
     Raises
     ------

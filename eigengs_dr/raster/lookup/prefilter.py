@@ -1,9 +1,9 @@
 """The sum of Gaussians seen through a Gaussian footprint: a prefilter in closed form.
 
 A Gaussian convolved with a Gaussian is one again, so what a pixel sees of a texture is the sum of
-widened splats (`eigengs_dr.raster.evaluate.widen`): no mip map, no more samples. A texture ends at its
-borders, or repeats: a splat then counts with the share of ``footprint x splat`` that lies in the
-image, and copies of the image that the footprint reaches are summed as well.
+widened splats (`eigengs_dr.raster.evaluate.widen`): no mip map, no more samples. A texture ends at
+its borders, or repeats: a splat then counts with the share of ``footprint x splat`` that lies in
+the image, and copies of the image that the footprint reaches are summed as well.
 """
 
 from __future__ import annotations

@@ -7,8 +7,9 @@ from typing import Any
 
 import click
 
-from .backend.selection import select
-from .cli_shared import (
+from ..backend.selection import select
+from .console import INTERRUPTED, progress_bar, say
+from .options import (
     ANY_PATH,
     EXISTING,
     backend_option,
@@ -18,7 +19,6 @@ from .cli_shared import (
     report_option,
     seed_option,
 )
-from .console import INTERRUPTED, progress_bar, say
 from .outputs import check_outputs, name_outputs
 from .report import write_report
 
@@ -123,7 +123,7 @@ def fit(
       eigengs-dr fit *.png -o fits/ --preview previews/ --iterations 300
       eigengs-dr fit roughness.png -o roughness.npz --color data
     """
-    from .image.io import SAVE_OPTIONS
+    from ..image.io import SAVE_OPTIONS
 
     _check_search(**settings)
     outputs = name_outputs(images, output, [".npz"])
@@ -160,8 +160,8 @@ def _check_search(
 
 def _basis(backend: str | None, init: str, preset: str, basis: str, **rest: Any) -> Any:
     """Read the model to start from, once for all images; its name where none is needed."""
-    from .eigenbasis.registry import load_basis
-    from .fitting.presets import PRESETS
+    from ..eigenbasis.registry import load_basis
+    from ..fitting.presets import PRESETS
 
     method = PRESETS[preset]
     if (method.init if init == "auto" else init) != "eigen":
@@ -191,7 +191,7 @@ def _fit_one(
     """Fit one image, write what was asked for, and return its figures."""
     import eigengs_dr as eg
 
-    from .image.metrics import unclamped
+    from ..image.metrics import unclamped
     from .pictures import comparison
 
     color = settings["color"]

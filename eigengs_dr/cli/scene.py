@@ -9,11 +9,11 @@ from typing import Any
 
 import click
 
-from .backend.selection import select
-from .cli_shared import ANY_PATH, EXISTING, quiet_option
+from ..backend.selection import select
+from ..storage.atomic import replacing
 from .console import progress_bar
+from .options import ANY_PATH, EXISTING, quiet_option
 from .outputs import check_outputs, name_outputs
-from .storage.atomic import replacing
 
 SUFFIXES = (".png", ".exr")
 """What is written: PNG as sRGB, clamped; EXR as it is."""
@@ -112,7 +112,7 @@ def _mitsuba(variant: str | None, quiet: bool) -> Any:
         raise ValueError(
             f"scenes need Mitsuba ({error}): pip install 'eigengs-dr[plugins]'"
         ) from error
-    from .plugins import register_plugins
+    from ..plugins import register_plugins
 
     if variant is None:
         variant = "cuda_ad_rgb" if "cuda" in module.__name__ else "llvm_ad_rgb"

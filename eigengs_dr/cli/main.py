@@ -9,13 +9,12 @@ from pathlib import Path
 
 import click
 
-from .backend.selection import select
-from .cli_bench import bench
-from .cli_fit import fit
-from .cli_info import info
-from .cli_pack import pack
-from .cli_scene import scene
-from .cli_shared import (
+from ..backend.selection import select
+from ..cli_bench import bench
+from .console import Program
+from .fit import fit
+from .info import info
+from .options import (
     ANY_PATH,
     EXISTING,
     MOST_PIXELS,
@@ -24,9 +23,10 @@ from .cli_shared import (
     checked_pixels,
     json_option,
 )
-from .cli_train import train
-from .console import Program
 from .outputs import check_outputs, name_outputs
+from .pack import pack
+from .scene import scene
+from .train import train
 
 
 @click.group(cls=Program)
@@ -84,14 +84,14 @@ def render(
     """
     if scale is not None and size is not None:
         raise click.UsageError("--scale and --size exclude each other; give one of them")
-    from .image.io import SAVE_OPTIONS
+    from ..image.io import SAVE_OPTIONS
 
     [output] = name_outputs([file], output, list(SAVE_OPTIONS))
     check_outputs([output], [file])
     select(backend)
     import eigengs_dr as eg
 
-    from .raster.render import picture_of
+    from ..raster.render import picture_of
 
     gaussians = eg.Gaussians.load(file, backend=backend)
     if first is not None and first > len(gaussians):
@@ -113,7 +113,7 @@ def doctor(context: click.Context, as_json: bool) -> None:
     Example:
       eigengs-dr doctor
     """
-    from .backend import doctor as doctor_module
+    from ..backend import doctor as doctor_module
 
     found = doctor_module.report()
     click.echo(json.dumps(found, indent=2) if as_json else doctor_module.describe(found))

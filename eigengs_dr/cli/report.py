@@ -5,7 +5,7 @@ import math
 import os
 from typing import Any
 
-from .storage.atomic import replacing
+from ..storage.atomic import replacing
 
 
 def write_report(path: str | os.PathLike[str], figures: dict[str, Any]) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from .backend.selection import describe
+from ..backend.selection import describe
 from .console import NAME
 
 EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)

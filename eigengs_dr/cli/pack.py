@@ -4,13 +4,13 @@ from pathlib import Path
 
 import click
 
-from .backend.selection import select
-from .cli_shared import ANY_PATH, EXISTING, backend_option, described, quiet_option, report_option
+from ..backend.selection import select
+from .options import ANY_PATH, EXISTING, backend_option, described, quiet_option, report_option
 from .outputs import check_outputs, name_outputs
 from .report import write_report
 
 SUFFIX, BUDGET = ".egs", 0.5
-"""Those of `eigengs_dr.codec.egsNone` and `eigengs_dr.codec.bit_allocationNone`, without importing Dr.Jit."""
+"""Those of `eigengs_dr.codec`, without importing Dr.Jit."""
 
 
 @click.command()

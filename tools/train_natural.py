@@ -1,4 +1,4 @@
-"""The basis "natural", which ships with the package: ``python -m eigengs_dr.natural FILE``.
+"""The basis "natural", which ships with the package: ``python tools/train_natural.py FILE``.
 
 It is trained on random crops of the photos inside scikit-image. At many sizes and places, mirrored
 both ways, they make a family without a preferred place: its components are close to waves of
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .image.io import SAMPLES, sample
-from .image.resize import resampled
+from eigengs_dr.image.io import SAMPLES, sample
+from eigengs_dr.image.resize import resampled
 
 DEMO = "coffee"
 """The photo of ``make demo``: not trained on, so that the demo shows what others can expect."""
@@ -61,9 +61,9 @@ def crops(count: int = CROPS, seed: int = 0) -> Iterator[NDArray[np.float32]]:
 
 def main(path: str) -> None:
     """Train the basis and write it to a file; it takes a minute."""
-    from .console import progress_bar
-    from .eigenbasis.basis import Eigenbasis
-    from .eigenbasis.eigengs import EigenGS
+    from eigengs_dr.cli.console import progress_bar
+    from eigengs_dr.eigenbasis.basis import Eigenbasis
+    from eigengs_dr.eigenbasis.eigengs import EigenGS
 
     with progress_bar(False) as show:
 
@@ -78,5 +78,5 @@ def main(path: str) -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) != 2:
-        sys.exit("usage: python -m eigengs_dr.natural FILE.npz")
+        sys.exit("usage: python tools/train_natural.py FILE.npz")
     main(sys.argv[1])

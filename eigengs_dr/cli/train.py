@@ -5,8 +5,9 @@ from typing import Any
 
 import click
 
-from .backend.selection import select
-from .cli_shared import (
+from ..backend.selection import select
+from .console import INTERRUPTED, progress_bar, say
+from .options import (
     ANY_PATH,
     FOLDER,
     Counts,
@@ -18,7 +19,6 @@ from .cli_shared import (
     report_option,
     seed_option,
 )
-from .console import INTERRUPTED, progress_bar, say
 from .outputs import check_outputs, name_outputs
 from .report import write_report
 
@@ -108,13 +108,13 @@ def train(
       eigengs-dr train photos/ -o photos.npz --target-psnr 24
       eigengs-dr fit photo.jpg -o photo.npz --init eigen --basis photos.npz
     """
-    from .image.io import SAVE_OPTIONS, image_files
+    from ..image.io import SAVE_OPTIONS, image_files
 
     [output] = name_outputs([folder], output, [".npz"])
     [picture] = name_outputs([folder], preview, list(SAVE_OPTIONS)) if preview else [None]
     check_outputs([output, picture, report], image_files(folder))
     select(backend)
-    from .eigenbasis import training
+    from ..eigenbasis import training
 
     settings = _settings(**options)
     try:
@@ -135,8 +135,8 @@ def train(
 
 def _settings(gaussians: int | None, frequency_aware: str, **options: Any) -> Any:
     """Turn options into the settings of a training."""
-    from .eigenbasis.training import Settings
-    from .fitting.initializers import usual_count
+    from ..eigenbasis.training import Settings
+    from ..fitting.initializers import usual_count
 
     width, height = options["size"]
     return Settings(
@@ -152,7 +152,7 @@ def _figures(figures: dict[str, Any]) -> dict[str, Any]:
 
 
 def _save_sheet(path: Path, trained: Any) -> None:
-    from .image.io import save_image
+    from ..image.io import save_image
     from .pictures import component_sheet
 
     save_image(path, component_sheet(trained.model, trained.basis))

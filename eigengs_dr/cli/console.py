@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from .backend.selection import BackendError
+from ..backend.selection import BackendError
 
 NAME = "eigengs-dr"
 """Name of the program, in front of all that it says on standard error."""

@@ -6,8 +6,8 @@ from typing import Any
 
 import click
 
-from .backend.selection import select
-from .cli_shared import ANY_PATH, checked_pixels, json_option
+from ..backend.selection import select
+from .options import ANY_PATH, checked_pixels, json_option
 from .outputs import check_outputs, name_outputs
 
 
@@ -35,19 +35,19 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
       eigengs-dr info natural
       eigengs-dr info model.npz --preview components.png
     """
-    from .image.io import SAVE_OPTIONS, save_image
+    from ..image.io import SAVE_OPTIONS, save_image
 
     [picture] = name_outputs([file], preview, list(SAVE_OPTIONS)) if preview else [None]
     check_outputs([picture], [file])
     select()
-    from .codec import egs as packed
-    from .eigenbasis import model_file as modelfile
-    from .eigenbasis.eigengs import EigenGS
-    from .eigenbasis.registry import SHIPPED
-    from .gaussian import file as setfile
-    from .gaussian.gaussians import Gaussians
+    from ..codec import egs as packed
+    from ..eigenbasis import model_file as modelfile
+    from ..eigenbasis.eigengs import EigenGS
+    from ..eigenbasis.registry import SHIPPED
+    from ..gaussian import file as setfile
+    from ..gaussian.gaussians import Gaussians
+    from ..storage import npz as archive
     from .pictures import component_sheet
-    from .storage import npz as archive
 
     kinds: dict[str, tuple[str, Any, Any, Any]] = {
         setfile.FORMAT: ("image", Gaussians.load, _describe_image, _rendered),
@@ -139,7 +139,7 @@ def _text(fall: Any = (), **facts: Any) -> str:
 
 
 def _rendered(gaussians: Any) -> Any:
-    from .raster.render import picture_of
+    from ..raster.render import picture_of
 
     checked_pixels(gaussians.width, gaussians.height)
     return picture_of(gaussians)

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .eigenbasis.basis import CHANNELS, Eigenbasis
-from .eigenbasis.components.solve import colored
-from .eigenbasis.eigengs import EigenGS
-from .gaussian.gaussians import Gaussians
-from .image.color import decode
-from .image.io import to_8bit
-from .image.montage import joined, line
-from .image.resize import resampled
-from .raster.render import render
+from ..eigenbasis.basis import CHANNELS, Eigenbasis
+from ..eigenbasis.components.solve import colored
+from ..eigenbasis.eigengs import EigenGS
+from ..gaussian.gaussians import Gaussians
+from ..image.color import decode
+from ..image.io import to_8bit
+from ..image.montage import joined, line
+from ..image.resize import resampled
+from ..raster.render import render
 
 FIRST = (1, 2, 3, 5, 10, 20, 50, 100, 200)
 """Components of the first channel that are shown, counted from 1."""

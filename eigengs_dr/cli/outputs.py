@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from .storage.atomic import require_writable
+from ..storage.atomic import require_writable
 
 
 def name_outputs(inputs: Sequence[Path], output: Path, suffixes: Sequence[str]) -> list[Path]:

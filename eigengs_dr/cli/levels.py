@@ -4,9 +4,9 @@ from pathlib import Path
 
 import click
 
-from .backend.selection import select
-from .cli_shared import EXISTING, backend_option, folder_option, quiet_option, seed_option
+from ..backend.selection import select
 from .console import progress_bar
+from .options import EXISTING, backend_option, folder_option, quiet_option, seed_option
 from .outputs import check_outputs
 
 SAMPLE, SIDE = "coffee", 256
@@ -42,11 +42,11 @@ def levels(
       eigengs-dr bench levels -o levels/
       eigengs-dr bench levels photo.jpg -o levels/ --gaussians 20000 --levels 5
     """
-    from .bench import levels as benchmark
-    from .bench.charts import new_figure, save_figure
-    from .bench.table import as_text
-    from .image.io import load_image, sample
-    from .image.resize import cropped
+    from ..bench import levels as benchmark
+    from ..bench.charts import new_figure, save_figure
+    from ..bench.table import as_text
+    from ..image.io import load_image, sample
+    from ..image.resize import cropped
 
     new_figure(1, 1)  # says now, not after the fits, that charts cannot be drawn
     drawing, file = output / "levels.svg", output / "levels.csv"
