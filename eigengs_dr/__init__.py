@@ -7,7 +7,7 @@ Mitsuba variant.
 
 import lazy_loader
 
-from .backend.selection import prepare
+from .backend.libllvm import prepare
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 

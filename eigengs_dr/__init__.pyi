@@ -8,8 +8,9 @@ from .fitting.fit import Fit, fit
 from .fitting.levels import fit_levels, level_counts
 from .gaussian.gaussians import Gaussians, concatenate
 from .gaussian.tensors import from_tensors, to_tensors
-from .image.io import ImageError, load_image, sample, save_image
+from .image.io import ImageError, load_image, save_image
 from .image.metrics import ms_ssim, psnr, ssim
+from .image.samples import sample
 from .plugins import register_plugins
 from .raster.render import picture_of, render
 from .scene.fit_scene import fit_for_scene

@@ -109,7 +109,8 @@ def eigen(
       eigengs-dr bench eigen natural photos/ --iterations 0
       eigengs-dr bench eigen faces.npz faces-test/ --images 50 --report eigen.json
     """
-    from .image.io import image_files, load_image
+    from .image.folder import image_files
+    from .image.io import load_image
 
     files = image_files(folder)[:images]
     check_outputs([report], files)

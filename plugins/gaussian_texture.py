@@ -17,7 +17,8 @@ import mitsuba as mi
 import numpy as np
 
 from eigengs_dr.image.color import to_linear
-from eigengs_dr.raster.evaluate import SHAPE, UNIT, pack
+from eigengs_dr.raster.evaluate import SHAPE, UNIT
+from eigengs_dr.raster.layout import pack
 from eigengs_dr.raster.lookup.footprint import bounded_covariance
 from eigengs_dr.raster.lookup.points import (
     cell_side,

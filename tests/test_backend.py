@@ -8,15 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from eigengs_dr.backend import selection as module
-from eigengs_dr.backend.selection import (
-    VARIABLE,
-    BackendError,
-    candidates,
-    describe,
-    prepare,
-    select,
-)
+from eigengs_dr.backend import libllvm as module
+from eigengs_dr.backend.libllvm import VARIABLE, candidates, prepare
+from eigengs_dr.backend.selection import BackendError, describe, select
 
 SELECT = """
 import eigengs_dr

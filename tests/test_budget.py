@@ -13,12 +13,13 @@ from scenes import few, scenes
 import eigengs_dr as eg
 from eigengs_dr.cli.main import main
 from eigengs_dr.fitting import search as budget
-from eigengs_dr.fitting.density_control import APART, grown, places, pruned, worth
+from eigengs_dr.fitting.density_control import grown, pruned, worth
 from eigengs_dr.fitting.fit import fit, most_gaussians
 from eigengs_dr.fitting.initializers import begin
 from eigengs_dr.fitting.placement.adaptive import adaptive
+from eigengs_dr.fitting.placement.density import APART, FALL, places, wanted
 from eigengs_dr.fitting.presets import PRESETS
-from eigengs_dr.fitting.redistribute import FALL, rearranged, residual, wanted
+from eigengs_dr.fitting.redistribute import rearranged, residual
 from eigengs_dr.fitting.search import fewest
 from eigengs_dr.fitting.solvers.conjugate_gradient import correlations
 from eigengs_dr.image.color import rgb_to_ycbcr
@@ -128,7 +129,8 @@ def test_fits_that_are_long_enough_rearrange_once():
         calls.append(count)
         return start.rearrange(gaussians, count)
 
-    from eigengs_dr.fitting.optimizers.descent import LONG, descend
+    from eigengs_dr.fitting.optimizers.descent import descend
+    from eigengs_dr.fitting.optimizers.schedule import LONG
 
     schedule = replace(PRESETS["default"].schedule, rearrange=2)
     for steps, times in ((2 * LONG - 1, 0), (2 * LONG, 1)):

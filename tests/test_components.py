@@ -18,7 +18,7 @@ import eigengs_dr as eg
 from eigengs_dr.cli.main import main
 from eigengs_dr.eigenbasis import model_file as modelfile
 from eigengs_dr.eigenbasis.components import solve as components
-from eigengs_dr.eigenbasis.components.solve import SPLIT_COST, split_reason, wants_split
+from eigengs_dr.eigenbasis.components.split import SPLIT_COST, split_reason, wants_split
 from eigengs_dr.eigenbasis.training import Settings, train
 from eigengs_dr.eigenbasis.truncation import expected, falling, fewest_apart, remaining
 from eigengs_dr.image.folder import to_planes

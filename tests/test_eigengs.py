@@ -9,7 +9,8 @@ from train_natural import DEMO, crops
 
 import eigengs_dr as eg
 from eigengs_dr.eigenbasis.components.shape_training import ROUND, samples, train_shapes
-from eigengs_dr.eigenbasis.components.solve import fit_components, psnr_components, wants_split
+from eigengs_dr.eigenbasis.components.solve import fit_components, psnr_components
+from eigengs_dr.eigenbasis.components.split import wants_split
 from eigengs_dr.eigenbasis.registry import load_basis
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.fitting.solvers.normal_equations import NormalEquations
@@ -108,7 +109,7 @@ def test_split_keeps_sides_apart(backend, split):
 
 def test_auto_splits_large_images_alone(backend, monkeypatch):
     assert wants_split(small_basis(), SPLATS, "auto", backend) == (False, {})
-    monkeypatch.setattr("eigengs_dr.eigenbasis.components.solve.SPLIT_FROM", SIDE)
+    monkeypatch.setattr("eigengs_dr.eigenbasis.components.split.SPLIT_FROM", SIDE)
     decision, figures = wants_split(small_basis(), SPLATS, "auto", backend)
     assert set(figures) == {"psnr_whole", "psnr_split"}
     assert decision == (figures["psnr_split"] > figures["psnr_whole"] - 0.2)
@@ -151,7 +152,7 @@ def test_a_tenth_of_the_splats_is_low(backend):
 @pytest.mark.parametrize(("split", "expected"), [(30.0, True), (29.9, True), (29.7, False)])
 def test_what_the_split_may_cost(backend, monkeypatch, split, expected):
     figures = iter([30.0, split])
-    monkeypatch.setattr("eigengs_dr.eigenbasis.components.solve.SPLIT_FROM", SIDE)
+    monkeypatch.setattr("eigengs_dr.eigenbasis.components.split.SPLIT_FROM", SIDE)
     monkeypatch.setattr(
         "eigengs_dr.eigenbasis.components.solve.decibels", lambda mse: next(figures)
     )

@@ -10,7 +10,8 @@ from scipy.special import erf
 
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.evaluate import SHAPE, UNIT, pack, widen
+from eigengs_dr.raster.evaluate import SHAPE, UNIT, widen
+from eigengs_dr.raster.layout import pack
 from eigengs_dr.raster.lookup.footprint import WIDEST, bounded_covariance, quick_erf
 from eigengs_dr.raster.lookup.prefilter import sum_filtered
 from eigengs_dr.raster.lookup.size_classes import sort_by_size

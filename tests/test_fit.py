@@ -14,8 +14,8 @@ from eigengs_dr.fitting import fit as fitting
 from eigengs_dr.fitting import initializers as starting
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.optimizers.adam import Adam
-from eigengs_dr.fitting.optimizers.descent import Schedule
-from eigengs_dr.fitting.placement.random import grid
+from eigengs_dr.fitting.optimizers.schedule import Schedule
+from eigengs_dr.fitting.placement.grid import grid
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.image.metrics import psnr

@@ -7,7 +7,8 @@ from scenes import SIZE, random_scene
 from test_filtered import brute_force, some_points, stacked, tiled
 
 from eigengs_dr.backend.arrays import types_of
-from eigengs_dr.raster.evaluate import SHAPE, pack
+from eigengs_dr.raster.evaluate import SHAPE
+from eigengs_dr.raster.layout import pack
 from eigengs_dr.raster.lookup import pyramid as module
 from eigengs_dr.raster.lookup.pyramid import build_lattice, is_distant, mean_of, sum_lattice
 from eigengs_dr.raster.lookup.size_classes import sort_by_size

@@ -14,8 +14,8 @@ from eigengs_dr.eigenbasis import basis_file as basisfile
 from eigengs_dr.eigenbasis import incremental_pca as incremental
 from eigengs_dr.eigenbasis.basis import Eigenbasis
 from eigengs_dr.eigenbasis.incremental_pca import EigenState, merge, start
-from eigengs_dr.image.folder import batches, to_planes
-from eigengs_dr.image.io import ImageError, check_image, image_files, save_image
+from eigengs_dr.image.folder import batches, image_files, to_planes
+from eigengs_dr.image.io import ImageError, check_image, save_image
 from eigengs_dr.image.resize import resampled
 from eigengs_dr.storage import npz as archive
 

@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scenes import covariances, few
 
-from eigengs_dr.codec.hilbert_index import hilbert_order
 from eigengs_dr.fitting.placement.adaptive import adaptive, bending, bent, capped, pieces, relaxed
-from eigengs_dr.fitting.placement.random import GRID_SIZE, grid, inverse_factor, random
+from eigengs_dr.fitting.placement.grid import GRID_SIZE, grid
+from eigengs_dr.fitting.placement.hilbert_scan import hilbert_order
+from eigengs_dr.fitting.placement.random import inverse_factor, random
 from eigengs_dr.image.resize import resampled
 
 INITS = [random, grid, adaptive]

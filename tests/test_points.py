@@ -11,7 +11,8 @@ from scenes import SIZE, few, random_scene, scenes
 
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.evaluate import SHAPE, UNIT, pack
+from eigengs_dr.raster.evaluate import SHAPE, UNIT
+from eigengs_dr.raster.layout import pack
 from eigengs_dr.raster.lookup.points import (
     cell_side,
     fold,

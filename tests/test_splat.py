@@ -8,16 +8,8 @@ import pytest
 
 from eigengs_dr.backend.arrays import _types, types_in, types_of
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.evaluate import (
-    UNIT,
-    exp2_neg,
-    falloff,
-    gather_run,
-    pack,
-    unpack,
-    weights,
-    weights_pullback,
-)
+from eigengs_dr.raster.evaluate import UNIT, exp2_neg, falloff, weights, weights_pullback
+from eigengs_dr.raster.layout import gather_run, pack, unpack
 
 TILE = (4, 3)
 CUTOFF = 3.0

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 import eigengs_dr.image.folder as stream
 from eigengs_dr.image.color import rgb_to_ycbcr
-from eigengs_dr.image.folder import batches, checked_size, to_planes
-from eigengs_dr.image.io import ImageError, check_image, image_files, load_image, save_image
+from eigengs_dr.image.folder import batches, checked_size, image_files, to_planes
+from eigengs_dr.image.io import ImageError, check_image, load_image, save_image
 from eigengs_dr.image.resize import cropped
 
 WIDTH, HEIGHT = SIZE = (6, 5)

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eigengs_dr.image.io import SAMPLES, sample
 from eigengs_dr.image.resize import resampled
+from eigengs_dr.image.samples import SAMPLES, sample
 
 DEMO = "coffee"
 """The photo of ``make demo``: not trained on, so that the demo shows what others can expect."""

@@ -11,7 +11,8 @@ import subprocess
 import sys
 from typing import Any
 
-from . import selection as backend
+from . import libllvm
+from .selection import version_of
 
 TRIAL = """
 import json, sys
@@ -49,9 +50,9 @@ def report() -> dict[str, Any]:
         "llvm": _try("llvm"),
         "cuda": _try("cuda"),
         "libllvm": [
-            {**library._asdict(), "usable": library.usable} for library in backend.candidates()
+            {**library._asdict(), "usable": library.usable} for library in libllvm.candidates()
         ],
-        "libllvm_path": os.environ.get(backend.VARIABLE),
+        "libllvm_path": os.environ.get(libllvm.VARIABLE),
         "mitsuba": _mitsuba(),
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -109,7 +110,7 @@ def _try(name: str) -> dict[str, Any]:
     if process.returncode == 0:
         return dict(json.loads(process.stdout.splitlines()[-1]))
     how = f"signal {-process.returncode}" if process.returncode < 0 else process.returncode
-    return {"works": False, "problem": f"the process ended with {how}; {backend.ADVICE}"}
+    return {"works": False, "problem": f"the process ended with {how}; {libllvm.ADVICE}"}
 
 
 def _mitsuba() -> dict[str, Any]:
@@ -118,7 +119,7 @@ def _mitsuba() -> dict[str, Any]:
         return {"version": None, "variants": None}
     process = _python(VARIANTS)
     variants = json.loads(process.stdout) if process.returncode == 0 else None
-    return {"version": backend.version_of("mitsuba"), "variants": variants}
+    return {"version": version_of("mitsuba"), "variants": variants}
 
 
 def _python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:

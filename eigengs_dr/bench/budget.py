@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..fitting.fit import fit, most_gaussians
 from ..fitting.initializers import GAUSSIANS, Start, begin
-from ..fitting.optimizers.descent import LONG
+from ..fitting.optimizers.schedule import LONG
 from ..fitting.presets import PRESETS
 from . import rows
 from .rate import images_of

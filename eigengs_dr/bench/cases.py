@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..fitting.placement.random import inverse_factor
-from ..image.io import sample
 from ..image.resize import cropped
+from ..image.samples import sample
 
 Image = NDArray[np.float32]
 Shapes = tuple[NDArray[np.float64], NDArray[np.float64]]

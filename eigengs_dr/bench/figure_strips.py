@@ -12,8 +12,8 @@ from ..cli.pictures import overlay
 from ..eigenbasis.eigengs import EigenGS
 from ..eigenbasis.registry import load_basis
 from ..gaussian.gaussians import Gaussians
-from ..image.io import sample
 from ..image.metrics import psnr
+from ..image.samples import sample
 from ..raster.render import picture_of
 from . import sets
 from .figure_pictures import Cell, Picture, Row, save_strip, strip

@@ -21,7 +21,8 @@ from ..fitting.refine import Progress
 from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr
-from ..image.io import check_image, sample
+from ..image.io import check_image
+from ..image.samples import sample
 from ..raster.evaluate import SHAPE, UNIT
 from ..raster.reference import render_plain
 from ..raster.render import lists_for, splat, splat_values, to_tensor

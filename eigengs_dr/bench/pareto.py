@@ -16,8 +16,8 @@ from ..eigenbasis.registry import load_basis
 from ..fitting.initializers import GAUSSIANS, Start, begin
 from ..fitting.presets import PRESETS
 from ..gaussian.gaussians import Gaussians
-from ..image.io import sample
 from ..image.resize import cropped
+from ..image.samples import sample
 from ..raster.render import CUTOFF, picture_of
 from .rows import Job, Row
 from .sets import SETS, model_for, test_images

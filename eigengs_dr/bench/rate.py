@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from ..codec.bit_allocation import pack
 from ..fitting.fit import fit
-from ..image.io import sample, to_8bit
+from ..image.io import to_8bit
 from ..image.metrics import ssim
 from ..image.resize import cropped
+from ..image.samples import sample
 from ..raster.render import picture_of
 from .pareto import SAMPLE_NAMES, SAMPLE_SIDE, SAMPLES
 from .rows import Job, Row

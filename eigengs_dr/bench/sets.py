@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from ..eigenbasis.basis import Eigenbasis
 from ..eigenbasis.eigengs import EigenGS
-from ..image.io import image_files, load_image
+from ..image.folder import image_files
+from ..image.io import load_image
 from ..image.resize import cropped
 
 Image = NDArray[np.float32]

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from ..eigenbasis.eigengs import EigenGS
 from ..fitting.initializers import Start, begin
-from ..fitting.optimizers.descent import LONG
+from ..fitting.optimizers.schedule import LONG
 from ..fitting.presets import PRESETS
 from ..image.metrics import psnr
 from . import rows

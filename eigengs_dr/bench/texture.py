@@ -13,7 +13,7 @@ import numpy as np
 from ..fitting.fit import fit
 from ..fitting.refine import Progress
 from ..image.color import to_linear
-from ..image.io import sample
+from ..image.samples import sample
 from ..raster.render import picture_of, render
 from .trial import whole
 

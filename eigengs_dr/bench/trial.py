@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ..fitting.fit import Fit
 from ..fitting.initializers import Start
-from ..fitting.optimizers.descent import LONG, Schedule, descend
+from ..fitting.optimizers.descent import descend
+from ..fitting.optimizers.schedule import LONG, Schedule
 from ..fitting.refine import EXACT, Refined
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import ms_ssim, psnr, ssim

@@ -45,8 +45,9 @@ def levels(
     from ..bench import levels as benchmark
     from ..bench.charts import new_figure, save_figure
     from ..bench.table import as_text
-    from ..image.io import load_image, sample
+    from ..image.io import load_image
     from ..image.resize import cropped
+    from ..image.samples import sample
 
     new_figure(1, 1)  # says now, not after the fits, that charts cannot be drawn
     drawing, file = output / "levels.svg", output / "levels.csv"

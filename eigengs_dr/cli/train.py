@@ -108,7 +108,8 @@ def train(
       eigengs-dr train photos/ -o photos.npz --target-psnr 24
       eigengs-dr fit photo.jpg -o photo.npz --init eigen --basis photos.npz
     """
-    from ..image.io import SAVE_OPTIONS, image_files
+    from ..image.folder import image_files
+    from ..image.io import SAVE_OPTIONS
 
     [output] = name_outputs([folder], output, [".npz"])
     [picture] = name_outputs([folder], preview, list(SAVE_OPTIONS)) if preview else [None]

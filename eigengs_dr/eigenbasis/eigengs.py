@@ -17,23 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..fitting.solvers.normal_equations import NormalEquations
+from ..fitting.solvers.normal_equations import NormalEquations, squares
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import to_planes
 from ..image.io import check_image
 from ..image.resize import resampled
 from ..storage import npz as archive
 from .basis import Eigenbasis
-from .components.solve import (
-    Fitted,
-    State,
-    check_arguments,
-    colored,
-    fit_components,
-    split_reason,
-    squares,
-    wants_split,
-)
+from .components.solve import Fitted, State, check_arguments, colored, fit_components
+from .components.split import split_reason, wants_split
 from .model_file import FORMAT, VERSION, from_members, layout_of, to_members
 from .projection import Span
 from .truncation import Fall, expected
@@ -109,7 +101,7 @@ class EigenGS:
             Number of splats, at most one a pixel.
         frequency_aware : {"auto", True, False}, optional
             Whether a tenth of the splats serve the first 50 components alone, and the others the
-            rest; see `eigengs_dr.eigenbasis.components.solve.wants_split`.
+            rest; see `eigengs_dr.eigenbasis.components.split.wants_split`.
         seed : int, optional
         preset : {"default", "eigengs"}, optional
             "default" places splats on a grid and solves for the weights of all components at once,

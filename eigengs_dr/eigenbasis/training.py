@@ -17,11 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..backend.interrupt import deferred
-from ..image.folder import SPACES, batches, checked_size
-from ..image.io import ImageError, image_files
+from ..image.folder import SPACES, batches, checked_size, image_files
+from ..image.io import ImageError
 from ..storage.checkpoint import Checkpoint
 from .basis import Eigenbasis, checked_components
-from .components.solve import State, check_arguments, fit_components, split_reason, wants_split
+from .components.solve import State, check_arguments, fit_components
+from .components.split import split_reason, wants_split
 from .eigengs import EigenGS
 from .evaluation import fall_on, measured
 from .incremental_pca import EigenState, block_length, merge, rank_for, start

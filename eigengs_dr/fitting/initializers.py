@@ -16,13 +16,14 @@ from ..gaussian.gaussians import Gaussians
 from ..image.color import decode, rgb_to_ycbcr, to_linear
 from ..image.folder import SPACES as BASIS_SPACES
 from ..raster.render import CUTOFF
-from .placement import random as places
 from .placement.adaptive import adaptive
+from .placement.grid import grid
+from .placement.random import random
 from .presets import Preset
 from .redistribute import rearranged
 from .solvers.conjugate_gradient import solve
 
-PLACES = {"random": places.random, "grid": places.grid, "adaptive": adaptive}
+PLACES = {"random": random, "grid": grid, "adaptive": adaptive}
 """Initialisers that look at the image alone, by name."""
 
 DARKNESS, BLACK = 0.3, 0.003

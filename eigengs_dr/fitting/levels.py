@@ -22,7 +22,8 @@ from ..raster.render import picture_of
 from .density_control import worth
 from .fit import Fit, check
 from .initializers import Start, begin, usual_count
-from .optimizers.descent import Schedule, descend
+from .optimizers.descent import descend
+from .optimizers.schedule import Schedule
 from .presets import PRESETS
 from .redistribute import placed_like, residual
 from .refine import Progress, refine

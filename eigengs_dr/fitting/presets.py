@@ -7,8 +7,8 @@ from functools import partial
 
 from .optimizers.adam import Adam
 from .optimizers.adan import Adan
-from .optimizers.descent import Schedule
 from .optimizers.parameterization import CHOLESKY
+from .optimizers.schedule import Schedule
 
 
 @dataclass(frozen=True)

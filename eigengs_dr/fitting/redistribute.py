@@ -24,20 +24,11 @@ from ..backend.arrays import types_of
 from ..gaussian.gaussians import Gaussians
 from ..image.resize import resampled
 from ..raster.render import CUTOFF, render
-from .placement.adaptive import Density, adaptive, bent, owners
+from .placement.adaptive import Density, adaptive, bent
+from .placement.density import wanted
 from .solvers.conjugate_gradient import solve
 
 Array = NDArray[np.floating]
-
-FALL = 4 / 3
-"""Twice as many splats leave ``2^-FALL`` of the squared error: 4 dB, as measured from 1,250 to
-20,000 splats on 256x256 pixels."""
-
-TOGETHER = 6
-"""Neighbours over which errors and densities are averaged: those of one splat are chance."""
-
-LEAST = 1e-3
-"""Share of the average error that every splat counts with: no part of an image is stripped bare."""
 
 
 def rearranged(
@@ -118,38 +109,3 @@ def residual(
     """Return what a set misses of an image in its own space, shape (H, W, C)."""
     shown = render(replace(dr.detach(gaussians), space="data"), cutoff=cutoff)
     return np.asarray(target - shown.numpy(), np.float32)
-
-
-def wanted(mean: Array, error: Array, bending: Array) -> NDArray[np.float64]:
-    """Density that leaves every splat the same error, up to a factor.
-
-    Parameters
-    ----------
-    mean : ndarray, shape (N, 2)
-        Where splats were, in pixels.
-    error : ndarray, shape (H, W)
-        Squared error that they left.
-    bending : ndarray, shape (H, W)
-        Density that the bending of the image asks for, up to a factor.
-
-    Returns
-    -------
-    ndarray, shape (H, W)
-        A splat's pixels, those that are nearest to it, get ``s^(1 / (FALL + 1))`` splats.
-    """
-    from scipy.spatial import cKDTree
-
-    count = len(mean)
-    owner = owners(mean, error.shape)
-    _, near = cKDTree(mean).query(mean, min(TOGETHER, count))
-    near = near.reshape(count, -1)
-
-    def around(values: Array) -> Array:
-        return np.bincount(owner, values.ravel(), count)[near].mean(axis=1)
-
-    share, mass = around(error), around(bending)
-    share = np.maximum(share, LEAST * share.mean()) ** (1 / (FALL + 1))
-    if not share.any():  # nothing was missed
-        share = np.ones(count)
-    ratio = share / np.maximum(mass, 1e-9 * mass.mean())
-    return bending.astype(np.float64) * ratio[owner].reshape(error.shape)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import psnr, unclamped
 from ..raster.render import CUTOFF, picture_of
-from .optimizers.descent import Rearrange, Schedule, descend
+from .optimizers.descent import Rearrange, descend
+from .optimizers.schedule import Schedule
 
 EXACT = 100.0
 """Decibels above which only rounding is left to fit."""

@@ -20,7 +20,8 @@ from ..gaussian.gaussians import Gaussians
 from ..raster.render import CUTOFF
 from .density_control import grown, pruned
 from .initializers import Start
-from .optimizers.descent import Schedule, descend
+from .optimizers.descent import descend
+from .optimizers.schedule import Schedule
 from .refine import Progress, Refined
 
 TRY, FIT, SETTLE = 0.1, 0.4, 0.12
@@ -33,9 +34,9 @@ TRIES, SETTLING = 4, 5
 """Most tries, and descents to settle after which a goal that is met is settled enough."""
 
 OCTAVE = 4.0
-"""Decibels that twice as many splats gain, see `eigengs_dr.fitting.redistribute.FALL`, until two
-tries of this
-image tell it."""
+"""Decibels that twice as many splats gain, see `eigengs_dr.fitting.placement.density.FALL`, until
+two
+tries of this image tell it."""
 
 SLOPES = (2.0, 12.0)
 """Fewest and most of them that are believed; a training image gained 8, another 1.6."""

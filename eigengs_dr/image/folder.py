@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .color import RGB_TO_YCBCR, YCBCR_OFFSET
-from .io import ImageError, check_image, image_files, load_image
+from .io import SAVE_OPTIONS, ImageError, check_image, load_image
 from .resize import cropped
 
 SPACES = ("ycbcr", "rgb")
@@ -55,6 +55,43 @@ class Prepared(NamedTuple):
     planes: NDArray[np.float32] | None
     fitted: bool
     problem: str = ""
+
+
+def image_files(folder: str | Path) -> list[Path]:
+    """List the images of a folder, without its subfolders.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Where to look.
+
+    Returns
+    -------
+    list of Path
+        Files with a suffix of `SAVE_OPTIONS` (in upper or lower case), sorted by name, hidden files
+        left out.
+
+    Raises
+    ------
+    ImageError
+        If the folder does not exist, is a file, or holds no image.
+    """
+    folder = Path(folder)
+    try:
+        entries = sorted(folder.iterdir())
+    except NotADirectoryError:
+        raise ImageError(f"{folder}: is a file; name the folder that holds it") from None
+    except OSError as error:
+        raise ImageError(f"{folder}: not a readable folder ({error.strerror}); check it") from None
+    files = [
+        entry
+        for entry in entries
+        if entry.suffix.lower() in SAVE_OPTIONS and entry.name[0] != "." and entry.is_file()
+    ]
+    if not files:
+        known = " ".join(SAVE_OPTIONS)
+        raise ImageError(f"{folder}: holds no images; expected files ending in {known}")
+    return files
 
 
 def batches(

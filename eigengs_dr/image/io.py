@@ -1,6 +1,5 @@
 """Reading, checking and writing images."""
 
-import importlib.util
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,22 +24,6 @@ SAVE_OPTIONS: dict[str, dict[str, Any]] = {
 }
 """Suffixes that are written and looked for in folders, with what Pillow is told when writing."""
 
-SAMPLES = {
-    "astronaut": "astronaut.png",
-    "brick": "brick.png",
-    "camera": "camera.png",
-    "chelsea": "chelsea.png",
-    "coffee": "coffee.png",
-    "coins": "coins.png",
-    "grass": "grass.png",
-    "gravel": "gravel.png",
-    "hubble": "hubble_deep_field.jpg",
-    "moon": "moon.png",
-    "motorcycle": "motorcycle_left.png",
-    "retina": "retina.jpg",
-    "rocket": "rocket.jpg",
-}
-"""Photos inside the scikit-image wheel, by name; the others of that library need a download."""
 
 LOWEST, HIGHEST = -0.5, 1.5
 """Range of accepted float pixels: room for what resampling overshoots, none for 0..255."""
@@ -197,70 +180,6 @@ def to_8bit(image: NDArray[Any]) -> NDArray[Any]:
         Whole numbers from 0 to 255; NaN stays NaN.
     """
     return np.rint(np.clip(image, 0, 1) * 255)
-
-
-def sample(name: str) -> NDArray[np.float32]:
-    """Load a photo that ships inside scikit-image: nothing is downloaded.
-
-    Parameters
-    ----------
-    name : str
-        One of `SAMPLES`, for instance ``"astronaut"``, ``"chelsea"`` (a cat) or ``"coffee"``.
-
-    Returns
-    -------
-    ndarray of float32, shape (H, W, 3)
-        RGB in [0, 1]; grey photos are replicated.
-
-    Raises
-    ------
-    ImageError
-        If there is no sample of that name, or scikit-image is not installed.
-    """
-    if name not in SAMPLES:
-        raise ImageError(f"sample {name!r} is unknown; use one of {', '.join(SAMPLES)}")
-    # The folder is found without importing scikit-image.
-    package = importlib.util.find_spec("skimage")
-    if package is None or package.origin is None:
-        raise ImageError("scikit-image, which holds the samples, is missing; install scikit-image")
-    return load_image(Path(package.origin).parent / "data" / SAMPLES[name])
-
-
-def image_files(folder: str | Path) -> list[Path]:
-    """List the images of a folder, without its subfolders.
-
-    Parameters
-    ----------
-    folder : str or Path
-        Where to look.
-
-    Returns
-    -------
-    list of Path
-        Files with a suffix of `SAVE_OPTIONS` (in upper or lower case), sorted by name, hidden files
-        left out.
-
-    Raises
-    ------
-    ImageError
-        If the folder does not exist, is a file, or holds no image.
-    """
-    folder = Path(folder)
-    try:
-        entries = sorted(folder.iterdir())
-    except NotADirectoryError:
-        raise ImageError(f"{folder}: is a file; name the folder that holds it") from None
-    except OSError as error:
-        raise ImageError(f"{folder}: not a readable folder ({error.strerror}); check it") from None
-    files = [
-        entry
-        for entry in entries
-        if entry.suffix.lower() in SAVE_OPTIONS and entry.name[0] != "." and entry.is_file()
-    ]
-    if not files:
-        known = " ".join(SAVE_OPTIONS)
-        raise ImageError(f"{folder}: holds no images; expected files ending in {known}")
-    return files
 
 
 def _pixels(image: "Image") -> tuple[NDArray[Any], bool]:

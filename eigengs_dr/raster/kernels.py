@@ -13,7 +13,8 @@ from typing import Any
 import drjit as dr
 
 from ..backend.arrays import ArrayTypes, types_of
-from .evaluate import SHAPE, gather_run, list_entry, unpack, weights, weights_pullback
+from .evaluate import SHAPE, weights, weights_pullback
+from .layout import gather_run, list_entry, unpack
 from .tiles import Grid, TileLists, walk
 
 # ---------------------------------------------------------------------------------------------

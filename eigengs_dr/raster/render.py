@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from ..backend.arrays import ArrayTypes, types_of, upload
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode, to_coded
-from .evaluate import UNIT, gather_run, pack
+from .evaluate import UNIT
 from .kernels import accumulate, adjoint, channel_sums
+from .layout import gather_run, pack
 from .tiles import Grid, TileLists, build_lists
 
 CUTOFF = 3.0

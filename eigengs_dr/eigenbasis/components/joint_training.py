@@ -23,8 +23,9 @@ from ...fitting.optimizers.adan import Adan
 from ...fitting.optimizers.parameterization import CHOLESKY
 from ...fitting.placement.random import random
 from ...gaussian.gaussians import Gaussians
-from ...raster.evaluate import SHAPE, UNIT, pack
+from ...raster.evaluate import SHAPE, UNIT
 from ...raster.kernels import accumulate, adjoint
+from ...raster.layout import pack
 from ...raster.render import CUTOFF, lists_for, to_tiles
 from ...raster.tiles import Grid
 

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from ...backend.arrays import types_of
 from ...backend.recording import frozen
 from ...fitting.optimizers.adam import Adam
-from ...fitting.optimizers.descent import Schedule, rate_left, step_program
-from ...fitting.placement.random import grid
+from ...fitting.optimizers.descent import step_program
+from ...fitting.optimizers.schedule import Schedule, rate_left
+from ...fitting.placement.grid import grid
 from ...fitting.solvers.conjugate_gradient import solve
 from ...gaussian.gaussians import Gaussians
 from ...raster.render import CUTOFF, lists_for, to_tiles

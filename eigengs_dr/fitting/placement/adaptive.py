@@ -14,8 +14,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ...codec.hilbert_index import hilbert_order
 from ...image.resize import resampled
+from .hilbert_scan import hilbert_order
 from .random import inverse_factor
 
 Array = NDArray[np.floating]

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from ...backend.arrays import types_of
 from ...backend.recording import frozen
 from ...gaussian.gaussians import Gaussians
-from ...raster.evaluate import SHAPE, UNIT, pack
+from ...raster.evaluate import SHAPE, UNIT
 from ...raster.kernels import accumulate, adjoint, channel_sums
+from ...raster.layout import pack
 from ...raster.render import CUTOFF, WIDEST_CUTOFF, lists_for, to_tiles
 from ...raster.tiles import TileLists
 

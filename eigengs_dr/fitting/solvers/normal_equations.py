@@ -20,8 +20,9 @@ from scipy.sparse.linalg import splu
 
 from ...backend.arrays import types_of, upload
 from ...gaussian.gaussians import Gaussians
-from ...raster.evaluate import SHAPE, UNIT, pack, unpack, weights
+from ...raster.evaluate import SHAPE, UNIT, weights
 from ...raster.kernels import adjoint
+from ...raster.layout import pack, unpack
 from ...raster.render import CUTOFF, lists_for, to_tiles
 
 GROUP = 3
@@ -278,3 +279,8 @@ def _expand(
     which = np.repeat(np.arange(len(low)), count)
     before = np.repeat(np.cumsum(count) - count, count)
     return which, (np.arange(len(which)) - before + low[which]).astype(np.int32)
+
+
+def squares(planes: NDArray[np.float32]) -> NDArray[np.float64]:
+    """``|D|^2`` of every plane."""
+    return np.einsum("nij,nij->n", planes, planes, dtype=np.float64)

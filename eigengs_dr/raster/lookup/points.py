@@ -16,7 +16,8 @@ from typing import Any
 import drjit as dr
 
 from ...backend.arrays import types_of
-from ..evaluate import LN2, SHAPE, list_entry, unpack, weights
+from ..evaluate import LN2, SHAPE, weights
+from ..layout import list_entry, unpack
 from ..tiles import Grid, build_lists
 
 
@@ -142,7 +143,7 @@ def sum_near(
     ----------
     cells : Cells
     packed : Float
-        Parameters of every splat, from `eigengs_dr.raster.evaluate.pack`; may carry gradients.
+        Parameters of every splat, from `eigengs_dr.raster.layout.pack`; may carry gradients.
     number : int
         Parameters of one splat.
     x, y : Float

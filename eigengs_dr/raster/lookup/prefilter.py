@@ -14,7 +14,8 @@ from typing import Any
 import drjit as dr
 
 from ...backend.arrays import types_of
-from ..evaluate import SHAPE, UNIT, gather_run, list_entry, unpack, weights, widen
+from ..evaluate import SHAPE, UNIT, weights, widen
+from ..layout import gather_run, list_entry, unpack
 from .footprint import share
 from .points import sum_near
 from .size_classes import Sizes

@@ -19,7 +19,8 @@ from typing import Any
 import drjit as dr
 
 from ...backend.arrays import ArrayTypes, types_of
-from ..evaluate import SHAPE, UNIT, falloff, gather_run
+from ..evaluate import SHAPE, UNIT, falloff
+from ..layout import gather_run
 from .prefilter import sum_filtered
 from .size_classes import Sizes
 
