@@ -23,15 +23,8 @@ from eigengs_dr.codec import bit_allocation as packing
 from eigengs_dr.codec import egs as packed
 from eigengs_dr.codec import entropy as planes
 from eigengs_dr.codec.hilbert_index import MAX_LEVELS, hilbert_decode, hilbert_encode
-from eigengs_dr.codec.quantization import (
-    MAX_SYMBOL,
-    Steps,
-    Symbols,
-    _round_to_steps,
-    factors_from_log_shapes,
-    log_shapes,
-    quantize,
-)
+from eigengs_dr.codec.quantization import MAX_SYMBOL, Steps, Symbols, _round_to_steps, quantize
+from eigengs_dr.gaussian.covariance import factors_from_log_shapes, log_shapes
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import picture_of
 from eigengs_dr.storage.npz import BadValue

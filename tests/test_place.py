@@ -17,7 +17,8 @@ from eigengs_dr.fitting.placement.adaptive import (
 )
 from eigengs_dr.fitting.placement.grid import DEVIATION, place_grid
 from eigengs_dr.fitting.placement.hilbert_scan import hilbert_order
-from eigengs_dr.fitting.placement.random import inverse_factor, place_random
+from eigengs_dr.fitting.placement.random import place_random
+from eigengs_dr.gaussian.covariance import factor_from_covariance
 from eigengs_dr.image.resize import resample
 
 INITS = [place_random, place_grid, place_adaptive]
@@ -95,7 +96,7 @@ def test_seeds_differ():
 def test_inverse_factor():
     rng = generator()
     sigma = covariances(rng.uniform(0.1, 100, (200, 2)), rng.uniform(0, np.pi, 200))
-    factor = inverse_factor(sigma[:, 0, 0], sigma[:, 0, 1], sigma[:, 1, 1])
+    factor = factor_from_covariance(sigma[:, 0, 0], sigma[:, 0, 1], sigma[:, 1, 1])
     np.testing.assert_allclose(covariances_of(factor), sigma, rtol=1e-9, atol=1e-9)
     assert (factor[:, [0, 2]] > 0).all()
 
