@@ -17,18 +17,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
 
-from ..fitting.initializers import dark_weight
+from ..fitting.initializers import FitProblem, dark_weight
 from ..fitting.optimizers.descent import descend
 from ..fitting.placement.adaptive import place_adaptive
 from ..fitting.presets import PRESETS
 from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.covariance import max_deviation
+from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.color import to_coded, to_linear
 from ..image.io import check_image
 from ..image.metrics import psnr as psnr_of
 from ..plugins.cone import PIXEL
-from ..raster.render import CUTOFF, render
+from ..raster.render import render
 from .back_projection import back_project, extrapolate
 from .visibility import Visibility, visibility
 
@@ -242,7 +243,8 @@ def _fit(
     ).bounded()
     start = solve(start, target).gaussians
     schedule = PRESETS["default"].schedule
-    (last,) = deque(descend(start, target, schedule, iterations, weight=weight), maxlen=1)
+    problem = FitProblem(start, target, weight)
+    (last,) = deque(descend(problem, schedule, iterations), maxlen=1)
     return last
 
 
