@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import drjit as dr
@@ -26,7 +27,7 @@ from ..image.color import rgb_to_ycbcr, to_coded
 from ..image.io import check_image
 from ..image.metrics import psnr_from_mse
 from ..raster.render import render
-from .egs import MAX_SECTIONS, EgsContent, to_bytes, write
+from .egs import MAX_SECTIONS, SUFFIX, EgsContent, to_bytes, write
 from .error_feedback import quantize_with_feedback, to_gaussians
 from .quantization import Steps
 
@@ -122,7 +123,8 @@ def pack(
     Raises
     ------
     ValueError
-        If the image or an argument does not fit the set, or no file holds the budget.
+        If the image or an argument does not fit the set, the file has another suffix than ``.egs``,
+        or no file holds the budget.
     OSError
         If the file cannot be written; an existing one is then as before.
 
@@ -130,6 +132,8 @@ def pack(
     -----
     The result is a function of the arguments, bit for bit, on one machine and backend.
     """
+    if Path(path).suffix.lower() != SUFFIX:
+        raise ValueError(f"{path}: packed sets end in {SUFFIX}; choose such a name, or use save()")
     rows = _rows(len(gaussians), sections)
     if not 0 < budget <= MAX_PSNR:
         raise ValueError(
