@@ -7,10 +7,10 @@ Mitsuba variant.
 
 import lazy_loader
 
-from .backend.libllvm import prepare
+from .backend.libllvm import select_libllvm
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 __version__ = "0.1.0"
 
-prepare()  # before anything imports Dr.Jit, which looks for libLLVM once
+select_libllvm()  # before anything imports Dr.Jit, which looks for libLLVM once

@@ -1,7 +1,7 @@
 """The public names of eigengs_dr, once: `lazy_loader` reads them here, and so do type checkers."""
 
 from .backend.selection import BackendError
-from .codec.bit_allocation import Receipt, pack
+from .codec.bit_allocation import PackResult, pack
 from .eigenbasis.basis import Eigenbasis
 from .eigenbasis.eigengs import EigenGS
 from .fitting.fit import Fit, fit
@@ -24,7 +24,7 @@ __all__ = [
     "Fit",
     "Gaussians",
     "ImageError",
-    "Receipt",
+    "PackResult",
     "concatenate",
     "fit",
     "fit_for_scene",

@@ -14,7 +14,7 @@ from .cli.options import (
     EXISTING,
     FOLDER,
     backend_option,
-    described,
+    describe_run,
     quiet_option,
     report_option,
 )
@@ -221,7 +221,7 @@ def inverse(
     if report:
         traces = benchmark.traces_of(results)
         figures = {**settings, **benchmark.figures_of(results), "traces": traces}
-        write_report(report, {**described(context, backend), **figures})
+        write_report(report, {**describe_run(context, backend), **figures})
     if not quiet:
         click.echo(benchmark.table(results))
 
@@ -236,6 +236,6 @@ def _tell(
 ) -> None:
     """Write the report and print the figures."""
     if report:
-        write_report(report, {**described(context, backend), **settings, **figures})
+        write_report(report, {**describe_run(context, backend), **settings, **figures})
     if not quiet:
         click.echo("\n".join(f"{key:24} {value:.4g}" for key, value in figures.items()))

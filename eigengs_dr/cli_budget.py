@@ -10,7 +10,7 @@ from .cli.options import (
     FOLDER,
     backend_option,
     chosen_sets,
-    described,
+    describe_run,
     folder_option,
     quiet_option,
     seed_option,
@@ -108,7 +108,7 @@ def budget(
             tuple(dict.fromkeys(targets)),
             gaussians,
             seed,
-            described(context, backend),
+            describe_run(context, backend),
             backend,
             show,
         )

@@ -6,7 +6,14 @@ import click
 
 from .backend.selection import select
 from .cli.console import progress_bar, say
-from .cli.options import FOLDER, backend_option, described, folder_option, quiet_option, seed_option
+from .cli.options import (
+    FOLDER,
+    backend_option,
+    describe_run,
+    folder_option,
+    quiet_option,
+    seed_option,
+)
 from .cli.outputs import check_outputs
 
 NAMES = ("iterations", "colors", "curves", "radii", "split", "cross")
@@ -71,7 +78,7 @@ def figures(
 
     output.mkdir(parents=True, exist_ok=True)
     check_outputs([output / "figures.json"], [])
-    machine = described(context, backend)
+    machine = describe_run(context, backend)
     with progress_bar(quiet) as show:
         made = benchmark.run(
             output, data, machine, names, iterations, images, seed, backend, show, say

@@ -11,7 +11,7 @@ from .cli.options import (
     FOLDER,
     backend_option,
     chosen_sets,
-    described,
+    describe_run,
     folder_option,
     quiet_option,
     seed_option,
@@ -79,7 +79,7 @@ def rate(
                 backend=backend,
             )
         ]
-        rows = measure(lines, jobs, described(context, backend), partial(show, "rate"))
+        rows = measure(lines, jobs, describe_run(context, backend), partial(show, "rate"))
     for name, path in drawings.items():
         save_figure(path, laid.chart(rows, name))
     if not quiet:

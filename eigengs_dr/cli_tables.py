@@ -10,7 +10,7 @@ from .cli.options import (
     FOLDER,
     SETS,
     backend_option,
-    described,
+    describe_run,
     folder_option,
     quiet_option,
     seed_option,
@@ -97,7 +97,7 @@ def tables(
             images,
             iterations,
             seed,
-            described(context, backend),
+            describe_run(context, backend),
             backend,
             show,
         )

@@ -9,7 +9,7 @@ import numpy as np
 
 from eigengs_dr.cli.pictures import overlay
 from eigengs_dr.image.color import to_coded
-from eigengs_dr.image.montage import joined, line
+from eigengs_dr.image.montage import join_pictures, text_line
 from eigengs_dr.plugins import texture_of
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "build/examples")
@@ -66,8 +66,8 @@ def strip(name, full, reduced, found):
         f"{len(found.gaussians)} Gaussians": reduced.repeat(2, axis=0).repeat(2, axis=1),
         "outlines of them": overlay(found.gaussians, eg.picture_of(found.gaussians)),
     }
-    cells = [joined([line(text, 2 * SIDE), p], 0, 0) for text, p in pictures.items()]
-    return joined(cells, 1)
+    cells = [join_pictures([text_line(text, 2 * SIDE), p], 0, 0) for text, p in pictures.items()]
+    return join_pictures(cells, 1)
 
 
 strips = []
@@ -82,4 +82,4 @@ for name, distance in (("far", 24), ("middle", 8), ("near", 3.2)):
         f"PSNR {found.psnr[0]:.1f} dB on the poster, {eg.psnr(full, reduced):.1f} dB rendered"
     )
     strips.append(strip(name, full, reduced, found))
-eg.save_image(folder / "budget.png", joined(strips, 0))
+eg.save_image(folder / "budget.png", join_pictures(strips, 0))

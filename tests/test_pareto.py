@@ -19,7 +19,7 @@ from eigengs_dr.bench import kernels, pareto, pareto_kernels, pareto_tables, set
 from eigengs_dr.bench.pareto import Collection, Variant, front
 from eigengs_dr.cli import options as cli_shared
 from eigengs_dr.cli.console import Program
-from eigengs_dr.fitting.initializers import begin
+from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.optimizers.descent import descend
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.raster.reference import render_exact
@@ -101,7 +101,7 @@ def test_fits_are_made_and_seen_at_their_cutoff(shorter, backend):
     row = pareto._fitted(Variant("cutoff", 2.0, 100, cutoff=2.0), image, 10, 0, backend)
     end = row["trace"][-1]
     assert end["psnr_ycbcr"] > end["psnr_wide"] + 1
-    start = begin(image, 100, "auto", "", PRESETS["default"], cutoff=2.0, backend=backend)
+    start = initialize(image, 100, "auto", "", PRESETS["default"], cutoff=2.0, backend=backend)
     sets = descend(start.gaussians, start.target, PRESETS["default"].schedule, 10, cutoff=2.0)
     *_, gaussians = sets
     for cutoff, figure in ((2.0, "psnr_ycbcr"), (6.0, "psnr_wide")):

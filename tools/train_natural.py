@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eigengs_dr.image.resize import resampled
+from eigengs_dr.image.resize import resample
 from eigengs_dr.image.samples import SAMPLES, sample
 
 DEMO = "coffee"
@@ -56,7 +56,7 @@ def crops(count: int = CROPS, seed: int = 0) -> Iterator[NDArray[np.float32]]:
         top, left = generator.integers(height - side + 1), generator.integers(width - side + 1)
         flips = generator.choice([-1, 1], 2)
         crop = photo[top : top + side, left : left + side][:: flips[0], :: flips[1]]
-        yield resampled(np.ascontiguousarray(crop), SIDE, SIDE)
+        yield resample(np.ascontiguousarray(crop), SIDE, SIDE)
 
 
 def main(path: str) -> None:

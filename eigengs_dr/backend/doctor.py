@@ -52,7 +52,7 @@ def report() -> dict[str, Any]:
         "libllvm": [
             {**library._asdict(), "usable": library.usable} for library in libllvm.candidates()
         ],
-        "libllvm_path": os.environ.get(libllvm.VARIABLE),
+        "libllvm_path": os.environ.get(libllvm.PATH_VARIABLE),
         "mitsuba": _mitsuba(),
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -110,7 +110,7 @@ def _try(name: str) -> dict[str, Any]:
     if process.returncode == 0:
         return dict(json.loads(process.stdout.splitlines()[-1]))
     how = f"signal {-process.returncode}" if process.returncode < 0 else process.returncode
-    return {"works": False, "problem": f"the process ended with {how}; {libllvm.ADVICE}"}
+    return {"works": False, "problem": f"the process ended with {how}; {libllvm.INSTALL_ADVICE}"}
 
 
 def _mitsuba() -> dict[str, Any]:

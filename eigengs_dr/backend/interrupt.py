@@ -8,7 +8,7 @@ from typing import Any
 
 
 @contextmanager
-def deferred() -> Iterator[Callable[[], bool]]:
+def defer_interrupts() -> Iterator[Callable[[], bool]]:
     """Remember Ctrl-C while a block runs, so that the block can end where it is whole.
 
     Inside a frozen function or a loop that is being traced, Dr.Jit turns `KeyboardInterrupt` into a

@@ -2,8 +2,8 @@
 
 Dr.Jit looks for libLLVM while it is being imported: at ``DRJIT_LIBLLVM_PATH`` if that is set, else
 for the system's ``libLLVM.so`` and then in ``/usr/lib``. The one it finds may be too old: version
-14 is refused, 15 and 16 are accepted and then end the process at the first ``dr.clip``. `prepare`
-therefore names a newer one before the import.
+14 is refused, 15 and 16 are accepted and then end the process at the first ``dr.clip``.
+`select_libllvm` therefore names a newer one before the import.
 """
 
 import glob
@@ -15,17 +15,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-VARIABLE = "DRJIT_LIBLLVM_PATH"
+PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 """The environment variable by which Dr.Jit is told which libLLVM to load."""
 
 
-OLDEST = 17
+MIN_VERSION = 17
 """The oldest major version of LLVM accepted; 19 and 22 are tested."""
 
 
-ADVICE = (
-    f"install LLVM {OLDEST} or newer: Debian, Ubuntu 'apt install libllvm19', Fedora 'dnf install "
-    "llvm-libs', macOS 'brew install llvm', Windows 'winget install LLVM.LLVM'"
+INSTALL_ADVICE = (
+    f"install LLVM {MIN_VERSION} or newer: Debian, Ubuntu 'apt install libllvm19', Fedora "
+    "'dnf install llvm-libs', macOS 'brew install llvm', Windows 'winget install LLVM.LLVM'"
 )
 """What to do where no libLLVM works, by operating system."""
 
@@ -47,7 +47,7 @@ class Library(NamedTuple):
     @property
     def usable(self) -> bool:
         """Whether Dr.Jit works with it; an unknown version gets the benefit of the doubt."""
-        return self.version is None or self.version >= OLDEST
+        return self.version is None or self.version >= MIN_VERSION
 
 
 def candidates() -> list[Library]:
@@ -68,17 +68,17 @@ def candidates() -> list[Library]:
     return sorted(found.values(), key=lambda library: -(library.version or 0))
 
 
-def prepare() -> None:
+def select_libllvm() -> None:
     """Point Dr.Jit to the newest libLLVM that works; called when the package is imported.
 
-    Sets `VARIABLE` where it is unset, Dr.Jit is not imported yet and a usable library is found.
-    Loads nothing.
+    Sets `PATH_VARIABLE` where it is unset, Dr.Jit is not imported yet and a usable library is
+    found. Loads nothing.
     """
-    if os.environ.get(VARIABLE) or "drjit" in sys.modules:
+    if os.environ.get(PATH_VARIABLE) or "drjit" in sys.modules:
         return
     newest = next(_usable(), None)
     if newest:
-        os.environ[VARIABLE] = newest.path
+        os.environ[PATH_VARIABLE] = newest.path
 
 
 def _patterns() -> list[str]:
@@ -116,28 +116,32 @@ def _usable() -> Iterator[Library]:
 
 def load_failure() -> str:
     """Say which libLLVM Dr.Jit refused, or that there is none."""
-    asked = os.environ.get(VARIABLE)
+    asked = os.environ.get(PATH_VARIABLE)
     if not asked:
         names = ", ".join(library.path for library in candidates())
         return f"no libLLVM is new enough for Dr.Jit ({names})" if names else "no libLLVM was found"
     if not os.path.exists(asked):
-        return f"{asked} (from {VARIABLE}) does not exist"
+        return f"{asked} (from {PATH_VARIABLE}) does not exist"
     version = _version_in(asked) or _version_in(os.path.realpath(asked))
     fault = f"is LLVM {version}, which Dr.Jit refuses" if version else "is no libLLVM"
-    return f"{asked} (from {VARIABLE}) {fault}"
+    return f"{asked} (from {PATH_VARIABLE}) {fault}"
 
 
 def advice() -> str:
     """What to do about a libLLVM that does not work: take another that is here, or install one."""
-    failed = os.path.realpath(os.environ.get(VARIABLE) or loaded_path() or "")
+    failed = os.path.realpath(os.environ.get(PATH_VARIABLE) or loaded_path() or "")
     others = (library.path for library in _usable() if os.path.realpath(library.path) != failed)
     other = next(others, None)
-    return f"set {VARIABLE}={other} before drjit is imported, or {ADVICE}" if other else ADVICE
+    return (
+        f"set {PATH_VARIABLE}={other} before drjit is imported, or {INSTALL_ADVICE}"
+        if other
+        else INSTALL_ADVICE
+    )
 
 
 def loaded_path() -> str | None:
     """Which libLLVM is loaded: what the system says, which only Linux does, else what was asked."""
-    asked = os.environ.get(VARIABLE)
+    asked = os.environ.get(PATH_VARIABLE)
     try:
         lines = Path("/proc/self/maps").read_text().splitlines()
     except OSError:

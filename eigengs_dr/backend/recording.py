@@ -11,7 +11,7 @@ import drjit as dr
 
 
 @contextmanager
-def frozen(function: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
+def freeze_program(function: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
     """Freeze a function by `drjit.freeze` for a block, and free its program after it.
 
     While Dr.Jit 1.5 records a program, the process ends if anything frees another program, or an

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from .libllvm import OLDEST, advice, load_failure, loaded_path
+from .libllvm import MIN_VERSION, advice, load_failure, loaded_path
 
 
 class BackendError(RuntimeError):
@@ -56,7 +56,7 @@ def select(backend: str | None = None) -> ModuleType:
     if not dr.has_backend(dr.JitBackend.LLVM):
         raise BackendError(f"{load_failure()}; {advice()}")
     version = dr.detail.llvm_version()[0]
-    if version < OLDEST:
+    if version < MIN_VERSION:
         raise BackendError(f"{loaded_path()} is LLVM {version}, which crashes Dr.Jit; {advice()}")
     return dr.llvm.ad
 

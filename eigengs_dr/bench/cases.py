@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..fitting.placement.random import inverse_factor
-from ..image.resize import cropped
+from ..image.resize import center_crop
 from ..image.samples import sample
 
 Image = NDArray[np.float32]
@@ -71,7 +71,7 @@ class Case(NamedTuple):
 
 def photo(width: int = SIDE, height: int = SIDE) -> Image:
     """Bring a photo of a cat to a size in pixels; enlarged, it is smooth."""
-    return np.clip(cropped(sample("chelsea"), width, height), 0, 1)
+    return np.clip(center_crop(sample("chelsea"), width, height), 0, 1)
 
 
 def flat(red: float, green: float, blue: float) -> Image:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..backend.selection import select
 from ..eigenbasis.registry import SHIPPED, load_basis
 from ..image.metrics import psnr
-from ..image.resize import cropped
+from ..image.resize import center_crop
 from ..plugins import register_plugins
 from .poster import CONDITIONS, Condition, head_on, photograph, scene_of
 from .unknowns import METHODS
@@ -114,7 +114,7 @@ def run(
     model = load_basis(basis, backend)
     file = SHIPPED.get(str(basis), basis)
     size = model.gaussians.width, model.gaussians.height
-    square = cropped(image, *2 * [min(image.shape[:2])])
+    square = center_crop(image, *2 * [min(image.shape[:2])])
     results = {}
     for name in conditions:
         condition = CONDITIONS[name]

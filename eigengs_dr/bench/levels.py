@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fitting.density_control import worth
+from ..fitting.density_control import removal_cost
 from ..fitting.fit import fit
 from ..fitting.levels import fit_levels, level_counts
 from ..gaussian.gaussians import Gaussians
@@ -86,7 +86,7 @@ def measure(
         alone[count] = whole(fit(image, count, **settings)).gaussians
         told(done)
     plain = alone[gaussians]
-    best = plain[np.argsort(-worth(plain, rgb_to_ycbcr(image)), kind="stable")]
+    best = plain[np.argsort(-removal_cost(plain, rgb_to_ycbcr(image)), kind="stable")]
 
     def reached(drawn: Gaussians) -> float:
         return psnr(picture_of(drawn), image, "ycbcr")

@@ -14,7 +14,7 @@ from .options import (
     EXISTING,
     backend_option,
     choice,
-    described,
+    describe_run,
     quiet_option,
     report_option,
     seed_option,
@@ -139,7 +139,7 @@ def fit(
             break
     if report:
         figures = records[0] if len(images) == 1 else {"images": records}
-        write_report(report, {**described(context, backend), **settings, **figures})
+        write_report(report, {**describe_run(context, backend), **settings, **figures})
     if records[-1]["stopped"] == "interrupted":
         say(f"interrupted; the best fit so far is in {records[-1]['output']}")
         context.exit(INTERRUPTED)
@@ -191,7 +191,7 @@ def _fit_one(
     """Fit one image, write what was asked for, and return its figures."""
     import eigengs_dr as eg
 
-    from ..image.metrics import unclamped
+    from ..image.metrics import float_space
     from .pictures import comparison
 
     color = settings["color"]
@@ -214,14 +214,14 @@ def _fit_one(
         "stopped": result.stopped,
         "seconds": result.seconds,
         "seconds_init": result.seconds_init,
-        "psnr_ycbcr": eg.psnr(image, result.image, space=unclamped(color)),
+        "psnr_ycbcr": eg.psnr(image, result.image, space=float_space(color)),
         "psnr_rgb": eg.psnr(image, result.image, space="rgb"),
         "ssim": eg.ssim(image, result.image),
-        "ms_ssim": eg.ms_ssim(image, result.image, space=unclamped(color)),
+        "ms_ssim": eg.ms_ssim(image, result.image, space=float_space(color)),
         "trace": result.trace,
     }
     if not quiet:
-        click.echo(_summary(record, preview, unclamped(color)))
+        click.echo(_summary(record, preview, float_space(color)))
     return record
 
 

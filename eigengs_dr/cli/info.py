@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from ..backend.selection import select
-from .options import ANY_PATH, checked_pixels, json_option
+from .options import ANY_PATH, check_pixels, json_option
 from .outputs import check_outputs, name_outputs
 
 
@@ -54,7 +54,7 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
         modelfile.FORMAT: ("model", EigenGS.load, _describe_model, component_sheet),
     }
     file = SHIPPED.get(str(file), file)
-    found = setfile.FORMAT if packed.is_packed(file) else archive.format_of(file)
+    found = setfile.FORMAT if packed.is_egs(file) else archive.format_of(file)
     if found not in kinds:
         raise ValueError(f"{file}: format is {found[:40]!r}, expected one of {', '.join(kinds)}")
     kind, load, describe, draw = kinds[found]
@@ -63,7 +63,7 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     if kind == "image":
         pixels = content.width * content.height
         facts["bpp"] = round(8 * facts["bytes"] / pixels, 4)
-    if packed.is_packed(file):
+    if packed.is_egs(file):
         facts |= _describe_packed(packed.read(file))
     if picture:
         save_image(picture, draw(content))
@@ -100,7 +100,7 @@ def _describe_model(model: Any) -> dict[str, Any]:
         facts["low_gaussians"] = model.low
         facts["high_gaussians"] = len(model.gaussians) - model.low
         facts["low_components"] = model.low_components
-    if fall := model.fall():
+    if fall := model.truncation_curve():
         facts["fall"] = _rows(fall, model.held_out)
     return facts
 
@@ -113,7 +113,7 @@ def _rows(fall: Any, held_out: Any) -> list[dict[str, Any]]:
     for n in sorted({0, *(n for n in round_numbers if n < last), last}):
         row = {
             "components": fall.counts[n].tolist(),
-            "variance": round(float(fall.shares()[n]), 6),
+            "variance": round(float(fall.explained_variance_ratio()[n]), 6),
             "psnr_training": round(float(fall.psnr[n]), 3),
         }
         if len(held_out):
@@ -141,5 +141,5 @@ def _text(fall: Any = (), **facts: Any) -> str:
 def _rendered(gaussians: Any) -> Any:
     from ..raster.render import picture_of
 
-    checked_pixels(gaussians.width, gaussians.height)
+    check_pixels(gaussians.width, gaussians.height)
     return picture_of(gaussians)

@@ -46,7 +46,7 @@ def levels(
     from ..bench.charts import new_figure, save_figure
     from ..bench.table import as_text
     from ..image.io import load_image
-    from ..image.resize import cropped
+    from ..image.resize import center_crop
     from ..image.samples import sample
 
     new_figure(1, 1)  # says now, not after the fits, that charts cannot be drawn
@@ -54,7 +54,7 @@ def levels(
     output.mkdir(parents=True, exist_ok=True)
     check_outputs([drawing, file], [image] if image else [])
     select(backend)
-    pixels = load_image(image) if image else cropped(sample(SAMPLE), SIDE, SIDE)
+    pixels = load_image(image) if image else center_crop(sample(SAMPLE), SIDE, SIDE)
     name = image.name if image else SAMPLE
     with progress_bar(quiet) as show:
         points = benchmark.measure(pixels, gaussians, levels, iterations, seed, backend, show)

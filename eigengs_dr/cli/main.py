@@ -17,10 +17,10 @@ from .info import info
 from .options import (
     ANY_PATH,
     EXISTING,
-    MOST_PIXELS,
+    MAX_PIXELS,
     Size,
     backend_option,
-    checked_pixels,
+    check_pixels,
     json_option,
 )
 from .outputs import check_outputs, name_outputs
@@ -125,5 +125,5 @@ def _scaled(width: int, height: int, scale: float | None) -> tuple[int, int]:
     scale = 1.0 if scale is None else scale
     if not (math.isfinite(scale) and scale > 0):
         raise click.UsageError(f"--scale {scale}: expected a number above 0, such as 2 or 0.5")
-    scale = min(scale, MOST_PIXELS)
-    return checked_pixels(max(1, round(width * scale)), max(1, round(height * scale)))
+    scale = min(scale, MAX_PIXELS)
+    return check_pixels(max(1, round(width * scale)), max(1, round(height * scale)))

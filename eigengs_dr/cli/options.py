@@ -20,7 +20,7 @@ SETS = ("faces256", "cats256", "cars256", "natural256", "cats512", "kodak")
 SAMPLES = "samples"
 """Photos of scikit-image, a set that needs no data."""
 
-MOST_PIXELS = 1 << 26
+MAX_PIXELS = 1 << 26
 """Largest picture that is rendered, thin ones counted in whole tiles: it takes some 6 GiB."""
 
 backend_option = click.option(
@@ -44,7 +44,7 @@ class Size(click.ParamType):
         match = re.fullmatch(r"(\d+)x(\d+)", value)
         if not match:
             self.fail(f"{value}: expected width and height, such as 1024x768", param, context)
-        return checked_pixels(int(match[1]), int(match[2]))
+        return check_pixels(int(match[1]), int(match[2]))
 
 
 class Counts(click.ParamType):
@@ -62,10 +62,10 @@ class Counts(click.ParamType):
         return counts if len(counts) > 1 else counts[0]
 
 
-def checked_pixels(width: int, height: int) -> tuple[int, int]:
+def check_pixels(width: int, height: int) -> tuple[int, int]:
     """Return the sides of a picture; refuse one that is too large to be made."""
-    if width < 1 or height < 1 or (width + 3) * (height + 3) > MOST_PIXELS:
-        raise click.UsageError(f"{width}x{height}: expected 1 to {MOST_PIXELS:,} pixels")
+    if width < 1 or height < 1 or (width + 3) * (height + 3) > MAX_PIXELS:
+        raise click.UsageError(f"{width}x{height}: expected 1 to {MAX_PIXELS:,} pixels")
     return width, height
 
 
@@ -75,7 +75,7 @@ def choice(name: str, values: list[str], text: str) -> Any:
     return click.option(name, type=kind, default=values[0], show_default=True, help=text)
 
 
-def described(context: click.Context, backend: str | None) -> dict[str, Any]:
+def describe_run(context: click.Context, backend: str | None) -> dict[str, Any]:
     """What every report says of its run: the command as it was typed, and the machine."""
     return {"command": shlex.join([NAME, *context.obj]), **describe(backend)}
 

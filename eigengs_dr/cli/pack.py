@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from ..backend.selection import select
-from .options import ANY_PATH, EXISTING, backend_option, described, quiet_option, report_option
+from .options import ANY_PATH, EXISTING, backend_option, describe_run, quiet_option, report_option
 from .outputs import check_outputs, name_outputs
 from .report import write_report
 
@@ -79,17 +79,17 @@ def pack(
         "bytes": receipt.bytes,
         "bits_per_pixel": receipt.bits_per_pixel,
         "psnr": receipt.psnr,
-        "lost": receipt.lost,
+        "lost": receipt.psnr_drop,
         "steps": receipt.steps._asdict(),
     }
     if report:
-        write_report(report, {**described(context, backend), **figures})
+        write_report(report, {**describe_run(context, backend), **figures})
     if not quiet:
         against = "the image" if image else "the rendering before"
         space = "sRGB" if gaussians.space == "linear" else gaussians.space
         click.echo(
             f"{file}: {len(gaussians):,} Gaussians, {file.stat().st_size:,} bytes\n"
             f"  wrote {target}: {receipt.bytes:,} bytes, {receipt.bits_per_pixel:.3f} bits a pixel"
-            f"\n  lost {receipt.lost:.2f} dB: {receipt.psnr:.2f} dB in {space} "
+            f"\n  lost {receipt.psnr_drop:.2f} dB: {receipt.psnr:.2f} dB in {space} "
             f"against {against}"
         )

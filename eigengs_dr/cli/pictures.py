@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..eigenbasis.basis import CHANNELS, Eigenbasis
-from ..eigenbasis.components.solve import colored
+from ..eigenbasis.components.solve import with_colors
 from ..eigenbasis.eigengs import EigenGS
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode
 from ..image.io import to_8bit
-from ..image.montage import joined, line
-from ..image.resize import resampled
+from ..image.montage import join_pictures, text_line
+from ..image.resize import resample
 from ..raster.render import render
 
 FIRST = (1, 2, 3, 5, 10, 20, 50, 100, 200)
@@ -32,16 +32,16 @@ COLUMNS = 7
 OUTLINES = 800
 """Longer side of a picture of ellipses, in pixels."""
 
-MOST_OUTLINES = 2000
+MAX_OUTLINES = 2000
 """Outlines over a picture: with more of them, single ones cannot be told apart."""
 
-SMALLEST = 512
+MIN_SIDE = 512
 """A picture whose longer side is shorter is enlarged before outlines are drawn over it."""
 
 LIGHTER = 0.6
 """How far a picture below outlines is brought to white."""
 
-FARTHEST = 100
+MAX_REACH = 100
 """Outlines that reach farther than so many pictures are not drawn: in it they are straight lines,
 and Pillow takes no larger numbers."""
 
@@ -78,12 +78,13 @@ def component_sheet(model: EigenGS, basis: Eigenbasis | None = None) -> Picture:
         _require_same(model, basis)
     columns = [_mean(model, basis), *_components(model, basis)]
     tables = [
-        joined(columns[first : first + COLUMNS], 1) for first in range(0, len(columns), COLUMNS)
+        join_pictures(columns[first : first + COLUMNS], 1)
+        for first in range(0, len(columns), COLUMNS)
     ]
     outlines = [_captioned("standard deviations", ellipses(model.gaussians, model.low))]
     if model.low:
         outlines += _parts_of_mean(model)
-    return joined([*tables, joined(outlines, 1)], 0)
+    return join_pictures([*tables, join_pictures(outlines, 1)], 0)
 
 
 def ellipses(gaussians: Gaussians, low: int = 0) -> Picture:
@@ -123,7 +124,7 @@ def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
         RGB.
     """
     # One of every few would draw stripes where splats lie on a grid.
-    chosen = np.random.default_rng(0).permutation(len(gaussians))[:MOST_OUTLINES]
+    chosen = np.random.default_rng(0).permutation(len(gaussians))[:MAX_OUTLINES]
     under = LIGHTER + (1 - LIGHTER) * np.clip(picture, 0, 1)
     drawn = gaussians[chosen]
     return _outlined(under, drawn, [HIGH_COLOR] * len(drawn))
@@ -145,7 +146,7 @@ def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Pictur
         RGB. Every pixel is repeated k times along both axes, so often that the longer side of each
         part has at least 512 pixels.
     """
-    times = -(-SMALLEST // max(image.shape[:2]))
+    times = -(-MIN_SIDE // max(image.shape[:2]))
     shape = (*image.shape[:2], 3)
     parts = [np.broadcast_to(part, shape) for part in (image, picture)]
     large = [part.repeat(times, axis=0).repeat(times, axis=1) for part in parts]
@@ -181,7 +182,7 @@ def _outlines(gaussians: Gaussians) -> Picture:
 def _in_sight(points: Picture, size: tuple[int, int]) -> Picture:
     """Tell whose outlines may cross a picture, and are small enough for Pillow to draw."""
     low, high = points.min(axis=1), points.max(axis=1)
-    longest = FARTHEST * max(size)
+    longest = MAX_REACH * max(size)
     near = (low > -longest) & (high < longest)
     return (near & (high >= 0) & (low <= size)).all(axis=1)
 
@@ -216,7 +217,7 @@ def _components(model: EigenGS, basis: Eigenbasis | None) -> list[Picture]:
         return []
     # At most 13 channels, so one program renders all.
     weights = np.stack([model.weights[channel][j] for channel, j in chosen], axis=1)
-    rendered = render(colored(model.gaussians, weights, "data")).numpy()
+    rendered = render(with_colors(model.gaussians, weights, "data")).numpy()
     columns = []
     for (channel, j), plane in zip(chosen, np.moveaxis(rendered, 2, 0), strict=True):
         planes = [plane] if basis is None else [basis.components[channel][j], plane]
@@ -254,9 +255,9 @@ def _within(longest: int, width: int, height: int) -> tuple[int, int]:
 def _cell(picture: Picture) -> Picture:
     """Bring a picture to the size of a sheet."""
     width, height = _within(CELL, picture.shape[1], picture.shape[0])
-    return resampled(picture.astype(np.float32), width, height)
+    return resample(picture.astype(np.float32), width, height)
 
 
 def _captioned(text: str, *pictures: Picture) -> Picture:
     """Put pictures on top of each other, below a line of text."""
-    return joined([line(text, pictures[0].shape[1]), *pictures], 0)
+    return join_pictures([text_line(text, pictures[0].shape[1]), *pictures], 0)

@@ -5,7 +5,7 @@ import math
 import os
 from typing import Any
 
-from ..storage.atomic import replacing
+from ..storage.atomic import atomic_write
 
 
 def write_report(path: str | os.PathLike[str], figures: dict[str, Any]) -> None:
@@ -25,7 +25,7 @@ def write_report(path: str | os.PathLike[str], figures: dict[str, Any]) -> None:
         If the file cannot be written; one that was there is then unchanged.
     """
     text = json.dumps(plain(figures), indent=2, allow_nan=False)
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 

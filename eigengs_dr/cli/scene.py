@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from ..backend.selection import select
-from ..storage.atomic import replacing
+from ..storage.atomic import atomic_write
 from .console import progress_bar
 from .options import ANY_PATH, EXISTING, quiet_option
 from .outputs import check_outputs, name_outputs
@@ -18,7 +18,7 @@ from .outputs import check_outputs, name_outputs
 SUFFIXES = (".png", ".exr")
 """What is written: PNG as sRGB, clamped; EXR as it is."""
 
-SAMPLES_A_PASS = 1 << 24
+SAMPLES_PER_PASS = 1 << 24
 """Most samples that are taken at once: their state is some 20 bytes each, and between two passes
 there is progress to show and Ctrl-C to listen to."""
 
@@ -139,7 +139,7 @@ def _render(
     sensor = scene.sensors()[0]
     width, height = sensor.film().crop_size()
     total = spp or sensor.sampler().sample_count()
-    most = max(1, SAMPLES_A_PASS // (width * height))
+    most = max(1, SAMPLES_PER_PASS // (width * height))
     pixels, done = np.zeros(()), 0
     while done < total:
         count = min(most, total - done)
@@ -157,7 +157,7 @@ def _write(mi: Any, path: Path, pixels: Any) -> None:
         bitmap = bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True)
     else:
         bitmap = mi.Bitmap(pixels)
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         bitmap.write(str(temporary))
 
 

@@ -14,7 +14,7 @@ from .options import (
     Size,
     backend_option,
     choice,
-    described,
+    describe_run,
     quiet_option,
     report_option,
     seed_option,
@@ -129,19 +129,19 @@ def train(
     record = {"input": str(folder), "output": str(output), **_figures(trained.figures)}
     if report:
         chosen = {**vars(settings), "most_components": settings.components}
-        write_report(report, {**described(context, backend), **chosen, **record})
+        write_report(report, {**describe_run(context, backend), **chosen, **record})
     if not quiet:
         click.echo(_summary(record, picture))
 
 
 def _settings(gaussians: int | None, frequency_aware: str, **options: Any) -> Any:
     """Turn options into the settings of a training."""
-    from ..eigenbasis.training import Settings
-    from ..fitting.initializers import usual_count
+    from ..eigenbasis.training import TrainOptions
+    from ..fitting.initializers import default_count
 
     width, height = options["size"]
-    return Settings(
-        gaussians=gaussians or usual_count(width * height),
+    return TrainOptions(
+        gaussians=gaussians or default_count(width * height),
         frequency_aware=FREQUENCY_AWARE[frequency_aware],
         **options,
     )

@@ -19,47 +19,47 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import types_of
-from ..fitting.refine import EXACT
+from ..fitting.refine import MAX_PSNR
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr, to_coded
 from ..image.io import check_image
-from ..image.metrics import decibels
+from ..image.metrics import psnr_from_mse
 from ..raster.render import CUTOFF, render
-from .egs import MOST_SECTIONS, Packed, to_bytes, write
-from .error_feedback import rounded, set_of
-from .quantization import Steps, shapes_of, sizes_of
+from .egs import MAX_SECTIONS, EgsContent, to_bytes, write
+from .error_feedback import quantize_with_feedback, to_gaussians
+from .quantization import Steps, log_shapes, sizes_from_log_shapes
 
 Array = NDArray[np.floating]
 
 BUDGET = 0.5
 """Decibels that a file may lose by default: beyond, more bits are saved by fewer splats."""
 
-UNSEEN = 1e-4
+MSE_WITHOUT_IMAGE = 1e-4
 """Mean squared error, 40 dB, that a set is taken to have where its image is not given."""
 
-FINEST = 1e-9
+MIN_MSE = 1e-9
 """Mean squared error, 90 dB, below which nothing is gained by less."""
 
-PROBE = Steps(mean=0.1, scale=0.08, stretch=0.06, color=0.125)
+PROBE_STEPS = Steps(mean=0.1, scale=0.08, stretch=0.06, color=0.125)
 """Steps at which the errors of one kind are measured; that of colours times their root mean
 square in units of one over the size."""
 
-COARSEST = Steps(mean=4.0, scale=1.0, stretch=1.0, color=1.0)
+MAX_STEPS = Steps(mean=4.0, scale=1.0, stretch=1.0, color=1.0)
 """Largest steps, in the same units: what does not show at any step would have none."""
 
 NEGLIGIBLE = 1 / 32
 """Share of a step at which errors are a thousandth."""
 
-SEARCH = 4
+HALVINGS = 4
 """Halvings of the interval of the common factor, of which the ends differ by a root of 2: the last
 one is worth 0.04 bits a number."""
 
 TOO_FINE = "pack: no rounding is fine enough for the budget; allow more dB"
 
-_Found = tuple[Packed, float]
+_Candidate = tuple[EgsContent, float]
 
 
-class Receipt(NamedTuple):
+class PackResult(NamedTuple):
     """Result of `pack`.
 
     Attributes
@@ -72,7 +72,7 @@ class Receipt(NamedTuple):
     psnr : float
         Decibels, in the space of the budget, of its rendering against the image; where none was
         given, against the rendering of the set before.
-    lost : float
+    psnr_drop : float
         Decibels below what the set had before; for want of an image, below 40 dB.
     steps : Steps
     """
@@ -81,7 +81,7 @@ class Receipt(NamedTuple):
     bytes: int
     bits_per_pixel: float
     psnr: float
-    lost: float
+    psnr_drop: float
     steps: Steps
 
 
@@ -92,7 +92,7 @@ def pack(
     budget: float = BUDGET,
     sections: Sequence[int] | None = None,
     cutoff: float = CUTOFF,
-) -> Receipt:
+) -> PackResult:
     """Write the smallest ``.egs`` file of a set that keeps its quality but for a budget.
 
     Parameters
@@ -130,67 +130,69 @@ def pack(
     The result is a function of the arguments, bit for bit, on one machine and backend.
     """
     rows = _rows(len(gaussians), sections)
-    if not 0 < budget <= EXACT:
+    if not 0 < budget <= MAX_PSNR:
         raise ValueError(
-            f"pack: budget is {budget}; it must be above 0 and at most {EXACT:g} dB, such as 0.5"
+            f"pack: budget is {budget}; it must be above 0 and at most {MAX_PSNR:g} dB, such as 0.5"
         )
     gaussians = dr.detach(gaussians)
     shown = _shown(gaussians, cutoff) if image is None else _compared(gaussians, image)
     # The best light for an image is not the best picture: a set that has found it is kept.
     keeps = image is None or gaussians.space == "linear"
     target = _planes_of(gaussians, cutoff) if keeps else shown
-    unseen = UNSEEN if image is None else 0
+    unseen = MSE_WITHOUT_IMAGE if image is None else 0
 
     def errors(found: Gaussians) -> list[float]:
         parts = [*(found[: r.stop] for r in rows[:-1]), found]
         return [_error(part, shown, cutoff) for part in parts]
 
-    before = [max(error + unseen, FINEST) for error in errors(gaussians)]
+    before = [max(error + unseen, MIN_MSE) for error in errors(gaussians)]
     limits = [error * 10 ** (budget / 10) - unseen for error in before]
     if min(limits) <= 0:
         raise ValueError(TOO_FINE)
 
-    def attempt(steps: Steps) -> _Found:
-        packed = rounded(gaussians, target, steps, rows, cutoff)
-        after = zip(errors(set_of(packed, gaussians)), limits, strict=True)
+    def attempt(steps: Steps) -> _Candidate:
+        packed = quantize_with_feedback(gaussians, target, steps, rows, cutoff)
+        after = zip(errors(to_gaussians(packed, gaussians)), limits, strict=True)
         # Of all that a reader may stop at the worst counts, on the scale of the whole.
         return packed, max(error * (limits[-1] / limit) for error, limit in after)
 
-    start = _balanced(attempt, gaussians, limits[-1])
+    start = _water_fill(attempt, gaussians, limits[-1])
     packed, _ = _search(attempt, start, limits[-1])
-    error = errors(set_of(packed, gaussians))[-1]
+    error = errors(to_gaussians(packed, gaussians))[-1]
     content = to_bytes(packed)
     write(path, content)
-    return Receipt(
+    return PackResult(
         gaussians=Gaussians.load(path, types_of(gaussians.mean).backend),
         bytes=len(content),
         bits_per_pixel=8 * len(content) / (gaussians.width * gaussians.height),
-        psnr=decibels(error),
-        lost=decibels(before[-1]) - decibels(error + unseen),
+        psnr=psnr_from_mse(error),
+        psnr_drop=psnr_from_mse(before[-1]) - psnr_from_mse(error + unseen),
         steps=packed.steps,
     )
 
 
-def _balanced(attempt: Callable[[Steps], _Found], gaussians: Gaussians, limit: float) -> Steps:
+def _water_fill(
+    attempt: Callable[[Steps], _Candidate], gaussians: Gaussians, limit: float
+) -> Steps:
     """Steps of equal marginal cost whose errors, were they squares, would reach the limit."""
     arrays = gaussians.to_arrays()
-    size = sizes_of(shapes_of(arrays["factor"]))
+    size = sizes_from_log_shapes(log_shapes(arrays["factor"]))
     spread = float(np.sqrt(np.mean(np.square(arrays["color"] * size[:, None]))))
     unit = np.array([1, 1, 1, max(spread, 1e-6)])
-    probe, numbers = np.array(PROBE) * unit, np.array([2, 1, 2, gaussians.channels])
+    probe, numbers = np.array(PROBE_STEPS) * unit, np.array([2, 1, 2, gaussians.channels])
     fine = probe * NEGLIGIBLE
     start = attempt(_steps(fine))[1]
     errors = [attempt(_steps(np.where(np.arange(4) == k, probe, fine)))[1] for k in range(4)]
     cost = np.maximum(np.array(errors) - start, 1e-6 * limit) / probe**2
     room = max(limit - start, 0.1 * limit)
     steps = np.sqrt(room / numbers.sum() * numbers / cost)
-    return _steps(np.minimum(steps, np.array(COARSEST) * unit))
+    return _steps(np.minimum(steps, np.array(MAX_STEPS) * unit))
 
 
-def _search(attempt: Callable[[Steps], _Found], steps: Steps, limit: float) -> _Found:
+def _search(attempt: Callable[[Steps], _Candidate], steps: Steps, limit: float) -> _Candidate:
     """Find the largest common factor of the steps whose error is within the limit."""
 
-    def scaled(power: float) -> _Found:
+    def scaled(power: float) -> _Candidate:
         return attempt(_steps(np.array(steps) * 2**power))
 
     power, best = 0.0, scaled(0.0)
@@ -203,7 +205,7 @@ def _search(attempt: Callable[[Steps], _Found], steps: Steps, limit: float) -> _
             if power < -12:
                 raise ValueError(TOO_FINE)
             best = scaled(power)
-    for k in range(SEARCH):
+    for k in range(HALVINGS):
         tried = scaled(power + 0.5 ** (k + 2))
         if tried[1] <= limit:
             power, best = power + 0.5 ** (k + 2), tried
@@ -218,9 +220,9 @@ def _steps(values: Array) -> Steps:
 def _rows(count: int, sections: Sequence[int] | None) -> list[slice]:
     """The splats of each section."""
     counts = [count] if sections is None else [int(k) for k in sections]
-    if not counts or min(counts) < 1 or sum(counts) != count or len(counts) > MOST_SECTIONS:
+    if not counts or min(counts) < 1 or sum(counts) != count or len(counts) > MAX_SECTIONS:
         raise ValueError(
-            f"pack: sections are {counts[:8]}, expected 1 to {MOST_SECTIONS} numbers of splats "
+            f"pack: sections are {counts[:8]}, expected 1 to {MAX_SECTIONS} numbers of splats "
             f"above 0 whose sum is {count}"
         )
     ends = np.cumsum(counts).tolist()

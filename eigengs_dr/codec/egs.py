@@ -17,12 +17,12 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..image.color import MOST_CHANNELS, SPACES
-from ..storage.atomic import replacing
-from ..storage.npz import MOST_ENTRIES, BadValue
-from .entropy import decoded, encoded
-from .hilbert_index import MOST_LEVELS, along_curve, on_curve
-from .quantization import Steps, Symbols, values_of
+from ..image.color import MAX_CHANNELS, SPACES
+from ..storage.atomic import atomic_write
+from ..storage.npz import MAX_ENTRIES, BadValue
+from .entropy import decode, encode
+from .hilbert_index import MAX_LEVELS, hilbert_decode, hilbert_encode
+from .quantization import Steps, Symbols, dequantize
 
 SUFFIX = ".egs"
 
@@ -31,7 +31,7 @@ MAGIC = b"\x89EGS"
 
 VERSION = 1
 
-MOST_SECTIONS = 1 << 12
+MAX_SECTIONS = 1 << 12
 
 _HEADER = struct.Struct("<4sBBBBHIIii4f")
 """Magic, version, space, channels, levels of the curve, sections, width, height, corner x and y
@@ -43,7 +43,7 @@ _SECTION = struct.Struct("<III")
 _CHECK = struct.Struct("<I")
 
 
-class Packed(NamedTuple):
+class EgsContent(NamedTuple):
     """What a file holds.
 
     Attributes
@@ -66,7 +66,7 @@ class Packed(NamedTuple):
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Mean (N, 2), factor (N, 3), color (N, C) and background (C,), all of float32."""
-        values = {**values_of(self.whole(), self.steps), "background": self.background}
+        values = {**dequantize(self.whole(), self.steps), "background": self.background}
         with np.errstate(over="ignore"):
             return {name: value.astype(np.float32) for name, value in values.items()}
 
@@ -89,13 +89,13 @@ class Packed(NamedTuple):
         )
 
 
-def is_packed(path: str | os.PathLike[str]) -> bool:
+def is_egs(path: str | os.PathLike[str]) -> bool:
     """Tell whether a file begins as a packed set; `OSError` if it cannot be opened."""
     with open(path, "rb") as file:
         return file.read(len(MAGIC)) == MAGIC
 
 
-def to_bytes(packed: Packed) -> bytes:
+def to_bytes(packed: EgsContent) -> bytes:
     """Lay a set out as a file; the splats of each section are put in the order of the curve."""
     mean = packed.whole().mean
     corner = mean.min(axis=0)
@@ -127,11 +127,11 @@ def write(path: str | os.PathLike[str], content: bytes) -> None:
     OSError
         If the file cannot be written; an existing one is then as before.
     """
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(content)
 
 
-def read(path: str | os.PathLike[str], sections: int | None = None) -> Packed:
+def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsContent:
     """Read a packed set; the file may be hostile.
 
     Parameters
@@ -158,16 +158,16 @@ def read(path: str | os.PathLike[str], sections: int | None = None) -> Packed:
 
 def _body(section: Symbols, corner: NDArray[np.int64], levels: int) -> bytes:
     """The planes of a section."""
-    places = along_curve(section.mean - corner, levels)
+    places = hilbert_encode(section.mean - corner, levels)
     # Splats in one place are sorted too: equal sets give equal files, in whatever order they are.
     columns = [*section.color.T[::-1], *section.shape.T[::-1], places]
     order = np.lexsort(columns)
     ways = np.diff(places[order], prepend=0)
     planes = [ways, *section.shape[order].T, *section.color[order].T]
-    return b"".join(map(encoded, planes))
+    return b"".join(map(encode, planes))
 
 
-def _read(file: BinaryIO, size: int, wanted: int | None) -> Packed:
+def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
     head = _exactly(file, _HEADER.size)
     magic, version, space, channels, levels, count, width, height, *rest = _HEADER.unpack(head)
     if magic != MAGIC:
@@ -187,7 +187,7 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> Packed:
     found: list[Symbols] = []
     for number in range(1, (wanted or count) + 1):
         body, splats = _section(file, size, number, 4 + channels)
-        room = MOST_ENTRIES // max(3, channels) - sum(len(section.mean) for section in found)
+        room = MAX_ENTRIES // max(3, channels) - sum(len(section.mean) for section in found)
         if splats > room:
             raise BadValue(f"section {number} claims {splats} splats, more than may be read")
         try:
@@ -196,17 +196,19 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> Packed:
             raise BadValue(f"section {number}: {error}; copy the file again") from None
     if wanted is None and file.read(1):
         raise BadValue("something follows the last section; copy the file again")
-    return Packed(found, steps, np.frombuffer(background, "<f4"), (width, height), SPACES[space])
+    return EgsContent(
+        found, steps, np.frombuffer(background, "<f4"), (width, height), SPACES[space]
+    )
 
 
 def _check_header(space: int, channels: int, levels: int, count: int, steps: Steps) -> None:
     """Refuse what `to_bytes` does not write; size and values are checked with all sets."""
-    if not 1 <= channels <= MOST_CHANNELS:
-        raise BadValue(f"the header claims {channels} channels, expected 1 to {MOST_CHANNELS}")
-    if space >= len(SPACES) or levels > MOST_LEVELS:
+    if not 1 <= channels <= MAX_CHANNELS:
+        raise BadValue(f"the header claims {channels} channels, expected 1 to {MAX_CHANNELS}")
+    if space >= len(SPACES) or levels > MAX_LEVELS:
         raise BadValue("the header holds values that are not known; upgrade eigengs-dr")
-    if not 1 <= count <= MOST_SECTIONS:
-        raise BadValue(f"the header claims {count} sections, expected 1 to {MOST_SECTIONS}")
+    if not 1 <= count <= MAX_SECTIONS:
+        raise BadValue(f"the header claims {count} sections, expected 1 to {MAX_SECTIONS}")
     if not all(0 < step < np.inf for step in steps):
         raise BadValue(f"the steps are {tuple(steps)}, expected numbers above 0")
 
@@ -231,7 +233,7 @@ def _symbols(
     """Decode the planes of a section, whose checksum does not say who wrote them."""
     planes, rest = list[NDArray[np.int64]](), memoryview(body)
     for _ in range(4 + channels):
-        plane, rest = decoded(rest, splats)
+        plane, rest = decode(rest, splats)
         planes.append(plane)
     if len(rest):
         raise BadValue("something follows the last plane")
@@ -239,7 +241,7 @@ def _symbols(
     if (ways < 0).any() or (places < 0).any() or places[-1] >> 2 * levels:
         raise BadValue("the curve leaves its square")
     return Symbols(
-        on_curve(places, levels) + corner,
+        hilbert_decode(places, levels) + corner,
         np.stack(planes[1:4], axis=1),
         np.stack(planes[4:], axis=1),
     )

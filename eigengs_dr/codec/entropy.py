@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from ..storage.npz import BadValue
 
-Whole = NDArray[np.int64]
+IntArray = NDArray[np.int64]
 
-WIDEST = 50
+MAX_BITS = 50
 """Bits of the largest number, sign included."""
 
 LEADING = (1, 2, 3, 4)
@@ -29,19 +29,19 @@ SIGNED = 8
 CENTRE = np.dtype("<i2")
 
 
-def encoded(values: Whole) -> bytes:
+def encode(values: IntArray) -> bytes:
     """Code whole numbers below ``2^48`` in absolute value, shape (N,)."""
     signed = bool((values < 0).any())
     centre = int(np.clip(np.median(values), -(1 << 15), (1 << 15) - 1)) if signed else 0
     away = values - centre
     folded = np.where(away < 0, -2 * away - 1, 2 * away) if signed else values
-    coded = (_coded(folded, leading, signed) for leading in LEADING)
+    coded = (_encode_leading(folded, leading, signed) for leading in LEADING)
     head, *rest = min((parts for parts in coded if parts), key=lambda parts: sum(map(len, parts)))
     return b"".join([head, CENTRE.type(centre).tobytes(), *rest])
 
 
-def decoded(data: memoryview, count: int) -> tuple[Whole, memoryview]:
-    """Read a plane of `count` numbers that `encoded` wrote; the data may be hostile.
+def decode(data: memoryview, count: int) -> tuple[IntArray, memoryview]:
+    """Read a plane of `count` numbers that `encode` wrote; the data may be hostile.
 
     Returns
     -------
@@ -66,13 +66,13 @@ def decoded(data: memoryview, count: int) -> tuple[Whole, memoryview]:
     if len(codes) != count or not stream.eof:
         raise BadValue(f"a plane of numbers does not hold {count}")
     low = memoryview(stream.unused_data)
-    folded, size = _joined(np.frombuffer(codes, np.uint8).astype(np.int64), low, leading)
+    folded, size = _join_bits(np.frombuffer(codes, np.uint8).astype(np.int64), low, leading)
     if signed:
         folded = np.where(folded & 1, -(folded + 1 >> 1), folded >> 1)
     return folded + int(np.frombuffer(head[1:], CENTRE)[0]), low[size:]
 
 
-def _coded(folded: Whole, leading: int, signed: bool) -> list[bytes]:
+def _encode_leading(folded: IntArray, leading: int, signed: bool) -> list[bytes]:
     """Head, codes and low bits; nothing where a code would not fit a byte."""
     shifted = folded + (1 << leading)
     width = np.frexp(shifted.astype(np.float64))[1].astype(np.int64) - 1 - leading
@@ -87,24 +87,24 @@ def _coded(folded: Whole, leading: int, signed: bool) -> list[bytes]:
     return [bytes([leading | SIGNED * signed]), packed, low]
 
 
-def _bits(width: Whole) -> tuple[Whole, Whole]:
+def _bits(width: IntArray) -> tuple[IntArray, IntArray]:
     """For every low bit, the number that it belongs to and its power of two, highest first."""
     owner = np.repeat(np.arange(len(width)), width)
     start = np.cumsum(width) - width
     return owner, width[owner] - 1 - (np.arange(len(owner)) - start[owner])
 
 
-def _joined(codes: Whole, low: memoryview, leading: int) -> tuple[Whole, int]:
+def _join_bits(codes: IntArray, low: memoryview, leading: int) -> tuple[IntArray, int]:
     """The numbers, and how many bytes their low bits took."""
     width = codes >> leading
     size = -(-int(width.sum()) // 8)
-    if size > len(low) or width.max() > WIDEST - leading:
+    if size > len(low) or width.max() > MAX_BITS - leading:
         raise BadValue("a plane of numbers claims more bits than the file holds")
     top = codes - (width << leading) + (1 << leading)
-    return (top << width) + _below(bytes(low[:size]), width) - (1 << leading), size
+    return (top << width) + _read_mantissas(bytes(low[:size]), width) - (1 << leading), size
 
 
-def _below(low: bytes, width: Whole) -> Whole:
+def _read_mantissas(low: bytes, width: IntArray) -> IntArray:
     """The low bits of every number; memory does not depend on how many they are."""
     start, data = np.cumsum(width) - width, np.frombuffer(low + bytes(8), np.uint8)
     word = np.zeros(len(width), np.uint64)

@@ -19,21 +19,21 @@ from ..fitting.presets import PRESETS
 from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.gaussians import Gaussians
 from ..raster.render import render
-from .egs import Packed
-from .quantization import Steps, shapes_of, symbols_of, values_of
+from .egs import EgsContent
+from .quantization import Steps, dequantize, log_shapes, quantize
 
 Array = NDArray[np.floating]
 
-DESCENT = 20
+COMPENSATION_STEPS = 20
 """Steps that means and colours take after the shapes are rounded."""
 
-RATES = 0.4
+COMPENSATION_RATE = 0.4
 """Their rates, as a share of those of `fit`: they are not far from where they should be."""
 
 
-def rounded(
+def quantize_with_feedback(
     gaussians: Gaussians, target: Array, steps: Steps, rows: list[slice], cutoff: float
-) -> Packed:
+) -> EgsContent:
     """Round shapes, then means, then colours, each time with the best of what is still free.
 
     Parameters
@@ -54,43 +54,43 @@ def rounded(
         If a number would be too large to be stored.
     """
     arrays = gaussians.to_arrays()
-    shape = shapes_of(arrays["factor"])
+    shape = log_shapes(arrays["factor"])
     if len(rows) == 1:  # what makes up for the whole does not for the first splats alone
-        arrays |= _made_up(gaussians, target, shape, steps, cutoff)
-    symbols = symbols_of(arrays["mean"], shape, arrays["color"], steps)
+        arrays |= _compensate(gaussians, target, shape, steps, cutoff)
+    symbols = quantize(arrays["mean"], shape, arrays["color"], steps)
     background, size = arrays["background"], (gaussians.width, gaussians.height)
-    return Packed([symbols.taken(r) for r in rows], steps, background, size, gaussians.space)
+    return EgsContent([symbols.select(r) for r in rows], steps, background, size, gaussians.space)
 
 
-def _made_up(
+def _compensate(
     gaussians: Gaussians, target: Array, shape: Array, steps: Steps, cutoff: float
 ) -> dict[str, Array]:
     """Means, colours and background that make up for what the rounding of others loses."""
     arrays, none = gaussians.to_arrays(), np.zeros((len(gaussians), gaussians.channels))
-    fixed = values_of(symbols_of(arrays["mean"], shape, none, steps), steps)
+    fixed = dequantize(quantize(arrays["mean"], shape, none, steps), steps)
     current = _with(gaussians, factor=fixed["factor"])
-    if _inside(gaussians):  # descent would move splats that lie outside into the image
+    if _all_inside(gaussians):  # descent would move splats that lie outside into the image
         current = solve(current, target, 5, cutoff, warm_start=True).gaussians
         schedule = PRESETS["default"].schedule
-        rates = {name: RATES * schedule.rates[name] for name in ("mean", "color")}
+        rates = {name: COMPENSATION_RATE * schedule.rates[name] for name in ("mean", "color")}
         slow = replace(schedule, rates=rates)
-        *_, current = descend(current, target.astype(np.float32), slow, DESCENT, cutoff)
+        *_, current = descend(current, target.astype(np.float32), slow, COMPENSATION_STEPS, cutoff)
     mean = current.to_arrays()["mean"]
-    fixed = values_of(symbols_of(mean, shape, none, steps), steps)
+    fixed = dequantize(quantize(mean, shape, none, steps), steps)
     current = _with(current, mean=fixed["mean"])
     solved = solve(current, target, 10, cutoff, warm_start=True).gaussians
-    arrays = _half_rounded(solved, target, mean, shape, steps, cutoff).to_arrays()
+    arrays = _round_alternately(solved, target, mean, shape, steps, cutoff).to_arrays()
     return {"mean": mean, "color": arrays["color"], "background": arrays["background"]}
 
 
-def _half_rounded(
+def _round_alternately(
     solved: Gaussians, target: Array, mean: Array, shape: Array, steps: Steps, cutoff: float
 ) -> Gaussians:
     """Round every other colour: those between, neighbours in space, make up for what is lost."""
     if len(solved) == 1:
         return solved
     arrays, late = solved.to_arrays(), np.arange(len(solved)) % 2 == 1
-    rough = values_of(symbols_of(mean, shape, arrays["color"], steps), steps)["color"]
+    rough = dequantize(quantize(mean, shape, arrays["color"], steps), steps)["color"]
     kept = _with(solved, color=rough, background=0 * arrays["background"])[~late]
     kept = replace(kept, space="data")
     rest = target - render(kept, cutoff=cutoff).numpy()
@@ -99,7 +99,7 @@ def _half_rounded(
     return _with(solved, color=rough, background=found["background"])
 
 
-def set_of(packed: Packed, like: Gaussians) -> Gaussians:
+def to_gaussians(packed: EgsContent, like: Gaussians) -> Gaussians:
     """Return the splats of a file before it is written, on the backend of another set."""
     backend = types_of(like.mean).backend
     return Gaussians.from_arrays(
@@ -117,7 +117,7 @@ def _with(gaussians: Gaussians, **changed: Array) -> Gaussians:
     )
 
 
-def _inside(gaussians: Gaussians) -> bool:
+def _all_inside(gaussians: Gaussians) -> bool:
     """Whether all means lie in the image."""
     mean = gaussians.to_arrays()["mean"]
     return bool(((mean >= 0) & (mean <= (gaussians.width, gaussians.height))).all())

@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Whole = NDArray[np.int64]
+IntArray = NDArray[np.int64]
 
-MOST_LEVELS = 24
+MAX_LEVELS = 24
 """Of squares within squares: places along the curve then fit 48 bits."""
 
 
-def along_curve(points: Whole, levels: int) -> Whole:
+def hilbert_encode(points: IntArray, levels: int) -> IntArray:
     """Find where on the curve points lie.
 
     Parameters
@@ -23,7 +23,7 @@ def along_curve(points: Whole, levels: int) -> Whole:
     points : ndarray of int64, shape (N, 2)
         x, y from 0 to ``2^levels - 1``.
     levels : int
-        At most `MOST_LEVELS`.
+        At most `MAX_LEVELS`.
 
     Returns
     -------
@@ -40,23 +40,25 @@ def along_curve(points: Whole, levels: int) -> Whole:
     for level in reversed(range(levels)):
         right, low = x >> level & 1, y >> level & 1
         place = place * 4 + (3 * right ^ low)
-        x, y = _turned(x, y, right, low, (1 << level) - 1)
+        x, y = _rotate(x, y, right, low, (1 << level) - 1)
     return place
 
 
-def on_curve(places: Whole, levels: int) -> Whole:
-    """Find the points, shape (N, 2), at places along the curve: the inverse of `along_curve`."""
+def hilbert_decode(places: IntArray, levels: int) -> IntArray:
+    """Find the points, shape (N, 2), at places along the curve: the inverse of `hilbert_encode`."""
     x = y = np.zeros_like(places)
     for level in range(levels):
         quarter = places >> 2 * level & 3
         right = quarter >> 1
         low = quarter & 1 ^ right
-        x, y = _turned(x, y, right, low, (1 << level) - 1)
+        x, y = _rotate(x, y, right, low, (1 << level) - 1)
         x, y = x + (right << level), y + (low << level)
     return np.stack([x, y], axis=1)
 
 
-def _turned(x: Whole, y: Whole, right: Whole, low: Whole, last: int) -> tuple[Whole, Whole]:
+def _rotate(
+    x: IntArray, y: IntArray, right: IntArray, low: IntArray, last: int
+) -> tuple[IntArray, IntArray]:
     """Coordinates inside a quarter, as the curve runs there; turning back is the same."""
     x, y = x & last, y & last
     mirrored = (low == 0) & (right == 1)

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
-Whole = NDArray[np.int64]
+IntArray = NDArray[np.int64]
 
-LARGEST = 1 << 23
+MAX_SYMBOL = 1 << 23
 """Whole numbers of parameters stay below: steps finer than that are not worth storing. Two of them
-differ by less than twice as much, which `eigengs_dr.codec.hilbert_index.MOST_LEVELS` holds."""
+differ by less than twice as much, which `eigengs_dr.codec.hilbert_index.MAX_LEVELS` holds."""
 
 
 class Steps(NamedTuple):
@@ -53,16 +53,16 @@ class Symbols(NamedTuple):
     color : ndarray of int64, shape (N, C)
     """
 
-    mean: Whole
-    shape: Whole
-    color: Whole
+    mean: IntArray
+    shape: IntArray
+    color: IntArray
 
-    def taken(self, chosen: slice | NDArray[np.integer]) -> Symbols:
+    def select(self, chosen: slice | NDArray[np.integer]) -> Symbols:
         """Return some of the splats."""
         return Symbols(*(part[chosen] for part in self))
 
 
-def shapes_of(factor: Array) -> NDArray[np.float64]:
+def log_shapes(factor: Array) -> NDArray[np.float64]:
     """Turn a, b, c, shape (N, 3), into s, u, v."""
     a, b, c = np.asarray(factor, np.float64).T
     half, across, size = 0.5 * (a * a - b * b - c * c), a * b, np.log(a * c)
@@ -73,8 +73,8 @@ def shapes_of(factor: Array) -> NDArray[np.float64]:
     return np.stack([0.5 * size, length * np.cos(angle), length * np.sin(angle)], axis=1)
 
 
-def factors_of(shape: Array) -> NDArray[np.float64]:
-    """Turn s, u, v, shape (N, 3), into a, b, c: the inverse of `shapes_of`."""
+def factors_from_log_shapes(shape: Array) -> NDArray[np.float64]:
+    """Turn s, u, v, shape (N, 3), into a, b, c: the inverse of `log_shapes`."""
     s, u, v = np.asarray(shape, np.float64).T
     length, angle = np.hypot(u, v), np.arctan2(v, u)
     # F^T F / exp(2 s) = cosh(2 length) + sinh(2 length) [[cos, sin], [sin, -cos]] of the angle; of
@@ -84,12 +84,12 @@ def factors_of(shape: Array) -> NDArray[np.float64]:
     return np.stack([a, odd * np.sin(angle) / a, 1 / a], axis=1) * np.exp(s)[:, None]
 
 
-def sizes_of(shape: Array) -> NDArray[np.float64]:
+def sizes_from_log_shapes(shape: Array) -> NDArray[np.float64]:
     """Geometric mean of the standard deviations in pixels, shape (N,): ``exp(-s)``."""
     return np.exp(-np.asarray(shape, np.float64)[:, 0])
 
 
-def symbols_of(mean: Array, shape: Array, color: Array, steps: Steps) -> Symbols:
+def quantize(mean: Array, shape: Array, color: Array, steps: Steps) -> Symbols:
     """Round splats.
 
     Parameters
@@ -104,19 +104,21 @@ def symbols_of(mean: Array, shape: Array, color: Array, steps: Steps) -> Symbols
     Raises
     ------
     ValueError
-        If a number would be `LARGEST` or more.
+        If a number would be `MAX_SYMBOL` or more.
     """
-    rounded = whole("shape", shape, (steps.scale, steps.stretch, steps.stretch))
-    unit = steps.color / sizes_of(rounded * (steps.scale, steps.stretch, steps.stretch))
+    rounded = _round_to_steps("shape", shape, (steps.scale, steps.stretch, steps.stretch))
+    unit = steps.color / sizes_from_log_shapes(
+        rounded * (steps.scale, steps.stretch, steps.stretch)
+    )
     return Symbols(
         # Steps count from the middle of the first pixel.
-        whole("mean", np.asarray(mean, np.float64) - 0.5, steps.mean),
+        _round_to_steps("mean", np.asarray(mean, np.float64) - 0.5, steps.mean),
         rounded,
-        whole("color", color, unit[:, None]),
+        _round_to_steps("color", color, unit[:, None]),
     )
 
 
-def values_of(symbols: Symbols, steps: Steps) -> dict[str, Array]:
+def dequantize(symbols: Symbols, steps: Steps) -> dict[str, Array]:
     """Turn whole numbers into mean (N, 2), factor (N, 3) and color (N, C).
 
     What overflows, in hostile files, is infinite or zero.
@@ -125,17 +127,17 @@ def values_of(symbols: Symbols, steps: Steps) -> dict[str, Array]:
         shape = symbols.shape * (steps.scale, steps.stretch, steps.stretch)
         return {
             "mean": symbols.mean * steps.mean + 0.5,
-            "factor": factors_of(shape),
-            "color": symbols.color * (steps.color / sizes_of(shape))[:, None],
+            "factor": factors_from_log_shapes(shape),
+            "color": symbols.color * (steps.color / sizes_from_log_shapes(shape))[:, None],
         }
 
 
-def whole(name: str, values: Array, step: object) -> Whole:
-    """Count the steps of each value, to the nearest; raises what `symbols_of` does."""
+def _round_to_steps(name: str, values: Array, step: object) -> IntArray:
+    """Count the steps of each value, to the nearest; raises what `quantize` does."""
     counts = np.rint(np.asarray(values, np.float64) / np.asarray(step))
-    if not (np.abs(counts) < LARGEST).all():
+    if not (np.abs(counts) < MAX_SYMBOL).all():
         raise ValueError(
-            f"pack: a {name} is {LARGEST} steps or more from zero; call bounded() first, or "
+            f"pack: a {name} is {MAX_SYMBOL} steps or more from zero; call bounded() first, or "
             "allow a larger error"
         )
     return counts.astype(np.int64)

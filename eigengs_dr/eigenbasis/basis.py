@@ -13,12 +13,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..image.color import ycbcr_to_rgb
-from ..image.folder import Progress, Source, batches, checked_size, to_planes
+from ..image.folder import ReadProgress, Source, check_size, read_blocks, to_planes
 from ..image.io import check_image
-from ..image.resize import resampled
-from .basis_file import ROUNDING, read_basis, write_basis
-from .incremental_pca import EigenState, block_length, merge, rank_for, start
-from .truncation import Fall, expected, falling, remaining
+from ..image.resize import resample
+from .basis_file import ENERGY_TOLERANCE, read_basis, write_basis
+from .incremental_pca import EigenState, block_length, empty_state, merge, rank_for
+from .truncation import (
+    TruncationCurve,
+    curve_from_eigenvalues,
+    curve_from_residuals,
+    residual_energy,
+)
 
 CHANNELS = {"ycbcr": ("Y", "Cb", "Cr"), "rgb": ("R", "G", "B")}
 """What the channels of a space are called in warnings."""
@@ -67,7 +72,7 @@ class Eigenbasis:
         energy: float | None = None,
         color: str = "ycbcr",
         seed: int = 0,
-        progress: Progress | None = None,
+        progress: ReadProgress | None = None,
     ) -> Eigenbasis:
         """Find the eigenbasis of a family of images in one pass, with memory for one block of them.
 
@@ -77,7 +82,7 @@ class Eigenbasis:
         Parameters
         ----------
         source : path, array or iterable
-            See `eigengs_dr.image.folder.batches`.
+            See `eigengs_dr.image.folder.read_blocks`.
         size : (int, int)
             Width and height of the basis.
         components : int or sequence of 3 ints
@@ -104,10 +109,10 @@ class Eigenbasis:
             If images were skipped or cropped, there are too few of them, or `components` is too low
             for the energy.
         """
-        size = checked_size(size)
-        most = checked_components(components, energy)
-        state = start(size, seed)
-        with closing(batches(source, size, color, block_length(size), progress)) as blocks:
+        size = check_size(size)
+        most = check_components(components, energy)
+        state = empty_state(size, seed)
+        with closing(read_blocks(source, size, color, block_length(size), progress)) as blocks:
             for block in blocks:
                 state = merge(state, block, [rank_for(k) for k in most])
                 del block  # before the next is read
@@ -125,7 +130,7 @@ class Eigenbasis:
         """Make the basis of all images that a state has seen; parameters as for `from_images`."""
         if state.count == 0:
             raise ValueError("no images were merged; merge at least one block first")
-        most = checked_components(components, energy)
+        most = check_components(components, energy)
         if energy is None and state.count <= max(most):
             have = "1 image gives" if state.count == 1 else f"{state.count} images give"
             warnings.warn(f"{have} at most {state.count - 1} components a channel", stacklevel=2)
@@ -142,7 +147,7 @@ class Eigenbasis:
             ),
         )
         basis = basis.truncated(most)
-        return basis if energy is None else _sufficient(basis, most, energy)
+        return basis if energy is None else _keep_energy(basis, most, energy)
 
     @property
     def width(self) -> int:
@@ -211,9 +216,9 @@ class Eigenbasis:
             Ascending, at most 1.
         """
         pairs = zip(self.eigenvalues, self.variance, strict=True)
-        return tuple(_shares(values, total) for values, total in pairs)
+        return tuple(_cumulative_share(values, total) for values, total in pairs)
 
-    def fall(self, images: Iterable[ArrayLike] | None = None) -> Fall:
+    def truncation_curve(self, images: Iterable[ArrayLike] | None = None) -> TruncationCurve:
         """Tell how the error falls with every component, and with how few it is low enough.
 
         Parameters
@@ -225,7 +230,8 @@ class Eigenbasis:
         Returns
         -------
         Fall
-            ``basis.truncated(basis.fall(images).fewest(30))`` reaches 30 dB, their mean PSNR.
+            ``basis.truncated(basis.truncation_curve(images).rank_for_psnr(30))`` reaches 30 dB,
+            their mean PSNR.
 
         Raises
         ------
@@ -233,12 +239,12 @@ class Eigenbasis:
             If there are no images, or one is none.
         """
         if images is None:
-            return expected(self.eigenvalues, self.variance, self.mean.size)
+            return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean.size)
         rows = [self._left(image) for image in images]
         if not rows:
             raise ValueError("there are no images to measure the basis on; pass at least one")
         left = [np.stack(channel) for channel in zip(*rows, strict=True)]
-        return falling(self.eigenvalues, left, self.mean.size)
+        return curve_from_residuals(self.eigenvalues, left, self.mean.size)
 
     def truncated(self, components: int | Sequence[int]) -> Eigenbasis:
         """Return the basis of the first components.
@@ -253,7 +259,7 @@ class Eigenbasis:
         ValueError
             If a number is negative, or there is not one a channel.
         """
-        most = checked_components(components)
+        most = check_components(components)
         return replace(
             self,
             components=tuple(c[:k] for c, k in zip(self.components, most, strict=True)),
@@ -286,7 +292,7 @@ class Eigenbasis:
 
     def _centred(self, image: ArrayLike) -> NDArray[np.float32]:
         """An image at the size and in the space of the basis, less the mean: shape (C, H, W)."""
-        fitting = resampled(check_image(image), self.width, self.height)
+        fitting = resample(check_image(image), self.width, self.height)
         planes = to_planes(fitting, self.space) - self.mean.reshape(self.channels, -1)
         return planes.reshape(self.mean.shape)
 
@@ -299,10 +305,10 @@ class Eigenbasis:
         planes = self._centred(image)
         lengths = np.einsum("cij,cij->c", planes, planes, dtype=np.float64)
         pairs = zip(lengths, self._coefficients(planes), strict=True)
-        return [remaining(length, w.astype(np.float64) ** 2) for length, w in pairs]
+        return [residual_energy(length, w.astype(np.float64) ** 2) for length, w in pairs]
 
 
-def checked_components(
+def check_components(
     components: int | Sequence[int], energy: float | None = None
 ) -> tuple[int, int, int]:
     """Return the most components of each channel; refuse what is no number, or no share."""
@@ -318,14 +324,14 @@ def checked_components(
     return y, cb, cr
 
 
-def _sufficient(basis: Eigenbasis, most: Sequence[int], energy: float) -> Eigenbasis:
+def _keep_energy(basis: Eigenbasis, most: Sequence[int], energy: float) -> Eigenbasis:
     """Keep as few components as hold a share of the variance."""
     enough = []
     for name, shares, cap in zip(CHANNELS[basis.space], basis.energy(), most, strict=True):
         enough.append(int(np.searchsorted(shares, energy)) + 1)
         varies = basis.variance[len(enough) - 1] > 0
         share = shares[-1] if len(shares) else 0.0
-        if varies and len(shares) == cap and share < energy - ROUNDING:
+        if varies and len(shares) == cap and share < energy - ENERGY_TOLERANCE:
             warnings.warn(
                 f"channel {name}: {cap} components hold {share:.2%} of the variance, "
                 f"less than {energy:.2%}; raise components",
@@ -334,7 +340,7 @@ def _sufficient(basis: Eigenbasis, most: Sequence[int], energy: float) -> Eigenb
     return basis.truncated(enough)
 
 
-def _shares(eigenvalues: NDArray[np.float64], variance: float) -> NDArray[np.float64]:
+def _cumulative_share(eigenvalues: NDArray[np.float64], variance: float) -> NDArray[np.float64]:
     """Cumulative share of the variance; empty where nothing varies."""
     return np.minimum(np.cumsum(eigenvalues) / (variance or 1), 1)
 

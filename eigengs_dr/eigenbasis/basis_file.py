@@ -11,24 +11,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..image.folder import SPACES
+from ..image.folder import BASIS_SPACES
 from ..storage import npz as archive
 from .incremental_pca import EXAMPLES
 
 FORMAT, VERSION = "eigengs_dr.eigenbasis", 1
 
-ROUNDING = 1e-5
+ENERGY_TOLERANCE = 1e-5
 """Share of the variance by which sums of eigenvalues may be off."""
 
-MOST_ENTRIES = 1 << 28
+MAX_ENTRIES = 1 << 28
 """Largest of the other arrays: 16 examples of 2,000x2,000 pixels."""
 
 LAYOUT: dict[str, archive.Field] = {
-    "mean": archive.Field("f4", 3, MOST_ENTRIES),
+    "mean": archive.Field("f4", 3, MAX_ENTRIES),
     "variance": archive.Field("f8", 1),
     "count": archive.Field("i8", 0),
     "space": archive.Field("U", 0),
-    "examples": archive.Field("f4", 4, MOST_ENTRIES),
+    "examples": archive.Field("f4", 4, MAX_ENTRIES),
     **{f"eigenvalues{c}": archive.Field("f8", 1) for c in range(3)},
 }
 """What a file holds besides the components, whose shapes follow from these."""
@@ -85,12 +85,14 @@ def _check(head: dict[str, NDArray[Any]]) -> None:
         require_descending(f"eigenvalues{c}", values)
         if len(values) > mean[0].size:
             raise archive.BadValue(f"eigenvalues{c} has {len(values)} values, more than pixels")
-        if values.sum() > variance[c] * (1 + ROUNDING):
+        if values.sum() > variance[c] * (1 + ENERGY_TOLERANCE):
             raise archive.BadValue(f"eigenvalues{c} add up to more than variance {c}")
     if head["count"] < 1:
         raise archive.BadValue(f"count is {head['count']}, expected at least 1")
-    if head["space"] not in SPACES:
-        raise archive.BadValue(f"space is '{head['space']}', expected one of {', '.join(SPACES)}")
+    if head["space"] not in BASIS_SPACES:
+        raise archive.BadValue(
+            f"space is '{head['space']}', expected one of {', '.join(BASIS_SPACES)}"
+        )
 
 
 def require_descending(name: str, values: NDArray[np.float64]) -> None:

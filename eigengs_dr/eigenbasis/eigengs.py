@@ -17,21 +17,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..fitting.solvers.normal_equations import NormalEquations, squares
+from ..fitting.solvers.normal_equations import NormalEquations, squared_norms
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import to_planes
 from ..image.io import check_image
-from ..image.resize import resampled
+from ..image.resize import resample
 from ..storage import npz as archive
 from .basis import Eigenbasis
-from .components.solve import Fitted, State, check_arguments, colored, fit_components
+from .components.solve import ComponentFit, State, check_arguments, fit_components, with_colors
 from .components.split import split_reason, wants_split
 from .model_file import FORMAT, VERSION, from_members, layout_of, to_members
-from .projection import Span
-from .truncation import Fall, expected
+from .projection import ComponentProjector
+from .truncation import TruncationCurve, curve_from_eigenvalues
 
 Planes = NDArray[np.float32]
-Progress = Callable[[int, int, dict[str, Any]], None]
+TrainProgress = Callable[[int, int, dict[str, Any]], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +61,12 @@ class EigenGS:
         Total variance of the training images, see `eigengs_dr.Eigenbasis`; empty, shape (0,), where
         an older file does not say.
     held_out : ndarray of float64, shape (n + 1,)
-        The PSNR of `eigengs_dr.eigenbasis.truncation.Fall`, in dB, mean over images that were not
-        trained on, of their PCA by the first 0, 1, ..., n components; empty where none were held
-        out.
+        The PSNR of `eigengs_dr.eigenbasis.truncation.TruncationCurve`, in dB, mean over images that
+        were not trained on, of their PCA by the first 0, 1, ..., n components; empty where none
+        were held out.
     figures : dict of str to float
         What was measured when the model was fitted, see
-        `eigengs_dr.eigenbasis.components.solve.Fitted`; not saved.
+        `eigengs_dr.eigenbasis.components.solve.ComponentFit`; not saved.
     """
 
     gaussians: Gaussians
@@ -90,7 +90,7 @@ class EigenGS:
         preset: str = "default",
         steps: int | None = None,
         backend: str | None = None,
-        progress: Progress | None = None,
+        progress: TrainProgress | None = None,
     ) -> EigenGS:
         """Fit one set of Gaussians to the mean image and all components of an eigenbasis.
 
@@ -133,11 +133,11 @@ class EigenGS:
 
         fitted = fit_components(basis, gaussians, split, preset, steps, seed, backend, save=save)
         reason = split_reason(basis, gaussians, frequency_aware, compared)
-        return cls.of(basis, fitted, compared, split_reason=reason)
+        return cls.from_fit(basis, fitted, compared, split_reason=reason)
 
     @classmethod
-    def of(
-        cls, basis: Eigenbasis, fitted: Fitted, figures: dict[str, float], **told: Any
+    def from_fit(
+        cls, basis: Eigenbasis, fitted: ComponentFit, figures: dict[str, float], **notes: Any
     ) -> EigenGS:
         """Put a model together from what was fitted to a basis, more figures and attributes."""
         return cls(
@@ -149,7 +149,7 @@ class EigenGS:
             low_components=fitted.low_components,
             variance=basis.variance,
             figures={**fitted.figures, **figures},
-            **told,
+            **notes,
         )
 
     @property
@@ -157,17 +157,18 @@ class EigenGS:
         """Number of components of every channel."""
         return tuple(len(w) for w in self.weights)
 
-    def fall(self) -> Fall | None:
+    def truncation_curve(self) -> TruncationCurve | None:
         """Tell how the error of the training images' PCA falls, component by component.
 
         Returns
         -------
         Fall or None
-            See `eigengs_dr.eigenbasis.truncation.expected`; None where an older file does not say.
+            See `eigengs_dr.eigenbasis.truncation.curve_from_eigenvalues`; None where an older file
+            does not say.
         """
         if not len(self.variance):
             return None
-        return expected(self.eigenvalues, self.variance, self.mean_image.size)
+        return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean_image.size)
 
     def project(self, image: ArrayLike, target_psnr: float | None = None) -> tuple[Planes, ...]:
         """Find the coefficients of an image: the closest point on the span of the components.
@@ -183,7 +184,7 @@ class EigenGS:
             Of any size; resampled to that of the model.
         target_psnr : float, optional
             Use as few components as reach it for this image at the size of the model, in dB, of the
-            channels as in `eigengs_dr.eigenbasis.truncation.Fall`. All by default.
+            channels as in `eigengs_dr.eigenbasis.truncation.TruncationCurve`. All by default.
 
         Returns
         -------
@@ -294,7 +295,7 @@ class EigenGS:
 
     def dense_mean(self, width: int, height: int) -> Planes:
         """Return the mean image as pixels, shape (height, width, C), in the space of the model."""
-        return resampled(np.moveaxis(self.mean_image, 0, 2), width, height)
+        return resample(np.moveaxis(self.mean_image, 0, 2), width, height)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the model as an ``.npz`` file, all or nothing.
@@ -338,14 +339,14 @@ class EigenGS:
         """Bring an RGB image to the size and space of the model, shape (C, H, W)."""
         width, height = self.gaussians.width, self.gaussians.height
         if pixels.shape[:2] != (height, width):
-            pixels = resampled(pixels, width, height)
+            pixels = resample(pixels, width, height)
         return to_planes(pixels, self.gaussians.space).reshape(-1, height, width)
 
     def _colored(
         self, coefficients: NDArray[np.float64], size: tuple[int, int] | None
     ) -> Gaussians:
         """The model's shapes with the colours and background given, scaled to a size."""
-        result = colored(self.gaussians, coefficients, self.gaussians.space)
+        result = with_colors(self.gaussians, coefficients, self.gaussians.space)
         return result.scaled(*size) if size else result
 
     # --- What is computed once a model -----------------------------------------------------------
@@ -367,9 +368,9 @@ class EigenGS:
         return self.equations.product(self._mean_coefficients)
 
     @cached_property
-    def _span(self) -> Span:
+    def _projector(self) -> ComponentProjector:
         """The rendered components, with the factors of their least squares."""
-        return Span(self.equations, self.weights)
+        return ComponentProjector(self.equations, self.weights)
 
     def _coefficients(
         self,
@@ -381,11 +382,11 @@ class EigenGS:
         """Least squares on the rendered components; `centred` planes lack the mean image."""
         seen = correlations if centred else correlations - self._mean_product
         if target_psnr is None:
-            return self._span.coefficients(seen)
-        lengths = squares(planes)
+            return self._projector.coefficients(seen)
+        lengths = squared_norms(planes)
         if not centred:
             lengths = self.equations.error(self._mean_coefficients, correlations, lengths)
-        return self._span.fewest(seen, lengths, planes.size, target_psnr)
+        return self._projector.coefficients_for_psnr(seen, lengths, planes.size, target_psnr)
 
     def _sum(self, coefficients: tuple[Any, ...]) -> NDArray[np.float64]:
         """``sum_j a_j psi_nj`` for every channel, shape (N + 1, C)."""

@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 
 from ..image.io import ImageError, load_image
 from ..image.metrics import psnr
-from ..image.resize import cropped
+from ..image.resize import center_crop
 from ..raster.render import render
 from .basis import Eigenbasis
 from .eigengs import EigenGS
-from .truncation import Fall
+from .truncation import TruncationCurve
 
-Watch = Callable[[int], None]
+OnImage = Callable[[int], None]
 """``watch(i)`` before image number i; what it raises ends the work."""
 
 
-def fall_on(basis: Eigenbasis, files: Sequence[Path], watch: Watch) -> Fall | None:
+def truncation_curve_on(
+    basis: Eigenbasis, files: Sequence[Path], watch: OnImage
+) -> TruncationCurve | None:
     """Measure how the error of images falls with the components; see `Eigenbasis.fall`.
 
     Parameters
@@ -39,11 +41,11 @@ def fall_on(basis: Eigenbasis, files: Sequence[Path], watch: Watch) -> Fall | No
     """
     readable = _readable(files, basis, watch, [])
     first = next(readable, None)
-    return None if first is None else basis.fall(chain([first], readable))
+    return None if first is None else basis.truncation_curve(chain([first], readable))
 
 
-def measured(
-    model: EigenGS, basis: Eigenbasis, files: Sequence[Path], watch: Watch
+def evaluate(
+    model: EigenGS, basis: Eigenbasis, files: Sequence[Path], watch: OnImage
 ) -> dict[str, float]:
     """Measure what components, projected and exact colours are worth.
 
@@ -81,13 +83,13 @@ def measured(
 
 
 def _readable(
-    files: Sequence[Path], basis: Eigenbasis, watch: Watch, bad: list[str]
+    files: Sequence[Path], basis: Eigenbasis, watch: OnImage, bad: list[str]
 ) -> Iterator[NDArray[np.float32]]:
     """Read images and crop them to the size of a basis; why some cannot be goes into `bad`."""
     for i, path in enumerate(files):
         watch(i)
         try:
-            image = cropped(load_image(path), basis.width, basis.height)
+            image = center_crop(load_image(path), basis.width, basis.height)
         except ImageError as error:
             bad.append(str(error))
         else:

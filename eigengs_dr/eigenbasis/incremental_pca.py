@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 BLOCK_BYTES = 768 << 20
 """Memory for a block of images."""
 
-LONGEST_BLOCK = 1024
+MAX_BLOCK = 1024
 """Most images in a block: its Gram matrix has as many rows."""
 
 MARGIN = 0.25
@@ -91,7 +91,7 @@ class EigenState:
         )
 
 
-def start(size: tuple[int, int], seed: int = 0) -> EigenState:
+def empty_state(size: tuple[int, int], seed: int = 0) -> EigenState:
     """Return the state before the first image, of three channels, for a size (width, height)."""
     if seed < 0:
         raise ValueError(f"seed is {seed}; expected no negative number")
@@ -109,7 +109,7 @@ def start(size: tuple[int, int], seed: int = 0) -> EigenState:
 
 def block_length(size: tuple[int, int]) -> int:
     """Return how many images of a size (width, height) make a block of `BLOCK_BYTES`."""
-    return max(1, min(LONGEST_BLOCK, BLOCK_BYTES // (12 * size[0] * size[1])))
+    return max(1, min(MAX_BLOCK, BLOCK_BYTES // (12 * size[0] * size[1])))
 
 
 def rank_for(components: int) -> int:
@@ -144,7 +144,7 @@ def merge(state: EigenState, block: NDArray[np.float32], rank: Sequence[int]) ->
     n, b = state.count, len(block)
     if b == 0:
         return state
-    examples = _drawn(state, block)
+    examples = _draw_examples(state, block)
     mean = block.mean(axis=0, dtype=np.float64)
     # Moved by this much towards the old mean, the new images have the scatter of both last terms.
     block -= (mean + np.sqrt(n / (n + b)) * (state.mean - mean)).astype(np.float32)
@@ -152,10 +152,10 @@ def merge(state: EigenState, block: NDArray[np.float32], rank: Sequence[int]) ->
     for c, most in enumerate(rank):
         gram = _gram(state.rows[c], state.scatter[c], block[:, c])
         squares.append(np.trace(gram[len(state.rows[c]) :, len(state.rows[c]) :]))
-        values, weights = _largest(gram, most, FLOOR * (n + b) * block.shape[2])
+        values, weights = _largest_eigenpairs(gram, most, FLOOR * (n + b) * block.shape[2])
         weights[: len(state.rows[c])] *= np.sqrt(state.scatter[c])[:, None]
-        found = _rotated(state.rows[c], block[:, c], weights.T.astype(np.float32))
-        found, values = _orthonormal(found, values)
+        found = _rotate(state.rows[c], block[:, c], weights.T.astype(np.float32))
+        found, values = _orthonormalize(found, values)
         rows.append(found)
         scatter.append(values)
     return EigenState(
@@ -189,7 +189,7 @@ def _product(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float
     return result
 
 
-def _largest(
+def _largest_eigenpairs(
     gram: NDArray[np.float64], most: int, floor: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the largest eigenvalues, descending, and what combines rows to unit eigenvectors."""
@@ -199,7 +199,7 @@ def _largest(
     return values[kept], vectors[:, kept] / np.sqrt(values[kept])
 
 
-def _rotated(
+def _rotate(
     rows: NDArray[np.float32], block: NDArray[np.float32], weights: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Combine old rows and new images to new rows."""
@@ -208,7 +208,7 @@ def _rotated(
     return result
 
 
-def _orthonormal(
+def _orthonormalize(
     rows: NDArray[np.float32], scatter: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Correct what rounding did to rows that should be orthonormal."""
@@ -224,7 +224,7 @@ def _orthonormal(
     return rows, scatter
 
 
-def _drawn(state: EigenState, block: NDArray[np.float32]) -> NDArray[np.float32]:
+def _draw_examples(state: EigenState, block: NDArray[np.float32]) -> NDArray[np.float32]:
     """Reservoir sampling: image number i takes one of i + 1 places, of which the first are kept."""
     examples = list(state.examples)
     for i, image in enumerate(block, state.count):

@@ -8,38 +8,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian.gaussians import Gaussians
-from ..image.folder import SPACES
+from ..image.folder import BASIS_SPACES
 from ..storage.npz import Field
-from .basis_file import ROUNDING, require_descending
+from .basis_file import ENERGY_TOLERANCE, require_descending
 
 FORMAT, VERSION = "eigengs_dr.model", 2
 
-MOST_ENTRIES = 1 << 28
+MAX_ENTRIES = 1 << 28
 """Largest array: 300 components of a million splats."""
 
-LARGEST = 1e6
+MAX_WEIGHT = 1e6
 """Largest colour or weight that is believed; 1 is white."""
 
-MOST_DECIBELS = 200.0
+MAX_PSNR = 200.0
 """Beyond all PSNR, of good and of bad."""
 
-FIRST: dict[str, Field] = {
+LAYOUT_V1: dict[str, Field] = {
     "mean": Field("f4", 2),
     "factor": Field("f4", 2),
     "color": Field("f4", 2),
     "background": Field("f4", 1),
     "size": Field("i8", 1),
     "space": Field("U", 0),
-    "mean_image": Field("f2", 3, MOST_ENTRIES),
+    "mean_image": Field("f2", 3, MAX_ENTRIES),
     "split": Field("i8", 1),
-    **{f"weights{c}": Field("f2", 2, MOST_ENTRIES) for c in range(3)},
+    **{f"weights{c}": Field("f2", 2, MAX_ENTRIES) for c in range(3)},
     **{f"scale{c}": Field("f4", 1) for c in range(3)},
     **{f"eigenvalues{c}": Field("f8", 1) for c in range(3)},
 }
 """What a file of version 1 holds: the kind and the number of dimensions of each array."""
 
 LAYOUT: dict[str, Field] = {
-    **FIRST,
+    **LAYOUT_V1,
     "variance": Field("f8", 1),
     "held_out": Field("f8", 1),
     "split_reason": Field("U", 0),
@@ -49,7 +49,7 @@ LAYOUT: dict[str, Field] = {
 
 def layout_of(version: int) -> dict[str, Field]:
     """Return what a file of a version that can be read holds."""
-    return FIRST if version < 2 else LAYOUT
+    return LAYOUT_V1 if version < 2 else LAYOUT
 
 
 def to_members(model: Any) -> dict[str, NDArray[Any]]:
@@ -87,7 +87,7 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
     Parameters
     ----------
     arrays : dict of str to ndarray
-        Of the types and dimensions of `LAYOUT`, or of `FIRST`.
+        Of the types and dimensions of `LAYOUT`, or of `LAYOUT_V1`.
     backend : {"llvm", "cuda"}, optional
 
     Returns
@@ -103,8 +103,8 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
     for key, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise ValueError(f"{key} holds values that are not finite")
-    if str(arrays["space"]) not in SPACES:
-        raise ValueError(f"space is {str(arrays['space'])!r}, expected {' or '.join(SPACES)}")
+    if str(arrays["space"]) not in BASIS_SPACES:
+        raise ValueError(f"space is {str(arrays['space'])!r}, expected {' or '.join(BASIS_SPACES)}")
     _require("size", arrays["size"], (2,))
     gaussians = Gaussians.from_arrays(
         **{key: arrays[key] for key in ("mean", "factor", "color", "background")},
@@ -139,8 +139,8 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
     values = {f"weights{c} times scale{c}": rows for c, rows in enumerate(weights)}
     values |= {key: arrays[key] for key in ("color", "background")}
     for name, rows in values.items():
-        if not np.abs(rows).max(initial=0) <= LARGEST:
-            raise ValueError(f"{name} exceeds {LARGEST:g}, which no image needs")
+        if not np.abs(rows).max(initial=0) <= MAX_WEIGHT:
+            raise ValueError(f"{name} exceeds {MAX_WEIGHT:g}, which no image needs")
     return {
         "gaussians": gaussians,
         "weights": weights,
@@ -148,11 +148,11 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
         "mean_image": arrays["mean_image"].astype(np.float32),
         "low": low,
         "low_components": low_components,
-        **_told(arrays),
+        **_optional_members(arrays),
     }
 
 
-def _told(arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
+def _optional_members(arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
     """Check what files tell since version 2; nothing of an older one."""
     if "variance" not in arrays:
         return {}
@@ -160,13 +160,13 @@ def _told(arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
     if len(variance):  # unknown in a model that came from an older file
         _require("variance", variance, (3,))
     for c, total in enumerate(variance):
-        if not 0 <= arrays[f"eigenvalues{c}"].sum() <= total * (1 + ROUNDING):
+        if not 0 <= arrays[f"eigenvalues{c}"].sum() <= total * (1 + ENERGY_TOLERANCE):
             raise ValueError(f"eigenvalues{c} add up to more than variance {c}")
     if len(held_out):  # where images were held out
         _require("held_out", held_out, (1 + sum(len(arrays[f"scale{c}"]) for c in range(3)),))
     falls = np.diff(held_out) < -1e-9  # that much is rounding of the logarithm
-    if falls.any() or (np.abs(held_out) > MOST_DECIBELS).any():
-        raise ValueError(f"held_out must ascend, within {MOST_DECIBELS:g} dB")
+    if falls.any() or (np.abs(held_out) > MAX_PSNR).any():
+        raise ValueError(f"held_out must ascend, within {MAX_PSNR:g} dB")
     reason = str(arrays["split_reason"])
     if not (reason.isascii() and reason.isprintable()):
         raise ValueError("split_reason holds characters that are not printed")

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from ..fitting.solvers.normal_equations import NormalEquations
-from .truncation import fewest_apart, remaining
+from .truncation import min_ranks_per_channel, residual_energy
 
 Coefficients = tuple[NDArray[np.float32], ...]
 
 
-class Span:
+class ComponentProjector:
     """All images that the rendered components Psi~ of each channel add up to.
 
     With the Cholesky factor L of ``Psi~^T Psi~``, the coefficients of an image x are
@@ -53,12 +53,12 @@ class Span:
         tuple of C ndarrays of float32, shape (k_c,)
         """
         found = []
-        for seen, factor in zip(self._seen(correlations), self.factors, strict=True):
+        for seen, factor in zip(self._inner_products(correlations), self.factors, strict=True):
             solved = cho_solve(factor, seen, check_finite=False) if len(seen) else seen
             found.append(solved.astype(np.float32))
         return tuple(found)
 
-    def fewest(
+    def coefficients_for_psnr(
         self,
         correlations: NDArray[np.float64],
         squares: NDArray[np.float64],
@@ -76,8 +76,8 @@ class Span:
         entries : int
             Pixels times channels.
         target_psnr : float
-            See `eigengs_dr.eigenbasis.truncation.fewest_apart`. The ridge on the diagonal of
-            ``Psi~^T Psi~`` only lets the error be smaller than it is taken to be.
+            See `eigengs_dr.eigenbasis.truncation.min_ranks_per_channel`. The ridge on the diagonal
+            of ``Psi~^T Psi~`` only lets the error be smaller than it is taken to be.
 
         Returns
         -------
@@ -86,11 +86,11 @@ class Span:
         """
         halves = [
             solve_triangular(factor[0], seen, lower=True, check_finite=False) if len(seen) else seen
-            for seen, factor in zip(self._seen(correlations), self.factors, strict=True)
+            for seen, factor in zip(self._inner_products(correlations), self.factors, strict=True)
         ]
         pairs = zip(squares, halves, strict=True)
-        left = [remaining(total, y.astype(np.float64) ** 2) for total, y in pairs]
-        counts = fewest_apart(left, entries, target_psnr)
+        left = [residual_energy(total, y.astype(np.float64) ** 2) for total, y in pairs]
+        counts = min_ranks_per_channel(left, entries, target_psnr)
         found = []
         for y, factor, k in zip(halves, self.factors, counts, strict=True):
             solved = y[:k]
@@ -100,7 +100,7 @@ class Span:
             found.append(solved.astype(np.float32))
         return tuple(found)
 
-    def _seen(self, correlations: NDArray[np.float64]) -> list[NDArray[np.float32]]:
+    def _inner_products(self, correlations: NDArray[np.float64]) -> list[NDArray[np.float32]]:
         """``Psi~^T x`` of every channel."""
         # Not a product by BLAS, whose threads and Dr.Jit's wait for each other: twice as slow.
         return [

@@ -16,28 +16,28 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..backend.interrupt import deferred
-from ..image.folder import SPACES, batches, checked_size, image_files
+from ..backend.interrupt import defer_interrupts
+from ..image.folder import BASIS_SPACES, check_size, image_files, read_blocks
 from ..image.io import ImageError
 from ..storage.checkpoint import Checkpoint
-from .basis import Eigenbasis, checked_components
+from .basis import Eigenbasis, check_components
 from .components.solve import State, check_arguments, fit_components
 from .components.split import split_reason, wants_split
 from .eigengs import EigenGS
-from .evaluation import fall_on, measured
-from .incremental_pca import EigenState, block_length, merge, rank_for, start
-from .truncation import Fall, check_target
+from .evaluation import evaluate, truncation_curve_on
+from .incremental_pca import EigenState, block_length, empty_state, merge, rank_for
+from .truncation import TruncationCurve, check_target
 
 HELD_OUT = 10
 """One image in so many is not trained on, but measured."""
 
-MOST_HELD_OUT = 100
+MAX_HELD_OUT = 100
 """Images measured at most: more would not change the figures much."""
 
 SAVE_SECONDS = 10.0
 """Time between two checkpoints of the shapes."""
 
-Progress = Callable[[str, int, int], None]
+StageProgress = Callable[[str, int, int], None]
 
 
 class Interrupted(Exception):
@@ -45,7 +45,7 @@ class Interrupted(Exception):
 
 
 @dataclass(frozen=True)
-class Settings:
+class TrainOptions:
     """What decides the result of a training, beside the images.
 
     Attributes
@@ -58,7 +58,7 @@ class Settings:
         Keep as few components as hold this share of a channel's variance.
     target_psnr : float or None
         Keep as few components as the images held out need for this mean PSNR of their PCA, in dB;
-        see `eigengs_dr.eigenbasis.truncation.Fall`.
+        see `eigengs_dr.eigenbasis.truncation.TruncationCurve`.
     gaussians, frequency_aware, preset, steps, seed
         See `eigengs_dr.EigenGS.fit`.
     color : {"ycbcr", "rgb"}
@@ -77,7 +77,7 @@ class Settings:
     seed: int = 0
 
 
-class Trained(NamedTuple):
+class Training(NamedTuple):
     """Result of `train`.
 
     Attributes
@@ -90,8 +90,8 @@ class Trained(NamedTuple):
         it went on with another: ``resumed``), ``peak_rss_mb``, ``images``, ``components`` of each
         channel, ``gaussians``, ``frequency_aware`` and ``split_reason``, why;
         ``psnr_held_out``, the attribute ``held_out`` of the model; ``psnr_components`` and others
-        of `eigengs_dr.eigenbasis.components.solve.Fitted`; those of
-        `eigengs_dr.eigenbasis.evaluation.measured`.
+        of `eigengs_dr.eigenbasis.components.solve.ComponentFit`; those of
+        `eigengs_dr.eigenbasis.evaluation.evaluate`.
     """
 
     model: EigenGS
@@ -102,10 +102,10 @@ class Trained(NamedTuple):
 def train(
     folder: str | os.PathLike[str],
     output: str | os.PathLike[str],
-    settings: Settings,
+    settings: TrainOptions,
     backend: str | None = None,
-    progress: Progress = lambda stage, done, total: None,
-) -> Trained:
+    progress: StageProgress = lambda stage, done, total: None,
+) -> Training:
     """Train a model on a folder of images and write it.
 
     A folder ``OUTPUT.checkpoint`` keeps what is done; a run that was stopped, by Ctrl-C or harder,
@@ -137,15 +137,17 @@ def train(
         If a file cannot be written.
     """
     started = time.perf_counter()
-    checked_components(settings.components, settings.energy)
+    check_components(settings.components, settings.energy)
     if settings.target_psnr is not None:
         check_target(settings.target_psnr)
         if settings.energy is not None:
             raise ValueError("energy and target_psnr both choose the components; give one of them")
-    if settings.color not in SPACES:
-        raise ValueError(f"color {settings.color!r} is unknown; use one of {', '.join(SPACES)}")
+    if settings.color not in BASIS_SPACES:
+        raise ValueError(
+            f"color {settings.color!r} is unknown; use one of {', '.join(BASIS_SPACES)}"
+        )
     steps = check_arguments(
-        checked_size(settings.size),
+        check_size(settings.size),
         settings.gaussians,
         settings.frequency_aware,
         settings.seed,
@@ -165,14 +167,16 @@ def train(
         files = [folder / name for name in checkpoint.files]
         held_out = files[HELD_OUT - 1 :: HELD_OUT]
         training = [path for i, path in enumerate(files) if i % HELD_OUT != HELD_OUT - 1]
-        with deferred() as pressed:
+        with defer_interrupts() as pressed:
             run = Run(checkpoint, settings, steps, backend, progress, pressed)
             try:
-                held_out = held_out[:MOST_HELD_OUT]
+                held_out = held_out[:MAX_HELD_OUT]
                 basis = _basis(training, held_out, run)
                 pca_seconds = time.perf_counter() - started
-                model = _model(basis, fall_on(basis, held_out, run.stop_if_pressed), run)
-                worth = measured(model, basis, held_out, partial(run.measure, total=len(held_out)))
+                model = _model(
+                    basis, truncation_curve_on(basis, held_out, run.stop_if_pressed), run
+                )
+                worth = evaluate(model, basis, held_out, partial(run.measure, total=len(held_out)))
             except ValueError as error:
                 if not checkpoint.holds_work:
                     raise
@@ -194,17 +198,17 @@ def train(
             "seconds": time.perf_counter() - started,
         }
         model.save(output)
-    return Trained(model, basis, figures)
+    return Training(model, basis, figures)
 
 
 class Run(NamedTuple):
     """What the stages of a training share."""
 
     checkpoint: Checkpoint
-    settings: Settings
+    settings: TrainOptions
     steps: int
     backend: str | None
-    progress: Progress
+    progress: StageProgress
     pressed: Callable[[], bool]
 
     def stop_if_pressed(self, *done: int) -> None:
@@ -225,7 +229,7 @@ def _basis(files: list[Path], held_out: list[Path], run: Run) -> Eigenbasis:
     if (path := checkpoint.folder / "basis.npz").exists():
         return Eigenbasis.load(path)
     arrays = checkpoint.load("pca")
-    state = EigenState.from_arrays(arrays) if arrays else start(settings.size, settings.seed)
+    state = EigenState.from_arrays(arrays) if arrays else empty_state(settings.size, settings.seed)
     first = int(arrays["next"]) if arrays else 0
     length = block_length(settings.size)
 
@@ -233,8 +237,8 @@ def _basis(files: list[Path], held_out: list[Path], run: Run) -> Eigenbasis:
         run.progress("components", first + done, len(files))
         run.stop_if_pressed()
 
-    ranks = [rank_for(k) for k in checked_components(settings.components)]
-    source = batches(files[first:], settings.size, settings.color, length, advance)
+    ranks = [rank_for(k) for k in check_components(settings.components)]
+    source = read_blocks(files[first:], settings.size, settings.color, length, advance)
     try:
         with closing(source) as blocks:
             for number, block in enumerate(blocks, 1):
@@ -250,18 +254,18 @@ def _basis(files: list[Path], held_out: list[Path], run: Run) -> Eigenbasis:
         state, settings.size, settings.components, settings.energy, settings.color
     )
     if settings.target_psnr is not None:
-        if (fall := fall_on(basis, held_out, run.stop_if_pressed)) is None:
+        if (fall := truncation_curve_on(basis, held_out, run.stop_if_pressed)) is None:
             raise ValueError(
                 f"target_psnr needs images that are held out, one in {HELD_OUT}, and there are "
                 "none that can be read; give more images, or use energy"
             )
-        basis = basis.truncated(fall.fewest(settings.target_psnr))
+        basis = basis.truncated(fall.rank_for_psnr(settings.target_psnr))
     basis.save(path)
     checkpoint.remove("pca")
     return basis
 
 
-def _model(basis: Eigenbasis, fall: Fall | None, run: Run) -> EigenGS:
+def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS:
     """Fit Gaussians to the components, saving what training has reached."""
     settings, checkpoint = run.settings, run.checkpoint
     run.stop_if_pressed()
@@ -291,7 +295,7 @@ def _model(basis: Eigenbasis, fall: Fall | None, run: Run) -> EigenGS:
         _states(checkpoint.load("shapes") or {}),
         save,
     )
-    return EigenGS.of(
+    return EigenGS.from_fit(
         basis,
         fitted,
         compared,

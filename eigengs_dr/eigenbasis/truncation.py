@@ -22,13 +22,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-ROUNDING = 1e-12
+MIN_MSE = 1e-12
 """Mean squared error below which all is rounding in single precision: 120 dB."""
 
 Values = NDArray[np.float64]
 
 
-class Fall(NamedTuple):
+class TruncationCurve(NamedTuple):
     """How much better an image is shown by 0, 1, 2, ..., n components.
 
     Attributes
@@ -43,7 +43,7 @@ class Fall(NamedTuple):
     counts: NDArray[np.int64]
     psnr: Values
 
-    def fewest(self, target_psnr: float) -> tuple[int, ...]:
+    def rank_for_psnr(self, target_psnr: float) -> tuple[int, ...]:
         """Find the fewest components of each channel that reach a PSNR.
 
         Parameters
@@ -71,7 +71,7 @@ class Fall(NamedTuple):
             _warn_out_of_reach(target_psnr, self.counts[-1], self.psnr[-1])
         return tuple(self.counts[enough.argmax() if enough.any() else -1].tolist())
 
-    def shares(self) -> Values:
+    def explained_variance_ratio(self) -> Values:
         """Return the share of the error without components that each number of them takes away.
 
         Returns
@@ -82,7 +82,9 @@ class Fall(NamedTuple):
         return 1 - 10 ** ((self.psnr[0] - self.psnr) / 10)
 
 
-def falling(eigenvalues: Sequence[Values], left: Sequence[Values], entries: int) -> Fall:
+def curve_from_residuals(
+    eigenvalues: Sequence[Values], left: Sequence[Values], entries: int
+) -> TruncationCurve:
     """Put the channels together.
 
     Parameters
@@ -106,16 +108,18 @@ def falling(eigenvalues: Sequence[Values], left: Sequence[Values], entries: int)
     added = channel[:, None] == np.array(channels)
     counts = np.vstack([np.zeros(len(channels), np.int64), np.cumsum(added, axis=0)])
     error = sum(rows[..., n] for rows, n in zip(left, counts.T, strict=True)) / entries
-    return Fall(counts, np.atleast_2d(_decibels(error)).mean(axis=0))
+    return TruncationCurve(counts, np.atleast_2d(_decibels(error)).mean(axis=0))
 
 
-def expected(eigenvalues: Sequence[Values], variance: Values, entries: int) -> Fall:
+def curve_from_eigenvalues(
+    eigenvalues: Sequence[Values], variance: Values, entries: int
+) -> TruncationCurve:
     """Tell how the error of the training images falls: that of their PCA, by eigenvalues alone.
 
     Parameters
     ----------
     eigenvalues, entries
-        See `falling`.
+        See `curve_from_residuals`.
     variance : ndarray of float64, shape (C,)
         Sum of all eigenvalues of a channel, of kept components or not.
 
@@ -124,17 +128,21 @@ def expected(eigenvalues: Sequence[Values], variance: Values, entries: int) -> F
     Fall
         With the PSNR of the mean error. Images that were not trained on have a larger one.
     """
-    left = [remaining(total, values) for total, values in zip(variance, eigenvalues, strict=True)]
-    return falling(eigenvalues, left, entries)
+    left = [
+        residual_energy(total, values) for total, values in zip(variance, eigenvalues, strict=True)
+    ]
+    return curve_from_residuals(eigenvalues, left, entries)
 
 
-def fewest_apart(left: Sequence[Values], entries: int, target_psnr: float) -> tuple[int, ...]:
+def min_ranks_per_channel(
+    left: Sequence[Values], entries: int, target_psnr: float
+) -> tuple[int, ...]:
     """Find the fewest components in all that reach a PSNR for one image, each channel's apart.
 
     Parameters
     ----------
     left : sequence of 3 ndarrays, shape (k_c + 1,)
-        See `falling`; descending.
+        See `curve_from_residuals`; descending.
     entries : int
         Pixels times channels.
     target_psnr : float
@@ -143,7 +151,7 @@ def fewest_apart(left: Sequence[Values], entries: int, target_psnr: float) -> tu
     Returns
     -------
     tuple of 3 ints
-        Raises and warns as `Fall.fewest` does.
+        Raises and warns as `TruncationCurve.fewest` does.
     """
     check_target(target_psnr)
     first, second, third = left
@@ -160,7 +168,7 @@ def fewest_apart(left: Sequence[Values], entries: int, target_psnr: float) -> tu
     return int(needed[j, k]), int(j), int(k)
 
 
-def remaining(total: float, gains: Values) -> Values:
+def residual_energy(total: float, gains: Values) -> Values:
     """``total - sum_(i <= n) gains_i`` for n = 0, 1, ..., k: shape (k + 1,) of gains (k,)."""
     return total - np.concatenate([[0.0], np.cumsum(gains, dtype=np.float64)])
 
@@ -172,7 +180,7 @@ def check_target(target_psnr: float) -> None:
 
 
 def _decibels(error: NDArray[np.float64] | float) -> Values:
-    return -10 * np.log10(np.maximum(error, ROUNDING))
+    return -10 * np.log10(np.maximum(error, MIN_MSE))
 
 
 def _warn_out_of_reach(target_psnr: float, counts: Iterable[int], reached: float) -> None:

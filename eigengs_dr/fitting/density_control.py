@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from ..backend.arrays import types_of
 from ..gaussian.gaussians import Gaussians, concatenate
 from ..raster.render import CUTOFF
-from .placement.density import places
+from .placement.density import residual_peaks
 from .redistribute import residual
-from .solvers.conjugate_gradient import correlations, solve
+from .solvers.conjugate_gradient import inner_products, solve
 
 Array = NDArray[np.floating]
 
@@ -21,7 +21,7 @@ SOLVE_STEPS = 5
 """Steps of the colour solve after splats were dropped: their neighbours take over."""
 
 
-def worth(
+def removal_cost(
     gaussians: Gaussians,
     target: NDArray[np.float32],
     weight: Array | None = None,
@@ -48,13 +48,13 @@ def worth(
     """
     counts = np.ones_like(target) if weight is None else np.square(weight).astype(np.float32)
     missed = residual(gaussians, target, cutoff) * counts
-    along = correlations(gaussians, missed, cutoff)
-    own = correlations(gaussians, counts, cutoff, squared=True)
+    along = inner_products(gaussians, missed, cutoff)
+    own = inner_products(gaussians, counts, cutoff, squared=True)
     color = gaussians.to_arrays()["color"].astype(np.float64)
     return (color * (color * own + 2 * along)).sum(axis=1)
 
 
-def pruned(
+def prune(
     gaussians: Gaussians,
     target: NDArray[np.float32],
     count: int,
@@ -63,17 +63,17 @@ def pruned(
 ) -> Gaussians:
     """Keep the `count` splats that are worth the most, in their order, and solve for the colours.
 
-    Parameters are those of `worth`. With a weight colours stay: those that are solved for minimise
-    the error without it.
+    Parameters are those of `removal_cost`. With a weight colours stay: those that are solved for
+    minimise the error without it.
     """
-    value = worth(gaussians, target, weight, cutoff)
+    value = removal_cost(gaussians, target, weight, cutoff)
     kept = np.sort(np.argsort(-value, kind="stable")[:count])
     if weight is not None:
         return gaussians[kept]
     return solve(gaussians[kept], target, SOLVE_STEPS, cutoff, warm_start=True).gaussians
 
 
-def grown(
+def densify(
     gaussians: Gaussians,
     target: NDArray[np.float32],
     count: int,
@@ -82,13 +82,13 @@ def grown(
 ) -> Gaussians:
     """Add round splats where one takes most from the error, until there are `count`.
 
-    Parameters are those of `worth`. Fewer are added where the image has no more places, see
-    `places`; none to a set that has as many.
+    Parameters are those of `removal_cost`. Fewer are added where the image has no more places, see
+    `residual_peaks`; none to a set that has as many.
     """
     if count <= len(gaussians):
         return gaussians
     missed = residual(gaussians, target, cutoff)
-    mean, size, color = places(missed, count - len(gaussians), _spacing(gaussians), weight)
+    mean, size, color = residual_peaks(missed, count - len(gaussians), _spacing(gaussians), weight)
     if not len(mean):
         return gaussians
     sharp = 1 / size

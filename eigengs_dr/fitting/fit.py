@@ -10,19 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.interrupt import deferred
+from ..backend.interrupt import defer_interrupts
 from ..eigenbasis.eigengs import EigenGS
 from ..gaussian.gaussians import Gaussians
 from ..image.color import SPACES
 from ..image.io import check_image
-from ..raster.evaluate import SHAPE
+from ..raster.evaluate import NUM_SHAPE_PARAMS
 from ..raster.render import picture_of
-from .initializers import INITS, begin
+from .initializers import INITS, initialize
 from .presets import PRESETS
-from .refine import EXACT, Progress, figures, refine
-from .search import fewest
+from .refine import MAX_PSNR, FitProgress, measure, refine
+from .search import search_count
 
-FIRST = 64
+PIXELS_PER_FIRST_GAUSSIAN = 64
 """Pixels a splat of the first try, where the number of splats is searched for."""
 
 
@@ -74,7 +74,7 @@ def fit(
     color: str = "ycbcr",
     seed: int = 0,
     backend: str | None = None,
-    progress: Progress | None = None,
+    progress: FitProgress | None = None,
     target_psnr: float | None = None,
     target_space: str = "ycbcr",
     max_gaussians: int | None = None,
@@ -142,16 +142,18 @@ def fit(
     """
     started = time.perf_counter()
     pixels = check_image(image, keep_grey=color == "data")
-    check(pixels, gaussians, iterations, init, preset, solve_steps, color, seed)
+    check_options(pixels, gaussians, iterations, init, preset, solve_steps, color, seed)
     method = PRESETS[preset]
     if target_psnr is None and (max_gaussians is not None or target_space != "ycbcr"):
         raise ValueError("max_gaussians and target_space belong to target_psnr; give it, too")
     if target_psnr is not None:
         _check_target(gaussians, init, preset, target_psnr, target_space, pixels, max_gaussians)
-        most = max_gaussians or most_gaussians(pixels)
-        gaussians = min(most, max(1, pixels.shape[0] * pixels.shape[1] // FIRST))
-    with deferred() as interrupted:
-        start = begin(
+        most = max_gaussians or max_gaussians_for(pixels)
+        gaussians = min(
+            most, max(1, pixels.shape[0] * pixels.shape[1] // PIXELS_PER_FIRST_GAUSSIAN)
+        )
+    with defer_interrupts() as interrupted:
+        start = initialize(
             pixels, gaussians, init, basis, method, solve_steps, color, seed, backend=backend
         )
         seconds_init = time.perf_counter() - started
@@ -163,16 +165,16 @@ def fit(
                 method.schedule,
                 iterations,
                 started=started,
-                added=start.added,
+                base_image=start.base_image,
                 weight=start.weight,
-                rearrange=start.rearrange,
+                redistribute=start.redistribute,
                 progress=progress,
                 interrupted=interrupted,
             )
         else:
-            refined = fewest(
+            refined = search_count(
                 start,
-                partial(figures, image=pixels, started=started),
+                partial(measure, image=pixels, started=started),
                 f"psnr_{target_space}",
                 target_psnr,
                 most,
@@ -185,16 +187,16 @@ def fit(
     return Fit(
         gaussians=refined.gaussians,
         trace=refined.trace,
-        image=rendered if start.added is None else rendered + start.added,
+        image=rendered if start.base_image is None else rendered + start.base_image,
         seconds=time.perf_counter() - started,
         seconds_init=seconds_init,
         iterations=refined.iterations,
         stopped=refined.stopped,
-        mean_image=start.added,
+        mean_image=start.base_image,
     )
 
 
-def check(
+def check_options(
     pixels: NDArray[np.float32],
     gaussians: int | None,
     iterations: int,
@@ -227,10 +229,10 @@ def check(
         raise ValueError(f"preset {preset!r} starts from a basis; use init 'auto', not {init!r}")
 
 
-def most_gaussians(pixels: NDArray[np.float32]) -> int:
+def max_gaussians_for(pixels: NDArray[np.float32]) -> int:
     """Splats that have as many parameters as an image has numbers; at least one."""
     channels = pixels.shape[2]
-    return max(1, pixels.size // (SHAPE + channels))
+    return max(1, pixels.size // (NUM_SHAPE_PARAMS + channels))
 
 
 def _check_target(
@@ -250,8 +252,10 @@ def _check_target(
             f"target_psnr works with preset 'default' and init 'adaptive', not with {preset!r} and "
             f"{init!r}"
         )
-    if not 0 < target_psnr <= EXACT:
-        raise ValueError(f"target_psnr is {target_psnr}; it must be above 0 and at most {EXACT:g}")
+    if not 0 < target_psnr <= MAX_PSNR:
+        raise ValueError(
+            f"target_psnr is {target_psnr}; it must be above 0 and at most {MAX_PSNR:g}"
+        )
     if target_space not in ("ycbcr", "rgb"):
         raise ValueError(f"target_space {target_space!r} is unknown; use ycbcr or rgb")
     height, width = pixels.shape[:2]

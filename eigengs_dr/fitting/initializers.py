@@ -14,16 +14,16 @@ from ..eigenbasis.eigengs import EigenGS
 from ..eigenbasis.registry import load_basis
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode, rgb_to_ycbcr, to_linear
-from ..image.folder import SPACES as BASIS_SPACES
+from ..image.folder import BASIS_SPACES as BASIS_SPACES
 from ..raster.render import CUTOFF
-from .placement.adaptive import adaptive
-from .placement.grid import grid
-from .placement.random import random
+from .placement.adaptive import place_adaptive
+from .placement.grid import place_grid
+from .placement.random import place_random
 from .presets import Preset
-from .redistribute import rearranged
+from .redistribute import redistribute
 from .solvers.conjugate_gradient import solve
 
-PLACES = {"random": random, "grid": grid, "adaptive": adaptive}
+PLACEMENTS = {"random": place_random, "grid": place_grid, "adaptive": place_adaptive}
 """Initialisers that look at the image alone, by name."""
 
 DARKNESS, BLACK = 0.3, 0.003
@@ -31,14 +31,14 @@ DARKNESS, BLACK = 0.3, 0.003
 between errors of light, which spare the dark, and errors of codes. At 5000 splats and 300 steps
 that gains 0.7 dB of psnr_rgb over no weights, on 12 training images of ImageNet classes."""
 
-INITS = ("auto", *PLACES, "eigen")
+INITS = ("auto", *PLACEMENTS, "eigen")
 """All names of initialisers."""
 
-GAUSSIANS = 5000
+DEFAULT_COUNT = 5000
 """Splats where no number is asked for."""
 
 
-class Start(NamedTuple):
+class FitProblem(NamedTuple):
     """What descent starts from, and what it aims at.
 
     Attributes
@@ -48,23 +48,23 @@ class Start(NamedTuple):
         The image in the space of the set; without the mean image where that stays pixels.
     weight : ndarray of float32, shape (H, W, C), or None
         What errors are multiplied by before they are squared.
-    added : ndarray of float32, shape (H, W, 3), or None
+    base_image : ndarray of float32, shape (H, W, 3), or None
         What renderings of the set are added to, RGB: the mean image, where it stays pixels.
-    rearrange : callable, or None
-        ``rearrange(gaussians, count)`` places splats anew where a fitted set left much error; None
-        where not the image alone places them.
+    redistribute : callable, or None
+        ``redistribute(gaussians, count)`` places splats anew where a fitted set left much error;
+        None where not the image alone places them.
     """
 
     gaussians: Gaussians
     target: NDArray[np.float32]
     weight: NDArray[np.float32] | None = None
-    added: NDArray[np.float32] | None = None
-    rearrange: Callable[[Gaussians, int], Gaussians] | None = None
+    base_image: NDArray[np.float32] | None = None
+    redistribute: Callable[[Gaussians, int], Gaussians] | None = None
 
 
-def usual_count(pixels: int) -> int:
-    """Splats where no number is asked for: `GAUSSIANS`, or one a pixel if these are fewer."""
-    return min(GAUSSIANS, pixels)
+def default_count(pixels: int) -> int:
+    """Splats where no number is asked for: `DEFAULT_COUNT`, or one a pixel if these are fewer."""
+    return min(DEFAULT_COUNT, pixels)
 
 
 def dark_weight(light: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -75,7 +75,7 @@ def dark_weight(light: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.maximum(light, BLACK) ** -DARKNESS, np.float32)
 
 
-def begin(
+def initialize(
     pixels: NDArray[np.float32],
     gaussians: int | None,
     init: str,
@@ -86,7 +86,7 @@ def begin(
     seed: int = 0,
     cutoff: float = CUTOFF,
     backend: str | None = None,
-) -> Start:
+) -> FitProblem:
     """Place splats and find their colours: all of `fit` that comes before refinement.
 
     Parameters are those of `fit`, `pixels` as `check_image` returns them, and `cutoff` is that of
@@ -100,30 +100,39 @@ def begin(
     target, weight = _target(pixels, color)
     init = method.init if init == "auto" else init
     if init != "eigen":
-        count = gaussians or usual_count(pixels.shape[0] * pixels.shape[1])
+        count = gaussians or default_count(pixels.shape[0] * pixels.shape[1])
         # Light would draw too few splats to the dark.
         shown = pixels if color == "linear" else target
-        placed = _placed(
-            shown, target, count, PLACES[init], method, solve_steps, color, seed, cutoff, backend
+        placed = _start_from_image(
+            shown,
+            target,
+            count,
+            PLACEMENTS[init],
+            method,
+            solve_steps,
+            color,
+            seed,
+            cutoff,
+            backend,
         )
         rearrange = None
         if init == "adaptive" and method.solves:
             rearrange = partial(
-                rearranged,
+                redistribute,
                 image=shown,
                 target=target,
                 weight=weight,
                 solve_steps=solve_steps,
                 cutoff=cutoff,
             )
-        return Start(placed, target, weight, rearrange=rearrange)
+        return FitProblem(placed, target, weight, redistribute=rearrange)
     model = load_basis(basis, backend)
     _check_basis(model, pixels, gaussians, color)
-    encoded = _encoded(model, pixels, target, method, solve_steps, cutoff)
+    encoded = _start_from_basis(model, pixels, target, method, solve_steps, cutoff)
     if method.mean != "dense":
-        return Start(encoded, target, weight)
+        return FitProblem(encoded, target, weight)
     dense = model.dense_mean(encoded.width, encoded.height)
-    return Start(encoded, target - dense, weight, _picture(dense, color))
+    return FitProblem(encoded, target - dense, weight, _picture(dense, color))
 
 
 def _target(
@@ -138,7 +147,7 @@ def _target(
     return pixels, None
 
 
-def _placed(
+def _start_from_image(
     shown: NDArray[np.float32],
     target: NDArray[np.float32],
     count: int,
@@ -161,7 +170,7 @@ def _placed(
     return solve(start, target, solve_steps, cutoff).gaussians if method.solves else start
 
 
-def _encoded(
+def _start_from_basis(
     model: EigenGS,
     pixels: NDArray[np.float32],
     target: NDArray[np.float32],

@@ -15,23 +15,23 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..backend.interrupt import deferred
+from ..backend.interrupt import defer_interrupts
 from ..gaussian.gaussians import Gaussians, concatenate
 from ..image.io import check_image
 from ..raster.render import picture_of
-from .density_control import worth
-from .fit import Fit, check
-from .initializers import Start, begin, usual_count
+from .density_control import removal_cost
+from .fit import Fit, check_options
+from .initializers import FitProblem, default_count, initialize
 from .optimizers.descent import descend
 from .optimizers.schedule import Schedule
 from .presets import PRESETS
-from .redistribute import placed_like, residual
-from .refine import Progress, refine
+from .redistribute import place_like, residual
+from .refine import FitProgress, refine
 
-RATIO = 4
+LEVEL_RATIO = 4
 """Splats of a level over those of the one before: half the distance between them."""
 
-STEPS = 50
+STEPS_PER_LEVEL = 50
 """Steps of refinement after a level is added, before the next one is placed."""
 
 
@@ -49,11 +49,11 @@ def level_counts(count: int, levels: int) -> list[int]:
     [78, 312, 1250, 5000]
     """
     most = 1
-    while count >= RATIO**most:
+    while count >= LEVEL_RATIO**most:
         most += 1
     if not 1 <= levels <= most:
         raise ValueError(f"levels is {levels}; {count} Gaussians make 1 to {most}")
-    return [count // RATIO**k for k in reversed(range(levels))]
+    return [count // LEVEL_RATIO**k for k in reversed(range(levels))]
 
 
 def fit_levels(
@@ -64,7 +64,7 @@ def fit_levels(
     color: str = "ycbcr",
     seed: int = 0,
     backend: str | None = None,
-    progress: Progress | None = None,
+    progress: FitProgress | None = None,
 ) -> Fit:
     """Fit Gaussians of which the first quarter makes the image too, and the first quarter of that.
 
@@ -92,14 +92,16 @@ def fit_levels(
     """
     started = time.perf_counter()
     pixels = check_image(image, keep_grey=color == "data")
-    check(pixels, gaussians, iterations, color=color, seed=seed)
-    counts = level_counts(gaussians or usual_count(pixels.shape[0] * pixels.shape[1]), levels)
+    check_options(pixels, gaussians, iterations, color=color, seed=seed)
+    counts = level_counts(gaussians or default_count(pixels.shape[0] * pixels.shape[1]), levels)
     method = PRESETS["default"]
-    with deferred() as interrupted:
-        start = begin(
+    with defer_interrupts() as interrupted:
+        start = initialize(
             pixels, counts[0], "auto", "natural", method, color=color, seed=seed, backend=backend
         )
-        placed = _raised(start, counts, method.schedule, min(STEPS, iterations), interrupted)
+        placed = _place_levels(
+            start, counts, method.schedule, min(STEPS_PER_LEVEL, iterations), interrupted
+        )
         seconds_init = time.perf_counter() - started
         refined = refine(
             placed,
@@ -113,7 +115,7 @@ def fit_levels(
             progress=progress,
             interrupted=interrupted,
         )
-    ordered = _in_order(refined.gaussians, start, counts)
+    ordered = _sort_levels(refined.gaussians, start, counts)
     return Fit(
         gaussians=ordered,
         trace=refined.trace,
@@ -125,8 +127,8 @@ def fit_levels(
     )
 
 
-def _raised(
-    start: Start,
+def _place_levels(
+    start: FitProblem,
     counts: list[int],
     schedule: Schedule,
     steps: int,
@@ -143,17 +145,17 @@ def _raised(
                 break
         gaussians = dr.detach(gaussians)
         left = residual(gaussians, start.target)
-        added = placed_like(gaussians, left, left, count - len(gaussians))
+        added = place_like(gaussians, left, left, count - len(gaussians))
         # A background of their own would be part of the levels before.
         gaussians = concatenate([gaussians, replace(added, background=0 * added.background)])
     return gaussians
 
 
-def _in_order(gaussians: Gaussians, start: Start, counts: list[int]) -> Gaussians:
+def _sort_levels(gaussians: Gaussians, start: FitProblem, counts: list[int]) -> Gaussians:
     """Sort the splats of each level, those that are worth most to it first."""
     order, before = [], 0
     for count in counts:
-        value = worth(gaussians[:count], start.target, start.weight)
+        value = removal_cost(gaussians[:count], start.target, start.weight)
         own = np.arange(before, count)
         order.append(own[np.argsort(-value[own], kind="stable")])
         before = count

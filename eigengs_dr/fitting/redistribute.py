@@ -22,16 +22,16 @@ from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
 from ..gaussian.gaussians import Gaussians
-from ..image.resize import resampled
+from ..image.resize import resample
 from ..raster.render import CUTOFF, render
-from .placement.adaptive import Density, adaptive, bent
-from .placement.density import wanted
+from .placement.adaptive import Density, density_from_hessian, place_adaptive
+from .placement.density import target_density
 from .solvers.conjugate_gradient import solve
 
 Array = NDArray[np.floating]
 
 
-def rearranged(
+def redistribute(
     gaussians: Gaussians,
     count: int,
     image: Array,
@@ -71,13 +71,13 @@ def rearranged(
     def density(bend: Array, spacing: float) -> Array:
         height, width = bend.shape[1:]  # of the image, or of a smaller one
         there = old * np.array([width / gaussians.width, height / gaussians.height])
-        here = np.maximum(resampled(error[..., None], width, height)[..., 0], 0)
-        return wanted(there, here, bent(bend, spacing))
+        here = np.maximum(resample(error[..., None], width, height)[..., 0], 0)
+        return target_density(there, here, density_from_hessian(bend, spacing))
 
-    return placed_like(gaussians, image, target, count, density, solve_steps, cutoff)
+    return place_like(gaussians, image, target, count, density, solve_steps, cutoff)
 
 
-def placed_like(
+def place_like(
     gaussians: Gaussians,
     image: Array,
     target: NDArray[np.float32],
@@ -88,10 +88,10 @@ def placed_like(
 ) -> Gaussians:
     """Place splats by an image and solve for their colours, in the space and size of another set.
 
-    Parameters are those of `rearranged`; see `eigengs_dr.fitting.placement.adaptive` for the
+    Parameters are those of `redistribute`; see `eigengs_dr.fitting.placement.adaptive` for the
     density.
     """
-    mean, factor = adaptive(image, count, density=density)
+    mean, factor = place_adaptive(image, count, density=density)
     placed = Gaussians.from_arrays(
         mean,
         factor,

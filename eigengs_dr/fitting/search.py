@@ -18,11 +18,11 @@ import drjit as dr
 
 from ..gaussian.gaussians import Gaussians
 from ..raster.render import CUTOFF
-from .density_control import grown, pruned
-from .initializers import Start
+from .density_control import densify, prune
+from .initializers import FitProblem
 from .optimizers.descent import descend
 from .optimizers.schedule import Schedule
-from .refine import Progress, Refined
+from .refine import FitProgress, Refinement
 
 TRY, FIT, SETTLE = 0.1, 0.4, 0.12
 """Shares of the iterations that a try takes, the fit, and each descent that settles."""
@@ -34,7 +34,8 @@ TRIES, SETTLING = 4, 5
 """Most tries, and descents to settle after which a goal that is met is settled enough."""
 
 OCTAVE = 4.0
-"""Decibels that twice as many splats gain, see `eigengs_dr.fitting.placement.density.FALL`, until
+"""Decibels that twice as many splats gain, see
+`eigengs_dr.fitting.placement.density.ERROR_EXPONENT`, until
 two
 tries of this image tell it."""
 
@@ -75,8 +76,8 @@ SURPLUS = 0.02
 Row = dict[str, Any]
 
 
-def fewest(
-    start: Start,
+def search_count(
+    start: FitProblem,
     measure: Callable[[Gaussians], Row],
     figure: str,
     goal: float,
@@ -84,9 +85,9 @@ def fewest(
     schedule: Schedule,
     iterations: int = 1000,
     cutoff: float = CUTOFF,
-    progress: Progress | None = None,
+    progress: FitProgress | None = None,
     interrupted: Callable[[], bool] = lambda: False,
-) -> Refined:
+) -> Refinement:
     """Find the fewest splats that meet a goal.
 
     Parameters
@@ -122,9 +123,9 @@ def fewest(
     tries, fit, settle = (max(1, round(share * iterations)) for share in (TRY, FIT, SETTLE))
     run.planned = TRIES * tries + fit + SETTLING * settle
     try:
-        placed = _estimated(run, most, tries)
+        placed = _estimate(run, most, tries)
         if run.best.missing > 0 or len(run.best.gaussians) > 1:
-            trial = _fitted(run, placed, most, fit)
+            trial = _fit_estimate(run, placed, most, fit)
             # Of few iterations the tries have taken all.
             most_steps = max(LENGTH * iterations, run.step + SETTLING * settle)
             _settle(run, trial, most, settle, most_steps)
@@ -132,7 +133,7 @@ def fewest(
     except KeyboardInterrupt:
         pressed = True
     met = "met" if run.best.missing <= 0 else "out of reach"
-    return Refined(run.best.gaussians, run.trace, run.step, "interrupted" if pressed else met)
+    return Refinement(run.best.gaussians, run.trace, run.step, "interrupted" if pressed else met)
 
 
 class _Trial(NamedTuple):
@@ -146,22 +147,22 @@ class _Trial(NamedTuple):
 class _Run:
     """What all descents of one search share, and what came of them."""
 
-    start: Start
+    start: FitProblem
     measure: Callable[[Gaussians], Row]
     figure: str
     goal: float
     schedule: Schedule
     cutoff: float
-    progress: Progress | None
+    progress: FitProgress | None
     interrupted: Callable[[], bool]
     planned: int = 0
     step: int = 0
-    octave: float = OCTAVE
+    db_per_doubling: float = OCTAVE
     trace: list[Row] = field(default_factory=list)
     best: _Trial = field(init=False)
 
     def __post_init__(self) -> None:
-        self.best = self.judged(self.start.gaussians)
+        self.best = self.score(self.start.gaussians)
 
     def descend(self, gaussians: Gaussians, steps: int, share: float = 1.0) -> _Trial:
         """Take some steps at a share of the rates, unless interrupted, and judge the set."""
@@ -181,9 +182,9 @@ class _Run:
             if self.progress and self.step % 10 == 0:
                 dr.sync_thread()  # steps run asynchronously; the bar tells what is done
                 self.progress(self.step, self.planned, self.trace[-1])
-        return self.judged(dr.detach(current))
+        return self.score(dr.detach(current))
 
-    def judged(self, gaussians: Gaussians) -> _Trial:
+    def score(self, gaussians: Gaussians) -> _Trial:
         figures = self.measure(gaussians)
         row = {"iteration": self.step, "gaussians": len(gaussians), **figures}
         self.trace.append(row)
@@ -200,35 +201,37 @@ def _better(a: _Trial, b: _Trial) -> bool:
     return a.missing < b.missing
 
 
-def _estimated(run: _Run, most: int, steps: int) -> Gaussians:
+def _estimate(run: _Run, most: int, steps: int) -> Gaussians:
     """Place about as many splats as the goal takes, where some steps told that they belong."""
-    assert run.start.rearrange is not None
+    assert run.start.redistribute is not None
     placed, before, last = run.start.gaussians, run.best, None
     for _ in range(TRIES):
         trial = run.descend(placed, steps)
-        run.octave = _octave(last, trial, run.octave)
+        run.db_per_doubling = _db_per_doubling(last, trial, run.db_per_doubling)
         gain = TO_COME * max(0.0, before.missing - trial.missing)
-        count = min(most, round(AIM * _times(run, len(placed), trial.missing - gain, most)))
+        count = min(
+            most, round(AIM * _count_for_gain(run, len(placed), trial.missing - gain, most))
+        )
         # The first try stands where the image bends, not yet where error was left.
         close = last is not None and abs(count - len(placed)) <= CLOSE * len(placed)
-        placed = run.start.rearrange(trial.gaussians, count)
-        last, before = trial, run.judged(placed)
+        placed = run.start.redistribute(trial.gaussians, count)
+        last, before = trial, run.score(placed)
         if close or run.interrupted():
             break
     return placed
 
 
-def _fitted(run: _Run, placed: Gaussians, most: int, steps: int) -> _Trial:
+def _fit_estimate(run: _Run, placed: Gaussians, most: int, steps: int) -> _Trial:
     """Fit, and once more where the estimate was far off: to place is better than to mend."""
     trial = run.descend(placed, steps)
-    count = _times(run, len(placed), trial.missing, most)
+    count = _count_for_gain(run, len(placed), trial.missing, most)
     if run.interrupted() or abs(count - len(placed)) <= FAR * len(placed):
         return trial
-    assert run.start.rearrange is not None
-    return run.descend(run.start.rearrange(trial.gaussians, count), steps)
+    assert run.start.redistribute is not None
+    return run.descend(run.start.redistribute(trial.gaussians, count), steps)
 
 
-def _octave(last: _Trial | None, trial: _Trial, octave: float) -> float:
+def _db_per_doubling(last: _Trial | None, trial: _Trial, octave: float) -> float:
     """Decibels of twice as many splats, by two tries; as known where they are close."""
     if last is None:
         return octave
@@ -238,9 +241,9 @@ def _octave(last: _Trial | None, trial: _Trial, octave: float) -> float:
     return min(max((last.missing - trial.missing) / apart, SLOPES[0]), SLOPES[1])
 
 
-def _times(run: _Run, count: int, missing: float, most: int) -> int:
+def _count_for_gain(run: _Run, count: int, missing: float, most: int) -> int:
     """Splats that would gain so many decibels more."""
-    octaves = min(max(missing / run.octave, -math.log2(LEAP)), math.log2(LEAP))
+    octaves = min(max(missing / run.db_per_doubling, -math.log2(LEAP)), math.log2(LEAP))
     return min(most, max(1, round(count * 2**octaves)))
 
 
@@ -257,21 +260,27 @@ def _settle(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
             return
         missing = trial.missing - gain
         if trial.missing <= 0:
-            wanted = max(_times(run, count, missing, count), math.floor((1 - DROP) * count))
+            wanted = max(
+                _count_for_gain(run, count, missing, count), math.floor((1 - DROP) * count)
+            )
             if wanted == count or -missing < SURPLUS:
                 return
-            changed = pruned(trial.gaussians, target, wanted, weight, run.cutoff)
+            changed = prune(trial.gaussians, target, wanted, weight, run.cutoff)
         elif found.missing <= 0:
             # Between what failed and what was found lies the answer; steps alone may lead there.
-            wanted = max(count, _times(run, count, missing, (count + len(found.gaussians)) // 2))
-            changed = grown(trial.gaussians, target, wanted, weight, run.cutoff)
+            wanted = max(
+                count, _count_for_gain(run, count, missing, (count + len(found.gaussians)) // 2)
+            )
+            changed = densify(trial.gaussians, target, wanted, weight, run.cutoff)
         else:
-            wanted = max(_times(run, count, missing, most), math.ceil(least_growth * count))
-            changed = grown(trial.gaussians, target, min(wanted, most), weight, run.cutoff)
+            wanted = max(
+                _count_for_gain(run, count, missing, most), math.ceil(least_growth * count)
+            )
+            changed = densify(trial.gaussians, target, min(wanted, most), weight, run.cutoff)
             if len(changed) == count:  # no more are allowed, or no place takes from the error
                 return
             least_growth = 2 * least_growth - 1
         rounds += 1
-        expected = trial.missing + run.octave * math.log2(count / len(changed))
+        expected = trial.missing + run.db_per_doubling * math.log2(count / len(changed))
         trial = run.descend(changed, steps, GENTLE)
         gain = AGAIN * max(0.0, expected - trial.missing)

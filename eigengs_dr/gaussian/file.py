@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codec import egs as packed
-from ..image.color import MOST_CHANNELS, SPACES
+from ..image.color import MAX_CHANNELS, SPACES
 from ..storage import npz as archive
 
 FORMAT = "eigengs_dr.gaussians"
@@ -57,7 +57,7 @@ def read(path: Path, sections: int | None = None) -> tuple[Arrays, tuple[int, in
     Parameters and errors are those of `eigengs_dr.Gaussians.load`, what is read is as `write` takes
     it.
     """
-    if packed.is_packed(path):
+    if packed.is_egs(path):
         content = packed.read(path, sections)
         arrays, size, space = content.arrays(), content.size, content.space
     elif sections is not None:
@@ -88,8 +88,8 @@ def check(arrays: Arrays, size: tuple[int, ...], space: str) -> None:
     if mean.ndim != 2 or mean.shape[1] != 2 or len(mean) == 0:
         raise archive.BadValue(f"mean has shape {mean.shape}, expected (N, 2) with N >= 1")
     channels = color.shape[1] if color.ndim == 2 else 3
-    if not 1 <= channels <= MOST_CHANNELS:
-        raise archive.BadValue(f"color has {channels} channels, expected 1 to {MOST_CHANNELS}")
+    if not 1 <= channels <= MAX_CHANNELS:
+        raise archive.BadValue(f"color has {channels} channels, expected 1 to {MAX_CHANNELS}")
     for name, array, expected in (
         ("factor", factor, (len(mean), 3)),
         ("color", color, (len(mean), channels)),

@@ -18,7 +18,7 @@ from ..backend.selection import select
 from ..storage.npz import BadValue
 from . import file as setfile
 
-NARROWEST = 0.25
+MIN_DEVIATION = 0.25
 """Smallest standard deviation along an axis of the factor, in pixels: what is narrower falls
 between pixel centres, and its gradient with it."""
 
@@ -186,12 +186,13 @@ class Gaussians:
     def bounded(self) -> Gaussians:
         """Return the set with every parameter inside its bounds, whatever a step did to it.
 
-        Means stay in the image, a and c between 1 / (twice the longer side) and 1 / `NARROWEST`, b
-        within +-1 / `NARROWEST`: the inverse covariance then has ``det = (a c)^2 > 0``. Values that
-        are not finite are replaced: a mean by the middle, a factor by the bound, a colour by 0.
+        Means stay in the image, a and c between 1 / (twice the longer side) and 1 /
+        `MIN_DEVIATION`, b within +-1 / `MIN_DEVIATION`: the inverse covariance then has ``det = (a
+        c)^2 > 0``. Values that are not finite are replaced: a mean by the middle, a factor by the
+        bound, a colour by 0.
         """
         types = types_of(self.mean)
-        low, high = 1 / (2 * max(self.width, self.height)), 1 / NARROWEST
+        low, high = 1 / (2 * max(self.width, self.height)), 1 / MIN_DEVIATION
 
         def inside(x: Any, low: float, high: float, otherwise: float) -> Any:
             return dr.select(dr.isfinite(x), dr.clip(x, low, high), otherwise)

@@ -13,7 +13,7 @@ SPACES = ("ycbcr", "rgb", "linear", "data")
 and ``"data"`` is anything else (roughness, normals, ...), with any number of channels.
 """
 
-MOST_CHANNELS = 64
+MAX_CHANNELS = 64
 """A program holds the sums of all channels of a tile in registers: it must end somewhere."""
 
 RGB_TO_YCBCR: NDArray[np.float64] = (
@@ -61,7 +61,7 @@ def rgb_to_ycbcr(image: NDArray[Any]) -> NDArray[Any]:
     >>> rgb_to_ycbcr(np.ones(3)).round(4)
     array([0.9216, 0.502 , 0.502 ])
     """
-    image = _checked(image)
+    image = _check_rgb(image)
     return image @ RGB_TO_YCBCR.T.astype(image.dtype) + YCBCR_OFFSET.astype(image.dtype)
 
 
@@ -83,7 +83,7 @@ def ycbcr_to_rgb(image: NDArray[Any]) -> NDArray[Any]:
     ValueError
         If the last axis is not 3 or the dtype is not float32 or float64.
     """
-    image = _checked(image)
+    image = _check_rgb(image)
     return (image - YCBCR_OFFSET.astype(image.dtype)) @ YCBCR_TO_RGB.T.astype(image.dtype)
 
 
@@ -198,7 +198,7 @@ def _functions(array: Any) -> tuple[Any, Any, Any]:
     return np.where, np.maximum, np.power
 
 
-def _checked(image: NDArray[Any]) -> NDArray[Any]:
+def _check_rgb(image: NDArray[Any]) -> NDArray[Any]:
     """Refuse what is not a float image of three channels: bytes would be taken for [0, 1]."""
     image = np.asarray(image)
     if image.shape[-1:] != (3,):

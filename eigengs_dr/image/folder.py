@@ -18,28 +18,28 @@ from numpy.typing import NDArray
 
 from .color import RGB_TO_YCBCR, YCBCR_OFFSET
 from .io import SAVE_OPTIONS, ImageError, check_image, load_image
-from .resize import cropped
+from .resize import center_crop
 
-SPACES = ("ycbcr", "rgb")
+BASIS_SPACES = ("ycbcr", "rgb")
 """Colour spaces that images can be read in."""
 
-THREADS = min(8, os.cpu_count() or 1)
+DECODE_THREADS = min(8, os.cpu_count() or 1)
 """Files decoded at the same time: Pillow and NumPy release the interpreter while they work."""
 
-AHEAD = 4 * THREADS
+MAX_WAITING = 4 * DECODE_THREADS
 """Images that may wait in memory until they are their turn."""
 
-NAMED = 3
+MAX_NAMED = 3
 """Skipped files that are named; the others are only counted."""
 
 Source = str | os.PathLike[str] | NDArray[Any] | Iterable[str | os.PathLike[str] | NDArray[Any]]
 """A folder, an array of images, or any iterable of files or such arrays."""
 
-Progress = Callable[[int, int | None, dict[str, Any]], None]
+ReadProgress = Callable[[int, int | None, dict[str, Any]], None]
 """``progress(done, total, row)``; the total is None where it is not known."""
 
 
-class Prepared(NamedTuple):
+class PreparedImage(NamedTuple):
     """One image of a stream.
 
     Attributes
@@ -94,8 +94,12 @@ def image_files(folder: str | Path) -> list[Path]:
     return files
 
 
-def batches(
-    source: Source, size: tuple[int, int], space: str, length: int, progress: Progress | None = None
+def read_blocks(
+    source: Source,
+    size: tuple[int, int],
+    space: str,
+    length: int,
+    progress: ReadProgress | None = None,
 ) -> Generator[NDArray[np.float32], None, None]:
     """Read images in blocks, in the order of the source.
 
@@ -137,9 +141,9 @@ def batches(
         At the end, in a line each: how many images were skipped, the first of them by name; how
         many were of another size.
     """
-    size = checked_size(size)
-    if space not in SPACES:
-        raise ValueError(f"colour space {space!r} is unknown; use one of {', '.join(SPACES)}")
+    size = check_size(size)
+    if space not in BASIS_SPACES:
+        raise ValueError(f"colour space {space!r} is unknown; use one of {', '.join(BASIS_SPACES)}")
     if length < 1:
         raise ValueError(f"length is {length}; a block needs at least 1 image")
     if isinstance(source, str | os.PathLike):
@@ -149,10 +153,10 @@ def batches(
     total = None
     if isinstance(source, Sequence):
         total = sum(1 if _is_file(item) else len(_images(item)) for item in source)
-    return _blocks(_prepared(source, size, space), size, length, total, progress)
+    return _blocks(_prepare_images(source, size, space), size, length, total, progress)
 
 
-def checked_size(size: Any) -> tuple[int, int]:
+def check_size(size: Any) -> tuple[int, int]:
     """Return a width and a height as integers.
 
     Parameters
@@ -204,11 +208,11 @@ def to_planes(image: NDArray[np.float32], space: str) -> NDArray[np.float32]:
 
 
 def _blocks(
-    images: Generator[Prepared, None, None],
+    images: Generator[PreparedImage, None, None],
     size: tuple[int, int],
     length: int,
     total: int | None,
-    progress: Progress | None,
+    progress: ReadProgress | None,
 ) -> Generator[NDArray[np.float32], None, None]:
     """Gather images into blocks, and say at the end what was wrong with some."""
     pixels = size[0] * size[1]
@@ -237,7 +241,7 @@ def _blocks(
     if len(problems) == done:
         raise ImageError(f"none of {done} images can be read, as {problems[0]}; check the files")
     if problems:
-        named = ", ".join(problems[:NAMED]) + (", ..." if len(problems) > NAMED else "")
+        named = ", ".join(problems[:MAX_NAMED]) + (", ..." if len(problems) > MAX_NAMED else "")
         warnings.warn(f"{len(problems)} of {done} images were skipped: {named}", stacklevel=2)
     if fitted:
         warnings.warn(
@@ -246,17 +250,17 @@ def _blocks(
         )
 
 
-def _prepared(
+def _prepare_images(
     source: Iterable[Any], size: tuple[int, int], space: str
-) -> Generator[Prepared, None, None]:
+) -> Generator[PreparedImage, None, None]:
     """Prepare images in parallel; they come in the order of the source."""
-    pool = ThreadPoolExecutor(THREADS, thread_name_prefix="decode")
-    waiting: deque[Future[Prepared]] = deque()
+    pool = ThreadPoolExecutor(DECODE_THREADS, thread_name_prefix="decode")
+    waiting: deque[Future[PreparedImage]] = deque()
     try:
         for place, item in enumerate(_singles(source)):
             waiting.append(pool.submit(_prepare, item, place, size, space))
             # An array is done with at once: its owner may overwrite it.
-            while len(waiting) > (AHEAD if isinstance(item, Path) else 0):
+            while len(waiting) > (MAX_WAITING if isinstance(item, Path) else 0):
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
@@ -273,7 +277,7 @@ def _singles(source: Iterable[Any]) -> Iterator[Any]:
             yield from _images(item)
 
 
-def _prepare(item: Any, place: int, size: tuple[int, int], space: str) -> Prepared:
+def _prepare(item: Any, place: int, size: tuple[int, int], space: str) -> PreparedImage:
     """Read, crop and convert one image."""
     try:
         image = load_image(item) if isinstance(item, Path) else check_image(item)
@@ -282,12 +286,12 @@ def _prepare(item: Any, place: int, size: tuple[int, int], space: str) -> Prepar
             raise ImageError(f"image {place} of the source{str(error)[len('image') :]}") from None
         # "folder/a.jpg: the file is empty (0 bytes); copy it again" is more than a list can hold.
         reason = str(error).removeprefix(f"{item}: ").split("; ")[0]
-        return Prepared(None, False, f"{item.name} ({reason})")
+        return PreparedImage(None, False, f"{item.name} ({reason})")
     width, height = size
     fitted = image.shape[:2] != (height, width)
     if fitted:
-        image = cropped(image, width, height)
-    return Prepared(to_planes(image, space), fitted)
+        image = center_crop(image, width, height)
+    return PreparedImage(to_planes(image, space), fitted)
 
 
 def _is_file(item: Any) -> bool:

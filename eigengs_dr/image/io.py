@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..storage.atomic import replacing
+from ..storage.atomic import atomic_write
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -25,7 +25,7 @@ SAVE_OPTIONS: dict[str, dict[str, Any]] = {
 """Suffixes that are written and looked for in folders, with what Pillow is told when writing."""
 
 
-LOWEST, HIGHEST = -0.5, 1.5
+MIN_PIXEL, MAX_PIXEL = -0.5, 1.5
 """Range of accepted float pixels: room for what resampling overshoots, none for 0..255."""
 
 
@@ -95,7 +95,7 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
         warnings.warn(f"{path}: transparent pixels are shown over white", stacklevel=2)
     if frames > 1:
         warnings.warn(f"{path}: holds {frames} frames, the first is used", stacklevel=2)
-    return _in_range(_rgb(pixels, str(path), keep_grey), str(path))
+    return _check_range(_rgb(pixels, str(path), keep_grey), str(path))
 
 
 def check_image(image: ArrayLike, keep_grey: bool = False) -> NDArray[np.float32]:
@@ -125,7 +125,7 @@ def check_image(image: ArrayLike, keep_grey: bool = False) -> NDArray[np.float32
     array([[0. , 0.2],
            [0.4, 1. ]], dtype=float32)
     """
-    return _in_range(_rgb(image, "image", keep_grey), "image")
+    return _check_range(_rgb(image, "image", keep_grey), "image")
 
 
 def save_image(path: str | Path, image: ArrayLike) -> None:
@@ -156,7 +156,7 @@ def save_image(path: str | Path, image: ArrayLike) -> None:
     pixels = to_8bit(_rgb(image, "image", keep_grey=True)).astype(np.uint8)
     pixels = pixels[..., 0] if pixels.shape[2] == 1 else pixels
     try:
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             Image.fromarray(pixels).save(temporary, **SAVE_OPTIONS[suffix])
     except (OSError, ValueError) as error:
         message = str(error)
@@ -228,10 +228,10 @@ def _rgb(image: ArrayLike, name: str, keep_grey: bool = False) -> NDArray[np.flo
     return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], channels)))
 
 
-def _in_range(pixels: NDArray[np.float32], name: str) -> NDArray[np.float32]:
+def _check_range(pixels: NDArray[np.float32], name: str) -> NDArray[np.float32]:
     """Refuse pixels that cannot be meant to lie in [0, 1]."""
     low, high = float(pixels.min()), float(pixels.max())
-    if low < LOWEST or high > HIGHEST:
+    if low < MIN_PIXEL or high > MAX_PIXEL:
         hint = "divide by 255" if 2 < high <= 255 and low >= 0 else "scale it"
         raise ImageError(f"{name}: pixels run from {low:g} to {high:g}, not 0 to 1; {hint} first")
     return pixels

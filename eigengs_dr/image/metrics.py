@@ -59,15 +59,15 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
         error = a - b
     else:
         raise ValueError(f"space {space!r} is unknown; use 'rgb', 'ycbcr' or 'data'")
-    return decibels(float(np.mean(np.square(error))))
+    return psnr_from_mse(float(np.mean(np.square(error))))
 
 
-def unclamped(color: str) -> str:
+def float_space(color: str) -> str:
     """Space of the PSNR that is called psnr_ycbcr: data has no YCbCr and is compared as it is."""
     return "data" if color == "data" else "ycbcr"
 
 
-def decibels(mse: float) -> float:
+def psnr_from_mse(mse: float) -> float:
     """Return ``10 log10(1 / mse)``, the PSNR of a mean squared error whose peak is 1; inf for 0."""
     return math.inf if mse == 0 else -10 * math.log10(mse)
 

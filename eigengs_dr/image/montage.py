@@ -17,7 +17,7 @@ SIZE = 10
 Picture = NDArray[Any]
 
 
-def line(text: str, width: int, size: int = SIZE) -> Picture:
+def text_line(text: str, width: int, size: int = SIZE) -> Picture:
     """Write a line of text, black on white.
 
     Parameters
@@ -42,7 +42,7 @@ def line(text: str, width: int, size: int = SIZE) -> Picture:
     return np.asarray(picture) / 255
 
 
-def joined(pictures: Sequence[Picture], axis: int, gap: int = GAP) -> Picture:
+def join_pictures(pictures: Sequence[Picture], axis: int, gap: int = GAP) -> Picture:
     """Put pictures below each other (axis 0) or side by side (axis 1), on white.
 
     Parameters

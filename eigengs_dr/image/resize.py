@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def resampled(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+def resample(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
     """Bring an image to another size, whatever its aspect ratio; shrinking filters what aliases.
 
     Parameters
@@ -30,10 +30,10 @@ def resampled(image: NDArray[np.float32], width: int, height: int) -> NDArray[np
     return _resized(image, width, height, (0, 0, image.shape[1], image.shape[0]))
 
 
-def cropped(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+def center_crop(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
     """Bring an image to another size without distortion: its largest centred part of that shape.
 
-    Parameters and results as for `resampled`. The part may begin inside a pixel, so that the centre
+    Parameters and results as for `resample`. The part may begin inside a pixel, so that the centre
     of the image stays the centre exactly, and filters see what lies around it.
     """
     rows, columns = image.shape[:2]

@@ -14,10 +14,10 @@ import drjit as dr
 
 from ..backend.arrays import types_of
 
-UNIT = math.sqrt(0.5 / math.log(2))
+EXP2_SCALE = math.sqrt(0.5 / math.log(2))
 """``exp(-q / 2) = 2^-(UNIT^2 q)``: kernels take factors in these units and save a product."""
 
-SHAPE = 5
+NUM_SHAPE_PARAMS = 5
 """Parameters of a splat before its colour: mean x, mean y, a, b, c."""
 
 
@@ -60,7 +60,7 @@ def falloff(q: Any, limit: float) -> Any:
 
 
 def weights(shape: list, x: Any, y: Any, tile: tuple[int, int], limit: float) -> list:
-    """Evaluate one splat at a block of pixels: ``2^-|F (x - mu)|^2``, F in units of `UNIT`.
+    """Evaluate one splat at a block of pixels: ``2^-|F (x - mu)|^2``, F in units of `EXP2_SCALE`.
 
     Everything that evaluates a Gaussian goes through here: the renderer, its derivatives both ways,
     the colour solve and the textures (with a block of one point).
@@ -68,7 +68,7 @@ def weights(shape: list, x: Any, y: Any, tile: tuple[int, int], limit: float) ->
     Parameters
     ----------
     shape : list of 5 Float
-        Mean x, mean y, a, b, c (see `UNIT`).
+        Mean x, mean y, a, b, c (see `EXP2_SCALE`).
     x, y : Float
         First point of the block.
     tile : (int, int)
@@ -98,7 +98,7 @@ def _rows(shape: list, x: Any, y: Any, tile: tuple[int, int]) -> list[tuple[list
     return rows
 
 
-def weights_pullback(
+def weights_vjp(
     shape: list,
     x: Any,
     y: Any,
@@ -165,7 +165,7 @@ def widen(shape: list, footprint: list) -> tuple[list, Any]:
     shape : list of 5 Float
         As in `weights`.
     footprint : list of 3 Float
-        xx, xy, yy of ``Sigma_f`` over `UNIT` squared.
+        xx, xy, yy of ``Sigma_f`` over `EXP2_SCALE` squared.
 
     Returns
     -------

@@ -13,18 +13,16 @@ from typing import Any
 import drjit as dr
 
 from ..backend.arrays import ArrayTypes, types_of
-from .evaluate import SHAPE, weights, weights_pullback
-from .layout import gather_run, list_entry, unpack
-from .tiles import Grid, TileLists, walk
+from .evaluate import NUM_SHAPE_PARAMS, weights, weights_vjp
+from .layout import gather_index, gather_run, unpack_parameters
+from .tiles import Grid, TileLists, for_each_tile
 
 # ---------------------------------------------------------------------------------------------
 #  Sum over splats, one lane a tile
 # ---------------------------------------------------------------------------------------------
 
 
-def accumulate(
-    packed: Any, start: list, lists: TileLists, limit: float, tangent: Any = None
-) -> Any:
+def forward(packed: Any, start: list, lists: TileLists, limit: float, tangent: Any = None) -> Any:
     """Sum the splats of every tile: the image, or its derivative along `tangent`.
 
     ``I_pc = start_c + sum_n w_n(p) c_nc``. Cost: one gather of the splat's parameters and
@@ -33,7 +31,7 @@ def accumulate(
     Parameters
     ----------
     packed : Float
-        `SHAPE` + channels parameters of every splat, from `pack`.
+        `NUM_SHAPE_PARAMS` + channels parameters of every splat, from `pack`.
     start : list of Float
         What each channel starts from: the background.
     lists : TileLists
@@ -49,28 +47,28 @@ def accumulate(
     """
     types = types_of(packed)
     grid, channels = lists.grid, len(start)
-    number = SHAPE + channels
+    number = NUM_SHAPE_PARAMS + channels
     x = types.Float(lists.order % grid.nx * grid.tile[0]) + 0.5
     y = types.Float(lists.order // grid.nx * grid.tile[1]) + 0.5
 
     def contributions(p: list) -> list:
-        spread = weights(p[:SHAPE], x, y, grid.tile, limit)
-        return [(w, c) for w in spread for c in p[SHAPE:]]
+        spread = weights(p[:NUM_SHAPE_PARAMS], x, y, grid.tile, limit)
+        return [(w, c) for w in spread for c in p[NUM_SHAPE_PARAMS:]]
 
     def add(i: Any, sums: list) -> tuple:
         active = i < lists.end
-        n = list_entry(types, lists.splat, i, active)
-        p = unpack(packed, n, number, active)
+        n = gather_index(types, lists.splat, i, active)
+        p = unpack_parameters(packed, n, number, active)
         sums = [dr.fma(w, c, s) for (w, c), s in zip(contributions(p), sums, strict=True)]
         return i + 1, sums
 
     def add_tangent(i: Any, sums: list) -> tuple:
         active = i < lists.end
-        n = list_entry(types, lists.splat, i, active)
-        p = unpack(packed, n, number, active)
+        n = gather_index(types, lists.splat, i, active)
+        p = unpack_parameters(packed, n, number, active)
         with dr.resume_grad():
             dr.enable_grad(p)
-            dr.set_grad(p, unpack(tangent, n, number, active))
+            dr.set_grad(p, unpack_parameters(tangent, n, number, active))
             out = [w * c for w, c in contributions(p)]
             dr.forward_to(out)
             change = dr.grad(out)
@@ -104,12 +102,12 @@ def adjoint(
     """Gradient of ``<delta, accumulate(packed)>`` with respect to the parameters of every splat.
 
     A lane owns a splat, walks the tiles inside its ellipse, gathers delta there and sums in
-    registers: no atomics, one result on every run. Derivatives of weights: `weights_pullback`.
+    registers: no atomics, one result on every run. Derivatives of weights: `weights_vjp`.
 
     Parameters
     ----------
     packed : Float
-        As in `accumulate`.
+        As in `forward`.
     delta : Float
         Derivative of a loss with respect to the image, in tile layout.
     channels : int
@@ -128,7 +126,7 @@ def adjoint(
     types = types_of(packed)
     grid = lists.grid
     limit = radius * radius
-    splat = unpack(packed, lists.splat_order, SHAPE + channels)
+    splat = unpack_parameters(packed, lists.splat_order, NUM_SHAPE_PARAMS + channels)
     length = grid.pixels * channels
 
     def pull_back(tile: Any, column: Any, row: Any, active: Any, sums: list) -> list:
@@ -141,19 +139,19 @@ def adjoint(
             g = type(w)(0)
             for c in range(channels):
                 color[c] = dr.fma(w, d[k * channels + c], color[c])
-                g = dr.fma(splat[SHAPE + c], d[k * channels + c], g)
+                g = dr.fma(splat[NUM_SHAPE_PARAMS + c], d[k * channels + c], g)
             return g
 
         if color_only:
-            for k, w in enumerate(weights(splat[:SHAPE], x, y, grid.tile, limit)):
+            for k, w in enumerate(weights(splat[:NUM_SHAPE_PARAMS], x, y, grid.tile, limit)):
                 pull(k, w)
             return color
-        gradient = weights_pullback(splat[:SHAPE], x, y, grid.tile, limit, pull)
+        gradient = weights_vjp(splat[:NUM_SHAPE_PARAMS], x, y, grid.tile, limit, pull)
         return [s + g for s, g in zip(sums, gradient, strict=False)] + color
 
-    number = channels if color_only else SHAPE + channels
-    sums = walk(
-        splat[:SHAPE],
+    number = channels if color_only else NUM_SHAPE_PARAMS + channels
+    sums = for_each_tile(
+        splat[:NUM_SHAPE_PARAMS],
         radius,
         grid,
         pull_back,
@@ -169,7 +167,7 @@ def _restore_order(types: ArrayTypes, sums: list, order: Any) -> list:
     stride = -(-number // 4) * 4
     packed = dr.empty(types.Float, stride * count)
     dr.scatter(packed, types.FloatX([*sums, *[types.Float(0)] * (stride - number)]), order)
-    return unpack(packed, dr.arange(types.UInt, count), number)
+    return unpack_parameters(packed, dr.arange(types.UInt, count), number)
 
 
 def channel_sums(image: Any, channels: int, grid: Grid) -> list:

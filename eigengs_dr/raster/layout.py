@@ -9,7 +9,7 @@ import drjit as dr
 from ..backend.arrays import ArrayTypes, types_of
 
 
-def pack(values: list) -> Any:
+def pack_parameters(values: list) -> Any:
     """Store the parameters of N splats one splat after another, padded to a multiple of 4 floats.
 
     Gathers of 4 neighbours are 8 times as fast as 4 gathers on the CPU. Arrays that wrap NumPy's
@@ -30,12 +30,12 @@ def gather_run(types: ArrayTypes, source: Any, index: Any, length: int, active: 
     return list(dr.gather(types.FloatX, source, index, active, shape=shape))
 
 
-def unpack(packed: Any, index: Any, number: int, active: Any = True) -> list:
-    """Gather the first `number` parameters of the splats `index` from the array `pack` made."""
+def unpack_parameters(packed: Any, index: Any, number: int, active: Any = True) -> list:
+    """Gather the first `number` parameters of the splats `index`; undoes `pack_parameters`."""
     return gather_run(types_of(packed), packed, index, -(-number // 4) * 4, active)[:number]
 
 
-def list_entry(types: ArrayTypes, splat: Any, i: Any, active: Any) -> Any:
+def gather_index(types: ArrayTypes, splat: Any, i: Any, active: Any) -> Any:
     """``splat[i]`` through a gather of a pair, 8 times as fast as a single one on the CPU."""
     pair = dr.gather(types.UInt2, splat, i >> 1, active)
     return dr.select((i & 1) == 0, pair[0], pair[1])

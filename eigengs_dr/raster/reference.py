@@ -8,7 +8,7 @@ import drjit as dr
 import numpy as np
 
 from ..backend.arrays import types_of
-from .evaluate import SHAPE, UNIT, weights
+from .evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, weights
 from .tiles import TileLists
 
 
@@ -36,14 +36,18 @@ def render_plain(values: list, background: list, lists: TileLists, cutoff: float
     x, y = types.Float(column) + 0.5, types.Float(row) + 0.5
     slot = _slots(lists, types.UInt, column // grid.tile[0] + row // grid.tile[1] * grid.nx)
     begin, end = dr.gather(types.UInt, lists.begin, slot), dr.gather(types.UInt, lists.end, slot)
-    scaled = [*values[:2], *[v * UNIT for v in values[2:SHAPE]], *values[SHAPE:]]
+    scaled = [
+        *values[:2],
+        *[v * EXP2_SCALE for v in values[2:NUM_SHAPE_PARAMS]],
+        *values[NUM_SHAPE_PARAMS:],
+    ]
 
     def add(i: Any, sums: list) -> tuple:
         active = i < end
         n = dr.gather(types.UInt, lists.splat, i, active)
         p = [dr.gather(types.Float, v, n, active) for v in scaled]
-        (w,) = weights(p[:SHAPE], x, y, (1, 1), (UNIT * cutoff) ** 2)
-        return i + 1, [dr.fma(w, c, s) for c, s in zip(p[SHAPE:], sums, strict=True)]
+        (w,) = weights(p[:NUM_SHAPE_PARAMS], x, y, (1, 1), (EXP2_SCALE * cutoff) ** 2)
+        return i + 1, [dr.fma(w, c, s) for c, s in zip(p[NUM_SHAPE_PARAMS:], sums, strict=True)]
 
     _, sums = dr.while_loop(
         (types.UInt(begin), [types.Float(0) for _ in background]),

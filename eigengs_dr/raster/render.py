@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from ..backend.arrays import ArrayTypes, types_of, upload
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode, to_coded
-from .evaluate import UNIT
-from .kernels import accumulate, adjoint, channel_sums
-from .layout import gather_run, pack
+from .evaluate import EXP2_SCALE
+from .kernels import adjoint, channel_sums, forward
+from .layout import gather_run, pack_parameters
 from .tiles import Grid, TileLists, build_lists
 
 CUTOFF = 3.0
 """Default cutoff in standard deviations. What is left out of a splat is at any point below
 ``exp(-cutoff^2 / 2)`` of its amplitude: 1.1 % at 3, 0.034 % at 4, 3.7e-6 at 5."""
 
-WIDEST_CUTOFF = 12.0
+MAX_CUTOFF = 12.0
 """``exp(-72)`` is below the precision of any format here; the fast exponential needs a bound."""
 
 
@@ -63,8 +63,8 @@ def render(
     The order of summation is a function of the input: renderings on one machine and backend are
     bit-equal. A splat whose mean or factor is not finite is not drawn; a colour that is not finite
     spoils the tiles that its splat touches. Building tile lists reads sizes back, which
-    `drjit.freeze` does not allow: freeze a function that takes `lists_for`'s result and calls
-    `splat`, as `eigengs_dr.fitting.optimizers.descent` does.
+    `drjit.freeze` does not allow: freeze a function that takes `bin_gaussians`'s result and calls
+    `rasterize`, as `eigengs_dr.fitting.optimizers.descent` does.
 
     Examples
     --------
@@ -76,9 +76,9 @@ def render(
     width, height = _size(gaussians, width, height)
     scaled = gaussians.scaled(width, height)
     cutoff = float(cutoff)  # a NumPy scalar would promote everything to float64
-    values, background = splat_values(scaled)
-    lists = lists_for(scaled, cutoff)
-    return to_tensor(splat(values, background, lists, cutoff), lists.grid, len(background))
+    values, background = kernel_parameters(scaled)
+    lists = bin_gaussians(scaled, cutoff)
+    return to_tensor(rasterize(values, background, lists, cutoff), lists.grid, len(background))
 
 
 def picture_of(
@@ -114,8 +114,8 @@ def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[
     return index(width), index(height)
 
 
-def splat_values(gaussians: Gaussians) -> tuple[list, list]:
-    """Parameters as the kernels take them: [mean x, mean y, a, b, c in `UNIT`, RGB...], background.
+def kernel_parameters(gaussians: Gaussians) -> tuple[list, list]:
+    """Return the parameters as the kernels take them, and the background.
 
     Colours are decoded here: the conversion is linear, so that N splats are converted and not
     H W pixels.
@@ -125,10 +125,10 @@ def splat_values(gaussians: Gaussians) -> tuple[list, list]:
         c - k for c, k in zip(decode(gaussians.space, list(gaussians.color)), black, strict=True)
     ]
     background = decode(gaussians.space, list(gaussians.background))
-    return [*gaussians.mean, *[f * UNIT for f in gaussians.factor], *color], background
+    return [*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor], *color], background
 
 
-def lists_for(gaussians: Gaussians, cutoff: float = CUTOFF, pad: float = 0.0) -> TileLists:
+def bin_gaussians(gaussians: Gaussians, cutoff: float = CUTOFF, pad: float = 0.0) -> TileLists:
     """List the splats of every tile of the image at native size; see `eigengs_dr.raster.tiles`.
 
     Raises
@@ -136,22 +136,22 @@ def lists_for(gaussians: Gaussians, cutoff: float = CUTOFF, pad: float = 0.0) ->
     ValueError
         If the cutoff is not in (0, 12].
     """
-    if not 0 < cutoff <= WIDEST_CUTOFF:
-        raise ValueError(f"cutoff is {cutoff}; it must be above 0 and at most {WIDEST_CUTOFF:g}")
+    if not 0 < cutoff <= MAX_CUTOFF:
+        raise ValueError(f"cutoff is {cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}")
     types = types_of(gaussians.mean)
-    shape = [*gaussians.mean, *[f * UNIT for f in gaussians.factor]]
+    shape = [*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor]]
     n = len(gaussians)
     shape = [dr.detach(v) + dr.zeros(types.Float, n) for v in shape]
-    return build_lists(shape, UNIT * cutoff, Grid(gaussians.width, gaussians.height), pad)
+    return build_lists(shape, EXP2_SCALE * cutoff, Grid(gaussians.width, gaussians.height), pad)
 
 
-def splat(values: list, background: list, lists: TileLists, cutoff: float = CUTOFF) -> Any:
+def rasterize(values: list, background: list, lists: TileLists, cutoff: float = CUTOFF) -> Any:
     """Sum splats to an image in tile layout; the differentiable operation behind `render`.
 
     Parameters
     ----------
     values : list of Float, shape (N,)
-        From `splat_values`.
+        From `kernel_parameters`.
     background : list of Float, shape (1,)
     lists : TileLists
         Of these splats, or of where they were a few small steps ago.
@@ -162,10 +162,10 @@ def splat(values: list, background: list, lists: TileLists, cutoff: float = CUTO
     Float, shape (tiles * pixels * channels,)
         See `eigengs_dr.raster.kernels` for the layout, `to_tensor` for an image.
     """
-    return dr.custom(_Splat, values, background, lists, UNIT * cutoff)
+    return dr.custom(_Rasterize, values, background, lists, EXP2_SCALE * cutoff)
 
 
-class _Splat(dr.CustomOp):
+class _Rasterize(dr.CustomOp):
     """``I = background + sum_n c_n w_n`` with the kernels' own derivatives.
 
     With ``w_n = 2^-q_n``, reverse mode gives every splat the sum over its pixels of ``dL/dI`` times
@@ -174,14 +174,14 @@ class _Splat(dr.CustomOp):
 
     def eval(self, values: list, background: list, lists: TileLists, radius: float) -> Any:
         self.lists, self.radius, self.channels = lists, radius, len(background)
-        self.packed = pack(values)
-        return accumulate(self.packed, background, lists, radius * radius)
+        self.packed = pack_parameters(values)
+        return forward(self.packed, background, lists, radius * radius)
 
     def forward(self) -> None:
-        tangent = pack(self.grad_in("values"))
+        tangent = pack_parameters(self.grad_in("values"))
         start = self.grad_in("background")
         self.set_grad_out(
-            accumulate(self.packed, start, self.lists, self.radius * self.radius, tangent)
+            forward(self.packed, start, self.lists, self.radius * self.radius, tangent)
         )
 
     def backward(self) -> None:

@@ -21,7 +21,7 @@ TILE = (4, 4)
 pixels in registers and visits 1.7 pixels for one inside the ellipse (8x8: 3.3)."""
 
 
-MOST_ENTRIES = 1 << 28
+MAX_LIST_ENTRIES = 1 << 28
 """Longest lists, all tiles together: sorting them takes 4 GiB."""
 
 
@@ -79,7 +79,9 @@ class TileLists:
     splat_order: Any
 
 
-def span(shape: list, radius: Any, grid: Grid, row: Any, pad: float = 0.0) -> tuple[Any, Any]:
+def tile_columns(
+    shape: list, radius: Any, grid: Grid, row: Any, pad: float = 0.0
+) -> tuple[Any, Any]:
     """Columns of tiles `[first, last)` that the ellipse of a splat touches in one row of tiles.
 
     The ellipse is ``(a dx + b dy)^2 + (c dy)^2 <= radius^2``. At height dy its right edge is
@@ -129,8 +131,8 @@ def span(shape: list, radius: Any, grid: Grid, row: Any, pad: float = 0.0) -> tu
     return dr.select(hit, Int(first), 0), dr.select(hit, Int(last), 0)
 
 
-def rows(shape: list, radius: Any, grid: Grid, pad: float = 0.0) -> tuple[Any, Any]:
-    """Rows of tiles `[first, last)` that the ellipse of a splat may touch; see `span`."""
+def tile_rows(shape: list, radius: Any, grid: Grid, pad: float = 0.0) -> tuple[Any, Any]:
+    """Rows of tiles `[first, last)` that the ellipse of a splat may touch; see `tile_columns`."""
     Int = types_of(shape[0]).Int
     my, c = shape[1], shape[4]
     height = grid.tile[1]
@@ -141,7 +143,7 @@ def rows(shape: list, radius: Any, grid: Grid, pad: float = 0.0) -> tuple[Any, A
     return dr.select(finite, Int(first), 0), dr.select(finite, Int(last), 0)
 
 
-def walk(
+def for_each_tile(
     shape: list,
     radius: float,
     grid: Grid,
@@ -159,9 +161,9 @@ def walk(
     Parameters
     ----------
     shape : list of 5 Float, shape (N,)
-        As in `span`.
+        As in `tile_columns`.
     radius, grid, pad
-        As in `span`.
+        As in `tile_columns`.
     visit : callable
         ``visit(tile, column, row, active, state) -> state``, tile being ``row * nx + column``.
     state : PyTree
@@ -174,15 +176,15 @@ def walk(
     PyTree
         The final `state`.
     """
-    row, stop = rows(shape, radius, grid, pad)
-    column, last = span(shape, radius, grid, row, pad)
+    row, stop = tile_rows(shape, radius, grid, pad)
+    column, last = tile_columns(shape, radius, grid, row, pad)
 
     def body(row: Any, column: Any, last: Any, state: Any) -> tuple:
         state = visit(row * grid.nx + column, column, row, column < last, state)
         column = column + 1
         done = column >= last
         row = dr.select(done, row + 1, row)
-        next_column, next_last = span(shape, radius, grid, row, pad)
+        next_column, next_last = tile_columns(shape, radius, grid, row, pad)
         column = dr.select(done, next_column, column)
         return row, column, dr.select(done, next_last, last), state
 
@@ -205,7 +207,7 @@ def build_lists(shape: list, radius: float, grid: Grid, pad: float = 0.0) -> Til
     Parameters
     ----------
     shape : list of 5 Float, shape (N,)
-        Mean x, mean y and the factor a, b, c, as in `span`.
+        Mean x, mean y and the factor a, b, c, as in `tile_columns`.
     radius : float
         Cutoff in the units of the factor.
     grid : Grid
@@ -215,11 +217,11 @@ def build_lists(shape: list, radius: float, grid: Grid, pad: float = 0.0) -> Til
     Raises
     ------
     ValueError
-        If the lists would have `MOST_ENTRIES` entries or more.
+        If the lists would have `MAX_LIST_ENTRIES` entries or more.
     """
     types = types_of(shape[0])
     count = dr.width(shape[0])
-    touched = walk(
+    touched = for_each_tile(
         shape,
         radius,
         grid,
@@ -230,9 +232,9 @@ def build_lists(shape: list, radius: float, grid: Grid, pad: float = 0.0) -> Til
     )
     dr.eval(touched)
     entries = int(dr.sum(dr.uint64_array_t(types.UInt)(touched))[0])
-    if entries >= MOST_ENTRIES:
+    if entries >= MAX_LIST_ENTRIES:
         raise ValueError(
-            f"{count} splats touch {entries} tiles in all, {MOST_ENTRIES} can be listed: "
+            f"{count} splats touch {entries} tiles in all, {MAX_LIST_ENTRIES} can be listed: "
             "use fewer or smaller splats, or a smaller image"
         )
     Key = types.UInt if grid.tiles * count < 2**32 else dr.uint64_array_t(types.UInt)
@@ -245,8 +247,8 @@ def build_lists(shape: list, radius: float, grid: Grid, pad: float = 0.0) -> Til
 
     if entries:
         slot = dr.prefix_sum(touched)
-        dr.eval(walk(shape, radius, grid, emit, slot, pad=pad, label="list tiles"), keys)
-        keys = _sorted(keys)
+        dr.eval(for_each_tile(shape, radius, grid, emit, slot, pad=pad, label="list tiles"), keys)
+        keys = _sort(keys)
     return _lists(types, grid, count, keys, entries, touched)
 
 
@@ -269,14 +271,14 @@ def _lists(
     dr.eval(starts, splat)
     begin = dr.gather(types.UInt, starts, dr.arange(types.UInt, grid.tiles))
     end = dr.gather(types.UInt, starts, dr.arange(types.UInt, grid.tiles) + 1)
-    order = _descending(end - begin)
+    order = _order_descending(end - begin)
     begin, end = dr.gather(types.UInt, begin, order), dr.gather(types.UInt, end, order)
-    lists = TileLists(grid, splat, begin, end, order, _descending(touched))
+    lists = TileLists(grid, splat, begin, end, order, _order_descending(touched))
     dr.eval(begin, end, order, lists.splat_order)
     return lists
 
 
-def _descending(length: Any) -> Any:
+def _order_descending(length: Any) -> Any:
     """Indices that sort lengths in descending order, ties by index."""
     UInt = type(length)
     count = dr.width(length)
@@ -284,11 +286,11 @@ def _descending(length: Any) -> Any:
     longest = int(dr.max(length)[0])
     Key = UInt if (longest + 1) * count < 2**32 else Key
     shorter = dr.opaque(UInt, longest) - length
-    keys = _sorted(Key(shorter) * count + Key(dr.arange(UInt, count)))
+    keys = _sort(Key(shorter) * count + Key(dr.arange(UInt, count)))
     return UInt(keys % count)
 
 
-def _sorted(keys: Any) -> Any:
+def _sort(keys: Any) -> Any:
     """Sort integers; NumPy's vectorised sort is 7 times as fast as `drjit.sort` on the CPU."""
     if dr.backend_v(keys) == dr.JitBackend.LLVM:
         return upload(type(keys), np.sort(keys.numpy()))

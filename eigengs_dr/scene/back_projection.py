@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from .visibility import Resolution
+from .visibility import Visibility
 
-RETURNS = 20
+ITERATIONS = 20
 """Steps in which a texture gets back what the pixels miss."""
 
 KNOWN = 0.3
@@ -30,7 +30,7 @@ KNOWN = 0.3
 Image = NDArray[np.float32]
 
 
-def filled(values: Image, seen: NDArray[np.bool_]) -> Image:
+def extrapolate(values: Image, seen: NDArray[np.bool_]) -> Image:
     """Continue an image smoothly to where it is not seen: there, nothing shall bend it.
 
     By means of the texels that are seen under Gaussians, narrow ones near to these, and far away
@@ -57,13 +57,13 @@ def filled(values: Image, seen: NDArray[np.bool_]) -> Image:
     return np.where(seen[..., None], values, result)
 
 
-def smoothest(whole: Image, found: Resolution, share: float) -> Image:
+def back_project(whole: Image, found: Visibility, share: float) -> Image:
     """Blur an image by a share of its footprints, then bring back what pixels see of it.
 
     Parameters
     ----------
     whole : ndarray of float32, shape (H, W, C)
-        In [0, 1], also where it is not seen; see `filled`.
+        In [0, 1], also where it is not seen; see `extrapolate`.
     found : Resolution
     share : float
         Standard deviation of B over that of the footprint.
@@ -75,11 +75,11 @@ def smoothest(whole: Image, found: Resolution, share: float) -> Image:
     """
     blur = _blur_by(np.where(found.seen, found.footprint, np.inf) * share)
     flat = whole.reshape(-1, whole.shape[2])
-    rows = found.lookups
+    rows = found.pixel_to_texel
     goal = [r @ flat for r in rows]
     weight = np.maximum(sum(np.asarray(r.sum(axis=0)) for r in rows), 1e-9)[:, None]
     target = blur(whole)
-    for _ in range(RETURNS):
+    for _ in range(ITERATIONS):
         missed = [g - r @ target.reshape(flat.shape) for g, r in zip(goal, rows, strict=True)]
         returned = sum(r.T @ m for m, r in zip(missed, rows, strict=True)) / weight
         target = (target + blur(returned.reshape(whole.shape).astype(np.float32))).clip(0, 1)

@@ -19,7 +19,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
 
 from ..fitting.initializers import dark_weight
 from ..fitting.optimizers.descent import descend
-from ..fitting.placement.adaptive import adaptive
+from ..fitting.placement.adaptive import place_adaptive
 from ..fitting.presets import PRESETS
 from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.gaussians import Gaussians
@@ -28,8 +28,8 @@ from ..image.io import check_image
 from ..image.metrics import psnr as psnr_of
 from ..plugins.cone import PIXEL
 from ..raster.render import CUTOFF, render
-from .back_projection import filled, smoothest
-from .visibility import Resolution, resolution
+from .back_projection import back_project, extrapolate
+from .visibility import Visibility, visibility
 
 COLORS = ("linear", "data")
 """What textures hold."""
@@ -78,7 +78,7 @@ class SceneFit(NamedTuple):
 
     gaussians: Gaussians
     psnr: tuple[float, ...]
-    resolution: Resolution
+    visibility: Visibility
     tried: list[tuple[int, float]]
 
 
@@ -114,7 +114,7 @@ def fit_for_scene(
     iterations : int, optional
         Steps of refinement for each number of Gaussians that is tried.
     wrap_mode : {"repeat", "mirror", "clamp"}, optional
-        See `eigengs_dr.scene.visibility.resolution`.
+        See `eigengs_dr.scene.visibility.visibility`.
 
     Returns
     -------
@@ -143,46 +143,46 @@ def fit_for_scene(
     pixels = check_image(image, keep_grey=color == "data").clip(0, 1)
     height, width = pixels.shape[:2]
     values = to_linear(pixels) if color == "linear" else pixels
-    found = resolution(scene, texture, width, height, wrap_mode)
+    found = visibility(scene, texture, width, height, wrap_mode)
     times = FINER if found.footprint.min() < ENOUGH * PIXEL else 1
     fine = found
     if times > 1:
         values = zoom(values, (times, times, 1), order=1, mode="nearest", grid_mode=True)
-        fine = resolution(scene, texture, times * width, times * height, wrap_mode)
-    values, fine, corner = _cropped(values, fine)
-    goal = [_shown(values, rows, color) for rows in fine.lookups]
+        fine = visibility(scene, texture, times * width, times * height, wrap_mode)
+    values, fine, corner = _crop_to_seen(values, fine)
+    goal = [_seen_by(values, rows, color) for rows in fine.pixel_to_texel]
 
     def seen(candidate: Image) -> tuple[float, ...]:
         space = "rgb" if color == "linear" else "data"
-        pictures = (_shown(candidate, rows, color) for rows in fine.lookups)
+        pictures = (_seen_by(candidate, rows, color) for rows in fine.pixel_to_texel)
         return tuple(psnr_of(a, b, space) for a, b in zip(pictures, goal, strict=True))
 
     target = _target(values, fine, lambda t: min(seen(t)) >= psnr + MARGIN)
     weight = _weights(fine, target, color)
 
     def attempt(count: int) -> tuple[Gaussians, tuple[float, ...]]:
-        gaussians = _fitted(target, weight, fine.seen, count, iterations, color)
+        gaussians = _fit(target, weight, fine.seen, count, iterations, color)
         return gaussians, seen(render(gaussians).numpy())
 
     most = min(most or int(found.seen.sum()), fine.seen.size)
     looks = np.minimum(PIXEL / found.footprint[found.seen], 1) ** 2  # pixels a texel, at most one
     start = max(1, int(looks.sum()) // PIXELS)
-    gaussians, reached, tried = _fewest(attempt, psnr, start, most)
-    placed = _moved(gaussians, corner, times * width, times * height).scaled(width, height)
+    gaussians, reached, tried = _search_count(attempt, psnr, start, most)
+    placed = _move(gaussians, corner, times * width, times * height).scaled(width, height)
     return SceneFit(placed, reached, found, tried)
 
 
-def _cropped(values: Image, found: Resolution) -> tuple[Image, Resolution, tuple[int, int]]:
+def _crop_to_seen(values: Image, found: Visibility) -> tuple[Image, Visibility, tuple[int, int]]:
     """Keep the rectangle of what is seen, and return its corner, column and row."""
     kept = [np.flatnonzero(found.seen.any(axis=axis)) for axis in (1, 0)]
     part = tuple(slice(k[0], k[-1] + 1) for k in kept)
     texels = np.arange(found.seen.size).reshape(found.seen.shape)[part].ravel()
-    lookups = [rows[:, texels] for rows in found.lookups]
-    cut = Resolution(found.footprint[part], lookups)
+    lookups = [rows[:, texels] for rows in found.pixel_to_texel]
+    cut = Visibility(found.footprint[part], lookups)
     return np.ascontiguousarray(values[part]), cut, (int(kept[1][0]), int(kept[0][0]))
 
 
-def _moved(gaussians: Gaussians, corner: tuple[int, int], width: int, height: int) -> Gaussians:
+def _move(gaussians: Gaussians, corner: tuple[int, int], width: int, height: int) -> Gaussians:
     """Put a set in its place in a larger image."""
     mean = gaussians.mean + type(gaussians.mean)(*corner)
     return replace(gaussians, mean=mean, width=width, height=height)
@@ -191,23 +191,23 @@ def _moved(gaussians: Gaussians, corner: tuple[int, int], width: int, height: in
 # --- What is fitted -------------------------------------------------------------------------------
 
 
-def _shown(texels: Image, rows: Any, color: str) -> NDArray[Any]:
+def _seen_by(texels: Image, rows: Any, color: str) -> NDArray[Any]:
     """What the pixels of a camera see of a texture, as a column of pixels, shape (n, 1, C)."""
     looks = rows @ texels.clip(0, 1).reshape(-1, texels.shape[2])
     return (to_coded(looks) if color == "linear" else looks)[:, None]
 
 
-def _target(values: Image, found: Resolution, is_close: Callable[[Image], bool]) -> Image:
+def _target(values: Image, found: Visibility, is_close: Callable[[Image], bool]) -> Image:
     """Find what to fit: the smoothest texture that is close enough, or else the image."""
-    whole = filled(values, found.seen)
+    whole = extrapolate(values, found.seen)
     for share in BLURS:
-        target = smoothest(whole, found, share / PIXEL)
+        target = back_project(whole, found, share / PIXEL)
         if is_close(target):
             return target
     return whole
 
 
-def _weights(found: Resolution, target: Image, color: str) -> Image:
+def _weights(found: Visibility, target: Image, color: str) -> Image:
     """What errors are multiplied by: the root of how much of the pixels a texel is, 0 unseen."""
     share = gaussian_filter(found.pixels, EVEN) * found.seen
     weight = np.sqrt(share / share.max())[..., None]
@@ -218,7 +218,7 @@ def _weights(found: Resolution, target: Image, color: str) -> Image:
 # --- The number ----------------------------------------------------------------------------------
 
 
-def _fitted(
+def _fit(
     target: Image,
     weight: Image,
     seen: NDArray[np.bool_],
@@ -229,8 +229,8 @@ def _fitted(
     """Fit so many Gaussians, less those that touch nothing that is seen."""
     height, width, channels = target.shape
     picture = to_coded(target) if color == "linear" else target
-    mean, factor = adaptive(picture, count, np.random.default_rng(0))
-    kept = _touching(mean, factor, seen)
+    mean, factor = place_adaptive(picture, count, np.random.default_rng(0))
+    kept = _reaches_seen(mean, factor, seen)
     start = Gaussians.from_arrays(
         mean[kept],
         factor[kept],
@@ -245,7 +245,7 @@ def _fitted(
     return last
 
 
-def _touching(
+def _reaches_seen(
     mean: NDArray[Any], factor: NDArray[Any], seen: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Tell which splats may reach a texel that is seen, by their longer axes; at least one."""
@@ -258,7 +258,7 @@ def _touching(
     return away <= np.maximum(CUTOFF / np.sqrt(least), away.min())
 
 
-def _fewest(
+def _search_count(
     attempt: Callable[[int], tuple[Gaussians, tuple[float, ...]]],
     bound: float,
     start: int,

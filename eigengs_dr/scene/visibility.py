@@ -27,16 +27,16 @@ from ..raster.lookup.points import fold
 SPACING = 0.5
 """Texels between two rays that are close enough: each texel is then met by some."""
 
-FEWEST_RAYS = 2
+MIN_RAYS = 2
 """Rays along a side of a pixel, at least: borders of the texture cross pixels."""
 
-MOST_RAYS = 1 << 22
+MAX_RAYS = 1 << 22
 """Rays of a camera; where these are too few, texels between hits take after the nearest one."""
 
 BATCH = 1 << 20
 """Rays that are traced at once."""
 
-REACH = 0.75
+PIXEL_REACH = 0.75
 """Distances of neighbouring rays over which a hit speaks for texels: half a diagonal, and some."""
 
 NEIGHBOURS = 1.5
@@ -48,7 +48,7 @@ WRAPS = ("repeat", "mirror", "clamp")
 Floats = NDArray[np.floating]
 
 
-class Resolution(NamedTuple):
+class Visibility(NamedTuple):
     """What cameras see of a texture.
 
     Attributes
@@ -58,14 +58,14 @@ class Resolution(NamedTuple):
         a texel most sharply; infinite where none does. A footprint that is longer than wide counts
         as if it were round and as small as it is narrow: no detail is taken for lost that is seen
         along some direction.
-    lookups : list of scipy.sparse.csr_array of float32, shape (pixels, H * W)
+    pixel_to_texel : list of scipy.sparse.csr_array of float32, shape (pixels, H * W)
         For each camera that sees the texture, of each pixel that does, the share of every texel in
         what it sees of the texture: rows add up to 1. ``lookups[k] @ texels`` is the texture in
         even light.
     """
 
     footprint: NDArray[np.float32]
-    lookups: list[Any]
+    pixel_to_texel: list[Any]
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -75,13 +75,13 @@ class Resolution(NamedTuple):
     @property
     def pixels(self) -> NDArray[np.float32]:
         """Share of each texel in what a camera sees, shape (H, W); mean of cameras, sum 1."""
-        shares = [np.asarray(rows.sum(axis=0)) / rows.shape[0] for rows in self.lookups]
+        shares = [np.asarray(rows.sum(axis=0)) / rows.shape[0] for rows in self.pixel_to_texel]
         return np.mean(shares, axis=0, dtype=np.float32).reshape(self.footprint.shape)
 
 
-def resolution(
+def visibility(
     scene: Any, texture: str, width: int, height: int, wrap_mode: str = "repeat"
-) -> Resolution:
+) -> Visibility:
     """Measure what the cameras of a scene resolve of a texture.
 
     Parameters
@@ -112,17 +112,17 @@ def resolution(
     footprint = np.full(height * width, np.inf, np.float32)
     lookups = []
     for sensor in scene.sensors():
-        hits = _looks(_View(scene, sensor, shapes, to_uv, wrap, width, height))
+        hits = _samples_of(_View(scene, sensor, shapes, to_uv, wrap, width, height))
         if hits is None:
             continue
-        np.minimum(footprint, _sharpest(hits, width, height), out=footprint)
+        np.minimum(footprint, _min_footprint(hits, width, height), out=footprint)
         lookups.append(_rows(hits, width, height))
     if not lookups:
         raise ValueError(
             f"no pixel of the scene's {len(scene.sensors())} cameras sees {texture!r}; check where "
             "they look, and what stands in front"
         )
-    return Resolution(footprint.reshape(height, width), lookups)
+    return Visibility(footprint.reshape(height, width), lookups)
 
 
 # --- The texture in its scene --------------------------------------------------------------------
@@ -191,33 +191,33 @@ class _Hits(NamedTuple):
     side: int
 
 
-def _looks(view: _View) -> _Hits | None:
+def _samples_of(view: _View) -> _Hits | None:
     """Send rays close enough to each other; None where a camera does not see the texture."""
     columns, rows = view.sensor.film().crop_size()
     every = np.arange(columns * rows, dtype=np.uint32)
-    hits = _traced(view, every, FEWEST_RAYS)
+    hits = _trace(view, every, MIN_RAYS)
     if not hits.pixel.size:
         return None
     pixels = np.unique(hits.pixel)
-    needed = math.ceil(min(float(hits.long.max()) / SPACING, MOST_RAYS))
-    side = min(needed, math.isqrt(MOST_RAYS // len(pixels)))
-    return _traced(view, pixels, side) if side > FEWEST_RAYS else hits
+    needed = math.ceil(min(float(hits.long.max()) / SPACING, MAX_RAYS))
+    side = min(needed, math.isqrt(MAX_RAYS // len(pixels)))
+    return _trace(view, pixels, side) if side > MIN_RAYS else hits
 
 
-def _traced(view: _View, pixels: NDArray[np.uint32], side: int) -> _Hits:
+def _trace(view: _View, pixels: NDArray[np.uint32], side: int) -> _Hits:
     """Send ``side * side`` rays through each of the pixels, and keep those that hit the texture."""
     step = max(1, BATCH // side**2)
     parts = []
     for first in range(0, len(pixels), step):
-        pixel, where = _places(view.sensor, pixels[first : first + step], side)
-        hit, *values = _traced_to(view, where)
+        pixel, where = _film_positions(view.sensor, pixels[first : first + step], side)
+        hit, *values = _trace_to(view, where)
         chosen = np.flatnonzero(hit.numpy())
         parts.append([array.numpy()[chosen] for array in (pixel, *values)])
     pixel, x, y, short, long = (np.concatenate(c) for c in zip(*parts, strict=True))
     return _Hits(pixel, x, y, short, long, side)
 
 
-def _places(sensor: Any, pixels: NDArray[np.uint32], side: int) -> tuple[Any, Any]:
+def _film_positions(sensor: Any, pixels: NDArray[np.uint32], side: int) -> tuple[Any, Any]:
     """Pixel of every ray, and its place on the film, in [0, 1]."""
     columns, rows = sensor.film().crop_size()
     ray = dr.arange(mi.UInt32, len(pixels) * side * side)
@@ -229,7 +229,7 @@ def _places(sensor: Any, pixels: NDArray[np.uint32], side: int) -> tuple[Any, An
     return pixel, mi.Point2f(x / columns, y / rows)
 
 
-def _traced_to(view: _View, where: Any) -> tuple:
+def _trace_to(view: _View, where: Any) -> tuple:
     """Trace rays from places on the film: which hit, where, and the half axes of their pixels."""
     with dr.suspend_grad():
         ray, _ = view.sensor.sample_ray_differential(0.0, 0.5, where, mi.Point2f(0.5))
@@ -266,14 +266,16 @@ def _on_texture(si: Any, view: _View) -> tuple:
 # --- Maps ----------------------------------------------------------------------------------------
 
 
-def _sharpest(hits: _Hits, width: int, height: int) -> NDArray[np.float32]:
+def _min_footprint(hits: _Hits, width: int, height: int) -> NDArray[np.float32]:
     """Smallest footprint at every texel, shape (H * W,); infinite where no hit is near."""
     column = hits.x.astype(int).clip(0, width - 1)
     texel = hits.y.astype(int).clip(0, height - 1) * width + column
     footprint = np.full(height * width, np.inf, np.float32)
     np.minimum.at(footprint, texel, (PIXEL * hits.short).astype(np.float32))
     reach = np.zeros(height * width, np.float32)
-    np.maximum.at(reach, texel, (REACH * hits.long / hits.side + NEIGHBOURS).astype(np.float32))
+    np.maximum.at(
+        reach, texel, (PIXEL_REACH * hits.long / hits.side + NEIGHBOURS).astype(np.float32)
+    )
     away, (row, column) = distance_transform_edt(
         np.isinf(footprint).reshape(height, width), return_indices=True
     )
@@ -282,7 +284,7 @@ def _sharpest(hits: _Hits, width: int, height: int) -> NDArray[np.float32]:
 
 
 def _rows(hits: _Hits, width: int, height: int) -> Any:
-    """Shares of texels in pixels, as `Resolution.lookups` holds them: bilinear at every hit."""
+    """Shares of texels in pixels, bilinear at every hit; see `Visibility.pixel_to_texel`."""
     pixels, row, count = np.unique(hits.pixel, return_inverse=True, return_counts=True)
     left, top = np.floor(hits.x - 0.5), np.floor(hits.y - 0.5)
     across, down = hits.x - 0.5 - left, hits.y - 0.5 - top

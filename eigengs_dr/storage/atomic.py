@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Replace a file in one step: write to the path that is given, beside the target.
 
     Readers see the old file or the new one, never a part of it, also after a crash.
@@ -49,7 +49,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:
-    """Check that `replacing` will be able to write a file, before long work depends on it.
+    """Check that `atomic_write` will be able to write a file, before long work depends on it.
 
     Parameters
     ----------

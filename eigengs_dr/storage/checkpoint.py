@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import npz as archive
-from .atomic import replacing
+from .atomic import atomic_write
 
 FORMAT, VERSION = "eigengs_dr.checkpoint", 1
 
-MOST_ENTRIES = 1 << 31
+MAX_ENTRIES = 1 << 31
 """Largest array: the components of large images are."""
 
 
@@ -53,7 +53,7 @@ class Checkpoint:
         head = self.folder / "run.json"
         if not self.resumed:
             self.folder.mkdir()
-            with replacing(head) as temporary:
+            with atomic_write(head) as temporary:
                 temporary.write_text(json.dumps({"settings": settings, "files": files}))
             return
         try:
@@ -105,7 +105,7 @@ class Checkpoint:
         layout = archive.read(path, FORMAT, VERSION, {"layout": archive.Field("u1", 1)})["layout"]
         try:
             fields = {
-                key: archive.Field(kind, ndim, MOST_ENTRIES)
+                key: archive.Field(kind, ndim, MAX_ENTRIES)
                 for key, (kind, ndim) in json.loads(layout.tobytes()).items()
             }
         except (ValueError, AttributeError, TypeError):

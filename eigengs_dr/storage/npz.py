@@ -14,9 +14,9 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from .atomic import replacing
+from .atomic import atomic_write
 
-MOST_ENTRIES = 1 << 26
+MAX_ENTRIES = 1 << 26
 """Largest number of elements read for one array: what a file claims is not believed beyond."""
 
 
@@ -29,7 +29,7 @@ class Field(NamedTuple):
 
     kind: str
     ndim: int
-    most: int = MOST_ENTRIES
+    most: int = MAX_ENTRIES
 
 
 def write(
@@ -56,7 +56,7 @@ def write(
     OSError
         If the file cannot be written; an existing one is then as before.
     """
-    with replacing(path) as temporary, open(temporary, "wb") as file:
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
         members: dict[str, Any] = {"format": np.array(name), "version": np.array(version), **arrays}
         (np.savez_compressed if compressed else np.savez)(file, **members)
 

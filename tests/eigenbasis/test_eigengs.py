@@ -16,7 +16,7 @@ from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.fitting.solvers.normal_equations import NormalEquations
 from eigengs_dr.image.folder import to_planes
 from eigengs_dr.image.io import ImageError
-from eigengs_dr.image.resize import resampled
+from eigengs_dr.image.resize import resample
 
 SIDE, SPLATS = 32, 100
 
@@ -306,11 +306,11 @@ def test_fewer_components(backend, others):
 def test_any_size_and_aspect(backend, size, others):
     """The splats are those of the image at the model's own size, scaled."""
     model = small_model(backend)
-    image = resampled(others[0], *size).clip(0, 1)
+    image = resample(others[0], *size).clip(0, 1)
     encoded = model.encode(image)
     assert (encoded.width, encoded.height) == size
     assert eg.render(encoded).shape == (size[1], size[0], 3)
-    small = model.encode(resampled(image, SIDE, SIDE))
+    small = model.encode(resample(image, SIDE, SIDE))
     np.testing.assert_allclose(encoded.to_arrays()["color"], small.to_arrays()["color"], atol=1e-3)
     assert eg.psnr(eg.render(encoded), image, "ycbcr") > 25
 
@@ -461,7 +461,7 @@ def test_fit_starts_from_the_exact_colours(backend, others):
 
 
 def test_fit_at_another_size_solves_again(backend, others):
-    model, image = small_model(backend), resampled(others[0], 60, 44).clip(0, 1)
+    model, image = small_model(backend), resample(others[0], 60, 44).clip(0, 1)
     result = eg.fit(image, iterations=0, init="eigen", basis=model, backend=backend)
     encoded = eg.psnr(eg.render(model.encode(image)), image, "ycbcr")
     assert result.trace[0]["psnr_ycbcr"] >= encoded - 1e-3

@@ -9,7 +9,7 @@ from test_training import SMALL, random_fields
 
 from eigengs_dr.eigenbasis import model_file as modelfile
 from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.eigenbasis.training import Settings, train
+from eigengs_dr.eigenbasis.training import TrainOptions, train
 from eigengs_dr.storage import npz as archive
 
 REALS = [key for key, field in modelfile.LAYOUT.items() if field.kind[0] == "f"]
@@ -20,7 +20,7 @@ NUMBERS = [key for key, field in modelfile.LAYOUT.items() if field.kind != "U"]
 def model(tmp_path_factory):
     folder = tmp_path_factory.mktemp("model")
     photos = random_fields(folder / "photos", 12)
-    settings = Settings(**SMALL, frequency_aware=True)
+    settings = TrainOptions(**SMALL, frequency_aware=True)
     return train(photos, folder / "model.npz", settings).model
 
 

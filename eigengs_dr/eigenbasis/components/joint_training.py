@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.arrays import ArrayTypes, types_in, types_of, upload
-from ...backend.recording import frozen
+from ...backend.recording import freeze_program
 from ...backend.selection import select
 from ...fitting.optimizers.adan import Adan
 from ...fitting.optimizers.parameterization import CHOLESKY
-from ...fitting.placement.random import random
+from ...fitting.placement.random import place_random
 from ...gaussian.gaussians import Gaussians
-from ...raster.evaluate import SHAPE, UNIT
-from ...raster.kernels import accumulate, adjoint
-from ...raster.layout import pack
-from ...raster.render import CUTOFF, lists_for, to_tiles
+from ...raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS
+from ...raster.kernels import adjoint, forward
+from ...raster.layout import pack_parameters
+from ...raster.render import CUTOFF, bin_gaussians, to_tiles
 from ...raster.tiles import Grid
 
 RATE = 1e-3
@@ -76,7 +76,9 @@ class JointState(NamedTuple):
     def gaussians(self, backend: str | None = None) -> Gaussians:
         """Return the N shapes; they have one channel of zeros, in the space "data"."""
         types = types_in(select(backend))
-        return _placed([upload(types.Float, row) for row in self.rows[0, :SHAPE]], self.size)
+        return _placed(
+            [upload(types.Float, row) for row in self.rows[0, :NUM_SHAPE_PARAMS]], self.size
+        )
 
     def weights(self) -> tuple[Planes, ...]:
         """Return the weights of the components as they were given, with the scaling undone.
@@ -89,7 +91,7 @@ class JointState(NamedTuple):
         tuple of C ndarrays of float32, shape (k_c, N + 1)
             Row j holds psi'_nj of all splats, then the background beta_j.
         """
-        parts = np.split(self.rows[0, SHAPE:], np.cumsum(self.counts)[:-1])
+        parts = np.split(self.rows[0, NUM_SHAPE_PARAMS:], np.cumsum(self.counts)[:-1])
         return tuple(
             np.pad(part * (high - low), [(0, 0), (0, 1)], constant_values=low)
             for part, (low, high) in zip(parts, self.bounds, strict=True)
@@ -146,7 +148,7 @@ def train_jointly(
     JointState
         After every `ROUND` steps and after the last; nothing if `state` is already there. No part
         of a state changes later. Between two of them, `KeyboardInterrupt` may become another
-        error: see `eigengs_dr.backend.interrupt.deferred`.
+        error: see `eigengs_dr.backend.interrupt.defer_interrupts`.
 
     Raises
     ------
@@ -178,14 +180,14 @@ def _start(
 ) -> Planes:
     """Draw the rows of a state; all moments are 0."""
     generator = np.random.default_rng(seed)
-    mean, factor = random(np.empty((size[1], size[0], 1)), count, generator)
+    mean, factor = place_random(np.empty((size[1], size[0], 1)), count, generator)
     placed = Gaussians.from_arrays(
         mean, factor, np.zeros((count, 1)), size=size, space="data", backend=backend
     )
-    rows = np.zeros((5, SHAPE + components, count), np.float32)
-    variables = CHOLESKY.of(placed)
-    rows[0, :SHAPE] = [v.numpy() for v in (*variables["mean"], *variables["cholesky"])]
-    rows[0, SHAPE:] = generator.uniform(0, 1, (components, count))
+    rows = np.zeros((5, NUM_SHAPE_PARAMS + components, count), np.float32)
+    variables = CHOLESKY.encode(placed)
+    rows[0, :NUM_SHAPE_PARAMS] = [v.numpy() for v in (*variables["mean"], *variables["cholesky"])]
+    rows[0, NUM_SHAPE_PARAMS:] = generator.uniform(0, 1, (components, count))
     return rows
 
 
@@ -194,22 +196,22 @@ def _train(
 ) -> Iterator[JointState]:
     """Take the steps that are missing."""
     types = types_in(select(backend))
-    shape = _optimizer(types, state.rows[:, :SHAPE], state.step)
+    shape = _optimizer(types, state.rows[:, :NUM_SHAPE_PARAMS], state.step)
     groups = list(_groups(types, state))
     targets = list(_targets(types, components, state))
     number = sum(state.counts) * math.prod(state.size)
     # The derivative of the loss is the error times this; nothing where tiles overhang.
     share = np.full((*state.size[::-1], GROUP), 2 / number, np.float32)
     share = to_tiles(types, share, Grid(*state.size))
-    with frozen(_move_group) as move:
+    with freeze_program(_move_group) as move:
         for step in range(state.step, steps):
             rate = dr.opaque(types.Float, RATE * 0.5 ** (step // HALVED))
             for optimizer in (shape, *groups):
                 optimizer.set_learning_rate(rate)
             current = _placed(shape["rows"], state.size)
-            values = [*current.mean, *[f * UNIT for f in current.factor]]
+            values = [*current.mean, *[f * EXP2_SCALE for f in current.factor]]
             # Lists are built every step: less work than to enlarge them so that they last several.
-            common = dr.detach(values), share, lists_for(current)
+            common = dr.detach(values), share, bin_gaussians(current)
             sums = [dr.opaque(types.Float, 0, dr.width(v)) for v in (*values, 0.0)]
             yields = (step + 1) % ROUND == 0 or step + 1 == steps
             for optimizer, target in zip(groups, targets, strict=True):
@@ -227,15 +229,15 @@ def _train(
 def _move_group(optimizer: Adan, target: Any, common: tuple, sums: list, told: bool) -> list:
     """Move weights of a group; add its gradients of shapes, and squares if told, to `sums`."""
     shape, share, lists = common
-    Float, radius = type(target), UNIT * CUTOFF
-    packed = pack([*shape, *optimizer["rows"]])
-    rendered = accumulate(packed, [Float(0)] * GROUP, lists, radius * radius)
+    Float, radius = type(target), EXP2_SCALE * CUTOFF
+    packed = pack_parameters([*shape, *optimizer["rows"]])
+    rendered = forward(packed, [Float(0)] * GROUP, lists, radius * radius)
     delta = (rendered - target) * share
     # By hand: backward mode would sum delta over all pixels too, for the backgrounds.
     gradient = adjoint(packed, delta, GROUP, lists, radius)
     squares = dr.squared_norm(delta) if told else Float(0)
-    added = [s + g for s, g in zip(sums, [*gradient[:SHAPE], squares], strict=True)]
-    dr.set_grad(optimizer["rows"], gradient[SHAPE:])
+    added = [s + g for s, g in zip(sums, [*gradient[:NUM_SHAPE_PARAMS], squares], strict=True)]
+    dr.set_grad(optimizer["rows"], gradient[NUM_SHAPE_PARAMS:])
     dr.eval(added, dr.grad(optimizer["rows"]))
     optimizer.step()
     return added
@@ -258,7 +260,7 @@ def _rows(optimizer: Adan) -> Planes:
 
 def _groups(types: ArrayTypes, state: JointState) -> Iterator[Adan]:
     """Make the optimiser of each group of weights."""
-    for first in range(SHAPE, state.rows.shape[1], GROUP):
+    for first in range(NUM_SHAPE_PARAMS, state.rows.shape[1], GROUP):
         rows = state.rows[:, first : first + GROUP]
         # What fills the last group stays: weights of 0 of a component of 0 have no gradient.
         rows = np.pad(rows, [(0, 0), (0, GROUP - rows.shape[1]), (0, 0)])
@@ -284,4 +286,4 @@ def _placed(rows: Any, size: tuple[int, int]) -> Gaussians:
     x, y, *factor = rows
     color, background = (dr.zeros(types.FloatX, (1, n)) for n in (dr.width(x), 1))
     blank = Gaussians(types.Float2(0), types.Float3(1), color, background, *size, "data")
-    return CHOLESKY.to(blank, {"mean": types.Float2(x, y), "cholesky": types.Float3(*factor)})
+    return CHOLESKY.decode(blank, {"mean": types.Float2(x, y), "cholesky": types.Float3(*factor)})

@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.arrays import types_of
-from ...backend.recording import frozen
+from ...backend.recording import freeze_program
 from ...fitting.optimizers.adam import Adam
 from ...fitting.optimizers.descent import step_program
-from ...fitting.optimizers.schedule import Schedule, rate_left
-from ...fitting.placement.grid import grid
+from ...fitting.optimizers.schedule import Schedule, lr_factor
+from ...fitting.placement.grid import place_grid
 from ...fitting.solvers.conjugate_gradient import solve
 from ...gaussian.gaussians import Gaussians
-from ...raster.render import CUTOFF, lists_for, to_tiles
+from ...raster.render import CUTOFF, bin_gaussians, to_tiles
 from ...raster.tiles import Grid
 
 Planes = NDArray[np.float32]
@@ -104,7 +104,7 @@ def train_shapes(
 
 def on_grid(size: tuple[int, int], count: int) -> State:
     """Return the state before training: `count` splats on a grid of a size (width, height)."""
-    mean, factor = grid(np.empty((size[1], size[0], 1)), count, np.random.default_rng(0))
+    mean, factor = place_grid(np.empty((size[1], size[0], 1)), count, np.random.default_rng(0))
     return {"step": np.array(0), "mean": mean, "factor": factor}
 
 
@@ -128,24 +128,24 @@ def _round(
     """Take steps from the first to before the last, with an optimiser of their own."""
     first, last, steps = span
     types, coordinates = types_of(gaussians.mean), SCHEDULE.coordinates
-    variables = coordinates.of(gaussians)
+    variables = coordinates.encode(gaussians)
     optimizer = SCHEDULE.optimizer(1.0)
     optimizer.update({name: variables[name] for name in SCHEDULE.rates})
-    grid = Grid(gaussians.width, gaussians.height)
+    place_grid = Grid(gaussians.width, gaussians.height)
     whole = np.ones((gaussians.height, gaussians.width, len(components)), np.float32)
-    inside = to_tiles(types, whole, grid)
+    inside = to_tiles(types, whole, place_grid)
     current = gaussians
-    with frozen(step_program(coordinates, CUTOFF)) as take_step:
+    with freeze_program(step_program(coordinates, CUTOFF)) as take_step:
         for step, image in enumerate(samples(components, eigenvalues, seed, first, last), first):
             solved = solve(current, image, SOLVE_STEPS).gaussians
             fixed = replace(gaussians, color=solved.color, background=solved.background)
-            left = rate_left(SCHEDULE, step, steps) * min(1.0, (step - first + 1) / WARM_UP)
+            left = lr_factor(SCHEDULE, step, steps) * min(1.0, (step - first + 1) / WARM_UP)
             optimizer.set_learning_rate(
                 {name: dr.opaque(types.Float, rate * left) for name, rate in SCHEDULE.rates.items()}
             )
-            target = to_tiles(types, image, grid)
-            take_step(optimizer, fixed, target, inside, [lists_for(current, CUTOFF)])
-            current = coordinates.to(fixed, dict(optimizer))
+            target = to_tiles(types, image, place_grid)
+            take_step(optimizer, fixed, target, inside, [bin_gaussians(current, CUTOFF)])
+            current = coordinates.decode(fixed, dict(optimizer))
             dr.eval(current)
     return dr.detach(current)
 

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.arrays import types_of, upload_rows
-from ...fitting.solvers.normal_equations import NormalEquations, squares
+from ...fitting.solvers.normal_equations import NormalEquations, squared_norms
 from ...gaussian.gaussians import Gaussians, concatenate
-from ...image.metrics import decibels
+from ...image.metrics import psnr_from_mse
 from ..basis import Eigenbasis
 from .joint_training import JointState, train_jointly
 from .shape_training import on_grid, shapes_of, train_shapes
-from .split import Side, _low_components, _sides
+from .split import FrequencyBand, frequency_bands, low_component_count
 
 STEPS = {"default": 0, "eigengs": 15_000}
 """Presets, and the steps of training that each takes when none are asked for."""
@@ -28,7 +28,7 @@ Part = tuple[NormalEquations, Gaussians, tuple[Planes, ...]]
 """Equations of splats, their shapes, and their weights in the components of each channel."""
 
 
-class Fitted(NamedTuple):
+class ComponentFit(NamedTuple):
     """Gaussians that render an eigenbasis.
 
     Attributes
@@ -58,7 +58,7 @@ def fit_components(
     backend: str | None = None,
     states: list[State] | None = None,
     save: Callable[[list[State]], None] = lambda states: None,
-) -> Fitted:
+) -> ComponentFit:
     """Place, train and weight one set of splats for all components.
 
     Parameters
@@ -83,15 +83,15 @@ def fit_components(
     if method == "eigengs" and not any(map(len, basis.components)):
         raise ValueError("the images give no components to train on; use preset 'default'")
     started = time.perf_counter()
-    sides, states = _sides(basis, count, split), list(states or [])
-    train, result = METHODS[method]
+    sides, states = frequency_bands(basis, count, split), list(states or [])
+    train, result = METHODS_BY_PRESET[method]
     for i, side in enumerate(sides):
         known = states[i] if i < len(states) else None
         for state in train(side, seed + i, steps, backend, known):
             states[i:] = [state]
             save(states)
     trained = time.perf_counter()
-    equations, gaussians, weights = _assembled(states, sides, result, backend)
+    equations, gaussians, weights = _assemble(states, sides, result, backend)
     mean = equations.solve(equations.correlate(basis.mean))
     figures = {
         "shape_seconds": trained - started,
@@ -101,25 +101,27 @@ def fit_components(
     if method == "default" and steps:
         size = (basis.width, basis.height)
         grids = [on_grid(size, side.splats) for side in sides]
-        equations, _, untrained = _assembled(grids, sides, result, backend)
+        equations, _, untrained = _assemble(grids, sides, result, backend)
         figures["psnr_untrained"] = psnr_components(equations, basis, untrained)
-    return Fitted(
-        gaussians=colored(gaussians, mean, basis.space),
+    return ComponentFit(
+        gaussians=with_colors(gaussians, mean, basis.space),
         weights=weights,
         low=sides[0].splats if split else 0,
-        low_components=_low_components(basis) if split else 0,
+        low_components=low_component_count(basis) if split else 0,
         figures=figures,
     )
 
 
-def _assembled(states: list[State], sides: list[Side], result: Any, backend: str | None) -> Part:
+def _assemble(
+    states: list[State], sides: list[FrequencyBand], result: Any, backend: str | None
+) -> Part:
     """The equations of all splats, and shapes and weights of all sides."""
     parts = [result(state, side, backend) for state, side in zip(states, sides, strict=True)]
     equations, gaussians, weights = parts[0]
     if len(parts) > 1:
         gaussians = concatenate([part[1] for part in parts])
         equations = NormalEquations(gaussians, sides[0].splats)
-        weights = _joined(weights, parts[1][2])
+        weights = _join_weights(weights, parts[1][2])
     return equations, gaussians, weights
 
 
@@ -160,20 +162,20 @@ def psnr_components(
     total = 0.0
     for planes, values, rows in zip(basis.components, basis.eigenvalues, weights, strict=True):
         correlations = equations.correlate(planes)
-        error = equations.error(rows.T.astype(np.float64), correlations, squares(planes))
+        error = equations.error(rows.T.astype(np.float64), correlations, squared_norms(planes))
         total += float(values @ error)
-    return decibels(total / basis.mean.size)
+    return psnr_from_mse(total / basis.mean.size)
 
 
-def _shapes(
-    side: Side, seed: int, steps: int, backend: str | None, state: State | None
+def _train_shapes(
+    side: FrequencyBand, seed: int, steps: int, backend: str | None, state: State | None
 ) -> Iterator[State]:
     return train_shapes(
         side.components, side.eigenvalues, side.splats, seed, steps, backend=backend, state=state
     )
 
 
-def _solved(state: State, side: Side, backend: str | None) -> Part:
+def _solve_weights(state: State, side: FrequencyBand, backend: str | None) -> Part:
     """The shapes of a state and the best weights on them."""
     height, width = side.components[0].shape[1:]
     shapes = shapes_of(state, (width, height), len(side.components), backend)
@@ -182,8 +184,8 @@ def _solved(state: State, side: Side, backend: str | None) -> Part:
     return equations, shapes, tuple(weights.T.astype(np.float32) for weights in solved)
 
 
-def _jointly(
-    side: Side, seed: int, steps: int, backend: str | None, state: State | None
+def _train_jointly(
+    side: FrequencyBand, seed: int, steps: int, backend: str | None, state: State | None
 ) -> Iterator[State]:
     known = JointState.from_arrays(state) if state else None
     for reached in train_jointly(
@@ -192,19 +194,22 @@ def _jointly(
         yield reached.arrays()
 
 
-def _trained(state: State, side: Side, backend: str | None) -> Part:
+def _weights_of(state: State, side: FrequencyBand, backend: str | None) -> Part:
     """Shapes and weights of a state, with as many (unused) channels as the components have."""
     reached = JointState.from_arrays(state)
     blank = np.zeros((side.splats + 1, len(side.components)))
-    shapes = colored(reached.gaussians(backend), blank, "data")
+    shapes = with_colors(reached.gaussians(backend), blank, "data")
     return NormalEquations(shapes), shapes, reached.weights()
 
 
-METHODS = {"default": (_shapes, _solved), "eigengs": (_jointly, _trained)}
+METHODS_BY_PRESET = {
+    "default": (_train_shapes, _solve_weights),
+    "eigengs": (_train_jointly, _weights_of),
+}
 """Presets: what trains one side step by step, and what makes shapes and weights of its state."""
 
 
-def _joined(first: tuple[Planes, ...], second: tuple[Planes, ...]) -> tuple[Planes, ...]:
+def _join_weights(first: tuple[Planes, ...], second: tuple[Planes, ...]) -> tuple[Planes, ...]:
     """Weights of all splats and components from those of both sides; across, they are 0."""
     joined = []
     for low, high in zip(first, second, strict=True):
@@ -215,7 +220,7 @@ def _joined(first: tuple[Planes, ...], second: tuple[Planes, ...]) -> tuple[Plan
     return tuple(joined)
 
 
-def colored(gaussians: Gaussians, coefficients: NDArray[np.float64], space: str) -> Gaussians:
+def with_colors(gaussians: Gaussians, coefficients: NDArray[np.float64], space: str) -> Gaussians:
     """Give shapes the colours of an image.
 
     Parameters

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...fitting.solvers.normal_equations import NormalEquations, squares
+from ...fitting.solvers.normal_equations import NormalEquations, squared_norms
 from ...gaussian.gaussians import concatenate
 from ...image.folder import to_planes
-from ...image.metrics import decibels
+from ...image.metrics import psnr_from_mse
 from ..basis import Eigenbasis
 from .shape_training import on_grid, shapes_of
 
@@ -34,7 +34,7 @@ SPLIT_COST = 0.2
 """Decibels of exact colours that "auto" pays for the split."""
 
 
-class Side(NamedTuple):
+class FrequencyBand(NamedTuple):
     """Splats and components that belong together: all of them, or one side of the split."""
 
     splats: int
@@ -58,7 +58,7 @@ def wants_split(
     dict of str to float
         ``psnr_whole`` and ``psnr_split`` in dB, if they were measured.
     """
-    if count < 2 or _low_components(basis) < 1:
+    if count < 2 or low_component_count(basis) < 1:
         return False, {}
     if isinstance(frequency_aware, bool):
         return frequency_aware, {}
@@ -68,13 +68,13 @@ def wants_split(
     planes = images.reshape(-1, basis.height, basis.width)
     figures = {}
     for name, split in (("psnr_whole", False), ("psnr_split", True)):
-        counts = [side.splats for side in _sides(basis, count, split)]
+        counts = [side.splats for side in frequency_bands(basis, count, split)]
         size = (basis.width, basis.height)
         sets = [shapes_of(on_grid(size, n), size, 1, backend) for n in counts]
         equations = NormalEquations(concatenate(sets), counts[0] if split else 0)
         correlations = equations.correlate(planes)
-        error = equations.error(equations.solve(correlations), correlations, squares(planes))
-        figures[name] = decibels(float(error.mean()) / (basis.width * basis.height))
+        error = equations.error(equations.solve(correlations), correlations, squared_norms(planes))
+        figures[name] = psnr_from_mse(float(error.mean()) / (basis.width * basis.height))
     return figures["psnr_split"] > figures["psnr_whole"] - SPLIT_COST, figures
 
 
@@ -82,7 +82,7 @@ def split_reason(
     basis: Eigenbasis, count: int, frequency_aware: bool | str, figures: dict[str, float]
 ) -> str:
     """Tell in under 64 characters why `wants_split` decided as it did, from its figures."""
-    if count < 2 or _low_components(basis) < 1:
+    if count < 2 or low_component_count(basis) < 1:
         return "too few Gaussians or components to split"
     if isinstance(frequency_aware, bool):
         return "as asked"
@@ -94,20 +94,20 @@ def split_reason(
     return "no training images to compare on"
 
 
-def _low_components(basis: Eigenbasis) -> int:
+def low_component_count(basis: Eigenbasis) -> int:
     """Components of each channel on the side of the low frequencies."""
     return min(LOW_COMPONENTS, max(map(len, basis.components)) // 2)
 
 
-def _sides(basis: Eigenbasis, count: int, split: bool) -> list[Side]:
+def frequency_bands(basis: Eigenbasis, count: int, split: bool) -> list[FrequencyBand]:
     """Divide splats and components, N_l before N_h."""
     if not split:
-        return [Side(count, basis.components, basis.eigenvalues)]
+        return [FrequencyBand(count, basis.components, basis.eigenvalues)]
     few = max(1, round(LOW_SHARE * count))
 
-    def part(number: int, rows: slice) -> Side:
+    def part(number: int, rows: slice) -> FrequencyBand:
         planes = tuple(c[rows] for c in basis.components)
-        return Side(number, planes, tuple(e[rows] for e in basis.eigenvalues))
+        return FrequencyBand(number, planes, tuple(e[rows] for e in basis.eigenvalues))
 
-    first = _low_components(basis)
+    first = low_component_count(basis)
     return [part(few, slice(first)), part(count - few, slice(first, None))]

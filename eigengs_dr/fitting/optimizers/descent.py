@@ -11,19 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.arrays import types_of
-from ...backend.recording import frozen
+from ...backend.recording import freeze_program
 from ...gaussian.gaussians import Gaussians
-from ...raster.evaluate import UNIT
-from ...raster.render import CUTOFF, lists_for, splat, to_tiles
+from ...raster.evaluate import EXP2_SCALE
+from ...raster.render import CUTOFF, bin_gaussians, rasterize, to_tiles
 from ...raster.tiles import Grid, TileLists
-from .parameterization import Coordinates
-from .schedule import LONG, Schedule, rate_left
+from .parameterization import Parameterization
+from .schedule import MIN_PHASE_RATIO, Schedule, lr_factor
 
-ROUNDING = 1e-10
+MSE_EPSILON = 1e-10
 """Mean squared error that is not told from none."""
 
 
-Rearrange = Callable[[Gaussians, int], Gaussians]
+Redistribute = Callable[[Gaussians, int], Gaussians]
 
 
 def descend(
@@ -33,26 +33,30 @@ def descend(
     iterations: int,
     cutoff: float = CUTOFF,
     weight: NDArray[np.float32] | None = None,
-    rearrange: Rearrange | None = None,
+    redistribute: Redistribute | None = None,
     levels: Sequence[int] = (),
 ) -> Iterator[Gaussians]:
     """Yield the set before the first step and after every step of gradient descent.
 
-    Parameters are those of `eigengs_dr.fitting.refine.refine`. From what `rearrange` makes of the
-    set after `Schedule.rearrange` steps, a descent of its own goes on: splats are placed anew where
-    they left much error. The first so many splats of each of the `levels` make the image too, as
-    well as they can. Steps run asynchronously: what is yielded may not be computed yet.
+    Parameters are those of `eigengs_dr.fitting.refine.refine`. From what `redistribute` makes of
+    the set after `Schedule.redistribute` steps, a descent of its own goes on: splats are placed
+    anew where they left much error. The first so many splats of each of the `levels` make the image
+    too, as well as they can. Steps run asynchronously: what is yielded may not be computed yet.
     """
     yield gaussians
-    tried = schedule.rearrange if rearrange and iterations >= LONG * schedule.rearrange else 0
-    if rearrange and tried:
-        for current in _stretch(gaussians, target, schedule, tried, cutoff, weight):
+    tried = (
+        schedule.redistribute_after
+        if redistribute and iterations >= MIN_PHASE_RATIO * schedule.redistribute_after
+        else 0
+    )
+    if redistribute and tried:
+        for current in _run_phase(gaussians, target, schedule, tried, cutoff, weight):
             yield current
-        gaussians = rearrange(dr.detach(current), len(current))
-    yield from _stretch(gaussians, target, schedule, iterations - tried, cutoff, weight, levels)
+        gaussians = redistribute(dr.detach(current), len(current))
+    yield from _run_phase(gaussians, target, schedule, iterations - tried, cutoff, weight, levels)
 
 
-def _stretch(
+def _run_phase(
     gaussians: Gaussians,
     target: NDArray[np.float32],
     schedule: Schedule,
@@ -67,7 +71,7 @@ def _stretch(
     """
     types = types_of(gaussians.mean)
     coordinates = schedule.coordinates
-    start = coordinates.of(gaussians)
+    start = coordinates.encode(gaussians)
     optimizer = schedule.optimizer(1.0)
     optimizer.update({name: start[name] for name in schedule.rates})
     current = gaussians
@@ -75,26 +79,26 @@ def _stretch(
     tiles = to_tiles(types, target, grid)
     weights = to_tiles(types, np.ones_like(target) if weight is None else weight, grid)
     zero = dr.opaque(types.Float, 0)
-    with frozen(step_program(coordinates, cutoff, levels)) as take_step:
+    with freeze_program(step_program(coordinates, cutoff, levels)) as take_step:
         for step in range(iterations):
             if step % schedule.rebuild == 0:
                 lists = [
-                    lists_for(first(current, count), cutoff, schedule.pad)
+                    bin_gaussians(prefix(current, count), cutoff, schedule.pad)
                     for count in (*levels, len(current))
                 ]
-            left = rate_left(schedule, step, iterations)
+            left = lr_factor(schedule, step, iterations)
             optimizer.set_learning_rate(
                 {name: dr.opaque(types.Float, rate * left) for name, rate in schedule.rates.items()}
             )
             take_step(optimizer, gaussians, tiles, weights, lists)
-            current = coordinates.to(gaussians, dict(optimizer))
+            current = coordinates.decode(gaussians, dict(optimizer))
             # Later steps write into the optimiser's arrays: what is yielded must be a copy.
             current = replace(current, color=current.color + zero)
             dr.eval(current)
             yield current
 
 
-def step_program(coordinates: Coordinates, cutoff: float, levels: Sequence[int] = ()) -> Any:
+def step_program(coordinates: Parameterization, cutoff: float, levels: Sequence[int] = ()) -> Any:
     """Make the function of a step, to be frozen: traced once, replayed without Python.
 
     A program belongs to one run: a replay does not notice that, say, the betas of another optimiser
@@ -108,29 +112,29 @@ def step_program(coordinates: Coordinates, cutoff: float, levels: Sequence[int] 
 
         The weights are 0 where tiles overhang the image.
         """
-        current = coordinates.to(fixed, dict(optimizer))
+        current = coordinates.decode(fixed, dict(optimizer))
         errors = [
-            _error(first(current, count), target, weights, listed, cutoff)
+            _error(prefix(current, count), target, weights, listed, cutoff)
             for count, listed in zip((*levels, len(fixed)), lists, strict=True)
         ]
         # Of several, the sum of their decibels: none is sacrificed for another.
-        loss = sum(dr.log(e + ROUNDING) for e in errors) if levels else errors[0]
+        loss = sum(dr.log(e + MSE_EPSILON) for e in errors) if levels else errors[0]
         dr.backward(loss)
         # Kept apart from the optimiser's arithmetic, the large kernels serve every preset.
         dr.eval([dr.grad(v) for v in optimizer.values()])
         optimizer.step(eval=False)
-        optimizer.update(coordinates.bounded(fixed, dict(optimizer)))
+        optimizer.update(coordinates.project(fixed, dict(optimizer)))
 
     return step
 
 
 def _error(gaussians: Gaussians, target: Any, weights: Any, lists: TileLists, cutoff: float) -> Any:
-    values = [*gaussians.mean, *[f * UNIT for f in gaussians.factor], *gaussians.color]
-    rendered = splat(values, list(gaussians.background), lists, cutoff)
+    values = [*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor], *gaussians.color]
+    rendered = rasterize(values, list(gaussians.background), lists, cutoff)
     return dr.mean(dr.square((rendered - target) * weights))
 
 
-def first(gaussians: Gaussians, count: int) -> Gaussians:
+def prefix(gaussians: Gaussians, count: int) -> Gaussians:
     """The first splats of a set; differentiable, also in a frozen program."""
     if count == len(gaussians):
         return gaussians

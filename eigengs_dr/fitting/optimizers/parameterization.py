@@ -12,23 +12,23 @@ from ...backend.arrays import types_of
 from ...gaussian.gaussians import Gaussians
 
 
-class Coordinates(NamedTuple):
+class Parameterization(NamedTuple):
     """A change of variables, differentiable by Dr.Jit.
 
     Attributes
     ----------
-    of : callable
-        ``of(gaussians) -> dict`` of named arrays.
-    to : callable
-        ``to(fixed, variables) -> Gaussians``; what is not among the variables is that of `fixed`,
-        the set that was given to `of`.
-    bounded : callable
-        ``bounded(fixed, variables) -> dict``: the variables, moved where a step left their bounds.
+    encode : callable
+        ``encode(gaussians) -> dict`` of named arrays.
+    decode : callable
+        ``decode(fixed, variables) -> Gaussians``; what is not among the variables is that of
+        `fixed`, the set that was given to `encode`.
+    project : callable
+        ``project(fixed, variables) -> dict``: the variables, moved where a step left their bounds.
     """
 
-    of: Callable[[Gaussians], dict[str, Any]]
-    to: Callable[[Gaussians, dict[str, Any]], Gaussians]
-    bounded: Callable[[Gaussians, dict[str, Any]], dict[str, Any]]
+    encode: Callable[[Gaussians], dict[str, Any]]
+    decode: Callable[[Gaussians, dict[str, Any]], Gaussians]
+    project: Callable[[Gaussians, dict[str, Any]], dict[str, Any]]
 
 
 # ---------------------------------------------------------------------------------------------
@@ -41,26 +41,26 @@ def _size(g: Gaussians) -> Any:
     return dr.rsqrt(g.factor[0] * g.factor[2])
 
 
-def _natural_of(g: Gaussians) -> dict[str, Any]:
-    return _in_units(g, _size(g))
+def _encode_relative(g: Gaussians) -> dict[str, Any]:
+    return _relative_to(g, _size(g))
 
 
-def _in_units(g: Gaussians, size: Any) -> dict[str, Any]:
+def _relative_to(g: Gaussians, size: Any) -> dict[str, Any]:
     return {"mean": g.mean / size, "factor": g.factor * size, "color": g.color}
 
 
-def _natural_to(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
+def _decode_relative(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
     size = _size(fixed)
     units = {"mean": size, "factor": 1 / size, "color": 1}
     return replace(fixed, **{name: value * units[name] for name, value in variables.items()})
 
 
-def _natural_bounded(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, Any]:
-    inside = _in_units(_natural_to(fixed, variables).bounded(), _size(fixed))
+def _project_relative(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, Any]:
+    inside = _relative_to(_decode_relative(fixed, variables).bounded(), _size(fixed))
     return {name: inside[name] for name in variables}
 
 
-NATURAL = Coordinates(_natural_of, _natural_to, _natural_bounded)
+SCALE_RELATIVE = Parameterization(_encode_relative, _decode_relative, _project_relative)
 """Mean over the size that the splat started with, factor times that size, colour: one rate serves
 small and large splats, and pictures of any size."""
 
@@ -73,7 +73,7 @@ CHOLESKY_BOUND = 0.5
 """Added to the diagonal of the Cholesky factor, in pixels: no splat is narrower."""
 
 
-def _cholesky_of(g: Gaussians) -> dict[str, Any]:
+def _encode_cholesky(g: Gaussians) -> dict[str, Any]:
     types = types_of(g.mean)
     x, y = g.mean
     a, b, c = g.factor
@@ -92,7 +92,7 @@ def _atanh(x: Any) -> Any:
     return dr.atanh(dr.clip(x, -0.999999, 0.999999))
 
 
-def _cholesky_to(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
+def _decode_cholesky(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
     parts = {}
     if "mean" in variables:
         x, y = (0.5 * (dr.tanh(v) + 1) for v in variables["mean"])
@@ -112,9 +112,9 @@ def _inverse_factor(l1: Any, l2: Any, l3: Any) -> tuple[Any, Any, Any]:
     return a, -l1 * l2 / yy * a, dr.rsqrt(yy)
 
 
-def _cholesky_bounded(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, Any]:
+def _project_cholesky(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, Any]:
     return variables
 
 
-CHOLESKY = Coordinates(_cholesky_of, _cholesky_to, _cholesky_bounded)
+CHOLESKY = Parameterization(_encode_cholesky, _decode_cholesky, _project_cholesky)
 """atanh of the mean in [-1, 1], Cholesky factor of the covariance in pixels, colour."""

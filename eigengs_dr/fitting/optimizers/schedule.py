@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from .parameterization import NATURAL, Coordinates
+from .parameterization import SCALE_RELATIVE, Parameterization
 
-LONG = 10
+MIN_PHASE_RATIO = 10
 """Splats are placed anew only where so many times as many steps are to be taken as before it: of
 1,000 steps that gains 0.8 dB, of 200 0.5, and of 100 nothing (5,000 splats, ImageNet classes)."""
 
@@ -23,8 +23,8 @@ class Schedule:
     optimizer : callable
         ``optimizer(lr) -> drjit.opt.Optimizer``.
     rates : dict of str to float
-        Learning rate of every coordinate at the start; in `NATURAL` coordinates of mean and factor
-        (in sizes of the splat) and color (1 is white).
+        Learning rate of every coordinate at the start; in `SCALE_RELATIVE` coordinates of mean and
+        factor (in sizes of the splat) and color (1 is white).
     coordinates : Coordinates
         The variables that the optimiser moves.
     warm_up : int
@@ -36,7 +36,7 @@ class Schedule:
         Steps between two builds of the tile lists.
     pad : float
         Pixels by which splats are enlarged when lists are built, so that they last `rebuild` steps.
-    rearrange : int
+    redistribute_after : int
         Steps after which splats may be placed anew, see `descend`.
     patience : int
         Stop when this many steps gained less than `least_gain`.
@@ -46,17 +46,17 @@ class Schedule:
 
     optimizer: Callable[[float], Any]
     rates: dict[str, float]
-    coordinates: Coordinates = NATURAL
+    coordinates: Parameterization = SCALE_RELATIVE
     warm_up: int = 5
     decay: float = 0.03
     rebuild: int = 4
     pad: float = 1.0
-    rearrange: int = 20
+    redistribute_after: int = 20
     patience: int = 300
     least_gain: float = 0.01
 
 
-def rate_left(schedule: Schedule, step: int, iterations: int) -> float:
+def lr_factor(schedule: Schedule, step: int, iterations: int) -> float:
     """Factor of the rates: a linear rise, then half a cosine."""
     along = 0.5 * (1 + math.cos(math.pi * step / iterations))
     left = schedule.decay + (1 - schedule.decay) * along

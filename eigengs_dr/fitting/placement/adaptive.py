@@ -1,10 +1,10 @@
 """Splats placed and shaped by the image: many, small and stretched where it bends the most.
 
 A Gaussian follows an image where that is nearly linear; what it misses is the second derivative. So
-the density of splats follows the squared Hessian (`bending`), their centres cut a space-filling
-curve into pieces of equal mass and take one Lloyd step, and each is stretched along the direction
-that bends the least. The constants were chosen on training images of faces and of ImageNet classes
-by the error after 10 steps of the colour solve.
+the density of splats follows the squared Hessian (`hessian_energy`), their centres cut a
+space-filling curve into pieces of equal mass and take one Lloyd step, and each is stretched along
+the direction that bends the least. The constants were chosen on training images of faces and of
+ImageNet classes by the error after 10 steps of the colour solve.
 """
 
 from __future__ import annotations
@@ -14,40 +14,40 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ...image.resize import resampled
+from ...image.resize import resample
 from .hilbert_scan import hilbert_order
 from .random import inverse_factor
 
 Array = NDArray[np.floating]
 Density = Callable[[Array, float], Array]
 
-BLUR = 0.18
+IMAGE_BLUR = 0.18
 """Standard deviation, in splat spacings, of what no splat can follow."""
 
-POOL = 0.14
+DENSITY_BLUR = 0.14
 """Over how many spacings the bending is averaged for the density."""
 
-ALIGN = 0.4
+DIRECTION_BLUR = 0.4
 """Over how many spacings it is averaged for the direction."""
 
-NOISE = 0.2
+NOISE_SLOPE = 0.2
 """Change of slope across a spacing that counts as noise, without direction; the pixels' unit."""
 
-POWER = 2 / 3
+DENSITY_EXPONENT = 2 / 3
 """Density is the squared Hessian to this power."""
 
-SIZE = 0.7
+RELATIVE_SIZE = 0.7
 """Geometric mean of both standard deviations over ``1 / sqrt(density)``."""
 
-STRETCH = 3.0
+MAX_STRETCH = 3.0
 """Ratio of the standard deviations along and across a straight edge."""
 
-FINEST = 8.0
+WORKING_SPACING = 8.0
 """Pixels between splats that are enough to place them: larger images are shrunk first, for the
 constants above were chosen at such a spacing, and filters of large images take long."""
 
 
-def adaptive(
+def place_adaptive(
     image: Array,
     count: int,
     generator: np.random.Generator | None = None,
@@ -65,7 +65,7 @@ def adaptive(
         Not used: the result is a function of the image.
     density : callable, optional
         ``density(bend, spacing)`` returns splats a pixel, up to a factor, of the shape of the image
-        or of a smaller one; by default `bent`.
+        or of a smaller one; by default `density_from_hessian`.
 
     Returns
     -------
@@ -76,20 +76,20 @@ def adaptive(
     """
     height, width = image.shape[:2]
     spacing = float(np.sqrt(height * width / count))
-    if spacing >= 2 * FINEST:
-        times = int(spacing / FINEST)
+    if spacing >= 2 * WORKING_SPACING:
+        times = int(spacing / WORKING_SPACING)
         size = -(-width // times), -(-height // times)
-        small = resampled(image.astype(np.float32), *size)
-        mean, factor = adaptive(small, count, density=density)
+        small = resample(image.astype(np.float32), *size)
+        mean, factor = place_adaptive(small, count, density=density)
         x, y = width / small.shape[1], height / small.shape[0]
         return mean * (x, y), factor / (x, y, y)
-    bend = bending(image, spacing)
-    splats = capped((density or bent)(bend, spacing), count)
-    mean = relaxed(pieces(splats, count), splats)
-    return mean, factors(mean, splats, bend, spacing)
+    bend = hessian_energy(image, spacing)
+    splats = normalize_density((density or density_from_hessian)(bend, spacing), count)
+    mean = lloyd_step(stratify_along_hilbert(splats, count), splats)
+    return mean, shapes_from_hessian(mean, splats, bend, spacing)
 
 
-def bending(image: Array, spacing: float) -> NDArray[np.float32]:
+def hessian_energy(image: Array, spacing: float) -> NDArray[np.float32]:
     """Squared Hessian ``sum_c H_c H_c`` of a blurred image plus isotropic noise.
 
     Returns
@@ -100,25 +100,25 @@ def bending(image: Array, spacing: float) -> NDArray[np.float32]:
     from scipy.ndimage import correlate1d, gaussian_filter
 
     channels = np.moveaxis(image, 2, 0).astype(np.float32)
-    channels = gaussian_filter(channels, (0, BLUR * spacing, BLUR * spacing))
+    channels = gaussian_filter(channels, (0, IMAGE_BLUR * spacing, IMAGE_BLUR * spacing))
     slope, bend = [-0.5, 0.0, 0.5], [1.0, -2.0, 1.0]
     xx = correlate1d(channels, bend, axis=2, mode="nearest")
     yy = correlate1d(channels, bend, axis=1, mode="nearest")
     xy = correlate1d(correlate1d(channels, slope, 2, mode="nearest"), slope, 1, mode="nearest")
-    noise = (NOISE / spacing**2) ** 2 / 2
+    noise = (NOISE_SLOPE / spacing**2) ** 2 / 2
     squared = np.stack([xx * xx + xy * xy, yy * yy + xy * xy, xy * (xx + yy)]).sum(axis=1)
     return squared + np.array([noise, noise, 0], np.float32)[:, None, None]
 
 
-def bent(bend: Array, spacing: float) -> Array:
+def density_from_hessian(bend: Array, spacing: float) -> Array:
     """Density that the bending asks for, shape (H, W), up to a factor."""
     from scipy.ndimage import gaussian_filter
 
-    mean = gaussian_filter(bend[0] + bend[1], POOL * spacing)
-    return np.power(mean, POWER, dtype=np.float64)
+    mean = gaussian_filter(bend[0] + bend[1], DENSITY_BLUR * spacing)
+    return np.power(mean, DENSITY_EXPONENT, dtype=np.float64)
 
 
-def capped(density: Array, count: int) -> NDArray[np.float64]:
+def normalize_density(density: Array, count: int) -> NDArray[np.float64]:
     """Scale a density to `count` splats in all, or a little less where most pixels have one."""
     splats: NDArray[np.float64] = density.astype(np.float64)
     for _ in range(5):  # what is cut off above goes to the rest
@@ -126,7 +126,7 @@ def capped(density: Array, count: int) -> NDArray[np.float64]:
     return splats
 
 
-def pieces(density: Array, count: int) -> NDArray[np.float64]:
+def stratify_along_hilbert(density: Array, count: int) -> NDArray[np.float64]:
     """Cut a Hilbert curve through the pixels into pieces of equal mass.
 
     Returns
@@ -147,10 +147,10 @@ def pieces(density: Array, count: int) -> NDArray[np.float64]:
     return np.stack([centroid(order % width + 0.5), centroid(order // width + 0.5)], axis=1)
 
 
-def relaxed(mean: Array, density: Array) -> NDArray[np.float64]:
+def lloyd_step(mean: Array, density: Array) -> NDArray[np.float64]:
     """One Lloyd step: each centre moves to the centroid of the pixels nearest to it."""
     count = len(mean)
-    owner = owners(mean, density.shape)
+    owner = nearest_center(mean, density.shape)
     rows, columns = np.indices(density.shape).reshape(2, -1)
     mass = np.bincount(owner, density.ravel(), count)
     moment = [np.bincount(owner, density.ravel() * (v + 0.5), count) for v in (columns, rows)]
@@ -160,7 +160,7 @@ def relaxed(mean: Array, density: Array) -> NDArray[np.float64]:
     return result
 
 
-def owners(mean: Array, shape: tuple[int, ...]) -> NDArray[np.int64]:
+def nearest_center(mean: Array, shape: tuple[int, ...]) -> NDArray[np.int64]:
     """Index of the centre nearest to each pixel, shape (H W,); of several in one pixel the last."""
     from scipy.ndimage import distance_transform_edt
 
@@ -171,15 +171,19 @@ def owners(mean: Array, shape: tuple[int, ...]) -> NDArray[np.int64]:
     return owner[y, x].ravel()
 
 
-def factors(mean: Array, density: Array, bend: Array, spacing: float) -> NDArray[np.float64]:
+def shapes_from_hessian(
+    mean: Array, density: Array, bend: Array, spacing: float
+) -> NDArray[np.float64]:
     """Shape the splats: size by the density, ratio and angle of the axes by the bending."""
     from scipy.ndimage import gaussian_filter
 
     column, row = _pixels(mean, density.shape)
-    xx, yy, xy = (gaussian_filter(b, ALIGN * spacing)[row, column].astype(float) for b in bend)
+    xx, yy, xy = (
+        gaussian_filter(b, DIRECTION_BLUR * spacing)[row, column].astype(float) for b in bend
+    )
     split = np.hypot(xx - yy, 2 * xy)
-    ratio = 1 + (STRETCH - 1) * split / (xx + yy)
-    variance = SIZE**2 / density[row, column]
+    ratio = 1 + (MAX_STRETCH - 1) * split / (xx + yy)
+    variance = RELATIVE_SIZE**2 / density[row, column]
     along, across = variance * ratio, variance / ratio
     angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the direction that bends the most
     cos, sin = np.cos(angle), np.sin(angle)

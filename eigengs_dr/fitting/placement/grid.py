@@ -7,12 +7,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-GRID_SIZE = 0.65
+DEVIATION = 0.65
 """Standard deviation of a splat on the grid over the root of the area it has for itself. Smaller
 leaves gaps; larger gains nothing, and colours take longer to solve for and grow."""
 
 
-def grid(
+def place_grid(
     image: NDArray[np.floating], count: int, generator: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Place round splats in rows, each shifted against the last by half a distance: hexagons.
@@ -29,5 +29,5 @@ def grid(
     number = np.diff(starts)[row]
     place = np.arange(count) - starts[row] + np.where(number > 1, 0.25 + 0.5 * (row % 2), 0.5)
     mean = np.stack([place * width / number, (row + 0.5) * height / rows], axis=-1)
-    sharpness = 1 / (GRID_SIZE * spacing)
+    sharpness = 1 / (DEVIATION * spacing)
     return mean, np.tile([sharpness, 0, sharpness], (count, 1))

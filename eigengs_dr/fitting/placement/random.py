@@ -1,4 +1,4 @@
-"""Where splats start: `random`, on a `grid`, or `adaptive` to the image."""
+"""Where splats start: `place_random`, on a `grid`, or `adaptive` to the image."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def random(
+def place_random(
     image: NDArray[np.floating], count: int, generator: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Place splats uniformly, shaped as GaussianImage does: Cholesky factors uniform in [0, 1].

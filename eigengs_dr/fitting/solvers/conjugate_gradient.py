@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.arrays import types_of
-from ...backend.recording import frozen
+from ...backend.recording import freeze_program
 from ...gaussian.gaussians import Gaussians
-from ...raster.evaluate import SHAPE, UNIT
-from ...raster.kernels import accumulate, adjoint, channel_sums
-from ...raster.layout import pack
-from ...raster.render import CUTOFF, WIDEST_CUTOFF, lists_for, to_tiles
+from ...raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS
+from ...raster.kernels import adjoint, channel_sums, forward
+from ...raster.layout import pack_parameters
+from ...raster.render import CUTOFF, MAX_CUTOFF, bin_gaussians, to_tiles
 from ...raster.tiles import TileLists
 
-ROUNDING = {32: 1e-12, 64: 1e-28}
+RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}
 """Share of the first ``r^T z`` below which only rounding is left, by bits of a number."""
 
 
@@ -87,7 +87,7 @@ def solve(
         return _solve(gaussians, image, steps, cutoff, warm_start)
 
 
-def correlations(
+def inner_products(
     gaussians: Gaussians, image: NDArray[Any], cutoff: float = CUTOFF, squared: bool = False
 ) -> NDArray[Any]:
     """Inner products of every splat's weights with an image.
@@ -111,10 +111,10 @@ def correlations(
     with dr.suspend_grad():
         types = types_of(gaussians.mean)
         n = len(gaussians)
-        lists = lists_for(gaussians, cutoff)
+        lists = bin_gaussians(gaussians, cutoff)
         delta = to_tiles(types, np.asarray(image, np.float32), lists.grid)
         shape = _shape(gaussians)
-        product = _of_squares if squared else _apply_transposed
+        product = _apply_squared if squared else _apply_transposed
         rows = product(shape, delta, image.shape[2], lists, cutoff)
         return np.stack([row.numpy()[:n] for row in rows], axis=1)
 
@@ -124,7 +124,7 @@ def _solve(
 ) -> Solution:
     types = types_of(gaussians.mean)
     n, channels = len(gaussians), gaussians.channels
-    lists = lists_for(gaussians, cutoff)
+    lists = bin_gaussians(gaussians, cutoff)
     inside = to_tiles(types, np.ones(image.shape, np.float32), lists.grid)
     shape = _shape(gaussians)
     if warm_start:
@@ -146,9 +146,11 @@ def _solve(
     inverse = _inverse_diagonal(shape, inside, channels, lists, cutoff)
     z = [a * b for a, b in zip(r, inverse, strict=True)]
     p, rz = z, [dr.dot(a, b) for a, b in zip(r, z, strict=True)]
-    enough = [ROUNDING[types.bits] * a for a in rz]
+    enough = [RELATIVE_TOLERANCE[types.bits] * a for a in rz]
     dr.eval(p, rz, enough)
-    with frozen(_step) as take_step:  # for this solve alone: a program does not notice another N
+    with freeze_program(
+        _step
+    ) as take_step:  # for this solve alone: a program does not notice another N
         for _ in range(steps):
             unknowns, residual, p, rz, square = take_step(
                 shape, unknowns, residual, p, rz, enough, inverse, inside, lists, cutoff
@@ -205,7 +207,9 @@ def _apply(shape: list, unknowns: list, lists: TileLists, inside: Any, cutoff: f
     n = dr.width(shape[0])
     color = [dr.gather(types.Float, u, dr.arange(types.UInt, n)) for u in unknowns]
     background = [dr.gather(types.Float, u, types.UInt(n)) for u in unknowns]
-    image = accumulate(pack([*shape, *color]), background, lists, (UNIT * cutoff) ** 2)
+    image = forward(
+        pack_parameters([*shape, *color]), background, lists, (EXP2_SCALE * cutoff) ** 2
+    )
     return image * inside
 
 
@@ -214,8 +218,8 @@ def _apply_transposed(
 ) -> list:
     """``A^T d``: correlate with every splat, and the sum of every channel."""
     types = types_of(delta)
-    packed = pack([*shape, *[types.Float(0)] * channels])
-    color = adjoint(packed, delta, channels, lists, UNIT * cutoff, color_only=True)
+    packed = pack_parameters([*shape, *[types.Float(0)] * channels])
+    color = adjoint(packed, delta, channels, lists, EXP2_SCALE * cutoff, color_only=True)
     totals = channel_sums(delta, channels, lists.grid)
     return [dr.concat([c, t]) for c, t in zip(color, totals, strict=True)]
 
@@ -224,20 +228,20 @@ def _inverse_diagonal(
     shape: list, inside: Any, channels: int, lists: TileLists, cutoff: float
 ) -> list:
     """One over the diagonal of ``A^T A``."""
-    diagonal = _of_squares(shape, inside, channels, lists, cutoff)
+    diagonal = _apply_squared(shape, inside, channels, lists, cutoff)
     return [dr.select(d > 1e-8, dr.rcp(d), 0) for d in diagonal]
 
 
-def _of_squares(shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float) -> list:
+def _apply_squared(shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float) -> list:
     """`_apply_transposed` for ``w^2``, the weight of a splat narrower by sqrt 2."""
     root = math.sqrt(2)
-    narrow = [*shape[:2], *[f * root for f in shape[2:SHAPE]]]
-    reach = min(cutoff * root, WIDEST_CUTOFF)  # beyond, squares are 0 in any precision
+    narrow = [*shape[:2], *[f * root for f in shape[2:NUM_SHAPE_PARAMS]]]
+    reach = min(cutoff * root, MAX_CUTOFF)  # beyond, squares are 0 in any precision
     return _apply_transposed(narrow, delta, channels, lists, reach)
 
 
 def _shape(gaussians: Gaussians) -> list:
     """Mean and factor as the kernels take them, every row of full length."""
     zeros = dr.zeros(types_of(gaussians.mean).Float, len(gaussians))
-    shape = [*gaussians.mean, *[f * UNIT for f in gaussians.factor]]
+    shape = [*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor]]
     return [dr.detach(v) + zeros for v in shape]

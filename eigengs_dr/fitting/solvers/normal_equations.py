@@ -20,15 +20,15 @@ from scipy.sparse.linalg import splu
 
 from ...backend.arrays import types_of, upload
 from ...gaussian.gaussians import Gaussians
-from ...raster.evaluate import SHAPE, UNIT, weights
+from ...raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, weights
 from ...raster.kernels import adjoint
-from ...raster.layout import pack, unpack
-from ...raster.render import CUTOFF, lists_for, to_tiles
+from ...raster.layout import pack_parameters, unpack_parameters
+from ...raster.render import CUTOFF, bin_gaussians, to_tiles
 
 GROUP = 3
 """Images that are correlated at once: an image's channels, so that one program serves all."""
 
-MOST_WEIGHTS = 1 << 28
+MAX_WEIGHTS = 1 << 28
 """Largest number of weights that a matrix may have: they and their places take 6 GiB."""
 
 RIDGE = 1e-4
@@ -87,7 +87,7 @@ class NormalEquations:
     def __init__(self, gaussians: Gaussians, low: int = 0, cutoff: float = CUTOFF) -> None:
         self.count, self.cutoff = len(gaussians), cutoff
         self.width, self.height = gaussians.width, gaussians.height
-        matrix = splat_matrix(gaussians, cutoff)
+        matrix = weight_matrix(gaussians, cutoff)
         double = matrix.astype(np.float64)
         self.gram = (double @ double.T).tocsr()
         self.coverage = np.asarray(matrix.sum(axis=1), np.float64)
@@ -95,9 +95,9 @@ class NormalEquations:
         self.blocks = [self._block(slice(*pair)) for pair in pairwise(ends)]
         with dr.suspend_grad():
             types = types_of(gaussians.mean)
-            shape = [*gaussians.mean, *[f * UNIT for f in gaussians.factor]]
-            self.packed = pack([*shape, *[types.Float(0)] * GROUP])
-            self.lists = lists_for(gaussians, cutoff)
+            shape = [*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor]]
+            self.packed = pack_parameters([*shape, *[types.Float(0)] * GROUP])
+            self.lists = bin_gaussians(gaussians, cutoff)
 
     def _block(self, rows: slice) -> Block:
         """Factorise the equations of some splats."""
@@ -139,7 +139,9 @@ class NormalEquations:
                 missing = [(0, GROUP - len(planes)), (0, 0), (0, 0)]
                 padded = np.pad(planes, missing) if len(planes) < GROUP else planes
                 delta = to_tiles(types, np.moveaxis(padded, 0, 2), self.lists.grid)
-                rows = adjoint(self.packed, delta, GROUP, self.lists, UNIT * self.cutoff, True)
+                rows = adjoint(
+                    self.packed, delta, GROUP, self.lists, EXP2_SCALE * self.cutoff, True
+                )
                 dr.eval(rows)
                 for column, row in zip(range(first, first + len(planes)), rows, strict=False):
                     result[:-1, column] = row.numpy()
@@ -180,7 +182,7 @@ class NormalEquations:
         self,
         coefficients: NDArray[np.float64],
         correlations: NDArray[np.float64],
-        squares: NDArray[np.float64],
+        squared_norms: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """``|A c + b 1 - D|^2`` of M images by inner products, without rendering one.
 
@@ -195,11 +197,11 @@ class NormalEquations:
         ndarray of float64, shape (M,)
         """
         product = self.product(coefficients)
-        error = squares + ((product - 2 * correlations) * coefficients).sum(axis=0)
+        error = squared_norms + ((product - 2 * correlations) * coefficients).sum(axis=0)
         return np.maximum(error, 0)
 
 
-def splat_matrix(gaussians: Gaussians, cutoff: float = CUTOFF) -> csr_array:
+def weight_matrix(gaussians: Gaussians, cutoff: float = CUTOFF) -> csr_array:
     """Weights of every splat at every pixel of the native size: the transpose of A.
 
     Parameters
@@ -218,7 +220,7 @@ def splat_matrix(gaussians: Gaussians, cutoff: float = CUTOFF) -> csr_array:
     Raises
     ------
     ValueError
-        If these are more than `MOST_WEIGHTS`.
+        If these are more than `MAX_WEIGHTS`.
     """
     arrays = gaussians.to_arrays()
     splat, x, y = _pixels_inside(
@@ -233,10 +235,10 @@ def splat_matrix(gaussians: Gaussians, cutoff: float = CUTOFF) -> csr_array:
         return csr_array(size, dtype=np.float32)
     types = types_of(gaussians.mean)
     with dr.suspend_grad():
-        packed = pack([*gaussians.mean, *[f * UNIT for f in gaussians.factor]])
-        shape = unpack(packed, upload(types.UInt, splat), SHAPE)
+        packed = pack_parameters([*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor]])
+        shape = unpack_parameters(packed, upload(types.UInt, splat), NUM_SHAPE_PARAMS)
         px, py = (upload(types.Float, (p + 0.5).astype(np.float32)) for p in (x, y))
-        [values] = weights(shape, px, py, (1, 1), (UNIT * cutoff) ** 2)
+        [values] = weights(shape, px, py, (1, 1), (EXP2_SCALE * cutoff) ** 2)
     columns = y * gaussians.width + x
     starts = np.concatenate([[0], np.cumsum(np.bincount(splat, minlength=len(gaussians)))])
     return csr_array((values.numpy(), columns, starts.astype(np.int32)), shape=size)
@@ -274,13 +276,13 @@ def _expand(
     """All integers of the ranges [low, high), each with the index of its range."""
     count = high - low
     total = int(count.sum(dtype=np.int64))
-    if total > MOST_WEIGHTS:
-        raise ValueError(f"the splats cover {total:,} pixels in all, over {MOST_WEIGHTS:,}")
+    if total > MAX_WEIGHTS:
+        raise ValueError(f"the splats cover {total:,} pixels in all, over {MAX_WEIGHTS:,}")
     which = np.repeat(np.arange(len(low)), count)
     before = np.repeat(np.cumsum(count) - count, count)
     return which, (np.arange(len(which)) - before + low[which]).astype(np.int32)
 
 
-def squares(planes: NDArray[np.float32]) -> NDArray[np.float64]:
+def squared_norms(planes: NDArray[np.float32]) -> NDArray[np.float64]:
     """``|D|^2`` of every plane."""
     return np.einsum("nij,nij->n", planes, planes, dtype=np.float64)

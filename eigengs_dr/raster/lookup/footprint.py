@@ -7,16 +7,16 @@ from typing import Any
 
 import drjit as dr
 
-from ..evaluate import UNIT
+from ..evaluate import EXP2_SCALE
 
-WIDEST = 0.4
+MAX_FOOTPRINT = 0.4
 """Largest standard deviation of a footprint, in widths and heights of the texture. One that is as
 wide as this in all directions sees the mean: what it leaves of a repeating texture is below
 ``exp(-(2 pi WIDEST)^2 / 2)`` = 4 % of its coarsest wave."""
 
 
-def bounded_covariance(metric: list) -> tuple[list, Any]:
-    """Invert the metric of a footprint, with no axis longer than `WIDEST`.
+def bound_covariance(metric: list) -> tuple[list, Any]:
+    """Invert the metric of a footprint, with no axis longer than `MAX_FOOTPRINT`.
 
     Of a symmetric 2x2 matrix M with eigenvalues p > q is
     ``f(M) = f(q) + (M - q) (f(p) - f(q)) / (p - q)``; here ``f(p) = 1 / max(p, WIDEST^-2)``.
@@ -34,7 +34,7 @@ def bounded_covariance(metric: list) -> tuple[list, Any]:
         Where the footprint is so wide in all directions that only the mean is left, or not finite.
     """
     xx, xy, yy = metric
-    floor = 1 / WIDEST**2
+    floor = 1 / MAX_FOOTPRINT**2
     middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
     root = dr.sqrt(dr.fma(half, half, xy * xy))
     p, q = middle + root, dr.maximum(middle - root, 0)
@@ -42,12 +42,12 @@ def bounded_covariance(metric: list) -> tuple[list, Any]:
     short, long = dr.rcp(dr.maximum(p, floor)), dr.rcp(dr.maximum(q, floor))
     slope = dr.select(root > 1e-6 * middle, (short - long) / (2 * root), 0)
     covariance = [dr.fma(slope, xx - q, long), slope * xy, dr.fma(slope, yy - q, long)]
-    round_one = (WIDEST**2, 0.0, WIDEST**2)
+    round_one = (MAX_FOOTPRINT**2, 0.0, MAX_FOOTPRINT**2)
     covariance = [dr.select(blind, r, c) for r, c in zip(round_one, covariance, strict=True)]
     return covariance, blind
 
 
-def share(shape: list, footprint: list, x: Any, y: Any, width: int, height: int) -> Any:
+def inside_share(shape: list, footprint: list, x: Any, y: Any, width: int, height: int) -> Any:
     """What part of ``footprint x splat`` lies in the image.
 
     The product of both Gaussians is one with the mean ``x - Sigma_f Sigma'^-1 (x - mu)`` and the
@@ -73,7 +73,7 @@ def share(shape: list, footprint: list, x: Any, y: Any, width: int, height: int)
     def strip(center: Any, along: Any, across: Any, other: Any, variance: Any, side: int) -> Any:
         left = dr.fma(a, along, b * across), c * across
         rest = dr.maximum(variance - dr.fma(left[0], left[0], left[1] * left[1]), 1e-6)
-        steep = dr.rsqrt(rest) * (math.sqrt(0.5) / UNIT)
+        steep = dr.rsqrt(rest) * (math.sqrt(0.5) / EXP2_SCALE)
         middle = center - other
         return 0.5 * (quick_erf((side - middle) * steep) + quick_erf(middle * steep))
 

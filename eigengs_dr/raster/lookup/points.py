@@ -16,8 +16,8 @@ from typing import Any
 import drjit as dr
 
 from ...backend.arrays import types_of
-from ..evaluate import LN2, SHAPE, weights
-from ..layout import list_entry, unpack
+from ..evaluate import LN2, NUM_SHAPE_PARAMS, weights
+from ..layout import gather_index, unpack_parameters
 from ..tiles import Grid, build_lists
 
 
@@ -111,7 +111,7 @@ def fold(x: Any, side: int, wrap: str) -> tuple[Any, Any]:
     return dr.select(odd, side - local, local), dr.select(odd, -one, one)
 
 
-def near(cells: Cells, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
+def cell_range(cells: Cells, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
     """Begin and end of the list of the cell at a point; both 0 outside the cells."""
     types = types_of(x)
     grid = cells.grid
@@ -125,7 +125,7 @@ def near(cells: Cells, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
     return ends[0], ends[1]
 
 
-def sum_near(
+def sum_at_points(
     cells: Cells,
     packed: Any,
     number: int,
@@ -143,7 +143,8 @@ def sum_near(
     ----------
     cells : Cells
     packed : Float
-        Parameters of every splat, from `eigengs_dr.raster.layout.pack`; may carry gradients.
+        Parameters of every splat, from `eigengs_dr.raster.layout.pack_parameters`; may carry
+        gradients.
     number : int
         Parameters of one splat.
     x, y : Float
@@ -159,11 +160,11 @@ def sum_near(
     list of `count` Float
     """
     types = types_of(packed)
-    begin, end = near(cells, x, y, active)
+    begin, end = cell_range(cells, x, y, active)
 
     def add(i: Any, end: Any, x: Any, y: Any, sums: list) -> tuple:
         here = i < end
-        splat = unpack(packed, list_entry(types, cells.splat, i, here), number, here)
+        splat = unpack_parameters(packed, gather_index(types, cells.splat, i, here), number, here)
         return i + 1, end, x, y, [s + t for s, t in zip(sums, terms(splat, x, y), strict=True)]
 
     # A pure sum, which "-1" tells Dr.Jit: its gradient needs no storage.
@@ -177,29 +178,30 @@ def sum_near(
     )[-1]
 
 
-def values(limit: float) -> Callable[[list, Any, Any], list]:
-    """Terms of the sum itself: ``c_n w_n(x)``; see `sum_near`."""
+def value_terms(limit: float) -> Callable[[list, Any, Any], list]:
+    """Terms of the sum itself: ``c_n w_n(x)``; see `sum_at_points`."""
 
     def terms(splat: list, x: Any, y: Any) -> list:
-        (w,) = weights(splat[:SHAPE], x, y, (1, 1), limit)
-        return [w * c for c in splat[SHAPE:]]
+        (w,) = weights(splat[:NUM_SHAPE_PARAMS], x, y, (1, 1), limit)
+        return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
 
     return terms
 
 
-def values_and_slopes(limit: float) -> Callable[[list, Any, Any], list]:
+def gradient_terms(limit: float) -> Callable[[list, Any, Any], list]:
     """Terms of the sum and of its derivatives along x and y, three for every channel.
 
-    ``grad w = -2 ln(2) w F^T F (x - mu)``, with F in units of `eigengs_dr.raster.evaluate.UNIT`.
+    ``grad w = -2 ln(2) w F^T F (x - mu)``, with F in units of
+    `eigengs_dr.raster.evaluate.EXP2_SCALE`.
     """
 
     def terms(splat: list, x: Any, y: Any) -> list:
-        mean_x, mean_y, a, b, c = splat[:SHAPE]
-        (w,) = weights(splat[:SHAPE], x, y, (1, 1), limit)
+        mean_x, mean_y, a, b, c = splat[:NUM_SHAPE_PARAMS]
+        (w,) = weights(splat[:NUM_SHAPE_PARAMS], x, y, (1, 1), limit)
         dx, dy = x - mean_x, y - mean_y
         u, v = dr.fma(a, dx, b * dy), c * dy
         steep = -2 * LN2 * w
         along = (w, steep * a * u, steep * dr.fma(b, u, c * v))
-        return [k * color for color in splat[SHAPE:] for k in along]
+        return [k * color for color in splat[NUM_SHAPE_PARAMS:] for k in along]
 
     return terms

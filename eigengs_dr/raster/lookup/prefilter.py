@@ -14,18 +14,18 @@ from typing import Any
 import drjit as dr
 
 from ...backend.arrays import types_of
-from ..evaluate import SHAPE, UNIT, weights, widen
-from ..layout import gather_run, list_entry, unpack
-from .footprint import share
-from .points import sum_near
-from .size_classes import Sizes
+from ..evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, weights, widen
+from ..layout import gather_index, gather_run, unpack_parameters
+from .footprint import inside_share
+from .points import sum_at_points
+from .size_classes import SizeClasses
 
-REACH = 3.0
+FOOTPRINT_REACH = 3.0
 """Standard deviations after which a footprint ends, where copies of the image are looked for."""
 
 
-def sum_filtered(
-    sizes: Sizes,
+def sum_prefiltered(
+    sizes: SizeClasses,
     packed: Any,
     number: int,
     x: Any,
@@ -40,7 +40,7 @@ def sum_filtered(
     ----------
     sizes : Sizes
     packed, number
-        As in `eigengs_dr.raster.lookup.points.sum_near`.
+        As in `eigengs_dr.raster.lookup.points.sum_at_points`.
     x, y : Float
         Centre of the footprint in the image, in pixels, see `eigengs_dr.raster.lookup.points.fold`.
     footprint : list of 3 Float
@@ -58,18 +58,18 @@ def sum_filtered(
     """
     types = types_of(packed)
     footprint = [dr.detach(f) for f in footprint]
-    reach = [REACH * dr.safe_sqrt(footprint[k]) for k in (0, 2)]
+    reach = [FOOTPRINT_REACH * dr.safe_sqrt(footprint[k]) for k in (0, 2)]
     sides = (sizes.width, sizes.height)
     first = [dr.floor((v - r) * (1 / s)) for v, r, s in zip((x, y), reach, sides, strict=True)]
     last = [dr.floor((v + r) * (1 / s)) for v, r, s in zip((x, y), reach, sides, strict=True)]
     inner = (x >= reach[0]) & (x + reach[0] <= sides[0])
     inner &= (y >= reach[1]) & (y + reach[1] <= sides[1])
-    widest = dr.maximum(*reach) * (1 / REACH)
-    terms = _widened_values(footprint, (UNIT * cutoff) ** 2)
-    total = [types.Float(0) for _ in range(number - SHAPE)]
-    for spread, cells in sizes.near:
+    widest = dr.maximum(*reach) * (1 / FOOTPRINT_REACH)
+    terms = _widened_values(footprint, (EXP2_SCALE * cutoff) ** 2)
+    total = [types.Float(0) for _ in range(number - NUM_SHAPE_PARAMS)]
+    for spread, cells in sizes.listed:
         small = active & inner & (widest <= spread)
-        part = sum_near(cells, packed, number, x, y, small, terms, len(total))
+        part = sum_at_points(cells, packed, number, x, y, small, terms, len(total))
         total = [t + p for t, p in zip(total, part, strict=True)]
         active = active & ~small
     lookup = _Lookup(sizes, packed, number, cutoff, footprint)
@@ -80,13 +80,13 @@ def sum_filtered(
 
 def _widened_values(footprint: list, limit: float) -> Any:
     """Terms of the sum seen through a footprint, inside the image; see `points.sum_near`."""
-    scaled = [f * (1 / UNIT**2) for f in footprint]
+    scaled = [f * (1 / EXP2_SCALE**2) for f in footprint]
 
     def terms(splat: list, x: Any, y: Any) -> list:
-        shape, amplitude = widen(splat[:SHAPE], scaled)
+        shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], scaled)
         (w,) = weights(shape, x, y, (1, 1), limit)
         w = w * amplitude
-        return [w * c for c in splat[SHAPE:]]
+        return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
 
     return terms
 
@@ -95,7 +95,7 @@ def _widened_values(footprint: list, limit: float) -> Any:
 class _Lookup:
     """What both passes of one call share."""
 
-    sizes: Sizes
+    sizes: SizeClasses
     packed: Any
     number: int
     cutoff: float
@@ -110,8 +110,8 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
     """
     sizes, footprint, packed = lookup.sizes, lookup.footprint, lookup.packed
     types = types_of(packed)
-    limit = (UNIT * lookup.cutoff) ** 2
-    scaled = [f * (1 / UNIT**2) for f in footprint]
+    limit = (EXP2_SCALE * lookup.cutoff) ** 2
+    scaled = [f * (1 / EXP2_SCALE**2) for f in footprint]
     left, top, right, bottom = copies
     bottom = dr.select(active, bottom, top - 1)
 
@@ -166,15 +166,15 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
         n: Any, end: Any, row: Any, stop: Any, k: Any, i: Any, j: Any, x: Any, y: Any, sums: list
     ) -> tuple:
         here = (n < end) & (j <= bottom)
-        index = list_entry(types, sizes.splat, n, here)
-        splat = unpack(packed, index, lookup.number, here)
+        index = gather_index(types, sizes.splat, n, here)
+        splat = unpack_parameters(packed, index, lookup.number, here)
         px, py, sign = local(i, j, x, y)
         seen = [scaled[0], scaled[1] * sign, scaled[2]]
-        shape, amplitude = widen(splat[:SHAPE], seen)
+        shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], seen)
         (w,) = weights(shape, px, py, (1, 1), limit)
-        part = share(shape, seen, px, py, sizes.width, sizes.height)
+        part = inside_share(shape, seen, px, py, sizes.width, sizes.height)
         w = dr.select(here, w * amplitude * part, 0)
-        sums = [dr.fma(w, c, s) for c, s in zip(splat[SHAPE:], sums, strict=True)]
+        sums = [dr.fma(w, c, s) for c, s in zip(splat[NUM_SHAPE_PARAMS:], sums, strict=True)]
         n = n + 1
         ran = n >= end
         row = dr.select(ran, row + 1, row)
@@ -192,7 +192,7 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
     k = types.Int(0) + dr.zeros(types.Int, dr.width(x))
     row, stop = rows(left, top, k)
     begin, end = run(left, top, k, row, active & (row <= stop))
-    sums = [types.Float(0) for _ in range(lookup.number - SHAPE)]
+    sums = [types.Float(0) for _ in range(lookup.number - NUM_SHAPE_PARAMS)]
     return dr.while_loop(
         (begin, end, row, stop, k, left, top, x, y, sums),
         lambda n, end, row, stop, k, i, j, *rest: j <= bottom,
@@ -212,7 +212,7 @@ def _advance(go: Any, k: Any, i: Any, j: Any, sizes: int, left: Any, right: Any)
     return k, dr.select(over, left, i), dr.select(over, j + 1, j)
 
 
-def _row_of(types: Any, sizes: Sizes, k: Any) -> list:
+def _row_of(types: Any, sizes: SizeClasses, k: Any) -> list:
     """Row k of the table of sizes."""
     row = gather_run(types, sizes.table, types.UInt(k), 8, True)  # 8: packets of a power of two
     return row[:6]

@@ -19,18 +19,18 @@ from typing import Any
 import drjit as dr
 
 from ...backend.arrays import ArrayTypes, types_of
-from ..evaluate import SHAPE, UNIT, falloff
+from ..evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, falloff
 from ..layout import gather_run
-from .prefilter import sum_filtered
-from .size_classes import Sizes
+from .prefilter import sum_prefiltered
+from .size_classes import SizeClasses
 
-SIGMA = 0.65
+SAMPLE_DEVIATION = 0.65
 """Standard deviation of the lattice's Gaussians in units of its spacing."""
 
 FINEST, FEWEST = 1, 8
 """Spacing of the finest lattice in pixels, and points along the shorter side of the coarsest."""
 
-REACH = 3.0
+SAMPLE_REACH = 3.0
 """Standard deviations after which Gaussians of a lattice end."""
 
 
@@ -46,7 +46,7 @@ class Level:
 
 
 @dataclass(frozen=True)
-class Lattice:
+class GaussianPyramid:
     """Lattices of spacings of powers of two.
 
     Attributes
@@ -70,7 +70,7 @@ class Lattice:
     values: Any
 
 
-def build_lattice(sizes: Sizes, packed: Any, number: int, cutoff: float) -> Lattice:
+def build_pyramid(sizes: SizeClasses, packed: Any, number: int, cutoff: float) -> GaussianPyramid:
     """Look a sum of Gaussians up at the points of all lattices, differentiably.
 
     Cost: one exact lookup for each of ``width height / FINEST^2`` points; coarser lattices come
@@ -79,11 +79,11 @@ def build_lattice(sizes: Sizes, packed: Any, number: int, cutoff: float) -> Latt
     Parameters
     ----------
     sizes, packed, number, cutoff
-        As in `eigengs_dr.raster.lookup.prefilter.sum_filtered`.
+        As in `eigengs_dr.raster.lookup.prefilter.sum_prefiltered`.
     """
     types = types_of(packed)
     width, height = sizes.width, sizes.height
-    lattice = Lattice(width, height, sizes.wrap, number - SHAPE, (), None)
+    lattice = GaussianPyramid(width, height, sizes.wrap, number - NUM_SHAPE_PARAMS, (), None)
     parts: list = []
     spacing = FINEST
     while not parts or min(width, height) >= FEWEST * spacing:
@@ -92,13 +92,13 @@ def build_lattice(sizes: Sizes, packed: Any, number: int, cutoff: float) -> Latt
         index = dr.arange(types.UInt, nx * ny)
         x = (types.Float(index % nx) + 0.5) * level.dx
         y = (types.Float(index // nx) + 0.5) * level.dy
-        blur = [types.Float((SIGMA * level.dx) ** 2), types.Float(0)]
-        blur.append(types.Float((SIGMA * level.dy) ** 2))
+        blur = [types.Float((SAMPLE_DEVIATION * level.dx) ** 2), types.Float(0)]
+        blur.append(types.Float((SAMPLE_DEVIATION * level.dy) ** 2))
         if parts:
             finer = replace(lattice, levels=(replace(lattice.levels[-1], first=0),))
-            seen = sum_lattice(replace(finer, values=parts[-1]), x, y, blur, types.Bool(True))
+            seen = sum_pyramid(replace(finer, values=parts[-1]), x, y, blur, types.Bool(True))
         else:
-            seen = sum_filtered(sizes, packed, number, x, y, blur, types.Bool(True), cutoff)
+            seen = sum_prefiltered(sizes, packed, number, x, y, blur, types.Bool(True), cutoff)
         parts.append(_interleaved(types, seen, nx * ny))
         lattice = replace(lattice, levels=(*lattice.levels, level))
         spacing *= 2
@@ -119,7 +119,7 @@ def _interleaved(types: ArrayTypes, rows: list, count: int) -> Any:
     return flat
 
 
-def mean_of(lattice: Lattice) -> list:
+def pyramid_mean(lattice: GaussianPyramid) -> list:
     """Mean of every channel over the image."""
     types = types_of(lattice.values)
     level = lattice.levels[-1]
@@ -129,19 +129,19 @@ def mean_of(lattice: Lattice) -> list:
     return [dr.mean(row) for row in rows[: lattice.channels]]
 
 
-def is_distant(lattice: Lattice, footprint: list) -> Any:
+def is_minified(lattice: GaussianPyramid, footprint: list) -> Any:
     """Where a footprint is wide enough in all directions for the finest lattice."""
     xx, xy, yy = footprint
     smallest = 0.5 * (xx + yy) - dr.sqrt(dr.fma(0.25 * (xx - yy), xx - yy, xy * xy))
-    return smallest >= _least(lattice.levels[0])
+    return smallest >= _min_variance(lattice.levels[0])
 
 
-def _least(level: Level) -> float:
+def _min_variance(level: Level) -> float:
     """Smallest variance of a footprint that a lattice serves."""
-    return 2 * (SIGMA * max(level.dx, level.dy)) ** 2
+    return 2 * (SAMPLE_DEVIATION * max(level.dx, level.dy)) ** 2
 
 
-def sum_lattice(lattice: Lattice, x: Any, y: Any, footprint: list, active: Any) -> list:
+def sum_pyramid(lattice: GaussianPyramid, x: Any, y: Any, footprint: list, active: Any) -> list:
     """Look a footprint up in the coarsest lattice that serves it.
 
     Parameters
@@ -150,7 +150,7 @@ def sum_lattice(lattice: Lattice, x: Any, y: Any, footprint: list, active: Any) 
     x, y : Float
         Centre of the footprint in the image, in pixels.
     footprint : list of 3 Float
-        xx, xy, yy of its covariance, in pixels squared, for which `is_distant` holds; not
+        xx, xy, yy of its covariance, in pixels squared, for which `is_minified` holds; not
         differentiated.
     active : Bool
 
@@ -158,7 +158,7 @@ def sum_lattice(lattice: Lattice, x: Any, y: Any, footprint: list, active: Any) 
     -------
     list of Float
         Sums of the channels. Cost: a weight and a gather for each point of the lattice inside the
-        ellipse of `REACH` standard deviations, some 30 to 100 times the ratio of its axes.
+        ellipse of `SAMPLE_REACH` standard deviations, some 30 to 100 times the ratio of its axes.
     """
     types = types_of(lattice.values)
     xx, xy, yy = (dr.detach(f) for f in footprint)
@@ -166,19 +166,19 @@ def sum_lattice(lattice: Lattice, x: Any, y: Any, footprint: list, active: Any) 
     first, nx, ny, dx, dy = _pick(types, lattice.levels, smallest)
     # In units of the lattice, without the blur that its values have already.
     u, v = x * dr.rcp(dx) - 0.5, y * dr.rcp(dy) - 0.5
-    xx = dr.maximum(xx * dr.square(dr.rcp(dx)) - SIGMA**2, SIGMA**2)
-    yy = dr.maximum(yy * dr.square(dr.rcp(dy)) - SIGMA**2, SIGMA**2)
+    xx = dr.maximum(xx * dr.square(dr.rcp(dx)) - SAMPLE_DEVIATION**2, SAMPLE_DEVIATION**2)
+    yy = dr.maximum(yy * dr.square(dr.rcp(dy)) - SAMPLE_DEVIATION**2, SAMPLE_DEVIATION**2)
     xy = xy * dr.rcp(dx * dy)
     determinant = dr.maximum(dr.fma(xx, yy, -xy * xy), 1e-6)
-    inverse = [k * dr.rcp(determinant) * UNIT**2 for k in (yy, -2 * xy, xx)]
+    inverse = [k * dr.rcp(determinant) * EXP2_SCALE**2 for k in (yy, -2 * xy, xx)]
     lean, free = xy * dr.rcp(yy), determinant * dr.rcp(yy)
-    reach = REACH * dr.sqrt(yy)
-    scale = dr.rsqrt(determinant) * (1 / (2 * math.pi * -math.expm1(-0.5 * REACH**2)))
+    reach = SAMPLE_REACH * dr.sqrt(yy)
+    scale = dr.rsqrt(determinant) * (1 / (2 * math.pi * -math.expm1(-0.5 * SAMPLE_REACH**2)))
 
     def row_of(j: Any) -> tuple:
         """Columns [i, stop] of the ellipse in one row of the lattice."""
         down = types.Float(j) - dr.detach(v)
-        half = dr.safe_sqrt(free * (REACH**2 - down * down * dr.rcp(yy)))
+        half = dr.safe_sqrt(free * (SAMPLE_REACH**2 - down * down * dr.rcp(yy)))
         middle = dr.fma(lean, down, dr.detach(u))
         return types.Int(dr.ceil(middle - half)), types.Int(dr.floor(middle + half))
 
@@ -186,7 +186,7 @@ def sum_lattice(lattice: Lattice, x: Any, y: Any, footprint: list, active: Any) 
         here = i <= stop
         across, down = types.Float(i) - u, types.Float(j) - v
         q = inverse[0] * across * across + (inverse[1] * across + inverse[2] * down) * down
-        w = falloff(dr.maximum(q, 0), 2 * (UNIT * REACH) ** 2) * scale
+        w = falloff(dr.maximum(q, 0), 2 * (EXP2_SCALE * SAMPLE_REACH) ** 2) * scale
         column, row = (_fold(types, k, n, lattice.wrap) for k, n in ((i, nx), (j, ny)))
         seen = gather_run(types, lattice.values, first + row * types.UInt(nx) + column, 4, here)
         sums = [dr.fma(w, c, s) for c, s in zip(seen, sums, strict=False)]
@@ -215,7 +215,7 @@ def _pick(types: ArrayTypes, levels: tuple[Level, ...], smallest: Any) -> list:
     rows = [(t.first, t.nx, t.ny, t.dx, t.dy) for t in levels]
     picked = [kind(number) for kind, number in zip(kinds, rows[0], strict=True)]
     for level, row in zip(levels[1:], rows[1:], strict=True):
-        fits = smallest >= _least(level)
+        fits = smallest >= _min_variance(level)
         picked = [
             dr.select(fits, kind(number), before)
             for kind, number, before in zip(kinds, row, picked, strict=True)

@@ -10,21 +10,21 @@ import drjit as dr
 import numpy as np
 
 from ...backend.arrays import types_of, upload
-from ..evaluate import UNIT, widen
+from ..evaluate import EXP2_SCALE, widen
 from .points import Cells, cell_side, list_cells
 
-SMALLEST = 1.0
+MIN_CLASS_SIZE = 1.0
 """Largest standard deviation, in pixels, of the smallest size that splats are sorted by."""
 
-RATIO = 3.0
+CLASS_RATIO = 3.0
 """Of one size to the next. More sizes are more rows to visit, fewer more splats in vain."""
 
-SPREADS = (1.0, 4.0)
+LISTED_FOOTPRINTS = (1.0, 4.0)
 """Footprints, in pixels, for which cells list their splats: where most lookups fall."""
 
 
 @dataclass(frozen=True)
-class Sizes:
+class SizeClasses:
     """Splats sorted by size, and those of one size by the cell that holds their mean.
 
     A splat of the size s, its largest standard deviation being at most s, can only be seen by a
@@ -44,7 +44,7 @@ class Sizes:
         Where the splats of every cell begin in `splat`.
     table : Float, shape (8 count,)
         Of each size its square, first cell, columns, rows, 1 / side and origin of the cells.
-    near : list of (float, Cells)
+    listed : list of (float, Cells)
         Lists for points inside of the image and footprints of up to this standard deviation: those
         of splats widened by it, whose ellipses contain those of smaller footprints.
     """
@@ -56,10 +56,10 @@ class Sizes:
     splat: Any
     starts: Any
     table: Any
-    near: list
+    listed: list
 
 
-def sort_by_size(shape: list, width: int, height: int, cutoff: float, wrap: str) -> Sizes:
+def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: str) -> SizeClasses:
     """Sort splats for `sum_filtered`.
 
     Parameters
@@ -77,7 +77,7 @@ def sort_by_size(shape: list, width: int, height: int, cutoff: float, wrap: str)
     with np.errstate(all="ignore"):
         size = _largest_deviation(a, b, c)
         drawn = np.isfinite(x + y + size) & (a > 0) & (c > 0)
-        rank = np.ceil(np.log(size / SMALLEST) / math.log(RATIO))
+        rank = np.ceil(np.log(size / MIN_CLASS_SIZE) / math.log(CLASS_RATIO))
     rank = np.where(drawn, np.maximum(rank, 0), 0).astype(np.int64)
     order, counts, table, first = [], [], [], 0
     for k in np.unique(rank[drawn]):
@@ -97,7 +97,7 @@ def sort_by_size(shape: list, width: int, height: int, cutoff: float, wrap: str)
     starts = np.cumsum(np.concatenate([[0], *counts] if counts else [[0, 0]]))
     found = np.concatenate([*order, [0]])  # never empty, and even: it is read in pairs
     splat = np.pad(found, (0, len(found) % 2))
-    return Sizes(
+    return SizeClasses(
         width,
         height,
         wrap,
@@ -105,21 +105,21 @@ def sort_by_size(shape: list, width: int, height: int, cutoff: float, wrap: str)
         upload(types.UInt, splat.astype(np.uint32)),
         upload(types.UInt, np.asarray(starts, np.uint32)),
         upload(types.Float, np.asarray(table or np.zeros((1, 8)), np.float32).ravel()),
-        [(s, _cells_for(shape, width, height, cutoff, s)) for s in SPREADS],
+        [(s, _cells_for(shape, width, height, cutoff, s)) for s in LISTED_FOOTPRINTS],
     )
 
 
 def _cells_for(shape: list, width: int, height: int, cutoff: float, spread: float) -> Cells:
     types = types_of(shape[0])
-    variance = dr.opaque(types.Float, (spread / UNIT) ** 2)
+    variance = dr.opaque(types.Float, (spread / EXP2_SCALE) ** 2)
     widened, _ = widen(shape, [variance, types.Float(0), variance])
     side = max(4, cell_side(width, height, dr.width(shape)))
-    return list_cells(widened, width, height, UNIT * cutoff, side)
+    return list_cells(widened, width, height, EXP2_SCALE * cutoff, side)
 
 
 def _largest_deviation(a: Any, b: Any, c: Any) -> Any:
-    """Largest standard deviation of splats with the factor ``[[a, b], [0, c]]`` over `UNIT`."""
+    """Largest standard deviation of a splat, from its factor over `EXP2_SCALE`."""
     ia, t, ic = 1 / a, -b / (a * c), 1 / c
     middle = 0.5 * (ia * ia + t * t + ic * ic)
     root = np.sqrt(np.maximum(middle * middle - (ia * ic) ** 2, 0))
-    return UNIT * np.sqrt(middle + root)
+    return EXP2_SCALE * np.sqrt(middle + root)
