@@ -1,20 +1,15 @@
-"""Sets of splats, and families of images, that tests share: drawn at random or by hypothesis.
+"""Sets of splats that tests share: drawn at random or by hypothesis.
 
-All numbers are rounded to float32, so that what is computed in float64 has the same input.
-"""
+All numbers are rounded to float32, so that what is computed in float64 has the same input."""
 
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from scipy.ndimage import gaussian_filter
 
 from eigengs_dr.backend.selection import select
-from eigengs_dr.eigenbasis.basis import Eigenbasis
-from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.raster.reference import render_exact
 
@@ -128,20 +123,17 @@ def scenes(count=COUNT, size=SIZE, channels=3):
     return unit.map(lambda values: scene_of(values, size))
 
 
-def family(count=40, side=32, seed=0):
-    """RGB images of low-pass noise, shape (count, side, side, 3)."""
-    noise = np.random.default_rng(seed).normal(size=(count, side, side, 3))
-    smooth = gaussian_filter(noise, (0, 3, 3, 0.5), mode="wrap")
-    return (0.5 + 0.15 * smooth / smooth.std()).clip(0, 1).astype(np.float32)
+NAMES = ("mean", "factor", "color", "background")
 
 
-@cache
-def small_basis(color="ycbcr"):
-    """Components of a family of 32x32 pixels: 12 of the first channel, 6 of the others."""
-    return Eigenbasis.from_images(family(), (32, 32), (12, 6, 6), color=color)
+def arrays_of(scene):
+    return {name: getattr(scene, name) for name in NAMES}
 
 
-@cache
-def small_model(backend, split=False, color="ycbcr"):
-    """A model of `small_basis` with 100 splats."""
-    return EigenGS.fit(small_basis(color), 100, frequency_aware=split, backend=backend)
+def check_equal(gaussians, arrays):
+    for name, found in gaussians.to_arrays().items():
+        np.testing.assert_array_equal(found, np.asarray(arrays[name], found.dtype), err_msg=name)
+
+
+def upload(types, *arrays):
+    return [types.Float(np.ascontiguousarray(v)) for v in arrays]

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from test_training import SMALL, random_fields
 
+from _helpers.photos import SMALL, random_fields
 from eigengs_dr.cli import pictures
 from eigengs_dr.cli.pictures import CELL, LIGHTER, comparison, component_sheet, ellipses, overlay
 from eigengs_dr.eigenbasis.training import TrainOptions, train
 from eigengs_dr.gaussian.gaussians import Gaussians
-from eigengs_dr.image.montage import GAP, join_pictures, text_line
+from eigengs_dr.image.montage import GAP
 from eigengs_dr.image.resize import resample
 from eigengs_dr.raster.render import render
 
@@ -160,19 +160,3 @@ def test_a_comparison_keeps_the_shape(height, width, times):
     grey = np.full((height, width, 1), 0.5)
     shown = comparison(grey, grey, round_splats([[0.5, 0.5]], 4.0, (width, height)))
     assert shown.shape == (times * height, 3 * times * width, 3)
-
-
-def test_pictures_are_joined_on_white():
-    joint = join_pictures([np.zeros((2, 3, 3)), np.zeros((4, 1, 3))], 1, gap=2)
-    assert joint.shape == (4, 3 + 2 + 1 + 2, 3)
-    black = joint.sum(axis=2) == 0
-    assert black[:2, :3].all() and black[:, 5].all() and black.sum() == 10
-    assert (joint[~black] == 1).all()
-
-
-def test_a_line_holds_its_text():
-    written = text_line("Agjpq", 200, 16)
-    assert written.shape == (20, 200, 3)
-    ink = np.argwhere(written.min(axis=2) < 0.5)
-    assert ink.min() > 0 and ink[:, 0].max() < 19  # nothing is cut off below
-    assert (text_line("", 200, 16) == 1).all()

@@ -10,32 +10,13 @@ from hypothesis import strategies as st
 from sklearn.decomposition import PCA
 
 import eigengs_dr.eigenbasis.basis as pca
-from eigengs_dr.eigenbasis import basis_file as basisfile
+from _helpers.errors import one_line
+from _helpers.low_rank import HEIGHT, SIZE, WIDTH, assert_same, basis_of, family, planes
 from eigengs_dr.eigenbasis import incremental_pca as incremental
 from eigengs_dr.eigenbasis.basis import Eigenbasis
-from eigengs_dr.eigenbasis.incremental_pca import EigenState, empty_state, merge
-from eigengs_dr.image.folder import image_files, read_blocks, to_planes
-from eigengs_dr.image.io import ImageError, check_image, save_image
+from eigengs_dr.image.folder import image_files
+from eigengs_dr.image.io import ImageError, save_image
 from eigengs_dr.image.resize import resample
-from eigengs_dr.storage import npz as archive
-
-WIDTH, HEIGHT = SIZE = (14, 11)
-PIXELS = WIDTH * HEIGHT
-
-
-def family(count=60, directions=20, noise=0.004, seed=0, size=SIZE):
-    """RGB images of low rank with falling variances, and noise."""
-    rng = np.random.default_rng(seed)
-    basis = rng.normal(size=(directions, size[1], size[0], 3))
-    weights = rng.normal(size=(count, directions)) * 0.06 * 0.8 ** np.arange(directions)
-    images = (
-        0.5 + np.tensordot(weights, basis, 1) + noise * rng.normal(size=(count, *basis[0].shape))
-    )
-    return np.clip(images, -0.4, 1.4).astype(np.float32)
-
-
-def planes(images, space="ycbcr"):
-    return np.stack([to_planes(check_image(image), space) for image in images])
 
 
 def exact(images, space="ycbcr"):
@@ -60,16 +41,6 @@ def assert_orthonormal(basis):
         np.testing.assert_allclose(rows @ rows.T, np.eye(len(rows)), rtol=0, atol=1e-5)
 
 
-def assert_same(a, b):
-    """Equal to the last bit."""
-    for name in ("mean", "variance", "examples", "count", "space"):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), name)
-    for name in ("components", "eigenvalues"):
-        for x, y in zip(getattr(a, name), getattr(b, name), strict=True):
-            assert x.dtype == y.dtype
-            np.testing.assert_array_equal(x, y, name)
-
-
 def psnr_of(basis, images):
     errors = [basis.reconstruct(basis.project(image)) - image for image in images]
     return -10 * np.log10(np.mean(np.square(errors)))
@@ -79,12 +50,6 @@ def psnr_of(basis, images):
 def blocks_of(monkeypatch):
     """Make `from_images` work in blocks of so many images."""
     return lambda length: monkeypatch.setattr(incremental, "MAX_BLOCK", length)
-
-
-def one_line(error):
-    message = str(error.value)
-    assert "\n" not in message and ";" in message
-    return message
 
 
 # ---------------------------------------------------------------- against scikit-learn
@@ -162,20 +127,6 @@ def test_blocks_lose_little_where_the_rank_does_not_suffice(blocks_of):
     assert psnr_of(whole, others) - psnr_of(parts, others) < 0.05
 
 
-def test_rows_stay_orthonormal_when_variances_differ_much():
-    """What rounding mixes into small components is as large as they are."""
-    rng = np.random.default_rng(0)
-    spread = np.logspace(-1, -4.5, 30)
-    directions = np.linalg.qr(rng.normal(size=(PIXELS, 30)))[0].T * np.sqrt(PIXELS)
-    images = 0.5 + (rng.normal(size=(200, 30)) * spread) @ directions
-    state = empty_state(SIZE)
-    for block in np.split(np.repeat(images[:, None], 3, axis=1).astype(np.float32), 8):
-        state = merge(state, block, (40,) * 3)
-        for rows in state.rows:
-            overlap = rows.astype(np.float64) @ rows.T.astype(np.float64)
-            assert np.abs(overlap - np.eye(len(rows))).max() < 1e-5
-
-
 # ---------------------------------------------------------------- streaming
 
 
@@ -187,37 +138,6 @@ def test_every_source_gives_the_same_bits(tmp_path, blocks_of):
     first = Eigenbasis.from_images(images, SIZE, 5)
     for source in (images, tmp_path, image_files(tmp_path), iter(np.split(images, 10))):
         assert_same(Eigenbasis.from_images(source, SIZE, 5), first)
-
-
-def test_merging_can_stop_and_go_on(tmp_path):
-    images, rank = family(40), (6, 6, 6)
-    whole, part = empty_state(SIZE, seed=3), empty_state(SIZE, seed=3)
-    for block in read_blocks(images, SIZE, "ycbcr", 8):
-        whole = merge(whole, block, rank)
-    for block in read_blocks(images[:16], SIZE, "ycbcr", 8):
-        part = merge(part, block, rank)
-    np.savez(tmp_path / "state.npz", **part.arrays())
-    with np.load(tmp_path / "state.npz") as file:
-        part = EigenState.from_arrays(dict(file))
-    for block in read_blocks(images[16:], SIZE, "ycbcr", 8):
-        part = merge(part, block, rank)
-    assert part.count == 40
-    assert_same(Eigenbasis.from_state(part, SIZE, 5), Eigenbasis.from_state(whole, SIZE, 5))
-
-
-def test_merging_nothing_changes_nothing():
-    state = merge(empty_state(SIZE), planes(family(5)), (4, 4, 4))
-    assert merge(state, np.zeros((0, 3, PIXELS), np.float32), (4, 4, 4)) is state
-    with pytest.raises(ValueError, match="no images were merged; merge"):
-        Eigenbasis.from_state(empty_state(SIZE), SIZE)
-
-
-def test_merge_leaves_the_old_state_alone():
-    state = merge(empty_state(SIZE), planes(family(10)), (4, 4, 4))
-    before = {key: array.copy() for key, array in state.arrays().items()}
-    merge(state, planes(family(10, seed=1)), (4, 4, 4))
-    for key, array in state.arrays().items():
-        np.testing.assert_array_equal(array, before[key])
 
 
 def test_examples_are_training_images_drawn_with_the_seed(blocks_of):
@@ -234,24 +154,6 @@ def test_examples_are_training_images_drawn_with_the_seed(blocks_of):
     assert not np.array_equal(
         Eigenbasis.from_images(images, SIZE, 2, seed=6).examples, first.examples
     )
-
-
-def test_every_image_is_drawn_with_the_same_probability():
-    block = np.zeros((64, 3, 1), np.float32) + np.arange(64, dtype=np.float32)[:, None, None]
-    drawn = [
-        incremental._draw_examples(empty_state((1, 1), seed), block)[:, 0, 0] for seed in range(400)
-    ]
-    counts = np.bincount(np.concatenate(drawn).astype(int), minlength=64)
-    # Expected 100 each, with a standard deviation of 8.7.
-    assert np.abs(counts - 100).max() < 40
-
-
-def test_block_length_keeps_to_its_memory():
-    assert incremental.block_length((256, 256)) == 1024
-    assert incremental.block_length((512, 512)) == 256
-    assert incremental.block_length((64, 64)) == 1024
-    assert incremental.block_length((1 << 14, 1 << 14)) == 1
-    assert [incremental.rank_for(k) for k in (0, 1, 300)] == [0, 2, 375]
 
 
 def test_interruption_leaves_no_thread(tmp_path):
@@ -435,7 +337,7 @@ def test_bad_arguments_are_refused_before_an_image_is_read(options, complaint):
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["ycbcr", "rgb"]))
 def test_project_undoes_reconstruct(seed, space):
-    basis = BASES[space]
+    basis = basis_of(space)
     rng = np.random.default_rng(seed)
     weights = [rng.uniform(-0.2, 0.2, len(c)) for c in basis.components]
     image = basis.reconstruct(weights)
@@ -448,7 +350,7 @@ def test_project_undoes_reconstruct(seed, space):
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_projecting_twice_is_projecting_once_and_brings_no_image_away(seed):
-    basis = BASES["rgb"]
+    basis = basis_of("rgb")
     image = np.random.default_rng(seed).random((HEIGHT, WIDTH, 3)).astype(np.float32)
     once = basis.reconstruct(basis.project(image))
     np.testing.assert_allclose(basis.reconstruct(basis.project(once)), once, atol=2e-5)
@@ -457,14 +359,8 @@ def test_projecting_twice_is_projecting_once_and_brings_no_image_away(seed):
     assert left + moved == pytest.approx(np.sum((image - mean) ** 2), rel=1e-4)  # Pythagoras
 
 
-BASES = {
-    space: Eigenbasis.from_images(family(), SIZE, (12, 5, 5), color=space)
-    for space in ("ycbcr", "rgb")
-}
-
-
 def test_images_of_any_size_and_type_are_projected():
-    basis = BASES["ycbcr"]
+    basis = basis_of("ycbcr")
     large = resample(family(1)[0], 50, 60)
     fitting = resample(large, WIDTH, HEIGHT)
     for a, b in zip(basis.project(large), basis.project(fitting), strict=True):
@@ -477,75 +373,5 @@ def test_images_of_any_size_and_type_are_projected():
 def test_coefficients_of_another_basis_are_refused():
     for weights in ([np.zeros(12)] * 3, [np.zeros(12)], [np.zeros((12, 1)), np.zeros(5), 0]):
         with pytest.raises(ValueError, match="coefficients have shapes") as error:
-            BASES["rgb"].reconstruct(weights)
+            basis_of("rgb").reconstruct(weights)
         one_line(error)
-
-
-# ---------------------------------------------------------------- files
-
-
-def test_saved_and_loaded_is_the_same(tmp_path):
-    for basis in (BASES["ycbcr"].truncated((4, 3, 0)), BASES["rgb"], BASES["rgb"].truncated(0)):
-        basis.save(tmp_path / "a.npz")
-        loaded = Eigenbasis.load(str(tmp_path / "a.npz"))
-        assert_same(loaded, basis)
-        assert type(loaded.count) is int and type(loaded.space) is str
-
-
-def change(key, value):
-    return lambda arrays: arrays.__setitem__(key, value)
-
-
-@pytest.mark.parametrize(
-    ("edit", "complaint"),
-    [
-        (lambda a: a.pop("mean"), "key 'mean' is missing"),
-        (lambda a: a.pop("components1"), "key 'components1' is missing"),
-        (change("mean", np.zeros((2, HEIGHT, WIDTH), "f4")), r"mean has shape \(2, 11, 14\)"),
-        (change("mean", np.zeros((3, 0, 4), "f4")), r"mean has shape \(3, 0, 4\)"),
-        (change("mean", np.zeros((3, 4, 4), "f4")), "examples has shape"),
-        (change("mean", np.zeros((3, HEIGHT, WIDTH))), "key 'mean' is 3-dimensional float64"),
-        (change("mean", np.full((3, HEIGHT, WIDTH), np.nan, "f4")), "mean holds values that are"),
-        (change("variance", np.ones(2)), r"variance has shape \(2,\)"),
-        (change("variance", np.zeros(3)), "eigenvalues0 add up to more than variance 0"),
-        (change("variance", np.array([9, 9, np.inf])), "variance holds values that are not finite"),
-        (change("eigenvalues2", np.arange(5.0)), "eigenvalues2 must descend"),
-        (change("eigenvalues2", -np.arange(5.0)), "eigenvalues2 must descend and not be negative"),
-        (change("eigenvalues2", np.zeros(4)), r"'components2' claims shape \(5, 11, 14\)"),
-        (
-            change("eigenvalues2", np.zeros(1 << 20)),
-            "eigenvalues2 has 1048576 values, more than pixels",
-        ),
-        (change("eigenvalues2", np.zeros(0)), "key 'components2' claims shape"),
-        (change("components0", np.zeros((12, 14, 11), "f4")), "components0 has shape"),
-        (
-            change("components0", np.full((12, HEIGHT, WIDTH), np.inf, "f4")),
-            "components0 holds values that are not finite",
-        ),
-        (change("count", np.array(0)), "count is 0, expected at least 1"),
-        (change("space", np.array("linear")), "space is 'linear', expected one of ycbcr, rgb"),
-        (change("examples", np.zeros((17, HEIGHT, WIDTH, 3), "f4")), "n <= 16"),
-    ],
-)
-def test_files_that_do_not_fit_together(tmp_path, edit, complaint):
-    path = tmp_path / "a.npz"
-    BASES["rgb"].save(path)
-    with np.load(path) as file:
-        arrays = {key: file[key] for key in file if key not in ("format", "version")}
-    edit(arrays)
-    archive.write(path, basisfile.FORMAT, basisfile.VERSION, arrays)
-    with pytest.raises(ValueError, match=complaint) as error:
-        Eigenbasis.load(path)
-    assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
-
-
-def test_files_that_are_something_else(tmp_path):
-    path = tmp_path / "a.npz"
-    path.write_bytes(b"something")
-    with pytest.raises(ValueError, match=r"not a readable .* file"):
-        Eigenbasis.load(path)
-    archive.write(path, "eigengs_dr.gaussians", 1, {})
-    with pytest.raises(ValueError, match="format is"):
-        Eigenbasis.load(path)
-    with pytest.raises(FileNotFoundError):
-        Eigenbasis.load(tmp_path / "nowhere.npz")

@@ -5,14 +5,16 @@ import zipfile
 import numpy as np
 import pytest
 from numpy.lib import format as npy
-from test_training import SMALL, random_fields
 
+import eigengs_dr as eg
+from _helpers.command import said
+from _helpers.families import family, fidelity, rendered, small_basis, small_model, splits
+from _helpers.photos import SMALL, random_fields
 from eigengs_dr.eigenbasis import model_file as modelfile
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.eigenbasis.training import TrainOptions, train
 from eigengs_dr.storage import npz as archive
 
-REALS = [key for key, field in modelfile.LAYOUT.items() if field.kind[0] == "f"]
 NUMBERS = [key for key, field in modelfile.LAYOUT.items() if field.kind != "U"]
 
 
@@ -184,3 +186,100 @@ def test_an_existing_file_stays_where_a_model_cannot_be_written(model, path, mon
     with pytest.raises(OSError, match="no space"):
         model.save(path)
     assert [(p, p.read_bytes()) for p in path.parent.iterdir()] == [(path, b"earlier")]
+
+
+@pytest.fixture(scope="module")
+def others():
+    """Images of the family that were not trained on."""
+    return family(8, seed=1)
+
+
+@splits
+def test_save_and_load(backend, split, others, tmp_path):
+    """Half precision costs nothing that can be seen."""
+    model = small_model(backend, split)
+    model.save(tmp_path / "model.npz")
+    again = eg.EigenGS.load(tmp_path / "model.npz", backend=backend)
+    assert (again.low, again.low_components) == (model.low, model.low_components)
+    assert again.gaussians.space == model.gaussians.space
+    for one, two in zip(again.weights, model.weights, strict=True):
+        np.testing.assert_allclose(one, two, atol=6e-4 * np.abs(two).max())
+    for one, two in zip(again.eigenvalues, model.eigenvalues, strict=True):
+        np.testing.assert_array_equal(one, two)
+    for colors in ("exact", "projected"):
+        first, second = (fidelity(rendered(m, others, colors), others) for m in (model, again))
+        assert second == pytest.approx(first, abs=0.01)
+
+
+def test_half_precision_of_extreme_weights(backend, tmp_path):
+    """Scaled by component: neither tiny nor huge ones are lost."""
+    basis, model = small_basis(), small_model(backend)
+    weights = tuple(w * s for w, s in zip(model.weights, (1e-9, 1e3, 0), strict=True))
+    odd = eg.EigenGS(model.gaussians, weights, basis.eigenvalues, basis.mean)
+    odd.save(tmp_path / "odd.npz")
+    for one, two in zip(eg.EigenGS.load(tmp_path / "odd.npz").weights, weights, strict=True):
+        np.testing.assert_allclose(one, two, atol=6e-4 * np.abs(two).max())
+
+
+def test_models_keep_how_the_error_falls(trained):
+    folder, result = trained
+    loaded = eg.EigenGS.load(folder / "model.npz")
+    np.testing.assert_array_equal(
+        loaded.truncation_curve().psnr, result.basis.truncation_curve().psnr
+    )
+    np.testing.assert_array_equal(loaded.held_out, result.model.held_out)
+    assert loaded.split_reason == "32 pixels a side; auto measures from 512 on"
+    assert len(loaded.held_out) == 19
+    assert loaded.held_out[-1] == pytest.approx(result.figures["psnr_pca"], abs=1e-3)
+
+
+def test_files_of_version_1_are_read(trained, tmp_path):
+    _, result = trained
+    old = {key: modelfile.to_members(result.model)[key] for key in modelfile.LAYOUT_V1}
+    archive.write(tmp_path / "old.npz", modelfile.FORMAT, 1, old)
+    loaded = eg.EigenGS.load(tmp_path / "old.npz")
+    assert (
+        loaded.truncation_curve() is None
+        and len(loaded.held_out) == 0
+        and loaded.split_reason == ""
+    )
+    for one, two in zip(
+        loaded.weights, eg.EigenGS.load(saved(result, tmp_path)).weights, strict=True
+    ):
+        np.testing.assert_array_equal(one, two)
+    loaded.save(tmp_path / "again.npz")
+    assert eg.EigenGS.load(tmp_path / "again.npz").truncation_curve() is None
+    told = said("info", tmp_path / "old.npz")
+    assert "variance" not in told and "split_reason" not in told
+    archive.write(tmp_path / "cut.npz", modelfile.FORMAT, 2, old)
+    with pytest.raises(ValueError, match="key 'variance' is missing"):
+        eg.EigenGS.load(tmp_path / "cut.npz")
+
+
+def saved(result, folder):
+    result.model.save(folder / "new.npz")
+    return folder / "new.npz"
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "words"),
+    [
+        ("variance", lambda a: a[:2], "variance has shape"),
+        ("variance", lambda a: 0 * a, "more than variance 0"),
+        ("variance", lambda a: -a, "more than variance 0"),
+        ("held_out", lambda a: a[:-1], "held_out has shape"),
+        ("held_out", lambda a: a[::-1], "held_out must ascend"),
+        ("held_out", lambda a: a + 1e6, "held_out must ascend"),
+        ("held_out", lambda a: a - 1e6, "held_out must ascend"),
+        ("split_reason", lambda a: np.array("\x1b[2J"), "not printed"),
+        ("split_reason", lambda a: np.array("a\nb"), "not printed"),
+        ("split_reason", lambda a: np.array("x" * 100), "over 64 characters"),
+    ],
+)
+def test_hostile_values(trained, tmp_path, key, change, words):
+    known = modelfile.to_members(trained[1].model)
+    path = tmp_path / "bad.npz"
+    archive.write(path, modelfile.FORMAT, 2, {**known, key: change(known[key])})
+    with pytest.raises(ValueError, match=words) as caught:
+        eg.EigenGS.load(path)
+    assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)

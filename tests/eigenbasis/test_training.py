@@ -9,17 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
-from scipy.ndimage import gaussian_filter
 
+from _helpers.photos import SMALL, random_fields
 from eigengs_dr.eigenbasis import training
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.eigenbasis.training import Interrupted, TrainOptions, train
 from eigengs_dr.image.io import ImageError, load_image
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import render
-
-SMALL = {"size": (32, 32), "components": 6, "gaussians": 60}
 
 FIGURES = {
     "seconds",
@@ -31,17 +28,6 @@ FIGURES = {
     "gaussians",
 }
 MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
-
-
-def random_fields(folder, count, seed=0, channels=3, size=32):
-    """Fill a new folder with pictures of low-pass noise."""
-    noise = np.random.default_rng(seed).normal(size=(count, size, size, channels))
-    smooth = gaussian_filter(noise, (0, 3, 3, 0), mode="wrap")
-    pixels = (127 + 45 * smooth / smooth.std()).clip(0, 255).astype(np.uint8)
-    folder.mkdir()
-    for i, image in enumerate(pixels):
-        Image.fromarray(image.squeeze()).save(folder / f"{i:03}.png")
-    return folder
 
 
 @pytest.fixture
@@ -190,7 +176,7 @@ def progress(stage, done, total):
         os.kill(os.getpid(), signal.SIGKILL)
 training.train({str(folder)!r}, {str(output)!r}, training.{settings(steps=40)!r}, None, progress)
 """
-    process = subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parent.parent)
+    process = subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parents[2])
     assert process.returncode == -signal.SIGKILL
     assert not output.exists()
     assert train(folder, output, settings(steps=40)).figures["resumed"]
@@ -381,3 +367,26 @@ def test_wrong_settings_leave_nothing(folder, output, changed, words):
 def test_wrong_numbers_are_refused_before_an_image_is_read(tmp_path, output):
     with pytest.raises(ValueError, match="gaussians is 1025"):
         train(tmp_path / "gone", output, settings(gaussians=1025))
+
+
+def test_train_to_a_target(trained, tmp_path):
+    folder, full = trained
+    target = float(full.model.held_out[8]) - 1e-6
+    result = train(folder / "photos", tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=target))
+    counts = result.basis.truncation_curve().counts[-1]
+    assert counts.tolist() == full.basis.truncation_curve().counts[8].tolist()
+    np.testing.assert_allclose(result.model.held_out, full.model.held_out[:9], atol=1e-6)
+    assert result.figures["psnr_pca"] == pytest.approx(target, abs=1e-3)
+    assert result.figures["components"] == counts.tolist()
+
+
+def test_train_without_images_for_a_target(tmp_path):
+    photos = random_fields(tmp_path / "few", 5)
+    with pytest.raises(ValueError, match="images that are held out"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        train(photos, tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=20))
+    assert [path.name for path in tmp_path.iterdir()] == ["few"]
+    with pytest.raises(ValueError, match="give one of them"):
+        train(photos, tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=20, energy=0.9))
+    with pytest.raises(ValueError, match="target_psnr is nan"):
+        train(tmp_path / "gone", tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=np.nan))

@@ -7,14 +7,12 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from scenes import random_scene, small_model
-from test_refine import SIDE, SPLATS, figures, picture, presets
 
+from _helpers.families import small_model
+from _helpers.waves import SIDE, SPLATS, figures, picture, presets
 from eigengs_dr.fitting import fit as fitting
 from eigengs_dr.fitting import initializers as starting
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.optimizers.adam import Adam
-from eigengs_dr.fitting.optimizers.schedule import Schedule
 from eigengs_dr.fitting.placement.grid import place_grid
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.image.color import to_coded, to_linear
@@ -187,15 +185,6 @@ def test_linear_light_weighs_errors_in_the_dark(backend, monkeypatch):
         image = fit(dark, SPLATS, 60, color="linear", backend=backend).image
         shown.append(np.square(image - dark)[: SIDE // 3].mean())
     assert shown[0] < 0.85 * shown[1]
-
-
-def test_negative_light_is_black(backend):
-    scene = random_scene(0, SPLATS, (SIDE, SIDE))
-    gaussians = scene._replace(background=np.full(3, -0.5)).on(backend, space="linear")
-    light, shown = render(gaussians).numpy(), picture_of(gaussians)
-    assert (light < 0).any()
-    assert (shown[light <= 0] == 0).all()
-    assert np.isfinite(shown).all()
 
 
 @presets
@@ -392,8 +381,3 @@ def test_errors_name_the_argument(name, value):
     arguments = {"gaussians": SPLATS, "iterations": 3, name: value}
     with pytest.raises((ValueError, TypeError), match=name):
         fit(picture(), **arguments)
-
-
-def test_schedules_are_plain_values():
-    """Two of the same numbers are the same."""
-    assert Schedule(Adam, {"mean": 1.0}) == Schedule(Adam, {"mean": 1.0})

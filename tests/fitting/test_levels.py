@@ -1,32 +1,24 @@
 """Levels of detail: prefixes of a set that make the image too."""
 
-import csv
-import json
 from itertools import pairwise
 
-import drjit as dr
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from scenes import random_scene
 
 import eigengs_dr as eg
-from eigengs_dr.cli.main import main
+from _helpers.photos import coffee
 from eigengs_dr.codec.bit_allocation import MSE_WITHOUT_IMAGE
 from eigengs_dr.fitting.density_control import removal_cost
 from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.levels import fit_levels, level_counts
-from eigengs_dr.fitting.optimizers.descent import prefix
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.image.color import rgb_to_ycbcr
-from eigengs_dr.raster.render import picture_of, render
-
-SIDE = 48
+from eigengs_dr.raster.render import picture_of
 
 
 @pytest.fixture(scope="module")
 def image():
-    return eg.sample("coffee")[100 : 100 + SIDE, 200 : 200 + SIDE]
+    return coffee(48)
 
 
 @pytest.fixture(scope="module")
@@ -50,16 +42,6 @@ def test_counts(count, levels, expected):
 def test_too_many_levels_are_refused(count, levels):
     with pytest.raises(ValueError, match=f"levels is {levels}; {count} Gaussians make 1 to"):
         level_counts(count, levels)
-
-
-def test_first_is_a_slice_and_differentiable(backend):
-    gaussians = random_scene().on(backend)
-    part = prefix(gaussians, 7)
-    np.testing.assert_array_equal(render(part).numpy(), render(gaussians[:7]).numpy())
-    dr.enable_grad(gaussians.color)
-    dr.backward(dr.sum(prefix(gaussians, 7).color, axis=None))
-    grad = dr.grad(gaussians.color).numpy()
-    assert (grad[:, :7] == 1).all() and (grad[:, 7:] == 0).all()
 
 
 def test_all_levels_make_the_image(image, result):
@@ -140,33 +122,6 @@ def test_packed_levels_without_an_image_keep_what_they_have_of_the_whole(result,
         assert error(part) <= 1.001 * 10**0.05 * error(result.gaussians[:count])
 
 
-def run(*arguments):
-    return CliRunner().invoke(main, [str(a) for a in arguments])
-
-
-def test_commands(image, tmp_path):
-    photo, fitted, small = (tmp_path / name for name in ("a.png", "a.npz", "a.egs"))
-    eg.save_image(photo, image)
-    base = ["fit", photo, "-o", fitted, "--quiet", "--iterations", 10]
-    done = run(*base, "--gaussians", 64, "--levels", 2)
-    assert done.exit_code == 0, done.stderr
-    assert run("pack", fitted, "-o", small, "--levels", 2, "--quiet").exit_code == 0
-    told = json.loads(run("info", small, "--json").stdout)
-    assert told["sections"] == [16, 48]
-    out = tmp_path / "b.png"
-    assert run("render", fitted, "-o", out, "--first", 16).exit_code == 0
-    refused = run("render", fitted, "-o", out, "--first", 65)
-    assert refused.exit_code == 2
-    assert "--first is 65; the file has 64 Gaussians" in refused.stderr
-    expected = picture_of(eg.Gaussians.load(fitted)[:16]).clip(0, 1)
-    assert np.abs(eg.load_image(out) - expected).max() < 0.003
-
-    for extra in (["--target-psnr", 30], ["--init", "grid"], ["--levels", 9]):
-        refused = run(*base, "--gaussians", 64, "--levels", 2, *extra)
-        assert refused.exit_code == 2
-        assert "levels" in refused.stderr and len(refused.stderr.splitlines()) == 1
-
-
 def test_levels_keep_the_background(image):
     """What is added later does not change the levels before: one background serves all."""
     found = fit_levels(image, 64, 2, iterations=0).gaussians
@@ -179,32 +134,3 @@ def test_levels_keep_the_background(image):
 def test_as_many_as_fit_takes_by_default(image):
     small = image[:4, :4]
     assert len(fit_levels(small, levels=2, iterations=0).gaussians) == 16
-
-
-def test_bench_draws_what_prefixes_are_worth(image, tmp_path):
-    photo, out = tmp_path / "a.png", tmp_path / "out"
-    eg.save_image(photo, image)
-    settings = ["--gaussians", 64, "--levels", 3, "--iterations", 20]
-    done = run("bench", "levels", photo, "-o", out, *settings)
-    assert done.exit_code == 0, done.stderr
-    lines = list(csv.DictReader((out / "levels.csv").open()))
-    assert [int(line["splats"]) for line in lines] == [4, 8, 16, 32, 64]
-    assert [line["level"] for line in lines] == ["True", "False", "True", "False", "True"]
-    own = reached(eg.fit(image, 8, iterations=20).gaussians, image)
-    assert float(lines[1]["alone"]) == pytest.approx(own, abs=1e-6)
-    # All of a set, in whatever order.
-    assert float(lines[-1]["alone"]) == pytest.approx(float(lines[-1]["sorted"]), abs=1e-4)
-    assert float(lines[0]["levels"]) > float(lines[0]["sorted"])
-    assert "8   " in done.stdout and (out / "levels.svg").stat().st_size > 1000
-
-
-def test_bench_ends_with_a_fit_that_was_broken_off(image, tmp_path, monkeypatch):
-    from eigengs_dr.bench import levels
-
-    broken = fit_levels(image, 16, 2, iterations=0)._replace(stopped="interrupted")
-    monkeypatch.setattr(levels, "fit_levels", lambda *rest, **settings: broken)
-    photo, out = tmp_path / "a.png", tmp_path / "out"
-    eg.save_image(photo, image)
-    settings = ["--gaussians", 16, "--levels", 2]
-    assert run("bench", "levels", photo, "-o", out, *settings).exit_code == 130
-    assert not list(out.iterdir())

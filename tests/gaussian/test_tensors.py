@@ -3,9 +3,9 @@
 import drjit as dr
 import numpy as np
 import pytest
-from scenes import random_scene
 
 import eigengs_dr as eg
+from _helpers.sets import random_scene
 from eigengs_dr.backend.arrays import types_of
 
 NAMES = ["mean", "factor", "color", "background"]

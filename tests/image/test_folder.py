@@ -9,9 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import eigengs_dr.image.folder as stream
+from _helpers.errors import one_line
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.folder import check_size, image_files, read_blocks, to_planes
-from eigengs_dr.image.io import ImageError, check_image, load_image, save_image
+from eigengs_dr.image.io import (
+    ImageError,
+    check_image,
+    load_image,
+    save_image,
+)
 from eigengs_dr.image.resize import center_crop
 
 WIDTH, HEIGHT = SIZE = (6, 5)
@@ -37,15 +43,6 @@ def read(source, size=SIZE, space="rgb", length=4, **options):
 
 def decoders():
     return [thread for thread in threading.enumerate() if thread.name.startswith("decode")]
-
-
-def one_line(error):
-    message = str(error.value)
-    assert "\n" not in message and ";" in message
-    return message
-
-
-# ---------------------------------------------------------------- sources
 
 
 @pytest.mark.parametrize("space", ["rgb", "ycbcr"])
@@ -149,9 +146,6 @@ def test_progress_counts_every_image(tmp_path):
         assert calls == [(done, total, {}) for done in range(1, 6)]
 
 
-# ---------------------------------------------------------------- other sizes, bad files
-
-
 def test_other_sizes_are_cropped_and_said_once():
     images = [*pictures(3), *pictures(2, 9, 20), *pictures(1, 2, 3)]
     with pytest.warns(UserWarning) as caught:
@@ -245,9 +239,6 @@ def test_bad_space_and_length():
         read_blocks(pictures(1), SIZE, "rgb", 0)
 
 
-# ---------------------------------------------------------------- leaving early
-
-
 def test_no_thread_outlives_the_stream(tmp_path):
     write(tmp_path, pictures(30))
     blocks = read_blocks(tmp_path, SIZE, "rgb", 2)
@@ -263,3 +254,20 @@ def test_no_thread_outlives_the_stream(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         read(tmp_path, progress=interrupt)
     assert not decoders()
+
+
+def test_image_files_are_sorted_and_only_images(tmp_path):
+    for name in ("b.JPG", "a.png", "notes.txt", ".hidden.png", "c.tif"):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "folder.png").mkdir()
+    assert image_files(tmp_path) == [tmp_path / name for name in ("a.png", "b.JPG", "c.tif")]
+    assert image_files(str(tmp_path)) == image_files(tmp_path)
+
+
+def test_folders_that_hold_no_images(tmp_path):
+    (tmp_path / "notes.txt").write_bytes(b"")
+    cases = {"": "holds no images", "notes.txt": "is a file", "nowhere": "No such file"}
+    for name, complaint in cases.items():
+        with pytest.raises(ImageError, match=complaint) as error:
+            image_files(tmp_path / name)
+        one_line(error)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from eigengs_dr.image.folder import image_files
+from _helpers.errors import one_line
 from eigengs_dr.image.io import (
     SAVE_OPTIONS,
     ImageError,
@@ -21,7 +21,6 @@ from eigengs_dr.image.io import (
     save_image,
     to_8bit,
 )
-from eigengs_dr.image.samples import SAMPLES, sample
 
 BYTES = np.array([[[0, 51, 102], [255, 204, 153]]], np.uint8)
 LOSSLESS = [".png", ".tif", ".tiff", ".bmp", ".ppm", ".PNG"]
@@ -29,14 +28,6 @@ LOSSLESS = [".png", ".tif", ".tiff", ".bmp", ".ppm", ".PNG"]
 byte_images = hnp.arrays(
     np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.sampled_from([1, 3]))
 )
-
-
-def one_line(error):
-    """Message of an error, checked to be one line that names a remedy after the complaint."""
-    message = str(error.value)
-    assert "\n" not in message
-    assert ";" in message
-    return message
 
 
 def property_of(path, name):
@@ -366,44 +357,3 @@ def test_bad_pixels_touch_no_file(tmp_path):
         with pytest.raises(ImageError):
             save_image(tmp_path / "a.png", image)
     assert not list(tmp_path.iterdir())
-
-
-# ---------------------------------------------------------------- samples and folders
-
-
-@pytest.mark.parametrize("name", SAMPLES)
-def test_samples_need_no_download(name):
-    image = sample(name)
-    assert image.dtype == np.float32 and image.shape[2] == 3
-    assert min(image.shape[:2]) >= 300
-    assert image.min() >= 0 and image.max() <= 1 and np.ptp(image) > 0.4
-
-
-def test_unknown_sample():
-    with pytest.raises(ImageError, match="use one of astronaut, ") as error:
-        sample("lena")
-    one_line(error)
-
-
-def test_sample_without_scikit_image(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ImageError, match="install scikit-image") as error:
-        sample("astronaut")
-    one_line(error)
-
-
-def test_image_files_are_sorted_and_only_images(tmp_path):
-    for name in ("b.JPG", "a.png", "notes.txt", ".hidden.png", "c.tif"):
-        (tmp_path / name).write_bytes(b"")
-    (tmp_path / "folder.png").mkdir()
-    assert image_files(tmp_path) == [tmp_path / name for name in ("a.png", "b.JPG", "c.tif")]
-    assert image_files(str(tmp_path)) == image_files(tmp_path)
-
-
-def test_folders_that_hold_no_images(tmp_path):
-    (tmp_path / "notes.txt").write_bytes(b"")
-    cases = {"": "holds no images", "notes.txt": "is a file", "nowhere": "No such file"}
-    for name, complaint in cases.items():
-        with pytest.raises(ImageError, match=complaint) as error:
-            image_files(tmp_path / name)
-        one_line(error)

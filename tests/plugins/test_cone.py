@@ -5,16 +5,16 @@ import gc
 import drjit as dr
 import numpy as np
 import pytest
-from scenes import SIZE, random_scene
+
+from _helpers.sets import SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-
-from test_texture import at, gaussians, texture  # noqa: E402
-from test_texture import variant as variant  # noqa: E402
-
+from _helpers.texture import at, gaussians, texture  # noqa: E402
 from eigengs_dr.plugins import pixel_angle, texture_of  # noqa: E402
 from eigengs_dr.plugins.cone import PIXEL, metric  # noqa: E402
 from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, bound_covariance  # noqa: E402
+
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
 
 def plane(tex, tiles=60, side=48):

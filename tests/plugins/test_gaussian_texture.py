@@ -1,53 +1,25 @@
 """The texture in Mitsuba: values, wrapping, colour, slots of scenes, sampling, mistakes."""
 
-import subprocess
-import sys
-
 import drjit as dr
 import numpy as np
 import pytest
-from scenes import COUNT, SIZE, random_scene
+
+from _helpers.sets import COUNT, SIZE
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-
 import eigengs_dr as eg  # noqa: E402
+from _helpers.texture import at, gaussians, picture, small_scene, texel_centres, texture  # noqa: E402
 from eigengs_dr.image.color import to_linear  # noqa: E402
 from eigengs_dr.plugins import texture_of  # noqa: E402
 from eigengs_dr.raster.render import picture_of  # noqa: E402
 
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
+
 VARIANTS = ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral"]
-
-
-@pytest.fixture(autouse=True)
-def variant(request):
-    """The variant that a test names by a marker, by default llvm_ad_rgb; then that before."""
-    before = mi.variant()
-    name = getattr(request, "param", "llvm_ad_rgb")
-    if not dr.has_backend(dr.JitBackend.LLVM):
-        pytest.skip("the llvm backend is not there")
-    mi.set_variant(name)
-    eg.register_plugins()
-    yield name
-    if before:
-        mi.set_variant(before)
 
 
 others = [pytest.param(name, marks=pytest.mark.slow) for name in VARIANTS[1:]]
 in_variants = pytest.mark.parametrize("variant", VARIANTS, indirect=True)
-
-
-def gaussians(space="rgb", channels=3, seed=0, quiet=True):
-    """A small set; a quiet one stays inside [0, 1], so that no value is clamped."""
-    scene = random_scene(seed, channels=channels)
-    if quiet:
-        scene = scene._replace(
-            color=0.04 * scene.color, background=np.full(channels, 0.5, np.float32)
-        )
-    return scene.on("llvm", space=space)
-
-
-def texture(g, **properties):
-    return mi.load_dict({**texture_of(g), **properties})
 
 
 def test_first_so_many_of_a_file(tmp_path):
@@ -58,21 +30,6 @@ def test_first_so_many_of_a_file(tmp_path):
     for wrong in (-1, True, 2.5):
         with pytest.raises(RuntimeError, match="must be a number of Gaussians"):
             mi.load_dict({**plain, "first": wrong})
-
-
-def at(u, v, count=1):
-    si = dr.zeros(mi.SurfaceInteraction3f, max(count, dr.width(u), dr.width(v)))
-    si.uv = mi.Point2f(u, v)
-    return si
-
-
-def texel_centres(size=SIZE):
-    v, u = np.mgrid[: size[1], : size[0]] + 0.5
-    return at(*(mi.Float(np.float32(k.ravel())) for k in (u / size[0], v / size[1])))
-
-
-def picture(rows, size=SIZE):
-    return np.stack([np.array(r) for r in rows], -1).reshape(size[1], size[0], -1)
 
 
 class TestValues:
@@ -264,42 +221,6 @@ def slots(g):
         },
         "bumpmap": {"type": "bumpmap", "bump": number, "scale": 3.0, "inner": diffuse},
     }
-
-
-def small_scene(bsdf, integrator="path", side=12, spp=32, emitter=None):
-    """A textured wall under a lamp."""
-    depth = {} if integrator == "direct" else {"max_depth": 3}
-    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(1.5)}
-    wall |= {"bsdf": bsdf} if bsdf else {"emitter": emitter}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": integrator, **depth},
-            "sensor": {
-                "type": "perspective",
-                "fov": 40,
-                "to_world": mi.ScalarTransform4f().look_at([1, 1, 3.5], [0, 0, 0], [0, 1, 0]),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": side,
-                    "height": side,
-                    "rfilter": {"type": "box"},
-                },
-                "sampler": {"type": "independent", "sample_count": spp},
-            },
-            "wall": wall,
-            "floor": {
-                "type": "rectangle",
-                "to_world": mi.ScalarTransform4f().translate([0, -2, 0]).rotate([1, 0, 0], -90),
-            },
-            "lamp": {
-                "type": "sphere",
-                "center": [0, 3, 3],
-                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 8.0}},
-            },
-            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.5}},
-        }
-    )
 
 
 class TestSlots:
@@ -511,35 +432,3 @@ class TestMistakes:
         parameters["color"] = mi.TensorXf(np.zeros((3, 3), np.float32))
         with pytest.raises(Exception, match=r"color has shape \(3, 3\), expected \(24, 3\)"):
             parameters.update()
-
-
-class TestFound:
-    def test_a_file_beside_the_scene(self, tmp_path, monkeypatch):
-        gaussians().save(tmp_path / "x.npz")
-        (tmp_path / "scene.xml").write_text(
-            '<scene version="3.0.0"><shape type="rectangle"><bsdf type="diffuse">'
-            '<texture type="gaussian_texture" name="reflectance">'
-            '<string name="filename" value="x.npz"/></texture></bsdf></shape></scene>'
-        )
-        monkeypatch.chdir("/")
-        scene = mi.load_file(str(tmp_path / "scene.xml"))
-        assert any(key.endswith("reflectance.mean") for key, _ in mi.traverse(scene))
-
-    def test_registering_again_keeps_the_class(self):
-        before = type(texture(gaussians()))
-        eg.register_plugins()
-        assert type(texture(gaussians())) is before
-
-    def test_registered_before_there_is_a_variant(self):
-        """In a process of its own, in which none was set yet."""
-        program = (
-            "import eigengs_dr as eg, mitsuba as mi\n"
-            "eg.register_plugins()\n"
-            "mi.set_variant('llvm_ad_rgb')\n"
-            "try:\n"
-            "    mi.load_dict({'type': 'gaussian_texture'})\n"
-            "except RuntimeError as error:\n"
-            "    print(error)\n"
-        )
-        found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-        assert "give one of filename" in found.stdout, found.stderr

@@ -3,16 +3,17 @@
 import drjit as dr
 import numpy as np
 import pytest
-from scenes import SIZE, random_scene, small_model
+
+from _helpers.families import small_model
+from _helpers.sets import SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-
-from test_texture import at, gaussians, picture, small_scene, texel_centres, texture  # noqa: E402
-from test_texture import variant as variant  # noqa: E402
-
 import eigengs_dr as eg  # noqa: E402
+from _helpers.texture import at, gaussians, picture, small_scene, texel_centres, texture  # noqa: E402
 from eigengs_dr.gaussian.gaussians import MIN_DEVIATION  # noqa: E402
 from eigengs_dr.plugins import gaussians_of, keep_in_bounds, texture_of  # noqa: E402
+
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
 PARAMETERS = ["mean", "factor", "color", "background"]
 TEXTURE = "wall.bsdf.reflectance"

@@ -12,6 +12,8 @@ import drjit as dr  # noqa: E402
 
 from eigengs_dr.plugins import spectrum  # noqa: E402
 
+pytestmark = pytest.mark.mitsuba
+
 
 @pytest.fixture(autouse=True)
 def spectral():

@@ -1,26 +1,32 @@
-"""One splat at a block of points: values, both derivatives, and how parameters lie in memory."""
+"""One splat at a block of points: values, both derivatives; splats that a footprint widens."""
 
 import math
 
 import drjit as dr
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from eigengs_dr.backend.arrays import _types, types_in, types_of
+from _helpers.footprints import matrices
+from _helpers.sets import covariances, few, random_scene, upload
+from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.evaluate import EXP2_SCALE, exp2_neg, falloff, weights, weights_vjp
-from eigengs_dr.raster.layout import gather_run, pack_parameters, unpack_parameters
+from eigengs_dr.raster.evaluate import (
+    EXP2_SCALE,
+    NUM_SHAPE_PARAMS,
+    exp2_neg,
+    falloff,
+    weights,
+    weights_vjp,
+    widen,
+)
+from eigengs_dr.raster.render import kernel_parameters
 
 TILE = (4, 3)
 CUTOFF = 3.0
 LIMIT = (EXP2_SCALE * CUTOFF) ** 2
 COUNT = 256
-
-
-@pytest.fixture(params=[32, 64])
-def types(backend, request):
-    """Types of a backend in single and in double precision."""
-    return _types(select(backend).__name__, request.param)
 
 
 def precision(types, single, double):
@@ -45,16 +51,9 @@ def squared_distance(shape, x, y):
     return (a * dx + b * dy) ** 2 + (c * dy) ** 2
 
 
-def upload(types, *arrays):
-    return [types.Float(np.ascontiguousarray(v)) for v in arrays]
-
-
 def scaled(types, shape):
     """Parameters as kernels take them: the factor in units of `EXP2_SCALE`."""
     return [v * EXP2_SCALE if k > 1 else v for k, v in enumerate(upload(types, *shape))]
-
-
-# --- 2^-q --------------------------------------------------------------------------------------
 
 
 def error_of_exp2_neg(types):
@@ -104,9 +103,6 @@ def test_derivative_of_falloff(types, mode):
     np.testing.assert_allclose(slope, exact, rtol=precision(types, 1e-6, 1e-13), atol=0)
 
 
-# --- Weights of a block ------------------------------------------------------------------------
-
-
 def test_weights(types):
     shape, x, y = draw()
     found = weights(scaled(types, shape), *upload(types, x, y), TILE, LIMIT)
@@ -137,9 +133,6 @@ def test_weights_are_never_nan(types, position, value):
     shape[position] = types.Float(value)
     found = weights(shape, types.Float(6.5), types.Float(6.5), TILE, LIMIT)
     assert not any(w.numpy().any() for w in found)
-
-
-# --- Their derivative --------------------------------------------------------------------------
 
 
 def pull_with(upstream):
@@ -210,58 +203,35 @@ def test_pullback_asks_with_the_weights(types):
         np.testing.assert_allclose(asked[k].numpy(), w.numpy(), rtol=0, atol=1e-6)
 
 
-# --- Memory ------------------------------------------------------------------------------------
+class TestWiden:
+    @few
+    @given(seed=st.integers(0, 1000))
+    def test_covariances_add_and_the_integral_stays(self, backend, seed):
+        rng = np.random.default_rng(seed)
+        scene = random_scene(seed)
+        spread = covariances(rng.uniform(0, 30, (1, 2)), rng.uniform(0, np.pi, 1))[0]
+        rows, _ = kernel_parameters(scene.on(backend, bits=64))
+        Float = types_of(rows[0]).Float
+        footprint = [Float(spread[k] / EXP2_SCALE**2) for k in ((0, 0), (0, 1), (1, 1))]
+        (_, _, a, b, c), amplitude = widen(rows[:NUM_SHAPE_PARAMS], footprint)
+        a, b, c = (np.array(v) / EXP2_SCALE for v in (a, b, c))
+        before, after = matrices(*scene.factor.T), matrices(a, b, c)
+        np.testing.assert_allclose(after, before + spread, rtol=1e-9, atol=1e-9)
+        integrals_before, integrals_after = (np.sqrt(np.linalg.det(m)) for m in (before, after))
+        np.testing.assert_allclose(np.array(amplitude) * integrals_after, integrals_before)
 
-
-@pytest.mark.parametrize("number", [1, 4, 6, 7, 8, 9])
-def test_unpack_returns_what_pack_stored(types, number):
-    values = np.random.default_rng(0).normal(size=(number, 50)).astype(np.float32)
-    packed = pack_parameters(upload(types, *values))
-    assert dr.width(packed) % 4 == 0
-    index = np.array([49, 0, 7, 7, 30])
-    found = unpack_parameters(packed, types.UInt(index), number)
-    assert len(found) == number
-    np.testing.assert_array_equal([v.numpy() for v in found], values[:, index])
-
-
-def test_pack_repeats_values_that_all_splats_share(types):
-    packed = pack_parameters([types.Float([1, 2, 3]), types.Float(7)])
-    found = unpack_parameters(packed, dr.arange(types.UInt, 3), 2)
-    np.testing.assert_array_equal(found[1].numpy(), [7, 7, 7])
-
-
-@pytest.mark.parametrize("length", [1, 2, 3, 5, 6, 12])
-def test_gather_run(types, length):
-    source = np.arange(10 * length)
-    runs = gather_run(types, types.Float(source), types.UInt([3, 0, 9]), length, True)
-    np.testing.assert_array_equal(
-        np.stack([r.numpy() for r in runs], 1), source.reshape(10, length)[[3, 0, 9]]
-    )
-
-
-def test_gather_run_reads_nothing_in_inactive_lanes(types):
-    runs = gather_run(
-        types, types.Float(np.ones(8)), types.UInt([0, 1 << 30]), 4, types.Bool([True, False])
-    )
-    np.testing.assert_array_equal([r.numpy() for r in runs], [[1, 0]] * 4)
-
-
-# --- Types -------------------------------------------------------------------------------------
-
-
-def test_types_of(types):
-    for array in (types.Float(1), types.Float3(1), types.FloatX([[1, 2]]), types.Tensor([1.0])):
-        assert types_of(array) == types
-    assert dr.type_v(types.Float) == getattr(dr.VarType, f"Float{types.bits}")
-
-
-@pytest.mark.parametrize("array", [dr.scalar.ArrayXf([1.0]), 1.0, np.ones(3)])
-def test_types_of_refuses_what_has_no_backend(array):
-    with pytest.raises(TypeError):
-        types_of(array)
-
-
-def test_types_of_refuses_integers_and_arrays_without_derivatives(backend):
-    for array in (select(backend).UInt32(1), getattr(dr, backend).Float(1)):
-        with pytest.raises(TypeError, match="expected float arrays"):
-            types_of(array)
+    @pytest.mark.parametrize("spread", [(0, 0, 0), (0.05, 0.01, 0.08), (1, 0.3, 2)])
+    def test_needles_keep_their_digits(self, backend, spread):
+        """Lengths of up to 1,000 times the width, at any angle, in single precision."""
+        rng = np.random.default_rng(0)
+        a, c = np.exp(rng.uniform(np.log(1 / 2048), np.log(4), (2, 10_000)))
+        b = rng.uniform(-4, 4, 10_000)
+        shape = [np.zeros(10_000), np.zeros(10_000), a, b, c]
+        found = {}
+        for bits in ("", "64"):
+            Float = getattr(select(backend), "Float" + bits)
+            rows = [Float(np.asarray(v, np.float32)) for v in shape]
+            (*_, a1, b1, c1), amplitude = widen(rows, [Float(v) for v in spread])
+            found[bits] = [np.array(v) for v in (a1, b1, c1, amplitude)]
+        for single, double in zip(found[""], found["64"], strict=True):
+            np.testing.assert_allclose(single, double, rtol=1e-3, atol=1e-6)

@@ -6,8 +6,8 @@ import drjit as dr
 import numpy as np
 import pytest
 from hypothesis import given
-from scenes import SIZE, few, random_scene, scenes
 
+from _helpers.sets import SIZE, few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.color import ycbcr_to_rgb

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import (
+from scipy.ndimage import maximum_filter
+
+from _helpers.sets import (
     COUNT,
     SIZE,
     Scene,
@@ -19,16 +21,16 @@ from scenes import (
     random_scene,
     scenes,
 )
-from scipy.ndimage import maximum_filter
-
+from _helpers.waves import SIDE, SPLATS
 from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.color import rgb_to_ycbcr, ycbcr_to_rgb
-from eigengs_dr.raster.reference import render_exact, render_plain
+from eigengs_dr.raster.reference import render_plain
 from eigengs_dr.raster.render import (
     CUTOFF,
     MAX_CUTOFF,
     bin_gaussians,
     kernel_parameters,
+    picture_of,
     render,
     to_tensor,
 )
@@ -43,22 +45,6 @@ def bound(scene, rounding):
     """What rounding may do at a pixel: relative to the sum of what is added there, (H, W, C)."""
     magnitudes = scene._replace(color=np.abs(scene.color), background=np.abs(scene.background))
     return rounding * (1e-3 + magnitudes.exact())
-
-
-# --- Against the formula -----------------------------------------------------------------------
-
-
-def test_reference_is_the_formula():
-    """``exp(-1/2 d^T Sigma^-1 d)`` with the covariances from which the factors came."""
-    rng = np.random.default_rng(0)
-    covariance = covariances(rng.uniform(0.5, 9, (COUNT, 2)), rng.uniform(0, np.pi, COUNT))
-    mean, color = rng.uniform(-2, 24, (COUNT, 2)), rng.normal(size=(COUNT, 3))
-    found = render_exact(mean, factors_of(covariance), color, np.array([1.0, 2, 3]), *SIZE)
-    row, column = 4, 11
-    d = np.array([column + 0.5, row + 0.5]) - mean
-    weight = np.exp(-0.5 * np.einsum("ni,nij,nj->n", d, np.linalg.inv(covariance), d))
-    np.testing.assert_allclose(found[row, column], [1, 2, 3] + weight @ color, rtol=1e-12)
-    assert found.shape == (SIZE[1], SIZE[0], 3)
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
@@ -153,9 +139,6 @@ def test_stretched_splats(backend):
     np.testing.assert_allclose(image[clear], scene.exact(CUTOFF)[clear], rtol=0, atol=1e-4)
 
 
-# --- Arguments ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("asked", "size"),
     [
@@ -216,9 +199,6 @@ def test_size_of_numpy(backend):
     gaussians = random_scene().on(backend)
     image = render(gaussians, width=np.int64(10), height=np.int64(8))
     np.testing.assert_array_equal(image, render(gaussians, width=10, height=8))
-
-
-# --- Special sets ------------------------------------------------------------------------------
 
 
 def test_one_splat(backend):
@@ -297,9 +277,6 @@ def test_a_splat_without_end(backend):
     np.testing.assert_allclose(image, scene.exact(), atol=1e-6)
 
 
-# --- Colour ------------------------------------------------------------------------------------
-
-
 def test_ycbcr_comes_out_as_rgb(backend):
     scene = random_scene(12)
     scene = scene._replace(background=np.float32(rgb_to_ycbcr(np.array([0.2, 0.5, 0.9]))))
@@ -314,9 +291,6 @@ def test_other_spaces_come_out_as_they_are(backend, space):
     scene = random_scene(13)
     image = render(scene.on(backend, space=space))
     np.testing.assert_array_equal(image, render(scene.on(backend)))
-
-
-# --- Invariants --------------------------------------------------------------------------------
 
 
 def test_renderings_are_bit_equal(backend):
@@ -418,9 +392,6 @@ def test_linear_in_colour(backend, scene, other, scale):
     assert (np.abs(images[0] + scale * images[1] - images[2]) <= limit).all()
 
 
-# --- The parts ---------------------------------------------------------------------------------
-
-
 def test_operation_behind_render(backend):
     gaussians = random_scene(16).on(backend, space="ycbcr")
     values, background = kernel_parameters(gaussians)
@@ -446,3 +417,12 @@ def test_lists_are_for_the_native_size(backend):
     assert (lists.grid.width, lists.grid.height) == SIZE
     inside = (distances(scene.mean, scene.factor, SIZE) < CUTOFF * 0.999).any(axis=(1, 2))
     assert int((lists.end - lists.begin).numpy().sum()) >= inside.sum()
+
+
+def test_negative_light_is_black(backend):
+    scene = random_scene(0, SPLATS, (SIDE, SIDE))
+    gaussians = scene._replace(background=np.full(3, -0.5)).on(backend, space="linear")
+    light, shown = render(gaussians).numpy(), picture_of(gaussians)
+    assert (light < 0).any()
+    assert (shown[light <= 0] == 0).all()
+    assert np.isfinite(shown).all()

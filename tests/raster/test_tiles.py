@@ -8,8 +8,8 @@ import drjit as dr
 import numpy as np
 import pytest
 from hypothesis import given
-from scenes import COUNT, SIZE, covariances, distances, factors_of, few, random_scene, scenes
 
+from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.tiles import TILE, Grid, build_lists, for_each_tile

@@ -1,89 +1,30 @@
 """What cameras resolve of a texture: against closed forms, and against renderings of its albedo."""
 
-import drjit as dr
 import numpy as np
 import pytest
-from scenes import random_scene
 from scipy.ndimage import binary_erosion
 
-mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
+from _helpers.sets import random_scene
 
-import eigengs_dr as eg  # noqa: E402
+mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
+from _helpers.poster import (  # noqa: E402
+    FOV,
+    NAME,
+    SIDE,
+    TEXELS,
+    albedo,
+    bitmap,
+    board,
+    camera,
+    picture,
+    pixel_at,
+    scene_of,
+)
 from eigengs_dr.plugins import texture_of  # noqa: E402
 from eigengs_dr.plugins.cone import PIXEL  # noqa: E402
 from eigengs_dr.scene.visibility import visibility  # noqa: E402
 
-FOV, SIDE, TEXELS = 40.0, 24, 32
-NAME = "poster.bsdf.reflectance"
-
-
-@pytest.fixture(autouse=True)
-def variant():
-    before = mi.variant()
-    if not dr.has_backend(dr.JitBackend.LLVM):
-        pytest.skip("the llvm backend is not there")
-    mi.set_variant("llvm_ad_rgb")
-    eg.register_plugins()
-    yield
-    if before:
-        mi.set_variant(before)
-
-
-def camera(place, side=SIDE, **film):
-    return {
-        "type": "perspective",
-        "fov": FOV,
-        "near_clip": 1e-3,
-        "to_world": mi.ScalarTransform4f().look_at(place, [0, 0, 0], [0, 1, 0]),
-        "film": {
-            "type": "hdrfilm",
-            "width": side,
-            "height": side,
-            "rfilter": {"type": "box"},
-            **film,
-        },
-    }
-
-
-def picture(side=TEXELS):
-    values = np.random.default_rng(1).uniform(0, 1, (side, side, 3))
-    return values.astype(np.float32)
-
-
-def bitmap(pixels=None, **properties):
-    data = mi.TensorXf(picture() if pixels is None else pixels)
-    properties = {"wrap_mode": "clamp", **properties}
-    return {"type": "bitmap", "data": data, "raw": True, **properties}
-
-
-def scene_of(*cameras, texture=None, **others):
-    """A poster from -1 to 1 in the plane z = 0."""
-    poster = {
-        "type": "rectangle",
-        "bsdf": {"type": "diffuse", "reflectance": texture or bitmap()},
-    }
-    sensors = {f"camera{n}": c for n, c in enumerate(cameras)}
-    lamp = {"type": "constant"}
-    return mi.load_dict({"type": "scene", **sensors, "lamp": lamp, "poster": poster, **others})
-
-
-def board(left, right):
-    """Something in front of the poster, from left to right."""
-    at = mi.ScalarTransform4f().translate([(left + right) / 2, 0, 0.001])
-    to_world = at.scale([(right - left) / 2, 2, 1])
-    grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.2}}
-    return {"type": "rectangle", "to_world": to_world, "bsdf": grey}
-
-
-def pixel_at(distance, texels=TEXELS, side=SIDE):
-    """Texels along a side of a pixel, from the front: two units of the world are all texels."""
-    return 2 * distance * np.tan(np.radians(FOV / 2)) / side * texels / 2
-
-
-def albedo(scene):
-    """What an independent renderer of the same pixels sees, shape (H, W, 3)."""
-    aov = mi.load_dict({"type": "aov", "aovs": "a:albedo", "nested": {"type": "direct"}})
-    return np.array(mi.render(scene, integrator=aov, spp=1024))[..., -3:]
+pytestmark = pytest.mark.mitsuba
 
 
 class TestFootprint:

@@ -1,12 +1,11 @@
-"""Where splats start: every initialiser on any image, and what each of them promises."""
+"""Adaptive placement: its density, its pieces, its shapes."""
 
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
-from scenes import covariances, few
 
+from _helpers.placements import check_placement, covariances_of, generator, images_and_counts
+from _helpers.sets import few
 from eigengs_dr.fitting.placement.adaptive import (
     density_from_hessian,
     hessian_energy,
@@ -15,160 +14,7 @@ from eigengs_dr.fitting.placement.adaptive import (
     place_adaptive,
     stratify_along_hilbert,
 )
-from eigengs_dr.fitting.placement.grid import DEVIATION, place_grid
-from eigengs_dr.fitting.placement.hilbert_scan import hilbert_order
-from eigengs_dr.fitting.placement.random import inverse_factor, place_random
 from eigengs_dr.image.resize import resample
-
-INITS = [place_random, place_grid, place_adaptive]
-
-
-def generator(seed=0):
-    return np.random.default_rng(seed)
-
-
-def covariances_of(factor):
-    a, b, c = np.asarray(factor, np.float64).T
-    matrix = np.array([[a, b], [np.zeros_like(a), c]]).transpose(2, 0, 1)
-    return np.linalg.inv(np.einsum("nji,njk->nik", matrix, matrix))
-
-
-def check_placement(mean, factor, count, size):
-    width, height = size
-    assert mean.shape == (count, 2)
-    assert factor.shape == (count, 3)
-    assert np.isfinite(mean).all()
-    assert np.isfinite(factor).all()
-    assert ((mean >= 0) & (mean <= [width, height])).all()
-    assert (factor[:, [0, 2]] > 0).all()
-
-
-@st.composite
-def images_and_counts(draw):
-    """Images down to one pixel, of noise, few values or one value, and any number of splats."""
-    height, width, channels = draw(
-        st.tuples(st.integers(1, 24), st.integers(1, 24), st.sampled_from([1, 3]))
-    )
-    elements = draw(
-        st.sampled_from([st.floats(0, 1, width=32), st.sampled_from([0.0, 1.0]), st.just(0.5)])
-    )
-    image = draw(hnp.arrays(np.float32, (height, width, channels), elements=elements))
-    return image, draw(st.integers(1, height * width))
-
-
-@pytest.mark.parametrize("place", INITS)
-@few
-@given(drawn=images_and_counts())
-def test_any_image_and_any_count(place, drawn):
-    image, count = drawn
-    mean, factor = place(image, count, generator())
-    check_placement(mean, factor, count, image.shape[1::-1])
-
-
-@pytest.mark.parametrize("place", INITS)
-@pytest.mark.parametrize("shape", [(1, 1), (1, 17), (17, 1), (2, 2), (64, 3)])
-@pytest.mark.parametrize("part", [0, 0.5, 1])
-def test_narrow_images(place, shape, part):
-    image = generator().uniform(0, 1, (*shape, 3)).astype(np.float32)
-    count = max(1, round(part * shape[0] * shape[1]))
-    mean, factor = place(image, count, generator())
-    check_placement(mean, factor, count, shape[::-1])
-
-
-@pytest.mark.parametrize("place", INITS)
-def test_one_seed_gives_one_placement(place):
-    image = generator(1).uniform(0, 1, (20, 30, 3)).astype(np.float32)
-    first, second = place(image, 50, generator(7)), place(image, 50, generator(7))
-    np.testing.assert_array_equal(first[0], second[0])
-    np.testing.assert_array_equal(first[1], second[1])
-
-
-def test_seeds_differ():
-    image = np.zeros((20, 30, 3), np.float32)
-    first, second = (place_random(image, 50, generator(seed))[0] for seed in (1, 2))
-    assert not np.array_equal(first, second)
-
-
-# --- Factors and random placement --------------------------------------------------------------
-
-
-def test_inverse_factor():
-    rng = generator()
-    sigma = covariances(rng.uniform(0.1, 100, (200, 2)), rng.uniform(0, np.pi, 200))
-    factor = inverse_factor(sigma[:, 0, 0], sigma[:, 0, 1], sigma[:, 1, 1])
-    np.testing.assert_allclose(covariances_of(factor), sigma, rtol=1e-9, atol=1e-9)
-    assert (factor[:, [0, 2]] > 0).all()
-
-
-def test_random_is_uniform():
-    """Means over the image; Cholesky factors over [0.5, 1.5], [0, 1], [0.5, 1.5]."""
-    count = 20_000
-    mean, factor = place_random(np.zeros((50, 200, 3)), count, generator())
-    cholesky = np.linalg.cholesky(covariances_of(factor))
-    drawn = [mean[:, 0] / 200, mean[:, 1] / 50]
-    drawn += [cholesky[:, 0, 0] - 0.5, cholesky[:, 1, 0], cholesky[:, 1, 1] - 0.5]
-    for values in drawn:
-        quantiles = np.quantile(values, [0, 0.25, 0.5, 0.75, 1])
-        np.testing.assert_allclose(quantiles, [0, 0.25, 0.5, 0.75, 1], atol=0.02)
-
-
-# --- Grid --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("width", "height", "count"), [(40, 40, 100), (64, 16, 64), (30, 50, 97)])
-def test_grid(width, height, count):
-    """Rows that differ by one splat at most and are shifted by half a distance; one size."""
-    mean, factor = place_grid(np.zeros((height, width, 3)), count, generator())
-    spacing = np.sqrt(width * height / count)
-    heights = np.unique(mean[:, 1])
-    numbers = [int((mean[:, 1] == y).sum()) for y in heights]
-    assert max(numbers) - min(numbers) <= 1
-    np.testing.assert_allclose(heights, (np.arange(len(heights)) + 0.5) * height / len(heights))
-    for k, (y, number) in enumerate(zip(heights, numbers, strict=True)):
-        x = mean[mean[:, 1] == y, 0]
-        np.testing.assert_allclose(x / width * number, np.arange(number) + 0.25 + 0.5 * (k % 2))
-    sharpness = 1 / (DEVIATION * spacing)
-    np.testing.assert_allclose(factor, np.tile([sharpness, 0, sharpness], (count, 1)))
-
-
-def test_grid_is_hexagonal():
-    """Six nearest neighbours at one distance, where rows have one length."""
-    mean, _ = place_grid(np.zeros((300, 300, 3)), 32 * 28, generator())
-    middle = np.argmin(np.abs(mean - 150).sum(axis=1))
-    distances = np.sort(np.linalg.norm(mean - mean[middle], axis=1))[1:8]
-    assert distances[5] < 1.1 * distances[0] < 1.5 * distances[0] < distances[6]
-
-
-# --- Hilbert curve -----------------------------------------------------------------------------
-
-
-@few
-@given(height=st.integers(1, 40), width=st.integers(1, 40))
-def test_hilbert_order_visits_every_pixel_once(height, width):
-    order = hilbert_order(height, width)
-    assert sorted(order) == list(range(height * width))
-
-
-@pytest.mark.parametrize("side", [1, 2, 4, 8, 32])
-def test_hilbert_curve_steps_to_neighbours(side):
-    row, column = np.divmod(hilbert_order(side, side), side)
-    assert (np.abs(np.diff(row)) + np.abs(np.diff(column)) == 1).all()
-
-
-@pytest.mark.parametrize("side", [4, 16])
-def test_hilbert_curve_stays_in_a_quarter(side):
-    """Any quarter of the curve is a quarter of the square, and a quarter of that again."""
-    order = hilbert_order(side, side)
-    block = side
-    while block > 1:
-        block //= 2
-        parts = order.reshape(-1, block * block)
-        row, column = np.divmod(parts, side)
-        assert (np.ptp(row, axis=1) == block - 1).all()
-        assert (np.ptp(column, axis=1) == block - 1).all()
-
-
-# --- Adaptive ----------------------------------------------------------------------------------
 
 
 def test_adaptive_does_not_use_the_generator():
@@ -302,3 +148,15 @@ def test_splats_far_apart_are_placed_on_a_smaller_image():
     covariance = covariances_of(expected_factor) * stretch * stretch[:, None]
     np.testing.assert_allclose(covariances_of(factor), covariance)
     check_placement(mean, factor, 21, (160, 97))
+
+
+def test_density_given_to_adaptive_is_followed():
+    image = np.zeros((40, 40, 3), np.float32)
+
+    def left(bend, spacing):
+        density = np.full(bend.shape[1:], 1e-6)
+        density[:, : bend.shape[2] // 2] = 1
+        return density
+
+    mean, _ = place_adaptive(image, 100, density=left)
+    assert (mean[:, 0] < 20.5).mean() > 0.95

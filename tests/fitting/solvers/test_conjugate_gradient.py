@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from drjit import JitFlag
 from hypothesis import given
-from scenes import COUNT, SIZE, Scene, few, random_scene, scene_of, scenes
 
-from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from _helpers.halves import SIDE, fitted
+from _helpers.sets import COUNT, SIZE, Scene, few, random_scene, scene_of, scenes
+from eigengs_dr.fitting.solvers.conjugate_gradient import inner_products, solve
 from eigengs_dr.raster.render import CUTOFF, render
 
 ROOMY = 12
@@ -50,9 +51,6 @@ def true_residual(solution, image, cutoff=CUTOFF):
     size = found.width, found.height
     scene = Scene(**{k: v.astype(float) for k, v in found.to_arrays().items()}, size=size)
     return rms(scene.exact(cutoff) - image)
-
-
-# --- The solution ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
@@ -111,9 +109,6 @@ def test_shapes_stay(backend):
     for name, value in gaussians.to_arrays().items():
         np.testing.assert_array_equal(value, before[name])
     assert (solved.width, solved.height, solved.space) == (*SIZE, "rgb")
-
-
-# --- Residuals ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("steps", [1, 2, 5])
@@ -201,9 +196,6 @@ def test_images_of_several_sizes_one_after_the_other(backend):
         assert solution.residuals[-1] == pytest.approx(true_residual(solution, image), rel=1e-5)
 
 
-# --- Cutoffs -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("cutoff", [2.0, 5.0, 9.0, 10.0, 12.0])
 def test_cutoffs(backend, cutoff):
     scene, image = roomy(), noise()
@@ -211,9 +203,6 @@ def test_cutoffs(backend, cutoff):
     pixels = image.reshape(-1, 3).astype(float)
     best = np.linalg.lstsq(matrix(scene, cutoff), pixels, rcond=None)[0]
     np.testing.assert_allclose(solution.gaussians.to_arrays()["color"], best[:-1], atol=1e-4)
-
-
-# --- Special sets and images -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [(1, 1), (9, 1), (5, 13)])
@@ -317,9 +306,6 @@ def test_an_image_that_is_not_finite(backend):
     assert not any(r == 0 for r in residuals)
 
 
-# --- Mistakes ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("shape", [(17, 22, 1), (22, 17, 3), (17, 22), (16, 22, 3), (17, 22, 4)])
 def test_wrong_shape(backend, shape):
     with pytest.raises(
@@ -333,3 +319,16 @@ def test_wrong_shape(backend, shape):
 def test_arguments_out_of_range(backend, name, value):
     with pytest.raises(ValueError, match=name):
         solve(random_scene().on(backend), noise(), **{name: value})
+
+
+def test_correlations_are_inner_products():
+    start, target = fitted(20)
+    plain = replace(start.gaussians, space="data")
+    ones = np.ones((SIDE, SIDE, 3), np.float32)
+    for n in (0, 7):
+        one = replace(plain[[n]], color=plain[[n]].color * 0 + 1, background=plain.background * 0)
+        weights = render(one).numpy().astype(np.float64)
+        first = inner_products(plain, target)[n]
+        np.testing.assert_allclose(first, (weights * target).sum((0, 1)), rtol=1e-4, atol=1e-5)
+        own = inner_products(plain, ones, squared=True)[n]
+        np.testing.assert_allclose(own, (weights**2).sum((0, 1)), rtol=1e-4)

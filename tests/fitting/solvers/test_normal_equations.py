@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from scenes import COUNT, SIZE, few, random_scene, scenes
 
+from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.fitting.solvers.normal_equations import RIDGE, NormalEquations, weight_matrix
 from eigengs_dr.raster.render import render

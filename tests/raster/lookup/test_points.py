@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import SIZE, few, random_scene, scenes
 
+from _helpers.sets import SIZE, few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS

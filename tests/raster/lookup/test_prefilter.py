@@ -3,24 +3,17 @@
 import drjit as dr
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scenes import SIZE, covariances, few, random_scene
-from scipy.special import erf
 
+from _helpers.footprints import CUTOFF, brute_force, matrices, some_points, stacked
+from _helpers.sets import SIZE, covariances, random_scene
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, widen
 from eigengs_dr.raster.layout import pack_parameters
-from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, bound_covariance, quick_erf
+from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
-from eigengs_dr.raster.reference import render_exact
 from eigengs_dr.raster.render import kernel_parameters
-
-CUTOFF = 5.0
-FINE = 4
-"""Samples a pixel of the pictures that brute force sums, along each axis."""
 
 FOOTPRINTS = [
     np.diag([0.3, 0.3]),
@@ -30,42 +23,6 @@ FOOTPRINTS = [
     np.diag((MAX_FOOTPRINT * np.array(SIZE)) ** 2),
 ]
 """Covariances in pixels squared: small, round, leaning, a long one, and the largest there is."""
-
-
-def some_points(count=60, size=SIZE, seed=3):
-    points = np.random.default_rng(seed).uniform(0, 1, (count, 2)) * size
-    return points.astype(np.float32).astype(np.float64)
-
-
-def tiled(scene, wrap, copies=3):
-    """The picture and copies of it on every side, at `FINE` samples a pixel."""
-    image = render_exact(
-        scene.mean * FINE,
-        scene.factor / FINE,
-        scene.color,
-        scene.background,
-        *(side * FINE for side in scene.size),
-        CUTOFF,
-    )
-    for axis in (0, 1):
-        flipped = np.flip(image, axis) if wrap == "mirror" else image
-        parts = [flipped if k % 2 else image for k in range(-copies, copies + 1)]
-        image = np.concatenate(parts, axis)
-    return image, copies
-
-
-def brute_force(scene, wrap, points, covariance):
-    """What a footprint sees at points, shape (points, C)."""
-    image, copies = tiled(scene, wrap)
-    x = (np.arange(image.shape[1]) + 0.5) / FINE - copies * scene.size[0]
-    y = (np.arange(image.shape[0]) + 0.5) / FINE - copies * scene.size[1]
-    (a, b), (_, c) = np.linalg.inv(covariance)
-    seen = []
-    for px, py in points:
-        dx, dy = x - px, (y - py)[:, None]
-        weight = np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
-        seen.append(np.tensordot(weight, image, 2) / weight.sum())
-    return np.array(seen)
 
 
 def filtered(gaussians, wrap, points, covariance, cutoff=CUTOFF):
@@ -80,10 +37,6 @@ def filtered(gaussians, wrap, points, covariance, cutoff=CUTOFF):
     return sum_prefiltered(
         sizes, pack_parameters(rows), number, x, y, footprint, types.Bool(True), cutoff
     )
-
-
-def stacked(rows):
-    return np.stack([np.array(r) for r in rows], axis=1)
 
 
 class TestSumFiltered:
@@ -237,85 +190,3 @@ class TestSumFiltered:
         scene = scene._replace(mean=scene.mean + 1e6)
         rows = stacked(filtered(scene.on(backend), "repeat", some_points(), FOOTPRINTS[1]))
         np.testing.assert_array_equal(rows, 0)
-
-
-class TestWiden:
-    @few
-    @given(seed=st.integers(0, 1000))
-    def test_covariances_add_and_the_integral_stays(self, backend, seed):
-        rng = np.random.default_rng(seed)
-        scene = random_scene(seed)
-        spread = covariances(rng.uniform(0, 30, (1, 2)), rng.uniform(0, np.pi, 1))[0]
-        rows, _ = kernel_parameters(scene.on(backend, bits=64))
-        Float = types_of(rows[0]).Float
-        footprint = [Float(spread[k] / EXP2_SCALE**2) for k in ((0, 0), (0, 1), (1, 1))]
-        (_, _, a, b, c), amplitude = widen(rows[:NUM_SHAPE_PARAMS], footprint)
-        a, b, c = (np.array(v) / EXP2_SCALE for v in (a, b, c))
-        before, after = matrices(*scene.factor.T), matrices(a, b, c)
-        np.testing.assert_allclose(after, before + spread, rtol=1e-9, atol=1e-9)
-        integrals_before, integrals_after = (np.sqrt(np.linalg.det(m)) for m in (before, after))
-        np.testing.assert_allclose(np.array(amplitude) * integrals_after, integrals_before)
-
-    @pytest.mark.parametrize("spread", [(0, 0, 0), (0.05, 0.01, 0.08), (1, 0.3, 2)])
-    def test_needles_keep_their_digits(self, backend, spread):
-        """Lengths of up to 1,000 times the width, at any angle, in single precision."""
-        rng = np.random.default_rng(0)
-        a, c = np.exp(rng.uniform(np.log(1 / 2048), np.log(4), (2, 10_000)))
-        b = rng.uniform(-4, 4, 10_000)
-        shape = [np.zeros(10_000), np.zeros(10_000), a, b, c]
-        found = {}
-        for bits in ("", "64"):
-            Float = getattr(select(backend), "Float" + bits)
-            rows = [Float(np.asarray(v, np.float32)) for v in shape]
-            (*_, a1, b1, c1), amplitude = widen(rows, [Float(v) for v in spread])
-            found[bits] = [np.array(v) for v in (a1, b1, c1, amplitude)]
-        for single, double in zip(found[""], found["64"], strict=True):
-            np.testing.assert_allclose(single, double, rtol=1e-3, atol=1e-6)
-
-
-def matrices(a, b, c):
-    """Covariances of the factors ``[[a, b], [0, c]]``, shape (N, 2, 2)."""
-    factor = np.zeros((len(a), 2, 2))
-    factor[:, 0, 0], factor[:, 0, 1], factor[:, 1, 1] = a, b, c
-    return np.linalg.inv(np.swapaxes(factor, 1, 2) @ factor)
-
-
-class TestBoundedCovariance:
-    def bounded(self, backend, metrics):
-        Float = types_in(select(backend)).Float
-        rows = [Float(np.asarray(m, np.float32)) for m in np.array(metrics).T.copy()]
-        covariance, blind = bound_covariance(rows)
-        return np.stack([np.array(c) for c in covariance], 1), np.array(blind)
-
-    @few
-    @given(
-        long=st.floats(0.001, 100),
-        short=st.floats(0.001, 100),
-        angle=st.floats(0, 3),
-    )
-    def test_inverts_and_shortens(self, backend, long, short, angle):
-        axes = covariances(np.array([[1.0, 0.0]]), np.array([angle]))[0]
-        other = np.eye(2) - axes
-        metric = axes / long**2 + other / short**2
-        expected = axes * min(long, MAX_FOOTPRINT) ** 2 + other * min(short, MAX_FOOTPRINT) ** 2
-        found, blind = self.bounded(backend, [[metric[0, 0], metric[0, 1], metric[1, 1]]])
-        if min(long, short) > MAX_FOOTPRINT * 1.001:
-            assert blind[0]
-        elif min(long, short) < MAX_FOOTPRINT / 1.001:
-            assert not blind[0]
-            keys = ((0, 0), (0, 1), (1, 1))
-            np.testing.assert_allclose(found[0], [expected[k] for k in keys], atol=2e-3)
-
-    def test_what_is_not_finite_is_blind(self, backend):
-        found, blind = self.bounded(
-            backend, [[np.nan, 0, 1], [np.inf, 0, np.inf], [0, 0, 0], [1, np.nan, 1]]
-        )
-        assert blind.all()
-        assert np.isfinite(found).all()
-
-
-def test_quick_erf_is_close(backend):
-    x = np.linspace(-6, 6, 2001, dtype=np.float32)
-    found = np.array(quick_erf(types_in(select(backend)).Float(x)))
-    np.testing.assert_allclose(found, erf(x), atol=0.0055)
-    assert np.abs(found).max() <= 1 + 1e-6

@@ -3,9 +3,9 @@
 import drjit as dr
 import numpy as np
 import pytest
-from scenes import SIZE, random_scene
-from test_filtered import brute_force, some_points, stacked, tiled
 
+from _helpers.footprints import CUTOFF, brute_force, some_points, stacked, tiled
+from _helpers.sets import SIZE, random_scene
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.raster.evaluate import NUM_SHAPE_PARAMS
 from eigengs_dr.raster.layout import pack_parameters
@@ -14,7 +14,6 @@ from eigengs_dr.raster.lookup.pyramid import build_pyramid, is_minified, pyramid
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
 from eigengs_dr.raster.render import kernel_parameters
 
-CUTOFF = 5.0
 FOOTPRINTS = [
     np.diag([1.0, 1.0]),
     np.diag([4.0, 4.0]),
