@@ -11,6 +11,7 @@ from _helpers.packed import SPACES, small_fit
 from _helpers.sets import COUNT, SIZE, random_scene
 from eigengs_dr.codec import bit_allocation as packing
 from eigengs_dr.codec import egs as packed
+from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import picture_of
 
 
@@ -61,8 +62,7 @@ def test_without_an_image_the_rendering_is_kept(fitted, path):
     receipt = eg.pack(gaussians, path)
     error = np.mean(
         np.square(
-            eg.color.rgb_to_ycbcr(picture_of(eg.Gaussians.load(path)))
-            - eg.color.rgb_to_ycbcr(picture_of(gaussians))
+            rgb_to_ycbcr(picture_of(eg.Gaussians.load(path))) - rgb_to_ycbcr(picture_of(gaussians))
         )
     )
     allowed = packing.MSE_WITHOUT_IMAGE * (10 ** (packing.BUDGET / 10) - 1)

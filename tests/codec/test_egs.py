@@ -216,8 +216,8 @@ def test_reading_reserves_no_more_than_the_file_is_long(path):
 
 def test_splats_are_bounded(path, monkeypatch):
     """As those of other files are: by the numbers in the widest array."""
-    monkeypatch.setattr(packed, "MOST_ENTRIES", 3 * COUNT)
+    monkeypatch.setattr(packed, "MAX_ENTRIES", 3 * COUNT)
     path.write_bytes(header() + body())
     assert len(eg.Gaussians.load(path)) == COUNT
-    monkeypatch.setattr(packed, "MOST_ENTRIES", 3 * COUNT - 1)
+    monkeypatch.setattr(packed, "MAX_ENTRIES", 3 * COUNT - 1)
     check_refused(path, header() + body(), "more than may be read")

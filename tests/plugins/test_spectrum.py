@@ -14,6 +14,8 @@ from eigengs_dr.plugins import spectrum  # noqa: E402
 
 pytestmark = pytest.mark.mitsuba
 
+pytestmark = pytest.mark.mitsuba
+
 
 @pytest.fixture(autouse=True)
 def spectral():

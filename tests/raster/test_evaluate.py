@@ -12,20 +12,13 @@ from _helpers.footprints import matrices
 from _helpers.sets import covariances, few, random_scene, upload
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.evaluate import (
-    EXP2_SCALE,
-    NUM_SHAPE_PARAMS,
-    exp2_neg,
-    falloff,
-    weights,
-    weights_vjp,
-    widen,
-)
-from eigengs_dr.raster.render import kernel_parameters
+from eigengs_dr.raster.evaluate import exp2_neg, falloff, weights, weights_vjp, widen
+from eigengs_dr.raster.parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_radius
+from eigengs_dr.raster.render import decode_parameters
 
 TILE = (4, 3)
 CUTOFF = 3.0
-LIMIT = (EXP2_SCALE * CUTOFF) ** 2
+RADIUS = kernel_radius(CUTOFF)
 COUNT = 256
 
 
@@ -105,7 +98,7 @@ def test_derivative_of_falloff(types, mode):
 
 def test_weights(types):
     shape, x, y = draw()
-    found = weights(scaled(types, shape), *upload(types, x, y), TILE, LIMIT)
+    found = weights(scaled(types, shape), *upload(types, x, y), TILE, RADIUS)
     assert len(found) == TILE[0] * TILE[1]
     q = squared_distance(shape, x, y)
     exact = np.where(q <= CUTOFF**2, np.exp(-0.5 * q), 0)
@@ -118,8 +111,8 @@ def test_weights(types):
 
 def test_one_point_is_a_block_of_one(types):
     shape, x, y = draw()
-    block = weights(scaled(types, shape), *upload(types, x, y), TILE, LIMIT)
-    [single] = weights(scaled(types, shape), *upload(types, x + 2, y + 1), (1, 1), LIMIT)
+    block = weights(scaled(types, shape), *upload(types, x, y), TILE, RADIUS)
+    [single] = weights(scaled(types, shape), *upload(types, x + 2, y + 1), (1, 1), RADIUS)
     q = squared_distance(shape, x, y)[TILE[0] + 2]
     clear = np.abs(q / CUTOFF**2 - 1) > 1e-4
     error = np.abs(single.numpy() - block[TILE[0] + 2].numpy())[clear]
@@ -131,7 +124,7 @@ def test_one_point_is_a_block_of_one(types):
 def test_weights_are_never_nan(types, position, value):
     shape = scaled(types, [[8.0], [8.0], [0.5], [0.1], [0.5]])
     shape[position] = types.Float(value)
-    found = weights(shape, types.Float(6.5), types.Float(6.5), TILE, LIMIT)
+    found = weights(shape, types.Float(6.5), types.Float(6.5), TILE, RADIUS)
     assert not any(w.numpy().any() for w in found)
 
 
@@ -144,10 +137,10 @@ def test_pullback_is_the_derivative_of_weights(types):
     rng = np.random.default_rng(1)
     upstream = upload(types, *rng.normal(size=(TILE[0] * TILE[1], COUNT)))
     parameters, x, y = scaled(types, shape), *upload(types, x, y)
-    by_hand = weights_vjp(parameters, x, y, TILE, LIMIT, pull_with(upstream))
+    by_hand = weights_vjp(parameters, x, y, TILE, RADIUS, pull_with(upstream))
     dr.enable_grad(parameters)
     total = sum(
-        g * w for g, w in zip(upstream, weights(parameters, x, y, TILE, LIMIT), strict=True)
+        g * w for g, w in zip(upstream, weights(parameters, x, y, TILE, RADIUS), strict=True)
     )
     dr.backward(total)
     for ours, theirs in zip(by_hand, dr.grad(parameters), strict=True):
@@ -158,8 +151,8 @@ def test_pullback_is_the_derivative_of_weights(types):
 
 def test_pullback_against_finite_differences(types):
     shape, x, y = draw()
-    everywhere = 100.0  # a limit beyond all points, so that no step crosses the edge
-    keep = squared_distance(shape, x, y).max(axis=0) * EXP2_SCALE**2 < everywhere
+    everywhere = 10.0  # a cutoff beyond all points, so that no step crosses the edge
+    keep = squared_distance(shape, x, y).max(axis=0) * EXP2_SCALE**2 < everywhere**2
     shape, x, y = shape[:, keep], x[keep], y[keep]
     assert keep.sum() > COUNT / 4
     upstream = np.random.default_rng(1).normal(size=(TILE[0] * TILE[1], keep.sum()))
@@ -195,9 +188,9 @@ def test_pullback_asks_with_the_weights(types):
         asked[k] = w
         return types.Float(0)
 
-    gradient = weights_vjp(parameters, x, y, TILE, LIMIT, pull)
+    gradient = weights_vjp(parameters, x, y, TILE, RADIUS, pull)
     assert not any(g.numpy().any() for g in gradient)
-    expected = weights(parameters, x, y, TILE, LIMIT)
+    expected = weights(parameters, x, y, TILE, RADIUS)
     assert sorted(asked) == list(range(len(expected)))
     for k, w in enumerate(expected):
         np.testing.assert_allclose(asked[k].numpy(), w.numpy(), rtol=0, atol=1e-6)
@@ -210,7 +203,8 @@ class TestWiden:
         rng = np.random.default_rng(seed)
         scene = random_scene(seed)
         spread = covariances(rng.uniform(0, 30, (1, 2)), rng.uniform(0, np.pi, 1))[0]
-        rows, _ = kernel_parameters(scene.on(backend, bits=64))
+        p = decode_parameters(scene.on(backend, bits=64))
+        rows = [*p.shape, *p.color]
         Float = types_of(rows[0]).Float
         footprint = [Float(spread[k] / EXP2_SCALE**2) for k in ((0, 0), (0, 1), (1, 1))]
         (_, _, a, b, c), amplitude = widen(rows[:NUM_SHAPE_PARAMS], footprint)

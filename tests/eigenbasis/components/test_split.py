@@ -5,7 +5,6 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, rendered, small_basis, small_model, splits
-from eigengs_dr.eigenbasis.components import solve as components
 from eigengs_dr.eigenbasis.components.split import SPLIT_COST, split_reason, wants_split
 from eigengs_dr.image.folder import to_planes
 
@@ -50,7 +49,7 @@ def test_what_the_split_may_cost(backend, monkeypatch, split, expected):
     figures = iter([30.0, split])
     monkeypatch.setattr("eigengs_dr.eigenbasis.components.split.SPLIT_FROM", SIDE)
     monkeypatch.setattr(
-        "eigengs_dr.eigenbasis.components.solve.decibels", lambda mse: next(figures)
+        "eigengs_dr.eigenbasis.components.split.psnr_from_mse", lambda mse: next(figures)
     )
     assert wants_split(small_basis(), SPLATS, "auto", backend)[0] == expected
 
@@ -68,7 +67,7 @@ def test_the_split_tells_why(backend, monkeypatch):
     assert reason(100, False) == (False, "as asked")
     assert reason(1, True) == (False, "too few Gaussians or components to split")
     assert reason(100, "auto") == (False, "32 pixels a side; auto measures from 512 on")
-    monkeypatch.setattr(components, "SPLIT_FROM", 32)
+    monkeypatch.setattr("eigengs_dr.eigenbasis.components.split.SPLIT_FROM", 32)
     decision, text = reason(100, "auto")
     whole, split = (float(text.split(word)[1].split(" dB")[0]) for word in ("whole ", "split "))
     assert decision == (split > whole - SPLIT_COST)

@@ -8,12 +8,13 @@ from _helpers.footprints import CUTOFF, brute_force, matrices, some_points, stac
 from _helpers.sets import SIZE, covariances, random_scene
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, widen
+from eigengs_dr.raster.evaluate import widen
 from eigengs_dr.raster.layout import pack_parameters
 from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
-from eigengs_dr.raster.render import kernel_parameters
+from eigengs_dr.raster.parameters import EXP2_SCALE, NUM_SHAPE_PARAMS
+from eigengs_dr.raster.render import decode_parameters
 
 FOOTPRINTS = [
     np.diag([0.3, 0.3]),
@@ -27,7 +28,8 @@ FOOTPRINTS = [
 
 def filtered(gaussians, wrap, points, covariance, cutoff=CUTOFF):
     """Rows of what `sum_prefiltered` gives, without the background."""
-    rows, _ = kernel_parameters(gaussians)
+    p = decode_parameters(gaussians)
+    rows = [*p.shape, *p.color]
     types = types_of(gaussians.mean)
     shape = [dr.detach(r) for r in rows[:NUM_SHAPE_PARAMS]]
     sizes = classify_by_size(shape, gaussians.width, gaussians.height, cutoff, wrap)
@@ -125,7 +127,8 @@ class TestSumFiltered:
             total = 0
             for n in range(80):
                 one = scene.permuted([n]).on(backend)
-                rows, _ = kernel_parameters(one)
+                p = decode_parameters(one)
+                rows = [*p.shape, *p.color]
                 scaled = [
                     types.Float(covariance[k] / EXP2_SCALE**2) for k in ((0, 0), (0, 1), (1, 1))
                 ]
