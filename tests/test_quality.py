@@ -14,15 +14,15 @@ COUNT = {"gaussians": 300, "iterations": 60}
 NATURAL = {"init": "eigen", "basis": "natural"}
 
 FITS = {
-    "default": ("coffee", COUNT, 0, 0),
-    "detail": ("face", COUNT, 0, 0),
-    "rgb": ("face", {**COUNT, "color": "rgb"}, 0, 0),
-    "linear": ("face", {**COUNT, "color": "linear"}, 0, 0),
-    "start": ("face", {**COUNT, "iterations": 0}, 0, 0),
-    "grid": ("face", {**COUNT, "iterations": 0, "init": "grid"}, 0, 0),
-    "gaussianimage": ("face", {**COUNT, "iterations": 300, "preset": "gaussianimage"}, 0, 0),
-    "basis": ("astronaut", {**NATURAL, "iterations": 0}, 0, 0),
-    "basis, 20 steps": ("astronaut", {**NATURAL, "iterations": 20}, 0, 0),
+    "default": ("coffee", COUNT, 41.01, 47.03),
+    "detail": ("face", COUNT, 35.40, 41.64),
+    "rgb": ("face", {**COUNT, "color": "rgb"}, 35.40, 41.51),
+    "linear": ("face", {**COUNT, "color": "linear"}, 34.65, 40.80),
+    "start": ("face", {**COUNT, "iterations": 0}, 29.39, 35.61),
+    "grid": ("face", {**COUNT, "iterations": 0, "init": "grid"}, 25.87, 32.08),
+    "gaussianimage": ("face", {**COUNT, "iterations": 300, "preset": "gaussianimage"}, 9.39, 14.56),
+    "basis": ("astronaut", {**NATURAL, "iterations": 0}, 32.74, 38.85),
+    "basis, 20 steps": ("astronaut", {**NATURAL, "iterations": 20}, 37.08, 43.14),
 }
 """Image, options of `fit`, and the recorded psnr_rgb and psnr_ycbcr."""
 
@@ -48,22 +48,22 @@ def test_fit(name):
 
 
 def test_search():
-    """The target is reached, and by few Gaussians."""
+    """The target is reached, by as few Gaussians; another CPU rounds otherwise, so a few more."""
     image = photo("face")
     found = eg.fit(image, target_psnr=32, iterations=60, backend="llvm")
     assert found.stopped == "met"
     assert eg.psnr(image, found.image, space="ycbcr") >= 32
-    assert len(found.gaussians) <= 1.05 * 0
+    assert len(found.gaussians) <= 1.1 * 42
 
 
 def test_levels():
     image = photo("face")
     gaussians = eg.fit_levels(image, 300, 2, iterations=60, backend="llvm").gaussians
-    check(image, eg.picture_of(gaussians[:75]), 0, 0)
-    check(image, eg.picture_of(gaussians), 0, 0)
+    check(image, eg.picture_of(gaussians[:75]), 28.86, 35.06)
+    check(image, eg.picture_of(gaussians), 35.16, 41.39)
 
 
-@pytest.mark.parametrize(("colors", "recorded"), [("exact", 0), ("projected", 0)])
+@pytest.mark.parametrize(("colors", "recorded"), [("exact", 43.90), ("projected", 24.25)])
 def test_encode(colors, recorded):
     model, images = small_model("llvm"), family(8, seed=1)
     shown = [eg.render(model.encode(image, colors)).numpy() for image in images]
@@ -76,5 +76,5 @@ def test_pack(tmp_path):
     image = photo("face")
     gaussians = eg.fit(image, **COUNT, backend="llvm").gaussians
     packed = eg.pack(gaussians, tmp_path / "x.egs", image)
-    check(image, eg.picture_of(eg.Gaussians.load(tmp_path / "x.egs", "llvm")), 0, 0)
-    assert packed.bytes <= 1.03 * 0
+    check(image, eg.picture_of(eg.Gaussians.load(tmp_path / "x.egs", "llvm")), 34.97, 41.16)
+    assert packed.bytes <= 1.03 * 1376
