@@ -30,10 +30,7 @@ from eigengs_dr.raster.lookup.points import (
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
 from eigengs_dr.raster.lookup.pyramid import build_pyramid, is_minified, pyramid_mean, sum_pyramid
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
-from eigengs_dr.raster.parameters import (
-    NUM_SHAPE_PARAMS,
-    kernel_radius,
-)
+from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
 from eigengs_dr.raster.render import decode_parameters
 
 from .cone import metric

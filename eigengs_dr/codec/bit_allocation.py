@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import types_of
 from ..fitting.refine import MAX_PSNR
+from ..gaussian.covariance import log_shapes, sizes_from_log_shapes
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr, to_coded
 from ..image.io import check_image
@@ -27,7 +28,7 @@ from ..image.metrics import psnr_from_mse
 from ..raster.render import CUTOFF, render
 from .egs import MAX_SECTIONS, EgsContent, to_bytes, write
 from .error_feedback import quantize_with_feedback, to_gaussians
-from .quantization import Steps, log_shapes, sizes_from_log_shapes
+from .quantization import Steps
 
 Array = NDArray[np.floating]
 

@@ -17,10 +17,11 @@ from ..backend.arrays import types_of
 from ..fitting.optimizers.descent import descend
 from ..fitting.presets import PRESETS
 from ..fitting.solvers.conjugate_gradient import solve
+from ..gaussian.covariance import log_shapes
 from ..gaussian.gaussians import Gaussians
 from ..raster.render import render
 from .egs import EgsContent
-from .quantization import Steps, dequantize, log_shapes, quantize
+from .quantization import Steps, dequantize, quantize
 
 Array = NDArray[np.floating]
 

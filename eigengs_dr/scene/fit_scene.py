@@ -22,6 +22,7 @@ from ..fitting.optimizers.descent import descend
 from ..fitting.placement.adaptive import place_adaptive
 from ..fitting.presets import PRESETS
 from ..fitting.solvers.conjugate_gradient import solve
+from ..gaussian.covariance import max_deviation
 from ..gaussian.gaussians import Gaussians
 from ..image.color import to_coded, to_linear
 from ..image.io import check_image
@@ -249,13 +250,10 @@ def _reaches_seen(
     mean: NDArray[Any], factor: NDArray[Any], seen: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Tell which splats may reach a texel that is seen, by their longer axes; at least one."""
-    a, b, c = factor.T
-    middle = 0.5 * (a * a + b * b + c * c)
-    least = (a * c) ** 2 / (middle + np.sqrt(np.maximum(middle**2 - (a * c) ** 2, 0)))
     column = mean[:, 0].astype(int).clip(0, seen.shape[1] - 1)
     row = mean[:, 1].astype(int).clip(0, seen.shape[0] - 1)
     away = distance_transform_edt(~seen)[row, column]
-    return away <= np.maximum(CUTOFF / np.sqrt(least), away.min())
+    return away <= np.maximum(CUTOFF * max_deviation(*factor.T), away.min())
 
 
 def _search_count(

@@ -31,13 +31,16 @@ def small_model(backend, split=False, color="ycbcr"):
 
 
 SIDE, SPLATS = 32, 100
+"""Size of the images of a family, and splats of a small model."""
 
 splits = pytest.mark.parametrize("split", [False, True])
 
 
 def fidelity(pictures, images):
+    """Mean PSNR of pictures in YCbCr."""
     return np.mean([eg.psnr(p, i, "ycbcr") for p, i in zip(pictures, images, strict=True)])
 
 
 def rendered(model, images, *options):
+    """Renderings of the codes of images."""
     return [eg.render(model.encode(image, *options)).numpy() for image in images]

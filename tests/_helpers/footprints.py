@@ -11,6 +11,7 @@ FINE = 4
 
 
 def some_points(count=60, size=SIZE, seed=3):
+    """Random points in an image, rounded to float32, shape (count, 2)."""
     points = np.random.default_rng(seed).uniform(0, 1, (count, 2)) * size
     return points.astype(np.float32).astype(np.float64)
 
@@ -47,6 +48,7 @@ def brute_force(scene, wrap, points, covariance):
 
 
 def stacked(rows):
+    """Rows of Dr.Jit as one array, shape (points, rows)."""
     return np.stack([np.array(r) for r in rows], axis=1)
 
 

@@ -20,9 +20,11 @@ def picture(seed=0):
 
 
 def fitted(count=60):
+    """A fit before its refinement, and its target in YCbCr."""
     image = picture()
     return initialize(image, count, "adaptive", "natural", PRESETS["default"]), rgb_to_ycbcr(image)
 
 
 def squared_error(gaussians, target, weight=1.0):
+    """Sum of the squares of what a rendering misses."""
     return float(np.square(weight * residual(gaussians, target).astype(np.float64)).sum())

@@ -24,6 +24,7 @@ def family(count=60, directions=20, noise=0.004, seed=0, size=SIZE):
 
 
 def planes(images, space="ycbcr"):
+    """Images as planes of their channels, shape (count, 3, pixels)."""
     return np.stack([to_planes(check_image(image), space) for image in images])
 
 

@@ -9,6 +9,7 @@ from eigengs_dr.codec.quantization import Steps
 
 STEPS = Steps(0.25, 0.125, 0.0625, 0.03125)
 SPACES = [("ycbcr", 3), ("rgb", 1), ("rgb", 4), ("linear", 3), ("data", 2)]
+"""Spaces of colours, and numbers of channels."""
 
 
 @cache

@@ -6,16 +6,19 @@ from hypothesis.extra import numpy as hnp
 
 
 def generator(seed=0):
+    """A generator of random numbers."""
     return np.random.default_rng(seed)
 
 
 def covariances_of(factor):
+    """Covariances of factors, shape (N, 2, 2)."""
     a, b, c = np.asarray(factor, np.float64).T
     matrix = np.array([[a, b], [np.zeros_like(a), c]]).transpose(2, 0, 1)
     return np.linalg.inv(np.einsum("nji,njk->nik", matrix, matrix))
 
 
 def check_placement(mean, factor, count, size):
+    """Check shapes and bounds of what a placement returns."""
     width, height = size
     assert mean.shape == (count, 2)
     assert factor.shape == (count, 3)

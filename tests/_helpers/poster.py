@@ -14,6 +14,7 @@ NAME = "poster.bsdf.reflectance"
 
 
 def camera(place, side=SIDE, **film):
+    """A camera that looks at the middle of the poster."""
     return {
         "type": "perspective",
         "fov": FOV,
@@ -30,11 +31,13 @@ def camera(place, side=SIDE, **film):
 
 
 def picture(side=TEXELS):
+    """Random colours, shape (side, side, 3)."""
     values = np.random.default_rng(1).uniform(0, 1, (side, side, 3))
     return values.astype(np.float32)
 
 
 def bitmap(pixels=None, **properties):
+    """A bitmap texture of linear values."""
     data = mi.TensorXf(picture() if pixels is None else pixels)
     properties = {"wrap_mode": "clamp", **properties}
     return {"type": "bitmap", "data": data, "raw": True, **properties}
@@ -71,6 +74,7 @@ def albedo(scene):
 
 
 def photo(side=48):
+    """A photo of a few pixels, shape (side, side, 3)."""
     return eg.sample("astronaut")[: 8 * side : 8, : 8 * side : 8]
 
 

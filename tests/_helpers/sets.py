@@ -114,6 +114,7 @@ def scene_of(unit, size=SIZE):
 
 
 def random_scene(seed=0, count=COUNT, size=SIZE, channels=3):
+    """A scene drawn from a seed."""
     return scene_of(np.random.default_rng(seed).uniform(0, 1, (count, 5 + channels)), size)
 
 
@@ -124,16 +125,20 @@ def scenes(count=COUNT, size=SIZE, channels=3):
 
 
 NAMES = ("mean", "factor", "color", "background")
+"""Parameters of a set."""
 
 
 def arrays_of(scene):
+    """Parameters of a scene, by name."""
     return {name: getattr(scene, name) for name in NAMES}
 
 
 def check_equal(gaussians, arrays):
+    """Check that a set holds these arrays, rounded to its precision."""
     for name, found in gaussians.to_arrays().items():
         np.testing.assert_array_equal(found, np.asarray(arrays[name], found.dtype), err_msg=name)
 
 
 def upload(types, *arrays):
+    """Arrays of a backend that hold the values of NumPy arrays."""
     return [types.Float(np.ascontiguousarray(v)) for v in arrays]

@@ -21,21 +21,25 @@ def gaussians(space="rgb", channels=3, seed=0, quiet=True):
 
 
 def texture(g, **properties):
+    """The texture of a set."""
     return mi.load_dict({**texture_of(g), **properties})
 
 
 def at(u, v, count=1):
+    """Surface interactions at texture coordinates."""
     si = dr.zeros(mi.SurfaceInteraction3f, max(count, dr.width(u), dr.width(v)))
     si.uv = mi.Point2f(u, v)
     return si
 
 
 def texel_centres(size=SIZE):
+    """Surface interactions at the centres of all texels."""
     v, u = np.mgrid[: size[1], : size[0]] + 0.5
     return at(*(mi.Float(np.float32(k.ravel())) for k in (u / size[0], v / size[1])))
 
 
 def picture(rows, size=SIZE):
+    """Values at all texels as an image, shape (H, W, C)."""
     return np.stack([np.array(r) for r in rows], -1).reshape(size[1], size[0], -1)
 
 

@@ -25,6 +25,7 @@ def picture(height=SIDE, width=SIDE):
 
 
 def figures(result):
+    """PSNR in YCbCr of all rows of the trace."""
     return [row["psnr_ycbcr"] for row in result.trace]
 
 
@@ -37,4 +38,5 @@ def start(backend, count=SPLATS, seed=0):
 
 
 def default(**changed):
+    """The schedule of the default preset, changed."""
     return replace(PRESETS["default"].schedule, **changed)

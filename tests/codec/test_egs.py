@@ -15,12 +15,8 @@ from _helpers.packed import SPACES, STEPS, peak
 from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
 from eigengs_dr.codec import egs as packed
 from eigengs_dr.codec import entropy as planes
-from eigengs_dr.codec.quantization import (
-    Steps,
-    Symbols,
-    log_shapes,
-    quantize,
-)
+from eigengs_dr.codec.quantization import Steps, Symbols, quantize
+from eigengs_dr.gaussian.covariance import log_shapes
 
 # --- Files -------------------------------------------------------------------------------------
 

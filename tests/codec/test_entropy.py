@@ -10,9 +10,7 @@ from hypothesis.extra import numpy as hnp
 
 from _helpers.packed import peak
 from eigengs_dr.codec import entropy as planes
-from eigengs_dr.codec.quantization import (
-    MAX_SYMBOL,
-)
+from eigengs_dr.codec.quantization import MAX_SYMBOL
 from eigengs_dr.storage.npz import BadValue
 
 NUMBERS = st.one_of(

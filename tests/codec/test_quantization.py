@@ -8,13 +8,8 @@ from _helpers.packed import STEPS
 from _helpers.sets import SIZE, few, scenes
 from eigengs_dr.codec import egs as packed
 from eigengs_dr.codec.hilbert_index import MAX_LEVELS
-from eigengs_dr.codec.quantization import (
-    MAX_SYMBOL,
-    _round_to_steps,
-    factors_from_log_shapes,
-    log_shapes,
-    quantize,
-)
+from eigengs_dr.codec.quantization import MAX_SYMBOL, _round_to_steps, quantize
+from eigengs_dr.gaussian.covariance import factors_from_log_shapes, log_shapes
 
 
 @given(scenes())

@@ -38,9 +38,6 @@ def others():
     return family(6, seed=1)
 
 
-# ---------------------------------------------------------------- a family
-
-
 def test_held_out_images_tell_the_rank():
     """Noise of the training images alone is no reason to keep components of it."""
     basis = eg.Eigenbasis.from_images(
@@ -144,10 +141,3 @@ def test_no_components_at_all():
     assert eg.Eigenbasis.from_images(family(1), (32, 32), 0).truncation_curve().psnr.tolist() == [
         120
     ]
-
-
-# ---------------------------------------------------------------- one image
-
-
-def shown(model, coefficients):
-    return eg.render(model.reconstruct(coefficients)).numpy()

@@ -12,10 +12,6 @@ from _helpers.sets import few, scenes
 from eigengs_dr.fitting.density_control import densify, prune, removal_cost
 from eigengs_dr.raster.render import render
 
-# ---------------------------------------------------------------------------------------------
-#  What a splat is worth
-# ---------------------------------------------------------------------------------------------
-
 
 @few
 @given(scenes())

@@ -13,10 +13,6 @@ from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.fitting.search import search_count
 
-# ---------------------------------------------------------------------------------------------
-#  The search
-# ---------------------------------------------------------------------------------------------
-
 
 def test_a_constant_image_takes_one_splat():
     result = fit(np.full((SIDE, SIDE, 3), 0.4), target_psnr=60, iterations=100)

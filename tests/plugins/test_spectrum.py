@@ -7,12 +7,9 @@ import numpy as np
 import pytest
 
 mi = pytest.importorskip("mitsuba")
-
 import drjit as dr  # noqa: E402
 
 from eigengs_dr.plugins import spectrum  # noqa: E402
-
-pytestmark = pytest.mark.mitsuba
 
 pytestmark = pytest.mark.mitsuba
 

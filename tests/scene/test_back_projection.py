@@ -8,11 +8,11 @@ from scipy.ndimage import gaussian_filter, laplace
 
 from _helpers.sets import few
 
-mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
+pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
 
-from _helpers.poster import blocks, photo  # noqa: E402
-from eigengs_dr.scene.back_projection import _blur_by, back_project, extrapolate  # noqa: E402
-from eigengs_dr.scene.visibility import Visibility  # noqa: E402
+from _helpers.poster import blocks, photo
+from eigengs_dr.scene.back_projection import _blur_by, back_project, extrapolate
+from eigengs_dr.scene.visibility import Visibility
 
 pytestmark = pytest.mark.mitsuba
 

@@ -7,14 +7,14 @@ from hypothesis import strategies as st
 from scipy.ndimage import laplace
 from scipy.sparse import csr_array
 
-mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
+pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
 
-import eigengs_dr as eg  # noqa: E402
-from _helpers.poster import NAME, albedo, bitmap, blocks, board, camera, photo, scene_of  # noqa: E402
-from eigengs_dr.image.color import to_coded, to_linear  # noqa: E402
-from eigengs_dr.plugins import texture_of  # noqa: E402
-from eigengs_dr.scene import fit_scene as scenefit  # noqa: E402
-from eigengs_dr.scene.visibility import Visibility  # noqa: E402
+import eigengs_dr as eg
+from _helpers.poster import NAME, albedo, bitmap, blocks, board, camera, photo, scene_of
+from eigengs_dr.image.color import to_coded, to_linear
+from eigengs_dr.plugins import texture_of
+from eigengs_dr.scene import fit_scene as scenefit
+from eigengs_dr.scene.visibility import Visibility
 
 pytestmark = pytest.mark.mitsuba
 

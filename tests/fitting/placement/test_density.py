@@ -12,10 +12,6 @@ from eigengs_dr.fitting.placement.density import (
     target_density,
 )
 
-# ---------------------------------------------------------------------------------------------
-#  Density by error
-# ---------------------------------------------------------------------------------------------
-
 
 def squares(side):
     """Centres of squares of 5 x 5 pixels."""

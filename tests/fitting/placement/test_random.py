@@ -4,7 +4,8 @@ import numpy as np
 
 from _helpers.placements import covariances_of, generator
 from _helpers.sets import covariances
-from eigengs_dr.fitting.placement.random import inverse_factor, place_random
+from eigengs_dr.fitting.placement.random import place_random
+from eigengs_dr.gaussian.covariance import factor_from_covariance
 
 
 def test_seeds_differ():
@@ -16,7 +17,7 @@ def test_seeds_differ():
 def test_inverse_factor():
     rng = generator()
     sigma = covariances(rng.uniform(0.1, 100, (200, 2)), rng.uniform(0, np.pi, 200))
-    factor = inverse_factor(sigma[:, 0, 0], sigma[:, 0, 1], sigma[:, 1, 1])
+    factor = factor_from_covariance(sigma[:, 0, 0], sigma[:, 0, 1], sigma[:, 1, 1])
     np.testing.assert_allclose(covariances_of(factor), sigma, rtol=1e-9, atol=1e-9)
     assert (factor[:, [0, 2]] > 0).all()
 
