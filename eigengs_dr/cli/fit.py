@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import fields, replace
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
@@ -105,9 +106,18 @@ def fit(
             break
     if report:
         figures = records[0] if len(paths) == 1 else {"images": records}
-        told = {"levels": levels, **settings}
-        write_report(report, {**describe_run(context, options.backend), **told, **figures})
+        told = describe_run(context, options.backend) | _decisive(options, levels)
+        write_report(report, told | figures)
     _exit(context, records, options)
+
+
+def _decisive(options: FitOptions, levels: int | None) -> dict[str, Any]:
+    """Return the settings for a report."""
+    settings = {field.name: getattr(options, field.name) for field in fields(options)}
+    del settings["backend"]  # the report names the backend that was used
+    if options.initializer == "eigen":
+        settings["basis"] = str(options.basis or DEFAULT_BASIS)
+    return settings | {"levels": levels}
 
 
 def _expand(images: tuple[Path, ...]) -> list[Path]:
@@ -129,8 +139,6 @@ def _check_levels(options: FitOptions, levels: int | None) -> None:
 
 def _fitter(options: FitOptions, levels: int | None) -> Callable[..., "Fit"]:
     """Return ``run(image, progress)``, which fits one image; a model is read once for all."""
-    import dataclasses
-
     from ..fitting.fit import fit_image
     from ..fitting.levels import fit_levels
 
@@ -144,7 +152,7 @@ def _fitter(options: FitOptions, levels: int | None) -> Callable[..., "Fit"]:
         if options.method.mean == "dense":
             say("note: the file holds the Gaussians alone; the mean image stays in the basis")
         model = load_basis(options.basis or DEFAULT_BASIS, options.backend)
-        options = dataclasses.replace(options, basis=model)
+        options = replace(options, basis=model)
     return lambda image, progress: fit_image(image, options, progress)
 
 

@@ -32,7 +32,7 @@ def hilbert_encode(points: IntArray, levels: int) -> IntArray:
 
     Examples
     --------
-    >>> along_curve(np.array([[0, 0], [0, 1], [1, 1], [1, 0]]), 1)
+    >>> hilbert_encode(np.array([[0, 0], [0, 1], [1, 1], [1, 0]]), 1)
     array([0, 1, 2, 3])
     """
     x, y = np.asarray(points, np.int64).T

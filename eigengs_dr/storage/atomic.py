@@ -32,7 +32,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     Examples
     --------
-    >>> with replacing("/tmp/note.txt") as temporary:
+    >>> with atomic_write("/tmp/note.txt") as temporary:
     ...     _ = temporary.write_text("whole")
     """
     target = _target(path)

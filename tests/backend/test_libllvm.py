@@ -71,12 +71,19 @@ def add_library(folder, name, size=2_000_000):
         file.truncate(size)
 
 
-def test_newest_is_chosen(folder):
+def test_the_newest_tested_version_is_chosen(folder):
     for name in ("libLLVM-14.so.1", "libLLVM.so.19.1", "libLLVM.so.20.1", "libLLVM-15.so.1"):
         add_library(folder, name)
     add_library(folder, "libLLVM-22.so", size=30)  # a linker script
     os.symlink(folder / "gone", folder / "libLLVM-21.so")
-    assert [library.version for library in candidates()] == [20, 19, 15, 14]
+    assert [library.version for library in candidates()] == [19, 20, 15, 14]
+    select_libllvm()
+    assert os.environ[PATH_VARIABLE] == str(folder / "libLLVM.so.19.1")
+
+
+def test_an_untested_version_is_chosen_if_no_other_works(folder):
+    for name in ("libLLVM-14.so.1", "libLLVM.so.20.1", "libLLVM.so.18.1"):
+        add_library(folder, name)
     select_libllvm()
     assert os.environ[PATH_VARIABLE] == str(folder / "libLLVM.so.20.1")
 

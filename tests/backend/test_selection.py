@@ -1,6 +1,7 @@
 """Which backend is selected, and what is said where there is none."""
 
 import json
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -71,3 +72,10 @@ def test_describe(backend):
     if backend == "llvm":
         assert int(found["versions"]["libllvm"].split(".")[0]) >= module.MIN_VERSION
     json.dumps(found)
+
+
+def test_import_where_standard_error_is_closed():
+    """As in some daemons."""
+    code = "import os; os.close(2); import eigengs_dr as eg; print(eg.render.__name__)"
+    found = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert (found.returncode, found.stdout) == (0, "render\n")

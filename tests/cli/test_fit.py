@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from eigengs_dr.backend.selection import BackendError, select
 from eigengs_dr.cli.main import main
 from eigengs_dr.eigenbasis import registry as bases
 from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.fitting import fit as fit_module
 from eigengs_dr.fitting.initializers import INITIALIZERS
+from eigengs_dr.fitting.options import DEFAULT_BASIS
 from eigengs_dr.image.color import SPACES, YCBCR_TO_RGB
 
 
@@ -176,13 +179,13 @@ def test_cuda_without_gpu(photo, existing):
 
 
 def test_interrupted_fit_is_kept(photo, tmp_path, monkeypatch):
-    complete = eg.fit
+    complete = fit_module.fit_image
 
     def interrupted(*arguments, **settings):
         result = complete(*arguments, **settings)
-        return result._replace(stopped="interrupted")
+        raise eg.FitInterrupted(replace(result, stopped="interrupted"))
 
-    monkeypatch.setattr(eg, "fit", interrupted)
+    monkeypatch.setattr(fit_module, "fit_image", interrupted)
     settings = ["--gaussians", 20, "--iterations", 1, "--report", tmp_path / "r.json"]
     result = run("fit", photo, "-o", tmp_path / "x.npz", *settings)
     assert result.exit_code == 130
@@ -196,7 +199,7 @@ def test_interrupted_before_there_is_a_fit(photo, existing, monkeypatch):
     def interrupted(*arguments, **settings):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(eg, "fit", interrupted)
+    monkeypatch.setattr(fit_module, "fit_image", interrupted)
     result = run("fit", photo, "-o", existing)
     assert result.exit_code == 130
     assert result.stderr.strip() == "eigengs-dr: interrupted"
@@ -234,7 +237,7 @@ def test_the_papers_form_lacks_the_mean_image(trained, photo, tmp_path):
     result = succeeded(run("fit", photo, *outputs, *options))
     assert result.stderr.count("\n") == 1
     assert "note: " in result.stderr
-    assert "mean image is kept in the basis" in result.stderr
+    assert "mean image stays in the basis" in result.stderr
     _, fit, _ = previewed(tmp_path / "both.png")
     model = EigenGS.load(folder / "m.npz")
     added = model.dense_mean(32, 32) @ YCBCR_TO_RGB.T
@@ -260,7 +263,7 @@ def test_the_names_of_inits_and_bases():
     [option] = [p for p in main.commands["fit"].params if p.name == "color"]
     assert tuple(option.type.choices) == SPACES
     [option] = [p for p in main.commands["fit"].params if p.name == "basis"]
-    assert option.default in bases.SHIPPED
+    assert DEFAULT_BASIS in bases.SHIPPED and DEFAULT_BASIS in option.help
 
 
 def test_command_finds_few_or_says_that_it_cannot(tmp_path):
@@ -282,8 +285,53 @@ def test_command_finds_few_or_says_that_it_cannot(tmp_path):
 
     for option in (("--space", "rgb"), ("--max-gaussians", 50), ("--levels", 2, "--space", "rgb")):
         alone = run(*base, *option)
-        assert alone.exit_code == 2 and "belong to --target-psnr" in alone.stderr
+        assert alone.exit_code == 2 and "belong to target_psnr" in alone.stderr
 
     both = run(*base, "--target-psnr", 30, "--gaussians", 9)
     assert both.exit_code == 2
     assert "exclude each other" in both.stderr
+
+
+# --- What one would try first -------------------------------------------------------------------
+
+QUICK = ("--gaussians", 20, "--iterations", 1)
+
+
+def test_without_output_the_current_folder_is_used(photo, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    succeeded(run("fit", photo, *QUICK))
+    assert len(eg.Gaussians.load(tmp_path / "here" / "photo.npz")) == 20
+
+
+def test_a_folder_is_fitted(photo, tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for name in ("a.png", "b.png"):
+        shutil.copy(photo, folder / name)
+    succeeded(run("fit", folder, "-o", tmp_path / "fits", *QUICK))
+    assert sorted(p.name for p in (tmp_path / "fits").iterdir()) == ["a.npz", "b.npz"]
+
+
+def test_several_images_are_not_written_to_a_file(photo, tmp_path):
+    other = tmp_path / "other.png"
+    shutil.copy(photo, other)
+    assert_refused(run("fit", photo, other, "-o", tmp_path / "out.npz", *QUICK), "need a folder")
+    assert not (tmp_path / "out.npz").exists()
+
+
+def test_a_basis_implies_its_start(trained, photo, tmp_path):
+    """It is read, or the command says that it cannot be."""
+    model, report = trained[0] / "m.npz", tmp_path / "r.json"
+    output = ["-o", tmp_path / "x.npz", "--iterations", 0, "--report", report]
+    succeeded(run("fit", photo, *output, "--basis", model))
+    told = json.loads(report.read_text())
+    assert (told["gaussians"], told["basis"]) == (60, str(model))
+    assert_refused(run("fit", photo, *output, "--basis", "nowhere.npz"), "nowhere.npz")
+    assert_refused(run("fit", photo, *output, "--basis", model, "--init", "grid"), "basis")
+
+
+def test_the_report_has_all_of_the_time(fitted):
+    report = json.loads((fitted[0] / "fit.json").read_text())
+    assert report["seconds_init"] <= report["seconds"] <= report["seconds_total"]
+    assert report["seconds_load"] + report["seconds"] <= report["seconds_total"]

@@ -33,7 +33,8 @@ def test_commands(image, tmp_path):
     expected = picture_of(eg.Gaussians.load(fitted)[:16]).clip(0, 1)
     assert np.abs(eg.load_image(out) - expected).max() < 0.003
 
-    for extra in (["--target-psnr", 30], ["--init", "grid"], ["--levels", 9]):
-        refused = run(*base, "--gaussians", 64, "--levels", 2, *extra)
+    count = ["--gaussians", 64]
+    for extra in (["--target-psnr", 30], [*count, "--init", "grid"], [*count, "--levels", 9]):
+        refused = run(*base, "--levels", 2, *extra)
         assert refused.exit_code == 2
         assert "levels" in refused.stderr and len(refused.stderr.splitlines()) == 1

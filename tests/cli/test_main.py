@@ -119,3 +119,16 @@ def test_help_loads_nothing_heavy():
     )
     process = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert process.stdout.splitlines()[-1] == ""
+
+
+def test_render_says_what_it_wrote(fitted, tmp_path):
+    target = tmp_path / "y.png"
+    told = succeeded(run("render", fitted[0] / "fit.npz", "-o", target)).stdout
+    assert str(target) in told and "32x24" in told
+    assert succeeded(run("render", fitted[0] / "fit.npz", "-o", target, "--quiet")).stdout == ""
+
+
+def test_python_m():
+    command = [sys.executable, "-m", "eigengs_dr", "--help"]
+    found = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "eigengs-dr fit" in found.stdout

@@ -155,4 +155,4 @@ def test_mistaken_files(scene, tmp_path):
 
 def test_without_mitsuba(scene, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    assert_refused(run(scene(), "-o", tmp_path / "x.png"), "pip install 'eigengs-dr[plugins]'")
+    assert_refused(run(scene(), "-o", tmp_path / "x.png"), "pip install 'mitsuba==3.9.*'")

@@ -53,8 +53,18 @@ def test_files_are_small_and_equal_for_equal_arguments(fitted, receipts, path):
     assert smaller.stat().st_size < 0.9 * file.stat().st_size
     eg.pack(gaussians, path, image)
     assert path.read_bytes() == file.read_bytes()
-    gaussians.save(path)
-    assert file.stat().st_size < path.stat().st_size / 4
+    saved = path.with_suffix(".npz")
+    gaussians.save(saved)
+    assert file.stat().st_size < saved.stat().st_size / 4
+
+
+def test_the_suffix_tells_the_format(fitted, path):
+    """`pack` writes no .npz file, and `save` no .egs file."""
+    gaussians, _ = fitted
+    for call, name in ((eg.pack, path.with_suffix(".npz")), (eg.Gaussians.save, path)):
+        with pytest.raises(ValueError, match=str(name)):
+            call(gaussians, name)
+        assert not name.exists()
 
 
 def test_without_an_image_the_rendering_is_kept(fitted, path):

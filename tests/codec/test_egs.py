@@ -4,6 +4,7 @@ import math
 import os
 import struct
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -157,7 +158,7 @@ def ways(*steps):
 HOSTILE = {
     "nothing": (b"", "not a readable"),
     "another magic": (header(magic=b"\x89EGT") + body(), "not a readable"),
-    "newer": (header(version=2) + body(), "version is 2"),
+    "newer": (header(version=3) + body(), "version is 3"),
     "version 0": (header(version=0) + body(), "version is 0"),
     "another space": (header(space=9) + body(), "not known"),
     "no channels": (header(channels=0) + body(), "claims 0 channels"),
@@ -217,3 +218,12 @@ def test_splats_are_bounded(path, monkeypatch):
     assert len(eg.Gaussians.load(path)) == COUNT
     monkeypatch.setattr(packed, "MAX_ENTRIES", 3 * COUNT - 1)
     check_refused(path, header() + body(), "more than may be read")
+
+
+@pytest.mark.parametrize("cutoff", [3.0, 4.5])
+def test_the_cutoff_is_kept(path, cutoff):
+    """A set with the default cutoff makes a file of version 1, which older packages read."""
+    gaussians = replace(random_scene().on("llvm", space="rgb"), cutoff=cutoff)
+    result = eg.pack(gaussians, path, budget=3.0)
+    assert path.read_bytes()[4] == (1 if cutoff == 3 else 2)
+    assert eg.Gaussians.load(path).cutoff == result.gaussians.cutoff == cutoff

@@ -32,3 +32,10 @@ def test_bases_by_name_and_file(backend, tmp_path):
     assert len(load_basis(tmp_path / "small.npz", backend).gaussians) == SPLATS
     with pytest.raises(ValueError, match="basis 'nature' is neither a file nor one of: natural"):
         load_basis("nature")
+
+
+def test_a_model_on_another_backend_is_refused():
+    model = small_model("llvm")
+    assert load_basis(model) is model and load_basis(model, "llvm") is model
+    with pytest.raises(ValueError, match="on backend 'llvm', not on 'cuda'"):
+        load_basis(model, "cuda")

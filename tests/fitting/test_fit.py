@@ -404,3 +404,23 @@ def test_errors_name_the_argument(name, value):
     arguments = {"gaussians": SPLATS, "iterations": 3, name: value}
     with pytest.raises((ValueError, TypeError), match=name):
         fit(picture(), **arguments)
+
+
+def test_the_repr_is_short(backend):
+    """It shows figures, and neither pixels nor the trace."""
+    text = repr(fit(picture(), SPLATS, 0, backend=backend))
+    assert len(text) < 200 and f"{SPLATS} Gaussians" in text and "psnr_rgb=" in text
+
+
+def test_a_cutoff_stays_with_its_set(backend):
+    result = fit(picture(), SPLATS, 10, cutoff=4, backend=backend)
+    assert result.gaussians.cutoff == 4
+    shown = render(result.gaussians).numpy()
+    np.testing.assert_array_equal(shown, result.image)
+    assert not np.array_equal(render(result.gaussians, cutoff=3).numpy(), shown)
+
+
+def test_seeds_of_the_default_preset_give_one_result(backend):
+    sets = [fit(picture(), SPLATS, 0, seed=seed, backend=backend).gaussians for seed in (0, 1)]
+    for first, second in zip(*(g.to_arrays().values() for g in sets), strict=True):
+        np.testing.assert_array_equal(first, second)

@@ -120,10 +120,11 @@ def members(**changed):
     arrays = {k: np.float32(v) for k, v in arrays_of(random_scene()).items()}
     good = {
         "format": np.array("eigengs_dr.gaussians"),
-        "version": np.array(1),
+        "version": np.array(2),
         **arrays,
         "size": np.array(SIZE),
         "space": np.array("data"),
+        "cutoff": np.array(3.0),
     }
     contents = {**{k: npy(v) for k, v in good.items()}, **changed}
     contents = {k: npy(v) if isinstance(v, np.ndarray) else v for k, v in contents.items()}
@@ -186,7 +187,7 @@ HOSTILE = {
     "a format of two lines": (members(format=np.array("a\nb")), "format is"),
     "a long format": (members(format=np.array("x" * 65)), "format"),
     "a format that is no text": (members(format=np.array(1)), "'format'"),
-    "newer": (members(version=np.array(2)), "version is 2"),
+    "newer": (members(version=np.array(3)), "version is 3"),
     "version 0": (members(version=np.array(0)), "version is 0"),
     "a version that is a float": (members(version=np.array(1.0)), "'version'"),
     "several versions": (members(version=np.array([1])), "'version'"),
@@ -233,6 +234,27 @@ HOSTILE = {
     "a long header": (members(mean=npy_with_header(" " * 20_000)), "not a readable"),
     "a version of .npy": (members(mean=b"\x93NUMPY\x09\x00" + bytes(64)), "not a readable"),
 }
+
+
+@pytest.mark.parametrize("cutoff", [2.0, 3.0, 4.5])
+def test_the_cutoff_is_kept(path, cutoff):
+    """It decides the rendering, and travels with the set."""
+    gaussians = replace(random_scene().on("llvm"), cutoff=cutoff)
+    gaussians.save(path)
+    found = Gaussians.load(path)
+    assert found.cutoff == cutoff
+    np.testing.assert_array_equal(render(found).numpy(), render(gaussians).numpy())
+    assert np.array_equal(render(found).numpy(), render(found, cutoff=3).numpy()) == (cutoff == 3)
+
+
+def test_files_of_version_1_have_the_default_cutoff(path):
+    path.write_bytes(zipped(members(version=np.array(1), cutoff=None)))
+    assert Gaussians.load(path).cutoff == 3.0
+
+
+@pytest.mark.parametrize("cutoff", [0.0, -1.0, 12.5, np.nan, np.inf])
+def test_cutoffs_out_of_range_are_refused(path, cutoff):
+    check_refused(path, zipped(members(cutoff=np.array(cutoff))), "cutoff")
 
 
 @pytest.mark.parametrize("name", HOSTILE)

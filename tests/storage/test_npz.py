@@ -1,9 +1,12 @@
 """Files of arrays, with a format and a version."""
 
+import errno
+
 import numpy as np
 import pytest
 
 from eigengs_dr.storage import npz as archive
+from eigengs_dr.storage.atomic import atomic_write
 
 
 def test_archive_reads_what_it_wrote(tmp_path):
@@ -20,3 +23,12 @@ def test_archive_reads_what_it_wrote(tmp_path):
             np.testing.assert_array_equal(found[key], value)
     with pytest.raises(ValueError, match="version is 3, this package reads up to 2"):
         archive.read(tmp_path / "x", "some.format", 2, layout)
+
+
+def test_a_full_disk_names_the_file(tmp_path):
+    """The system reports it without a name."""
+    target = tmp_path / "x.npz"
+    with pytest.raises(OSError, match="No space left") as error, atomic_write(target):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert error.value.filename == str(target)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,107 @@
+"""Forms of covariances against linear algebra in double precision."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from _helpers.sets import few
+from eigengs_dr.backend.selection import select
+from eigengs_dr.gaussian.covariance import (
+    cholesky_from_factor,
+    condition_number,
+    factor_from_cholesky,
+    factor_from_covariance,
+    factors_from_log_shapes,
+    log_shapes,
+    max_deviation,
+    outline,
+    sizes_from_log_shapes,
+)
+
+
+def draw(seed, count=50):
+    """Random factors, needles among them, and their covariances (N, 2, 2)."""
+    generator = np.random.default_rng(seed)
+    a, c = np.exp(generator.uniform(-3, 3, (2, count)))
+    b = generator.normal(size=count) * np.exp(generator.uniform(-3, 2, count))
+    factor = np.stack([a, b, c], axis=1)
+    whole = np.zeros((count, 2, 2))
+    whole[:, 0, 0], whole[:, 0, 1], whole[:, 1, 1] = a, b, c
+    inverse = np.linalg.inv(whole)
+    return factor, inverse @ np.swapaxes(inverse, 1, 2)
+
+
+seeds = given(st.integers(0, 2**32 - 1))
+
+
+@few
+@seeds
+def test_factors_of_covariances(seed):
+    factor, covariance = draw(seed)
+    found = factor_from_covariance(covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1])
+    precision = np.linalg.inv(covariance)
+    well = np.linalg.cond(covariance) < 1e6  # entries of needles do not hold their determinant
+    a, b, c = found[well].T
+    np.testing.assert_allclose(a * a, precision[well, 0, 0], rtol=1e-6)
+    np.testing.assert_allclose(
+        a * b, precision[well, 0, 1], rtol=1e-6, atol=1e-9 * np.abs(a * a).max()
+    )
+    np.testing.assert_allclose(found[well], factor[well], rtol=1e-5, atol=1e-6)
+    assert c.min() > 0
+
+
+@few
+@seeds
+def test_eigenvalues(seed):
+    factor, covariance = draw(seed)
+    values = np.linalg.eigvalsh(covariance)
+    np.testing.assert_allclose(max_deviation(*factor.T), np.sqrt(values[:, 1]), rtol=1e-9)
+    well = values[:, 0] > 1e-9 * values[:, 1]
+    ratio = (values[:, 1] / values[:, 0])[well]
+    np.testing.assert_allclose(condition_number(factor)[well], ratio, rtol=1e-5)
+
+
+def test_round_gaussians_have_condition_one():
+    factor = np.array([[0.5, 0, 0.5], [3.0, 0, 3.0]])
+    np.testing.assert_array_equal(condition_number(factor), 1)
+    np.testing.assert_allclose(max_deviation(*factor.T), [2, 1 / 3])
+
+
+@few
+@seeds
+def test_outlines_are_one_deviation_away(seed):
+    factor, _ = draw(seed)
+    points = outline(factor, 9)
+    a, b, c = (k[:, None] for k in factor.T)
+    x, y = points[..., 0], points[..., 1]
+    np.testing.assert_allclose((a * x + b * y) ** 2 + (c * y) ** 2, 1, rtol=1e-6)
+    np.testing.assert_array_equal(points[:, 0, 0], points[:, 8, 0])
+
+
+@few
+@seeds
+def test_logarithms_there_and_back(seed):
+    factor, covariance = draw(seed)
+    shape = log_shapes(factor)
+    np.testing.assert_allclose(factors_from_log_shapes(shape), factor, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        sizes_from_log_shapes(shape), np.linalg.det(covariance) ** 0.25, rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_cholesky_factors(backend, seed):
+    factor, covariance = draw(seed)
+    well = np.linalg.cond(covariance) < 1e4
+    Float = select(backend).Float64
+    given = [Float(np.ascontiguousarray(k)) for k in factor[well].T]
+    l1, l2, l3 = (np.array(v) for v in cholesky_from_factor(*given))
+    expected = np.linalg.cholesky(covariance[well])
+    tolerance = {"rtol": 1e-4, "atol": 1e-6}  # square roots of cuda have 20 bits
+    np.testing.assert_allclose(l1, expected[:, 0, 0], **tolerance)
+    np.testing.assert_allclose(l2, expected[:, 1, 0], **tolerance)
+    np.testing.assert_allclose(l3, expected[:, 1, 1], **tolerance)
+    back = factor_from_cholesky(Float(l1), Float(l2), Float(l3))
+    for found, value in zip(back, given, strict=True):
+        np.testing.assert_allclose(np.array(found), np.array(value), **tolerance)
