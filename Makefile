@@ -75,7 +75,7 @@ $(DOCS_READY): $(READY)
 	@touch $@
 
 docs: $(DOCS_READY)
-	$(BIN)/sphinx-build -W --keep-going -n -d build/docs/doctrees docs build/docs/html
+	$(BIN)/sphinx-build -E -W --keep-going -n -d build/docs/doctrees docs build/docs/html
 
 bench: $(READY)
 	@mkdir -p build/bench

@@ -49,6 +49,7 @@ numpydoc_class_members_toctree = False
 
 # A name in single backticks is a link where it is public, else plain code.
 default_role = "py:obj"
+smartquotes = False  # options keep both of their hyphens
 _public = "|".join(name for name in eg.__all__)
 nitpick_ignore_regex = [("py:obj", rf"(?!(eigengs_dr\.)?({_public})$).*"), ("py:class", r".*")]
 
@@ -61,9 +62,24 @@ def skip_tuple_fields(
     return True if is_field else None
 
 
+def show_examples_as_code(app: Any, context: Any, lines: list[str]) -> None:
+    """Turn the lines of a help text that keep their breaks into a block of code."""
+    result: list[str] = []
+    for line in lines:
+        text = line.removeprefix("| ")
+        if text == line or not text.startswith(" "):
+            result.append(text)
+            continue
+        if not result[-1].startswith("   "):
+            result += ["", ".. code-block:: text", ""]
+        result.append("   " + text.strip())
+    lines[:] = result
+
+
 def setup(app: Any) -> None:
-    """Connect the function above."""
+    """Connect the functions above."""
     app.connect("autodoc-skip-member", skip_tuple_fields)
+    app.connect("sphinx-click-process-description", show_examples_as_code)
 
 
 # --- Tutorials -----------------------------------------------------------------------------------
