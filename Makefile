@@ -93,7 +93,7 @@ report: $(READY)
 	$(BIN)/eigengs-dr bench report $(RESULTS) -o docs/results
 
 basis: $(READY)
-	$(BIN)/python -m eigengs_dr.natural eigengs_dr/data/natural.npz
+	$(BIN)/python tools/train_natural.py eigengs_dr/data/natural.npz
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,78 +1,16 @@
 """EigenGS for Dr.Jit and Mitsuba: images as sums of differentiable 2D Gaussians.
 
-Importing the package starts no backend and sets no Mitsuba variant: what it offers is imported when
-it is first used, because Dr.Jit loads libLLVM while it is imported.
+The public names stand in ``__init__.pyi``. Each name is imported when it is first used, because
+Dr.Jit loads libLLVM while it is imported: importing this package starts no backend and sets no
+Mitsuba variant.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+import lazy_loader
 
-from .backend import BackendError, prepare
+from .backend.libllvm import select_libllvm
 
-if TYPE_CHECKING:
-    from .eigengs import EigenGS
-    from .fitting import Fit, fit
-    from .gaussians import Gaussians, concatenate
-    from .images import load_image, sample, save_image
-    from .levels import fit_levels, level_counts
-    from .metrics import ms_ssim, psnr, ssim
-    from .packing import Receipt, pack
-    from .pca import Eigenbasis
-    from .plugins import register_plugins
-    from .rendering import picture_of, render
-    from .scenefit import fit_for_scene
-    from .tensors import from_tensors, to_tensors
-
-__all__ = [
-    "BackendError",
-    "EigenGS",
-    "Eigenbasis",
-    "Fit",
-    "Gaussians",
-    "Receipt",
-    "concatenate",
-    "fit",
-    "fit_for_scene",
-    "fit_levels",
-    "from_tensors",
-    "level_counts",
-    "load_image",
-    "ms_ssim",
-    "pack",
-    "picture_of",
-    "psnr",
-    "register_plugins",
-    "render",
-    "sample",
-    "save_image",
-    "ssim",
-    "to_tensors",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 __version__ = "0.1.0"
 
-_HOMES = {
-    "eigengs": ("EigenGS",),
-    "fitting": ("Fit", "fit"),
-    "gaussians": ("Gaussians", "concatenate"),
-    "images": ("load_image", "sample", "save_image"),
-    "levels": ("fit_levels", "level_counts"),
-    "metrics": ("ms_ssim", "psnr", "ssim"),
-    "packing": ("Receipt", "pack"),
-    "pca": ("Eigenbasis",),
-    "plugins": ("register_plugins",),
-    "rendering": ("picture_of", "render"),
-    "scenefit": ("fit_for_scene",),
-    "tensors": ("from_tensors", "to_tensors"),
-}
-
-prepare()  # before anything imports Dr.Jit, which looks for libLLVM once
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is first asked for."""
-    for module, names in _HOMES.items():
-        if name in names:
-            value = globals()[name] = getattr(import_module(f".{module}", __name__), name)
-            return value
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+select_libllvm()  # before anything imports Dr.Jit, which looks for libLLVM once

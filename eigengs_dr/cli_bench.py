@@ -6,27 +6,27 @@ from typing import Any
 
 import click
 
-from .backend import select
-from .cli_budget import budget
-from .cli_figures import figures
-from .cli_levels import levels
-from .cli_pareto import pareto
-from .cli_rate import rate
-from .cli_report import report as make_report
-from .cli_shared import (
+from .backend.selection import select
+from .cli.console import progress_bar
+from .cli.levels import levels
+from .cli.options import (
     ANY_PATH,
     EXISTING,
     FOLDER,
     backend_option,
-    described,
+    describe_run,
     quiet_option,
     report_option,
 )
+from .cli.outputs import check_outputs
+from .cli.report import write_report
+from .cli_budget import budget
+from .cli_figures import figures
+from .cli_pareto import pareto
+from .cli_rate import rate
+from .cli_report import report as make_report
 from .cli_stability import stability
 from .cli_tables import tables
-from .console import progress_bar
-from .outputs import check_outputs
-from .report import write_report
 
 CONDITIONS = ("cameras", "grazing", "hidden", "noise")
 """Of `inverse`, without importing Mitsuba, which their module does."""
@@ -109,13 +109,14 @@ def eigen(
       eigengs-dr bench eigen natural photos/ --iterations 0
       eigengs-dr bench eigen faces.npz faces-test/ --images 50 --report eigen.json
     """
-    from .images import image_files, load_image
+    from .image.folder import image_files
+    from .image.io import load_image
 
     files = image_files(folder)[:images]
     check_outputs([report], files)
     select(backend)
-    from .bases import load_basis
     from .bench import eigen as benchmark
+    from .eigenbasis.registry import load_basis
 
     model = load_basis(basis, backend)
     with progress_bar(quiet) as show:
@@ -191,7 +192,7 @@ def inverse(
       eigengs-dr bench inverse photo.jpg --condition hidden --strip strip.png
       eigengs-dr bench inverse cat.jpg --basis cats.npz --report inverse.json --chart inverse.png
     """
-    from .images import SAVE_OPTIONS, load_image, save_image
+    from .image.io import SAVE_OPTIONS, load_image, save_image
 
     names = tuple(dict.fromkeys(conditions)) or CONDITIONS
     strips = {name: strip.with_stem(f"{strip.stem}-{name}") for name in names} if strip else {}
@@ -220,7 +221,7 @@ def inverse(
     if report:
         traces = benchmark.traces_of(results)
         figures = {**settings, **benchmark.figures_of(results), "traces": traces}
-        write_report(report, {**described(context, backend), **figures})
+        write_report(report, {**describe_run(context, backend), **figures})
     if not quiet:
         click.echo(benchmark.table(results))
 
@@ -235,6 +236,6 @@ def _tell(
 ) -> None:
     """Write the report and print the figures."""
     if report:
-        write_report(report, {**described(context, backend), **settings, **figures})
+        write_report(report, {**describe_run(context, backend), **settings, **figures})
     if not quiet:
         click.echo("\n".join(f"{key:24} {value:.4g}" for key, value in figures.items()))

@@ -4,23 +4,23 @@ from pathlib import Path
 
 import click
 
-from .backend import select
-from .cli_shared import (
+from .backend.selection import select
+from .cli.console import progress_bar
+from .cli.options import (
     FOLDER,
     backend_option,
     chosen_sets,
-    described,
+    describe_run,
     folder_option,
     quiet_option,
     seed_option,
     set_option,
 )
-from .console import progress_bar
-from .outputs import check_outputs
+from .cli.outputs import check_outputs
 
 NATURAL = "natural256"
 TARGETS, HIGHEST = (32.0, 36.0, 40.0), 100.0
-"""Of `eigengs_dr.bench.budget` and `eigengs_dr.refine`, without importing them."""
+"""Of `eigengs_dr.bench.budget` and `eigengs_dr.fitting.refine`, without importing them."""
 
 
 @click.command()
@@ -108,7 +108,7 @@ def budget(
             tuple(dict.fromkeys(targets)),
             gaussians,
             seed,
-            described(context, backend),
+            describe_run(context, backend),
             backend,
             show,
         )

@@ -4,17 +4,17 @@ from pathlib import Path
 
 import click
 
-from .backend import select
-from .cli_shared import (
+from .backend.selection import select
+from .cli.console import progress_bar, say
+from .cli.options import (
     FOLDER,
     backend_option,
-    described,
+    describe_run,
     folder_option,
     quiet_option,
     seed_option,
 )
-from .console import progress_bar, say
-from .outputs import check_outputs
+from .cli.outputs import check_outputs
 
 NAMES = ("iterations", "colors", "curves", "radii", "split", "cross")
 """Of the figures, without importing Dr.Jit, which their module does."""
@@ -78,7 +78,7 @@ def figures(
 
     output.mkdir(parents=True, exist_ok=True)
     check_outputs([output / "figures.json"], [])
-    machine = described(context, backend)
+    machine = describe_run(context, backend)
     with progress_bar(quiet) as show:
         made = benchmark.run(
             output, data, machine, names, iterations, images, seed, backend, show, say

@@ -5,19 +5,19 @@ from pathlib import Path
 
 import click
 
-from .backend import select
-from .cli_shared import (
+from .backend.selection import select
+from .cli.console import progress_bar
+from .cli.options import (
     FOLDER,
     backend_option,
     chosen_sets,
-    described,
+    describe_run,
     folder_option,
     quiet_option,
     seed_option,
     set_option,
 )
-from .console import progress_bar
-from .outputs import check_outputs
+from .cli.outputs import check_outputs
 
 
 @click.command()
@@ -78,7 +78,7 @@ def pareto(
         ]
         jobs = [job for c in collections for job in benchmark.jobs(c, iterations, seed, backend)]
         jobs.append(kernel_job(backend))
-        rows = measure(lines, jobs, described(context, backend), partial(show, "pareto"))
+        rows = measure(lines, jobs, describe_run(context, backend), partial(show, "pareto"))
     settings = {"iterations": iterations, "seed": seed}
     same = [row for row in read(lines) if settings.items() <= row["job"].items()]
     for name, path in points.items():

@@ -5,19 +5,19 @@ from pathlib import Path
 
 import click
 
-from .backend import select
-from .cli_shared import (
+from .backend.selection import select
+from .cli.console import progress_bar
+from .cli.options import (
     FOLDER,
     backend_option,
     chosen_sets,
-    described,
+    describe_run,
     folder_option,
     quiet_option,
     seed_option,
     set_option,
 )
-from .console import progress_bar
-from .outputs import check_outputs
+from .cli.outputs import check_outputs
 
 
 @click.command()
@@ -79,7 +79,7 @@ def rate(
                 backend=backend,
             )
         ]
-        rows = measure(lines, jobs, described(context, backend), partial(show, "rate"))
+        rows = measure(lines, jobs, describe_run(context, backend), partial(show, "rate"))
     for name, path in drawings.items():
         save_figure(path, laid.chart(rows, name))
     if not quiet:

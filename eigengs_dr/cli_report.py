@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from .cli_shared import FOLDER, folder_option, quiet_option
-from .outputs import check_outputs
+from .cli.options import FOLDER, folder_option, quiet_option
+from .cli.outputs import check_outputs
 
 
 @click.command()

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import click
 
-from .backend import select
-from .cli_shared import backend_option, described, folder_option, quiet_option, seed_option
-from .console import progress_bar
-from .outputs import check_outputs
+from .backend.selection import select
+from .cli.console import progress_bar
+from .cli.options import backend_option, describe_run, folder_option, quiet_option, seed_option
+from .cli.outputs import check_outputs
 
 NAMES = ("default", "gaussianimage", "eigengs")
 """Of the presets, without importing Dr.Jit, which their module does."""
@@ -77,7 +77,7 @@ def stability(
         new_figure(1, 1)  # says now that matplotlib is missing, not after ten minutes
     jobs = benchmark.jobs(chosen, tuple(dict.fromkeys(presets)) or NAMES, seed, backend)
     with progress_bar(quiet) as show:
-        run = described(context, backend)
+        run = describe_run(context, backend)
         measured = rows.measure(results, jobs, run, partial(show, "stability"))
         if smooth:
             image, shown = smooth.image(), {}

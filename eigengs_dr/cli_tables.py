@@ -4,18 +4,18 @@ from pathlib import Path
 
 import click
 
-from .backend import select
-from .cli_shared import (
+from .backend.selection import select
+from .cli.console import progress_bar
+from .cli.options import (
     FOLDER,
     SETS,
     backend_option,
-    described,
+    describe_run,
     folder_option,
     quiet_option,
     seed_option,
 )
-from .console import progress_bar
-from .outputs import check_outputs
+from .cli.outputs import check_outputs
 
 PAPERS = SETS[:-1]
 """The paper's kinds of images: all but Kodak's photos."""
@@ -97,7 +97,7 @@ def tables(
             images,
             iterations,
             seed,
-            described(context, backend),
+            describe_run(context, backend),
             backend,
             show,
         )

@@ -1,8 +1,8 @@
 """The Mitsuba texture ``gaussian_texture``: a sum of 2D Gaussians, differentiable and prefiltered.
 
 Dr.Jit takes `self` for loop state, which silently loses gradients, and knows no custom derivatives
-inside a virtual call: the class below only hands arrays to the functions of `eigengs_dr.points` and
-`eigengs_dr.filtered`.
+inside a virtual call: the class below only hands arrays to the functions of
+`eigengs_dr.raster.lookup.points` and `eigengs_dr.raster.lookup.prefilter`.
 """
 
 from __future__ import annotations
@@ -16,21 +16,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.color import to_linear
-from eigengs_dr.filtered import sum_filtered
-from eigengs_dr.footprints import bounded_covariance
-from eigengs_dr.lattice import build_lattice, is_distant, mean_of, sum_lattice
-from eigengs_dr.points import (
+from eigengs_dr.image.color import to_linear
+from eigengs_dr.raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS
+from eigengs_dr.raster.layout import pack_parameters
+from eigengs_dr.raster.lookup.footprint import bound_covariance
+from eigengs_dr.raster.lookup.points import (
     cell_side,
     fold,
+    gradient_terms,
     list_cells,
-    sum_near,
-    values,
-    values_and_slopes,
+    sum_at_points,
+    value_terms,
 )
-from eigengs_dr.rendering import splat_values
-from eigengs_dr.sizes import sort_by_size
-from eigengs_dr.splat import SHAPE, UNIT, pack
+from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
+from eigengs_dr.raster.lookup.pyramid import build_pyramid, is_minified, pyramid_mean, sum_pyramid
+from eigengs_dr.raster.lookup.size_classes import classify_by_size
+from eigengs_dr.raster.render import kernel_parameters
 
 from .cone import metric
 from .properties import affine, angle, cutoff, raw, source_of, wrap_mode
@@ -95,29 +96,29 @@ def gaussian_texture() -> type:
 
         def parameters_changed(self, keys: list[str]) -> None:
             gaussians = self.source.gaussians()
-            rows, background = splat_values(gaussians)
-            shape, color = rows[:SHAPE], [_finite(c) for c in rows[SHAPE:]]
+            rows, background = kernel_parameters(gaussians)
+            shape, color = rows[:NUM_SHAPE_PARAMS], [_finite(c) for c in rows[NUM_SHAPE_PARAMS:]]
             # First what may refuse: old lists of new splats would read beyond their end.
             if not keys or any(key in self.source.shaping for key in keys):
                 self._list([dr.detach(s) for s in shape])
             self.background = [_finite(b) for b in background]
-            self.packed = pack([*shape, *color])
+            self.packed = pack_parameters([*shape, *color])
             dr.eval(self.packed, self.background)
             if self.angle:
-                number = SHAPE + self.channels
-                self.lattice = build_lattice(self.sizes, self.packed, number, self.cutoff)
-                self.average = mean_of(self.lattice)
+                number = NUM_SHAPE_PARAMS + self.channels
+                self.lattice = build_pyramid(self.sizes, self.packed, number, self.cutoff)
+                self.average = pyramid_mean(self.lattice)
                 dr.eval(self.average)
             self._survey()
 
         def _list(self, shape: list) -> None:
             """List the splats near every cell."""
             size = (self.width, self.height)
-            radius = UNIT * self.cutoff
+            radius = EXP2_SCALE * self.cutoff
             side = cell_side(*size, dr.width(shape))
             cells = list_cells(shape, *size, radius, side)
             if self.angle:
-                self.sizes = sort_by_size(shape, *size, self.cutoff, self.wrap)
+                self.sizes = classify_by_size(shape, *size, self.cutoff, self.wrap)
             self.cells = cells
 
         # --- Lookups -----------------------------------------------------------------------------
@@ -152,9 +153,11 @@ def gaussian_texture() -> type:
         @uncollected
         def eval_1_grad(self, si: Any, active: Any = True) -> Any:
             (x, sx), (y, sy), active = self._point(si, active)
-            terms = values_and_slopes((UNIT * self.cutoff) ** 2)
-            number = SHAPE + self.channels
-            sums = sum_near(self.cells, self.packed, number, x, y, active, terms, 3 * self.channels)
+            terms = gradient_terms((EXP2_SCALE * self.cutoff) ** 2)
+            number = NUM_SHAPE_PARAMS + self.channels
+            sums = sum_at_points(
+                self.cells, self.packed, number, x, y, active, terms, 3 * self.channels
+            )
             coded = [s + b for s, b in zip(sums[::3], self.background, strict=True)]
             slope = [dr.select((c >= 0) & (c <= 1) | self.raw, _slope(self, c), 0) for c in coded]
             du = _luminance([s * k for s, k in zip(slope, sums[1::3], strict=True)])
@@ -169,8 +172,13 @@ def gaussian_texture() -> type:
             if self.angle:
                 sums = self._filtered(si, (x, sx), (y, sy), active)
             else:
-                number, terms = SHAPE + self.channels, values((UNIT * self.cutoff) ** 2)
-                sums = sum_near(self.cells, self.packed, number, x, y, active, terms, self.channels)
+                number, terms = (
+                    NUM_SHAPE_PARAMS + self.channels,
+                    value_terms((EXP2_SCALE * self.cutoff) ** 2),
+                )
+                sums = sum_at_points(
+                    self.cells, self.packed, number, x, y, active, terms, self.channels
+                )
             sums = [s + b for s, b in zip(sums, self.background, strict=True)]
             return [dr.select(active, _shown(self, s), 0) for s in sums]
 
@@ -186,22 +194,22 @@ def gaussian_texture() -> type:
                     dr.clip(y, INSIDE, self.height - INSIDE),
                 )
             inverse, valid = metric(si, self.from_uv, self.angle)
-            unit, blind = bounded_covariance(inverse)
+            unit, blind = bound_covariance(inverse)
             sizes = (sx * sx, sx * sy, sy * sy)
             footprint = [dr.select(valid, f * s, 0) for f, s in zip(unit, sizes, strict=True)]
             blind &= valid & (sx * sy != 0)
-            distant = is_distant(self.lattice, footprint)
-            near = sum_filtered(
+            distant = is_minified(self.lattice, footprint)
+            near = sum_prefiltered(
                 self.sizes,
                 self.packed,
-                SHAPE + self.channels,
+                NUM_SHAPE_PARAMS + self.channels,
                 x,
                 y,
                 footprint,
                 active & ~distant,
                 self.cutoff,
             )
-            far = sum_lattice(self.lattice, x, y, footprint, active & distant & ~blind)
+            far = sum_pyramid(self.lattice, x, y, footprint, active & distant & ~blind)
             seen = [dr.select(distant, f, n) for f, n in zip(far, near, strict=True)]
             return [dr.select(blind, m, s) for m, s in zip(self.average, seen, strict=True)]
 

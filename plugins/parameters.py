@@ -9,10 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.arrays import types_of
-from eigengs_dr.eigengs import EigenGS
-from eigengs_dr.gaussians import Gaussians
-from eigengs_dr.tensors import FIELDS, from_tensors, to_tensors
+from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.gaussian.tensors import FIELDS, from_tensors, to_tensors
 
 
 def texture_of(gaussians: Gaussians, **properties: Any) -> dict[str, Any]:

@@ -7,11 +7,11 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.color import SPACES
-from eigengs_dr.eigengs import EigenGS
-from eigengs_dr.gaussians import Gaussians
-from eigengs_dr.rendering import CUTOFF, WIDEST_CUTOFF
-from eigengs_dr.tensors import FIELDS
+from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.gaussian.tensors import FIELDS
+from eigengs_dr.image.color import SPACES
+from eigengs_dr.raster.render import CUTOFF, MAX_CUTOFF
 
 from .parameters import FromModel, FromSet
 
@@ -112,9 +112,9 @@ def _number(props: Any, key: str, default: float) -> float:
 def cutoff(props: Any) -> float:
     """Read ``cutoff``: standard deviations after which a splat ends."""
     value = _number(props, "cutoff", CUTOFF)
-    if not 0 < value <= WIDEST_CUTOFF:
+    if not 0 < value <= MAX_CUTOFF:
         raise ValueError(
-            f"gaussian_texture: cutoff is {value}; it must be above 0 and at most {WIDEST_CUTOFF:g}"
+            f"gaussian_texture: cutoff is {value}; it must be above 0 and at most {MAX_CUTOFF:g}"
         )
     return value
 

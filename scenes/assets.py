@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 import eigengs_dr as eg
-from eigengs_dr.resampling import resampled
+from eigengs_dr.image.resize import resample
 
 FOLDER = Path(__file__).parent.parent / "build" / "scenes"
 """Where the scenes look for the sets unless told otherwise."""
@@ -105,7 +105,7 @@ def main(folder=FOLDER):
     color, roughness, normals = tiles()
     cat = eg.sample("chelsea")[:, 100:400]
     # Brighter than it is, as the only light of a room.
-    portrait = resampled(eg.sample("astronaut"), 384, 384).clip(0, 1) ** 0.7
+    portrait = resample(eg.sample("astronaut"), 384, 384).clip(0, 1) ** 0.7
     # Emission and reflectance are light, which sums and filters right as it is. A coded picture
     # looks the same where it is looked at closely.
     fitted(folder, "floor", floor(), 4000, "linear")

@@ -14,8 +14,8 @@ import numpy as np
 from assets import FOLDER, fitted, floor
 
 import eigengs_dr as eg
-from eigengs_dr.backend import select
-from eigengs_dr.color import to_coded
+from eigengs_dr.backend.selection import select
+from eigengs_dr.image.color import to_coded
 from eigengs_dr.plugins import pixel_angle
 
 SCENE = Path(__file__).parent / "plane.xml"

@@ -2,7 +2,7 @@ import signal
 
 import pytest
 
-from eigengs_dr.backend import BackendError, select
+from eigengs_dr.backend.selection import BackendError, select
 
 # A shell that starts the tests in the background has them ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)

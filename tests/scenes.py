@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.ndimage import gaussian_filter
 
-from eigengs_dr.backend import select
-from eigengs_dr.eigengs import EigenGS
-from eigengs_dr.gaussians import Gaussians
-from eigengs_dr.pca import Eigenbasis
-from eigengs_dr.reference import render_exact
+from eigengs_dr.backend.selection import select
+from eigengs_dr.eigenbasis.basis import Eigenbasis
+from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.raster.reference import render_exact
 
 SIZE = (22, 17)
 """Width and height: no multiples of a tile. The same for all tests, so that kernels are

@@ -8,12 +8,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from eigengs_dr import backend as module
-from eigengs_dr.backend import VARIABLE, BackendError, candidates, describe, prepare, select
+from eigengs_dr.backend import libllvm as module
+from eigengs_dr.backend.libllvm import PATH_VARIABLE, candidates, select_libllvm
+from eigengs_dr.backend.selection import BackendError, describe, select
 
 SELECT = """
 import eigengs_dr
-from eigengs_dr.backend import BackendError, select
+from eigengs_dr.backend.selection import BackendError, select
 try:
     types = select("llvm")
 except BackendError as error:
@@ -41,7 +42,7 @@ def run_python(code, **environment):
 
 def refusal(library):
     """What `select` says where `library` is forced; it has to be all that is said."""
-    process = run_python(SELECT, **{VARIABLE: str(library)})
+    process = run_python(SELECT, **{PATH_VARIABLE: str(library)})
     assert process.returncode == 0, process.stderr
     assert process.stderr == ""
     assert process.stdout.count("\n") == 1
@@ -79,7 +80,7 @@ def test_other_library_is_refused(tmp_path):
 
 @pytest.mark.skipif(not installed(*range(17, 30)), reason="needs an LLVM that works")
 def test_newest_installed_llvm_works():
-    process = run_python(SELECT, **{VARIABLE: None})
+    process = run_python(SELECT, **{PATH_VARIABLE: None})
     assert (process.stdout, process.stderr) == ("[1, 2, 2]\n", "")
 
 
@@ -92,7 +93,7 @@ def fake_drjit(monkeypatch, *, llvm, version):
         detail=SimpleNamespace(llvm_version=lambda: version),
     )
     monkeypatch.setitem(sys.modules, "drjit", drjit)
-    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.delenv(PATH_VARIABLE, raising=False)
 
 
 def test_machine_without_llvm(monkeypatch):
@@ -138,8 +139,8 @@ def test_unknown_backend():
 def folder(tmp_path, monkeypatch):
     """A folder that is the only place where libraries are looked for, before Dr.Jit is imported."""
     monkeypatch.setattr(module, "_patterns", lambda: [str(tmp_path / "libLLVM*.so*")])
-    # Set and removed, so that whatever `prepare` sets is taken back.
-    monkeypatch.setenv(VARIABLE, "")
+    # Set and removed, so that whatever `select_libllvm` sets is taken back.
+    monkeypatch.setenv(PATH_VARIABLE, "")
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
     return tmp_path
 
@@ -155,22 +156,22 @@ def test_newest_is_chosen(folder):
     add_library(folder, "libLLVM-22.so", size=30)  # a linker script
     os.symlink(folder / "gone", folder / "libLLVM-21.so")
     assert [library.version for library in candidates()] == [20, 19, 15, 14]
-    prepare()
-    assert os.environ[VARIABLE] == str(folder / "libLLVM.so.20.1")
+    select_libllvm()
+    assert os.environ[PATH_VARIABLE] == str(folder / "libLLVM.so.20.1")
 
 
 def test_old_ones_are_not_chosen(folder):
     for name in ("libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM-16.so.1"):
         add_library(folder, name)
-    prepare()
-    assert os.environ[VARIABLE] == ""
+    select_libllvm()
+    assert os.environ[PATH_VARIABLE] == ""
 
 
 def test_choice_of_the_user_stays(folder, monkeypatch):
     add_library(folder, "libLLVM.so.19.1")
-    monkeypatch.setenv(VARIABLE, "/my/libLLVM.so")
-    prepare()
-    assert os.environ[VARIABLE] == "/my/libLLVM.so"
+    monkeypatch.setenv(PATH_VARIABLE, "/my/libLLVM.so")
+    select_libllvm()
+    assert os.environ[PATH_VARIABLE] == "/my/libLLVM.so"
 
 
 @pytest.mark.parametrize(
@@ -197,7 +198,7 @@ def test_describe(backend):
     assert found["threads"] >= 1
     assert found["versions"]["drjit"].startswith("1.")
     if backend == "llvm":
-        assert int(found["versions"]["libllvm"].split(".")[0]) >= module.OLDEST
+        assert int(found["versions"]["libllvm"].split(".")[0]) >= module.MIN_VERSION
     json.dumps(found)
 
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scenes import family, small_model
 
-from eigengs_dr.arrays import types_in
-from eigengs_dr.backend import select
+from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.selection import select
 from eigengs_dr.bench import eigen, kernels
-from eigengs_dr.fitting import fit
-from eigengs_dr.metrics import psnr
-from eigengs_dr.rendering import render
+from eigengs_dr.fitting.fit import fit
+from eigengs_dr.image.metrics import psnr
+from eigengs_dr.raster.render import render
 
 FIGURES = {
     "plain_ms",

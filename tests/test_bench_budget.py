@@ -15,16 +15,17 @@ from hypothesis import strategies as st
 from scenes import family
 
 import eigengs_dr as eg
-from eigengs_dr import cli_budget, cli_shared
+from eigengs_dr import cli_budget
 from eigengs_dr.bench import budget, budget_tables, rate, rows
+from eigengs_dr.cli import options as cli_shared
+from eigengs_dr.cli.console import Program
 from eigengs_dr.cli_bench import bench as group
-from eigengs_dr.console import Program
-from eigengs_dr.descent import descend
-from eigengs_dr.fitting import most_gaussians
-from eigengs_dr.presets import PRESETS
-from eigengs_dr.refine import EXACT
-from eigengs_dr.rendering import picture_of
-from eigengs_dr.starting import begin
+from eigengs_dr.fitting.fit import max_gaussians_for
+from eigengs_dr.fitting.initializers import initialize
+from eigengs_dr.fitting.optimizers.descent import descend
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.refine import MAX_PSNR
+from eigengs_dr.raster.render import picture_of
 
 RUN = {"command": "eigengs-dr bench budget", "cpu": "a CPU"}
 
@@ -37,7 +38,7 @@ def test_fixed_numbers_span_all_that_a_search_may_use(height, width):
     image = np.zeros((height, width, 3), np.float32)
     counts = budget.grid(image)
     assert counts == sorted(set(counts))
-    assert counts[-1] == most_gaussians(image)
+    assert counts[-1] == max_gaussians_for(image)
     assert counts[0] == min(counts[-1], math.ceil(height * width / 1024))
     for few, many in pairwise(counts):  # as they were before rounding
         assert (many - 0.5) / (few + 0.5) <= math.sqrt(2) + 1e-9
@@ -97,9 +98,11 @@ def test_fits_are_those_that_they_are_called(backend):
     once, anew = (budget._fit(image, 60, again, 200, 0, backend) for again in (False, True))
     assert once["iteration"] == anew["iteration"] == 200
     method = PRESETS["default"]
-    start = begin(image, 60, "auto", "natural", method, backend=backend)
-    for row, rearrange in ((once, None), (anew, start.rearrange)):
-        *_, last = descend(start.gaussians, start.target, method.schedule, 200, rearrange=rearrange)
+    start = initialize(image, 60, "auto", "natural", method, backend=backend)
+    for row, rearrange in ((once, None), (anew, start.redistribute)):
+        *_, last = descend(
+            start.gaussians, start.target, method.schedule, 200, redistribute=rearrange
+        )
         assert row["psnr_ycbcr"] == eg.psnr(picture_of(last), image, "ycbcr")
     assert once["psnr_ycbcr"] != anew["psnr_ycbcr"]
 
@@ -359,4 +362,4 @@ def test_the_command_is_there_and_says_what_is_so():
     assert group.commands["budget"] is cli_budget.budget
     assert "Examples" in bench("--help").output
     assert (cli_shared.SAMPLES, cli_budget.TARGETS) == (rate.SAMPLES, budget.TARGETS)
-    assert cli_budget.HIGHEST == EXACT and cli_budget.NATURAL in budget.SETS
+    assert cli_budget.HIGHEST == MAX_PSNR and cli_budget.NATURAL in budget.SETS

@@ -11,18 +11,24 @@ from hypothesis import strategies as st
 from scenes import few, scenes
 
 import eigengs_dr as eg
-from eigengs_dr import budget
-from eigengs_dr.adaptive import adaptive
-from eigengs_dr.budget import fewest
-from eigengs_dr.cli import main
-from eigengs_dr.color import rgb_to_ycbcr
-from eigengs_dr.fitting import fit, most_gaussians
-from eigengs_dr.growth import APART, grown, places, pruned, worth
-from eigengs_dr.presets import PRESETS
-from eigengs_dr.rearrange import FALL, rearranged, residual, wanted
-from eigengs_dr.rendering import render
-from eigengs_dr.solve import correlations
-from eigengs_dr.starting import begin
+from eigengs_dr.cli.main import main
+from eigengs_dr.fitting import search as budget
+from eigengs_dr.fitting.density_control import densify, prune, removal_cost
+from eigengs_dr.fitting.fit import fit, max_gaussians_for
+from eigengs_dr.fitting.initializers import initialize
+from eigengs_dr.fitting.placement.adaptive import place_adaptive
+from eigengs_dr.fitting.placement.density import (
+    ERROR_EXPONENT,
+    SUPPRESSION_RADIUS,
+    residual_peaks,
+    target_density,
+)
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.redistribute import redistribute, residual
+from eigengs_dr.fitting.search import search_count
+from eigengs_dr.fitting.solvers.conjugate_gradient import inner_products
+from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.raster.render import render
 
 SIDE = 32
 
@@ -38,7 +44,7 @@ def picture(seed=0):
 
 def fitted(count=60):
     image = picture()
-    return begin(image, count, "adaptive", "natural", PRESETS["default"]), rgb_to_ycbcr(image)
+    return initialize(image, count, "adaptive", "natural", PRESETS["default"]), rgb_to_ycbcr(image)
 
 
 def squared_error(gaussians, target, weight=1.0):
@@ -58,7 +64,7 @@ def squares(side):
 
 def test_equal_shares_of_error_leave_the_density_as_it_was():
     """Splats on a grid, each with the same error: nothing is gained by moving any."""
-    density = wanted(squares(30), np.ones((30, 30)), np.ones((30, 30)))
+    density = target_density(squares(30), np.ones((30, 30)), np.ones((30, 30)))
     np.testing.assert_allclose(density, density.mean(), rtol=1e-9)
 
 
@@ -67,35 +73,35 @@ def test_density_follows_the_error_by_its_power(times):
     """Far from the border of two halves, densities differ by ``times^(1 / (FALL + 1))``."""
     error = np.ones((60, 60))
     error[:, 30:] = times
-    density = wanted(squares(60), error, np.ones((60, 60)))
+    density = target_density(squares(60), error, np.ones((60, 60)))
     ratio = density[:, 50:].mean() / density[:, :10].mean()
-    np.testing.assert_allclose(ratio, times ** (1 / (FALL + 1)), rtol=1e-6)
+    np.testing.assert_allclose(ratio, times ** (1 / (ERROR_EXPONENT + 1)), rtol=1e-6)
 
 
 def test_that_power_leaves_the_least_error():
     """Of all powers of the error, it is the one whose density misses least: a numerical check."""
     share, tried = np.array([1.0, 30.0]), np.array([0.5, 0.5])
-    factor = share * tried**FALL * tried  # e = factor rho^-FALL on two equal areas
+    factor = share * tried**ERROR_EXPONENT * tried  # e = factor rho^-FALL on two equal areas
 
     def error(power):
         density = tried * share**power
-        return (factor * (density / density.sum()) ** -FALL).sum()
+        return (factor * (density / density.sum()) ** -ERROR_EXPONENT).sum()
 
     powers = np.linspace(0, 1, 2001)
     best = powers[np.argmin([error(p) for p in powers])]
-    assert best == pytest.approx(1 / (FALL + 1), abs=1e-3)
+    assert best == pytest.approx(1 / (ERROR_EXPONENT + 1), abs=1e-3)
 
 
 def test_among_neighbours_density_follows_the_bending():
     mean = np.array([[8.0, 16.0], [24.0, 16.0]])
     bending = np.ones((32, 32))
     bending[:, 4:8] = 5
-    density = wanted(mean, np.ones((32, 32)), bending)
+    density = target_density(mean, np.ones((32, 32)), bending)
     np.testing.assert_allclose(density / density[0, 0], bending, rtol=1e-9)
 
 
 def test_nothing_missed_and_nothing_bent_is_still_a_density():
-    density = wanted(np.array([[5.0, 5.0]]), np.zeros((8, 8)), np.full((8, 8), 1e-30))
+    density = target_density(np.array([[5.0, 5.0]]), np.zeros((8, 8)), np.full((8, 8), 1e-30))
     assert np.isfinite(density).all() and (density > 0).all()
 
 
@@ -103,8 +109,8 @@ def test_nothing_missed_and_nothing_bent_is_still_a_density():
 def test_rearranged_has_the_count_and_goes_where_the_error_is(side):
     """Also where splats are so far apart that they are placed on a smaller image."""
     image = np.kron(picture(), np.ones((-(-side // SIDE), -(-side // SIDE), 1)))[:side, :side]
-    start = begin(image.astype(np.float32), 64, "grid", "natural", PRESETS["default"])
-    result = rearranged(start.gaussians, 50, start.target, start.target)
+    start = initialize(image.astype(np.float32), 64, "grid", "natural", PRESETS["default"])
+    result = redistribute(start.gaussians, 50, start.target, start.target)
     left = result.mean.numpy()[0] < side / 2
     assert len(result) == 50
     assert left.mean() > 0.6  # half of the area, most of the error
@@ -115,25 +121,26 @@ def test_weights_draw_splats():
     start, target = fitted()
     weight = np.ones_like(target)
     weight[SIDE // 2 :] = 1e-3
-    result = rearranged(start.gaussians, 60, target, target, weight)
+    result = redistribute(start.gaussians, 60, target, target, weight)
     assert (result.mean.numpy()[1] < SIDE / 2).mean() > 0.7
 
 
 def test_fits_that_are_long_enough_rearrange_once():
     image = picture()
     calls = []
-    start = begin(image, 60, "adaptive", "natural", PRESETS["default"])
+    start = initialize(image, 60, "adaptive", "natural", PRESETS["default"])
 
     def rearrange(gaussians, count):
         calls.append(count)
-        return start.rearrange(gaussians, count)
+        return start.redistribute(gaussians, count)
 
-    from eigengs_dr.descent import LONG, descend
+    from eigengs_dr.fitting.optimizers.descent import descend
+    from eigengs_dr.fitting.optimizers.schedule import MIN_PHASE_RATIO
 
-    schedule = replace(PRESETS["default"].schedule, rearrange=2)
-    for steps, times in ((2 * LONG - 1, 0), (2 * LONG, 1)):
+    schedule = replace(PRESETS["default"].schedule, redistribute_after=2)
+    for steps, times in ((2 * MIN_PHASE_RATIO - 1, 0), (2 * MIN_PHASE_RATIO, 1)):
         calls.clear()
-        sets = list(descend(start.gaussians, start.target, schedule, steps, rearrange=rearrange))
+        sets = list(descend(start.gaussians, start.target, schedule, steps, redistribute=rearrange))
         assert len(sets) == steps + 1
         assert calls == [60] * times
 
@@ -142,7 +149,7 @@ def test_fits_that_are_long_enough_rearrange_once():
 def test_other_starts_are_not_rearranged(init):
     image = np.tile(picture(), (3, 3, 1)) if init == "eigen" else picture()
     count = None if init == "eigen" else 60
-    assert begin(image, count, init, "natural", PRESETS["default"]).rearrange is None
+    assert initialize(image, count, init, "natural", PRESETS["default"]).redistribute is None
 
 
 # ---------------------------------------------------------------------------------------------
@@ -158,7 +165,7 @@ def test_worth_is_the_rise_of_the_error(backend, scene):
     generator = np.random.default_rng(1)
     target = generator.uniform(0, 1, shape).astype(np.float32)
     weight = generator.uniform(0, 2, shape).astype(np.float32)
-    value = worth(gaussians, target, weight)
+    value = removal_cost(gaussians, target, weight)
     before = squared_error(gaussians, target, weight)
     for n in range(min(4, len(gaussians))):
         rest = gaussians[np.arange(len(gaussians)) != n]
@@ -173,17 +180,17 @@ def test_correlations_are_inner_products():
     for n in (0, 7):
         one = replace(plain[[n]], color=plain[[n]].color * 0 + 1, background=plain.background * 0)
         weights = render(one).numpy().astype(np.float64)
-        first = correlations(plain, target)[n]
+        first = inner_products(plain, target)[n]
         np.testing.assert_allclose(first, (weights * target).sum((0, 1)), rtol=1e-4, atol=1e-5)
-        own = correlations(plain, ones, squared=True)[n]
+        own = inner_products(plain, ones, squared=True)[n]
         np.testing.assert_allclose(own, (weights**2).sum((0, 1)), rtol=1e-4)
 
 
 def test_pruned_keeps_what_counts_in_order():
     start, target = fitted()
     color = start.gaussians.to_arrays()["color"]
-    value = worth(start.gaussians, target)
-    kept = pruned(start.gaussians, target, 40)
+    value = removal_cost(start.gaussians, target)
+    kept = prune(start.gaussians, target, 40)
     best = np.sort(np.argsort(value)[-40:])
     mean = start.gaussians.to_arrays()["mean"]
     np.testing.assert_array_equal(kept.to_arrays()["mean"], mean[best])
@@ -204,7 +211,7 @@ def test_grown_adds_where_the_error_is():
         space="data",
         backend="llvm",
     )
-    result = grown(empty, target, 61)
+    result = densify(empty, target, 61)
     assert len(result) == 61
     np.testing.assert_allclose(result.to_arrays()["mean"][60], [20.5, 9.5])
     assert squared_error(result, target) < 0.2 * squared_error(empty, target)
@@ -215,7 +222,7 @@ def test_gain_of_a_place_is_what_a_splat_takes(deviation):
     """Of a residual that is one round splat of a tried size, also where it is below a pixel."""
     y, x = np.indices((64, 64)) + 0.5
     splat = 0.7 * np.exp(-((x - 32.5) ** 2 + (y - 30.5) ** 2) / (2 * deviation**2))
-    mean, size, color = places(splat[..., None], 1, deviation)
+    mean, size, color = residual_peaks(splat[..., None], 1, deviation)
     np.testing.assert_allclose(mean, [[32.5, 30.5]])
     np.testing.assert_allclose(size, [deviation])
     np.testing.assert_allclose(color, [[0.7]], rtol=0.01)
@@ -224,23 +231,23 @@ def test_gain_of_a_place_is_what_a_splat_takes(deviation):
 @given(st.integers(0, 40))
 def test_places_keep_apart_and_never_exceed(count):
     missed = np.random.default_rng(count).normal(size=(24, 20, 3))
-    mean, size, color = places(missed, count, 4.0)
+    mean, size, color = residual_peaks(missed, count, 4.0)
     assert len(mean) == len(size) == len(color) <= count
     for k in range(len(mean)):
         away = np.abs(mean[k + 1 :] - mean[k]).max(axis=1)
-        assert (away > np.ceil(APART * size[k])).all()
+        assert (away > np.ceil(SUPPRESSION_RADIUS * size[k])).all()
 
 
 def test_grown_to_fewer_or_as_many_is_the_set():
     start, target = fitted()
     for count in (10, 60):
-        assert grown(start.gaussians, target, count) is start.gaussians
+        assert densify(start.gaussians, target, count) is start.gaussians
 
 
 def test_grown_of_a_perfect_set_is_the_set():
     start, _ = fitted(20)
     plain = replace(start.gaussians, space="data")
-    assert len(grown(plain, render(plain).numpy(), 30)) == 20
+    assert len(densify(plain, render(plain).numpy(), 30)) == 20
 
 
 # ---------------------------------------------------------------------------------------------
@@ -266,7 +273,7 @@ def test_noise_is_out_of_reach():
     noise = np.random.default_rng(0).uniform(0, 1, (SIDE, SIDE, 3))
     result = fit(noise, target_psnr=45, iterations=100)
     assert result.stopped == "out of reach"
-    assert len(result.gaussians) <= most_gaussians(noise) == SIDE * SIDE * 3 // 8
+    assert len(result.gaussians) <= max_gaussians_for(noise) == SIDE * SIDE * 3 // 8
 
 
 @pytest.mark.parametrize("space", ["ycbcr", "rgb"])
@@ -316,7 +323,7 @@ def test_interrupted_while_it_settles_it_keeps_the_best():
 
 def test_interrupted_it_returns_what_there_is():
     image = picture()
-    start = begin(image, 60, "adaptive", "natural", PRESETS["default"])
+    start = initialize(image, 60, "adaptive", "natural", PRESETS["default"])
     asked = []
 
     def interrupted():
@@ -327,7 +334,9 @@ def test_interrupted_it_returns_what_there_is():
         return {"decibels": 10.0}
 
     schedule = PRESETS["default"].schedule
-    result = fewest(start, measure, "decibels", 20.0, 100, schedule, 100, interrupted=interrupted)
+    result = search_count(
+        start, measure, "decibels", 20.0, 100, schedule, 100, interrupted=interrupted
+    )
     assert result.stopped == "interrupted"
     assert result.iterations <= 7
     assert len(result.gaussians) <= 100
@@ -335,8 +344,8 @@ def test_interrupted_it_returns_what_there_is():
 
 def test_a_search_whose_goal_is_not_met_ends():
     """Where every round adds a splat or two, by the steps that it has taken."""
-    start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
-    result = fewest(
+    start = initialize(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    result = search_count(
         start,
         lambda gaussians: {"decibels": 18.0},
         "decibels",
@@ -351,8 +360,8 @@ def test_a_search_whose_goal_is_not_met_ends():
 def test_a_weight_leaves_colours_as_they_are():
     start, target = fitted(60)
     gaussians, weight = start.gaussians, np.ones_like(target)
-    kept = pruned(gaussians, target, 30, weight)
-    value = worth(gaussians, target, weight)
+    kept = prune(gaussians, target, 30, weight)
+    value = removal_cost(gaussians, target, weight)
     best = np.sort(np.argsort(-value, kind="stable")[:30])
     np.testing.assert_array_equal(kept.to_arrays()["color"], gaussians[best].to_arrays()["color"])
 
@@ -360,13 +369,13 @@ def test_a_weight_leaves_colours_as_they_are():
 @pytest.mark.parametrize("octave", [2.5, 4.0, 9.0])
 def test_a_search_learns_what_more_splats_gain(octave):
     """Where only their number counts: the fewest are found at any slope."""
-    start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    start = initialize(picture(), 60, "adaptive", "natural", PRESETS["default"])
     schedule = PRESETS["default"].schedule
 
     def measure(gaussians):
         return {"decibels": octave * np.log2(len(gaussians) / 150)}
 
-    result = fewest(start, measure, "decibels", 0.0, 1000, schedule, 40)
+    result = search_count(start, measure, "decibels", 0.0, 1000, schedule, 40)
     assert result.stopped == "met"
     assert 150 <= len(result.gaussians) <= 152
 
@@ -376,7 +385,7 @@ def searched(monkeypatch, measure):
 
     ``measure(gaussians, steps)`` returns decibels, where `steps` lists those of all descents.
     """
-    start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    start = initialize(picture(), 60, "adaptive", "natural", PRESETS["default"])
     steps = []
 
     def stand(gaussians, target, schedule, count, *rest):
@@ -387,7 +396,7 @@ def searched(monkeypatch, measure):
         return {"decibels": measure(gaussians, steps)}
 
     monkeypatch.setattr(budget, "descend", stand)
-    result = fewest(start, judge, "decibels", 0.0, 1000, PRESETS["default"].schedule, 1000)
+    result = search_count(start, judge, "decibels", 0.0, 1000, PRESETS["default"].schedule, 1000)
     assert result.stopped == "met"
     return result, steps
 
@@ -407,7 +416,7 @@ def test_a_search_adds_nothing_where_steps_lead_to_the_goal(monkeypatch):
 
     def counted(gaussians, target, count, *rest):
         added.append(count - len(gaussians))
-        return grown(gaussians, target, count, *rest)
+        return densify(gaussians, target, count, *rest)
 
     monkeypatch.setattr(budget, "grown", counted)
     result, _ = searched(
@@ -434,11 +443,11 @@ def test_a_search_goes_on_where_the_fit_just_meets_the_goal(monkeypatch):
 
 
 def test_a_search_ends_where_no_place_is_left_to_grow(monkeypatch):
-    start = begin(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    start = initialize(picture(), 60, "adaptive", "natural", PRESETS["default"])
     asked = []
     monkeypatch.setattr(budget, "grown", lambda gaussians, *rest: asked.append(1) or gaussians)
     schedule = PRESETS["default"].schedule
-    result = fewest(start, lambda g: {"decibels": 18.0}, "decibels", 20.0, 1000, schedule, 40)
+    result = search_count(start, lambda g: {"decibels": 18.0}, "decibels", 20.0, 1000, schedule, 40)
     assert result.stopped == "out of reach"
     assert len(asked) == 1
 
@@ -474,7 +483,7 @@ def test_density_given_to_adaptive_is_followed():
         density[:, : bend.shape[2] // 2] = 1
         return density
 
-    mean, _ = adaptive(image, 100, density=left)
+    mean, _ = place_adaptive(image, 100, density=left)
     assert (mean[:, 0] < 20.5).mean() > 0.95
 
 

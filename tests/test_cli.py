@@ -15,12 +15,13 @@ from PIL import Image
 from test_training import random_fields
 
 import eigengs_dr as eg
-from eigengs_dr import bases, cli_train
-from eigengs_dr.backend import BackendError, select
-from eigengs_dr.cli import main
-from eigengs_dr.color import SPACES, YCBCR_TO_RGB
-from eigengs_dr.eigengs import EigenGS
-from eigengs_dr.starting import INITS
+from eigengs_dr.backend.selection import BackendError, select
+from eigengs_dr.cli import train as cli_train
+from eigengs_dr.cli.main import main
+from eigengs_dr.eigenbasis import registry as bases
+from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.fitting.initializers import INITS
+from eigengs_dr.image.color import SPACES, YCBCR_TO_RGB
 
 
 def run(*arguments):
@@ -672,7 +673,7 @@ def test_the_names_of_inits_and_bases():
 
 def test_help_loads_nothing_heavy():
     script = (
-        "import sys; from eigengs_dr.cli import main\n"
+        "import sys; from eigengs_dr.cli.main import main\n"
         "try: main(['train', '--help'])\n"
         "except SystemExit: print(*(n for n in ('drjit', 'scipy', 'PIL') if n in sys.modules))"
     )

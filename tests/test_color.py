@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from skimage.color import rgb2ycbcr
 
-from eigengs_dr.backend import select
-from eigengs_dr.color import (
+from eigengs_dr.backend.selection import select
+from eigengs_dr.image.color import (
     SPACES,
     YCBCR_OFFSET,
     decode,
@@ -157,7 +157,7 @@ def test_slopes_of_srgb_are_finite_everywhere(backend, convert, slopes):
 
 
 def test_importing_the_colours_loads_no_drjit():
-    script = "import sys, eigengs_dr.color; sys.exit('drjit' in sys.modules)"
+    script = "import sys, eigengs_dr.image.color; sys.exit('drjit' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
 
 

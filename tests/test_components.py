@@ -15,12 +15,19 @@ from scipy.linalg import cho_factor, cho_solve
 from test_training import SMALL, random_fields
 
 import eigengs_dr as eg
-from eigengs_dr import archive, components, modelfile
-from eigengs_dr.cli import main
-from eigengs_dr.components import SPLIT_COST, split_reason, wants_split
-from eigengs_dr.fall import expected, falling, fewest_apart, remaining
-from eigengs_dr.stream import to_planes
-from eigengs_dr.training import Settings, train
+from eigengs_dr.cli.main import main
+from eigengs_dr.eigenbasis import model_file as modelfile
+from eigengs_dr.eigenbasis.components import solve as components
+from eigengs_dr.eigenbasis.components.split import SPLIT_COST, split_reason, wants_split
+from eigengs_dr.eigenbasis.training import TrainOptions, train
+from eigengs_dr.eigenbasis.truncation import (
+    curve_from_eigenvalues,
+    curve_from_residuals,
+    min_ranks_per_channel,
+    residual_energy,
+)
+from eigengs_dr.image.folder import to_planes
+from eigengs_dr.storage import npz as archive
 
 SIDE, RANKS = 16, (5, 3, 1)
 
@@ -47,7 +54,7 @@ def others():
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("trained")
     random_fields(folder / "photos", 30)
-    return folder, train(folder / "photos", folder / "model.npz", Settings(**SMALL))
+    return folder, train(folder / "photos", folder / "model.npz", TrainOptions(**SMALL))
 
 
 # ---------------------------------------------------------------- a family
@@ -59,9 +66,12 @@ def test_held_out_images_tell_the_rank():
         low_rank(60, 1e-3, seed=1), (SIDE, SIDE), components=20, color="rgb"
     )
     assert [len(c) for c in basis.components] == [20] * 3
-    fall = basis.fall(low_rank(20, 0, seed=2))
-    assert fall.fewest(50) == RANKS
-    assert basis.truncated(fall.fewest(50)).fall(low_rank(20, 0, seed=2)).psnr[-1] >= 50
+    fall = basis.truncation_curve(low_rank(20, 0, seed=2))
+    assert fall.rank_for_psnr(50) == RANKS
+    assert (
+        basis.truncated(fall.rank_for_psnr(50)).truncation_curve(low_rank(20, 0, seed=2)).psnr[-1]
+        >= 50
+    )
     energy = eg.Eigenbasis.from_images(
         low_rank(60, 1e-4, seed=1), (SIDE, SIDE), energy=0.999, color="rgb"
     )
@@ -70,7 +80,7 @@ def test_held_out_images_tell_the_rank():
 
 def test_fall_is_what_truncated_bases_reach(others):
     basis = small_basis()
-    fall = basis.fall(others)
+    fall = basis.truncation_curve(others)
     assert fall.counts[-1].tolist() == [12, 6, 6] and len(fall.psnr) == 25
     for n in (0, 1, 7, 24):
         few = basis.truncated(fall.counts[n])
@@ -82,7 +92,7 @@ def test_fall_is_what_truncated_bases_reach(others):
 def test_fall_of_the_training_images():
     images = family()
     full = eg.Eigenbasis.from_images(images, (32, 32), 39)
-    basis, fall = small_basis(), small_basis().fall()
+    basis, fall = small_basis(), small_basis().truncation_curve()
     for n in (0, 5, 24):
         few = basis.truncated(fall.counts[n])
         errors = [
@@ -91,9 +101,9 @@ def test_fall_of_the_training_images():
         ]
         assert fall.psnr[n] == pytest.approx(-10 * np.log10(np.mean(errors)), abs=1e-3)
     held = sum(values.sum() for values in basis.eigenvalues) / basis.variance.sum()
-    assert fall.shares()[0] == 0
-    assert fall.shares()[-1] == pytest.approx(held)
-    assert full.fall().shares()[-1] == pytest.approx(1, abs=1e-5)
+    assert fall.explained_variance_ratio()[0] == 0
+    assert fall.explained_variance_ratio()[-1] == pytest.approx(held)
+    assert full.truncation_curve().explained_variance_ratio()[-1] == pytest.approx(1, abs=1e-5)
 
 
 spectra = st.lists(st.floats(0, 9), max_size=6).map(lambda v: np.array(sorted(v, reverse=True)))
@@ -102,7 +112,7 @@ spectra = st.lists(st.floats(0, 9), max_size=6).map(lambda v: np.array(sorted(v,
 @given(st.tuples(spectra, spectra, spectra))
 @settings(max_examples=50, deadline=None)
 def test_components_come_by_falling_eigenvalue(eigenvalues):
-    fall = expected(eigenvalues, np.array([v.sum() + 1 for v in eigenvalues]), 10)
+    fall = curve_from_eigenvalues(eigenvalues, np.array([v.sum() + 1 for v in eigenvalues]), 10)
     steps = np.diff(fall.counts, axis=0)
     assert (steps.sum(axis=1) == 1).all() and (steps >= 0).all()
     assert fall.counts[-1].tolist() == [len(v) for v in eigenvalues]
@@ -116,13 +126,13 @@ def test_components_come_by_falling_eigenvalue(eigenvalues):
 )
 @settings(max_examples=60, deadline=None)
 def test_no_fewer_components_do(gains, target):
-    left = [remaining(values.sum() + 0.1, values) for values in gains]
+    left = [residual_energy(values.sum() + 0.1, values) for values in gains]
     allowed = 7 * 10 ** (-target / 10)
     ways = itertools.product(*[range(len(rows)) for rows in left])
     enough = [w for w in ways if left[0][w[0]] + left[1][w[1]] + left[2][w[2]] <= allowed - 1e-9]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = fewest_apart(left, 7, target)
+        found = min_ranks_per_channel(left, 7, target)
     if enough:
         assert sum(found) <= min(map(sum, enough))
         assert sum(rows[k] for rows, k in zip(left, found, strict=True)) <= allowed + 1e-9
@@ -133,24 +143,26 @@ def test_no_fewer_components_do(gains, target):
 
 def test_components_that_add_nothing_are_left_out():
     none = np.zeros(1)
-    assert fewest_apart([np.array([2, 1, 1, 0.5]), none, none], 10, 10) == (1, 0, 0)
+    assert min_ranks_per_channel([np.array([2, 1, 1, 0.5]), none, none], 10, 10) == (1, 0, 0)
 
 
 def test_targets_out_of_reach_are_told(others):
-    fall = small_basis().fall(others)
+    fall = small_basis().truncation_curve(others)
     with pytest.warns(UserWarning, match=r"90 dB are out of reach: all 12\+6\+6 components have"):
-        assert fall.fewest(90) == (12, 6, 6)
+        assert fall.rank_for_psnr(90) == (12, 6, 6)
     for target in (0, -3, np.nan, np.inf):
         with pytest.raises(ValueError, match="target_psnr is"):
-            fall.fewest(target)
+            fall.rank_for_psnr(target)
     with pytest.raises(ValueError, match="no images"):
-        small_basis().fall([])
+        small_basis().truncation_curve([])
 
 
 def test_no_components_at_all():
-    fall = falling([np.zeros(0)] * 3, [np.array([2.0])] * 3, 6)
+    fall = curve_from_residuals([np.zeros(0)] * 3, [np.array([2.0])] * 3, 6)
     assert fall.counts.tolist() == [[0, 0, 0]] and fall.psnr.tolist() == [0]
-    assert eg.Eigenbasis.from_images(family(1), (32, 32), 0).fall().psnr.tolist() == [120]
+    assert eg.Eigenbasis.from_images(family(1), (32, 32), 0).truncation_curve().psnr.tolist() == [
+        120
+    ]
 
 
 # ---------------------------------------------------------------- one image
@@ -217,12 +229,14 @@ def test_encode_is_as_before_without_a_target(backend, others, split, mean):
         right = np.einsum("jn,n->j", weights, seen[:, c].astype(np.float32))
         a = cho_solve(cho_factor(gram, lower=True), right).astype(np.float32)
         columns.append(np.einsum("j,jn->n", a, weights))
-    expected = np.stack(columns, axis=1).astype(np.float64)
+    curve_from_eigenvalues = np.stack(columns, axis=1).astype(np.float64)
     if mean == "gaussians":
-        expected = start + expected
+        curve_from_eigenvalues = start + curve_from_eigenvalues
     found = model.encode(others[0], "projected", mean).to_arrays()
-    np.testing.assert_array_equal(found["color"], expected[:-1].astype(np.float32))
-    np.testing.assert_array_equal(found["background"], expected[-1].astype(np.float32))
+    np.testing.assert_array_equal(found["color"], curve_from_eigenvalues[:-1].astype(np.float32))
+    np.testing.assert_array_equal(
+        found["background"], curve_from_eigenvalues[-1].astype(np.float32)
+    )
 
 
 def test_encode_with_a_dense_mean(backend, others):
@@ -284,7 +298,9 @@ def members(model):
 def test_models_keep_how_the_error_falls(trained):
     folder, result = trained
     loaded = eg.EigenGS.load(folder / "model.npz")
-    np.testing.assert_array_equal(loaded.fall().psnr, result.basis.fall().psnr)
+    np.testing.assert_array_equal(
+        loaded.truncation_curve().psnr, result.basis.truncation_curve().psnr
+    )
     np.testing.assert_array_equal(loaded.held_out, result.model.held_out)
     assert loaded.split_reason == "32 pixels a side; auto measures from 512 on"
     assert len(loaded.held_out) == 19
@@ -293,16 +309,20 @@ def test_models_keep_how_the_error_falls(trained):
 
 def test_files_of_version_1_are_read(trained, tmp_path):
     _, result = trained
-    old = {key: members(result.model)[key] for key in modelfile.FIRST}
+    old = {key: members(result.model)[key] for key in modelfile.LAYOUT_V1}
     archive.write(tmp_path / "old.npz", modelfile.FORMAT, 1, old)
     loaded = eg.EigenGS.load(tmp_path / "old.npz")
-    assert loaded.fall() is None and len(loaded.held_out) == 0 and loaded.split_reason == ""
+    assert (
+        loaded.truncation_curve() is None
+        and len(loaded.held_out) == 0
+        and loaded.split_reason == ""
+    )
     for one, two in zip(
         loaded.weights, eg.EigenGS.load(saved(result, tmp_path)).weights, strict=True
     ):
         np.testing.assert_array_equal(one, two)
     loaded.save(tmp_path / "again.npz")
-    assert eg.EigenGS.load(tmp_path / "again.npz").fall() is None
+    assert eg.EigenGS.load(tmp_path / "again.npz").truncation_curve() is None
     told = said("info", tmp_path / "old.npz")
     assert "variance" not in told and "split_reason" not in told
     archive.write(tmp_path / "cut.npz", modelfile.FORMAT, 2, old)
@@ -351,9 +371,9 @@ def said(*arguments):
 def test_train_to_a_target(trained, tmp_path):
     folder, full = trained
     target = float(full.model.held_out[8]) - 1e-6
-    result = train(folder / "photos", tmp_path / "m.npz", Settings(**SMALL, target_psnr=target))
-    counts = result.basis.fall().counts[-1]
-    assert counts.tolist() == full.basis.fall().counts[8].tolist()
+    result = train(folder / "photos", tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=target))
+    counts = result.basis.truncation_curve().counts[-1]
+    assert counts.tolist() == full.basis.truncation_curve().counts[8].tolist()
     np.testing.assert_allclose(result.model.held_out, full.model.held_out[:9], atol=1e-6)
     assert result.figures["psnr_pca"] == pytest.approx(target, abs=1e-3)
     assert result.figures["components"] == counts.tolist()
@@ -363,12 +383,12 @@ def test_train_without_images_for_a_target(tmp_path):
     photos = random_fields(tmp_path / "few", 5)
     with pytest.raises(ValueError, match="images that are held out"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        train(photos, tmp_path / "m.npz", Settings(**SMALL, target_psnr=20))
+        train(photos, tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=20))
     assert [path.name for path in tmp_path.iterdir()] == ["few"]
     with pytest.raises(ValueError, match="give one of them"):
-        train(photos, tmp_path / "m.npz", Settings(**SMALL, target_psnr=20, energy=0.9))
+        train(photos, tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=20, energy=0.9))
     with pytest.raises(ValueError, match="target_psnr is nan"):
-        train(tmp_path / "gone", tmp_path / "m.npz", Settings(**SMALL, target_psnr=np.nan))
+        train(tmp_path / "gone", tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=np.nan))
 
 
 def test_commands(trained, tmp_path):

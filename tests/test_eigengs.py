@@ -5,17 +5,18 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 from scenes import family, small_basis, small_model
+from train_natural import DEMO, crops
 
 import eigengs_dr as eg
-from eigengs_dr.bases import load_basis
-from eigengs_dr.components import fit_components, psnr_components, wants_split
-from eigengs_dr.images import ImageError
-from eigengs_dr.natural import DEMO, crops
-from eigengs_dr.normal import NormalEquations
-from eigengs_dr.resampling import resampled
-from eigengs_dr.shapes import ROUND, samples, train_shapes
-from eigengs_dr.solve import solve
-from eigengs_dr.stream import to_planes
+from eigengs_dr.eigenbasis.components.shape_training import ROUND, samples, train_shapes
+from eigengs_dr.eigenbasis.components.solve import fit_components, psnr_components
+from eigengs_dr.eigenbasis.components.split import wants_split
+from eigengs_dr.eigenbasis.registry import load_basis
+from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.solvers.normal_equations import NormalEquations
+from eigengs_dr.image.folder import to_planes
+from eigengs_dr.image.io import ImageError
+from eigengs_dr.image.resize import resample
 
 SIDE, SPLATS = 32, 100
 
@@ -108,7 +109,7 @@ def test_split_keeps_sides_apart(backend, split):
 
 def test_auto_splits_large_images_alone(backend, monkeypatch):
     assert wants_split(small_basis(), SPLATS, "auto", backend) == (False, {})
-    monkeypatch.setattr("eigengs_dr.components.SPLIT_FROM", SIDE)
+    monkeypatch.setattr("eigengs_dr.eigenbasis.components.split.SPLIT_FROM", SIDE)
     decision, figures = wants_split(small_basis(), SPLATS, "auto", backend)
     assert set(figures) == {"psnr_whole", "psnr_split"}
     assert decision == (figures["psnr_split"] > figures["psnr_whole"] - 0.2)
@@ -151,8 +152,10 @@ def test_a_tenth_of_the_splats_is_low(backend):
 @pytest.mark.parametrize(("split", "expected"), [(30.0, True), (29.9, True), (29.7, False)])
 def test_what_the_split_may_cost(backend, monkeypatch, split, expected):
     figures = iter([30.0, split])
-    monkeypatch.setattr("eigengs_dr.components.SPLIT_FROM", SIDE)
-    monkeypatch.setattr("eigengs_dr.components.decibels", lambda mse: next(figures))
+    monkeypatch.setattr("eigengs_dr.eigenbasis.components.split.SPLIT_FROM", SIDE)
+    monkeypatch.setattr(
+        "eigengs_dr.eigenbasis.components.solve.decibels", lambda mse: next(figures)
+    )
     assert wants_split(small_basis(), SPLATS, "auto", backend)[0] == expected
 
 
@@ -303,11 +306,11 @@ def test_fewer_components(backend, others):
 def test_any_size_and_aspect(backend, size, others):
     """The splats are those of the image at the model's own size, scaled."""
     model = small_model(backend)
-    image = resampled(others[0], *size).clip(0, 1)
+    image = resample(others[0], *size).clip(0, 1)
     encoded = model.encode(image)
     assert (encoded.width, encoded.height) == size
     assert eg.render(encoded).shape == (size[1], size[0], 3)
-    small = model.encode(resampled(image, SIDE, SIDE))
+    small = model.encode(resample(image, SIDE, SIDE))
     np.testing.assert_allclose(encoded.to_arrays()["color"], small.to_arrays()["color"], atol=1e-3)
     assert eg.psnr(eg.render(encoded), image, "ycbcr") > 25
 
@@ -425,7 +428,7 @@ def test_shipped_basis(backend):
 
 
 def test_shipped_basis_is_small():
-    from eigengs_dr.bases import SHIPPED
+    from eigengs_dr.eigenbasis.registry import SHIPPED
 
     assert SHIPPED["natural"].stat().st_size <= 4_000_000
 
@@ -458,7 +461,7 @@ def test_fit_starts_from_the_exact_colours(backend, others):
 
 
 def test_fit_at_another_size_solves_again(backend, others):
-    model, image = small_model(backend), resampled(others[0], 60, 44).clip(0, 1)
+    model, image = small_model(backend), resample(others[0], 60, 44).clip(0, 1)
     result = eg.fit(image, iterations=0, init="eigen", basis=model, backend=backend)
     encoded = eg.psnr(eg.render(model.encode(image)), image, "ycbcr")
     assert result.trace[0]["psnr_ycbcr"] >= encoded - 1e-3

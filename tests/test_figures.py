@@ -11,13 +11,14 @@ from PIL import Image
 from scenes import covariances, factors_of, family, small_model
 
 import eigengs_dr as eg
-from eigengs_dr import cli_figures, pictures
+from eigengs_dr import cli_figures
 from eigengs_dr.bench import figure_charts, figure_strips, figure_task, figures, sets
 from eigengs_dr.bench.figure_pictures import CELL, HEADING, LETTERS, Cell, Row, save_strip, strip
-from eigengs_dr.console import Program
-from eigengs_dr.metrics import psnr
-from eigengs_dr.rendering import picture_of
-from eigengs_dr.strips import GAP
+from eigengs_dr.cli import pictures
+from eigengs_dr.cli.console import Program
+from eigengs_dr.image.metrics import psnr
+from eigengs_dr.image.montage import GAP
+from eigengs_dr.raster.render import picture_of
 
 SETS = ("cats512", "natural256", "kodak")
 MACHINE = {"command": "test", "cpu": "any"}

@@ -8,14 +8,15 @@ from hypothesis import strategies as st
 from scenes import SIZE, covariances, few, random_scene
 from scipy.special import erf
 
-from eigengs_dr.arrays import types_in, types_of
-from eigengs_dr.backend import select
-from eigengs_dr.filtered import sum_filtered
-from eigengs_dr.footprints import WIDEST, bounded_covariance, quick_erf
-from eigengs_dr.reference import render_exact
-from eigengs_dr.rendering import splat_values
-from eigengs_dr.sizes import sort_by_size
-from eigengs_dr.splat import SHAPE, UNIT, pack, widen
+from eigengs_dr.backend.arrays import types_in, types_of
+from eigengs_dr.backend.selection import select
+from eigengs_dr.raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, widen
+from eigengs_dr.raster.layout import pack_parameters
+from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, bound_covariance, quick_erf
+from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
+from eigengs_dr.raster.lookup.size_classes import classify_by_size
+from eigengs_dr.raster.reference import render_exact
+from eigengs_dr.raster.render import kernel_parameters
 
 CUTOFF = 5.0
 FINE = 4
@@ -26,7 +27,7 @@ FOOTPRINTS = [
     np.diag([4.0, 4.0]),
     np.array([[9.0, 4.0], [4.0, 3.0]]),
     np.diag([60.0, 0.5]),
-    np.diag((WIDEST * np.array(SIZE)) ** 2),
+    np.diag((MAX_FOOTPRINT * np.array(SIZE)) ** 2),
 ]
 """Covariances in pixels squared: small, round, leaning, a long one, and the largest there is."""
 
@@ -68,15 +69,17 @@ def brute_force(scene, wrap, points, covariance):
 
 
 def filtered(gaussians, wrap, points, covariance, cutoff=CUTOFF):
-    """Rows of what `sum_filtered` gives, without the background."""
-    rows, _ = splat_values(gaussians)
+    """Rows of what `sum_prefiltered` gives, without the background."""
+    rows, _ = kernel_parameters(gaussians)
     types = types_of(gaussians.mean)
-    shape = [dr.detach(r) for r in rows[:SHAPE]]
-    sizes = sort_by_size(shape, gaussians.width, gaussians.height, cutoff, wrap)
+    shape = [dr.detach(r) for r in rows[:NUM_SHAPE_PARAMS]]
+    sizes = classify_by_size(shape, gaussians.width, gaussians.height, cutoff, wrap)
     x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
     footprint = [types.Float(float(covariance[k])) for k in ((0, 0), (0, 1), (1, 1))]
-    number = SHAPE + gaussians.channels
-    return sum_filtered(sizes, pack(rows), number, x, y, footprint, types.Bool(True), cutoff)
+    number = NUM_SHAPE_PARAMS + gaussians.channels
+    return sum_prefiltered(
+        sizes, pack_parameters(rows), number, x, y, footprint, types.Bool(True), cutoff
+    )
 
 
 def stacked(rows):
@@ -169,10 +172,12 @@ class TestSumFiltered:
             total = 0
             for n in range(80):
                 one = scene.permuted([n]).on(backend)
-                rows, _ = splat_values(one)
-                scaled = [types.Float(covariance[k] / UNIT**2) for k in ((0, 0), (0, 1), (1, 1))]
-                (mx, my, a, b, c), amplitude = widen(rows[:SHAPE], scaled)
-                a, b, c = (np.array(v)[0] / UNIT for v in (a, b, c))
+                rows, _ = kernel_parameters(one)
+                scaled = [
+                    types.Float(covariance[k] / EXP2_SCALE**2) for k in ((0, 0), (0, 1), (1, 1))
+                ]
+                (mx, my, a, b, c), amplitude = widen(rows[:NUM_SHAPE_PARAMS], scaled)
+                a, b, c = (np.array(v)[0] / EXP2_SCALE for v in (a, b, c))
                 dx, dy = (points[:, k] - np.array(v)[0] for k, v in ((0, mx), (1, my)))
                 distance = np.hypot(a * dx + b * dy, c * dy)
                 weight = np.where(distance <= 3, np.exp(-0.5 * distance**2), 0)
@@ -241,11 +246,11 @@ class TestWiden:
         rng = np.random.default_rng(seed)
         scene = random_scene(seed)
         spread = covariances(rng.uniform(0, 30, (1, 2)), rng.uniform(0, np.pi, 1))[0]
-        rows, _ = splat_values(scene.on(backend, bits=64))
+        rows, _ = kernel_parameters(scene.on(backend, bits=64))
         Float = types_of(rows[0]).Float
-        footprint = [Float(spread[k] / UNIT**2) for k in ((0, 0), (0, 1), (1, 1))]
-        (_, _, a, b, c), amplitude = widen(rows[:SHAPE], footprint)
-        a, b, c = (np.array(v) / UNIT for v in (a, b, c))
+        footprint = [Float(spread[k] / EXP2_SCALE**2) for k in ((0, 0), (0, 1), (1, 1))]
+        (_, _, a, b, c), amplitude = widen(rows[:NUM_SHAPE_PARAMS], footprint)
+        a, b, c = (np.array(v) / EXP2_SCALE for v in (a, b, c))
         before, after = matrices(*scene.factor.T), matrices(a, b, c)
         np.testing.assert_allclose(after, before + spread, rtol=1e-9, atol=1e-9)
         integrals_before, integrals_after = (np.sqrt(np.linalg.det(m)) for m in (before, after))
@@ -279,7 +284,7 @@ class TestBoundedCovariance:
     def bounded(self, backend, metrics):
         Float = types_in(select(backend)).Float
         rows = [Float(np.asarray(m, np.float32)) for m in np.array(metrics).T.copy()]
-        covariance, blind = bounded_covariance(rows)
+        covariance, blind = bound_covariance(rows)
         return np.stack([np.array(c) for c in covariance], 1), np.array(blind)
 
     @few
@@ -292,11 +297,11 @@ class TestBoundedCovariance:
         axes = covariances(np.array([[1.0, 0.0]]), np.array([angle]))[0]
         other = np.eye(2) - axes
         metric = axes / long**2 + other / short**2
-        expected = axes * min(long, WIDEST) ** 2 + other * min(short, WIDEST) ** 2
+        expected = axes * min(long, MAX_FOOTPRINT) ** 2 + other * min(short, MAX_FOOTPRINT) ** 2
         found, blind = self.bounded(backend, [[metric[0, 0], metric[0, 1], metric[1, 1]]])
-        if min(long, short) > WIDEST * 1.001:
+        if min(long, short) > MAX_FOOTPRINT * 1.001:
             assert blind[0]
-        elif min(long, short) < WIDEST / 1.001:
+        elif min(long, short) < MAX_FOOTPRINT / 1.001:
             assert not blind[0]
             keys = ((0, 0), (0, 1), (1, 1))
             np.testing.assert_allclose(found[0], [expected[k] for k in keys], atol=2e-3)

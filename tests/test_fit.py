@@ -10,15 +10,16 @@ import pytest
 from scenes import random_scene, small_model
 from test_refine import SIDE, SPLATS, figures, picture, presets
 
-from eigengs_dr import fitting, starting
-from eigengs_dr.adam import Adam
-from eigengs_dr.color import to_coded, to_linear
-from eigengs_dr.descent import Schedule
-from eigengs_dr.fitting import fit
-from eigengs_dr.metrics import psnr
-from eigengs_dr.place import grid
-from eigengs_dr.presets import PRESETS
-from eigengs_dr.rendering import picture_of, render
+from eigengs_dr.fitting import fit as fitting
+from eigengs_dr.fitting import initializers as starting
+from eigengs_dr.fitting.fit import fit
+from eigengs_dr.fitting.optimizers.adam import Adam
+from eigengs_dr.fitting.optimizers.schedule import Schedule
+from eigengs_dr.fitting.placement.grid import place_grid
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.image.color import to_coded, to_linear
+from eigengs_dr.image.metrics import psnr
+from eigengs_dr.raster.render import picture_of, render
 
 
 def check_sound(result, image):
@@ -291,13 +292,13 @@ def test_ctrl_c(backend):
 
 def place_and_press(image, count, generator):
     press_ctrl_c()
-    return grid(image, count, generator)
+    return place_grid(image, count, generator)
 
 
 @pytest.mark.parametrize("iterations", [0, 1, 60])
 def test_ctrl_c_before_refinement(backend, iterations):
     """The start is returned, and the caller told."""
-    with patch.dict(starting.PLACES, grid=place_and_press):
+    with patch.dict(starting.PLACEMENTS, grid=place_and_press):
         result = fit(picture(), SPLATS, iterations, init="grid", backend=backend)
     check_sound(result, picture())
     assert len(result.trace) == 1
@@ -306,7 +307,7 @@ def test_ctrl_c_before_refinement(backend, iterations):
 
 def test_ctrl_c_is_the_callers_after_an_error(backend):
     before = signal.getsignal(signal.SIGINT)
-    with patch.dict(starting.PLACES, grid=lambda *a: 1 / 0), pytest.raises(ZeroDivisionError):
+    with patch.dict(starting.PLACEMENTS, grid=lambda *a: 1 / 0), pytest.raises(ZeroDivisionError):
         fit(picture(), SPLATS, 10, init="grid", backend=backend)
     assert signal.getsignal(signal.SIGINT) is before
 

@@ -7,16 +7,16 @@ import sys
 import drjit as dr
 import pytest
 
-from eigengs_dr.backend import select
-from eigengs_dr.freezing import frozen
+from eigengs_dr.backend.recording import freeze_program
+from eigengs_dr.backend.selection import select
 
 LITTER = """
 import gc
 
 import numpy as np
 
-from eigengs_dr.backend import select
-from eigengs_dr.freezing import frozen
+from eigengs_dr.backend.selection import select
+from eigengs_dr.backend.recording import frozen
 
 class Node:
     pass
@@ -46,7 +46,7 @@ def test_results_are_those_of_the_function(backend):
     def program(x, y):
         return x * y + 1
 
-    with frozen(program) as call:
+    with freeze_program(program) as call:
         for start in (0, 1, 5):
             x, y = dr.arange(Float, 4) + start, dr.arange(Float, 4) - start
             dr.eval(x, y)
@@ -60,12 +60,12 @@ def test_the_collector_is_left_as_it_was(backend):
         assert not gc.isenabled()
         raise ValueError("no")
 
-    with frozen(refuse) as call, pytest.raises(RuntimeError):
+    with freeze_program(refuse) as call, pytest.raises(RuntimeError):
         call(Float(1))
     assert gc.isenabled()
     gc.disable()
     try:
-        with frozen(lambda x: x + 1) as call:
+        with freeze_program(lambda x: x + 1) as call:
             call(Float(1))
         assert not gc.isenabled()
     finally:

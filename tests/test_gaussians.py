@@ -18,13 +18,13 @@ from hypothesis.extra import numpy as hnp
 from scenes import COUNT, SIZE, few, random_scene
 
 import eigengs_dr
-from eigengs_dr import archive
-from eigengs_dr.backend import select
-from eigengs_dr.gaussians import NARROWEST, Gaussians, concatenate
-from eigengs_dr.rendering import render
+from eigengs_dr.backend.selection import select
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION, Gaussians, concatenate
+from eigengs_dr.raster.render import render
+from eigengs_dr.storage import npz as archive
 
 NAMES = ("mean", "factor", "color", "background")
-LOW, HIGH = 1 / (2 * max(SIZE)), 1 / NARROWEST
+LOW, HIGH = 1 / (2 * max(SIZE)), 1 / MIN_DEVIATION
 """Bounds of the diagonal of a factor."""
 
 MODULES = [m.name for m in pkgutil.iter_modules(eigengs_dr.__path__) if m.name != "plugins"]

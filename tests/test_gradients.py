@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from scenes import SIZE, few, random_scene, scenes
 
-from eigengs_dr.arrays import types_of
-from eigengs_dr.color import ycbcr_to_rgb
-from eigengs_dr.gaussians import concatenate
-from eigengs_dr.reference import render_plain
-from eigengs_dr.rendering import CUTOFF, lists_for, render
+from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.gaussian.gaussians import concatenate
+from eigengs_dr.image.color import ycbcr_to_rgb
+from eigengs_dr.raster.reference import render_plain
+from eigengs_dr.raster.render import CUTOFF, bin_gaussians, render
 
 COUNT = 7
 NAMES = ("mean", "factor", "color", "background")
@@ -166,7 +166,9 @@ def plain_gradient(gaussians, delta, cutoff=CUTOFF):
     types = types_of(gaussians.mean)
     attached(gaussians)
     values = [*gaussians.mean, *gaussians.factor, *gaussians.color]
-    image = render_plain(values, list(gaussians.background), lists_for(gaussians, cutoff), cutoff)
+    image = render_plain(
+        values, list(gaussians.background), bin_gaussians(gaussians, cutoff), cutoff
+    )
     dr.backward(dr.sum(image * types.Float(delta.ravel())))
     return gradient_of(gaussians)
 

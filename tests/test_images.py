@@ -12,17 +12,16 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from eigengs_dr.images import (
-    SAMPLES,
+from eigengs_dr.image.folder import image_files
+from eigengs_dr.image.io import (
     SAVE_OPTIONS,
     ImageError,
     check_image,
-    image_files,
     load_image,
-    sample,
     save_image,
     to_8bit,
 )
+from eigengs_dr.image.samples import SAMPLES, sample
 
 BYTES = np.array([[[0, 51, 102], [255, 204, 153]]], np.uint8)
 LOSSLESS = [".png", ".tif", ".tiff", ".bmp", ".ppm", ".PNG"]

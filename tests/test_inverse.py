@@ -13,8 +13,8 @@ mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 import eigengs_dr as eg  # noqa: E402
 from eigengs_dr.bench import inverse, poster, unknowns  # noqa: E402
 from eigengs_dr.bench.unknowns import METHODS, Coefficients  # noqa: E402
-from eigengs_dr.cli import main  # noqa: E402
-from eigengs_dr.rendering import picture_of  # noqa: E402
+from eigengs_dr.cli.main import main  # noqa: E402
+from eigengs_dr.raster.render import picture_of  # noqa: E402
 
 FIGURES = {"psnr_ycbcr", "psnr_rgb", "seconds", "goal_steps", "goal_seconds"}
 TINY = poster.Condition(cameras=(poster.FRONT,), side=24, samples=64)

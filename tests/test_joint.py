@@ -6,14 +6,14 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from eigengs_dr import joint
-from eigengs_dr.arrays import types_of
-from eigengs_dr.backend import select
-from eigengs_dr.coordinates import CHOLESKY
-from eigengs_dr.gaussians import Gaussians
-from eigengs_dr.joint import RATE, JointState, train_jointly
-from eigengs_dr.reference import render_plain
-from eigengs_dr.rendering import lists_for, render
+from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.backend.selection import select
+from eigengs_dr.eigenbasis.components import joint_training as joint
+from eigengs_dr.eigenbasis.components.joint_training import RATE, JointState, train_jointly
+from eigengs_dr.fitting.optimizers.parameterization import CHOLESKY
+from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.raster.reference import render_plain
+from eigengs_dr.raster.render import bin_gaussians, render
 
 WIDTH, HEIGHT = 23, 18
 """No multiples of a tile."""
@@ -90,9 +90,9 @@ def plain_loss(rows, planes, backend):
         np.hstack([zeros, zeros]), zeros + np.array([1, 0, 1]), zeros,
         size=(WIDTH, HEIGHT), space="data", backend=backend,
     )  # fmt: skip
-    placed = CHOLESKY.to(fixed, {"mean": types.Float2(x, y), "cholesky": types.Float3(*factor)})
+    placed = CHOLESKY.decode(fixed, {"mean": types.Float2(x, y), "cholesky": types.Float3(*factor)})
     values = [*placed.mean, *placed.factor, *rows[5:]]
-    image = render_plain(values, [types.Float(0)] * len(planes), lists_for(placed))
+    image = render_plain(values, [types.Float(0)] * len(planes), bin_gaussians(placed))
     return dr.mean(dr.square(image - types.Float(np.moveaxis(planes, 0, 2).ravel())))
 
 

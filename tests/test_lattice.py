@@ -6,12 +6,13 @@ import pytest
 from scenes import SIZE, random_scene
 from test_filtered import brute_force, some_points, stacked, tiled
 
-from eigengs_dr import lattice as module
-from eigengs_dr.arrays import types_of
-from eigengs_dr.lattice import build_lattice, is_distant, mean_of, sum_lattice
-from eigengs_dr.rendering import splat_values
-from eigengs_dr.sizes import sort_by_size
-from eigengs_dr.splat import SHAPE, pack
+from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.raster.evaluate import NUM_SHAPE_PARAMS
+from eigengs_dr.raster.layout import pack_parameters
+from eigengs_dr.raster.lookup import pyramid as module
+from eigengs_dr.raster.lookup.pyramid import build_pyramid, is_minified, pyramid_mean, sum_pyramid
+from eigengs_dr.raster.lookup.size_classes import classify_by_size
+from eigengs_dr.raster.render import kernel_parameters
 
 CUTOFF = 5.0
 FOOTPRINTS = [
@@ -26,18 +27,20 @@ FOOTPRINTS = [
 
 
 def lattice_of(gaussians, wrap, cutoff=CUTOFF):
-    rows, _ = splat_values(gaussians)
-    shape = [dr.detach(r) for r in rows[:SHAPE]]
-    sizes = sort_by_size(shape, gaussians.width, gaussians.height, cutoff, wrap)
-    return build_lattice(sizes, pack(rows), SHAPE + gaussians.channels, cutoff)
+    rows, _ = kernel_parameters(gaussians)
+    shape = [dr.detach(r) for r in rows[:NUM_SHAPE_PARAMS]]
+    sizes = classify_by_size(shape, gaussians.width, gaussians.height, cutoff, wrap)
+    return build_pyramid(
+        sizes, pack_parameters(rows), NUM_SHAPE_PARAMS + gaussians.channels, cutoff
+    )
 
 
 def looked_up(lattice, points, covariance):
     types = types_of(lattice.values)
     x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
     footprint = [types.Float(float(covariance[k])) for k in ((0, 0), (0, 1), (1, 1))]
-    assert np.array(is_distant(lattice, footprint)).all()
-    return sum_lattice(lattice, x, y, footprint, types.Bool(True))
+    assert np.array(is_minified(lattice, footprint)).all()
+    return sum_pyramid(lattice, x, y, footprint, types.Bool(True))
 
 
 def inner_scene(seed=1, count=60):
@@ -81,14 +84,14 @@ class TestLookup:
         lattice = lattice_of(inner_scene().on(backend), "repeat")
         Float = types_of(lattice.values).Float
         for covariance in ([0, 0, 0], [0.5, 0, 100], [50, 49.9, 50]):
-            assert not np.array(is_distant(lattice, [Float(c) for c in covariance])).any()
+            assert not np.array(is_minified(lattice, [Float(c) for c in covariance])).any()
 
     def test_inactive_lanes_are_zero(self, backend):
         lattice = lattice_of(inner_scene().on(backend), "repeat")
         types = types_of(lattice.values)
         four = [types.Float(4), types.Float(0), types.Float(4)]
         active = types.Bool([True, False])
-        rows = sum_lattice(lattice, types.Float([5, 5]), types.Float([5, 5]), four, active)
+        rows = sum_pyramid(lattice, types.Float([5, 5]), types.Float([5, 5]), four, active)
         assert (stacked(rows)[1] == 0).all()
         assert (stacked(rows)[0] != 0).all()
 
@@ -98,7 +101,7 @@ class TestMean:
     def test_is_that_of_a_fine_picture(self, backend, wrap):
         scene = inner_scene(7)
         fine = tiled(scene, "repeat", copies=0)[0].mean(axis=(0, 1))
-        found = np.array(mean_of(lattice_of(scene.on(backend), wrap))).ravel()
+        found = np.array(pyramid_mean(lattice_of(scene.on(backend), wrap))).ravel()
         np.testing.assert_allclose(scene.background + found, fine, atol=0.01)
 
 
@@ -114,7 +117,7 @@ class TestGradient:
             rows = looked_up(lattice, points, FOOTPRINTS[2])
             Float = types_of(gaussians.mean).Float
             seen = sum(r * Float(w) for r, w in zip(rows, weight.T.copy(), strict=True))
-            return dr.sum(seen) + mean_of(lattice)[0]
+            return dr.sum(seen) + pyramid_mean(lattice)[0]
 
         gaussians = scene.on(backend, bits=64)
         dr.enable_grad(getattr(gaussians, name))

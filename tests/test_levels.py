@@ -11,15 +11,15 @@ from click.testing import CliRunner
 from scenes import random_scene
 
 import eigengs_dr as eg
-from eigengs_dr.cli import main
-from eigengs_dr.color import rgb_to_ycbcr
-from eigengs_dr.descent import first
-from eigengs_dr.growth import worth
-from eigengs_dr.levels import fit_levels, level_counts
-from eigengs_dr.packing import UNSEEN
-from eigengs_dr.presets import PRESETS
-from eigengs_dr.rendering import picture_of, render
-from eigengs_dr.starting import begin
+from eigengs_dr.cli.main import main
+from eigengs_dr.codec.bit_allocation import MSE_WITHOUT_IMAGE
+from eigengs_dr.fitting.density_control import removal_cost
+from eigengs_dr.fitting.initializers import initialize
+from eigengs_dr.fitting.levels import fit_levels, level_counts
+from eigengs_dr.fitting.optimizers.descent import prefix
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.raster.render import picture_of, render
 
 SIDE = 48
 
@@ -54,10 +54,10 @@ def test_too_many_levels_are_refused(count, levels):
 
 def test_first_is_a_slice_and_differentiable(backend):
     gaussians = random_scene().on(backend)
-    part = first(gaussians, 7)
+    part = prefix(gaussians, 7)
     np.testing.assert_array_equal(render(part).numpy(), render(gaussians[:7]).numpy())
     dr.enable_grad(gaussians.color)
-    dr.backward(dr.sum(first(gaussians, 7).color, axis=None))
+    dr.backward(dr.sum(prefix(gaussians, 7).color, axis=None))
     grad = dr.grad(gaussians.color).numpy()
     assert (grad[:, :7] == 1).all() and (grad[:, 7:] == 0).all()
 
@@ -65,7 +65,7 @@ def test_first_is_a_slice_and_differentiable(backend):
 def test_all_levels_make_the_image(image, result):
     """Beside fits of their own, levels lose little; of a plain fit, as many are no image."""
     plain = eg.fit(image, 256, iterations=150).gaussians
-    order = np.argsort(-worth(plain, rgb_to_ycbcr(image)))
+    order = np.argsort(-removal_cost(plain, rgb_to_ycbcr(image)))
     for count in level_counts(256, 3)[:-1]:
         own = reached(eg.fit(image, count, iterations=150).gaussians, image)
         level = reached(result.gaussians[:count], image)
@@ -85,7 +85,7 @@ def test_a_level_is_sorted_by_worth(image, result):
     target = rgb_to_ycbcr(image)
     before = 0
     for count in level_counts(256, 3):
-        value = worth(result.gaussians[:count], target)[before:]
+        value = removal_cost(result.gaussians[:count], target)[before:]
         assert (np.diff(value) <= 1e-4 * value.max()).all()
         before = count
 
@@ -121,8 +121,8 @@ def test_packed_levels_are_read_one_by_one(image, result, tmp_path):
         assert len(part) == count
         lost = reached(result.gaussians[:count], image) - reached(part, image)
         assert lost <= 1.0 + 1e-3
-    assert receipt.lost == pytest.approx(lost, abs=1e-3)
-    assert receipt.lost > 0.3
+    assert receipt.psnr_drop == pytest.approx(lost, abs=1e-3)
+    assert receipt.psnr_drop > 0.3
     plain = eg.pack(result.gaussians, tmp_path / "b.egs", image, 1.0)
     assert plain.bytes < receipt.bytes < 1.5 * plain.bytes
 
@@ -133,7 +133,7 @@ def test_packed_levels_without_an_image_keep_what_they_have_of_the_whole(result,
     whole = rgb_to_ycbcr(picture_of(result.gaussians))
 
     def error(part):
-        return np.square(rgb_to_ycbcr(picture_of(part)) - whole).mean() + UNSEEN
+        return np.square(rgb_to_ycbcr(picture_of(part)) - whole).mean() + MSE_WITHOUT_IMAGE
 
     for k, count in enumerate(counts, 1):
         part = eg.Gaussians.load(tmp_path / "a.egs", sections=k)
@@ -170,7 +170,7 @@ def test_commands(image, tmp_path):
 def test_levels_keep_the_background(image):
     """What is added later does not change the levels before: one background serves all."""
     found = fit_levels(image, 64, 2, iterations=0).gaussians
-    alone = begin(image, 16, "auto", "natural", PRESETS["default"]).gaussians
+    alone = initialize(image, 16, "auto", "natural", PRESETS["default"]).gaussians
     np.testing.assert_allclose(
         found.to_arrays()["background"], alone.to_arrays()["background"], atol=1e-6
     )

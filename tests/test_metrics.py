@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import correlate2d
 from skimage import color, metrics
 
-from eigengs_dr.metrics import ms_ssim, psnr, ssim
+from eigengs_dr.image.metrics import ms_ssim, psnr, ssim
 
 SIZES = [(1, 1), (1, 9), (2, 3), (10, 11), (12, 40), (23, 22), (45, 50)]
 

@@ -7,9 +7,10 @@ import pytest
 from numpy.lib import format as npy
 from test_training import SMALL, random_fields
 
-from eigengs_dr import archive, modelfile
-from eigengs_dr.eigengs import EigenGS
-from eigengs_dr.training import Settings, train
+from eigengs_dr.eigenbasis import model_file as modelfile
+from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.eigenbasis.training import TrainOptions, train
+from eigengs_dr.storage import npz as archive
 
 REALS = [key for key, field in modelfile.LAYOUT.items() if field.kind[0] == "f"]
 NUMBERS = [key for key, field in modelfile.LAYOUT.items() if field.kind != "U"]
@@ -19,7 +20,7 @@ NUMBERS = [key for key, field in modelfile.LAYOUT.items() if field.kind != "U"]
 def model(tmp_path_factory):
     folder = tmp_path_factory.mktemp("model")
     photos = random_fields(folder / "photos", 12)
-    settings = Settings(**SMALL, frequency_aware=True)
+    settings = TrainOptions(**SMALL, frequency_aware=True)
     return train(photos, folder / "model.npz", settings).model
 
 

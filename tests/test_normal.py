@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from scenes import COUNT, SIZE, few, random_scene, scenes
 
-from eigengs_dr.normal import RIDGE, NormalEquations, splat_matrix
-from eigengs_dr.rendering import render
-from eigengs_dr.solve import solve
+from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.solvers.normal_equations import RIDGE, NormalEquations, weight_matrix
+from eigengs_dr.raster.render import render
 
 
 def dense_matrix(scene, cutoff=np.inf):
@@ -26,7 +26,7 @@ def images(count=3, seed=0):
 @given(scene=scenes())
 def test_splat_matrix(backend, cutoff, scene):
     """Every weight of brute force, and nothing else but on the edge of a cutoff."""
-    matrix = splat_matrix(scene.on(backend), cutoff).toarray()
+    matrix = weight_matrix(scene.on(backend), cutoff).toarray()
     expected = dense_matrix(scene, cutoff)[:, :-1].T
     away = scene.off_edge(cutoff).ravel()
     np.testing.assert_allclose(matrix[:, away], expected[:, away], atol=1e-5)
@@ -35,7 +35,7 @@ def test_splat_matrix(backend, cutoff, scene):
 def test_splat_matrix_renders(backend):
     """Its transpose times colours is what the renderer draws."""
     scene = random_scene(3)
-    picture = splat_matrix(scene.on(backend)).T @ scene.color + scene.background
+    picture = weight_matrix(scene.on(backend)).T @ scene.color + scene.background
     rendered = render(scene.on(backend)).numpy().reshape(-1, 3)
     np.testing.assert_allclose(picture, rendered, atol=2e-6)
 
@@ -43,7 +43,7 @@ def test_splat_matrix_renders(backend):
 def test_splats_outside_have_empty_rows(backend):
     scene = random_scene()
     scene.mean[:5] = [-500, 900]
-    matrix = splat_matrix(scene.on(backend))
+    matrix = weight_matrix(scene.on(backend))
     assert matrix.shape == (COUNT, SIZE[0] * SIZE[1])
     assert (np.diff(matrix.indptr)[:5] == 0).all()
     equations = NormalEquations(scene.on(backend))
@@ -66,7 +66,7 @@ def test_correlate(backend, scene):
 def test_solve_is_least_squares(backend):
     """The residual is that of NumPy's least squares: the ridge costs nothing that matters."""
     scene = random_scene(1)
-    matrix = splat_matrix(scene.on(backend)).toarray().astype(np.float64).T
+    matrix = weight_matrix(scene.on(backend)).toarray().astype(np.float64).T
     matrix = np.hstack([matrix, np.ones((len(matrix), 1))])
     targets = images().reshape(3, -1).T
     best = np.linalg.lstsq(matrix, targets, rcond=None)[0]
@@ -116,7 +116,7 @@ def test_error_is_that_of_the_rendering(backend):
     scene = random_scene(7)
     equations = NormalEquations(scene.on(backend))
     coefficients = np.random.default_rng(0).normal(size=(COUNT + 1, 3))
-    rendered = (splat_matrix(scene.on(backend)).T @ coefficients[:-1] + coefficients[-1]).T
+    rendered = (weight_matrix(scene.on(backend)).T @ coefficients[:-1] + coefficients[-1]).T
     error = np.square(rendered - images().reshape(3, -1)).sum(axis=1)
     squares = np.square(images(), dtype=np.float64).sum(axis=(1, 2))
     found = equations.error(coefficients, equations.correlate(images()), squares)
@@ -152,14 +152,14 @@ def test_blocks_fit_what_is_left(backend):
     coarse = alone.solve(alone.correlate(images()))
     np.testing.assert_allclose(found[:low], coarse[:-1], atol=1e-4)
     np.testing.assert_allclose(found[-1], coarse[-1], atol=1e-4)
-    left = images().reshape(3, -1).T - (splat_matrix(first).T @ coarse[:-1] + coarse[-1])
-    matrix = splat_matrix(rest).astype(np.float64)
+    left = images().reshape(3, -1).T - (weight_matrix(first).T @ coarse[:-1] + coarse[-1])
+    matrix = weight_matrix(rest).astype(np.float64)
     gram = (matrix @ matrix.T).toarray()
     gram += RIDGE * gram.diagonal().mean() * np.eye(len(gram))
     np.testing.assert_allclose(found[low:-1], np.linalg.solve(gram, matrix @ left), atol=2e-3)
 
 
 def test_a_matrix_too_large_is_refused(backend, monkeypatch):
-    monkeypatch.setattr("eigengs_dr.normal.MOST_WEIGHTS", 100)
+    monkeypatch.setattr("eigengs_dr.fitting.solvers.normal_equations.MAX_WEIGHTS", 100)
     with pytest.raises(ValueError, match=r"the splats cover [\d,]+ pixels in all, over 100"):
         NormalEquations(random_scene().on(backend))

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scenes import COUNT, SIZE, few, random_scene, scenes
 
-from eigengs_dr.adam import Adam
-from eigengs_dr.adan import Adan
-from eigengs_dr.backend import select
-from eigengs_dr.coordinates import CHOLESKY, CHOLESKY_BOUND, NATURAL
-from eigengs_dr.gaussians import NARROWEST
+from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.optimizers.adam import Adam
+from eigengs_dr.fitting.optimizers.adan import Adan
+from eigengs_dr.fitting.optimizers.parameterization import CHOLESKY, CHOLESKY_BOUND, SCALE_RELATIVE
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
 
 # --- Adam --------------------------------------------------------------------------------------
 
@@ -155,12 +155,12 @@ def test_adan_refuses_betas(betas):
 
 @few
 @given(scene=scenes())
-@pytest.mark.parametrize("coordinates", [NATURAL, CHOLESKY], ids=["natural", "cholesky"])
+@pytest.mark.parametrize("coordinates", [SCALE_RELATIVE, CHOLESKY], ids=["natural", "cholesky"])
 def test_there_and_back(backend, coordinates, scene):
     """Those of GaussianImage hold means inside the image only."""
     scene = scene._replace(mean=np.clip(scene.mean, 0.01, np.array(SIZE) - 0.01))
     gaussians = scene.on(backend)
-    back = coordinates.to(gaussians, coordinates.of(gaussians)).to_arrays()
+    back = coordinates.decode(gaussians, coordinates.encode(gaussians)).to_arrays()
     np.testing.assert_allclose(back["mean"], scene.mean, atol=1e-3)
     scale = np.abs(scene.factor).max(axis=1, keepdims=True)
     assert (np.abs(back["factor"] - scene.factor) <= 1e-4 * scale).all()
@@ -174,7 +174,7 @@ def test_cholesky_coordinates(backend):
     variables = {"mean": rng.normal(size=(2, COUNT)), "cholesky": rng.uniform(0, 2, (3, COUNT))}
     module = select(backend)
     fixed = random_scene().on(backend)
-    moved = CHOLESKY.to(
+    moved = CHOLESKY.decode(
         fixed,
         {
             "mean": module.Array2f(*variables["mean"].astype("f4")),
@@ -194,11 +194,11 @@ def test_cholesky_coordinates(backend):
     np.testing.assert_allclose(moved["mean"], expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("coordinates", [NATURAL, CHOLESKY], ids=["natural", "cholesky"])
+@pytest.mark.parametrize("coordinates", [SCALE_RELATIVE, CHOLESKY], ids=["natural", "cholesky"])
 def test_what_is_not_a_variable_is_that_of_the_set(backend, coordinates):
     """As `Coordinates.to` says."""
     gaussians = random_scene().on(backend)
-    moved = coordinates.to(gaussians, {"color": gaussians.color * 2}).to_arrays()
+    moved = coordinates.decode(gaussians, {"color": gaussians.color * 2}).to_arrays()
     np.testing.assert_array_equal(moved["mean"], gaussians.to_arrays()["mean"])
     np.testing.assert_array_equal(moved["factor"], gaussians.to_arrays()["factor"])
 
@@ -216,10 +216,10 @@ def test_natural_variables_come_back_into_their_bounds(backend, values):
         "factor": module.Array3f(*values[2:5]),
         "color": module.ArrayXf(list(values[5:])),
     }
-    found = NATURAL.to(fixed, NATURAL.bounded(fixed, variables)).to_arrays()
+    found = SCALE_RELATIVE.decode(fixed, SCALE_RELATIVE.project(fixed, variables)).to_arrays()
     slack = 1 + 1e-5  # of going through the units of the variables
     assert ((found["mean"] >= 0) & (found["mean"] <= np.array(SIZE) * slack)).all()
     diagonal = found["factor"][:, [0, 2]]
     assert (diagonal * slack >= 1 / (2 * max(SIZE))).all()
-    assert (np.abs(found["factor"]) <= slack / NARROWEST).all()
+    assert (np.abs(found["factor"]) <= slack / MIN_DEVIATION).all()
     assert np.isfinite(found["color"]).all()

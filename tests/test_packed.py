@@ -17,11 +17,23 @@ from hypothesis.extra import numpy as hnp
 from scenes import COUNT, SIZE, family, few, random_scene, scenes
 
 import eigengs_dr as eg
-from eigengs_dr import cli, cli_pack, packed, packing, planes
-from eigengs_dr.archive import BadValue
-from eigengs_dr.curve import MOST_LEVELS, along_curve, on_curve
-from eigengs_dr.quantising import LARGEST, Steps, Symbols, factors_of, shapes_of, symbols_of, whole
-from eigengs_dr.rendering import picture_of
+from eigengs_dr.cli import main as cli
+from eigengs_dr.cli import pack as cli_pack
+from eigengs_dr.codec import bit_allocation as packing
+from eigengs_dr.codec import egs as packed
+from eigengs_dr.codec import entropy as planes
+from eigengs_dr.codec.hilbert_index import MAX_LEVELS, hilbert_decode, hilbert_encode
+from eigengs_dr.codec.quantization import (
+    MAX_SYMBOL,
+    Steps,
+    Symbols,
+    _round_to_steps,
+    factors_from_log_shapes,
+    log_shapes,
+    quantize,
+)
+from eigengs_dr.raster.render import picture_of
+from eigengs_dr.storage.npz import BadValue
 
 STEPS = Steps(0.25, 0.125, 0.0625, 0.03125)
 SPACES = [("ycbcr", 3), ("rgb", 1), ("rgb", 4), ("linear", 3), ("data", 2)]
@@ -34,30 +46,30 @@ SPACES = [("ycbcr", 3), ("rgb", 1), ("rgb", 4), ("linear", 3), ("data", 2)]
 def test_the_curve_visits_every_point_by_single_steps(levels):
     side = 1 << levels
     points = np.indices((side, side)).reshape(2, -1).T
-    places = along_curve(points, levels)
+    places = hilbert_encode(points, levels)
     assert sorted(places) == list(range(side * side))
     path = points[np.argsort(places)]
     assert (np.abs(np.diff(path, axis=0)).sum(axis=1) == 1).all()
-    np.testing.assert_array_equal(on_curve(places, levels), points)
+    np.testing.assert_array_equal(hilbert_decode(places, levels), points)
 
 
-@given(hnp.arrays(np.int64, (7, 2), elements=st.integers(0, (1 << MOST_LEVELS) - 1)))
+@given(hnp.arrays(np.int64, (7, 2), elements=st.integers(0, (1 << MAX_LEVELS) - 1)))
 def test_places_on_the_largest_curve_come_back(points):
-    places = along_curve(points, MOST_LEVELS)
-    assert (places >> 2 * MOST_LEVELS == 0).all()
-    np.testing.assert_array_equal(on_curve(places, MOST_LEVELS), points)
+    places = hilbert_encode(points, MAX_LEVELS)
+    assert (places >> 2 * MAX_LEVELS == 0).all()
+    np.testing.assert_array_equal(hilbert_decode(places, MAX_LEVELS), points)
 
 
 # --- Planes of numbers -------------------------------------------------------------------------
 
 NUMBERS = st.one_of(
-    st.integers(-9, 9), st.integers(0, (1 << 48) - 1), st.integers(-LARGEST, LARGEST)
+    st.integers(-9, 9), st.integers(0, (1 << 48) - 1), st.integers(-MAX_SYMBOL, MAX_SYMBOL)
 )
 
 
 @given(hnp.arrays(np.int64, st.integers(1, 40), elements=NUMBERS), st.binary(max_size=4))
 def test_planes_come_back_and_end_where_they_end(values, rest):
-    found, left = planes.decoded(memoryview(planes.encoded(values) + rest), len(values))
+    found, left = planes.decode(memoryview(planes.encode(values) + rest), len(values))
     np.testing.assert_array_equal(found, values)
     assert bytes(left) == rest
 
@@ -66,33 +78,33 @@ def test_planes_come_close_to_their_entropy():
     values = np.random.default_rng(0).normal(0, 12, 5000).round().astype(np.int64)
     share = np.unique(values, return_counts=True)[1] / len(values)
     least = -len(values) * (share * np.log2(share)).sum() / 8
-    assert least < len(planes.encoded(values)) < 1.03 * least + 30
+    assert least < len(planes.encode(values)) < 1.03 * least + 30
 
 
 @given(st.binary(max_size=60), st.integers(1, 50))
 def test_planes_of_any_bytes(data, count):
     for head in (b"", b"\x01\0\0", b"\x0a\x05\0"):
         try:
-            values, _ = planes.decoded(memoryview(head + data), count)
+            values, _ = planes.decode(memoryview(head + data), count)
         except BadValue:
             continue
         assert values.shape == (count,)
 
 
 def test_planes_cut_off_anywhere():
-    whole = planes.encoded(np.array([3, 1 << 30, 5, 77777], np.int64))
-    for length in range(len(whole)):
+    _round_to_steps = planes.encode(np.array([3, 1 << 30, 5, 77777], np.int64))
+    for length in range(len(_round_to_steps)):
         with pytest.raises(BadValue):
-            planes.decoded(memoryview(whole[:length]), 4)
+            planes.decode(memoryview(_round_to_steps[:length]), 4)
 
 
 def test_planes_that_claim_much():
     bomb = zlib.compress(bytes(1 << 24), 9, -15)
     with pytest.raises(BadValue, match="does not hold 9"):
-        planes.decoded(memoryview(b"\x01\0\0" + bomb), 9)
+        planes.decode(memoryview(b"\x01\0\0" + bomb), 9)
     wide = zlib.compress(bytes([255] * 9), 9, -15)  # widths of 127 bits
     with pytest.raises(BadValue, match="more bits"):
-        planes.decoded(memoryview(b"\x01\0\0" + wide + bytes(999)), 9)
+        planes.decode(memoryview(b"\x01\0\0" + wide + bytes(999)), 9)
 
 
 # --- Splats as whole numbers -------------------------------------------------------------------
@@ -100,8 +112,8 @@ def test_planes_that_claim_much():
 
 @given(scenes())
 def test_shapes_are_the_logarithms_of_matrices(scene):
-    shape = shapes_of(scene.factor)
-    np.testing.assert_allclose(factors_of(shape), scene.factor, rtol=1e-6, atol=1e-6)
+    shape = log_shapes(scene.factor)
+    np.testing.assert_allclose(factors_from_log_shapes(shape), scene.factor, rtol=1e-6, atol=1e-6)
     a, b, c = scene.factor.T
     inverse = np.stack([a * a, a * b, a * b, b * b + c * c], -1).reshape(-1, 2, 2)
     values, vectors = np.linalg.eigh(inverse)
@@ -113,16 +125,18 @@ def test_shapes_are_the_logarithms_of_matrices(scene):
 
 def test_shapes_of_extreme_splats():
     factor = np.array([[1e-4, 0, 4], [4, 0, 1e-4], [1, 0, 1], [1e-30, 0, 1e-30], [4, -4, 1e-4]])
-    np.testing.assert_allclose(factors_of(shapes_of(factor)), factor, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        factors_from_log_shapes(log_shapes(factor)), factor, rtol=1e-6, atol=1e-9
+    )
 
 
 @few
 @given(scenes())
 def test_rounding_moves_by_half_a_step(scene):
-    shape = shapes_of(scene.factor)
-    symbols = symbols_of(scene.mean, shape, scene.color, STEPS)
-    found = packed.Packed([symbols], STEPS, np.zeros(3, np.float32), SIZE, "data").arrays()
-    near = shapes_of(found["factor"])
+    shape = log_shapes(scene.factor)
+    symbols = quantize(scene.mean, shape, scene.color, STEPS)
+    found = packed.EgsContent([symbols], STEPS, np.zeros(3, np.float32), SIZE, "data").arrays()
+    near = log_shapes(found["factor"])
     assert np.abs(found["mean"] - scene.mean).max() <= STEPS.mean / 2 + 1e-5
     assert np.abs(near - shape)[:, 0].max() <= STEPS.scale / 2 + 1e-5
     assert np.abs(near - shape)[:, 1:].max() <= STEPS.stretch / 2 + 1e-5
@@ -132,11 +146,11 @@ def test_rounding_moves_by_half_a_step(scene):
 
 def test_numbers_beyond_the_largest_are_refused():
     with pytest.raises(ValueError, match="a mean is 8388608 steps or more"):
-        symbols_of(np.full((1, 2), 1e9), np.zeros((1, 3)), np.zeros((1, 3)), STEPS)
-    ends = np.array([[-LARGEST + 1.0], [LARGEST - 1.0]])
-    assert int(np.ptp(whole("mean", ends, 1.0))).bit_length() == MOST_LEVELS
+        quantize(np.full((1, 2), 1e9), np.zeros((1, 3)), np.zeros((1, 3)), STEPS)
+    ends = np.array([[-MAX_SYMBOL + 1.0], [MAX_SYMBOL - 1.0]])
+    assert int(np.ptp(_round_to_steps("mean", ends, 1.0))).bit_length() == MAX_LEVELS
     with pytest.raises(ValueError, match="a mean is"):
-        whole("mean", ends + 1, 1.0)
+        _round_to_steps("mean", ends + 1, 1.0)
 
 
 # --- Files -------------------------------------------------------------------------------------
@@ -144,10 +158,10 @@ def test_numbers_beyond_the_largest_are_refused():
 
 def content(scene=None, space="data", sections=(COUNT,)):
     scene = scene or random_scene()
-    symbols = symbols_of(scene.mean, shapes_of(scene.factor), scene.color, STEPS)
+    symbols = quantize(scene.mean, log_shapes(scene.factor), scene.color, STEPS)
     ends = np.cumsum(sections)
-    parts = [symbols.taken(slice(end - k, end)) for end, k in zip(ends, sections, strict=True)]
-    return packed.Packed(parts, STEPS, scene.background.astype(np.float32), scene.size, space)
+    parts = [symbols.select(slice(end - k, end)) for end, k in zip(ends, sections, strict=True)]
+    return packed.EgsContent(parts, STEPS, scene.background.astype(np.float32), scene.size, space)
 
 
 def rows_of(symbols):
@@ -197,13 +211,13 @@ def test_sets_load_as_other_files_do(backend, tmp_path, space, channels):
 
 def test_reading_stops_after_the_sections_that_are_asked_for(tmp_path):
     path, sections = tmp_path / "x.egs", (5, 9, COUNT - 14)
-    whole = packed.to_bytes(content(sections=sections))
+    _round_to_steps = packed.to_bytes(content(sections=sections))
     first = len(
         packed.to_bytes(content()._replace(sections=content(sections=sections).sections[:1]))
     )
-    path.write_bytes(whole)
+    path.write_bytes(_round_to_steps)
     assert len(eg.Gaussians.load(path, sections=2)) == 14
-    path.write_bytes(whole[: first + 40])
+    path.write_bytes(_round_to_steps[: first + 40])
     assert len(eg.Gaussians.load(path, sections=1)) == 5
     for wanted in (0, 4, 2, None):
         with pytest.raises(ValueError, match=r"x\.egs: .*(section|cut off)"):
@@ -232,10 +246,10 @@ def path(tmp_path):
 
 
 def test_files_cut_off_anywhere(path):
-    whole = packed.to_bytes(content(sections=(9, COUNT - 9)))
-    for length in range(0, len(whole), 3):
-        check_refused(path, whole[:length])
-    check_refused(path, whole + b"\0", "something follows")
+    _round_to_steps = packed.to_bytes(content(sections=(9, COUNT - 9)))
+    for length in range(0, len(_round_to_steps), 3):
+        check_refused(path, _round_to_steps[:length])
+    check_refused(path, _round_to_steps + b"\0", "something follows")
 
 
 @few
@@ -243,10 +257,12 @@ def test_files_cut_off_anywhere(path):
 def test_files_with_damaged_bytes(tmp_path_factory, data):
     """The checksums find every change."""
     path = tmp_path_factory.mktemp("any") / "x.egs"
-    whole = bytearray(packed.to_bytes(content()))
+    _round_to_steps = bytearray(packed.to_bytes(content()))
     for _ in range(40):
-        damaged = whole.copy()
-        damaged[data.draw(st.integers(0, len(whole) - 1))] ^= data.draw(st.integers(1, 255))
+        damaged = _round_to_steps.copy()
+        damaged[data.draw(st.integers(0, len(_round_to_steps) - 1))] ^= data.draw(
+            st.integers(1, 255)
+        )
         check_refused(path, bytes(damaged))
 
 
@@ -261,20 +277,20 @@ def header(**changed):
 
 
 def body(splats=COUNT, data=None, length=None):
-    whole = packed.to_bytes(content())
-    data = whole[len(header()) + packed._SECTION.size :] if data is None else data
+    _round_to_steps = packed.to_bytes(content())
+    data = _round_to_steps[len(header()) + packed._SECTION.size :] if data is None else data
     return (
         packed._SECTION.pack(splats, len(data) if length is None else length, zlib.crc32(data))
         + data
     )
 
 
-ZEROS = planes.encoded(np.zeros(COUNT, np.int64))
+ZEROS = planes.encode(np.zeros(COUNT, np.int64))
 
 
 def ways(*steps):
     """A section whose first splats are so many steps apart on the curve."""
-    plane = planes.encoded(np.array([*steps, *[0] * (COUNT - len(steps))], np.int64))
+    plane = planes.encode(np.array([*steps, *[0] * (COUNT - len(steps))], np.int64))
     return plane + 6 * ZEROS
 
 
@@ -337,8 +353,8 @@ def test_reading_reserves_no_more_than_the_file_is_long(path):
 def test_low_bits_take_no_more_memory_than_numbers():
     """Of numbers of 47 bits each, where a number a bit would be forty times as much."""
     values = np.random.default_rng(0).integers(1 << 46, 1 << 47, 1 << 16)
-    coded = memoryview(planes.encoded(values))
-    assert peak(lambda: planes.decoded(coded, len(values))) < 12 * values.nbytes
+    coded = memoryview(planes.encode(values))
+    assert peak(lambda: planes.decode(coded, len(values))) < 12 * values.nbytes
 
 
 def test_splats_are_bounded(path, monkeypatch):
@@ -388,7 +404,7 @@ def test_the_budget_holds_and_is_used(fitted, receipts, budget):
     receipt, file = receipts[budget]
     found = eg.Gaussians.load(file)
     lost = decibels(gaussians, image) - decibels(found, image)
-    assert lost == pytest.approx(receipt.lost, abs=1e-3)
+    assert lost == pytest.approx(receipt.psnr_drop, abs=1e-3)
     assert 0.7 * budget < lost <= budget + 1e-3
     assert receipt.psnr == pytest.approx(decibels(found, image), abs=1e-3)
     assert receipt.bytes == file.stat().st_size
@@ -415,7 +431,7 @@ def test_without_an_image_the_rendering_is_kept(fitted, path):
             - eg.color.rgb_to_ycbcr(picture_of(gaussians))
         )
     )
-    allowed = packing.UNSEEN * (10 ** (packing.BUDGET / 10) - 1)
+    allowed = packing.MSE_WITHOUT_IMAGE * (10 ** (packing.BUDGET / 10) - 1)
     assert 0.5 * allowed < error <= 1.001 * allowed
     assert receipt.psnr == pytest.approx(-10 * np.log10(error), abs=1e-2)
 
@@ -430,13 +446,13 @@ def test_light_is_compared_as_it_is_shown(fitted, path):
 
 def test_steps_of_equal_marginal_cost_give_smaller_files(fitted, receipts, path, monkeypatch):
     gaussians, image = fitted
-    balanced, least = packing._balanced, receipts[0.5][0].bytes
+    balanced, least = packing._water_fill, receipts[0.5][0].bytes
 
     def tilted(*arguments):
         steps = balanced(*arguments)
         return steps._replace(mean=steps.mean * 4, color=steps.color / 4)
 
-    monkeypatch.setattr(packing, "_balanced", tilted)
+    monkeypatch.setattr(packing, "_water_fill", tilted)
     assert eg.pack(gaussians, path, image).bytes > 1.05 * least
 
 
@@ -448,7 +464,7 @@ def test_a_perfect_fit_may_be_rounded(path):
     gaussians = replace(gaussians, color=0 * gaussians.color)
     receipt = eg.pack(gaussians, path, np.full((*SIZE[::-1], 3), 0.5, np.float32))
     assert receipt.psnr > 89
-    assert receipt.lost <= packing.BUDGET + 1e-3
+    assert receipt.psnr_drop <= packing.BUDGET + 1e-3
 
 
 def test_sections_hold_the_splats_in_their_order(fitted, path):
@@ -466,7 +482,7 @@ def test_sections_hold_the_splats_in_their_order(fitted, path):
 def test_all_spaces_and_channels(backend, path, space, channels):
     gaussians = random_scene(3, channels=channels).on(backend, space=space)
     receipt = eg.pack(gaussians, path)
-    assert 0 < receipt.lost <= packing.BUDGET + 1e-3
+    assert 0 < receipt.psnr_drop <= packing.BUDGET + 1e-3
     found = eg.Gaussians.load(path, backend)
     assert (found.space, found.channels, len(found)) == (space, channels, COUNT)
 
@@ -491,8 +507,8 @@ def test_edge_cases(backend, path, name):
     gaussians = edge_cases()[name].on(backend)
     receipt = eg.pack(gaussians, path)
     error = np.square(picture_of(eg.Gaussians.load(path)) - picture_of(gaussians)).mean()
-    assert error <= 1.001 * packing.UNSEEN * (10 ** (packing.BUDGET / 10) - 1)
-    assert receipt.lost <= packing.BUDGET + 1e-3
+    assert error <= 1.001 * packing.MSE_WITHOUT_IMAGE * (10 ** (packing.BUDGET / 10) - 1)
+    assert receipt.psnr_drop <= packing.BUDGET + 1e-3
     assert len(receipt.gaussians) == len(gaussians)
 
 

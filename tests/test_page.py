@@ -10,7 +10,7 @@ from browser import probe
 
 from eigengs_dr.bench.charts import new_figure, save_figure
 from eigengs_dr.bench.page import Page, Picture, Section, Table, write_html, write_markdown
-from eigengs_dr.images import save_image
+from eigengs_dr.image.io import save_image
 
 NASTY = """<b>&"'|`_a_ *b* <script>alert(1)</script> $title"""
 """Nothing in it may mean anything."""

@@ -12,17 +12,18 @@ from hypothesis import strategies as st
 from scenes import family, few, small_model
 
 import eigengs_dr as eg
-from eigengs_dr import cli_pareto, cli_shared
-from eigengs_dr.arrays import types_in
-from eigengs_dr.backend import select
+from eigengs_dr import cli_pareto
+from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.selection import select
 from eigengs_dr.bench import kernels, pareto, pareto_kernels, pareto_tables, sets
 from eigengs_dr.bench.pareto import Collection, Variant, front
-from eigengs_dr.console import Program
-from eigengs_dr.descent import descend
-from eigengs_dr.presets import PRESETS
-from eigengs_dr.reference import render_exact
-from eigengs_dr.rendering import picture_of
-from eigengs_dr.starting import begin
+from eigengs_dr.cli import options as cli_shared
+from eigengs_dr.cli.console import Program
+from eigengs_dr.fitting.initializers import initialize
+from eigengs_dr.fitting.optimizers.descent import descend
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.raster.reference import render_exact
+from eigengs_dr.raster.render import picture_of
 
 COORDINATES = st.sampled_from([0.0, 0.5, 1.0, 2.0, 3.0, float("nan")])
 FILES = ["pareto.jsonl", "pareto-samples.csv"]
@@ -100,7 +101,7 @@ def test_fits_are_made_and_seen_at_their_cutoff(shorter, backend):
     row = pareto._fitted(Variant("cutoff", 2.0, 100, cutoff=2.0), image, 10, 0, backend)
     end = row["trace"][-1]
     assert end["psnr_ycbcr"] > end["psnr_wide"] + 1
-    start = begin(image, 100, "auto", "", PRESETS["default"], cutoff=2.0, backend=backend)
+    start = initialize(image, 100, "auto", "", PRESETS["default"], cutoff=2.0, backend=backend)
     sets = descend(start.gaussians, start.target, PRESETS["default"].schedule, 10, cutoff=2.0)
     *_, gaussians = sets
     for cutoff, figure in ((2.0, "psnr_ycbcr"), (6.0, "psnr_wide")):

@@ -9,13 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.decomposition import PCA
 
-import eigengs_dr.pca as pca
-from eigengs_dr import archive, basisfile, incremental
-from eigengs_dr.images import ImageError, check_image, image_files, save_image
-from eigengs_dr.incremental import EigenState, merge, start
-from eigengs_dr.pca import Eigenbasis
-from eigengs_dr.resampling import resampled
-from eigengs_dr.stream import batches, to_planes
+import eigengs_dr.eigenbasis.basis as pca
+from eigengs_dr.eigenbasis import basis_file as basisfile
+from eigengs_dr.eigenbasis import incremental_pca as incremental
+from eigengs_dr.eigenbasis.basis import Eigenbasis
+from eigengs_dr.eigenbasis.incremental_pca import EigenState, empty_state, merge
+from eigengs_dr.image.folder import image_files, read_blocks, to_planes
+from eigengs_dr.image.io import ImageError, check_image, save_image
+from eigengs_dr.image.resize import resample
+from eigengs_dr.storage import npz as archive
 
 WIDTH, HEIGHT = SIZE = (14, 11)
 PIXELS = WIDTH * HEIGHT
@@ -76,7 +78,7 @@ def psnr_of(basis, images):
 @pytest.fixture
 def blocks_of(monkeypatch):
     """Make `from_images` work in blocks of so many images."""
-    return lambda length: monkeypatch.setattr(incremental, "LONGEST_BLOCK", length)
+    return lambda length: monkeypatch.setattr(incremental, "MAX_BLOCK", length)
 
 
 def one_line(error):
@@ -166,7 +168,7 @@ def test_rows_stay_orthonormal_when_variances_differ_much():
     spread = np.logspace(-1, -4.5, 30)
     directions = np.linalg.qr(rng.normal(size=(PIXELS, 30)))[0].T * np.sqrt(PIXELS)
     images = 0.5 + (rng.normal(size=(200, 30)) * spread) @ directions
-    state = start(SIZE)
+    state = empty_state(SIZE)
     for block in np.split(np.repeat(images[:, None], 3, axis=1).astype(np.float32), 8):
         state = merge(state, block, (40,) * 3)
         for rows in state.rows:
@@ -189,29 +191,29 @@ def test_every_source_gives_the_same_bits(tmp_path, blocks_of):
 
 def test_merging_can_stop_and_go_on(tmp_path):
     images, rank = family(40), (6, 6, 6)
-    whole, part = start(SIZE, seed=3), start(SIZE, seed=3)
-    for block in batches(images, SIZE, "ycbcr", 8):
+    whole, part = empty_state(SIZE, seed=3), empty_state(SIZE, seed=3)
+    for block in read_blocks(images, SIZE, "ycbcr", 8):
         whole = merge(whole, block, rank)
-    for block in batches(images[:16], SIZE, "ycbcr", 8):
+    for block in read_blocks(images[:16], SIZE, "ycbcr", 8):
         part = merge(part, block, rank)
     np.savez(tmp_path / "state.npz", **part.arrays())
     with np.load(tmp_path / "state.npz") as file:
         part = EigenState.from_arrays(dict(file))
-    for block in batches(images[16:], SIZE, "ycbcr", 8):
+    for block in read_blocks(images[16:], SIZE, "ycbcr", 8):
         part = merge(part, block, rank)
     assert part.count == 40
     assert_same(Eigenbasis.from_state(part, SIZE, 5), Eigenbasis.from_state(whole, SIZE, 5))
 
 
 def test_merging_nothing_changes_nothing():
-    state = merge(start(SIZE), planes(family(5)), (4, 4, 4))
+    state = merge(empty_state(SIZE), planes(family(5)), (4, 4, 4))
     assert merge(state, np.zeros((0, 3, PIXELS), np.float32), (4, 4, 4)) is state
     with pytest.raises(ValueError, match="no images were merged; merge"):
-        Eigenbasis.from_state(start(SIZE), SIZE)
+        Eigenbasis.from_state(empty_state(SIZE), SIZE)
 
 
 def test_merge_leaves_the_old_state_alone():
-    state = merge(start(SIZE), planes(family(10)), (4, 4, 4))
+    state = merge(empty_state(SIZE), planes(family(10)), (4, 4, 4))
     before = {key: array.copy() for key, array in state.arrays().items()}
     merge(state, planes(family(10, seed=1)), (4, 4, 4))
     for key, array in state.arrays().items():
@@ -236,7 +238,9 @@ def test_examples_are_training_images_drawn_with_the_seed(blocks_of):
 
 def test_every_image_is_drawn_with_the_same_probability():
     block = np.zeros((64, 3, 1), np.float32) + np.arange(64, dtype=np.float32)[:, None, None]
-    drawn = [incremental._drawn(start((1, 1), seed), block)[:, 0, 0] for seed in range(400)]
+    drawn = [
+        incremental._draw_examples(empty_state((1, 1), seed), block)[:, 0, 0] for seed in range(400)
+    ]
     counts = np.bincount(np.concatenate(drawn).astype(int), minlength=64)
     # Expected 100 each, with a standard deviation of 8.7.
     assert np.abs(counts - 100).max() < 40
@@ -388,7 +392,7 @@ def test_copies_of_few_images_span_no_more(blocks_of):
 
 def test_mixed_sizes_and_bad_files(tmp_path):
     for i, image in enumerate(family(8)):
-        save_image(tmp_path / f"{i}.png", image if i else resampled(image, 40, 20))
+        save_image(tmp_path / f"{i}.png", image if i else resample(image, 40, 20))
     (tmp_path / "7.png").write_bytes(b"damaged")
     with pytest.warns(UserWarning) as caught:
         basis = Eigenbasis.from_images(tmp_path, SIZE, 3)
@@ -461,8 +465,8 @@ BASES = {
 
 def test_images_of_any_size_and_type_are_projected():
     basis = BASES["ycbcr"]
-    large = resampled(family(1)[0], 50, 60)
-    fitting = resampled(large, WIDTH, HEIGHT)
+    large = resample(family(1)[0], 50, 60)
+    fitting = resample(large, WIDTH, HEIGHT)
     for a, b in zip(basis.project(large), basis.project(fitting), strict=True):
         np.testing.assert_array_equal(a, b)
     assert len(basis.project(np.zeros((4, 4), np.uint8))[0]) == 12

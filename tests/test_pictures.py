@@ -4,20 +4,13 @@ import numpy as np
 import pytest
 from test_training import SMALL, random_fields
 
-from eigengs_dr import pictures
-from eigengs_dr.gaussians import Gaussians
-from eigengs_dr.pictures import (
-    CELL,
-    LIGHTER,
-    comparison,
-    component_sheet,
-    ellipses,
-    overlay,
-)
-from eigengs_dr.rendering import render
-from eigengs_dr.resampling import resampled
-from eigengs_dr.strips import GAP, joined, line
-from eigengs_dr.training import Settings, train
+from eigengs_dr.cli import pictures
+from eigengs_dr.cli.pictures import CELL, LIGHTER, comparison, component_sheet, ellipses, overlay
+from eigengs_dr.eigenbasis.training import TrainOptions, train
+from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.image.montage import GAP, join_pictures, text_line
+from eigengs_dr.image.resize import resample
+from eigengs_dr.raster.render import render
 
 CAPTION = 12
 """Height of the line above a picture."""
@@ -27,7 +20,7 @@ CAPTION = 12
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pictures")
     photos = random_fields(folder / "photos", 12)
-    settings = Settings(**SMALL, frequency_aware=True)
+    settings = TrainOptions(**SMALL, frequency_aware=True)
     return train(photos, folder / "model.npz", settings)
 
 
@@ -39,9 +32,9 @@ def cell(sheet, column, row):
 
 def test_the_mean_comes_first(trained):
     sheet = component_sheet(trained.model, trained.basis)
-    rendered = resampled(render(trained.model.gaussians).numpy(), CELL, CELL)
+    rendered = resample(render(trained.model.gaussians).numpy(), CELL, CELL)
     np.testing.assert_allclose(cell(sheet, 0, 1), rendered, atol=1e-5)
-    mean = resampled(trained.basis.reconstruct([np.zeros(6)] * 3), CELL, CELL)
+    mean = resample(trained.basis.reconstruct([np.zeros(6)] * 3), CELL, CELL)
     np.testing.assert_allclose(cell(sheet, 0, 0), mean, atol=1e-5)
     np.testing.assert_array_equal(cell(component_sheet(trained.model), 0, 0), cell(sheet, 0, 1))
 
@@ -51,7 +44,7 @@ def test_a_component_is_above_its_rendering_on_one_scale(trained):
     sheet = component_sheet(model, basis)
     for column, j in ((1, 0), (2, 1)):
         shown = cell(sheet, column, 0) - 0.5
-        component = resampled(basis.components[0][j][..., None], CELL, CELL)
+        component = resample(basis.components[0][j][..., None], CELL, CELL)
         factor = shown[..., :1].ravel() @ component.ravel() / np.square(component).sum()
         np.testing.assert_allclose(shown, np.repeat(factor * component, 3, 2), atol=1e-4)
         assert 0.4 < np.abs(shown).max() < 0.8
@@ -128,7 +121,7 @@ def test_an_overlay_of_every_space(space, channels):
 
 def test_single_outlines_can_be_told_apart(monkeypatch):
     """Of many splats some are drawn, always the same, and neither the first nor every third."""
-    monkeypatch.setattr(pictures, "MOST_OUTLINES", 4)
+    monkeypatch.setattr(pictures, "MAX_OUTLINES", 4)
     splats = round_splats([[30 + 60 * n, 10] for n in range(10)], 5.0, (600, 20))
     drawn, again = (overlay(splats, np.ones((20, 600, 1)))[..., 0] for _ in range(2))
     np.testing.assert_array_equal(drawn, again)
@@ -170,7 +163,7 @@ def test_a_comparison_keeps_the_shape(height, width, times):
 
 
 def test_pictures_are_joined_on_white():
-    joint = joined([np.zeros((2, 3, 3)), np.zeros((4, 1, 3))], 1, gap=2)
+    joint = join_pictures([np.zeros((2, 3, 3)), np.zeros((4, 1, 3))], 1, gap=2)
     assert joint.shape == (4, 3 + 2 + 1 + 2, 3)
     black = joint.sum(axis=2) == 0
     assert black[:2, :3].all() and black[:, 5].all() and black.sum() == 10
@@ -178,8 +171,8 @@ def test_pictures_are_joined_on_white():
 
 
 def test_a_line_holds_its_text():
-    written = line("Agjpq", 200, 16)
+    written = text_line("Agjpq", 200, 16)
     assert written.shape == (20, 200, 3)
     ink = np.argwhere(written.min(axis=2) < 0.5)
     assert ink.min() > 0 and ink[:, 0].max() < 19  # nothing is cut off below
-    assert (line("", 200, 16) == 1).all()
+    assert (text_line("", 200, 16) == 1).all()

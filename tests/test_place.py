@@ -7,12 +7,20 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scenes import covariances, few
 
-from eigengs_dr.adaptive import adaptive, bending, bent, capped, pieces, relaxed
-from eigengs_dr.curve import hilbert_order
-from eigengs_dr.place import GRID_SIZE, grid, inverse_factor, random
-from eigengs_dr.resampling import resampled
+from eigengs_dr.fitting.placement.adaptive import (
+    density_from_hessian,
+    hessian_energy,
+    lloyd_step,
+    normalize_density,
+    place_adaptive,
+    stratify_along_hilbert,
+)
+from eigengs_dr.fitting.placement.grid import DEVIATION, place_grid
+from eigengs_dr.fitting.placement.hilbert_scan import hilbert_order
+from eigengs_dr.fitting.placement.random import inverse_factor, place_random
+from eigengs_dr.image.resize import resample
 
-INITS = [random, grid, adaptive]
+INITS = [place_random, place_grid, place_adaptive]
 
 
 def generator(seed=0):
@@ -77,7 +85,7 @@ def test_one_seed_gives_one_placement(place):
 
 def test_seeds_differ():
     image = np.zeros((20, 30, 3), np.float32)
-    first, second = (random(image, 50, generator(seed))[0] for seed in (1, 2))
+    first, second = (place_random(image, 50, generator(seed))[0] for seed in (1, 2))
     assert not np.array_equal(first, second)
 
 
@@ -95,7 +103,7 @@ def test_inverse_factor():
 def test_random_is_uniform():
     """Means over the image; Cholesky factors over [0.5, 1.5], [0, 1], [0.5, 1.5]."""
     count = 20_000
-    mean, factor = random(np.zeros((50, 200, 3)), count, generator())
+    mean, factor = place_random(np.zeros((50, 200, 3)), count, generator())
     cholesky = np.linalg.cholesky(covariances_of(factor))
     drawn = [mean[:, 0] / 200, mean[:, 1] / 50]
     drawn += [cholesky[:, 0, 0] - 0.5, cholesky[:, 1, 0], cholesky[:, 1, 1] - 0.5]
@@ -110,7 +118,7 @@ def test_random_is_uniform():
 @pytest.mark.parametrize(("width", "height", "count"), [(40, 40, 100), (64, 16, 64), (30, 50, 97)])
 def test_grid(width, height, count):
     """Rows that differ by one splat at most and are shifted by half a distance; one size."""
-    mean, factor = grid(np.zeros((height, width, 3)), count, generator())
+    mean, factor = place_grid(np.zeros((height, width, 3)), count, generator())
     spacing = np.sqrt(width * height / count)
     heights = np.unique(mean[:, 1])
     numbers = [int((mean[:, 1] == y).sum()) for y in heights]
@@ -119,13 +127,13 @@ def test_grid(width, height, count):
     for k, (y, number) in enumerate(zip(heights, numbers, strict=True)):
         x = mean[mean[:, 1] == y, 0]
         np.testing.assert_allclose(x / width * number, np.arange(number) + 0.25 + 0.5 * (k % 2))
-    sharpness = 1 / (GRID_SIZE * spacing)
+    sharpness = 1 / (DEVIATION * spacing)
     np.testing.assert_allclose(factor, np.tile([sharpness, 0, sharpness], (count, 1)))
 
 
 def test_grid_is_hexagonal():
     """Six nearest neighbours at one distance, where rows have one length."""
-    mean, _ = grid(np.zeros((300, 300, 3)), 32 * 28, generator())
+    mean, _ = place_grid(np.zeros((300, 300, 3)), 32 * 28, generator())
     middle = np.argmin(np.abs(mean - 150).sum(axis=1))
     distances = np.sort(np.linalg.norm(mean - mean[middle], axis=1))[1:8]
     assert distances[5] < 1.1 * distances[0] < 1.5 * distances[0] < distances[6]
@@ -165,7 +173,7 @@ def test_hilbert_curve_stays_in_a_quarter(side):
 
 def test_adaptive_does_not_use_the_generator():
     image = generator(1).uniform(0, 1, (20, 30, 3)).astype(np.float32)
-    first, second = adaptive(image, 50, generator(1)), adaptive(image, 50, generator(2))
+    first, second = place_adaptive(image, 50, generator(1)), place_adaptive(image, 50, generator(2))
     np.testing.assert_array_equal(first[0], second[0])
 
 
@@ -176,7 +184,9 @@ def test_density_of_any_image(drawn):
     image, count = drawn
     pixels = image.shape[0] * image.shape[1]
     spacing = float(np.sqrt(pixels / count))
-    density = capped(bent(bending(image, spacing), spacing), count)
+    density = normalize_density(
+        density_from_hessian(hessian_energy(image, spacing), spacing), count
+    )
     assert density.shape == image.shape[:2]
     assert (density > 0).all()
     assert density.max() <= 1
@@ -188,14 +198,16 @@ def test_density_sums_to_the_count(count):
     y, x = np.indices((40, 40)) / 40
     image = np.stack([np.sin(7 * x * x + y), np.cos(9 * y), x * y], axis=-1).astype(np.float32)
     spacing = float(np.sqrt(1600 / count))
-    assert capped(bent(bending(image, spacing), spacing), count).sum() == pytest.approx(count)
+    assert normalize_density(
+        density_from_hessian(hessian_energy(image, spacing), spacing), count
+    ).sum() == pytest.approx(count)
 
 
 def test_bending_of_a_parabola():
     """Second derivatives 2 and 6 along the axes, 1 across: H H, whatever the blur."""
     y, x = np.indices((30, 40)).astype(np.float32)
     image = (x * x + 3 * y * y + x * y)[..., None]
-    found = bending(image, 4.0)[:, 10:20, 10:30]
+    found = hessian_energy(image, 4.0)[:, 10:20, 10:30]
     hessian = np.array([[2.0, 1], [1, 6]])
     squared = hessian @ hessian
     expected = np.array([squared[0, 0], squared[1, 1], squared[0, 1]])[:, None, None]
@@ -205,12 +217,14 @@ def test_bending_of_a_parabola():
 def test_straight_ramps_do_not_bend():
     y, x = np.indices((30, 40)).astype(np.float32)
     image = np.stack([0.01 * x, 0.02 * y, 0.01 * (x + y)], axis=-1)
-    flat = bending(np.zeros_like(image), 4.0)
-    np.testing.assert_allclose(bending(image, 4.0)[:, 5:-5, 5:-5], flat[:, 5:-5, 5:-5], atol=1e-9)
+    flat = hessian_energy(np.zeros_like(image), 4.0)
+    np.testing.assert_allclose(
+        hessian_energy(image, 4.0)[:, 5:-5, 5:-5], flat[:, 5:-5, 5:-5], atol=1e-9
+    )
 
 
 def test_constant_image_is_covered_evenly():
-    mean, factor = adaptive(np.full((64, 64, 3), 0.5, np.float32), 256, generator())
+    mean, factor = place_adaptive(np.full((64, 64, 3), 0.5, np.float32), 256, generator())
     quarter = (mean // 32).astype(int)
     numbers = np.bincount(quarter[:, 0] + 2 * quarter[:, 1], minlength=4)
     assert np.abs(numbers - 64).max() <= 3
@@ -224,7 +238,7 @@ def test_constant_image_is_covered_evenly():
 def test_splats_gather_at_an_edge_and_lie_along_it(upright):
     image = np.zeros((64, 64, 3), np.float32)
     image[:, 32:] = 1
-    mean, factor = adaptive(image if upright else image.transpose(1, 0, 2), 200, generator())
+    mean, factor = place_adaptive(image if upright else image.transpose(1, 0, 2), 200, generator())
     near = np.abs(mean[:, 0 if upright else 1] - 32) < 6
     assert near.mean() > 2 * 12 / 64
     sigma = covariances_of(factor[near])
@@ -236,7 +250,7 @@ def test_splats_lie_along_a_slanted_edge():
     """At 45 degrees, falling to the right: the covariance of x and y is positive along it."""
     y, x = np.indices((64, 64))
     image = np.repeat((x > y)[..., None], 3, axis=2).astype(np.float32)
-    mean, factor = adaptive(image, 200, generator())
+    mean, factor = place_adaptive(image, 200, generator())
     near = np.abs(mean[:, 0] - mean[:, 1]) < 6
     sigma = covariances_of(factor[near])
     along = sigma.sum(axis=(1, 2)) / 2  # variance along (1, 1) / sqrt 2
@@ -246,13 +260,13 @@ def test_splats_lie_along_a_slanted_edge():
 
 def test_brightness_does_not_move_splats():
     image = generator(2).uniform(0, 0.5, (32, 32, 3)).astype(np.float32)
-    first, second = (adaptive(image + shift, 80, generator())[0] for shift in (0, 0.25))
+    first, second = (place_adaptive(image + shift, 80, generator())[0] for shift in (0, 0.25))
     np.testing.assert_allclose(first, second, atol=0.5)
 
 
 def test_pieces_of_an_even_density_are_squares():
     """64 splats on 32 x 32 pixels: pieces of the curve are blocks of 4 x 4."""
-    mean = pieces(np.full((32, 32), 64 / 1024), 64)
+    mean = stratify_along_hilbert(np.full((32, 32), 64 / 1024), 64)
     expected = {(4 * i + 2.0, 4 * j + 2.0) for i in range(8) for j in range(8)}
     assert {tuple(np.round(m, 6)) for m in mean} == expected
 
@@ -261,28 +275,28 @@ def test_one_piece_is_the_centroid():
     density = generator(3).uniform(0.1, 1, (9, 14))
     y, x = np.indices(density.shape) + 0.5
     expected = [(density * v).sum() / density.sum() for v in (x, y)]
-    np.testing.assert_allclose(pieces(density, 1)[0], expected)
+    np.testing.assert_allclose(stratify_along_hilbert(density, 1)[0], expected)
 
 
 def test_relaxation_moves_to_centroids():
     """Two centres share the pixels of an even strip: each moves to the middle of its half."""
-    mean = relaxed(np.array([[1.2, 0.5], [8.9, 0.5]]), np.full((1, 10), 0.2))
+    mean = lloyd_step(np.array([[1.2, 0.5], [8.9, 0.5]]), np.full((1, 10), 0.2))
     np.testing.assert_allclose(mean, [[2.5, 0.5], [7.5, 0.5]])
 
 
 def test_relaxation_of_centres_in_one_pixel():
     """The last of them moves, the others stay: none is lost and none is NaN."""
     start = np.array([[2.5, 0.5], [2.6, 0.5], [2.7, 0.5]])
-    mean = relaxed(start, np.full((1, 10), 0.3))
+    mean = lloyd_step(start, np.full((1, 10), 0.3))
     np.testing.assert_allclose(mean, [[2.5, 0.5], [2.6, 0.5], [5, 0.5]])
 
 
 def test_splats_far_apart_are_placed_on_a_smaller_image():
     """Their means and covariances are those of the small one, stretched along both axes."""
     image = np.random.default_rng(0).uniform(0, 1, (97, 160, 3)).astype(np.float32)
-    small = resampled(image, 54, 33)  # splats lie 27 pixels apart: a third
-    mean, factor = adaptive(image, 21, generator())
-    expected_mean, expected_factor = adaptive(small, 21, generator())
+    small = resample(image, 54, 33)  # splats lie 27 pixels apart: a third
+    mean, factor = place_adaptive(image, 21, generator())
+    expected_mean, expected_factor = place_adaptive(small, 21, generator())
     stretch = np.array([160 / 54, 97 / 33])
     np.testing.assert_allclose(mean, expected_mean * stretch)
     covariance = covariances_of(expected_factor) * stretch * stretch[:, None]

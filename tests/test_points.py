@@ -9,11 +9,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scenes import SIZE, few, random_scene, scenes
 
-from eigengs_dr.arrays import types_in, types_of
-from eigengs_dr.backend import select
-from eigengs_dr.points import cell_side, fold, list_cells, sum_near, values, values_and_slopes
-from eigengs_dr.rendering import render, splat_values
-from eigengs_dr.splat import SHAPE, UNIT, pack
+from eigengs_dr.backend.arrays import types_in, types_of
+from eigengs_dr.backend.selection import select
+from eigengs_dr.raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS
+from eigengs_dr.raster.layout import pack_parameters
+from eigengs_dr.raster.lookup.points import (
+    cell_side,
+    fold,
+    gradient_terms,
+    list_cells,
+    sum_at_points,
+    value_terms,
+)
+from eigengs_dr.raster.render import kernel_parameters, render
 
 POINTS = 400
 WIDE = 9.0
@@ -42,20 +50,22 @@ def exact_at(scene, points, cutoff):
 
 def arrays_of(gaussians, points):
     """Packed parameters, shape, background, and x and y of points, as lookups take them."""
-    rows, background = splat_values(gaussians)
+    rows, background = kernel_parameters(gaussians)
     types = types_of(gaussians.mean)
     x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
-    return pack(rows), [dr.detach(r) for r in rows[:SHAPE]], background, x, y
+    return pack_parameters(rows), [dr.detach(r) for r in rows[:NUM_SHAPE_PARAMS]], background, x, y
 
 
-def look_up(gaussians, points, cutoff, side=4, terms=values, number=1):
+def look_up(gaussians, points, cutoff, side=4, terms=value_terms, number=1):
     """Rows of sums at points, without the background."""
     packed, shape, _, x, y = arrays_of(gaussians, points)
     size, channels = (gaussians.width, gaussians.height), gaussians.channels
-    cells = list_cells(shape, *size, UNIT * cutoff, side)
+    cells = list_cells(shape, *size, EXP2_SCALE * cutoff, side)
     active = types_of(x).Bool(True)
-    term = terms((UNIT * cutoff) ** 2)
-    return sum_near(cells, packed, SHAPE + channels, x, y, active, term, number * channels)
+    term = terms((EXP2_SCALE * cutoff) ** 2)
+    return sum_at_points(
+        cells, packed, NUM_SHAPE_PARAMS + channels, x, y, active, term, number * channels
+    )
 
 
 def stacked(rows):
@@ -101,7 +111,7 @@ class TestValues:
                 mean=rng.uniform(0, 1, (count, 2)) * size, factor=np.tile([0.3, 0, 0.3], (count, 1))
             )
             _, shape, *_ = arrays_of(scene.on(backend), some_points(size=size))
-            ends = np.array(list_cells(shape, *size, UNIT * 3, 4).ends).reshape(-1, 2)
+            ends = np.array(list_cells(shape, *size, EXP2_SCALE * 3, 4).ends).reshape(-1, 2)
             lengths.append(np.mean(ends[:, 1].astype(int) - ends[:, 0]))
         assert lengths[1] < 1.4 * lengths[0]  # fewer cells lie at the border
 
@@ -121,7 +131,7 @@ class TestDerivatives:
     def test_slopes_are_finite_differences(self, backend):
         scene, points, step = random_scene(6), some_points(), 1e-5
         rows = stacked(
-            look_up(scene.on(backend, bits=64), points, WIDE, terms=values_and_slopes, number=3)
+            look_up(scene.on(backend, bits=64), points, WIDE, terms=gradient_terms, number=3)
         )
         for k, direction in ((1, [step, 0]), (2, [0, step])):
             up, down = (exact_at(scene, points + s * np.array(direction), WIDE)[0] for s in (1, -1))
@@ -154,12 +164,14 @@ class TestDerivatives:
         """The loop hands on derivatives of where it is evaluated, which geometry may have."""
         gaussians = random_scene(8).on(backend, bits=64)
         packed, shape, _, x, y = arrays_of(gaussians, some_points())
-        cells = list_cells(shape, *SIZE, UNIT * WIDE, 4)
+        cells = list_cells(shape, *SIZE, EXP2_SCALE * WIDE, 4)
         active = types_of(x).Bool(True)
         dr.enable_grad(x, y)
-        sums = sum_near(cells, packed, 8, x, y, active, values((UNIT * WIDE) ** 2), 3)
+        sums = sum_at_points(
+            cells, packed, 8, x, y, active, value_terms((EXP2_SCALE * WIDE) ** 2), 3
+        )
         dr.backward(dr.sum(sums[0]))
-        rows = look_up(gaussians, some_points(), WIDE, terms=values_and_slopes, number=3)
+        rows = look_up(gaussians, some_points(), WIDE, terms=gradient_terms, number=3)
         np.testing.assert_allclose(np.array(dr.grad(x)), np.array(rows[1]), atol=1e-9)
         np.testing.assert_allclose(np.array(dr.grad(y)), np.array(rows[2]), atol=1e-9)
 

@@ -12,10 +12,11 @@ from PIL import Image
 from scenes import family
 
 import eigengs_dr as eg
-from eigengs_dr import cli_rate, cli_shared
+from eigengs_dr import cli_rate
 from eigengs_dr.bench import rate, rate_tables, rows
-from eigengs_dr.console import Program
-from eigengs_dr.refine import EXACT
+from eigengs_dr.cli import options as cli_shared
+from eigengs_dr.cli.console import Program
+from eigengs_dr.fitting.refine import MAX_PSNR
 
 
 @pytest.fixture
@@ -60,7 +61,7 @@ def test_what_is_exact_can_be_told_and_drawn(small, tmp_path, backend):
     )
     for row in found:
         if row["job"]["codec"].startswith("JPEG"):
-            assert {point["psnr_rgb"] for point in row["points"]} == {EXACT}
+            assert {point["psnr_rgb"] for point in row["points"]} == {MAX_PSNR}
     rate_tables.tables(found)
     rate_tables.chart(found, "made").draw_without_rendering()
 

@@ -9,11 +9,11 @@ import pytest
 from drjit import JitFlag
 from scenes import Scene, random_scene
 
-from eigengs_dr.color import rgb_to_ycbcr
-from eigengs_dr.descent import descend
-from eigengs_dr.presets import PRESETS
-from eigengs_dr.refine import refine, rows_at
-from eigengs_dr.rendering import render
+from eigengs_dr.fitting.optimizers.descent import descend
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.refine import refine, trace_steps
+from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.raster.render import render
 
 SIDE, SPLATS = 32, 100
 """Size of the pictures that are fitted, and splats in a fit: one set of kernels."""
@@ -175,7 +175,7 @@ def test_rates(backend, warm_up):
 @pytest.mark.parametrize("iterations", [0, 1, 10, 55, 100, 250])
 def test_rows_of_the_trace(iterations):
     usual = [0, 10, 20, 50, *range(100, iterations, 100)]
-    assert sorted(rows_at(iterations)) == sorted(
+    assert sorted(trace_steps(iterations)) == sorted(
         {m for m in usual if m <= iterations} | {iterations}
     )
 

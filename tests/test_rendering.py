@@ -21,12 +21,19 @@ from scenes import (
 )
 from scipy.ndimage import maximum_filter
 
-from eigengs_dr.color import rgb_to_ycbcr, ycbcr_to_rgb
-from eigengs_dr.gaussians import concatenate
-from eigengs_dr.reference import render_exact, render_plain
-from eigengs_dr.rendering import CUTOFF, WIDEST_CUTOFF, lists_for, render, splat_values, to_tensor
-from eigengs_dr.rendering import splat as splat_operation
-from eigengs_dr.tiles import TILE
+from eigengs_dr.gaussian.gaussians import concatenate
+from eigengs_dr.image.color import rgb_to_ycbcr, ycbcr_to_rgb
+from eigengs_dr.raster.reference import render_exact, render_plain
+from eigengs_dr.raster.render import (
+    CUTOFF,
+    MAX_CUTOFF,
+    bin_gaussians,
+    kernel_parameters,
+    render,
+    to_tensor,
+)
+from eigengs_dr.raster.render import rasterize as splat_operation
+from eigengs_dr.raster.tiles import TILE
 
 SMOOTH = 6.0
 """A cutoff whose edge, exp(-18), is below rounding: invariants hold at every pixel."""
@@ -108,7 +115,9 @@ def test_figures_of_the_cutoff():
 
 def plain(gaussians, cutoff=CUTOFF):
     values = [*gaussians.mean, *gaussians.factor, *gaussians.color]
-    image = render_plain(values, list(gaussians.background), lists_for(gaussians, cutoff), cutoff)
+    image = render_plain(
+        values, list(gaussians.background), bin_gaussians(gaussians, cutoff), cutoff
+    )
     return image.numpy().reshape(gaussians.height, gaussians.width, gaussians.channels)
 
 
@@ -186,7 +195,7 @@ def test_cutoff_that_is_an_integer(backend):
 
 def test_widest_cutoff(backend):
     scene = random_scene(5)
-    image = render(scene.on(backend), cutoff=WIDEST_CUTOFF).numpy()
+    image = render(scene.on(backend), cutoff=MAX_CUTOFF).numpy()
     assert (np.abs(image - scene.exact()) <= bound(scene, 1e-5)).all()
 
 
@@ -414,8 +423,8 @@ def test_linear_in_colour(backend, scene, other, scale):
 
 def test_operation_behind_render(backend):
     gaussians = random_scene(16).on(backend, space="ycbcr")
-    values, background = splat_values(gaussians)
-    lists = lists_for(gaussians)
+    values, background = kernel_parameters(gaussians)
+    lists = bin_gaussians(gaussians)
     image = to_tensor(splat_operation(values, background, lists), lists.grid, 3)
     np.testing.assert_array_equal(image, render(gaussians))
 
@@ -423,8 +432,8 @@ def test_operation_behind_render(backend):
 def test_padded_lists_make_the_same_picture(backend):
     scene = random_scene(17)
     gaussians = scene.on(backend)
-    values, background = splat_values(gaussians)
-    lists = lists_for(gaussians, CUTOFF, 2.0)
+    values, background = kernel_parameters(gaussians)
+    lists = bin_gaussians(gaussians, CUTOFF, 2.0)
     image = to_tensor(splat_operation(values, background, lists), lists.grid, 3).numpy()
     assert (np.abs(image - render(gaussians).numpy()) <= bound(scene, 1e-5))[
         scene.off_edge(CUTOFF)
@@ -433,7 +442,7 @@ def test_padded_lists_make_the_same_picture(backend):
 
 def test_lists_are_for_the_native_size(backend):
     scene = random_scene(18)
-    lists = lists_for(scene.on(backend))
+    lists = bin_gaussians(scene.on(backend))
     assert (lists.grid.width, lists.grid.height) == SIZE
     inside = (distances(scene.mean, scene.factor, SIZE) < CUTOFF * 0.999).any(axis=(1, 2))
     assert int((lists.end - lists.begin).numpy().sum()) >= inside.sum()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eigengs_dr.resampling import cropped, resampled
+from eigengs_dr.image.resize import center_crop, resample
 
 sizes = st.tuples(st.integers(1, 40), st.integers(1, 40))
 
@@ -14,7 +14,7 @@ sizes = st.tuples(st.integers(1, 40), st.integers(1, 40))
 @given(start=sizes, end=sizes, value=st.floats(-0.5, 1.5, width=32), channels=st.integers(1, 4))
 def test_resampling_keeps_constants(start, end, value, channels):
     image = np.full((*start, channels), value, np.float32)
-    for result in (resampled(image, *end), cropped(image, *end)):
+    for result in (resample(image, *end), center_crop(image, *end)):
         assert result.dtype == np.float32 and result.shape == (end[1], end[0], channels)
         np.testing.assert_allclose(result, image[0, 0, 0], atol=1e-6)
 
@@ -22,7 +22,7 @@ def test_resampling_keeps_constants(start, end, value, channels):
 @given(size=sizes)
 def test_the_same_size_is_an_exact_copy(size):
     image = np.random.default_rng(0).normal(size=(*size, 3)).astype(np.float32)
-    for result in (resampled(image, *size[::-1]), cropped(image, *size[::-1])):
+    for result in (resample(image, *size[::-1]), center_crop(image, *size[::-1])):
         np.testing.assert_array_equal(result, image)
         assert not np.shares_memory(result, image)
 
@@ -31,34 +31,34 @@ def test_resampling_keeps_the_mean_and_filters_what_aliases():
     rng = np.random.default_rng(0)
     image = np.pad(rng.random((32, 48, 3)).astype(np.float32), [(16, 16), (16, 16), (0, 0)])
     for size in ((40, 32), (20, 16), (100, 90), (13, 64)):
-        result = resampled(image, *size)
+        result = resample(image, *size)
         np.testing.assert_allclose(result.mean(axis=(0, 1)), image.mean(axis=(0, 1)), rtol=5e-3)
     stripes = np.tile([0, 1], (64, 32))[..., None].astype(np.float32)
-    np.testing.assert_allclose(resampled(stripes, 16, 16)[2:-2, 2:-2], 0.5, atol=1e-3)
+    np.testing.assert_allclose(resample(stripes, 16, 16)[2:-2, 2:-2], 0.5, atol=1e-3)
 
 
 def test_resampling_knows_rows_from_columns_and_channels_apart():
     ramp = np.linspace(0, 1, 30, dtype=np.float32)
     image = np.stack(np.meshgrid(ramp, ramp[:20]), axis=2)
-    result = resampled(image, 60, 10)
+    result = resample(image, 60, 10)
     assert np.ptp(result[:, 20, 0]) < 1e-5 and np.ptp(result[5, :, 1]) < 1e-5
     assert (np.diff(result[5, :, 0]) > 0).all() and (np.diff(result[:, 5, 1]) > 0).all()
 
 
 def test_cropping_takes_the_centre_undistorted():
     image = np.random.default_rng(0).random((20, 31, 2)).astype(np.float32)
-    part = resampled(image[:, 5:25], 10, 10)  # whose filters see nothing beyond its edges
-    inside = cropped(image[:, :30], 10, 10)[:, 2:-2]
+    part = resample(image[:, 5:25], 10, 10)  # whose filters see nothing beyond its edges
+    inside = center_crop(image[:, :30], 10, 10)[:, 2:-2]
     np.testing.assert_allclose(inside, part[:, 2:-2], atol=1e-6)
-    turned = cropped(image.transpose(1, 0, 2), 7, 9)
-    np.testing.assert_allclose(cropped(image, 9, 7).transpose(1, 0, 2), turned, atol=1e-6)
+    turned = center_crop(image.transpose(1, 0, 2), 7, 9)
+    np.testing.assert_allclose(center_crop(image, 9, 7).transpose(1, 0, 2), turned, atol=1e-6)
     # An odd rest is cut off in halves of a pixel: mirroring changes nothing.
     np.testing.assert_allclose(
-        cropped(image[:, ::-1], 10, 10)[:, ::-1], cropped(image, 10, 10), atol=1e-5
+        center_crop(image[:, ::-1], 10, 10)[:, ::-1], center_crop(image, 10, 10), atol=1e-5
     )
 
 
-@pytest.mark.parametrize("resize", [resampled, cropped])
+@pytest.mark.parametrize("resize", [resample, center_crop])
 @pytest.mark.parametrize("size", [(0, 4), (4, -1)])
 def test_sizes_without_pixels_are_refused(resize, size):
     with pytest.raises(ValueError, match=r"^size is [^\n]*; both sides must be at least 1 pixel$"):

@@ -13,8 +13,8 @@ from click.testing import CliRunner
 from eigengs_dr.bench import results
 from eigengs_dr.bench.charts import new_figure, save_figure
 from eigengs_dr.bench.tables import Method
-from eigengs_dr.cli import main
-from eigengs_dr.images import save_image
+from eigengs_dr.cli.main import main
+from eigengs_dr.image.io import save_image
 
 VERSIONS = {"drjit": "1.5.0", "libllvm": "19.1.7", "libllvm_path": "/usr/lib/x.so"}
 RUN = {"cpu": "a CPU", "threads": 2, "backend": "llvm", "versions": VERSIONS}

@@ -14,11 +14,11 @@ from test_resolution import NAME, albedo, bitmap, board, camera, scene_of  # noq
 from test_resolution import variant as variant  # noqa: E402
 
 import eigengs_dr as eg  # noqa: E402
-from eigengs_dr import scenefit  # noqa: E402
-from eigengs_dr.color import to_coded, to_linear  # noqa: E402
+from eigengs_dr.image.color import to_coded, to_linear  # noqa: E402
 from eigengs_dr.plugins import texture_of  # noqa: E402
-from eigengs_dr.resolution import Resolution  # noqa: E402
-from eigengs_dr.smoothest import _blur_by, filled, smoothest  # noqa: E402
+from eigengs_dr.scene import fit_scene as scenefit  # noqa: E402
+from eigengs_dr.scene.back_projection import _blur_by, back_project, extrapolate  # noqa: E402
+from eigengs_dr.scene.visibility import Visibility  # noqa: E402
 
 BOUND, STEPS = 33.0, 30
 
@@ -44,7 +44,7 @@ class TestTarget:
         values = generator.uniform(0.2, 0.8, (20, 13, 3)).astype(np.float32)
         seen = generator.uniform(size=(20, 13)) >= hidden
         seen[3, 4] = True
-        found = filled(np.where(seen[..., None], values, np.float32(1e6)), seen)
+        found = extrapolate(np.where(seen[..., None], values, np.float32(1e6)), seen)
         np.testing.assert_array_equal(found[seen], values[seen])
         low, high = values[seen].min(axis=0), values[seen].max(axis=0)
         assert (found >= low - 1e-3).all() and (found <= high + 1e-3).all()
@@ -53,7 +53,7 @@ class TestTarget:
         values = photo(64)
         seen = np.zeros((64, 64), bool)
         seen[:, :20] = True
-        bend = np.abs(laplace(filled(values, seen).mean(axis=2)))
+        bend = np.abs(laplace(extrapolate(values, seen).mean(axis=2)))
         assert bend[:, 24:].max() < 0.05 < np.abs(laplace(values.mean(axis=2)))[:, 24:].max()
 
     def test_an_even_blur_is_gaussian(self):
@@ -74,8 +74,8 @@ class TestTarget:
     def test_cameras_take_it_for_the_image(self):
         image = photo()
         rows = blocks(48, 6)
-        found = Resolution(np.full((48, 48), 2.4, np.float32), [rows])
-        target = smoothest(image, found, 1.0)
+        found = Visibility(np.full((48, 48), 2.4, np.float32), [rows])
+        target = back_project(image, found, 1.0)
         blurred = gaussian_filter(image, (2.4, 2.4, 0), mode="nearest")
 
         def missed(t):
@@ -89,7 +89,7 @@ class TestTarget:
         assert target.min() >= 0 and target.max() <= 1
 
     def test_is_the_smoothest_that_is_close_enough(self):
-        image, found = photo(), Resolution(np.full((48, 48), 2.4, np.float32), [blocks(48, 6)])
+        image, found = photo(), Visibility(np.full((48, 48), 2.4, np.float32), [blocks(48, 6)])
         asked = []
 
         def is_close(target, after):
@@ -113,7 +113,7 @@ class TestTarget:
         footprint = np.full((side, side), 0.4, np.float32)
         footprint[30:] = np.inf
         grey = np.full((side, side, 3), 0.5, np.float32)
-        weight = scenefit._weights(Resolution(footprint, [rows]), grey, "data")
+        weight = scenefit._weights(Visibility(footprint, [rows]), grey, "data")
         assert (weight[30:] == 0).all() and weight.shape == grey.shape
         np.testing.assert_allclose(weight[10, 35] / weight[10, 5], 2, rtol=1e-3)
 
@@ -122,10 +122,10 @@ class TestTarget:
         seen[:, :10] = True
         mean = np.array([[5, 5], [12, 5], [20, 5], [20, 5], [60, 5]], float)
         factor = np.array([[1, 0, 1], [1, 0, 1], [1, 0, 1], [0.2, 0.1, 1], [1, 0, 1]])
-        kept = scenefit._touching(mean, factor, seen)
+        kept = scenefit._reaches_seen(mean, factor, seen)
         np.testing.assert_array_equal(kept, [True, True, False, True, False])
         np.testing.assert_array_equal(
-            scenefit._touching(mean[[2, 4]], factor[[2, 4]], seen), [1, 0]
+            scenefit._reaches_seen(mean[[2, 4]], factor[[2, 4]], seen), [1, 0]
         )
 
 
@@ -135,7 +135,7 @@ class TestSearch:
         def attempt(count):
             return range(count), (50.0, 30.0 + (count >= threshold))
 
-        best, reached, tried = scenefit._fewest(attempt, 31.0, start, 8000)
+        best, reached, tried = scenefit._search_count(attempt, 31.0, start, 8000)
         assert reached == (50.0, 31.0)
         assert threshold <= len(best) <= max(threshold * scenefit.CLOSE, threshold)
         counts = [count for count, _ in tried]
@@ -143,7 +143,7 @@ class TestSearch:
 
     def test_the_most_may_be_too_few(self):
         with pytest.raises(ValueError, match=r"^70 Gaussians reach 20\.0 dB where .* see 31;"):
-            scenefit._fewest(lambda count: (range(count), (20.0, 40.0)), 31.0, 3, 70)
+            scenefit._search_count(lambda count: (range(count), (20.0, 40.0)), 31.0, 3, 70)
 
 
 def seen_by_a_renderer(found, scene, place, image):
@@ -202,7 +202,7 @@ class TestFit:
             scene_of(camera([0, 0, 5.0])), NAME, data, psnr=BOUND, color="data", iterations=STEPS
         )
         assert found.gaussians.space == "data" and found.gaussians.channels == 1
-        rows = found.resolution.lookups[0]
+        rows = found.resolution.pixel_to_texel[0]
         shown = (rows @ p.reshape(-1, 1) for p in (eg.render(found.gaussians).numpy(), data))
         assert eg.psnr(*(s[:, None] for s in shown), space="data") > BOUND - 0.5
 

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
 
 import eigengs_dr as eg  # noqa: E402
-from eigengs_dr.cli import main  # noqa: E402
+from eigengs_dr.cli.main import main  # noqa: E402
 
 SCENES = Path(__file__).parent.parent / "scenes"
 SMALL = ["-D", "resolution=32", "--spp", "16", "--variant", "llvm_ad_rgb", "--quiet"]
@@ -210,7 +210,7 @@ def test_several_scenes_into_a_folder(scene, tmp_path):
 
 
 def test_passes_make_one_picture(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("eigengs_dr.cli_scene.SAMPLES_A_PASS", 8 * 6 * 2)
+    monkeypatch.setattr("eigengs_dr.cli.scene.SAMPLES_PER_PASS", 8 * 6 * 2)
     result = run(scene(), "-o", tmp_path / "x.exr", "--spp", 5)
     assert "samples a pixel: 5" in result.stdout
     assert np.allclose(mi.Bitmap(str(tmp_path / "x.exr")), 0.5)

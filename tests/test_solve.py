@@ -10,8 +10,8 @@ from drjit import JitFlag
 from hypothesis import given
 from scenes import COUNT, SIZE, Scene, few, random_scene, scene_of, scenes
 
-from eigengs_dr.rendering import CUTOFF, render
-from eigengs_dr.solve import solve
+from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.raster.render import CUTOFF, render
 
 ROOMY = 12
 """Splats that overlap little: few steps converge."""

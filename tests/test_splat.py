@@ -6,22 +6,14 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from eigengs_dr.arrays import _types, types_in, types_of
-from eigengs_dr.backend import select
-from eigengs_dr.splat import (
-    UNIT,
-    exp2_neg,
-    falloff,
-    gather_run,
-    pack,
-    unpack,
-    weights,
-    weights_pullback,
-)
+from eigengs_dr.backend.arrays import _types, types_in, types_of
+from eigengs_dr.backend.selection import select
+from eigengs_dr.raster.evaluate import EXP2_SCALE, exp2_neg, falloff, weights, weights_vjp
+from eigengs_dr.raster.layout import gather_run, pack_parameters, unpack_parameters
 
 TILE = (4, 3)
 CUTOFF = 3.0
-LIMIT = (UNIT * CUTOFF) ** 2
+LIMIT = (EXP2_SCALE * CUTOFF) ** 2
 COUNT = 256
 
 
@@ -58,8 +50,8 @@ def upload(types, *arrays):
 
 
 def scaled(types, shape):
-    """Parameters as kernels take them: the factor in units of `UNIT`."""
-    return [v * UNIT if k > 1 else v for k, v in enumerate(upload(types, *shape))]
+    """Parameters as kernels take them: the factor in units of `EXP2_SCALE`."""
+    return [v * EXP2_SCALE if k > 1 else v for k, v in enumerate(upload(types, *shape))]
 
 
 # --- 2^-q --------------------------------------------------------------------------------------
@@ -159,7 +151,7 @@ def test_pullback_is_the_derivative_of_weights(types):
     rng = np.random.default_rng(1)
     upstream = upload(types, *rng.normal(size=(TILE[0] * TILE[1], COUNT)))
     parameters, x, y = scaled(types, shape), *upload(types, x, y)
-    by_hand = weights_pullback(parameters, x, y, TILE, LIMIT, pull_with(upstream))
+    by_hand = weights_vjp(parameters, x, y, TILE, LIMIT, pull_with(upstream))
     dr.enable_grad(parameters)
     total = sum(
         g * w for g, w in zip(upstream, weights(parameters, x, y, TILE, LIMIT), strict=True)
@@ -174,11 +166,11 @@ def test_pullback_is_the_derivative_of_weights(types):
 def test_pullback_against_finite_differences(types):
     shape, x, y = draw()
     everywhere = 100.0  # a limit beyond all points, so that no step crosses the edge
-    keep = squared_distance(shape, x, y).max(axis=0) * UNIT**2 < everywhere
+    keep = squared_distance(shape, x, y).max(axis=0) * EXP2_SCALE**2 < everywhere
     shape, x, y = shape[:, keep], x[keep], y[keep]
     assert keep.sum() > COUNT / 4
     upstream = np.random.default_rng(1).normal(size=(TILE[0] * TILE[1], keep.sum()))
-    found = weights_pullback(
+    found = weights_vjp(
         scaled(types, shape),
         *upload(types, x, y),
         TILE,
@@ -194,7 +186,7 @@ def test_pullback_against_finite_differences(types):
             for s in (1, -1)
         )
         exact = (up - down) / (2 * step)
-        ours = derivative.numpy() * (UNIT if k > 1 else 1)
+        ours = derivative.numpy() * (EXP2_SCALE if k > 1 else 1)
         scale = np.abs(exact).max()
         np.testing.assert_allclose(
             ours, exact, rtol=1e-4, atol=precision(types, 1e-5, 1e-7) * scale
@@ -210,7 +202,7 @@ def test_pullback_asks_with_the_weights(types):
         asked[k] = w
         return types.Float(0)
 
-    gradient = weights_pullback(parameters, x, y, TILE, LIMIT, pull)
+    gradient = weights_vjp(parameters, x, y, TILE, LIMIT, pull)
     assert not any(g.numpy().any() for g in gradient)
     expected = weights(parameters, x, y, TILE, LIMIT)
     assert sorted(asked) == list(range(len(expected)))
@@ -224,17 +216,17 @@ def test_pullback_asks_with_the_weights(types):
 @pytest.mark.parametrize("number", [1, 4, 6, 7, 8, 9])
 def test_unpack_returns_what_pack_stored(types, number):
     values = np.random.default_rng(0).normal(size=(number, 50)).astype(np.float32)
-    packed = pack(upload(types, *values))
+    packed = pack_parameters(upload(types, *values))
     assert dr.width(packed) % 4 == 0
     index = np.array([49, 0, 7, 7, 30])
-    found = unpack(packed, types.UInt(index), number)
+    found = unpack_parameters(packed, types.UInt(index), number)
     assert len(found) == number
     np.testing.assert_array_equal([v.numpy() for v in found], values[:, index])
 
 
 def test_pack_repeats_values_that_all_splats_share(types):
-    packed = pack([types.Float([1, 2, 3]), types.Float(7)])
-    found = unpack(packed, dr.arange(types.UInt, 3), 2)
+    packed = pack_parameters([types.Float([1, 2, 3]), types.Float(7)])
+    found = unpack_parameters(packed, dr.arange(types.UInt, 3), 2)
     np.testing.assert_array_equal(found[1].numpy(), [7, 7, 7])
 
 

@@ -11,13 +11,13 @@ import eigengs_dr as eg
 from eigengs_dr.bench import stability, tiling
 from eigengs_dr.bench.cases import CASES, Case, flat, heap, needles, outside, photo, subpixel
 from eigengs_dr.bench.rows import read
+from eigengs_dr.cli.console import Program
 from eigengs_dr.cli_stability import NAMES
 from eigengs_dr.cli_stability import stability as command
-from eigengs_dr.console import Program
-from eigengs_dr.gaussians import NARROWEST
-from eigengs_dr.place import inverse_factor
-from eigengs_dr.presets import PRESETS
-from eigengs_dr.refine import EXACT
+from eigengs_dr.fitting.placement.random import inverse_factor
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.refine import MAX_PSNR
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
 
 
 @click.group(cls=Program)
@@ -76,7 +76,7 @@ def test_hard_starts_are_what_they_are_called():
     image, generator = np.zeros((20, 40, 3), np.float32), np.random.default_rng(0)
     mean, factor = needles(image, 50, generator)
     assert stability.condition(factor) == pytest.approx(1e4)
-    assert (1 / subpixel(image, 50, generator)[1][:, 0] < NARROWEST).all()
+    assert (1 / subpixel(image, 50, generator)[1][:, 0] < MIN_DEVIATION).all()
     assert len(np.unique(heap(image, 50, generator)[0], axis=0)) == 1
     mean, factor = outside(image, 50, generator)
     assert mean.shape == (50, 2) and factor.shape == (50, 3)
@@ -119,8 +119,8 @@ def test_a_cell_tells_what_the_moments_say(backend):
 def test_exact_pictures_do_not_drop(backend):
     case = Case("constant", partial(flat, 0.2, 0.5, 0.7), 20, 3)
     found = stability.measured(case, "default", 0, backend)
-    assert found["start_ycbcr"] == EXACT
-    assert found["drop_ycbcr"] == EXACT - found["end_ycbcr"]
+    assert found["start_ycbcr"] == MAX_PSNR
+    assert found["drop_ycbcr"] == MAX_PSNR - found["end_ycbcr"]
 
 
 def test_rates_are_multiplied(backend):
@@ -140,7 +140,7 @@ def test_given_shapes_are_brought_inside_their_bounds(backend, place):
     [start] = stability.moments(case, case.image(), "default", 0, backend)
     arrays = start.gaussians.to_arrays()
     assert (arrays["mean"] >= 0).all() and (arrays["mean"] <= [24, 16]).all()
-    assert arrays["factor"].max() <= 1 / NARROWEST
+    assert arrays["factor"].max() <= 1 / MIN_DEVIATION
 
 
 @pytest.mark.parametrize("preset", ["default", "eigengs"])
@@ -202,7 +202,7 @@ def test_defects_are_named():
 
 def test_tables_show_presets_side_by_side():
     rows = [
-        row(end_rgb=EXACT, half_rgb=90.0, seconds=1.0, peak_gib=2.5, drop_ycbcr=0.0),
+        row(end_rgb=MAX_PSNR, half_rgb=90.0, seconds=1.0, peak_gib=2.5, drop_ycbcr=0.0),
         row("eigengs", finite=False),
         row("eigengs", case="other", condition=123456.7),
         {"job": {"case": "thin", "preset": "default", "iterations": 2000}, "needs": "a basis"},

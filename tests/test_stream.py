@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import eigengs_dr.stream as stream
-from eigengs_dr.color import rgb_to_ycbcr
-from eigengs_dr.images import ImageError, check_image, image_files, load_image, save_image
-from eigengs_dr.resampling import cropped
-from eigengs_dr.stream import batches, checked_size, to_planes
+import eigengs_dr.image.folder as stream
+from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.image.folder import check_size, image_files, read_blocks, to_planes
+from eigengs_dr.image.io import ImageError, check_image, load_image, save_image
+from eigengs_dr.image.resize import center_crop
 
 WIDTH, HEIGHT = SIZE = (6, 5)
 
@@ -32,7 +32,7 @@ def planes(images, space="rgb"):
 
 
 def read(source, size=SIZE, space="rgb", length=4, **options):
-    return [block.copy() for block in batches(source, size, space, length, **options)]
+    return [block.copy() for block in read_blocks(source, size, space, length, **options)]
 
 
 def decoders():
@@ -131,7 +131,7 @@ def test_few_images_wait_in_memory(tmp_path, monkeypatch):
     files = image_files(write(tmp_path, pictures(40)))
     monkeypatch.setattr(stream, "AHEAD", 5)
     monkeypatch.setattr(stream, "load_image", lambda path: started.append(path) or load_image(path))
-    blocks = batches(files, SIZE, "rgb", 2)
+    blocks = read_blocks(files, SIZE, "rgb", 2)
     for taken in range(2, 13, 2):
         next(blocks)
         assert len(started) <= taken + 5
@@ -159,7 +159,7 @@ def test_other_sizes_are_cropped_and_said_once():
     assert [str(w.message) for w in caught] == [
         "3 of 6 images were centre-cropped and resized to 6x5"
     ]
-    expected = [cropped(check_image(image), WIDTH, HEIGHT) for image in images]
+    expected = [center_crop(check_image(image), WIDTH, HEIGHT) for image in images]
     np.testing.assert_array_equal(np.concatenate(blocks), planes(expected))
 
 
@@ -184,7 +184,7 @@ def test_files_that_cannot_be_read_are_named_and_skipped(tmp_path):
 def test_a_folder_is_listed_once(tmp_path):
     images = pictures(6)
     write(tmp_path, images[:5])
-    blocks = batches(tmp_path, SIZE, "rgb", 2)
+    blocks = read_blocks(tmp_path, SIZE, "rgb", 2)
     save_image(tmp_path / "100.png", images[5])
     assert sum(len(block) for block in blocks) == 5
 
@@ -207,9 +207,9 @@ def test_nothing_at_all_is_an_error(source):
 
 def test_folders_without_images(tmp_path):
     with pytest.raises(ImageError, match="holds no images"):
-        batches(tmp_path, SIZE, "rgb", 2)
+        read_blocks(tmp_path, SIZE, "rgb", 2)
     with pytest.raises(ImageError, match="No such file"):
-        batches(tmp_path / "nowhere", SIZE, "rgb", 2)
+        read_blocks(tmp_path / "nowhere", SIZE, "rgb", 2)
 
 
 @pytest.mark.parametrize(
@@ -233,16 +233,16 @@ def test_arrays_that_are_no_images(source, complaint):
 @pytest.mark.parametrize("size", [(0, 4), (4, -1), 4, (4,), (4, 4, 3), (4.5, 4), "ab", None])
 def test_bad_sizes(size):
     with pytest.raises(ValueError, match="size is") as error:
-        batches(pictures(1), size, "rgb", 1)
+        read_blocks(pictures(1), size, "rgb", 1)
     one_line(error)
-    assert checked_size(np.array([3, 2])) == (3, 2)
+    assert check_size(np.array([3, 2])) == (3, 2)
 
 
 def test_bad_space_and_length():
     with pytest.raises(ValueError, match="'linear' is unknown; use one of ycbcr, rgb"):
-        batches(pictures(1), SIZE, "linear", 1)
+        read_blocks(pictures(1), SIZE, "linear", 1)
     with pytest.raises(ValueError, match="length is 0; a block needs"):
-        batches(pictures(1), SIZE, "rgb", 0)
+        read_blocks(pictures(1), SIZE, "rgb", 0)
 
 
 # ---------------------------------------------------------------- leaving early
@@ -250,7 +250,7 @@ def test_bad_space_and_length():
 
 def test_no_thread_outlives_the_stream(tmp_path):
     write(tmp_path, pictures(30))
-    blocks = batches(tmp_path, SIZE, "rgb", 2)
+    blocks = read_blocks(tmp_path, SIZE, "rgb", 2)
     next(blocks)
     assert decoders()
     blocks.close()

@@ -10,13 +10,13 @@ from scenes import family, small_model
 from eigengs_dr import cli_tables
 from eigengs_dr.bench import losses, rows, sets, summary, tables, trial
 from eigengs_dr.bench.table import Table, as_text, mean, median, number, spread
-from eigengs_dr.cli import main
-from eigengs_dr.fitting import fit
-from eigengs_dr.images import ImageError, save_image
-from eigengs_dr.metrics import psnr
-from eigengs_dr.presets import PRESETS
-from eigengs_dr.rendering import picture_of
-from eigengs_dr.starting import begin
+from eigengs_dr.cli.main import main
+from eigengs_dr.fitting.fit import fit
+from eigengs_dr.fitting.initializers import initialize
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.image.io import ImageError, save_image
+from eigengs_dr.image.metrics import psnr
+from eigengs_dr.raster.render import picture_of
 
 RUN = {"command": "eigengs-dr bench tables", "cpu": "a CPU"}
 
@@ -56,7 +56,7 @@ def test_a_trial_sees_what_fit_sees(backend, preset):
     method = PRESETS[preset]
     moments = list(
         trial.follow(
-            lambda: begin(image, 100, method=method, backend=backend, **settings),
+            lambda: initialize(image, 100, method=method, backend=backend, **settings),
             method.schedule,
             20,
             {0, 10, 20},
@@ -65,7 +65,7 @@ def test_a_trial_sees_what_fit_sees(backend, preset):
     trace = fit(image, 100, 20, preset=preset, backend=backend, **settings).trace
     assert [m.iteration for m in moments] == [row["iteration"] for row in trace] == [0, 10, 20]
     for moment, row in zip(moments, trace, strict=True):
-        judged = trial.judged(moment, image)
+        judged = trial.score(moment, image)
         assert judged["psnr_rgb"] == row["psnr_rgb"]
         assert judged["psnr_ycbcr"] == row["psnr_ycbcr"]
         assert judged["ms_ssim"] <= 1
@@ -81,7 +81,7 @@ def test_the_clock_starts_before_the_start_and_stops_for_the_observer(backend, m
     def start():
         for _ in range(50):
             next(ticks)
-        return begin(image, 30, "grid", "", PRESETS["default"], backend=backend)
+        return initialize(image, 30, "grid", "", PRESETS["default"], backend=backend)
 
     seconds = []
     for moment in trial.follow(start, PRESETS["default"].schedule, 2, {0, 1, 2}):
@@ -245,7 +245,7 @@ def test_a_goal_above_the_start_is_reached_by_descent(backend):
     image = family(1)[0]
 
     def start(depth):
-        return begin(image, 60, "grid", "", PRESETS["default"], depth, backend=backend)
+        return initialize(image, 60, "grid", "", PRESETS["default"], depth, backend=backend)
 
     reached = psnr(picture_of(start(10).gaussians), image, "ycbcr")
     goal = {"psnr_ycbcr": reached + 3, "seconds": 2.0}
@@ -260,7 +260,9 @@ def test_a_goal_above_the_start_is_reached_by_descent(backend):
 def test_programs_are_compiled_for_splats_placed_anew_where_a_run_places_them(
     backend, iterations, anew
 ):
-    placed = begin(family(1, seed=3)[0], 10, "auto", "natural", PRESETS["default"], backend=backend)
+    placed = initialize(
+        family(1, seed=3)[0], 10, "auto", "natural", PRESETS["default"], backend=backend
+    )
     counts = []
 
     def rearrange(gaussians, count):
@@ -268,7 +270,7 @@ def test_programs_are_compiled_for_splats_placed_anew_where_a_run_places_them(
         return gaussians
 
     def start():
-        return placed._replace(rearrange=rearrange)
+        return placed._replace(redistribute=rearrange)
 
     trial.warm_up(start, PRESETS["default"].schedule, iterations)
     assert counts == anew

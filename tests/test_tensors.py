@@ -6,7 +6,7 @@ import pytest
 from scenes import random_scene
 
 import eigengs_dr as eg
-from eigengs_dr.arrays import types_of
+from eigengs_dr.backend.arrays import types_of
 
 NAMES = ["mean", "factor", "color", "background"]
 

@@ -11,9 +11,9 @@ from scenes import COUNT, SIZE, random_scene
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 
 import eigengs_dr as eg  # noqa: E402
-from eigengs_dr.color import to_linear  # noqa: E402
+from eigengs_dr.image.color import to_linear  # noqa: E402
 from eigengs_dr.plugins import texture_of  # noqa: E402
-from eigengs_dr.rendering import picture_of  # noqa: E402
+from eigengs_dr.raster.render import picture_of  # noqa: E402
 
 VARIANTS = ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral"]
 

@@ -11,7 +11,7 @@ from test_texture import at, gaussians, picture, small_scene, texel_centres, tex
 from test_texture import variant as variant  # noqa: E402
 
 import eigengs_dr as eg  # noqa: E402
-from eigengs_dr.gaussians import NARROWEST  # noqa: E402
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION  # noqa: E402
 from eigengs_dr.plugins import gaussians_of, keep_in_bounds, texture_of  # noqa: E402
 
 PARAMETERS = ["mean", "factor", "color", "background"]
@@ -186,7 +186,7 @@ class TestBroken:
         optimizer["t.factor"] = mi.TensorXf(np.float32([[1, 2, 3], [np.nan, 99, -1], [1, 0, 1]]))
         optimizer["t.color"] = mi.TensorXf(np.float32([[1, 2, 3], [np.nan, 99, -1], [1, 0, 1]]))
         keep_in_bounds(optimizer, "t", gaussians())
-        high, low = 1 / NARROWEST, 1 / (2 * max(SIZE))
+        high, low = 1 / MIN_DEVIATION, 1 / (2 * max(SIZE))
         np.testing.assert_allclose(
             np.array(optimizer["t.mean"]), [[1, 2], [SIZE[0] / 2, SIZE[1]], [0, 4]]
         )

@@ -12,9 +12,9 @@ mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 from test_texture import at, gaussians, texture  # noqa: E402
 from test_texture import variant as variant  # noqa: E402
 
-from eigengs_dr.footprints import WIDEST, bounded_covariance  # noqa: E402
 from eigengs_dr.plugins import pixel_angle, texture_of  # noqa: E402
 from eigengs_dr.plugins.cone import PIXEL, metric  # noqa: E402
+from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, bound_covariance  # noqa: E402
 
 
 def plane(tex, tiles=60, side=48):
@@ -51,7 +51,7 @@ def plane(tex, tiles=60, side=48):
 def seen(si, angle, inverse=(1.0, 0.0, 0.0, 1.0)):
     """Standard deviations along u and v of the footprint of a surface interaction."""
     rows, valid = metric(si, inverse, angle)
-    covariance, blind = bounded_covariance(rows)
+    covariance, blind = bound_covariance(rows)
     return np.sqrt([np.array(covariance[0]), np.array(covariance[2])]), valid, blind
 
 
@@ -94,7 +94,7 @@ class TestCone:
     def test_at_grazing_angles_it_stays_bounded(self):
         width, valid, _ = seen(facing(np.pi / 2 - 1e-6), 0.001)
         assert valid == [True]
-        assert width[1] == pytest.approx(WIDEST, rel=1e-3)
+        assert width[1] == pytest.approx(MAX_FOOTPRINT, rel=1e-3)
 
     @pytest.mark.parametrize("change", ["no uv", "a line", "no distance", "infinite", "nan"])
     def test_without_a_jacobian_there_is_none(self, change):

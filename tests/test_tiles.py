@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from scenes import COUNT, SIZE, covariances, distances, factors_of, few, random_scene, scenes
 
-from eigengs_dr.arrays import types_in
-from eigengs_dr.backend import select
-from eigengs_dr.tiles import TILE, Grid, build_lists, walk
+from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.selection import select
+from eigengs_dr.raster.tiles import TILE, Grid, build_lists, for_each_tile
 
 RADIUS = 3.0
 GRID = Grid(*SIZE)
@@ -232,7 +232,7 @@ def test_the_walk_visits_the_lists(backend):
         dr.scatter_add(visits, types.UInt(1), owner * GRID.tiles + types.UInt(tile), active)
         return state + dr.select(active, types.UInt(column + row * GRID.nx) - types.UInt(tile), 0)
 
-    wrong = walk(shape, RADIUS, GRID, visit, dr.zeros(types.UInt, COUNT), label="test")
+    wrong = for_each_tile(shape, RADIUS, GRID, visit, dr.zeros(types.UInt, COUNT), label="test")
     dr.eval(wrong, visits)
     assert not wrong.numpy().any()
     expected = membership(lists_of(backend, scene.mean, scene.factor)).reshape(-1)

@@ -12,12 +12,12 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from eigengs_dr import training
-from eigengs_dr.eigengs import EigenGS
-from eigengs_dr.images import ImageError, load_image
-from eigengs_dr.metrics import psnr
-from eigengs_dr.rendering import render
-from eigengs_dr.training import Interrupted, Settings, train
+from eigengs_dr.eigenbasis import training
+from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.eigenbasis.training import Interrupted, TrainOptions, train
+from eigengs_dr.image.io import ImageError, load_image
+from eigengs_dr.image.metrics import psnr
+from eigengs_dr.raster.render import render
 
 SMALL = {"size": (32, 32), "components": 6, "gaussians": 60}
 
@@ -62,7 +62,7 @@ def in_pieces(monkeypatch):
 
 
 def settings(**changed):
-    return Settings(**{**SMALL, **changed})
+    return TrainOptions(**{**SMALL, **changed})
 
 
 def checkpoint_of(output):
@@ -181,7 +181,7 @@ def test_killed_by_the_system(folder, output, tmp_path, in_pieces):
     train(folder, tmp_path / "whole.npz", settings(steps=40))
     script = f"""
 import os, signal
-from eigengs_dr import training
+from eigengs_dr.eigenbasis import training
 training.block_length, training.SAVE_SECONDS = lambda size: 5, 0
 seen = []
 def progress(stage, done, total):

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..descent import LONG
-from ..fitting import fit, most_gaussians
-from ..presets import PRESETS
-from ..starting import GAUSSIANS, Start, begin
+from ..fitting.fit import fit, max_gaussians_for
+from ..fitting.initializers import DEFAULT_COUNT, FitProblem, initialize
+from ..fitting.optimizers.schedule import MIN_PHASE_RATIO
+from ..fitting.presets import PRESETS
 from . import rows
 from .rate import images_of
 from .rows import Row
@@ -67,7 +67,7 @@ def run(
     images : int
         How many of a set, at most.
     iterations : int
-        Steps of every fit, and what the search is told; with fewer than `LONG` times
+        Steps of every fit, and what the search is told; with fewer than `MIN_PHASE_RATIO` times
         `Schedule.rearrange`, no fit places its splats anew.
     targets : sequence of float
         Decibels of psnr_ycbcr.
@@ -98,7 +98,7 @@ def run(
     found: list[Row] = []
     for name in names:
         pictures = images_of(data, name, images)
-        usual = gaussians or (SETS[name].gaussians if name in SETS else GAUSSIANS)
+        usual = gaussians or (SETS[name].gaussians if name in SETS else DEFAULT_COUNT)
         total = len(pictures) * (3 * len(targets) + 2)
         progress(name, 0, total)
         done = 0
@@ -119,7 +119,7 @@ def grid(image: Image) -> list[int]:
     From one for `SPARSEST` pixels to the most that a search uses, each at most the root of two
     times the one before.
     """
-    most = most_gaussians(image)
+    most = max_gaussians_for(image)
     least = min(most, math.ceil(image.shape[0] * image.shape[1] / SPARSEST))
     steps = math.ceil(STEPS_AN_OCTAVE * math.log2(most / least))
     return sorted({round(count) for count in np.geomspace(least, most, steps + 1)})
@@ -196,9 +196,9 @@ def _fit(
 ) -> Row:
     method = PRESETS["default"]
 
-    def start() -> Start:
-        begun = begin(image, count, "auto", "natural", method, seed=seed, backend=backend)
-        return begun if rearranged else begun._replace(rearrange=None)
+    def start() -> FitProblem:
+        begun = initialize(image, count, "auto", "natural", method, seed=seed, backend=backend)
+        return begun if rearranged else begun._replace(redistribute=None)
 
     warm_up(start, method.schedule, iterations)
     (moment,) = follow(start, method.schedule, iterations, (iterations,))
@@ -206,7 +206,7 @@ def _fit(
 
 
 def _search(image: Image, target: float, iterations: int, seed: int, backend: str | None) -> Row:
-    for steps in (min(LONG, iterations), iterations):  # first untimed, to compile
+    for steps in (min(MIN_PHASE_RATIO, iterations), iterations):  # first untimed, to compile
         found = whole(fit(image, iterations=steps, target_psnr=target, seed=seed, backend=backend))
     return {
         "gaussians": len(found.gaussians),

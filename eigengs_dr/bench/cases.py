@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..images import sample
-from ..place import inverse_factor
-from ..resampling import cropped
+from ..fitting.placement.random import inverse_factor
+from ..image.resize import center_crop
+from ..image.samples import sample
 
 Image = NDArray[np.float32]
 Shapes = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -47,8 +47,8 @@ class Case(NamedTuple):
         Splats; a start from a basis has those of the basis.
     iterations : int
     place : callable or None
-        Means and factors to start from, called as those of `eigengs_dr.place` are and brought
-        inside their bounds as those are; None for those of the preset.
+        Means and factors to start from, called as those of `eigengs_dr.fitting.placement.random`
+        are and brought inside their bounds as those are; None for those of the preset.
     rates : float
         What the rates of the preset are multiplied by.
     alone : bool
@@ -71,7 +71,7 @@ class Case(NamedTuple):
 
 def photo(width: int = SIDE, height: int = SIDE) -> Image:
     """Bring a photo of a cat to a size in pixels; enlarged, it is smooth."""
-    return np.clip(cropped(sample("chelsea"), width, height), 0, 1)
+    return np.clip(center_crop(sample("chelsea"), width, height), 0, 1)
 
 
 def flat(red: float, green: float, blue: float) -> Image:
@@ -143,7 +143,8 @@ def _grey(plane: NDArray[np.number]) -> Image:
 
 
 # ---------------------------------------------------------------------------------------------
-#  Starts: mean (N, 2) in pixels and factor (N, 3), as those of `eigengs_dr.place`
+#  Starts: mean (N, 2) in pixels and factor (N, 3), as those of
+#  `eigengs_dr.fitting.placement.random`
 # ---------------------------------------------------------------------------------------------
 
 

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..atomic import replacing
+from ..storage.atomic import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,5 +60,5 @@ def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
         raise ValueError(f"{path}: the name must end in {', '.join(SUFFIXES)}")
     # Names in an SVG file are else drawn at random.
     metadata: dict[str, Any] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-    with replacing(path) as temporary, matplotlib.rc_context({"svg.hashsalt": "eigengs_dr"}):
+    with atomic_write(path) as temporary, matplotlib.rc_context({"svg.hashsalt": "eigengs_dr"}):
         figure.savefig(temporary, format=suffix[1:], dpi=90, metadata=metadata.get(suffix))

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color import rgb_to_ycbcr
-from ..eigengs import EigenGS
-from ..fitting import fit
-from ..gaussians import Gaussians
-from ..metrics import psnr
-from ..presets import PRESETS
-from ..refine import refine
-from ..rendering import render
-from ..solve import solve
+from ..eigenbasis.eigengs import EigenGS
+from ..fitting.fit import fit
+from ..fitting.presets import PRESETS
+from ..fitting.refine import refine
+from ..fitting.solvers.conjugate_gradient import solve
+from ..gaussian.gaussians import Gaussians
+from ..image.color import rgb_to_ycbcr
+from ..image.metrics import psnr
+from ..raster.render import render
 from .trial import whole
 
 SOLVE_STEPS = 10

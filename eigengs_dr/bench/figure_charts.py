@@ -8,10 +8,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bases import load_basis
-from ..eigengs import EigenGS
-from ..gaussians import Gaussians
-from ..metrics import psnr
+from ..eigenbasis.eigengs import EigenGS
+from ..eigenbasis.registry import load_basis
+from ..gaussian.gaussians import Gaussians
+from ..image.metrics import psnr
 from . import rows, sets
 from .figure_pictures import Curve, Radii, save_curves, save_radii
 from .figure_task import CATS, COMPONENTS, METHODS, Figure, Image, Task, descent, model_of, to_size

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import replacing
-from ..images import to_8bit
-from ..resampling import resampled
-from ..strips import joined, line
+from ..image.io import to_8bit
+from ..image.montage import join_pictures, text_line
+from ..image.resize import resample
+from ..storage.atomic import atomic_write
 from .charts import COLORS, new_figure, save_figure
 
 CELL = 160
@@ -100,12 +100,12 @@ def strip(rows: Sequence[Row], credit: str = "", side: int = CELL) -> Picture:
     """
     drawn = []
     for row in rows:
-        cells = joined([_cell(*cell, side) for cell in row.cells], 1)
-        heading = [line(row.heading, cells.shape[1], HEADING)] if row.heading else []
-        drawn.append(joined([*heading, cells], 0, 2))
+        cells = join_pictures([_cell(*cell, side) for cell in row.cells], 1)
+        heading = [text_line(row.heading, cells.shape[1], HEADING)] if row.heading else []
+        drawn.append(join_pictures([*heading, cells], 0, 2))
     if credit:
-        drawn.append(line(f"Images: {credit}", drawn[0].shape[1], LETTERS))
-    return joined(drawn, 0)
+        drawn.append(text_line(f"Images: {credit}", drawn[0].shape[1], LETTERS))
+    return join_pictures(drawn, 0)
 
 
 def save_strip(path: str | os.PathLike[str], picture: Picture) -> None:
@@ -126,7 +126,7 @@ def save_strip(path: str | os.PathLike[str], picture: Picture) -> None:
     from PIL import Image
 
     image = Image.fromarray(to_8bit(picture).astype(np.uint8))
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         if Path(path).suffix == ".png":
             image.quantize(PALETTE).save(temporary, optimize=True)
         else:
@@ -217,5 +217,5 @@ def _cell(caption: str, picture: Picture, side: int) -> Picture:
     height, width = picture.shape[:2]
     scale = side / max(height, width)
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    scaled = resampled(np.clip(picture, 0, 1).astype(np.float32), *size)
-    return joined([scaled, line(caption, size[0], LETTERS)], 0, 0)
+    scaled = resample(np.clip(picture, 0, 1).astype(np.float32), *size)
+    return join_pictures([scaled, text_line(caption, size[0], LETTERS)], 0, 0)

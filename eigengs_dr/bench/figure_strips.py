@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..bases import load_basis
-from ..eigengs import EigenGS
-from ..gaussians import Gaussians
-from ..images import sample
-from ..metrics import psnr
-from ..pictures import overlay
-from ..rendering import picture_of
+from ..cli.pictures import overlay
+from ..eigenbasis.eigengs import EigenGS
+from ..eigenbasis.registry import load_basis
+from ..gaussian.gaussians import Gaussians
+from ..image.metrics import psnr
+from ..image.samples import sample
+from ..raster.render import picture_of
 from . import sets
 from .figure_pictures import Cell, Picture, Row, save_strip, strip
 from .figure_task import (

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..eigengs import EigenGS
-from ..presets import PRESETS
-from ..resampling import cropped
-from ..starting import begin
+from ..eigenbasis.eigengs import EigenGS
+from ..fitting.initializers import initialize
+from ..fitting.presets import PRESETS
+from ..image.resize import center_crop
 from . import rows, sets
 from .trial import Moment, follow
 
@@ -121,7 +121,7 @@ def descent(
     color : str, optional
     """
     start = partial(
-        begin,
+        initialize,
         image,
         len(model.gaussians),
         "auto",
@@ -136,7 +136,7 @@ def descent(
 
 def to_size(image: Image, model: EigenGS) -> Image:
     """Bring the largest centred part of an image to the size of a model."""
-    return cropped(image, model.gaussians.width, model.gaussians.height)
+    return center_crop(image, model.gaussians.width, model.gaussians.height)
 
 
 def size_of(model: EigenGS) -> str:

@@ -6,8 +6,8 @@ import json
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
-from ..atomic import require_writable
-from ..report import write_report
+from ..cli.report import write_report
+from ..storage.atomic import require_writable
 from . import charts, figure_charts, figure_strips, rows, sets
 from .figure_charts import PANELS
 from .figure_task import CATS, NATURAL, Figure, Progress, Task

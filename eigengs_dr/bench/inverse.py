@@ -14,11 +14,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend import select
-from ..bases import SHIPPED, load_basis
-from ..metrics import psnr
+from ..backend.selection import select
+from ..eigenbasis.registry import SHIPPED, load_basis
+from ..image.metrics import psnr
+from ..image.resize import center_crop
 from ..plugins import register_plugins
-from ..resampling import cropped
 from .poster import CONDITIONS, Condition, head_on, photograph, scene_of
 from .unknowns import METHODS
 
@@ -90,7 +90,7 @@ def run(
     Parameters
     ----------
     basis : str or path-like
-        A name of `eigengs_dr.bases.SHIPPED` or a file.
+        A name of `eigengs_dr.eigenbasis.registry.SHIPPED` or a file.
     image : ndarray of float32, shape (H, W, 3)
         RGB; its largest square is hung up.
     conditions : sequence of str, optional
@@ -114,7 +114,7 @@ def run(
     model = load_basis(basis, backend)
     file = SHIPPED.get(str(basis), basis)
     size = model.gaussians.width, model.gaussians.height
-    square = cropped(image, *2 * [min(image.shape[:2])])
+    square = center_crop(image, *2 * [min(image.shape[:2])])
     results = {}
     for name in conditions:
         condition = CONDITIONS[name]

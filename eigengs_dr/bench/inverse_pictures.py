@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..atomic import replacing
-from ..color import to_coded
-from ..resampling import resampled
-from ..strips import joined, line
+from ..image.color import to_coded
+from ..image.montage import join_pictures, text_line
+from ..image.resize import resample
+from ..storage.atomic import atomic_write
 
 if TYPE_CHECKING:
     from .inverse import Image, Result
@@ -72,7 +72,7 @@ def save_chart(path: str | os.PathLike[str], results: dict[str, Result]) -> None
         row[0].set_ylabel("PSNR (YCbCr) / dB")
     lines = axes[0, 0].get_lines()
     figure.legend(handles=lines, loc="outside lower center", ncols=len(lines), fontsize=9)
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, format=Path(path).suffix[1:], dpi=90)
 
 
@@ -96,20 +96,20 @@ def strip(result: Result) -> Image:
             for step, picture in trace.pictures.items()
         ]
         cells.append(_captioned("truth", result.truth))
-        rows.append(_titled(TITLES[method], joined(cells, 1, GAP)))
-    return joined(rows, 0, GAP).astype(np.float32)
+        rows.append(_titled(TITLES[method], join_pictures(cells, 1, GAP)))
+    return join_pictures(rows, 0, GAP).astype(np.float32)
 
 
 def _photos(result: Result) -> Any:
     height, width = result.photos.shape[:2]
     coded = to_coded(result.photos.clip(0, 1))
-    return _titled("photos", resampled(coded, round(CELL * width / height), CELL))
+    return _titled("photos", resample(coded, round(CELL * width / height), CELL))
 
 
 def _captioned(text: str, picture: Any) -> Any:
     """A picture of a strip above a line of text."""
-    return joined([resampled(picture, CELL, CELL), line(text, CELL)], 0, 0)
+    return join_pictures([resample(picture, CELL, CELL), text_line(text, CELL)], 0, 0)
 
 
 def _titled(text: str, row: Any) -> Any:
-    return joined([line(text, row.shape[1]), row], 0, 0)
+    return join_pictures([text_line(text, row.shape[1]), row], 0, 0)

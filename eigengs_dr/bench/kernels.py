@@ -12,20 +12,21 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..adaptive import adaptive
-from ..arrays import ArrayTypes, types_in, types_of, upload
-from ..backend import select
-from ..color import rgb_to_ycbcr
-from ..descent import descend
-from ..gaussians import Gaussians
-from ..images import check_image, sample
-from ..presets import PRESETS
-from ..reference import render_plain
-from ..refine import Progress
-from ..rendering import lists_for, splat, splat_values, to_tensor
-from ..solve import solve
-from ..splat import SHAPE, UNIT
-from ..tiles import Grid, TileLists, build_lists
+from ..backend.arrays import ArrayTypes, types_in, types_of, upload
+from ..backend.selection import select
+from ..fitting.optimizers.descent import descend
+from ..fitting.placement.adaptive import place_adaptive
+from ..fitting.presets import PRESETS
+from ..fitting.refine import FitProgress
+from ..fitting.solvers.conjugate_gradient import solve
+from ..gaussian.gaussians import Gaussians
+from ..image.color import rgb_to_ycbcr
+from ..image.io import check_image
+from ..image.samples import sample
+from ..raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS
+from ..raster.reference import render_plain
+from ..raster.render import bin_gaussians, kernel_parameters, rasterize, to_tensor
+from ..raster.tiles import Grid, TileLists, build_lists
 
 SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
 """The scene: splats of equal size, spread evenly at random over a square picture."""
@@ -44,7 +45,7 @@ PEAK_LANES, PEAK_LOOPS, PEAK_UNROLL = 1 << 16, 100, 8
 
 
 def run(
-    image: ArrayLike | None = None, backend: str | None = None, progress: Progress | None = None
+    image: ArrayLike | None = None, backend: str | None = None, progress: FitProgress | None = None
 ) -> dict[str, float]:
     """Time the kernels in one run, the variants interleaved; every figure is a median.
 
@@ -102,7 +103,7 @@ def _scene(types: ArrayTypes) -> Gaussians:
 
 
 def _kernel_figures(
-    types: ArrayTypes, scene: Gaussians, progress: Progress | None
+    types: ArrayTypes, scene: Gaussians, progress: FitProgress | None
 ) -> dict[str, float]:
     plain_forward, plain_step, _ = programs(scene, CUTOFF, plain=True)
     fast_forward, fast_step, _ = programs(scene, CUTOFF, plain=False)
@@ -113,7 +114,7 @@ def _kernel_figures(
         "fast_ms": fast_step,
         "plain_forward_ms": plain_forward,
         "fast_forward_ms": fast_forward,
-        "lists_ms": lambda: lists_for(scene, CUTOFF),
+        "lists_ms": lambda: bin_gaussians(scene, CUTOFF),
         "peak_ms": lambda: _peak(seeds),
     }
     ms = _interleaved(variants, progress)
@@ -142,7 +143,7 @@ def programs(
     cutoff : float
         In standard deviations.
     plain : bool
-        By `render_plain` instead of `splat`; tile lists are built here in both cases.
+        By `render_plain` instead of `rasterize`; tile lists are built here in both cases.
 
     Returns
     -------
@@ -151,14 +152,14 @@ def programs(
     shown : callable
         ``shown()`` is the picture, ndarray of shape (H, W, C).
     """
-    values, background = splat_values(scene)
+    values, background = kernel_parameters(scene)
     dr.eval(values)
     if plain:
         grid, draw = Grid(scene.width, scene.height, PLAIN_TILE), render_plain
-        lists = build_lists(values[:SHAPE], UNIT * cutoff, grid)
-        values = [*values[:2], *scene.factor, *values[SHAPE:]]  # not in `UNIT`
+        lists = build_lists(values[:NUM_SHAPE_PARAMS], EXP2_SCALE * cutoff, grid)
+        values = [*values[:2], *scene.factor, *values[NUM_SHAPE_PARAMS:]]  # not in `EXP2_SCALE`
     else:
-        draw, lists = splat, lists_for(scene, cutoff)
+        draw, lists = rasterize, bin_gaussians(scene, cutoff)
     shape = (scene.height, scene.width, scene.channels)
     delta = upload(type(values[0]), np.random.default_rng(1).normal(size=math.prod(shape)))
 
@@ -185,7 +186,7 @@ def programs(
 
 
 def _interleaved(
-    variants: dict[str, Callable[[], Any]], progress: Progress | None
+    variants: dict[str, Callable[[], Any]], progress: FitProgress | None
 ) -> dict[str, float]:
     """Median milliseconds of every variant; one of each a round, after rounds that compile."""
     times: dict[str, list[float]] = {name: [] for name in variants}
@@ -230,11 +231,11 @@ def _pixels_inside(scene: Gaussians) -> int:
 
 
 def _growth_figures(
-    image: NDArray[np.float32], types: ArrayTypes, progress: Progress | None
+    image: NDArray[np.float32], types: ArrayTypes, progress: FitProgress | None
 ) -> dict[str, float]:
     """Time every step of a refinement: splats stretch, and a poor renderer slows down."""
     target = rgb_to_ycbcr(image)
-    mean, factor = adaptive(target, COUNT, np.random.default_rng(0))
+    mean, factor = place_adaptive(target, COUNT, np.random.default_rng(0))
     start = Gaussians.from_arrays(
         mean, factor, np.zeros((COUNT, 3)), size=(SIDE, SIDE), backend=types.backend
     ).bounded()

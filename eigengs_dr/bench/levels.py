@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color import rgb_to_ycbcr
-from ..fitting import fit
-from ..gaussians import Gaussians
-from ..growth import worth
-from ..levels import fit_levels, level_counts
-from ..metrics import psnr
-from ..rendering import picture_of
+from ..fitting.density_control import removal_cost
+from ..fitting.fit import fit
+from ..fitting.levels import fit_levels, level_counts
+from ..gaussian.gaussians import Gaussians
+from ..image.color import rgb_to_ycbcr
+from ..image.metrics import psnr
+from ..raster.render import picture_of
 from .charts import new_figure
 from .table import Table, number, save_csv
 from .trial import whole
@@ -86,7 +86,7 @@ def measure(
         alone[count] = whole(fit(image, count, **settings)).gaussians
         told(done)
     plain = alone[gaussians]
-    best = plain[np.argsort(-worth(plain, rgb_to_ycbcr(image)), kind="stable")]
+    best = plain[np.argsort(-removal_cost(plain, rgb_to_ycbcr(image)), kind="stable")]
 
     def reached(drawn: Gaussians) -> float:
         return psnr(picture_of(drawn), image, "ycbcr")

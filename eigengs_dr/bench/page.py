@@ -11,7 +11,7 @@ from pathlib import Path
 from string import Template
 from typing import NamedTuple
 
-from ..atomic import replacing
+from ..storage.atomic import atomic_write
 from .inline import TYPES, drawing, photo
 from .prose import as_html, as_markdown, bare, lines, literal, paragraphs
 from .table import MISSING, Table
@@ -107,7 +107,7 @@ def write_html(path: str | os.PathLike[str], page: Page) -> None:
         contents="\n".join(f'<li><a href="#{k}">{escape(one.title)}</a></li>' for k, one in named),
         sections="\n".join(_html_section(name, section) for name, section in named),
     )
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
@@ -148,9 +148,9 @@ def write_markdown(folder: str | os.PathLike[str], page: Page) -> None:
 
     copies.mkdir(parents=True, exist_ok=True)
     for name, content in zip(files, contents, strict=True):
-        with replacing(copies / name) as temporary:
+        with atomic_write(copies / name) as temporary:
             temporary.write_bytes(content)
-    with replacing(readme) as temporary:
+    with atomic_write(readme) as temporary:
         temporary.write_text("\n\n".join(blocks) + "\n", encoding="utf-8")
     for name in earlier.difference(files):
         (copies / name).unlink(missing_ok=True)

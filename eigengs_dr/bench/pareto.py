@@ -11,14 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bases import load_basis
-from ..eigengs import EigenGS
-from ..gaussians import Gaussians
-from ..images import sample
-from ..presets import PRESETS
-from ..rendering import CUTOFF, picture_of
-from ..resampling import cropped
-from ..starting import GAUSSIANS, Start, begin
+from ..eigenbasis.eigengs import EigenGS
+from ..eigenbasis.registry import load_basis
+from ..fitting.initializers import DEFAULT_COUNT, FitProblem, initialize
+from ..fitting.presets import PRESETS
+from ..gaussian.gaussians import Gaussians
+from ..image.resize import center_crop
+from ..image.samples import sample
+from ..raster.render import CUTOFF, picture_of
 from .rows import Job, Row
 from .sets import SETS, model_for, test_images
 from .trial import Moment, decibels, follow, judged, warm_up
@@ -103,8 +103,8 @@ def collected(
     shipped = load_basis("natural", backend)
     if name == SAMPLES:
         side = SAMPLE_SIDE
-        images = [(photo, cropped(sample(photo), side, side)) for photo in SAMPLE_NAMES[:count]]
-        return Collection(name, images, GAUSSIANS, shipped, {})
+        images = [(photo, center_crop(sample(photo), side, side)) for photo in SAMPLE_NAMES[:count]]
+        return Collection(name, images, DEFAULT_COUNT, shipped, {})
     if data is None:
         raise ValueError(f"set {name!r} needs DATA, the folder that holds it")
     images, chosen = test_images(data, name, count), SETS[name]
@@ -185,10 +185,10 @@ def _moments(
     return follow(start, schedule, steps, marks, fit.cutoff)
 
 
-def _start(fit: Variant, image: Image, seed: int, backend: str | None) -> Callable[[], Start]:
+def _start(fit: Variant, image: Image, seed: int, backend: str | None) -> Callable[[], FitProblem]:
     method = PRESETS[fit.preset]
     start = partial(
-        begin, image, fit.gaussians, fit.init, fit.basis, method, fit.solve_steps, seed=seed
+        initialize, image, fit.gaussians, fit.init, fit.basis, method, fit.solve_steps, seed=seed
     )
     return partial(start, cutoff=fit.cutoff, backend=backend)
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import types_in
-from ..backend import select
-from ..rendering import render
+from ..backend.arrays import types_in
+from ..backend.selection import select
+from ..raster.render import render
 from . import kernels
 from .rows import Job, Row
 

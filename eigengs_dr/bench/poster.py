@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color import to_coded, to_linear
+from ..image.color import to_coded, to_linear
 
 DEPTH = 3
 """Longest path: from the lamp to the poster at once, or over the floor."""

@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fitting import fit
-from ..images import sample, to_8bit
-from ..metrics import ssim
-from ..packing import pack
-from ..rendering import picture_of
-from ..resampling import cropped
+from ..codec.bit_allocation import pack
+from ..fitting.fit import fit
+from ..image.io import to_8bit
+from ..image.metrics import ssim
+from ..image.resize import center_crop
+from ..image.samples import sample
+from ..raster.render import picture_of
 from .pareto import SAMPLE_NAMES, SAMPLE_SIDE, SAMPLES
 from .rows import Job, Row
 from .sets import test_images
@@ -76,7 +77,7 @@ def images_of(data: Path | None, name: str, count: int) -> list[tuple[str, Image
     """
     if name == SAMPLES:
         names = SAMPLE_NAMES[:count]
-        return [(photo, cropped(sample(photo), SAMPLE_SIDE, SAMPLE_SIDE)) for photo in names]
+        return [(photo, center_crop(sample(photo), SAMPLE_SIDE, SAMPLE_SIDE)) for photo in names]
     if data is None:
         raise ValueError(f"set {name!r} needs DATA, the folder that holds it")
     return test_images(data, name, count)

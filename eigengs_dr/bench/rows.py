@@ -9,8 +9,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from ..atomic import replacing
-from ..report import plain
+from ..cli.report import plain
+from ..storage.atomic import atomic_write
 
 Row = dict[str, Any]
 
@@ -108,7 +108,7 @@ def _rows(path: Path) -> Iterator[Row]:
 def _append(path: Path, row: Row) -> None:
     """Add a line behind the last whole one."""
     if not path.exists():
-        with replacing(path):
+        with atomic_write(path):
             pass
     with path.open("rb+") as file:
         whole = file.read().rfind(b"\n") + 1

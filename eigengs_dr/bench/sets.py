@@ -14,10 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..eigengs import EigenGS
-from ..images import image_files, load_image
-from ..pca import Eigenbasis
-from ..resampling import cropped
+from ..eigenbasis.basis import Eigenbasis
+from ..eigenbasis.eigengs import EigenGS
+from ..image.folder import image_files
+from ..image.io import load_image
+from ..image.resize import center_crop
 
 Image = NDArray[np.float32]
 Progress = Callable[[str, int, int], None]
@@ -92,7 +93,7 @@ def _upright(picture: Image, chosen: ImageSet) -> Image:
     """Bring an image to the size of its set, portraits to that of a portrait."""
     sides = (chosen.width, chosen.height)
     upright = picture.shape[0] > picture.shape[1]
-    return cropped(picture, min(sides), max(sides)) if upright else cropped(picture, *sides)
+    return center_crop(picture, min(sides), max(sides)) if upright else center_crop(picture, *sides)
 
 
 def model_for(

@@ -15,14 +15,14 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bases import load_basis
-from ..color import rgb_to_ycbcr
-from ..gaussians import Gaussians
-from ..presets import PRESETS, Preset
-from ..refine import EXACT, rows_at
-from ..rendering import picture_of
-from ..solve import solve
-from ..starting import Start, begin
+from ..eigenbasis.registry import load_basis
+from ..fitting.initializers import FitProblem, initialize
+from ..fitting.presets import PRESETS, Preset
+from ..fitting.refine import MAX_PSNR, trace_steps
+from ..fitting.solvers.conjugate_gradient import solve
+from ..gaussian.gaussians import Gaussians
+from ..image.color import rgb_to_ycbcr
+from ..raster.render import picture_of
 from .cases import Case
 from .rows import Job, Row
 from .table import MISSING, Table, number
@@ -80,12 +80,13 @@ def measured(case: Case, preset: str, seed: int, backend: str | None) -> Row:
     -------
     dict
         ``needs``, what is missing, alone where the preset cannot run. Else ``finite``, whether all
-        parameters and pixels were at all marks of `rows_at`; ``start_S``, ``end_S`` and
+        parameters and pixels were at all marks of `trace_steps`; ``start_S``, ``end_S`` and
         ``half_S``, the PSNR in dB of the first and of the last moment and of the last set in half
-        precision, with S one of ycbcr and rgb, at most `EXACT`; ``drop_S``, from the best moment to
-        the last; ``condition``, the highest of a covariance at a mark; ``tiling``, see that module;
-        ``gaussians``, how many; ``seconds``, without what the judgement takes; and, of a case that
-        is alone, ``peak_gib``, the most memory that the process had, pictures to judge included.
+        precision, with S one of ycbcr and rgb, at most `MAX_PSNR`; ``drop_S``, from the best moment
+        to the last; ``condition``, the highest of a covariance at a mark; ``tiling``, see that
+        module; ``gaussians``, how many; ``seconds``, without what the judgement takes; and, of a
+        case that is alone, ``peak_gib``, the most memory that the process had, pictures to judge
+        included.
     """
     image = case.image()
     most = image.shape[0] * image.shape[1]
@@ -99,12 +100,12 @@ def measured(case: Case, preset: str, seed: int, backend: str | None) -> Row:
 def moments(
     case: Case, image: Image, preset: str, seed: int, backend: str | None = None
 ) -> list[Moment]:
-    """Follow the descent of a preset on the image of a case, at the marks of `rows_at`."""
+    """Follow the descent of a preset on the image of a case, at the marks of `trace_steps`."""
     method = PRESETS[preset]
     rates = {name: case.rates * rate for name, rate in method.schedule.rates.items()}
     schedule = replace(method.schedule, rates=rates)
     start = partial(_start, case, image, method, seed, backend)
-    return list(follow(start, schedule, case.iterations, rows_at(case.iterations)))
+    return list(follow(start, schedule, case.iterations, trace_steps(case.iterations)))
 
 
 def condition(factor: NDArray[np.floating]) -> float:
@@ -129,17 +130,17 @@ def _encodes(case: Case, method: Preset) -> bool:
     return method.init == "eigen" and case.place is None
 
 
-def _start(case: Case, image: Image, method: Preset, seed: int, backend: str | None) -> Start:
+def _start(case: Case, image: Image, method: Preset, seed: int, backend: str | None) -> FitProblem:
     """Start as the preset does, or in its way from the shapes of the case."""
     if case.place is None:
         count = None if _encodes(case, method) else case.gaussians
-        return begin(image, count, "auto", BASIS, method, seed=seed, backend=backend)
+        return initialize(image, count, "auto", BASIS, method, seed=seed, backend=backend)
     target, generator = rgb_to_ycbcr(image), np.random.default_rng(seed)
     mean, factor = case.place(image, case.gaussians, generator)
     size, shape = (image.shape[1], image.shape[0]), (case.gaussians, 3)
     colors = np.zeros(shape) if method.solves else generator.uniform(0, 1, shape)
     start = Gaussians.from_arrays(mean, factor, colors, size=size, backend=backend).bounded()
-    return Start(solve(start, target).gaussians if method.solves else start, target)
+    return FitProblem(solve(start, target).gaussians if method.solves else start, target)
 
 
 def _judged(followed: list[Moment], image: Image) -> Row:
@@ -211,7 +212,7 @@ def _peak() -> float | None:
 def defects(rows: Iterable[Row], preset: str = "default") -> list[str]:
     """Name the cells of a preset that are not finite, or end below their start: one line each.
 
-    An end counts as below if its psnr_ycbcr is by more than `TOLERANCE`, both at most `EXACT`.
+    An end counts as below if its psnr_ycbcr is by more than `TOLERANCE`, both at most `MAX_PSNR`.
 
     Parameters
     ----------
@@ -259,7 +260,7 @@ def _ends(row: Row) -> str:
 
 
 def _decibels(value: float | None) -> str:
-    return "exact" if value == EXACT else number(value)
+    return "exact" if value == MAX_PSNR else number(value)
 
 
 def _ratio(value: float | None) -> str:

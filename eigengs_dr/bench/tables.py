@@ -7,11 +7,11 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..descent import LONG
-from ..eigengs import EigenGS
-from ..metrics import psnr
-from ..presets import PRESETS
-from ..starting import Start, begin
+from ..eigenbasis.eigengs import EigenGS
+from ..fitting.initializers import FitProblem, initialize
+from ..fitting.optimizers.schedule import MIN_PHASE_RATIO
+from ..fitting.presets import PRESETS
+from ..image.metrics import psnr
 from . import rows
 from .rows import Job, Row
 from .sets import SETS, UNIVERSAL, Image, ImageSet, model_for, test_images
@@ -155,7 +155,7 @@ def run(
     return found
 
 
-Ready = Callable[[Method], Callable[..., Start]]
+Ready = Callable[[Method], Callable[..., FitProblem]]
 
 
 def _preparation(
@@ -169,7 +169,7 @@ def _preparation(
     """Function that returns how a method starts; asked first, it trains and compiles untimed."""
 
     @cache
-    def ready(method: Method) -> Callable[..., Start]:
+    def ready(method: Method) -> Callable[..., FitProblem]:
         model: EigenGS | str = "natural"
         if method.source:
             split = {"split": True, "whole": False}.get(method.split, "auto")
@@ -185,10 +185,10 @@ def _preparation(
                 backend,
             )
 
-        def start(image: Image, seed: int, solve_steps: int = 10) -> Start:
+        def start(image: Image, seed: int, solve_steps: int = 10) -> FitProblem:
             preset = PRESETS[method.preset]
             count = None if method.source else SETS[name].gaussians
-            return begin(
+            return initialize(
                 image,
                 count,
                 "auto",
@@ -200,7 +200,7 @@ def _preparation(
                 backend=backend,
             )
 
-        warm_up(lambda: start(picture, 0), PRESETS[method.preset].schedule, LONG)
+        warm_up(lambda: start(picture, 0), PRESETS[method.preset].schedule, MIN_PHASE_RATIO)
         return start
 
     return ready
@@ -257,7 +257,7 @@ def _reach_jobs(
         yield name, work
 
 
-def _reach(start: Callable[[int], Start], image: Image, goal: dict[str, Any]) -> Row:
+def _reach(start: Callable[[int], FitProblem], image: Image, goal: dict[str, Any]) -> Row:
     """Time until "default" has the PSNR of a goal: by its start, stopped early, or after it.
 
     Returns `solve_steps` and `iteration` where that was, `seconds`, `psnr_ycbcr`, and as `share`

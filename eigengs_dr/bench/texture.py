@@ -10,11 +10,11 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..color import to_linear
-from ..fitting import fit
-from ..images import sample
-from ..refine import Progress
-from ..rendering import picture_of, render
+from ..fitting.fit import fit
+from ..fitting.refine import FitProgress
+from ..image.color import to_linear
+from ..image.samples import sample
+from ..raster.render import picture_of, render
 from .trial import whole
 
 SIDE, TEXELS, SPP = 512, 1024, 16
@@ -30,7 +30,7 @@ STEPS, WARM_UP, ROUNDS = 100, 2, 9
 """Steps of the fits, rounds that compile and settle, and rounds that are measured."""
 
 
-def run(variant: str = "llvm_ad_rgb", progress: Progress | None = None) -> dict[str, float]:
+def run(variant: str = "llvm_ad_rgb", progress: FitProgress | None = None) -> dict[str, float]:
     """Time a material ball with each texture in turn, in one run; every figure is a median.
 
     Parameters
@@ -153,7 +153,7 @@ def _change(mi: Any, scene: Any) -> Any:
 
 
 def _interleaved(
-    variants: dict[str, Callable[[], Any]], progress: Progress | None
+    variants: dict[str, Callable[[], Any]], progress: FitProgress | None
 ) -> dict[str, float]:
     """Median milliseconds of every variant; one of each a round, after rounds that compile."""
     times: dict[str, list[float]] = {name: [] for name in variants}

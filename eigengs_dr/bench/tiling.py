@@ -7,7 +7,7 @@ import os
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color import RGB_TO_YCBCR
+from ..image.color import RGB_TO_YCBCR
 from .charts import new_figure, save_figure
 
 Image = NDArray[np.float32]

@@ -11,17 +11,18 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..descent import LONG, Schedule, descend
-from ..fitting import Fit
-from ..gaussians import Gaussians
-from ..metrics import ms_ssim, psnr, ssim
-from ..refine import EXACT, Refined
-from ..rendering import CUTOFF, picture_of
-from ..starting import Start
+from ..fitting.fit import Fit
+from ..fitting.initializers import FitProblem
+from ..fitting.optimizers.descent import descend
+from ..fitting.optimizers.schedule import MIN_PHASE_RATIO, Schedule
+from ..fitting.refine import MAX_PSNR, Refinement
+from ..gaussian.gaussians import Gaussians
+from ..image.metrics import ms_ssim, psnr, ssim
+from ..raster.render import CUTOFF, picture_of
 
 Image = NDArray[np.float32]
 
-Fitted = TypeVar("Fitted", Fit, Refined)
+Fitted = TypeVar("Fitted", Fit, Refinement)
 
 ITERATIONS = (0, 10, 100, 500, 1000, 5000, 10000)
 """Where the paper's tables look, and 0 and 10 beside."""
@@ -48,7 +49,7 @@ class Moment(NamedTuple):
 
 
 def follow(
-    begin: Callable[[], Start],
+    begin: Callable[[], FitProblem],
     schedule: Schedule,
     iterations: int,
     marks: Collection[int],
@@ -72,7 +73,13 @@ def follow(
     spent, resumed = 0.0, time.perf_counter()
     start = begin()
     sets = descend(
-        start.gaussians, start.target, schedule, iterations, cutoff, start.weight, start.rearrange
+        start.gaussians,
+        start.target,
+        schedule,
+        iterations,
+        cutoff,
+        start.weight,
+        start.redistribute,
     )
     for iteration, current in enumerate(sets):
         if iteration not in marks:
@@ -82,20 +89,23 @@ def follow(
         spent += time.perf_counter() - resumed
         picture = picture_of(current, cutoff=cutoff)
         yield Moment(
-            iteration, spent, current, picture if start.added is None else picture + start.added
+            iteration,
+            spent,
+            current,
+            picture if start.base_image is None else picture + start.base_image,
         )
         resumed = time.perf_counter()
 
 
 def warm_up(
-    begin: Callable[[], Start], schedule: Schedule, iterations: int, cutoff: float = CUTOFF
+    begin: Callable[[], FitProblem], schedule: Schedule, iterations: int, cutoff: float = CUTOFF
 ) -> None:
     """Compile what a descent of so many steps runs, splats placed anew included.
 
     Parameters are those of `follow`.
     """
-    steps = min(LONG, iterations)
-    list(follow(begin, replace(schedule, rearrange=1), steps, (0, steps), cutoff))
+    steps = min(MIN_PHASE_RATIO, iterations)
+    list(follow(begin, replace(schedule, redistribute_after=1), steps, (0, steps), cutoff))
 
 
 def whole(fitted: Fitted) -> Fitted:
@@ -112,11 +122,11 @@ def whole(fitted: Fitted) -> Fitted:
 
 
 def decibels(picture: Image, image: Image, space: str) -> float:
-    """Return a PSNR for a row, in dB and at most `EXACT`; NaN is left to fits that have failed.
+    """Return a PSNR for a row, in dB and at most `MAX_PSNR`; NaN is left to fits that have failed.
 
     Parameters are those of `eigengs_dr.psnr`.
     """
-    return min(psnr(picture, image, space), EXACT)
+    return min(psnr(picture, image, space), MAX_PSNR)
 
 
 def judged(moment: Moment, image: Image) -> dict[str, Any]:

@@ -10,9 +10,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..color import rgb_to_ycbcr, to_linear
-from ..eigengs import EigenGS
-from ..gaussians import Gaussians
+from ..eigenbasis.eigengs import EigenGS
+from ..gaussian.gaussians import Gaussians
+from ..image.color import rgb_to_ycbcr, to_linear
 from ..plugins import keep_in_bounds, texture_of
 from .poster import POSTER, bitmap
 

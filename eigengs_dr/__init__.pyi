@@ -1,0 +1,45 @@
+"""The public names of eigengs_dr, once: `lazy_loader` reads them here, and so do type checkers."""
+
+from .backend.selection import BackendError
+from .codec.bit_allocation import PackResult, pack
+from .eigenbasis.basis import Eigenbasis
+from .eigenbasis.eigengs import EigenGS
+from .fitting.fit import Fit, fit
+from .fitting.levels import fit_levels, level_counts
+from .gaussian.gaussians import Gaussians, concatenate
+from .gaussian.tensors import from_tensors, to_tensors
+from .image.io import ImageError, load_image, save_image
+from .image.metrics import ms_ssim, psnr, ssim
+from .image.samples import sample
+from .plugins import register_plugins
+from .raster.render import picture_of, render
+from .scene.fit_scene import fit_for_scene
+
+__version__: str
+
+__all__ = [
+    "BackendError",
+    "EigenGS",
+    "Eigenbasis",
+    "Fit",
+    "Gaussians",
+    "ImageError",
+    "PackResult",
+    "concatenate",
+    "fit",
+    "fit_for_scene",
+    "fit_levels",
+    "from_tensors",
+    "level_counts",
+    "load_image",
+    "ms_ssim",
+    "pack",
+    "picture_of",
+    "psnr",
+    "register_plugins",
+    "render",
+    "sample",
+    "save_image",
+    "ssim",
+    "to_tensors",
+]

@@ -1,0 +1,128 @@
+"""Say what works on this machine and what to install.
+
+Each backend is tried in a process of its own, so that one that crashes is reported like any other.
+"""
+
+import importlib.util
+import json
+import os
+import platform
+import subprocess
+import sys
+from typing import Any
+
+from . import libllvm
+from .selection import version_of
+
+TRIAL = """
+import json, sys
+from eigengs_dr.backend.selection import describe, select
+try:
+    types = select(sys.argv[1])
+    import drjit as dr
+    # Versions 15 and 16 of LLVM get as far as here and end the process in dr.clip.
+    if dr.clip(types.Float(1, 2, 3), 0, 2)[2] != 2:
+        raise RuntimeError("wrong result")
+    answer = {"works": True, "problem": None, **describe(sys.argv[1])}
+except Exception as error:
+    answer = {"works": False, "problem": str(error)}
+print(json.dumps(answer))
+"""
+
+VARIANTS = "import json, mitsuba; print(json.dumps(mitsuba.variants()))"
+
+
+def report() -> dict[str, Any]:
+    """Find out what works here.
+
+    Takes a second or two; starts Dr.Jit in other processes only.
+
+    Returns
+    -------
+    dict
+        ``llvm`` and ``cuda``: for each ``works``, ``problem`` (one line that says what to do, or
+        None) and, where it works, what `backend.describe` returns. ``libllvm``: rows of ``path``,
+        ``version`` and ``usable`` of all that were found. ``libllvm_path``: the value of
+        ``DRJIT_LIBLLVM_PATH``, or None. ``mitsuba``: ``version`` and ``variants``, both None where
+        it is not installed. ``python``, ``platform``.
+    """
+    return {
+        "llvm": _try("llvm"),
+        "cuda": _try("cuda"),
+        "libllvm": [
+            {**library._asdict(), "usable": library.usable} for library in libllvm.candidates()
+        ],
+        "libllvm_path": os.environ.get(libllvm.PATH_VARIABLE),
+        "mitsuba": _mitsuba(),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+    }
+
+
+def describe(found: dict[str, Any]) -> str:
+    """Write a report as text.
+
+    Parameters
+    ----------
+    found : dict
+        What `report` returned.
+
+    Returns
+    -------
+    str
+        Lines for a terminal, without a newline at the end.
+    """
+    lines = [f"python   {found['python']} on {found['platform']}"]
+    for name in ("llvm", "cuda"):
+        trial = found[name]
+        if trial["works"]:
+            lines.append(f"{name}     works: {_details(name, trial)}")
+        else:
+            lines.append(f"{name}     does not work: {trial['problem']}")
+    lines.append("libLLVM  found:" if found["libllvm"] else "libLLVM  none found")
+    used = found["llvm"]["versions"]["libllvm_path"] if found["llvm"]["works"] else None
+    for library in found["libllvm"]:
+        note = "used" if library["path"] == used else "usable" if library["usable"] else "too old"
+        lines.append(f"           {library['version'] or '?':>3}  {library['path']} ({note})")
+    lines.append(f"mitsuba  {_mitsuba_line(**found['mitsuba'])}")
+    return "\n".join(lines)
+
+
+def _details(name: str, trial: dict[str, Any]) -> str:
+    """What a backend that works works with."""
+    versions = trial["versions"]
+    if name == "cuda":
+        return f"Dr.Jit {versions['drjit']}"
+    library = f"LLVM {versions['libllvm']} at {versions['libllvm_path']}"
+    return f"Dr.Jit {versions['drjit']}, {library}, {trial['threads']} threads on {trial['cpu']}"
+
+
+def _mitsuba_line(version: str | None, variants: list[str] | None) -> str:
+    """What there is of Mitsuba."""
+    if version is None:
+        return "not installed; only the plugins need it: pip install mitsuba"
+    return f"{version}: {', '.join(variants) if variants else 'cannot be imported'}"
+
+
+def _try(name: str) -> dict[str, Any]:
+    """Compute something small with a backend, in another process."""
+    process = _python(TRIAL, name)
+    if process.returncode == 0:
+        return dict(json.loads(process.stdout.splitlines()[-1]))
+    how = f"signal {-process.returncode}" if process.returncode < 0 else process.returncode
+    return {"works": False, "problem": f"the process ended with {how}; {libllvm.INSTALL_ADVICE}"}
+
+
+def _mitsuba() -> dict[str, Any]:
+    """Version and variants of Mitsuba, if it is there."""
+    if importlib.util.find_spec("mitsuba") is None:
+        return {"version": None, "variants": None}
+    process = _python(VARIANTS)
+    variants = json.loads(process.stdout) if process.returncode == 0 else None
+    return {"version": version_of("mitsuba"), "variants": variants}
+
+
+def _python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Python code in a fresh interpreter."""
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)

@@ -1,0 +1,159 @@
+"""Pick the backend: llvm, where a libLLVM works, or cuda."""
+
+import importlib
+import importlib.metadata
+import os
+import platform
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from .libllvm import MIN_VERSION, advice, load_failure, loaded_path
+
+
+class BackendError(RuntimeError):
+    """A backend that is not there; the message is one line that says what to install."""
+
+
+def select(backend: str | None = None) -> ModuleType:
+    """Return the module of a backend's differentiable array types.
+
+    Parameters
+    ----------
+    backend : {"llvm", "cuda"}, optional
+        The backend. By default "cuda" where there is a GPU, else "llvm".
+
+    Returns
+    -------
+    module
+        ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
+
+    Raises
+    ------
+    BackendError
+        If the backend is not there, its libLLVM would end the process, or Dr.Jit cannot be
+        imported. One line that says what to install.
+    ValueError
+        If `backend` is another name.
+
+    Examples
+    --------
+    >>> from eigengs_dr.backend.selection import select
+    >>> select().Float(1, 2).shape
+    (2,)
+    """
+    if backend not in (None, "llvm", "cuda"):
+        raise ValueError(f"backend {backend!r} is unknown; use 'llvm' or 'cuda'")
+    dr = _import_drjit()
+    if backend != "llvm" and dr.has_backend(dr.JitBackend.CUDA):
+        return dr.cuda.ad
+    if backend == "cuda":
+        raise BackendError("no CUDA GPU or driver was found; use backend 'llvm'")
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        raise BackendError(f"{load_failure()}; {advice()}")
+    version = dr.detail.llvm_version()[0]
+    if version < MIN_VERSION:
+        raise BackendError(f"{loaded_path()} is LLVM {version}, which crashes Dr.Jit; {advice()}")
+    return dr.llvm.ad
+
+
+def describe(backend: str | None = None) -> dict[str, Any]:
+    """Say what a figure was measured with.
+
+    Parameters
+    ----------
+    backend : {"llvm", "cuda"}, optional
+        As for `select`.
+
+    Returns
+    -------
+    dict
+        ``backend``; ``threads``, those of the llvm backend; ``cpu``, its model; ``platform``; and
+        ``versions`` of eigengs_dr, drjit, numpy and python, with ``libllvm`` and ``libllvm_path``,
+        both None where none is loaded.
+
+    Raises
+    ------
+    BackendError
+        As `select` does.
+    """
+    module = select(backend)
+    import drjit as dr
+
+    llvm = dr.has_backend(dr.JitBackend.LLVM)
+    return {
+        "backend": "cuda" if module is dr.cuda.ad else "llvm",
+        "threads": dr.thread_count(),
+        "cpu": _cpu_model(),
+        "platform": platform.platform(),
+        "versions": {
+            "eigengs_dr": version_of("eigengs-dr"),
+            "drjit": version_of("drjit"),
+            "numpy": version_of("numpy"),
+            "python": platform.python_version(),
+            "libllvm": ".".join(map(str, dr.detail.llvm_version())) if llvm else None,
+            "libllvm_path": loaded_path() if llvm else None,
+        },
+    }
+
+
+def version_of(package: str) -> str | None:
+    """Version of an installed package.
+
+    Parameters
+    ----------
+    package : str
+        Its name on the package index.
+
+    Returns
+    -------
+    str or None
+        None where it is not installed.
+    """
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _import_drjit() -> ModuleType:
+    """Import Dr.Jit; its wheel needs a library that bare systems lack, and says so badly."""
+    try:
+        with _silent_stderr():
+            return importlib.import_module("drjit")
+    except (ImportError, NameError) as error:
+        reason = error.__context__ or error
+        raise BackendError(
+            f"Dr.Jit cannot be imported ({reason}); where libatomic is missing, install it: "
+            "Debian, Ubuntu 'apt install libatomic1', Fedora 'dnf install libatomic'"
+        ) from error
+
+
+def _cpu_model() -> str:
+    """Model of the processor, as Linux names it; elsewhere the architecture."""
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return platform.processor()
+    model = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
+    return model.group(1) if model else platform.machine()
+
+
+@contextmanager
+def _silent_stderr() -> Iterator[None]:
+    """Keep Dr.Jit's own lines on a libLLVM that fails off the terminal: ours says what to do."""
+    if "drjit" in sys.modules:
+        yield
+        return
+    saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
+    try:
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(null)

@@ -1,0 +1,106 @@
+"""How the command line speaks: one line for an error or a note, a bar for progress."""
+
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import click
+
+from ..backend.selection import BackendError
+
+NAME = "eigengs-dr"
+"""Name of the program, in front of all that it says on standard error."""
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, by the convention of shells."""
+
+
+class Program(click.Group):
+    """A group of commands that says what went wrong in one line and exits with code 2.
+
+    ``context.obj`` is the list of arguments, for reports.
+    """
+
+    def main(self, args: Sequence[str] | None = None, *rest: Any, **extra: Any) -> Any:
+        """Run the command that the arguments name, then exit; see `click.Command.main`."""
+        arguments = sys.argv[1:] if args is None else list(args)
+        extra.update(prog_name=NAME, standalone_mode=False, obj=list(arguments))
+        try:
+            with _notes():
+                sys.exit(super().main(arguments, *rest, **extra))
+        except click.exceptions.NoArgsIsHelpError as error:
+            error.show()
+        except click.Abort:
+            say("interrupted")
+            sys.exit(INTERRUPTED)
+        except click.ClickException as error:
+            say(f"error: {error.format_message()}")
+        except OSError as error:
+            told = error.filename is not None and error.strerror is not None
+            say(f"error: {error.filename}: {error.strerror}" if told else f"error: {error}")
+        except (ValueError, BackendError) as error:
+            say(f"error: {error}")
+        except RuntimeError as error:
+            # What Dr.Jit makes of a second Ctrl-C, inside a program that is being traced.
+            if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
+                raise
+            say("interrupted")
+            sys.exit(INTERRUPTED)
+        sys.exit(2)
+
+
+def say(text: str) -> None:
+    """Write one line to standard error.
+
+    Parameters
+    ----------
+    text : str
+        Whatever lines it has are joined.
+    """
+    click.echo(f"{NAME}: {' '.join(text.split())}", err=True)
+
+
+@contextmanager
+def progress_bar(quiet: bool) -> Iterator[Callable[..., None]]:
+    """Show a bar on standard error while a block runs, where that is a terminal.
+
+    Parameters
+    ----------
+    quiet : bool
+        Show nothing.
+
+    Yields
+    ------
+    callable
+        ``show(label, done, total, row)``: what is being worked on, the steps done, the steps in
+        all, and, if there is one, a row of figures, of which ``psnr_rgb`` is shown. Another label
+        starts the bar anew.
+    """
+    from tqdm import tqdm
+
+    with tqdm(unit="it", leave=False, disable=True if quiet else None) as bar:
+        current = ""
+
+        def show(label: str, done: int, total: int, row: dict[str, Any] | None = None) -> None:
+            nonlocal current
+            if label != current:
+                current = label
+                bar.set_description_str(label, refresh=False)
+                bar.reset(total)
+            bar.total = total
+            if row and "psnr_rgb" in row:
+                bar.set_postfix_str(f"{row['psnr_rgb']:.2f} dB", refresh=False)
+            bar.update(done - bar.n)
+
+        yield show
+
+
+@contextmanager
+def _notes() -> Iterator[None]:
+    """Show warnings as one line each, without the line of code that raised them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = lambda message, *_: say(f"note: {message}")
+        yield

@@ -1,0 +1,145 @@
+"""``eigengs-dr info``: what a file holds."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..backend.selection import select
+from .options import ANY_PATH, check_pixels, json_option
+from .outputs import check_outputs, name_outputs
+
+
+@click.command()
+@click.argument("file", type=ANY_PATH, metavar="NAME|FILE")
+@json_option
+@click.option("--preview", type=ANY_PATH, help="Picture of what the file holds.")
+def info(file: Path, as_json: bool, preview: Path | None) -> None:
+    """Show what a fitted image or a model holds; NAME is that of a basis that ships.
+
+    Of a fitted image also the bits a pixel (bpp) of its file; of a packed one the bits that tell
+    the values of a parameter apart, and the steps between them.
+
+    Of a model also how the error falls with the number of components, those of all channels taken
+    by falling variance: the share of the variance of the training images that the first ones hold,
+    and the PSNR of PCA by them, of the training images and, on the mean, of images held out.
+
+    The preview of a fitted image is its rendering. That of a model shows the mean image, some
+    components and the outlines of the Gaussians.
+
+    \b
+    Examples:
+      eigengs-dr info photo.npz
+      eigengs-dr info photo.egs --json
+      eigengs-dr info natural
+      eigengs-dr info model.npz --preview components.png
+    """
+    from ..image.io import SAVE_OPTIONS, save_image
+
+    [picture] = name_outputs([file], preview, list(SAVE_OPTIONS)) if preview else [None]
+    check_outputs([picture], [file])
+    select()
+    from ..codec import egs as packed
+    from ..eigenbasis import model_file as modelfile
+    from ..eigenbasis.eigengs import EigenGS
+    from ..eigenbasis.registry import SHIPPED
+    from ..gaussian import file as setfile
+    from ..gaussian.gaussians import Gaussians
+    from ..storage import npz as archive
+    from .pictures import component_sheet
+
+    kinds: dict[str, tuple[str, Any, Any, Any]] = {
+        setfile.FORMAT: ("image", Gaussians.load, _describe_image, _rendered),
+        modelfile.FORMAT: ("model", EigenGS.load, _describe_model, component_sheet),
+    }
+    file = SHIPPED.get(str(file), file)
+    found = setfile.FORMAT if packed.is_egs(file) else archive.format_of(file)
+    if found not in kinds:
+        raise ValueError(f"{file}: format is {found[:40]!r}, expected one of {', '.join(kinds)}")
+    kind, load, describe, draw = kinds[found]
+    content = load(file)
+    facts = {"file": str(file), "kind": kind, "bytes": file.stat().st_size, **describe(content)}
+    if kind == "image":
+        pixels = content.width * content.height
+        facts["bpp"] = round(8 * facts["bytes"] / pixels, 4)
+    if packed.is_egs(file):
+        facts |= _describe_packed(packed.read(file))
+    if picture:
+        save_image(picture, draw(content))
+    click.echo(json.dumps(facts, indent=2) if as_json else _text(**facts))
+
+
+def _describe_image(gaussians: Any) -> dict[str, Any]:
+    return {
+        "gaussians": len(gaussians),
+        "width": gaussians.width,
+        "height": gaussians.height,
+        "channels": gaussians.channels,
+        "space": gaussians.space,
+    }
+
+
+def _describe_packed(content: Any) -> dict[str, Any]:
+    """Bits that tell the values of a parameter apart, and the steps that they count."""
+    return {
+        "sections": [len(section.mean) for section in content.sections],
+        **{f"{name}_bits": bits for name, bits in content.widths().items()},
+        **{f"{name}_step": float(f"{step:.4g}") for name, step in content.steps._asdict().items()},
+    }
+
+
+def _describe_model(model: Any) -> dict[str, Any]:
+    facts = _describe_image(model.gaussians) | {
+        "components": list(model.components),
+        "frequency_aware": model.low > 0,
+    }
+    if model.split_reason:
+        facts["split_reason"] = model.split_reason
+    if model.low:
+        facts["low_gaussians"] = model.low
+        facts["high_gaussians"] = len(model.gaussians) - model.low
+        facts["low_components"] = model.low_components
+    if fall := model.truncation_curve():
+        facts["fall"] = _rows(fall, model.held_out)
+    return facts
+
+
+def _rows(fall: Any, held_out: Any) -> list[dict[str, Any]]:
+    """How the error falls, at 1, 2, 5, 10, ... components and all."""
+    last = len(fall.psnr) - 1
+    round_numbers = [m * 10**e for e in range(len(str(last))) for m in (1, 2, 5)]
+    rows = []
+    for n in sorted({0, *(n for n in round_numbers if n < last), last}):
+        row = {
+            "components": fall.counts[n].tolist(),
+            "variance": round(float(fall.explained_variance_ratio()[n]), 6),
+            "psnr_training": round(float(fall.psnr[n]), 3),
+        }
+        if len(held_out):
+            row["psnr_held_out"] = round(float(held_out[n]), 3)
+        rows.append(row)
+    return rows
+
+
+def _text(fall: Any = (), **facts: Any) -> str:
+    """Facts as lines, and below them how the error falls as a table."""
+    width = max(map(len, facts)) + 1
+    lines = [f"{key:{width}} {value}" for key, value in facts.items()]
+    if fall:
+        lines += ["", f"components{'':16} {'variance':>8} {'training':>9} {'held out':>9}"]
+    for row in fall:
+        each = "+".join(map(str, row["components"]))
+        tested = f"{row['psnr_held_out']:6.2f} dB" if "psnr_held_out" in row else "-"
+        lines.append(
+            f"{sum(row['components']):10} = {each:13} {row['variance']:8.2%} "
+            f"{row['psnr_training']:6.2f} dB {tested:>9}"
+        )
+    return "\n".join(lines)
+
+
+def _rendered(gaussians: Any) -> Any:
+    from ..raster.render import picture_of
+
+    check_pixels(gaussians.width, gaussians.height)
+    return picture_of(gaussians)

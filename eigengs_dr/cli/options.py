@@ -1,0 +1,107 @@
+"""What the commands share: their options, and what every report says of its run."""
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..backend.selection import describe
+from .console import NAME
+
+EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
+FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+ANY_PATH = click.Path(path_type=Path)
+
+SETS = ("faces256", "cats256", "cars256", "natural256", "cats512", "kodak")
+"""Of benchmarks, without importing their module, which imports Dr.Jit."""
+
+SAMPLES = "samples"
+"""Photos of scikit-image, a set that needs no data."""
+
+MAX_PIXELS = 1 << 26
+"""Largest picture that is rendered, thin ones counted in whole tiles: it takes some 6 GiB."""
+
+backend_option = click.option(
+    "--backend",
+    type=click.Choice(["llvm", "cuda"]),
+    help="Where to compute; by default cuda where there is a GPU.",
+)
+seed_option = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+report_option = click.option("--report", type=ANY_PATH, help="JSON file for all figures.")
+quiet_option = click.option("--quiet", is_flag=True, help="No progress and no summary.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+
+
+class Size(click.ParamType):
+    """Width and height in pixels, as in "1024x768"."""
+
+    name = "WxH"
+
+    def convert(self, value: Any, param: Any, context: Any) -> tuple[int, int]:
+        """Turn the text of an option into two numbers."""
+        match = re.fullmatch(r"(\d+)x(\d+)", value)
+        if not match:
+            self.fail(f"{value}: expected width and height, such as 1024x768", param, context)
+        return check_pixels(int(match[1]), int(match[2]))
+
+
+class Counts(click.ParamType):
+    """A number for every channel, or three with commas, as in "230,60,60"."""
+
+    name = "K"
+
+    def convert(self, value: Any, param: Any, context: Any) -> int | tuple[int, ...]:
+        """Turn the text of an option into one number or three."""
+        if isinstance(value, int):  # the default
+            return value
+        if not re.fullmatch(r"\d+(,\d+,\d+)?", value) or not any(map(int, value.split(","))):
+            self.fail(f"{value}: expected a number above 0, or three such as 230,60,60", param)
+        counts = tuple(map(int, value.split(",")))
+        return counts if len(counts) > 1 else counts[0]
+
+
+def check_pixels(width: int, height: int) -> tuple[int, int]:
+    """Return the sides of a picture; refuse one that is too large to be made."""
+    if width < 1 or height < 1 or (width + 3) * (height + 3) > MAX_PIXELS:
+        raise click.UsageError(f"{width}x{height}: expected 1 to {MAX_PIXELS:,} pixels")
+    return width, height
+
+
+def choice(name: str, values: list[str], text: str) -> Any:
+    """Make an option that takes one of some words, by default the first."""
+    kind = click.Choice(values)
+    return click.option(name, type=kind, default=values[0], show_default=True, help=text)
+
+
+def describe_run(context: click.Context, backend: str | None) -> dict[str, Any]:
+    """What every report says of its run: the command as it was typed, and the machine."""
+    return {"command": shlex.join([NAME, *context.obj]), **describe(backend)}
+
+
+def folder_option(text: str) -> Any:
+    """Make the option that names the folder of what a command writes."""
+    kind = click.Path(file_okay=False, path_type=Path)
+    text = f"{text}; made where it is missing."
+    return click.option("-o", "--output", required=True, type=kind, metavar="FOLDER", help=text)
+
+
+def set_option(text: str) -> Any:
+    """Make the option that names sets of images."""
+    kind = click.Choice([SAMPLES, *SETS])
+    return click.option("--set", "names", multiple=True, type=kind, help=text)
+
+
+def chosen_sets(names: tuple[str, ...], data: Path | None, usual: str = SAMPLES) -> tuple[str, ...]:
+    """Sets to measure on, each once; without data `SAMPLES` alone.
+
+    Raises
+    ------
+    ValueError
+        If a set is named that needs data.
+    """
+    wanted = tuple(dict.fromkeys(names)) or (SAMPLES if data is None else usual,)
+    if data is None and set(wanted) - {SAMPLES}:
+        raise ValueError("--set needs DATA, the folder that holds the set, for all but samples")
+    return wanted

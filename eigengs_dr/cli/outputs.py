@@ -1,0 +1,75 @@
+"""Where results go: file names, checked before the work starts."""
+
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from ..storage.atomic import require_writable
+
+
+def name_outputs(inputs: Sequence[Path], output: Path, suffixes: Sequence[str]) -> list[Path]:
+    """Name one output file an input.
+
+    Parameters
+    ----------
+    inputs : sequence of Path
+        The files to work on.
+    output : Path
+        The file to write, or a folder to write into: with several inputs it has to be one and is
+        created where it is missing. The files in it are named like the inputs.
+    suffixes : sequence of str
+        Suffixes that the file may have; in a folder the first is used.
+
+    Returns
+    -------
+    list of Path
+        One path an input.
+
+    Raises
+    ------
+    ValueError
+        If the file has another suffix, is no folder although there are several inputs, or two
+        inputs would be written to one file.
+    OSError
+        If the folder cannot be created.
+    """
+    if len(inputs) == 1 and not output.is_dir():
+        if output.suffix.lower() not in suffixes:
+            raise ValueError(f"{output}: the name must end in {' or '.join(suffixes)}")
+        return [output]
+    if output.exists() and not output.is_dir():
+        raise ValueError(f"{output}: is a file; several images need a folder")
+    names = [path.stem + suffixes[0] for path in inputs]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice:
+        raise ValueError(f"{output / twice}: two of the images have this name; rename one of them")
+    output.mkdir(parents=True, exist_ok=True)
+    return [output / name for name in names]
+
+
+def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> None:
+    """Check that every output can be written and overwrites neither an input nor another output.
+
+    Parameters
+    ----------
+    outputs : iterable of Path or None
+        The files to write; None for one that was not asked for.
+    inputs : iterable of Path
+        The files that are read.
+
+    Raises
+    ------
+    ValueError
+        If one file is named twice.
+    OSError
+        If a file cannot be written.
+    """
+    taken = {os.path.realpath(path): "is read" for path in inputs}
+    for output in outputs:
+        if output is None:
+            continue
+        real = os.path.realpath(output)
+        if real in taken:
+            raise ValueError(f"{output}: {taken[real]} too; write to another file")
+        taken[real] = "is written"
+        require_writable(output)

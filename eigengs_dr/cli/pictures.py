@@ -1,0 +1,263 @@
+"""Pictures of models and of fits: what the components look like, and where the splats lie."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..eigenbasis.basis import CHANNELS, Eigenbasis
+from ..eigenbasis.components.solve import with_colors
+from ..eigenbasis.eigengs import EigenGS
+from ..gaussian.gaussians import Gaussians
+from ..image.color import decode
+from ..image.io import to_8bit
+from ..image.montage import join_pictures, text_line
+from ..image.resize import resample
+from ..raster.render import render
+
+FIRST = (1, 2, 3, 5, 10, 20, 50, 100, 200)
+"""Components of the first channel that are shown, counted from 1."""
+
+OTHERS = (1, 2)
+"""Components of the other channels that are shown."""
+
+CELL = 240
+"""Longer side of a component in a sheet, in pixels."""
+
+COLUMNS = 7
+"""Pictures side by side in a sheet."""
+
+OUTLINES = 800
+"""Longer side of a picture of ellipses, in pixels."""
+
+MAX_OUTLINES = 2000
+"""Outlines over a picture: with more of them, single ones cannot be told apart."""
+
+MIN_SIDE = 512
+"""A picture whose longer side is shorter is enlarged before outlines are drawn over it."""
+
+LIGHTER = 0.6
+"""How far a picture below outlines is brought to white."""
+
+MAX_REACH = 100
+"""Outlines that reach farther than so many pictures are not drawn: in it they are straight lines,
+and Pillow takes no larger numbers."""
+
+LOW_COLOR, HIGH_COLOR = (214, 96, 20), (30, 90, 160)
+"""Outlines of the splats for low frequencies, orange, and of all others, blue."""
+
+Picture = NDArray[Any]
+Color = tuple[int, int, int]
+
+
+def component_sheet(model: EigenGS, basis: Eigenbasis | None = None) -> Picture:
+    """Draw the mean image and some components of a model, and the outlines of its splats.
+
+    Components are signed: they are shown around mid-grey, those of a colour difference in the
+    colours between which they change.
+
+    Parameters
+    ----------
+    model : EigenGS
+    basis : Eigenbasis, optional
+        What the model was fitted to: shown above what the Gaussians render, on the same scale.
+
+    Returns
+    -------
+    ndarray of float, shape (H, W, 3)
+        RGB, not clamped, under 2,000 pixels wide.
+
+    Raises
+    ------
+    ValueError
+        If the basis has another size, space or number of components than the model.
+    """
+    if basis is not None:
+        _require_same(model, basis)
+    columns = [_mean(model, basis), *_components(model, basis)]
+    tables = [
+        join_pictures(columns[first : first + COLUMNS], 1)
+        for first in range(0, len(columns), COLUMNS)
+    ]
+    outlines = [_captioned("standard deviations", ellipses(model.gaussians, model.low))]
+    if model.low:
+        outlines += _parts_of_mean(model)
+    return join_pictures([*tables, join_pictures(outlines, 1)], 0)
+
+
+def ellipses(gaussians: Gaussians, low: int = 0) -> Picture:
+    """Draw the outline of every splat at one standard deviation.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    low : int, optional
+        So many splats, the first ones, are drawn in orange over the others in blue.
+
+    Returns
+    -------
+    ndarray of float, shape (H, W, 3)
+        RGB on white, the longer side 800 pixels.
+    """
+    width, height = _within(OUTLINES, gaussians.width, gaussians.height)
+    colors = [LOW_COLOR] * low + [HIGH_COLOR] * (len(gaussians) - low)
+    return _outlined(np.ones((height, width, 3)), gaussians, colors)
+
+
+def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
+    """Draw the outlines of splats at one standard deviation over a lightened picture.
+
+    Of more than 2,000 splats as many are drawn, chosen at random, the same ones each time.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Of any space and native size.
+    picture : ndarray of float, shape (H, W, 3) or (H, W, 1)
+        RGB or grey; clamped.
+
+    Returns
+    -------
+    ndarray of float, shape (H, W, 3)
+        RGB.
+    """
+    # One of every few would draw stripes where splats lie on a grid.
+    chosen = np.random.default_rng(0).permutation(len(gaussians))[:MAX_OUTLINES]
+    under = LIGHTER + (1 - LIGHTER) * np.clip(picture, 0, 1)
+    drawn = gaussians[chosen]
+    return _outlined(under, drawn, [HIGH_COLOR] * len(drawn))
+
+
+def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Picture:
+    """Put an image, its fit, and the outlines of splats over the fit side by side.
+
+    Parameters
+    ----------
+    image, picture : ndarray of float, shape (H, W, 3) or (H, W, 1)
+        RGB or grey, of one size.
+    gaussians : Gaussians
+        Those that make the picture.
+
+    Returns
+    -------
+    ndarray of float, shape (k * H, 3 * k * W, 3)
+        RGB. Every pixel is repeated k times along both axes, so often that the longer side of each
+        part has at least 512 pixels.
+    """
+    times = -(-MIN_SIDE // max(image.shape[:2]))
+    shape = (*image.shape[:2], 3)
+    parts = [np.broadcast_to(part, shape) for part in (image, picture)]
+    large = [part.repeat(times, axis=0).repeat(times, axis=1) for part in parts]
+    return np.concatenate([*large, overlay(gaussians, large[1])], axis=1)
+
+
+def _outlined(picture: Picture, gaussians: Gaussians, colors: list[Color]) -> Picture:
+    """Draw outlines at one standard deviation in one colour each, the first splats on top."""
+    from PIL import Image, ImageDraw
+
+    height, width = picture.shape[:2]
+    # Lines are drawn at twice the size and averaged: Pillow's have jagged edges.
+    under = np.broadcast_to(to_8bit(picture), (height, width, 3)).astype(np.uint8)
+    image = Image.fromarray(under.repeat(2, axis=0).repeat(2, axis=1))
+    draw = ImageDraw.Draw(image)
+    points = _outlines(gaussians.scaled(2 * width, 2 * height))
+    for n in reversed(np.flatnonzero(_in_sight(points, image.size))):
+        draw.line(points[n].ravel().tolist(), fill=colors[n], width=2)
+    return np.asarray(image.resize((width, height), Image.Resampling.BOX), np.float32) / 255
+
+
+def _outlines(gaussians: Gaussians) -> Picture:
+    """Points around every splat at one standard deviation, the first one twice, (N, 25, 2)."""
+    arrays = {name: array.astype(np.float64) for name, array in gaussians.to_arrays().items()}
+    turn = np.linspace(0, 2 * np.pi, 25)
+    a, b, c = arrays["factor"].T[:, :, None]
+    with np.errstate(all="ignore"):  # what is not finite is not in sight
+        y = np.sin(turn) / c
+        x = (np.cos(turn) - b * y) / a
+    return np.stack([x, y], axis=2) + arrays["mean"][:, None]
+
+
+def _in_sight(points: Picture, size: tuple[int, int]) -> Picture:
+    """Tell whose outlines may cross a picture, and are small enough for Pillow to draw."""
+    low, high = points.min(axis=1), points.max(axis=1)
+    longest = MAX_REACH * max(size)
+    near = (low > -longest) & (high < longest)
+    return (near & (high >= 0) & (low <= size)).all(axis=1)
+
+
+def _require_same(model: EigenGS, basis: Eigenbasis) -> None:
+    """Raise ValueError for a basis that the model was not fitted to."""
+    shapes = model.gaussians
+    made = (shapes.width, shapes.height, shapes.space, model.components)
+    given = (basis.width, basis.height, basis.space, tuple(map(len, basis.components)))
+    if made != given:
+        raise ValueError(f"basis is {given}, the model {made}; pass the basis it was fitted to")
+
+
+def _mean(model: EigenGS, basis: Eigenbasis | None) -> Picture:
+    """Column of the mean image."""
+    pictures = [render(model.gaussians).numpy()]
+    if basis is not None:
+        pictures.insert(0, np.stack(decode(basis.space, list(basis.mean)), axis=2))
+    return _captioned("mean", *map(_cell, pictures))
+
+
+def _components(model: EigenGS, basis: Eigenbasis | None) -> list[Picture]:
+    """One column a component that is shown."""
+    space = model.gaussians.space
+    chosen = [
+        (channel, number - 1)
+        for channel, count in enumerate(model.components)
+        for number in (OTHERS if channel else FIRST)
+        if number <= count
+    ]
+    if not chosen:
+        return []
+    # At most 13 channels, so one program renders all.
+    weights = np.stack([model.weights[channel][j] for channel, j in chosen], axis=1)
+    rendered = render(with_colors(model.gaussians, weights, "data")).numpy()
+    columns = []
+    for (channel, j), plane in zip(chosen, np.moveaxis(rendered, 2, 0), strict=True):
+        planes = [plane] if basis is None else [basis.components[channel][j], plane]
+        # One bright pixel must not make everything else grey.
+        scale = 0.5 / (np.quantile(np.abs(planes[0]), 0.999) or 1)
+        hue = _hue(space, channel)
+        pictures = [_cell(0.5 + scale * plane[..., None] * hue) for plane in planes]
+        columns.append(_captioned(f"{CHANNELS[space][channel]} {j + 1}", *pictures))
+    return columns
+
+
+def _parts_of_mean(model: EigenGS) -> list[Picture]:
+    """What the splats for low and for high frequencies add to the mean image."""
+    low = render(model.gaussians[: model.low]).numpy()
+    high = render(model.gaussians).numpy() - low
+    rest = len(model.gaussians) - model.low
+    return [
+        _captioned(f"mean by {model.low} low", _cell(low)),
+        _captioned(f"mean by {rest} high", _cell(0.5 + high)),
+    ]
+
+
+def _hue(space: str, channel: int) -> NDArray[np.float32]:
+    """RGB that one channel of a space adds, its largest entry 1."""
+    added = np.subtract(decode(space, list(np.eye(3)[channel])), decode(space, [0.0] * 3))
+    return (added / np.abs(added).max()).astype(np.float32)
+
+
+def _within(longest: int, width: int, height: int) -> tuple[int, int]:
+    """Width and height of the same shape with a given longer side."""
+    scale = longest / max(width, height)
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def _cell(picture: Picture) -> Picture:
+    """Bring a picture to the size of a sheet."""
+    width, height = _within(CELL, picture.shape[1], picture.shape[0])
+    return resample(picture.astype(np.float32), width, height)
+
+
+def _captioned(text: str, *pictures: Picture) -> Picture:
+    """Put pictures on top of each other, below a line of text."""
+    return join_pictures([text_line(text, pictures[0].shape[1]), *pictures], 0)

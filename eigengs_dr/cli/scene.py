@@ -1,0 +1,175 @@
+"""``eigengs-dr scene``: Mitsuba scenes that use the plugins."""
+
+import re
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..backend.selection import select
+from ..storage.atomic import atomic_write
+from .console import progress_bar
+from .options import ANY_PATH, EXISTING, quiet_option
+from .outputs import check_outputs, name_outputs
+
+SUFFIXES = (".png", ".exr")
+"""What is written: PNG as sRGB, clamped; EXR as it is."""
+
+SAMPLES_PER_PASS = 1 << 24
+"""Most samples that are taken at once: their state is some 20 bytes each, and between two passes
+there is progress to show and Ctrl-C to listen to."""
+
+RESERVED = ("path", "parallel", "optimize")
+"""Names that `mitsuba.load_file` takes for itself."""
+
+
+class Definition(click.ParamType):
+    """A parameter of a scene and its value, as in "spp=16"."""
+
+    name = "KEY=VALUE"
+
+    def convert(self, value: Any, param: Any, context: Any) -> tuple[str, str]:
+        """Turn the text of an option into a name and a value."""
+        key, sign, text = value.partition("=")
+        if not (key and sign):
+            self.fail(f"{value}: expected a name and a value, such as spp=16", param, context)
+        if key in RESERVED:
+            self.fail(f"{key}: Mitsuba takes this name for itself; rename it in the scene", param)
+        return key, text
+
+
+@click.command()
+@click.argument("scenes", nargs=-1, required=True, type=EXISTING, metavar="SCENE.xml...")
+@click.option("-o", "--output", required=True, type=ANY_PATH, help=".png or .exr; or a folder.")
+@click.option(
+    "--variant",
+    metavar="NAME",
+    help="Of Mitsuba; by default cuda_ad_rgb where there is a GPU, else llvm_ad_rgb.",
+)
+@click.option(
+    "--spp", type=click.IntRange(min=1), help="Samples a pixel; by default those of the scene."
+)
+@click.option(
+    "-D",
+    "definitions",
+    multiple=True,
+    type=Definition(),
+    help="Set a <default> of the scene; may be repeated.",
+)
+@quiet_option
+def scene(
+    scenes: tuple[Path, ...],
+    output: Path,
+    variant: str | None,
+    spp: int | None,
+    definitions: tuple[tuple[str, str], ...],
+    quiet: bool,
+) -> None:
+    """Render Mitsuba scenes that use the texture gaussian_texture.
+
+    The mitsuba executable does not know it: plugins that are written in Python are registered from
+    Python. For several scenes -o names a folder, and the files are named like the scenes.
+
+    \b
+    Examples:
+      eigengs-dr scene scenes/plane.xml -o plane.png
+      eigengs-dr scene scenes/plane.xml -o plane.png -D prefilter=0 --spp 64
+      eigengs-dr scene scenes/*.xml -o build/scenes/
+      eigengs-dr scene scenes/ball.xml -o ball.exr --variant llvm_ad_spectral
+    """
+    outputs = name_outputs(scenes, output, SUFFIXES)
+    check_outputs(outputs, scenes)
+    mi = _mitsuba(variant, quiet)
+    for path, target in zip(scenes, outputs, strict=True):
+        started = time.perf_counter()
+        try:
+            with progress_bar(quiet) as show:
+                pixels, samples = _render(
+                    mi, path, spp, dict(definitions), partial(show, str(path))
+                )
+        # Mitsuba raises many types, and only its messages tell mistakes in a scene from others.
+        except Exception as error:
+            raise _refusal(path, error) from error
+        _write(mi, target, pixels)
+        if not quiet:
+            height, width = pixels.shape[:2]
+            click.echo(
+                f"{path}: {width}x{height}, samples a pixel: {samples}, "
+                f"{time.perf_counter() - started:.1f} s\n  wrote {target}"
+            )
+
+
+def _mitsuba(variant: str | None, quiet: bool) -> Any:
+    """Import Mitsuba, set a variant and register the plugins."""
+    backend = variant.partition("_")[0] if variant else None
+    module = select(backend if backend in ("llvm", "cuda") else None)
+    try:
+        import mitsuba as mi
+    except ImportError as error:
+        raise ValueError(
+            f"scenes need Mitsuba ({error}): pip install 'eigengs-dr[plugins]'"
+        ) from error
+    from ..plugins import register_plugins
+
+    if variant is None:
+        variant = "cuda_ad_rgb" if "cuda" in module.__name__ else "llvm_ad_rgb"
+    if variant not in mi.variants():
+        known = ", ".join(mi.variants())
+        raise click.UsageError(f"--variant {variant}: unknown; use one of {known}")
+    mi.set_variant(variant)
+    mi.set_log_level(mi.LogLevel.Error if quiet else mi.LogLevel.Warn)
+    register_plugins()
+    return mi
+
+
+def _render(
+    mi: Any, path: Path, spp: int | None, parameters: dict[str, str], show: Callable[..., None]
+) -> tuple[Any, int]:
+    """Render a scene in passes; its pixels, shape (H, W, C), and the number of samples in each."""
+    import numpy as np
+
+    scene = mi.load_file(str(path), **parameters)
+    if not isinstance(scene, mi.Scene):
+        raise ValueError("holds no scene; its root must be <scene version='3.0.0'>")
+    if not scene.sensors():
+        raise ValueError("the scene has no sensor; add one")
+    sensor = scene.sensors()[0]
+    width, height = sensor.film().crop_size()
+    total = spp or sensor.sampler().sample_count()
+    most = max(1, SAMPLES_PER_PASS // (width * height))
+    pixels, done = np.zeros(()), 0
+    while done < total:
+        count = min(most, total - done)
+        pixels = pixels + count * np.array(mi.render(scene, spp=count, seed=done), np.float64)
+        done += count
+        show(done, total)
+    return (pixels / total).astype(np.float32), total
+
+
+def _write(mi: Any, path: Path, pixels: Any) -> None:
+    """Write a picture whole or not at all."""
+    if path.suffix.lower() == ".png":
+        channels = pixels.shape[2] if pixels.shape[2] <= 4 else 3  # what follows colours are AOVs
+        bitmap = mi.Bitmap(pixels[..., :channels].copy())
+        bitmap = bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True)
+    else:
+        bitmap = mi.Bitmap(pixels)
+    with atomic_write(path) as temporary:
+        bitmap.write(str(temporary))
+
+
+def _refusal(path: Path, error: BaseException) -> Exception:
+    """Boil an error of Mitsuba down to one line that says what is wrong."""
+    while error.__cause__:  # Dr.Jit's own says "see above"
+        error = error.__cause__
+    if isinstance(error, KeyboardInterrupt):
+        return click.Abort()
+    text = re.sub(r"\[\w+\.cpp:\d+\] ", "", str(error))
+    # Of an error of a plugin Mitsuba tells the whole traceback; the message is its last line.
+    where, _, trace = text.partition("Traceback (most recent call last):")
+    if trace:
+        text = where + re.sub(r"^\w+: (\[Errno \d+\] )?", "", trace.strip().splitlines()[-1])
+    return ValueError(f"{path}: {text or type(error).__name__}")

@@ -1,0 +1,255 @@
+"""The file of a packed set, ``.egs``: splats as whole numbers, in sections read one by one.
+
+All numbers are little endian. A header (`_HEADER`) with what all splats share, the background, and
+a checksum; then the sections, each with the number of its splats, its length and its checksum
+(`_SECTION`), and the planes of its numbers (`eigengs_dr.codec.entropy`): steps along a Hilbert
+curve through the means, s, u, v, and one plane a channel.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..image.color import MAX_CHANNELS, SPACES
+from ..storage.atomic import atomic_write
+from ..storage.npz import MAX_ENTRIES, BadValue
+from .entropy import decode, encode
+from .hilbert_index import MAX_LEVELS, hilbert_decode, hilbert_encode
+from .quantization import Steps, Symbols, dequantize
+
+SUFFIX = ".egs"
+
+MAGIC = b"\x89EGS"
+"""First bytes of a file: the first is no letter, so that no text begins so."""
+
+VERSION = 1
+
+MAX_SECTIONS = 1 << 12
+
+_HEADER = struct.Struct("<4sBBBBHIIii4f")
+"""Magic, version, space, channels, levels of the curve, sections, width, height, corner x and y
+(steps from the first pixel's middle), and the steps."""
+
+_SECTION = struct.Struct("<III")
+"""Splats, bytes that follow, and their CRC-32."""
+
+_CHECK = struct.Struct("<I")
+
+
+class EgsContent(NamedTuple):
+    """What a file holds.
+
+    Attributes
+    ----------
+    sections : list of Symbols
+        Splats, section by section.
+    steps : Steps
+    background : ndarray of float32, shape (C,)
+    size : (int, int)
+        Native width and height.
+    space : str
+        One of `eigengs_dr.image.color.SPACES`.
+    """
+
+    sections: list[Symbols]
+    steps: Steps
+    background: NDArray[np.float32]
+    size: tuple[int, int]
+    space: str
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Mean (N, 2), factor (N, 3), color (N, C) and background (C,), all of float32."""
+        values = {**dequantize(self.whole(), self.steps), "background": self.background}
+        with np.errstate(over="ignore"):
+            return {name: value.astype(np.float32) for name, value in values.items()}
+
+    def widths(self) -> dict[str, list[int]]:
+        """Bits that tell the values of each parameter apart: of x and y; s, u and v; the colours.
+
+        The codes of a file are shorter, as near values are frequent.
+        """
+        return {
+            name: [int(span).bit_length() for span in np.ptp(part, axis=0)]
+            for name, part in self.whole()._asdict().items()
+        }
+
+    def whole(self) -> Symbols:
+        """Return the splats of all sections."""
+        return Symbols(
+            np.concatenate([section.mean for section in self.sections]),
+            np.concatenate([section.shape for section in self.sections]),
+            np.concatenate([section.color for section in self.sections]),
+        )
+
+
+def is_egs(path: str | os.PathLike[str]) -> bool:
+    """Tell whether a file begins as a packed set; `OSError` if it cannot be opened."""
+    with open(path, "rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
+def to_bytes(packed: EgsContent) -> bytes:
+    """Lay a set out as a file; the splats of each section are put in the order of the curve."""
+    mean = packed.whole().mean
+    corner = mean.min(axis=0)
+    levels = int((mean - corner).max()).bit_length()
+    head = _HEADER.pack(
+        MAGIC,
+        VERSION,
+        SPACES.index(packed.space),
+        len(packed.background),
+        levels,
+        len(packed.sections),
+        *packed.size,
+        *corner.tolist(),
+        *packed.steps,
+    )
+    head += packed.background.astype("<f4").tobytes()
+    parts = [head, _CHECK.pack(zlib.crc32(head))]
+    for section in packed.sections:
+        body = _body(section, corner, levels)
+        parts += [_SECTION.pack(len(section.mean), len(body), zlib.crc32(body)), body]
+    return b"".join(parts)
+
+
+def write(path: str | os.PathLike[str], content: bytes) -> None:
+    """Write what `to_bytes` laid out, all or nothing.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written; an existing one is then as before.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsContent:
+    """Read a packed set; the file may be hostile.
+
+    Parameters
+    ----------
+    path : path-like
+    sections : int, optional
+        Read so many sections, from the first; what follows may be missing. By default all.
+
+    Raises
+    ------
+    ValueError
+        If the file is no packed set, is damaged, cut off, or newer than this package, or has fewer
+        sections: one line that names the file.
+    OSError
+        If it cannot be opened.
+    """
+    path = Path(path)
+    with path.open("rb") as file:
+        try:
+            return _read(file, os.fstat(file.fileno()).st_size, sections)
+        except BadValue as error:
+            raise ValueError(f"{path}: {error}") from None
+
+
+def _body(section: Symbols, corner: NDArray[np.int64], levels: int) -> bytes:
+    """The planes of a section."""
+    places = hilbert_encode(section.mean - corner, levels)
+    # Splats in one place are sorted too: equal sets give equal files, in whatever order they are.
+    columns = [*section.color.T[::-1], *section.shape.T[::-1], places]
+    order = np.lexsort(columns)
+    ways = np.diff(places[order], prepend=0)
+    planes = [ways, *section.shape[order].T, *section.color[order].T]
+    return b"".join(map(encode, planes))
+
+
+def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
+    head = _exactly(file, _HEADER.size)
+    magic, version, space, channels, levels, count, width, height, *rest = _HEADER.unpack(head)
+    if magic != MAGIC:
+        raise BadValue("not a packed set of Gaussians; it may be damaged or something else")
+    if not 1 <= version <= VERSION:
+        raise BadValue(
+            f"version is {version}, this package reads up to {VERSION}; upgrade eigengs-dr"
+        )
+    background = _exactly(file, 4 * channels)
+    (check,) = _CHECK.unpack(_exactly(file, _CHECK.size))
+    if check != zlib.crc32(head + background):
+        raise BadValue("the header is damaged; copy the file again")
+    corner, steps = np.array(rest[:2], np.int64), Steps(*rest[2:])
+    _check_header(space, channels, levels, count, steps)
+    if wanted is not None and not 1 <= wanted <= count:
+        raise BadValue(f"{wanted} sections are asked for, the file has {count}; ask for 1 or more")
+    found: list[Symbols] = []
+    for number in range(1, (wanted or count) + 1):
+        body, splats = _section(file, size, number, 4 + channels)
+        room = MAX_ENTRIES // max(3, channels) - sum(len(section.mean) for section in found)
+        if splats > room:
+            raise BadValue(f"section {number} claims {splats} splats, more than may be read")
+        try:
+            found.append(_symbols(body, splats, channels, corner, levels))
+        except BadValue as error:
+            raise BadValue(f"section {number}: {error}; copy the file again") from None
+    if wanted is None and file.read(1):
+        raise BadValue("something follows the last section; copy the file again")
+    return EgsContent(
+        found, steps, np.frombuffer(background, "<f4"), (width, height), SPACES[space]
+    )
+
+
+def _check_header(space: int, channels: int, levels: int, count: int, steps: Steps) -> None:
+    """Refuse what `to_bytes` does not write; size and values are checked with all sets."""
+    if not 1 <= channels <= MAX_CHANNELS:
+        raise BadValue(f"the header claims {channels} channels, expected 1 to {MAX_CHANNELS}")
+    if space >= len(SPACES) or levels > MAX_LEVELS:
+        raise BadValue("the header holds values that are not known; upgrade eigengs-dr")
+    if not 1 <= count <= MAX_SECTIONS:
+        raise BadValue(f"the header claims {count} sections, expected 1 to {MAX_SECTIONS}")
+    if not all(0 < step < np.inf for step in steps):
+        raise BadValue(f"the steps are {tuple(steps)}, expected numbers above 0")
+
+
+def _section(file: BinaryIO, size: int, number: int, planes: int) -> tuple[bytes, int]:
+    """The planes of the section that comes next, unchanged by accident, and its splats."""
+    splats, length, check = _SECTION.unpack(_exactly(file, _SECTION.size))
+    if length > size - file.tell():
+        raise BadValue(f"section {number} is cut off; copy the file again")
+    # Every number takes a bit at least: memory is bounded by what the file is long.
+    if not 1 <= splats <= 8 * length // planes:
+        raise BadValue(f"section {number} claims {splats} splats in {length} bytes")
+    body = _exactly(file, length)
+    if zlib.crc32(body) != check:
+        raise BadValue(f"section {number} is damaged; copy the file again")
+    return body, splats
+
+
+def _symbols(
+    body: bytes, splats: int, channels: int, corner: NDArray[np.int64], levels: int
+) -> Symbols:
+    """Decode the planes of a section, whose checksum does not say who wrote them."""
+    planes, rest = list[NDArray[np.int64]](), memoryview(body)
+    for _ in range(4 + channels):
+        plane, rest = decode(rest, splats)
+        planes.append(plane)
+    if len(rest):
+        raise BadValue("something follows the last plane")
+    ways, places = planes[0], np.cumsum(planes[0])
+    if (ways < 0).any() or (places < 0).any() or places[-1] >> 2 * levels:
+        raise BadValue("the curve leaves its square")
+    return Symbols(
+        hilbert_decode(places, levels) + corner,
+        np.stack(planes[1:4], axis=1),
+        np.stack(planes[4:], axis=1),
+    )
+
+
+def _exactly(file: BinaryIO, count: int) -> bytes:
+    """Read bytes that must be there."""
+    data = file.read(count)
+    if len(data) < count:
+        raise BadValue("the file is cut off; copy it again")
+    return data

@@ -1,0 +1,351 @@
+"""The eigenbasis of a family of images: PCA of each colour channel, one block at a time."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from operator import index
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..image.color import ycbcr_to_rgb
+from ..image.folder import ReadProgress, Source, check_size, read_blocks, to_planes
+from ..image.io import check_image
+from ..image.resize import resample
+from .basis_file import ENERGY_TOLERANCE, read_basis, write_basis
+from .incremental_pca import EigenState, block_length, empty_state, merge, rank_for
+from .truncation import (
+    TruncationCurve,
+    curve_from_eigenvalues,
+    curve_from_residuals,
+    residual_energy,
+)
+
+CHANNELS = {"ycbcr": ("Y", "Cb", "Cr"), "rgb": ("R", "G", "B")}
+"""What the channels of a space are called in warnings."""
+
+
+@dataclass(frozen=True, eq=False)
+class Eigenbasis:
+    """The mean of a family of images and the directions in which they differ most.
+
+    The basis of EigenGS: every channel of an image I is the mean Psi_0 plus a sum of components
+    Psi_j, weighted by w_j = <Psi_j, I - Psi_0>.
+
+    Attributes
+    ----------
+    mean : ndarray of float32, shape (C, H, W)
+        In the colour space of the basis, on a [0, 1] scale.
+    components : tuple of C ndarrays of float32, shape (k_c, H, W)
+        Orthonormal among the pixels of a channel; the numbers k_c may differ, and be 0.
+    eigenvalues : tuple of C ndarrays of float64, shape (k_c,)
+        Variance of the training images along each component, descending; the covariance is
+        ``1/m sum v v^T`` over the m images (eq. 1 of the paper).
+    variance : ndarray of float64, shape (C,)
+        Total variance: the sum of all eigenvalues, of kept components or not.
+    count : int
+        Training images, m.
+    space : {"ycbcr", "rgb"}
+        What the C = 3 channels mean.
+    examples : ndarray of float32, shape (n, H, W, 3)
+        Up to 16 training images as RGB, drawn at random.
+    """
+
+    mean: NDArray[np.float32]
+    components: tuple[NDArray[np.float32], ...]
+    eigenvalues: tuple[NDArray[np.float64], ...]
+    variance: NDArray[np.float64]
+    count: int
+    space: str
+    examples: NDArray[np.float32]
+
+    @classmethod
+    def from_images(
+        cls,
+        source: Source,
+        size: tuple[int, int] = (256, 256),
+        components: int | Sequence[int] = 300,
+        energy: float | None = None,
+        color: str = "ycbcr",
+        seed: int = 0,
+        progress: ReadProgress | None = None,
+    ) -> Eigenbasis:
+        """Find the eigenbasis of a family of images in one pass, with memory for one block of them.
+
+        Exact for as many images as fit in a block (1,024 of 256x256); beyond, some variance of the
+        last components is lost.
+
+        Parameters
+        ----------
+        source : path, array or iterable
+            See `eigengs_dr.image.folder.read_blocks`.
+        size : (int, int)
+            Width and height of the basis.
+        components : int or sequence of 3 ints
+            The most kept of each channel.
+        energy : float, optional
+            In (0, 1]: keep as few components as hold this share of a channel's variance.
+        color : {"ycbcr", "rgb"}
+            Space of the channels.
+        seed : int
+            Draws the examples.
+        progress : callable, optional
+            ``progress(done, total, {})`` after every image that was read; `total` may be None.
+
+        Raises
+        ------
+        ImageError
+            If the source holds no images that can be read.
+        ValueError
+            If an argument is none of the above.
+
+        Warns
+        -----
+        UserWarning
+            If images were skipped or cropped, there are too few of them, or `components` is too low
+            for the energy.
+        """
+        size = check_size(size)
+        most = check_components(components, energy)
+        state = empty_state(size, seed)
+        with closing(read_blocks(source, size, color, block_length(size), progress)) as blocks:
+            for block in blocks:
+                state = merge(state, block, [rank_for(k) for k in most])
+                del block  # before the next is read
+        return cls.from_state(state, size, components, energy, color)
+
+    @classmethod
+    def from_state(
+        cls,
+        state: EigenState,
+        size: tuple[int, int],
+        components: int | Sequence[int] = 300,
+        energy: float | None = None,
+        color: str = "ycbcr",
+    ) -> Eigenbasis:
+        """Make the basis of all images that a state has seen; parameters as for `from_images`."""
+        if state.count == 0:
+            raise ValueError("no images were merged; merge at least one block first")
+        most = check_components(components, energy)
+        if energy is None and state.count <= max(most):
+            have = "1 image gives" if state.count == 1 else f"{state.count} images give"
+            warnings.warn(f"{have} at most {state.count - 1} components a channel", stacklevel=2)
+        shape = (size[1], size[0])
+        basis = cls(
+            mean=state.mean.astype(np.float32).reshape(-1, *shape),
+            components=tuple(rows.reshape(-1, *shape) for rows in state.rows),
+            eigenvalues=tuple(scatter / state.count for scatter in state.scatter),
+            variance=state.squares / state.count,
+            count=state.count,
+            space=color,
+            examples=np.stack(
+                [_rgb(planes.reshape(-1, *shape), color) for planes in state.examples]
+            ),
+        )
+        basis = basis.truncated(most)
+        return basis if energy is None else _keep_energy(basis, most, energy)
+
+    @property
+    def width(self) -> int:
+        """Columns of pixels."""
+        return self.mean.shape[2]
+
+    @property
+    def height(self) -> int:
+        """Rows of pixels."""
+        return self.mean.shape[1]
+
+    @property
+    def channels(self) -> int:
+        """Colour channels, C."""
+        return self.mean.shape[0]
+
+    def project(self, image: ArrayLike) -> tuple[NDArray[np.float32], ...]:
+        """Find the coefficients w_j of an image.
+
+        Parameters
+        ----------
+        image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
+            As for `check_image`, of any size: it is resampled to the size of the basis.
+
+        Returns
+        -------
+        tuple of C ndarrays of float32, shape (k_c,)
+
+        Raises
+        ------
+        ImageError
+            If it is not an image.
+        """
+        return self._coefficients(self._centred(image))
+
+    def reconstruct(self, coefficients: Sequence[ArrayLike]) -> NDArray[np.float32]:
+        """Return the image of given coefficients: the inverse of `project` within the basis.
+
+        Parameters
+        ----------
+        coefficients : sequence of C array_like, shape (k_c,)
+
+        Returns
+        -------
+        ndarray of float32, shape (H, W, 3)
+            RGB, not clamped.
+
+        Raises
+        ------
+        ValueError
+            If their numbers are not those of the components.
+        """
+        weights = [np.asarray(w, np.float32) for w in coefficients]
+        given, kept = [w.shape for w in weights], [(len(c),) for c in self.components]
+        if given != kept:
+            raise ValueError(f"coefficients have shapes {given}; expected {kept}")
+        pairs = zip(weights, self.components, strict=True)
+        return _rgb(self.mean + np.stack([np.tensordot(w, c, 1) for w, c in pairs]), self.space)
+
+    def energy(self) -> tuple[NDArray[np.float64], ...]:
+        """Return the share of the variance that the first 1, 2, ..., k_c components hold.
+
+        Returns
+        -------
+        tuple of C ndarrays of float64, shape (k_c,)
+            Ascending, at most 1.
+        """
+        pairs = zip(self.eigenvalues, self.variance, strict=True)
+        return tuple(_cumulative_share(values, total) for values, total in pairs)
+
+    def truncation_curve(self, images: Iterable[ArrayLike] | None = None) -> TruncationCurve:
+        """Tell how the error falls with every component, and with how few it is low enough.
+
+        Parameters
+        ----------
+        images : iterable of array_like, optional
+            As for `project`; best those that the basis was not made of. By default the training
+            images are told of, by the eigenvalues.
+
+        Returns
+        -------
+        Fall
+            ``basis.truncated(basis.truncation_curve(images).rank_for_psnr(30))`` reaches 30 dB,
+            their mean PSNR.
+
+        Raises
+        ------
+        ValueError
+            If there are no images, or one is none.
+        """
+        if images is None:
+            return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean.size)
+        rows = [self._left(image) for image in images]
+        if not rows:
+            raise ValueError("there are no images to measure the basis on; pass at least one")
+        left = [np.stack(channel) for channel in zip(*rows, strict=True)]
+        return curve_from_residuals(self.eigenvalues, left, self.mean.size)
+
+    def truncated(self, components: int | Sequence[int]) -> Eigenbasis:
+        """Return the basis of the first components.
+
+        Parameters
+        ----------
+        components : int or sequence of C ints
+            The most kept of each channel; a channel that has fewer keeps all.
+
+        Raises
+        ------
+        ValueError
+            If a number is negative, or there is not one a channel.
+        """
+        most = check_components(components)
+        return replace(
+            self,
+            components=tuple(c[:k] for c, k in zip(self.components, most, strict=True)),
+            eigenvalues=tuple(e[:k] for e, k in zip(self.eigenvalues, most, strict=True)),
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the basis to an ``.npz`` file, all or nothing.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written; an existing one is then as before.
+        """
+        write_basis(path, self)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Eigenbasis:
+        """Read a file that `save` wrote.
+
+        Raises
+        ------
+        ValueError
+            If the file is not one of these, is damaged, newer than this package, or holds values
+            that do not fit together: one line that names file and key.
+        OSError
+            If it cannot be opened.
+        """
+        return cls(**read_basis(path))
+
+    def _centred(self, image: ArrayLike) -> NDArray[np.float32]:
+        """An image at the size and in the space of the basis, less the mean: shape (C, H, W)."""
+        fitting = resample(check_image(image), self.width, self.height)
+        planes = to_planes(fitting, self.space) - self.mean.reshape(self.channels, -1)
+        return planes.reshape(self.mean.shape)
+
+    def _coefficients(self, planes: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
+        pairs = zip(self.components, planes, strict=True)
+        return tuple(np.tensordot(components, plane) for components, plane in pairs)
+
+    def _left(self, image: ArrayLike) -> list[NDArray[np.float64]]:
+        """Squared error of every channel after 0, 1, ..., k_c of its components."""
+        planes = self._centred(image)
+        lengths = np.einsum("cij,cij->c", planes, planes, dtype=np.float64)
+        pairs = zip(lengths, self._coefficients(planes), strict=True)
+        return [residual_energy(length, w.astype(np.float64) ** 2) for length, w in pairs]
+
+
+def check_components(
+    components: int | Sequence[int], energy: float | None = None
+) -> tuple[int, int, int]:
+    """Return the most components of each channel; refuse what is no number, or no share."""
+    if energy is not None and not 0 < energy <= 1:
+        raise ValueError(f"energy is {energy}; expected a share of the variance in (0, 1]")
+    try:
+        each = components if isinstance(components, Iterable) else (components,) * 3
+        y, cb, cr = map(index, each)
+    except (TypeError, ValueError):
+        raise ValueError(f"components is {components!r}; expected a number, or three") from None
+    if min(y, cb, cr) < 0:
+        raise ValueError(f"components is {components!r}; expected no negative number")
+    return y, cb, cr
+
+
+def _keep_energy(basis: Eigenbasis, most: Sequence[int], energy: float) -> Eigenbasis:
+    """Keep as few components as hold a share of the variance."""
+    enough = []
+    for name, shares, cap in zip(CHANNELS[basis.space], basis.energy(), most, strict=True):
+        enough.append(int(np.searchsorted(shares, energy)) + 1)
+        varies = basis.variance[len(enough) - 1] > 0
+        share = shares[-1] if len(shares) else 0.0
+        if varies and len(shares) == cap and share < energy - ENERGY_TOLERANCE:
+            warnings.warn(
+                f"channel {name}: {cap} components hold {share:.2%} of the variance, "
+                f"less than {energy:.2%}; raise components",
+                stacklevel=3,
+            )
+    return basis.truncated(enough)
+
+
+def _cumulative_share(eigenvalues: NDArray[np.float64], variance: float) -> NDArray[np.float64]:
+    """Cumulative share of the variance; empty where nothing varies."""
+    return np.minimum(np.cumsum(eigenvalues) / (variance or 1), 1)
+
+
+def _rgb(planes: NDArray[np.float32], space: str) -> NDArray[np.float32]:
+    """Turn (C, H, W) in a colour space into RGB (H, W, 3)."""
+    image = np.ascontiguousarray(np.moveaxis(planes, 0, 2))
+    return ycbcr_to_rgb(image) if space == "ycbcr" else image

@@ -1,0 +1,1 @@
+"""Shared Gaussians for all components of an eigenbasis."""

@@ -1,0 +1,241 @@
+"""Shared Gaussians for an eigenbasis: their shapes, and a weight for each splat and component."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...backend.arrays import types_of, upload_rows
+from ...fitting.solvers.normal_equations import NormalEquations, squared_norms
+from ...gaussian.gaussians import Gaussians, concatenate
+from ...image.metrics import psnr_from_mse
+from ..basis import Eigenbasis
+from .joint_training import JointState, train_jointly
+from .shape_training import on_grid, shapes_of, train_shapes
+from .split import FrequencyBand, frequency_bands, low_component_count
+
+STEPS = {"default": 0, "eigengs": 15_000}
+"""Presets, and the steps of training that each takes when none are asked for."""
+
+Planes = NDArray[np.float32]
+State = dict[str, NDArray[Any]]
+Part = tuple[NormalEquations, Gaussians, tuple[Planes, ...]]
+"""Equations of splats, their shapes, and their weights in the components of each channel."""
+
+
+class ComponentFit(NamedTuple):
+    """Gaussians that render an eigenbasis.
+
+    Attributes
+    ----------
+    gaussians, weights, low, low_components
+        See `eigengs_dr.EigenGS`.
+    figures : dict of str to float
+        ``psnr_components``: fit of the components, weighted by their variances, in dB;
+        ``psnr_untrained``: the same before the shapes were trained, if they were;
+        ``shape_seconds``, ``weight_seconds``: training, and the rest.
+    """
+
+    gaussians: Gaussians
+    weights: tuple[Planes, ...]
+    low: int
+    low_components: int
+    figures: dict[str, float]
+
+
+def fit_components(
+    basis: Eigenbasis,
+    count: int,
+    split: bool,
+    method: str,
+    steps: int,
+    seed: int,
+    backend: str | None = None,
+    states: list[State] | None = None,
+    save: Callable[[list[State]], None] = lambda states: None,
+) -> ComponentFit:
+    """Place, train and weight one set of splats for all components.
+
+    Parameters
+    ----------
+    basis : Eigenbasis
+    count : int
+        Splats, at most one a pixel; at least 2 for the split.
+    split : bool
+        Whether `LOW_SHARE` of the splats serve the first components alone, the rest the others.
+    method : {"default", "eigengs"}
+        "default" solves for the weights, and trains the shapes on random combinations of
+        components; "eigengs" trains shapes and weights together, as the paper does.
+    steps : int
+        Steps of training for each side.
+    seed : int
+    backend : {"llvm", "cuda"}, optional
+    states : list of dict, optional
+        What `save` was given last: training goes on from there.
+    save : callable, optional
+        ``save(states)`` after every round of training; what it raises ends the work.
+    """
+    if method == "eigengs" and not any(map(len, basis.components)):
+        raise ValueError("the images give no components to train on; use preset 'default'")
+    started = time.perf_counter()
+    sides, states = frequency_bands(basis, count, split), list(states or [])
+    train, result = METHODS_BY_PRESET[method]
+    for i, side in enumerate(sides):
+        known = states[i] if i < len(states) else None
+        for state in train(side, seed + i, steps, backend, known):
+            states[i:] = [state]
+            save(states)
+    trained = time.perf_counter()
+    equations, gaussians, weights = _assemble(states, sides, result, backend)
+    mean = equations.solve(equations.correlate(basis.mean))
+    figures = {
+        "shape_seconds": trained - started,
+        "weight_seconds": time.perf_counter() - trained,
+        "psnr_components": psnr_components(equations, basis, weights),
+    }
+    if method == "default" and steps:
+        size = (basis.width, basis.height)
+        grids = [on_grid(size, side.splats) for side in sides]
+        equations, _, untrained = _assemble(grids, sides, result, backend)
+        figures["psnr_untrained"] = psnr_components(equations, basis, untrained)
+    return ComponentFit(
+        gaussians=with_colors(gaussians, mean, basis.space),
+        weights=weights,
+        low=sides[0].splats if split else 0,
+        low_components=low_component_count(basis) if split else 0,
+        figures=figures,
+    )
+
+
+def _assemble(
+    states: list[State], sides: list[FrequencyBand], result: Any, backend: str | None
+) -> Part:
+    """The equations of all splats, and shapes and weights of all sides."""
+    parts = [result(state, side, backend) for state, side in zip(states, sides, strict=True)]
+    equations, gaussians, weights = parts[0]
+    if len(parts) > 1:
+        gaussians = concatenate([part[1] for part in parts])
+        equations = NormalEquations(gaussians, sides[0].splats)
+        weights = _join_weights(weights, parts[1][2])
+    return equations, gaussians, weights
+
+
+def check_arguments(
+    size: tuple[int, int],
+    gaussians: int,
+    frequency_aware: bool | str,
+    seed: int,
+    preset: str,
+    steps: int | None,
+) -> int:
+    """Raise ValueError for the first argument of `EigenGS.fit` out of range; return the steps.
+
+    ``size`` is width and height of the basis in pixels; the others are those of `EigenGS.fit`.
+    """
+    if preset not in STEPS:
+        raise ValueError(f"preset {preset!r} is unknown; use one of {', '.join(STEPS)}")
+    steps = STEPS[preset] if steps is None else steps
+    for name, number in (("gaussians", gaussians), ("seed", seed), ("steps", steps)):
+        if not isinstance(number, (int, np.integer)) or number < 0:
+            raise ValueError(f"{name} is {number!r}; it must be at least 0, and whole")
+    most = size[0] * size[1]
+    if not 1 <= gaussians <= most:
+        raise ValueError(
+            f"gaussians is {gaussians}; a basis of {size[0]}x{size[1]} takes 1 to {most}"
+        )
+    if preset == "eigengs" and steps < 1:
+        raise ValueError("steps is 0; the preset 'eigengs' finds weights by training alone")
+    if not isinstance(frequency_aware, bool) and frequency_aware != "auto":
+        raise ValueError(f"frequency_aware is {frequency_aware!r}; use 'auto', True or False")
+    return steps
+
+
+def psnr_components(
+    equations: NormalEquations, basis: Eigenbasis, weights: tuple[Planes, ...]
+) -> float:
+    """Fit of the components, ``sum_j lambda_j |Psi~_j - Psi_j|^2`` a pixel and channel, in dB."""
+    total = 0.0
+    for planes, values, rows in zip(basis.components, basis.eigenvalues, weights, strict=True):
+        correlations = equations.correlate(planes)
+        error = equations.error(rows.T.astype(np.float64), correlations, squared_norms(planes))
+        total += float(values @ error)
+    return psnr_from_mse(total / basis.mean.size)
+
+
+def _train_shapes(
+    side: FrequencyBand, seed: int, steps: int, backend: str | None, state: State | None
+) -> Iterator[State]:
+    return train_shapes(
+        side.components, side.eigenvalues, side.splats, seed, steps, backend=backend, state=state
+    )
+
+
+def _solve_weights(state: State, side: FrequencyBand, backend: str | None) -> Part:
+    """The shapes of a state and the best weights on them."""
+    height, width = side.components[0].shape[1:]
+    shapes = shapes_of(state, (width, height), len(side.components), backend)
+    equations = NormalEquations(shapes)
+    solved = [equations.solve(equations.correlate(planes)) for planes in side.components]
+    return equations, shapes, tuple(weights.T.astype(np.float32) for weights in solved)
+
+
+def _train_jointly(
+    side: FrequencyBand, seed: int, steps: int, backend: str | None, state: State | None
+) -> Iterator[State]:
+    known = JointState.from_arrays(state) if state else None
+    for reached in train_jointly(
+        side.components, side.splats, seed, steps, backend=backend, state=known
+    ):
+        yield reached.arrays()
+
+
+def _weights_of(state: State, side: FrequencyBand, backend: str | None) -> Part:
+    """Shapes and weights of a state, with as many (unused) channels as the components have."""
+    reached = JointState.from_arrays(state)
+    blank = np.zeros((side.splats + 1, len(side.components)))
+    shapes = with_colors(reached.gaussians(backend), blank, "data")
+    return NormalEquations(shapes), shapes, reached.weights()
+
+
+METHODS_BY_PRESET = {
+    "default": (_train_shapes, _solve_weights),
+    "eigengs": (_train_jointly, _weights_of),
+}
+"""Presets: what trains one side step by step, and what makes shapes and weights of its state."""
+
+
+def _join_weights(first: tuple[Planes, ...], second: tuple[Planes, ...]) -> tuple[Planes, ...]:
+    """Weights of all splats and components from those of both sides; across, they are 0."""
+    joined = []
+    for low, high in zip(first, second, strict=True):
+        right, left = high.shape[1] - 1, low.shape[1] - 1
+        above = np.hstack([low[:, :-1], np.zeros((len(low), right), np.float32), low[:, -1:]])
+        below = np.hstack([np.zeros((len(high), left), np.float32), high])
+        joined.append(np.vstack([above, below]))
+    return tuple(joined)
+
+
+def with_colors(gaussians: Gaussians, coefficients: NDArray[np.float64], space: str) -> Gaussians:
+    """Give shapes the colours of an image.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    coefficients : ndarray, shape (N + 1, C)
+        Colours and, last, the background.
+    space : str
+        What the channels mean.
+    """
+    types = types_of(gaussians.mean)
+    rows = coefficients.astype(np.float32).T
+    return replace(
+        gaussians,
+        color=types.FloatX(upload_rows(types.Float, rows[:, :-1])),
+        background=types.FloatX(upload_rows(types.Float, rows[:, -1:])),
+        space=space,
+    )

@@ -1,0 +1,235 @@
+"""Incremental PCA: the mean and the main directions of images that come in blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+BLOCK_BYTES = 768 << 20
+"""Memory for a block of images."""
+
+MAX_BLOCK = 1024
+"""Most images in a block: its Gram matrix has as many rows."""
+
+MARGIN = 0.25
+"""Components carried from block to block beyond those that are kept, as a share of these."""
+
+EXAMPLES = 16
+"""Training images kept with a basis."""
+
+FLOOR = 1e-10
+"""Variance a pixel (1 is white) below which a component is nothing but rounding."""
+
+NOISE = 1e-8
+"""Share of all variance below which an eigenvalue is rounding of the Gram matrix."""
+
+DRIFT = 1e-6
+"""Largest entry of ``V V^T - 1`` that is left alone."""
+
+COLUMNS = 4096
+"""Pixels whose products are summed in single precision, before they are added in double."""
+
+
+@dataclass(frozen=True, eq=False)
+class EigenState:
+    """What the images seen so far have in common: all that the next block needs to know.
+
+    Attributes
+    ----------
+    count : int
+        Images seen, m.
+    seed : int
+        Draws the examples.
+    mean : ndarray of float64, shape (C, d)
+    rows : tuple of C ndarrays of float32, shape (r_c, d)
+        Orthonormal: the directions of largest scatter, descending.
+    scatter : tuple of C ndarrays of float64, shape (r_c,)
+        Sum over the images of the squared length along each row: m times its variance.
+    squares : ndarray of float64, shape (C,)
+        Sum over the images of the squared distance to the mean.
+    examples : ndarray of float32, shape (n, C, d)
+        At most `EXAMPLES` images, each image seen with the same probability.
+    """
+
+    count: int
+    seed: int
+    mean: NDArray[np.float64]
+    rows: tuple[NDArray[np.float32], ...]
+    scatter: tuple[NDArray[np.float64], ...]
+    squares: NDArray[np.float64]
+    examples: NDArray[np.float32]
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return everything as plain arrays, for a checkpoint."""
+        result: dict[str, NDArray[Any]] = {
+            "count": np.array(self.count),
+            "seed": np.array(self.seed),
+            "mean": self.mean,
+            "squares": self.squares,
+            "examples": self.examples,
+        }
+        for c, (rows, scatter) in enumerate(zip(self.rows, self.scatter, strict=True)):
+            result |= {f"rows{c}": rows, f"scatter{c}": scatter}
+        return result
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> EigenState:
+        """Rebuild a state from what `arrays` returned; going on from it gives equal bits."""
+        channels = range(len(arrays["mean"]))
+        return cls(
+            int(arrays["count"]),
+            int(arrays["seed"]),
+            arrays["mean"],
+            tuple(arrays[f"rows{c}"] for c in channels),
+            tuple(arrays[f"scatter{c}"] for c in channels),
+            arrays["squares"],
+            arrays["examples"],
+        )
+
+
+def empty_state(size: tuple[int, int], seed: int = 0) -> EigenState:
+    """Return the state before the first image, of three channels, for a size (width, height)."""
+    if seed < 0:
+        raise ValueError(f"seed is {seed}; expected no negative number")
+    pixels = size[0] * size[1]
+    return EigenState(
+        count=0,
+        seed=seed,
+        mean=np.zeros((3, pixels)),
+        rows=(np.zeros((0, pixels), np.float32),) * 3,
+        scatter=(np.zeros(0),) * 3,
+        squares=np.zeros(3),
+        examples=np.zeros((0, 3, pixels), np.float32),
+    )
+
+
+def block_length(size: tuple[int, int]) -> int:
+    """Return how many images of a size (width, height) make a block of `BLOCK_BYTES`."""
+    return max(1, min(MAX_BLOCK, BLOCK_BYTES // (12 * size[0] * size[1])))
+
+
+def rank_for(components: int) -> int:
+    """Return how many rows a state needs so that `components` of them are good in the end."""
+    return components + int(np.ceil(MARGIN * components))
+
+
+def merge(state: EigenState, block: NDArray[np.float32], rank: Sequence[int]) -> EigenState:
+    """Add images to a state: one step of incremental PCA.
+
+    With n images of mean m1 before and b new ones of mean m2, the scatter matrix of all is ::
+
+        S = S1 + S2 + n b / (n + b) (m1 - m2) (m1 - m2)^T
+
+    (Ross et al. 2008, "Incremental learning for robust visual tracking", IJCV 77, eq. 3). Its
+    eigenvectors follow from the Gram matrix of the rows that make it up, which is small. Exact but
+    for rounding as long as no channel has more than `rank` directions.
+
+    Parameters
+    ----------
+    state : EigenState
+        Stays as it is.
+    block : ndarray of float32, shape (b, C, d)
+        Overwritten.
+    rank : sequence of C ints
+        Most rows kept a channel; see `rank_for`.
+
+    Returns
+    -------
+    EigenState
+    """
+    n, b = state.count, len(block)
+    if b == 0:
+        return state
+    examples = _draw_examples(state, block)
+    mean = block.mean(axis=0, dtype=np.float64)
+    # Moved by this much towards the old mean, the new images have the scatter of both last terms.
+    block -= (mean + np.sqrt(n / (n + b)) * (state.mean - mean)).astype(np.float32)
+    rows, scatter, squares = [], [], []
+    for c, most in enumerate(rank):
+        gram = _gram(state.rows[c], state.scatter[c], block[:, c])
+        squares.append(np.trace(gram[len(state.rows[c]) :, len(state.rows[c]) :]))
+        values, weights = _largest_eigenpairs(gram, most, FLOOR * (n + b) * block.shape[2])
+        weights[: len(state.rows[c])] *= np.sqrt(state.scatter[c])[:, None]
+        found = _rotate(state.rows[c], block[:, c], weights.T.astype(np.float32))
+        found, values = _orthonormalize(found, values)
+        rows.append(found)
+        scatter.append(values)
+    return EigenState(
+        count=n + b,
+        seed=state.seed,
+        mean=state.mean + b / (n + b) * (mean - state.mean),
+        rows=tuple(rows),
+        scatter=tuple(scatter),
+        squares=state.squares + squares,
+        examples=examples,
+    )
+
+
+def _gram(
+    rows: NDArray[np.float32], scatter: NDArray[np.float64], block: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Products of ``[sqrt(scatter) rows; block]`` among each other; the upper right is not set."""
+    r = len(rows)
+    gram = np.zeros((r + len(block),) * 2)
+    gram[np.arange(r), np.arange(r)] = scatter
+    gram[r:, :r] = _product(block, rows) * np.sqrt(scatter)
+    gram[r:, r:] = _product(block, block)
+    return gram
+
+
+def _product(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return ``a b^T`` for long rows: single precision is fast, and would lose small variances."""
+    result = np.zeros((len(a), len(b)))
+    for first in range(0, a.shape[1], COLUMNS):
+        result += a[:, first : first + COLUMNS] @ b[:, first : first + COLUMNS].T
+    return result
+
+
+def _largest_eigenpairs(
+    gram: NDArray[np.float64], most: int, floor: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the largest eigenvalues, descending, and what combines rows to unit eigenvectors."""
+    values, vectors = np.linalg.eigh(gram, UPLO="L")
+    values, vectors = values[::-1][:most], vectors[:, ::-1][:, :most]
+    kept = values > max(floor, NOISE * np.trace(gram))
+    return values[kept], vectors[:, kept] / np.sqrt(values[kept])
+
+
+def _rotate(
+    rows: NDArray[np.float32], block: NDArray[np.float32], weights: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Combine old rows and new images to new rows."""
+    result = weights[:, len(rows) :] @ block
+    result += weights[:, : len(rows)] @ rows
+    return result
+
+
+def _orthonormalize(
+    rows: NDArray[np.float32], scatter: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Correct what rounding did to rows that should be orthonormal."""
+    overlap = _product(rows, rows)
+    # A row of another length has an eigenvalue that is rounding: there is no such direction.
+    real = np.abs(np.diag(overlap) - 1) < 0.5
+    if not real.all():
+        rows, scatter, overlap = rows[real], scatter[real], overlap[real][:, real]
+    if np.abs(overlap - np.eye(len(rows))).max(initial=0) > DRIFT:
+        # Gram-Schmidt, largest scatter first: what rounding mixed into the small ones goes.
+        inverse = np.linalg.inv(np.linalg.cholesky(overlap))
+        rows = inverse.astype(np.float32) @ rows
+    return rows, scatter
+
+
+def _draw_examples(state: EigenState, block: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Reservoir sampling: image number i takes one of i + 1 places, of which the first are kept."""
+    examples = list(state.examples)
+    for i, image in enumerate(block, state.count):
+        # A generator an image: nothing has to be remembered from block to block.
+        place = i if i < EXAMPLES else np.random.default_rng((state.seed, i)).integers(i + 1)
+        if place < EXAMPLES:
+            examples[place : place + 1] = [image.copy()]
+    return np.stack(examples)

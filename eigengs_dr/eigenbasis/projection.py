@@ -1,0 +1,109 @@
+"""Least squares on the rendered components of a model: all of them, or as few as are enough."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from ..fitting.solvers.normal_equations import NormalEquations
+from .truncation import min_ranks_per_channel, residual_energy
+
+Coefficients = tuple[NDArray[np.float32], ...]
+
+
+class ComponentProjector:
+    """All images that the rendered components Psi~ of each channel add up to.
+
+    With the Cholesky factor L of ``Psi~^T Psi~``, the coefficients of an image x are
+    ``a = L^-T y`` with ``y = L^-1 Psi~^T x``. Here y are those on the components made orthonormal
+    one after the other (Gram and Schmidt), so that the first k components alone leave the error
+    ``|x|^2 - sum_(j <= k) y_j^2``, and have the coefficients of the leading blocks of L and y.
+
+    Parameters
+    ----------
+    equations : NormalEquations
+    weights : sequence of C ndarrays of float32, shape (k_c, N + 1)
+        See `eigengs_dr.EigenGS`.
+    """
+
+    def __init__(self, equations: NormalEquations, weights: Sequence[NDArray[np.float32]]) -> None:
+        self.weights = weights
+        self.factors: list[Any] = []
+        for rows in weights:
+            # In double precision: components outnumber splats, or render alike, in some models.
+            double = rows.astype(np.float64)
+            gram = double @ equations.product(double.T)
+            gram += np.eye(len(gram)) * (1e-9 * np.trace(gram) / max(1, len(gram)) + 1e-30)
+            self.factors.append(cho_factor(gram, lower=True) if len(gram) else None)
+
+    def coefficients(self, correlations: NDArray[np.float64]) -> Coefficients:
+        """Coefficients on all components.
+
+        Parameters
+        ----------
+        correlations : ndarray of float64, shape (N + 1, C)
+            ``[A 1]^T x`` of every channel of an image x without the mean image.
+
+        Returns
+        -------
+        tuple of C ndarrays of float32, shape (k_c,)
+        """
+        found = []
+        for seen, factor in zip(self._inner_products(correlations), self.factors, strict=True):
+            solved = cho_solve(factor, seen, check_finite=False) if len(seen) else seen
+            found.append(solved.astype(np.float32))
+        return tuple(found)
+
+    def coefficients_for_psnr(
+        self,
+        correlations: NDArray[np.float64],
+        squares: NDArray[np.float64],
+        entries: int,
+        target_psnr: float,
+    ) -> Coefficients:
+        """Coefficients on the fewest components that reach a PSNR.
+
+        Parameters
+        ----------
+        correlations
+            See `coefficients`.
+        squares : ndarray of float64, shape (C,)
+            ``|x|^2`` of every channel.
+        entries : int
+            Pixels times channels.
+        target_psnr : float
+            See `eigengs_dr.eigenbasis.truncation.min_ranks_per_channel`. The ridge on the diagonal
+            of ``Psi~^T Psi~`` only lets the error be smaller than it is taken to be.
+
+        Returns
+        -------
+        tuple of C ndarrays of float32, shape (m_c,)
+            With ``m_c <= k_c``.
+        """
+        halves = [
+            solve_triangular(factor[0], seen, lower=True, check_finite=False) if len(seen) else seen
+            for seen, factor in zip(self._inner_products(correlations), self.factors, strict=True)
+        ]
+        pairs = zip(squares, halves, strict=True)
+        left = [residual_energy(total, y.astype(np.float64) ** 2) for total, y in pairs]
+        counts = min_ranks_per_channel(left, entries, target_psnr)
+        found = []
+        for y, factor, k in zip(halves, self.factors, counts, strict=True):
+            solved = y[:k]
+            if k:
+                lower = factor[0][:k, :k]
+                solved = solve_triangular(lower, solved, "T", lower=True, check_finite=False)
+            found.append(solved.astype(np.float32))
+        return tuple(found)
+
+    def _inner_products(self, correlations: NDArray[np.float64]) -> list[NDArray[np.float32]]:
+        """``Psi~^T x`` of every channel."""
+        # Not a product by BLAS, whose threads and Dr.Jit's wait for each other: twice as slow.
+        return [
+            np.einsum("jn,n->j", weights, correlations[:, c].astype(np.float32))
+            for c, weights in enumerate(self.weights)
+        ]

@@ -1,0 +1,41 @@
+"""Models by name: those that ship with the package, and files."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from pathlib import Path
+
+from .eigengs import EigenGS
+
+SHIPPED = {"natural": Path(__file__).parents[1] / "data" / "natural.npz"}
+"""Files of the bases that are part of the package, by name; see ``tools/train_natural.py``."""
+
+
+def load_basis(basis: str | os.PathLike[str] | EigenGS, backend: str | None = None) -> EigenGS:
+    """Find a model by name or file.
+
+    Parameters
+    ----------
+    basis : str, path-like or EigenGS
+        A name of `SHIPPED`, which is read once; a file; a model, which is returned as it is.
+    backend : {"llvm", "cuda"}, optional
+
+    Raises
+    ------
+    ValueError
+        If there is no such name or file, or the file is no model.
+    """
+    if isinstance(basis, EigenGS):
+        return basis
+    if basis in SHIPPED:
+        return _shipped(str(basis), backend)
+    if not Path(basis).is_file():
+        names = ", ".join(SHIPPED)
+        raise ValueError(f"basis {str(basis)!r} is neither a file nor one of: {names}")
+    return EigenGS.load(basis, backend)
+
+
+@cache
+def _shipped(name: str, backend: str | None) -> EigenGS:
+    return EigenGS.load(SHIPPED[name], backend)

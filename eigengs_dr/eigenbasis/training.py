@@ -1,0 +1,323 @@
+"""`train`: a folder of images to a model, with checkpoints and figures on images held out."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..backend.interrupt import defer_interrupts
+from ..image.folder import BASIS_SPACES, check_size, image_files, read_blocks
+from ..image.io import ImageError
+from ..storage.checkpoint import Checkpoint
+from .basis import Eigenbasis, check_components
+from .components.solve import State, check_arguments, fit_components
+from .components.split import split_reason, wants_split
+from .eigengs import EigenGS
+from .evaluation import evaluate, truncation_curve_on
+from .incremental_pca import EigenState, block_length, empty_state, merge, rank_for
+from .truncation import TruncationCurve, check_target
+
+HELD_OUT = 10
+"""One image in so many is not trained on, but measured."""
+
+MAX_HELD_OUT = 100
+"""Images measured at most: more would not change the figures much."""
+
+SAVE_SECONDS = 10.0
+"""Time between two checkpoints of the shapes."""
+
+StageProgress = Callable[[str, int, int], None]
+
+
+class Interrupted(Exception):
+    """Ctrl-C was pressed; the message says what is saved."""
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """What decides the result of a training, beside the images.
+
+    Attributes
+    ----------
+    size : (int, int)
+        Width and height in pixels.
+    components : int or tuple of 3 ints
+        The most kept of each channel.
+    energy : float or None
+        Keep as few components as hold this share of a channel's variance.
+    target_psnr : float or None
+        Keep as few components as the images held out need for this mean PSNR of their PCA, in dB;
+        see `eigengs_dr.eigenbasis.truncation.TruncationCurve`.
+    gaussians, frequency_aware, preset, steps, seed
+        See `eigengs_dr.EigenGS.fit`.
+    color : {"ycbcr", "rgb"}
+        Space of the components.
+    """
+
+    size: tuple[int, int] = (256, 256)
+    components: int | tuple[int, int, int] = 300
+    energy: float | None = None
+    target_psnr: float | None = None
+    gaussians: int = 5000
+    frequency_aware: bool | str = "auto"
+    preset: str = "default"
+    steps: int | None = None
+    color: str = "ycbcr"
+    seed: int = 0
+
+
+class Training(NamedTuple):
+    """Result of `train`.
+
+    Attributes
+    ----------
+    model : EigenGS
+    basis : Eigenbasis
+        The components that the model renders.
+    figures : dict of str to object
+        ``seconds``, ``pca_seconds``, ``shape_seconds``, ``weight_seconds`` (of this run alone, if
+        it went on with another: ``resumed``), ``peak_rss_mb``, ``images``, ``components`` of each
+        channel, ``gaussians``, ``frequency_aware`` and ``split_reason``, why;
+        ``psnr_held_out``, the attribute ``held_out`` of the model; ``psnr_components`` and others
+        of `eigengs_dr.eigenbasis.components.solve.ComponentFit`; those of
+        `eigengs_dr.eigenbasis.evaluation.evaluate`.
+    """
+
+    model: EigenGS
+    basis: Eigenbasis
+    figures: dict[str, Any]
+
+
+def train(
+    folder: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    settings: TrainOptions,
+    backend: str | None = None,
+    progress: StageProgress = lambda stage, done, total: None,
+) -> Training:
+    """Train a model on a folder of images and write it.
+
+    A folder ``OUTPUT.checkpoint`` keeps what is done; a run that was stopped, by Ctrl-C or harder,
+    goes on from there when it is started again, with the images it began with, to the same result.
+
+    Parameters
+    ----------
+    folder : path-like
+        One image in `HELD_OUT` is held out and measured.
+    output : path-like
+        The model's file.
+    settings : Settings
+    backend : {"llvm", "cuda"}, optional
+    progress : callable, optional
+        ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    Trained
+
+    Raises
+    ------
+    Interrupted
+        After Ctrl-C.
+    ValueError
+        If no image of the folder can be read, or the settings are wrong or not those of the
+        checkpoint.
+    OSError
+        If a file cannot be written.
+    """
+    started = time.perf_counter()
+    check_components(settings.components, settings.energy)
+    if settings.target_psnr is not None:
+        check_target(settings.target_psnr)
+        if settings.energy is not None:
+            raise ValueError("energy and target_psnr both choose the components; give one of them")
+    if settings.color not in BASIS_SPACES:
+        raise ValueError(
+            f"color {settings.color!r} is unknown; use one of {', '.join(BASIS_SPACES)}"
+        )
+    steps = check_arguments(
+        check_size(settings.size),
+        settings.gaussians,
+        settings.frequency_aware,
+        settings.seed,
+        settings.preset,
+        settings.steps,
+    )
+    folder = Path(folder)
+    names = [path.name for path in image_files(folder)]
+    decisive = {**asdict(settings), "steps": steps, "folder": str(folder)}
+    with Checkpoint(output, json.loads(json.dumps(decisive)), names) as checkpoint:
+        if names != checkpoint.files:
+            warnings.warn(
+                f"{folder}: its images are others than when this training began; it goes on with "
+                f"the {len(checkpoint.files)} that were there",
+                stacklevel=2,
+            )
+        files = [folder / name for name in checkpoint.files]
+        held_out = files[HELD_OUT - 1 :: HELD_OUT]
+        training = [path for i, path in enumerate(files) if i % HELD_OUT != HELD_OUT - 1]
+        with defer_interrupts() as pressed:
+            run = Run(checkpoint, settings, steps, backend, progress, pressed)
+            try:
+                held_out = held_out[:MAX_HELD_OUT]
+                basis = _basis(training, held_out, run)
+                pca_seconds = time.perf_counter() - started
+                model = _model(
+                    basis, truncation_curve_on(basis, held_out, run.stop_if_pressed), run
+                )
+                worth = evaluate(model, basis, held_out, partial(run.measure, total=len(held_out)))
+            except ValueError as error:
+                if not checkpoint.holds_work:
+                    raise
+                advice = f"to start anew, delete {checkpoint.folder}"
+                raise ValueError(f"{error}; {advice}") from None
+        figures = {
+            "resumed": checkpoint.resumed,
+            "images": basis.count,
+            "components": list(model.components),
+            "gaussians": len(model.gaussians),
+            "frequency_aware": model.low > 0,
+            "split_reason": model.split_reason,
+            "psnr_held_out": model.held_out.tolist(),
+            "steps": steps,
+            "pca_seconds": pca_seconds,
+            **model.figures,
+            **worth,
+            "peak_rss_mb": _peak_rss(),
+            "seconds": time.perf_counter() - started,
+        }
+        model.save(output)
+    return Training(model, basis, figures)
+
+
+class Run(NamedTuple):
+    """What the stages of a training share."""
+
+    checkpoint: Checkpoint
+    settings: TrainOptions
+    steps: int
+    backend: str | None
+    progress: StageProgress
+    pressed: Callable[[], bool]
+
+    def stop_if_pressed(self, *done: int) -> None:
+        """Raise `Interrupted` after Ctrl-C."""
+        if self.pressed():
+            kept = self.checkpoint.holds_work
+            raise Interrupted("the same command goes on from here" if kept else "nothing is saved")
+
+    def measure(self, done: int, total: int) -> None:
+        """Tell that images are measured, before the next one."""
+        self.progress("measure", done, total)
+        self.stop_if_pressed()
+
+
+def _basis(files: list[Path], held_out: list[Path], run: Run) -> Eigenbasis:
+    """Find the components, block by block, or read them from the checkpoint."""
+    settings, checkpoint = run.settings, run.checkpoint
+    if (path := checkpoint.folder / "basis.npz").exists():
+        return Eigenbasis.load(path)
+    arrays = checkpoint.load("pca")
+    state = EigenState.from_arrays(arrays) if arrays else empty_state(settings.size, settings.seed)
+    first = int(arrays["next"]) if arrays else 0
+    length = block_length(settings.size)
+
+    def advance(done: int, total: int | None, row: dict[str, Any]) -> None:
+        run.progress("components", first + done, len(files))
+        run.stop_if_pressed()
+
+    ranks = [rank_for(k) for k in check_components(settings.components)]
+    source = read_blocks(files[first:], settings.size, settings.color, length, advance)
+    try:
+        with closing(source) as blocks:
+            for number, block in enumerate(blocks, 1):
+                state = merge(state, block, ranks)
+                del block  # before the next is read
+                if (done := first + number * length) < len(files):
+                    checkpoint.save("pca", state.arrays() | {"next": np.array(done)})
+    except ImageError as error:
+        if not state.count:  # of an earlier run that went on here: only what was left is bad
+            raise
+        warnings.warn(f"the rest was skipped: {error}", stacklevel=2)
+    basis = Eigenbasis.from_state(
+        state, settings.size, settings.components, settings.energy, settings.color
+    )
+    if settings.target_psnr is not None:
+        if (fall := truncation_curve_on(basis, held_out, run.stop_if_pressed)) is None:
+            raise ValueError(
+                f"target_psnr needs images that are held out, one in {HELD_OUT}, and there are "
+                "none that can be read; give more images, or use energy"
+            )
+        basis = basis.truncated(fall.rank_for_psnr(settings.target_psnr))
+    basis.save(path)
+    checkpoint.remove("pca")
+    return basis
+
+
+def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS:
+    """Fit Gaussians to the components, saving what training has reached."""
+    settings, checkpoint = run.settings, run.checkpoint
+    run.stop_if_pressed()
+    run.progress("weights", 0, 1)
+    split, compared = wants_split(basis, settings.gaussians, settings.frequency_aware, run.backend)
+    saved = time.perf_counter()
+
+    def save(states: list[State]) -> None:
+        nonlocal saved
+        done = sum(int(state["step"]) for state in states)
+        if run.steps:
+            run.progress("shapes", done, run.steps * (2 if split else 1))
+            if run.pressed() or time.perf_counter() - saved > SAVE_SECONDS:
+                saved = time.perf_counter()
+                flat = {f"{i}.{k}": v for i, state in enumerate(states) for k, v in state.items()}
+                checkpoint.save("shapes", flat)
+        run.stop_if_pressed()
+
+    fitted = fit_components(
+        basis,
+        settings.gaussians,
+        split,
+        settings.preset,
+        run.steps,
+        settings.seed,
+        run.backend,
+        _states(checkpoint.load("shapes") or {}),
+        save,
+    )
+    return EigenGS.from_fit(
+        basis,
+        fitted,
+        compared,
+        split_reason=split_reason(basis, settings.gaussians, settings.frequency_aware, compared),
+        held_out=np.zeros(0) if fall is None else fall.psnr,
+    )
+
+
+def _states(flat: dict[str, Any]) -> list[State]:
+    """Undo the flattening of the states of both sides: "1.step" is the step of the second."""
+    states: dict[str, State] = {}
+    for key, array in flat.items():
+        side, name = key.split(".", 1)
+        states.setdefault(side, {})[name] = array
+    return [states[side] for side in sorted(states)]
+
+
+def _peak_rss() -> float | None:
+    """Most memory this process ever held, in MiB; None where the system does not say."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10  # macOS bytes, Linux KiB

@@ -1,0 +1,1 @@
+"""Variables, optimisers and schedules of gradient descent."""

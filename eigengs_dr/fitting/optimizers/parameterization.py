@@ -1,0 +1,120 @@
+"""The variables that an optimiser moves, and the Gaussians they stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import drjit as dr
+
+from ...backend.arrays import types_of
+from ...gaussian.gaussians import Gaussians
+
+
+class Parameterization(NamedTuple):
+    """A change of variables, differentiable by Dr.Jit.
+
+    Attributes
+    ----------
+    encode : callable
+        ``encode(gaussians) -> dict`` of named arrays.
+    decode : callable
+        ``decode(fixed, variables) -> Gaussians``; what is not among the variables is that of
+        `fixed`, the set that was given to `encode`.
+    project : callable
+        ``project(fixed, variables) -> dict``: the variables, moved where a step left their bounds.
+    """
+
+    encode: Callable[[Gaussians], dict[str, Any]]
+    decode: Callable[[Gaussians, dict[str, Any]], Gaussians]
+    project: Callable[[Gaussians, dict[str, Any]], dict[str, Any]]
+
+
+# ---------------------------------------------------------------------------------------------
+#  The parameters themselves, in units of each splat's size
+# ---------------------------------------------------------------------------------------------
+
+
+def _size(g: Gaussians) -> Any:
+    """Geometric mean of a splat's standard deviations, in pixels: ``det F = a c``."""
+    return dr.rsqrt(g.factor[0] * g.factor[2])
+
+
+def _encode_relative(g: Gaussians) -> dict[str, Any]:
+    return _relative_to(g, _size(g))
+
+
+def _relative_to(g: Gaussians, size: Any) -> dict[str, Any]:
+    return {"mean": g.mean / size, "factor": g.factor * size, "color": g.color}
+
+
+def _decode_relative(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
+    size = _size(fixed)
+    units = {"mean": size, "factor": 1 / size, "color": 1}
+    return replace(fixed, **{name: value * units[name] for name, value in variables.items()})
+
+
+def _project_relative(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, Any]:
+    inside = _relative_to(_decode_relative(fixed, variables).bounded(), _size(fixed))
+    return {name: inside[name] for name in variables}
+
+
+SCALE_RELATIVE = Parameterization(_encode_relative, _decode_relative, _project_relative)
+"""Mean over the size that the splat started with, factor times that size, colour: one rate serves
+small and large splats, and pictures of any size."""
+
+
+# ---------------------------------------------------------------------------------------------
+#  Those of GaussianImage (Zhang et al., ECCV 2024)
+# ---------------------------------------------------------------------------------------------
+
+CHOLESKY_BOUND = 0.5
+"""Added to the diagonal of the Cholesky factor, in pixels: no splat is narrower."""
+
+
+def _encode_cholesky(g: Gaussians) -> dict[str, Any]:
+    types = types_of(g.mean)
+    x, y = g.mean
+    a, b, c = g.factor
+    # Sigma = F^-1 F^-T = [[1 / a^2 + b^2 / (a c)^2, -b / (a c^2)], [., 1 / c^2]] = L L^T
+    l1 = dr.sqrt(dr.square(1 / a) + dr.square(b / (a * c)))
+    l2 = -b / (a * c * c * l1)
+    l3 = 1 / (a * c * l1)
+    return {
+        "mean": types.Float2(_atanh(2 * x / g.width - 1), _atanh(2 * y / g.height - 1)),
+        "cholesky": types.Float3(l1 - CHOLESKY_BOUND, l2, l3 - CHOLESKY_BOUND),
+        "color": g.color,
+    }
+
+
+def _atanh(x: Any) -> Any:
+    return dr.atanh(dr.clip(x, -0.999999, 0.999999))
+
+
+def _decode_cholesky(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
+    parts = {}
+    if "mean" in variables:
+        x, y = (0.5 * (dr.tanh(v) + 1) for v in variables["mean"])
+        parts["mean"] = type(fixed.mean)(x * fixed.width, y * fixed.height)
+    if "cholesky" in variables:
+        parts["factor"] = type(fixed.factor)(_inverse_factor(*variables["cholesky"]))
+    if "color" in variables:
+        parts["color"] = variables["color"]
+    return replace(fixed, **parts)
+
+
+def _inverse_factor(l1: Any, l2: Any, l3: Any) -> tuple[Any, Any, Any]:
+    """``F`` with ``F^T F = (L L^T)^-1``; see `inverse_factor` of the placement."""
+    l1, l3 = l1 + CHOLESKY_BOUND, l3 + CHOLESKY_BOUND
+    yy = dr.square(l2) + dr.square(l3)
+    a = dr.sqrt(yy) / dr.abs(l1 * l3)
+    return a, -l1 * l2 / yy * a, dr.rsqrt(yy)
+
+
+def _project_cholesky(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, Any]:
+    return variables
+
+
+CHOLESKY = Parameterization(_encode_cholesky, _decode_cholesky, _project_cholesky)
+"""atanh of the mean in [-1, 1], Cholesky factor of the covariance in pixels, colour."""

@@ -1,0 +1,1 @@
+"""Where Gaussians start and where they are added. NumPy only."""

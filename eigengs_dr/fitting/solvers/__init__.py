@@ -1,0 +1,1 @@
+"""Linear least squares for colours on fixed shapes."""

@@ -1,0 +1,288 @@
+"""The best colours on shapes that many images share: one sparse factorisation serves them all.
+
+With A, whose column n holds the weights of splat n at all pixels, the best colours c and background
+b of an image D minimise ``|A c + b 1 - D|^2``. Shapes that do not change from image to image leave
+``A^T A`` as it is: it is factorised once, and each image costs one product and one
+back-substitution. For the shapes of one image alone,
+`eigengs_dr.fitting.solvers.conjugate_gradient` is cheaper.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import splu
+
+from ...backend.arrays import types_of, upload
+from ...gaussian.gaussians import Gaussians
+from ...raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, weights
+from ...raster.kernels import adjoint
+from ...raster.layout import pack_parameters, unpack_parameters
+from ...raster.render import CUTOFF, bin_gaussians, to_tiles
+
+GROUP = 3
+"""Images that are correlated at once: an image's channels, so that one program serves all."""
+
+MAX_WEIGHTS = 1 << 28
+"""Largest number of weights that a matrix may have: they and their places take 6 GiB."""
+
+RIDGE = 1e-4
+"""Added to the diagonal of ``A^T A``, as a share of its mean: bounds the colours of splats that
+overlap much, at no visible cost."""
+
+
+class Block(NamedTuple):
+    """Consecutive splats whose colours are solved for together.
+
+    Attributes
+    ----------
+    rows : slice
+    factor : SuperLU
+        Of ``A^T A + ridge``, in single precision: half the memory to read for every image, and
+        what that loses is below the ridge.
+    spread : ndarray of float64, shape (n,)
+        ``h = (A^T A + ridge)^-1 A^T 1``, by which a background moves the colours.
+    """
+
+    rows: slice
+    factor: Any
+    spread: NDArray[np.float64]
+
+    def divide(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
+        """``(A^T A + ridge)^-1`` times columns."""
+        return self.factor.solve(np.asarray(sums, np.float32, order="F")).astype(np.float64)
+
+
+class NormalEquations:
+    """``(A^T A + ridge) c = A^T (D - b)`` for any number of images D on fixed shapes, factorised.
+
+    Solved exactly, or, with `low`, for two blocks of splats one after the other.
+
+    The background, a dense column of ones beside A, stays out of the sparse factor: block
+    elimination gives it from two sums. A column of coefficients is N colours and, last, the
+    background.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Shapes and native size; colours are not used.
+    low : int, optional
+        So many splats, the first ones, fit an image with the background, and the others what is
+        left. With large splats below small ones that starts some 0.1 dB below the solution for all
+        at once, in which both cancel each other in large numbers: it ends 1 dB lower when refined.
+    cutoff : float, optional
+        See `eigengs_dr.render`.
+
+    Raises
+    ------
+    ValueError
+        If the shapes are so alike that the equations are singular to working precision.
+    """
+
+    def __init__(self, gaussians: Gaussians, low: int = 0, cutoff: float = CUTOFF) -> None:
+        self.count, self.cutoff = len(gaussians), cutoff
+        self.width, self.height = gaussians.width, gaussians.height
+        matrix = weight_matrix(gaussians, cutoff)
+        double = matrix.astype(np.float64)
+        self.gram = (double @ double.T).tocsr()
+        self.coverage = np.asarray(matrix.sum(axis=1), np.float64)
+        ends = [0, low, self.count] if low else [0, self.count]
+        self.blocks = [self._block(slice(*pair)) for pair in pairwise(ends)]
+        with dr.suspend_grad():
+            types = types_of(gaussians.mean)
+            shape = [*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor]]
+            self.packed = pack_parameters([*shape, *[types.Float(0)] * GROUP])
+            self.lists = bin_gaussians(gaussians, cutoff)
+
+    def _block(self, rows: slice) -> Block:
+        """Factorise the equations of some splats."""
+        gram = self.gram[rows, rows]
+        ridge = max(RIDGE * gram.diagonal().mean(), 1e-12)
+        system = (gram + diags_array(np.full(gram.shape[0], ridge))).tocsc()
+        try:
+            factor = splu(
+                system.astype(np.float32),
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )
+        except RuntimeError as error:
+            raise ValueError(f"the splats' equations have no solution ({error})") from None
+        coverage = self.coverage[rows]
+        block = Block(rows, factor, 0 * coverage)
+        spread = block.divide(coverage)
+        return block._replace(spread=spread + block.divide(coverage - system @ spread))
+
+    def correlate(self, images: NDArray[np.float32]) -> NDArray[np.float64]:
+        """``A^T D`` and, last, ``1^T D``.
+
+        Parameters
+        ----------
+        images : ndarray of float32, shape (M, H, W)
+            M planes at the native size.
+
+        Returns
+        -------
+        ndarray of float64, shape (N + 1, M)
+            Cost: one adjoint with respect to colours for every `GROUP` planes.
+        """
+        result = np.empty((self.count + 1, len(images)))
+        types = types_of(self.packed)
+        with dr.suspend_grad():
+            for first in range(0, len(images), GROUP):
+                planes = images[first : first + GROUP]
+                missing = [(0, GROUP - len(planes)), (0, 0), (0, 0)]
+                padded = np.pad(planes, missing) if len(planes) < GROUP else planes
+                delta = to_tiles(types, np.moveaxis(padded, 0, 2), self.lists.grid)
+                rows = adjoint(
+                    self.packed, delta, GROUP, self.lists, EXP2_SCALE * self.cutoff, True
+                )
+                dr.eval(rows)
+                for column, row in zip(range(first, first + len(planes)), rows, strict=False):
+                    result[:-1, column] = row.numpy()
+        result[-1] = images.sum(axis=(1, 2), dtype=np.float64)
+        return result
+
+    def solve(self, correlations: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Coefficients of least squares from what `correlate` gave; both of shape (N + 1, M).
+
+        With two blocks those of the first, and then those of the second for what is left.
+        """
+        first, *others = self.blocks
+        sums, total = correlations[first.rows], correlations[-1]
+        pixels = self.width * self.height
+        free = pixels - first.spread @ self.coverage[first.rows]
+        # Splats that make a constant by themselves leave nothing for the background.
+        background = (total - first.spread @ sums) / free if free > 1e-6 * pixels else 0 * total
+        solved = np.zeros(correlations.shape)
+        solved[-1] = background
+        solved[first.rows] = first.divide(sums) - np.outer(first.spread, background)
+        for block in others:
+            left = correlations - self.product(solved)
+            solved[block.rows] = block.divide(left[block.rows])
+        return solved
+
+    def product(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+        """``[A 1]^T [A 1] x`` for coefficients x of shape (N + 1, M)."""
+        colors, background = coefficients[:-1], coefficients[-1:]
+        pixels = self.width * self.height
+        return np.vstack(
+            [
+                self.gram @ colors + self.coverage[:, None] * background,
+                self.coverage @ colors + pixels * background[0],
+            ]
+        )
+
+    def error(
+        self,
+        coefficients: NDArray[np.float64],
+        correlations: NDArray[np.float64],
+        squared_norms: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """``|A c + b 1 - D|^2`` of M images by inner products, without rendering one.
+
+        Parameters
+        ----------
+        coefficients, correlations : ndarray of float64, shape (N + 1, M)
+        squares : ndarray of float64, shape (M,)
+            ``|D|^2``; the result is exact to about 1e-6 of it.
+
+        Returns
+        -------
+        ndarray of float64, shape (M,)
+        """
+        product = self.product(coefficients)
+        error = squared_norms + ((product - 2 * correlations) * coefficients).sum(axis=0)
+        return np.maximum(error, 0)
+
+
+def weight_matrix(gaussians: Gaussians, cutoff: float = CUTOFF) -> csr_array:
+    """Weights of every splat at every pixel of the native size: the transpose of A.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        N splats; colours are not used.
+    cutoff : float, optional
+        See `eigengs_dr.render`.
+
+    Returns
+    -------
+    csr_array of float32, shape (N, H * W)
+        Row n holds the weights of splat n, by `eigengs_dr.raster.evaluate.weights`. Cost and size:
+        the number of pixels inside all ellipses; 8 bytes each, and 30 while it is made.
+
+    Raises
+    ------
+    ValueError
+        If these are more than `MAX_WEIGHTS`.
+    """
+    arrays = gaussians.to_arrays()
+    splat, x, y = _pixels_inside(
+        arrays["mean"].astype(np.float64),
+        arrays["factor"].astype(np.float64),
+        gaussians.width,
+        gaussians.height,
+        cutoff,
+    )
+    size = (len(gaussians), gaussians.width * gaussians.height)
+    if len(splat) == 0:  # Dr.Jit does not compute with no elements
+        return csr_array(size, dtype=np.float32)
+    types = types_of(gaussians.mean)
+    with dr.suspend_grad():
+        packed = pack_parameters([*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor]])
+        shape = unpack_parameters(packed, upload(types.UInt, splat), NUM_SHAPE_PARAMS)
+        px, py = (upload(types.Float, (p + 0.5).astype(np.float32)) for p in (x, y))
+        [values] = weights(shape, px, py, (1, 1), (EXP2_SCALE * cutoff) ** 2)
+    columns = y * gaussians.width + x
+    starts = np.concatenate([[0], np.cumsum(np.bincount(splat, minlength=len(gaussians)))])
+    return csr_array((values.numpy(), columns, starts.astype(np.int32)), shape=size)
+
+
+def _pixels_inside(
+    mean: NDArray[np.float64],
+    factor: NDArray[np.float64],
+    width: int,
+    height: int,
+    cutoff: float,
+) -> tuple[NDArray[np.uint32], NDArray[np.int32], NDArray[np.int32]]:
+    """List (splat, x, y) of the pixels inside each ellipse, row by row.
+
+    On the row at distance dy, ``|F (x - mu)| <= cutoff`` is
+    ``|a dx + b dy| <= sqrt(cutoff^2 - (c dy)^2)``.
+    """
+    a, b, c = factor.T
+    reach = cutoff / c
+    low = np.clip(np.ceil(mean[:, 1] - reach - 0.5), 0, height).astype(np.int32)
+    high = np.clip(np.floor(mean[:, 1] + reach - 0.5) + 1, low, height).astype(np.int32)
+    splat, y = _expand(low, high)
+    dy = y + 0.5 - mean[splat, 1]
+    half = np.sqrt(np.maximum(cutoff**2 - (c[splat] * dy) ** 2, 0)) / a[splat]
+    middle = mean[splat, 0] - b[splat] / a[splat] * dy
+    low = np.clip(np.ceil(middle - half - 0.5), 0, width).astype(np.int32)
+    high = np.clip(np.floor(middle + half - 0.5) + 1, low, width).astype(np.int32)
+    row, x = _expand(low, high)
+    return splat[row].astype(np.uint32), x, y[row]
+
+
+def _expand(
+    low: NDArray[np.int32], high: NDArray[np.int32]
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """All integers of the ranges [low, high), each with the index of its range."""
+    count = high - low
+    total = int(count.sum(dtype=np.int64))
+    if total > MAX_WEIGHTS:
+        raise ValueError(f"the splats cover {total:,} pixels in all, over {MAX_WEIGHTS:,}")
+    which = np.repeat(np.arange(len(low)), count)
+    before = np.repeat(np.cumsum(count) - count, count)
+    return which, (np.arange(len(which)) - before + low[which]).astype(np.int32)
+
+
+def squared_norms(planes: NDArray[np.float32]) -> NDArray[np.float64]:
+    """``|D|^2`` of every plane."""
+    return np.einsum("nij,nij->n", planes, planes, dtype=np.float64)

@@ -1,0 +1,1 @@
+"""The representation: sets of 2D Gaussians, their covariances, their files."""

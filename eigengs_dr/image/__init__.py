@@ -1,0 +1,1 @@
+"""Pixels: files, colour spaces, sizes, metrics. No Gaussians."""

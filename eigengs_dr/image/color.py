@@ -1,0 +1,208 @@
+"""Colour spaces: RGB to the studio-range YCbCr of ITU-R BT.601 or to linear light, and back."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+SPACES = ("ycbcr", "rgb", "linear", "data")
+"""What the channels of a set of Gaussians may mean.
+
+``"ycbcr"`` is studio-range YCbCr / 255, ``"rgb"`` is gamma-encoded RGB, ``"linear"`` is linear RGB
+and ``"data"`` is anything else (roughness, normals, ...), with any number of channels.
+"""
+
+MAX_CHANNELS = 64
+"""A program holds the sums of all channels of a tile in registers: it must end somewhere."""
+
+RGB_TO_YCBCR: NDArray[np.float64] = (
+    np.array(
+        [
+            [65.481, 128.553, 24.966],
+            [-37.797, -74.203, 112.0],
+            [112.0, -93.786, -18.214],
+        ]
+    )
+    / 255
+)
+"""Matrix M, shape (3, 3), of ``ycbcr = M rgb + YCBCR_OFFSET``, rows Y, Cb, Cr; ITU-R BT.601."""
+
+YCBCR_OFFSET: NDArray[np.float64] = np.array([16.0, 128.0, 128.0]) / 255
+"""YCbCr of black, shape (3,)."""
+
+YCBCR_TO_RGB: NDArray[np.floating[Any]] = np.linalg.inv(RGB_TO_YCBCR)
+"""Inverse of `RGB_TO_YCBCR`, shape (3, 3)."""
+
+
+def rgb_to_ycbcr(image: NDArray[Any]) -> NDArray[Any]:
+    """Convert RGB to studio-range YCbCr / 255.
+
+    For RGB in [0, 1], Y lies in [16, 235] / 255 and Cb and Cr in [16, 240] / 255. Nothing is
+    clamped, so that the conversion is affine and invertible everywhere.
+
+    Parameters
+    ----------
+    image : ndarray of float32 or float64, shape (..., 3)
+        Gamma-encoded RGB, 1 is white.
+
+    Returns
+    -------
+    ndarray, same shape and dtype
+        Y, Cb, Cr; equals ``skimage.color.rgb2ycbcr(image) / 255``.
+
+    Raises
+    ------
+    ValueError
+        If the last axis is not 3 or the dtype is not float32 or float64.
+
+    Examples
+    --------
+    >>> rgb_to_ycbcr(np.ones(3)).round(4)
+    array([0.9216, 0.502 , 0.502 ])
+    """
+    image = _check_rgb(image)
+    return image @ RGB_TO_YCBCR.T.astype(image.dtype) + YCBCR_OFFSET.astype(image.dtype)
+
+
+def ycbcr_to_rgb(image: NDArray[Any]) -> NDArray[Any]:
+    """Convert studio-range YCbCr / 255 to RGB, the inverse of `rgb_to_ycbcr`.
+
+    Parameters
+    ----------
+    image : ndarray of float32 or float64, shape (..., 3)
+        Y, Cb, Cr on a [0, 1] scale.
+
+    Returns
+    -------
+    ndarray, same shape and dtype
+        RGB, 1 is white, not clamped: many YCbCr triples lie outside the RGB cube.
+
+    Raises
+    ------
+    ValueError
+        If the last axis is not 3 or the dtype is not float32 or float64.
+    """
+    image = _check_rgb(image)
+    return (image - YCBCR_OFFSET.astype(image.dtype)) @ YCBCR_TO_RGB.T.astype(image.dtype)
+
+
+def to_linear(coded: Any) -> Any:
+    """Decode sRGB to linear light: ``x / 12.92``, above 0.04045 ``((x + 0.055) / 1.055)^2.4``.
+
+    Elementwise on NumPy and Dr.Jit arrays (vectors, colours and tensors too), in their precision.
+    Both parts continue beyond [0, 1], so that values and derivatives are finite everywhere, also
+    where the other part applies.
+
+    Parameters
+    ----------
+    coded : array of floats, any shape
+        sRGB, 1 is white.
+
+    Returns
+    -------
+    array, same shape and type
+        Linear light, 1 is white.
+
+    Raises
+    ------
+    ValueError
+        If a NumPy array is not float32 or float64.
+
+    References
+    ----------
+    IEC 61966-2-1:1999, section 5.2.
+
+    Examples
+    --------
+    >>> to_linear(np.array([0.0, 0.5, 1.0])).round(4)
+    array([0.   , 0.214, 1.   ])
+    """
+    select, maximum, power = _functions(coded)
+    # The power sees no argument where its slope is infinite or its value is NaN: in reverse mode
+    # even zero times that would be NaN.
+    curved = power((maximum(coded, 0.04045) + 0.055) * (1 / 1.055), 2.4)
+    return select(coded <= 0.04045, coded * (1 / 12.92), curved)
+
+
+def to_coded(linear: Any) -> Any:
+    """Code linear light as sRGB: ``12.92 x``, above 0.0031308 ``1.055 x^(1 / 2.4) - 0.055``.
+
+    The inverse of `to_linear`, of which the rest holds here too; only where both parts meet do the
+    constants of the standard leave a step of 3e-8.
+
+    Parameters
+    ----------
+    linear : array of floats, any shape
+        Linear light, 1 is white.
+
+    Returns
+    -------
+    array, same shape and type
+        sRGB, 1 is white, not clamped: light below 0 gives codes below 0.
+
+    Raises
+    ------
+    ValueError
+        If a NumPy array is not float32 or float64.
+    """
+    select, maximum, power = _functions(linear)
+    curved = power(maximum(linear, 0.0031308), 1 / 2.4) * 1.055 - 0.055
+    return select(linear <= 0.0031308, linear * 12.92, curved)
+
+
+def decode(space: str, channels: Sequence[Any]) -> list[Any]:
+    """Turn the channels of a render into what is shown: RGB, or data as it is.
+
+    Works on any array type that multiplies by a Python float (NumPy or Dr.Jit, attached to a
+    derivative or not), and keeps the precision of the arrays.
+
+    Parameters
+    ----------
+    space : {"ycbcr", "rgb", "linear", "data"}
+        What the channels mean, one of `SPACES`.
+    channels : sequence of arrays
+        One array a channel, all of one shape; exactly three for ``"ycbcr"``.
+
+    Returns
+    -------
+    list of arrays
+        R, G, B for ``"ycbcr"``, not clamped; the channels unchanged for every other space.
+
+    Raises
+    ------
+    ValueError
+        If the space is unknown, or is ``"ycbcr"`` without having three channels.
+    """
+    if space not in SPACES:
+        raise ValueError(f"colour space {space!r} is unknown; use one of {', '.join(SPACES)}")
+    if space != "ycbcr":
+        return list(channels)
+    if len(channels) != 3:
+        raise ValueError(f"space 'ycbcr' needs 3 channels, not {len(channels)}; use space 'data'")
+    y, cb, cr = channels
+    # Python floats: a NumPy float64 scalar would promote a Dr.Jit float32 array to float64.
+    matrix = YCBCR_TO_RGB.tolist()
+    black = (-YCBCR_TO_RGB @ YCBCR_OFFSET).tolist()
+    return [a * y + b * cb + c * cr + d for (a, b, c), d in zip(matrix, black, strict=True)]
+
+
+def _functions(array: Any) -> tuple[Any, Any, Any]:
+    """Select, maximum and power for a NumPy or a Dr.Jit array."""
+    if not isinstance(array, np.ndarray | np.generic | float):
+        import drjit as dr  # loads libLLVM, which must be found first
+
+        return dr.select, dr.maximum, dr.power
+    if isinstance(array, np.ndarray | np.generic) and array.dtype not in (np.float32, np.float64):
+        raise ValueError(f"array is {array.dtype}; convert to float32 or float64 in [0, 1] first")
+    return np.where, np.maximum, np.power
+
+
+def _check_rgb(image: NDArray[Any]) -> NDArray[Any]:
+    """Refuse what is not a float image of three channels: bytes would be taken for [0, 1]."""
+    image = np.asarray(image)
+    if image.shape[-1:] != (3,):
+        raise ValueError(f"image has shape {image.shape}; expected (..., 3)")
+    if image.dtype not in (np.float32, np.float64):
+        raise ValueError(f"image is {image.dtype}; convert to float32 or float64 in [0, 1] first")
+    return image

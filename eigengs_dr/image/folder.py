@@ -1,0 +1,307 @@
+"""Families of images, read in blocks of bounded memory: folders, files, arrays, iterators."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from itertools import islice
+from operator import index
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .color import RGB_TO_YCBCR, YCBCR_OFFSET
+from .io import SAVE_OPTIONS, ImageError, check_image, load_image
+from .resize import center_crop
+
+BASIS_SPACES = ("ycbcr", "rgb")
+"""Colour spaces that images can be read in."""
+
+DECODE_THREADS = min(8, os.cpu_count() or 1)
+"""Files decoded at the same time: Pillow and NumPy release the interpreter while they work."""
+
+MAX_WAITING = 4 * DECODE_THREADS
+"""Images that may wait in memory until they are their turn."""
+
+MAX_NAMED = 3
+"""Skipped files that are named; the others are only counted."""
+
+Source = str | os.PathLike[str] | NDArray[Any] | Iterable[str | os.PathLike[str] | NDArray[Any]]
+"""A folder, an array of images, or any iterable of files or such arrays."""
+
+ReadProgress = Callable[[int, int | None, dict[str, Any]], None]
+"""``progress(done, total, row)``; the total is None where it is not known."""
+
+
+class PreparedImage(NamedTuple):
+    """One image of a stream.
+
+    Attributes
+    ----------
+    planes : ndarray of float32, shape (3, d), or None
+        None where the file could not be read.
+    fitted : bool
+        Whether it was of another size.
+    problem : str
+        The name of the file and why it could not be read.
+    """
+
+    planes: NDArray[np.float32] | None
+    fitted: bool
+    problem: str = ""
+
+
+def image_files(folder: str | Path) -> list[Path]:
+    """List the images of a folder, without its subfolders.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Where to look.
+
+    Returns
+    -------
+    list of Path
+        Files with a suffix of `SAVE_OPTIONS` (in upper or lower case), sorted by name, hidden files
+        left out.
+
+    Raises
+    ------
+    ImageError
+        If the folder does not exist, is a file, or holds no image.
+    """
+    folder = Path(folder)
+    try:
+        entries = sorted(folder.iterdir())
+    except NotADirectoryError:
+        raise ImageError(f"{folder}: is a file; name the folder that holds it") from None
+    except OSError as error:
+        raise ImageError(f"{folder}: not a readable folder ({error.strerror}); check it") from None
+    files = [
+        entry
+        for entry in entries
+        if entry.suffix.lower() in SAVE_OPTIONS and entry.name[0] != "." and entry.is_file()
+    ]
+    if not files:
+        known = " ".join(SAVE_OPTIONS)
+        raise ImageError(f"{folder}: holds no images; expected files ending in {known}")
+    return files
+
+
+def read_blocks(
+    source: Source,
+    size: tuple[int, int],
+    space: str,
+    length: int,
+    progress: ReadProgress | None = None,
+) -> Generator[NDArray[np.float32], None, None]:
+    """Read images in blocks, in the order of the source.
+
+    Every `length` consecutive images of the source make one block, from which those that cannot be
+    read are missing. Work that stopped after n blocks therefore goes on, with the same blocks as if
+    it had not, with the source from image ``n * length`` on.
+
+    Parameters
+    ----------
+    source : path, array or iterable
+        A folder (its images are listed once), an array of images (n, H, W, 3) or (n, H, W), or an
+        iterable of files, of such arrays or of single RGB images (H, W, 3). Pixels as for
+        `check_image`. Arrays are used before the next is asked for, and may then be overwritten.
+    size : (int, int)
+        Width and height. Images of another size are cropped around their centre and resampled.
+    space : {"ycbcr", "rgb"}
+        What the three channels mean.
+    length : int
+        Most images in a block.
+    progress : callable, optional
+        ``progress(done, total, {})`` after every image; `total` is None for an iterator.
+
+    Yields
+    ------
+    ndarray of float32, shape (b, 3, height * width)
+        With b <= length, and b = 0 where no file of a block could be read. It may be overwritten.
+        While the caller keeps it, two blocks are in memory: let go of it before asking for more.
+
+    Raises
+    ------
+    ImageError
+        If the source holds no image, none of its files can be read, or an array is not images.
+    ValueError
+        If an argument is none of the above.
+
+    Warns
+    -----
+    UserWarning
+        At the end, in a line each: how many images were skipped, the first of them by name; how
+        many were of another size.
+    """
+    size = check_size(size)
+    if space not in BASIS_SPACES:
+        raise ValueError(f"colour space {space!r} is unknown; use one of {', '.join(BASIS_SPACES)}")
+    if length < 1:
+        raise ValueError(f"length is {length}; a block needs at least 1 image")
+    if isinstance(source, str | os.PathLike):
+        source = image_files(Path(source))
+    elif isinstance(source, np.ndarray):
+        source = [source]
+    total = None
+    if isinstance(source, Sequence):
+        total = sum(1 if _is_file(item) else len(_images(item)) for item in source)
+    return _blocks(_prepare_images(source, size, space), size, length, total, progress)
+
+
+def check_size(size: Any) -> tuple[int, int]:
+    """Return a width and a height as integers.
+
+    Parameters
+    ----------
+    size : (int, int)
+        Width and height.
+
+    Raises
+    ------
+    ValueError
+        If it is something else, or a side is not positive.
+    """
+    try:
+        width, height = map(index, size)
+    except (TypeError, ValueError):
+        raise ValueError(f"size is {size!r}; expected (width, height) in whole pixels") from None
+    if min(width, height) < 1:
+        raise ValueError(f"size is {width}x{height}; both sides must be at least 1 pixel")
+    return width, height
+
+
+def to_planes(image: NDArray[np.float32], space: str) -> NDArray[np.float32]:
+    """Separate the channels of an RGB image, converted to a colour space.
+
+    Parameters
+    ----------
+    image : ndarray of float32, shape (H, W, 3)
+        RGB.
+    space : {"ycbcr", "rgb"}
+
+    Returns
+    -------
+    ndarray of float32, shape (3, H * W)
+        Each channel row by row; for ``"ycbcr"`` as `rgb_to_ycbcr` has it, but for rounding.
+    """
+    planes = np.ascontiguousarray(image.reshape(-1, 3).T)
+    if space == "rgb":
+        return planes
+    # Not a product of matrices: the threads of BLAS and those that decode would fight for cores.
+    result = np.empty_like(planes)
+    for row, weights, offset in zip(
+        result, RGB_TO_YCBCR.astype(np.float32), YCBCR_OFFSET.astype(np.float32), strict=True
+    ):
+        np.multiply(planes[0], weights[0], out=row)
+        row += weights[1] * planes[1]
+        row += weights[2] * planes[2]
+        row += offset
+    return result
+
+
+def _blocks(
+    images: Generator[PreparedImage, None, None],
+    size: tuple[int, int],
+    length: int,
+    total: int | None,
+    progress: ReadProgress | None,
+) -> Generator[NDArray[np.float32], None, None]:
+    """Gather images into blocks, and say at the end what was wrong with some."""
+    pixels = size[0] * size[1]
+    done = fitted = 0
+    problems: list[str] = []
+    with closing(images):
+        while True:
+            block = np.empty((min(length, total or length), 3, pixels), np.float32)
+            before, filled = done, 0
+            for image in islice(images, length):
+                if image.planes is None:
+                    problems.append(image.problem)
+                else:
+                    block[filled] = image.planes
+                    filled += 1
+                done += 1
+                fitted += image.fitted
+                if progress:
+                    progress(done, total, {})
+            if done == before:
+                break
+            yield block[:filled]
+            del block  # before the next is made
+    if done == 0:
+        raise ImageError("the source holds no images; check where they should come from")
+    if len(problems) == done:
+        raise ImageError(f"none of {done} images can be read, as {problems[0]}; check the files")
+    if problems:
+        named = ", ".join(problems[:MAX_NAMED]) + (", ..." if len(problems) > MAX_NAMED else "")
+        warnings.warn(f"{len(problems)} of {done} images were skipped: {named}", stacklevel=2)
+    if fitted:
+        warnings.warn(
+            f"{fitted} of {done} images were centre-cropped and resized to {size[0]}x{size[1]}",
+            stacklevel=2,
+        )
+
+
+def _prepare_images(
+    source: Iterable[Any], size: tuple[int, int], space: str
+) -> Generator[PreparedImage, None, None]:
+    """Prepare images in parallel; they come in the order of the source."""
+    pool = ThreadPoolExecutor(DECODE_THREADS, thread_name_prefix="decode")
+    waiting: deque[Future[PreparedImage]] = deque()
+    try:
+        for place, item in enumerate(_singles(source)):
+            waiting.append(pool.submit(_prepare, item, place, size, space))
+            # An array is done with at once: its owner may overwrite it.
+            while len(waiting) > (MAX_WAITING if isinstance(item, Path) else 0):
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _singles(source: Iterable[Any]) -> Iterator[Any]:
+    """Take arrays of several images apart."""
+    for item in source:
+        if _is_file(item):
+            yield Path(item)
+        else:
+            yield from _images(item)
+
+
+def _prepare(item: Any, place: int, size: tuple[int, int], space: str) -> PreparedImage:
+    """Read, crop and convert one image."""
+    try:
+        image = load_image(item) if isinstance(item, Path) else check_image(item)
+    except ImageError as error:
+        if not isinstance(item, Path):
+            raise ImageError(f"image {place} of the source{str(error)[len('image') :]}") from None
+        # "folder/a.jpg: the file is empty (0 bytes); copy it again" is more than a list can hold.
+        reason = str(error).removeprefix(f"{item}: ").split("; ")[0]
+        return PreparedImage(None, False, f"{item.name} ({reason})")
+    width, height = size
+    fitted = image.shape[:2] != (height, width)
+    if fitted:
+        image = center_crop(image, width, height)
+    return PreparedImage(to_planes(image, space), fitted)
+
+
+def _is_file(item: Any) -> bool:
+    return isinstance(item, str | os.PathLike)
+
+
+def _images(item: Any) -> Sequence[Any]:
+    """Look at an array as a sequence of images."""
+    if not isinstance(item, np.ndarray) or item.ndim not in (3, 4):
+        kind = f"shape {item.shape}" if isinstance(item, np.ndarray) else type(item).__name__
+        raise ImageError(f"images: found {kind}, expected (n, H, W, 3) or (n, H, W); pass arrays")
+    # A short last axis holds channels: nobody has grey images that narrow.
+    return [item] if item.ndim == 3 and item.shape[2] in (1, 3) else list(item)

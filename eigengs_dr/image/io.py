@@ -1,0 +1,237 @@
+"""Reading, checking and writing images."""
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..storage.atomic import atomic_write
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+SAVE_OPTIONS: dict[str, dict[str, Any]] = {
+    ".png": {},
+    ".jpg": {"quality": 95},
+    ".jpeg": {"quality": 95},
+    ".webp": {"quality": 95},
+    ".tif": {},
+    ".tiff": {},
+    ".bmp": {},
+    ".ppm": {},
+}
+"""Suffixes that are written and looked for in folders, with what Pillow is told when writing."""
+
+
+MIN_PIXEL, MAX_PIXEL = -0.5, 1.5
+"""Range of accepted float pixels: room for what resampling overshoots, none for 0..255."""
+
+
+class ImageError(ValueError):
+    """An image that cannot be used: one line that says which, why and what to do."""
+
+
+def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]:
+    """Read an image file as RGB.
+
+    Grey is replicated, palette, CMYK and YCbCr are converted, and the orientation of the EXIF
+    header is applied. 8-bit values v become v/255 exactly. 16-bit grey keeps its precision
+    (v/65535); of 16-bit RGB and RGBA, and of 16-bit grey with alpha, Pillow keeps the upper 8 bits.
+
+    Parameters
+    ----------
+    path : str or Path
+        Anything that Pillow reads.
+    keep_grey : bool, optional
+        Return one channel where the file is opaque grey.
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W, 3), or (H, W, 1)
+        RGB in [0, 1] as stored in the file (colour profiles are ignored); float files as they are.
+
+    Warns
+    -----
+    UserWarning
+        If the image is transparent somewhere: it is shown over white. If it holds several frames:
+        the first is used.
+
+    Raises
+    ------
+    ImageError
+        If there is no such file, or it is empty, damaged, too large or not an image.
+    """
+    from PIL import Image, ImageOps, UnidentifiedImageError  # 0.05 s
+
+    path = Path(path)
+    try:
+        if path.stat().st_size == 0:
+            raise ImageError(f"{path}: the file is empty (0 bytes); copy or export it again")
+        with Image.open(path) as file:
+            frames = getattr(file, "n_frames", 1)
+            pixels, transparent = _pixels(ImageOps.exif_transpose(file))
+    except ImageError:
+        raise
+    except FileNotFoundError:
+        raise ImageError(f"{path}: no such file; check the path") from None
+    except IsADirectoryError:
+        raise ImageError(f"{path}: is a folder; name an image file in it") from None
+    except PermissionError:
+        raise ImageError(f"{path}: may not be read; check its permissions") from None
+    except UnidentifiedImageError:
+        raise ImageError(
+            f"{path}: not an image that Pillow knows; save it as PNG or JPEG"
+        ) from None
+    except Image.DecompressionBombError:
+        limit = f"{2 * (Image.MAX_IMAGE_PIXELS or 0):,}"
+        raise ImageError(f"{path}: has more than {limit} pixels; scale it down first") from None
+    except Exception as error:  # on damaged files Pillow's decoders raise many types
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ImageError(f"{path}: damaged or unsupported ({reason}); export it again") from error
+
+    if transparent:
+        warnings.warn(f"{path}: transparent pixels are shown over white", stacklevel=2)
+    if frames > 1:
+        warnings.warn(f"{path}: holds {frames} frames, the first is used", stacklevel=2)
+    return _check_range(_rgb(pixels, str(path), keep_grey), str(path))
+
+
+def check_image(image: ArrayLike, keep_grey: bool = False) -> NDArray[np.float32]:
+    """Bring an array that should be an image into the form that everything else expects.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W), (H, W, 1) or (H, W, 3)
+        Grey or RGB: uint8 or uint16 (scaled to [0, 1]), bool, or floats, where 1 is white. Floats
+        may overshoot [0, 1] by 0.5, as resampled images do, and are not clamped.
+    keep_grey : bool, optional
+        Leave grey at one channel.
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W, 3), or (H, W, 1)
+        RGB, C-contiguous, never sharing memory with the argument.
+
+    Raises
+    ------
+    ImageError
+        If the shape, the type or the range is another, there are no pixels, or some are not finite.
+
+    Examples
+    --------
+    >>> check_image(np.array([[0, 51], [102, 255]], np.uint8))[..., 0]
+    array([[0. , 0.2],
+           [0.4, 1. ]], dtype=float32)
+    """
+    return _check_range(_rgb(image, "image", keep_grey), "image")
+
+
+def save_image(path: str | Path, image: ArrayLike) -> None:
+    """Write an image file, 8 bits a channel, in one step: whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+        The suffix chooses the format and is one of `SAVE_OPTIONS`; a file that is there is
+        replaced. PNG, TIFF, BMP and PPM are lossless; JPEG and WebP are written with quality 95.
+    image : array_like, shape (H, W), (H, W, 1) or (H, W, 3)
+        As for `check_image`, but floats of any finite value are clamped to [0, 1]. One channel is
+        written as grey.
+
+    Raises
+    ------
+    ImageError
+        If the image is not one, the suffix is unknown or the file cannot be written. A file that
+        was there is then unchanged, and nothing else is left behind.
+    """
+    from PIL import Image
+
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SAVE_OPTIONS:
+        known = " ".join(SAVE_OPTIONS)
+        raise ImageError(f"{path}: image suffix {suffix!r} is unknown; use one of {known}")
+    pixels = to_8bit(_rgb(image, "image", keep_grey=True)).astype(np.uint8)
+    pixels = pixels[..., 0] if pixels.shape[2] == 1 else pixels
+    try:
+        with atomic_write(path) as temporary:
+            Image.fromarray(pixels).save(temporary, **SAVE_OPTIONS[suffix])
+    except (OSError, ValueError) as error:
+        message = str(error)
+        if not message.startswith(f"{path}: "):  # what replacing() refuses, it explains itself
+            reason = getattr(error, "strerror", None) or message
+            message = f"{path}: cannot be written ({reason}); choose another path"
+        raise ImageError(message) from error
+
+
+def to_8bit(image: NDArray[Any]) -> NDArray[Any]:
+    """Round to what an 8-bit file holds, in floats.
+
+    Parameters
+    ----------
+    image : ndarray of float
+        On a [0, 1] scale; clamped to it.
+
+    Returns
+    -------
+    ndarray, same shape and dtype
+        Whole numbers from 0 to 255; NaN stays NaN.
+    """
+    return np.rint(np.clip(image, 0, 1) * 255)
+
+
+def _pixels(image: "Image") -> tuple[NDArray[Any], bool]:
+    """Pixels of a Pillow image, and whether some were transparent."""
+    if image.mode == "I":  # 16-bit grey of PGM files comes as 32-bit integers
+        return np.asarray(image) / 65535, False
+    if image.mode == "F" or image.mode.startswith("I;16"):
+        return np.asarray(image), False
+    if not image.has_transparency_data:
+        return np.asarray(image if image.mode in ("1", "L") else image.convert("RGB")), False
+    pixels = np.asarray(image.convert("RGBA")).astype(np.float32) / 255
+    color, alpha = pixels[..., :3], pixels[..., 3:]
+    return 1 - alpha * (1 - color), bool(alpha.min() < 1)
+
+
+def _rgb(image: ArrayLike, name: str, keep_grey: bool = False) -> NDArray[np.float32]:
+    """Scale to float32 and replicate grey to RGB; `name` is what errors call the image."""
+    try:
+        array = np.asarray(image)
+    except ValueError:  # rows of unequal length
+        raise ImageError(f"{name}: not an array; expected shape (H, W, 3)") from None
+    if array.ndim == 2:
+        array = array[..., None]
+    if array.ndim != 3 or array.shape[2] not in (1, 3):
+        alpha = array.ndim == 3 and array.shape[2] == 4
+        hint = "drop alpha, as in image[..., :3]" if alpha else "pass one grey or RGB image"
+        raise ImageError(f"{name}: shape {array.shape}, expected (H, W) or (H, W, 3); {hint}")
+    if array.size == 0:
+        raise ImageError(f"{name}: shape {array.shape} has no pixels; check how it was cropped")
+
+    kind = array.dtype.kind
+    if kind not in "bf" and not (kind == "u" and array.itemsize <= 2):
+        expected = "expected uint8, uint16 or floats in [0, 1]"
+        raise ImageError(f"{name}: pixels are {array.dtype}; {expected}")
+    if kind == "f" and not np.isfinite(array).all():
+        bad = np.argwhere(~np.isfinite(array).all(axis=2))
+        row, column = bad[0].tolist()
+        raise ImageError(
+            f"{name}: {len(bad)} of {array.shape[0] * array.shape[1]} pixels are not finite, "
+            f"the first at [{row}, {column}]; replace them, as with np.nan_to_num"
+        )
+    peak = np.iinfo(array.dtype).max if kind == "u" else 1
+    with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite: clamped or refused
+        pixels = np.divide(array, peak, dtype=np.float32)
+    channels = pixels.shape[2] if keep_grey else 3
+    return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], channels)))
+
+
+def _check_range(pixels: NDArray[np.float32], name: str) -> NDArray[np.float32]:
+    """Refuse pixels that cannot be meant to lie in [0, 1]."""
+    low, high = float(pixels.min()), float(pixels.max())
+    if low < MIN_PIXEL or high > MAX_PIXEL:
+        hint = "divide by 255" if 2 < high <= 255 and low >= 0 else "scale it"
+        raise ImageError(f"{name}: pixels run from {low:g} to {high:g}, not 0 to 1; {hint} first")
+    return pixels

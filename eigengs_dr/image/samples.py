@@ -1,0 +1,58 @@
+"""Photos that ship inside scikit-image."""
+
+import importlib.util
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .io import ImageError, load_image
+
+if TYPE_CHECKING:
+    pass
+
+
+SAMPLES = {
+    "astronaut": "astronaut.png",
+    "brick": "brick.png",
+    "camera": "camera.png",
+    "chelsea": "chelsea.png",
+    "coffee": "coffee.png",
+    "coins": "coins.png",
+    "grass": "grass.png",
+    "gravel": "gravel.png",
+    "hubble": "hubble_deep_field.jpg",
+    "moon": "moon.png",
+    "motorcycle": "motorcycle_left.png",
+    "retina": "retina.jpg",
+    "rocket": "rocket.jpg",
+}
+"""Photos inside the scikit-image wheel, by name; the others of that library need a download."""
+
+
+def sample(name: str) -> NDArray[np.float32]:
+    """Load a photo that ships inside scikit-image: nothing is downloaded.
+
+    Parameters
+    ----------
+    name : str
+        One of `SAMPLES`, for instance ``"astronaut"``, ``"chelsea"`` (a cat) or ``"coffee"``.
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W, 3)
+        RGB in [0, 1]; grey photos are replicated.
+
+    Raises
+    ------
+    ImageError
+        If there is no sample of that name, or scikit-image is not installed.
+    """
+    if name not in SAMPLES:
+        raise ImageError(f"sample {name!r} is unknown; use one of {', '.join(SAMPLES)}")
+    # The folder is found without importing scikit-image.
+    package = importlib.util.find_spec("skimage")
+    if package is None or package.origin is None:
+        raise ImageError("scikit-image, which holds the samples, is missing; install scikit-image")
+    return load_image(Path(package.origin).parent / "data" / SAMPLES[name])

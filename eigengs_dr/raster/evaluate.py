@@ -1,0 +1,191 @@
+"""One splat: what it contributes at a point, and where its parameters lie in memory.
+
+A splat with mean mu and the inverse factor ``F = [[a, b], [0, c]]``, so that ``Sigma^-1 = F^T F``,
+has the weight ``exp(-1/2 |F (x - mu)|^2)`` at x, and 0 where ``|F (x - mu)| > cutoff``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+
+from ..backend.arrays import types_of
+
+EXP2_SCALE = math.sqrt(0.5 / math.log(2))
+"""``exp(-q / 2) = 2^-(UNIT^2 q)``: kernels take factors in these units and save a product."""
+
+NUM_SHAPE_PARAMS = 5
+"""Parameters of a splat before its colour: mean x, mean y, a, b, c."""
+
+
+LN2 = math.log(2)
+
+
+def exp2_neg(q: Any) -> Any:
+    """``2^-q`` for ``0 <= q <= 120``: relative error < 3e-7 at half the cost of `drjit.exp2`.
+
+    ``q = n - f`` with integer n and ``|f| <= 1/2``: a polynomial gives ``2^f``, and n is subtracted
+    from its exponent bits. Outside the range the result is arbitrary and callers mask it. In double
+    precision this is `drjit.exp2`. Not differentiable: see `falloff`.
+    """
+    types = types_of(q)
+    if types.bits == 64:
+        return dr.exp2(-q)
+    shifter = 12582912.0  # 1.5 * 2^23: adding it rounds to an integer in the low mantissa bits
+    shifted = shifter - q
+    f = (shifter - shifted) - q
+    power = types.Float(0.0013276471780829455)
+    for coefficient in (
+        0.009675541332756499,
+        0.05550713274151576,
+        0.24022119723882304,
+        0.6931469670643609,
+        1.0,
+    ):
+        power = dr.fma(power, f, coefficient)
+    exponent = dr.reinterpret_array(types.UInt, shifted) << 23
+    return dr.reinterpret_array(types.Float, dr.reinterpret_array(types.UInt, power) + exponent)
+
+
+def falloff(q: Any, limit: float) -> Any:
+    """``2^-q`` inside the cutoff ``q <= limit`` and 0 outside, with derivative ``-ln(2) 2^-q``."""
+    exact = dr.detach(q)
+    value = dr.select(exact <= limit, exp2_neg(exact), 0)
+    if not dr.grad_enabled(q):
+        return value
+    return dr.replace_grad(value, (-LN2 * value) * q)
+
+
+def weights(shape: list, x: Any, y: Any, tile: tuple[int, int], limit: float) -> list:
+    """Evaluate one splat at a block of pixels: ``2^-|F (x - mu)|^2``, F in units of `EXP2_SCALE`.
+
+    Everything that evaluates a Gaussian goes through here: the renderer, its derivatives both ways,
+    the colour solve and the textures (with a block of one point).
+
+    Parameters
+    ----------
+    shape : list of 5 Float
+        Mean x, mean y, a, b, c (see `EXP2_SCALE`).
+    x, y : Float
+        First point of the block.
+    tile : (int, int)
+        Width and height of the block; points are 1 apart.
+    limit : float
+        ``(UNIT * cutoff)^2``.
+
+    Returns
+    -------
+    list of Float
+        Weights in [0, 1], row after row. Cost: one `exp2_neg`, a comparison and 2 or 3 more
+        operations a point.
+    """
+    return [falloff(dr.fma(u, u, v * v), limit) for us, v in _rows(shape, x, y, tile) for u in us]
+
+
+def _rows(shape: list, x: Any, y: Any, tile: tuple[int, int]) -> list[tuple[list, Any]]:
+    """``F (x - mu) = (u, v)`` at a block of pixels: for every row its u's and its one v."""
+    mean_x, mean_y, a, b, c = shape
+    dx, dy = x - mean_x, y - mean_y
+    u0, v0 = dr.fma(a, dx, b * dy), c * dy
+    rows = []
+    for j in range(tile[1]):
+        u = dr.fma(b, float(j), u0) if j else u0
+        v = dr.fma(c, float(j), v0) if j else v0
+        rows.append(([dr.fma(a, float(i), u) if i else u for i in range(tile[0])], v))
+    return rows
+
+
+def weights_vjp(
+    shape: list,
+    x: Any,
+    y: Any,
+    tile: tuple[int, int],
+    limit: float,
+    pull: Callable[[int, Any], Any],
+) -> list:
+    """Gradient of ``sum_k g_k w_k`` with respect to the shape, where ``g_k = pull(k, w_k)``.
+
+    Derived by hand beside `weights`, which a test compares it with, because it halves the adjoint:
+    with ``e = -2 ln(2) g w``, ``du = e u`` and ``dv = e v``, and (i, j) the place in the block,
+    ``da = sum du (dx + i)``, ``db = sum du (dy + j)``, ``dc = sum dv (dy + j)`` and
+    ``d mu = -(a sum du, b sum du + c sum dv)``.
+
+    Parameters
+    ----------
+    shape, x, y, tile, limit
+        As in `weights`.
+    pull : callable
+        ``pull(k, w)`` receives the weight of the k-th point and returns the derivative of the loss
+        with respect to it.
+
+    Returns
+    -------
+    list of 5 Float
+        Derivatives with respect to mean x, mean y, a, b, c.
+    """
+    mean_x, mean_y, a, b, c = shape
+    du = dui = duj = dv = dvj = type(mean_x)(0)
+    for j, (us, v) in enumerate(_rows(shape, x, y, tile)):
+        e_row = u_row = type(mean_x)(0)
+        for i, u in enumerate(us):
+            w = falloff(dr.fma(u, u, v * v), limit)
+            e = w * pull(j * tile[0] + i, w)
+            e_row = e_row + e
+            u_row = dr.fma(e, u, u_row)
+            if i:
+                dui = dr.fma(e * u, float(i), dui)
+        dv_row = e_row * v
+        du, dv = du + u_row, dv + dv_row
+        if j:
+            duj, dvj = dr.fma(u_row, float(j), duj), dr.fma(dv_row, float(j), dvj)
+    dx, dy = x - mean_x, y - mean_y
+    return [
+        k * (-2 * LN2)
+        for k in (
+            -a * du,
+            -dr.fma(b, du, c * dv),
+            dr.fma(dx, du, dui),
+            dr.fma(dy, du, duj),
+            dr.fma(dy, dv, dvj),
+        )
+    ]
+
+
+def widen(shape: list, footprint: list) -> tuple[list, Any]:
+    """Convolve a splat with a Gaussian of unit integral: a filter, or what a pixel sees.
+
+    ``Sigma' = Sigma + Sigma_f``, with the amplitude ``sqrt(det Sigma / det Sigma')`` that keeps the
+    integral (Heckbert, "Fundamentals of Texture Mapping and Image Warping", 1989).
+
+    Parameters
+    ----------
+    shape : list of 5 Float
+        As in `weights`.
+    footprint : list of 3 Float
+        xx, xy, yy of ``Sigma_f`` over `EXP2_SCALE` squared.
+
+    Returns
+    -------
+    shape : list of 5 Float
+        The same mean and the factor of ``Sigma'``.
+    amplitude : Float
+        In (0, 1].
+    """
+    mean_x, mean_y, a, b, c = shape
+    fxx, fxy, fyy = footprint
+    ia, ic = dr.rcp(a), dr.rcp(c)
+    t = -b * ia * ic  # F^-1 = [[1/a, t], [0, 1/c]]
+    xy = dr.fma(t, ic, fxy)
+    yy = dr.fma(ic, ic, fyy)
+    # det(S + F) = det S + tr(adj(S) F) + det F, a sum of squares: the plain determinant loses all
+    # its digits for needles.
+    across = dr.fma(ic * ic, fxx, t * dr.fma(t, fyy, -2 * ic * fxy))
+    whole = ia * ic
+    added = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0) + dr.maximum(across, 0)
+    scale = dr.rsqrt(dr.fma(whole, whole, dr.fma(ia * ia, fyy, added)))
+    new_c = dr.rsqrt(yy)
+    scaled = new_c * scale
+    return [mean_x, mean_y, yy * scaled, -xy * scaled, new_c], whole * scale

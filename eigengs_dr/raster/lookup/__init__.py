@@ -1,0 +1,1 @@
+"""The sum at scattered points and through footprints, as textures need it."""

@@ -1,0 +1,218 @@
+"""The sum of Gaussians seen through a Gaussian footprint: a prefilter in closed form.
+
+A Gaussian convolved with a Gaussian is one again, so what a pixel sees of a texture is the sum of
+widened splats (`eigengs_dr.raster.evaluate.widen`): no mip map, no more samples. A texture ends at
+its borders, or repeats: a splat then counts with the share of ``footprint x splat`` that lies in
+the image, and copies of the image that the footprint reaches are summed as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ...backend.arrays import types_of
+from ..evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, weights, widen
+from ..layout import gather_index, gather_run, unpack_parameters
+from .footprint import inside_share
+from .points import sum_at_points
+from .size_classes import SizeClasses
+
+FOOTPRINT_REACH = 3.0
+"""Standard deviations after which a footprint ends, where copies of the image are looked for."""
+
+
+def sum_prefiltered(
+    sizes: SizeClasses,
+    packed: Any,
+    number: int,
+    x: Any,
+    y: Any,
+    footprint: list,
+    active: Any,
+    cutoff: float,
+) -> list:
+    """Sum the splats that a footprint sees.
+
+    Parameters
+    ----------
+    sizes : Sizes
+    packed, number
+        As in `eigengs_dr.raster.lookup.points.sum_at_points`.
+    x, y : Float
+        Centre of the footprint in the image, in pixels, see `eigengs_dr.raster.lookup.points.fold`.
+    footprint : list of 3 Float
+        xx, xy, yy of its covariance, in pixels squared; not differentiated.
+    active : Bool
+    cutoff : float
+        In standard deviations.
+
+    Returns
+    -------
+    list of Float
+        Sums of the channels. Cost: for every splat listed near the footprint in the image, and in
+        each copy of the image that it reaches, a widening and a weight; where it reaches over a
+        border, four error functions more.
+    """
+    types = types_of(packed)
+    footprint = [dr.detach(f) for f in footprint]
+    reach = [FOOTPRINT_REACH * dr.safe_sqrt(footprint[k]) for k in (0, 2)]
+    sides = (sizes.width, sizes.height)
+    first = [dr.floor((v - r) * (1 / s)) for v, r, s in zip((x, y), reach, sides, strict=True)]
+    last = [dr.floor((v + r) * (1 / s)) for v, r, s in zip((x, y), reach, sides, strict=True)]
+    inner = (x >= reach[0]) & (x + reach[0] <= sides[0])
+    inner &= (y >= reach[1]) & (y + reach[1] <= sides[1])
+    widest = dr.maximum(*reach) * (1 / FOOTPRINT_REACH)
+    terms = _widened_values(footprint, (EXP2_SCALE * cutoff) ** 2)
+    total = [types.Float(0) for _ in range(number - NUM_SHAPE_PARAMS)]
+    for spread, cells in sizes.listed:
+        small = active & inner & (widest <= spread)
+        part = sum_at_points(cells, packed, number, x, y, small, terms, len(total))
+        total = [t + p for t, p in zip(total, part, strict=True)]
+        active = active & ~small
+    lookup = _Lookup(sizes, packed, number, cutoff, footprint)
+    copies = [types.Int(dr.detach(v)) for v in (*first, *last)]
+    part = _sum_copies(lookup, x, y, copies, active)
+    return [t + p for t, p in zip(total, part, strict=True)]
+
+
+def _widened_values(footprint: list, limit: float) -> Any:
+    """Terms of the sum seen through a footprint, inside the image; see `points.sum_near`."""
+    scaled = [f * (1 / EXP2_SCALE**2) for f in footprint]
+
+    def terms(splat: list, x: Any, y: Any) -> list:
+        shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], scaled)
+        (w,) = weights(shape, x, y, (1, 1), limit)
+        w = w * amplitude
+        return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
+
+    return terms
+
+
+@dataclass(frozen=True)
+class _Lookup:
+    """What both passes of one call share."""
+
+    sizes: SizeClasses
+    packed: Any
+    number: int
+    cutoff: float
+    footprint: list
+
+
+def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> list:
+    """Sum over the copies of the image from ``copies[:2]`` to ``copies[2:]``.
+
+    Four loops in one, so that the lanes of a packet wait for the longest sum in total: over rows
+    and columns of copies, sizes, rows of cells, and the run of splats in a row.
+    """
+    sizes, footprint, packed = lookup.sizes, lookup.footprint, lookup.packed
+    types = types_of(packed)
+    limit = (EXP2_SCALE * lookup.cutoff) ** 2
+    scaled = [f * (1 / EXP2_SCALE**2) for f in footprint]
+    left, top, right, bottom = copies
+    bottom = dr.select(active, bottom, top - 1)
+
+    def local(i: Any, j: Any, x: Any, y: Any) -> tuple:
+        """Point in the copy (i, j), and the sign its mirroring gives to the footprint's xy."""
+        x, y = x - types.Float(i) * sizes.width, y - types.Float(j) * sizes.height
+        if sizes.wrap == "repeat":
+            return x, y, types.Float(1)
+        odd_x, odd_y = (i & 1) == 1, (j & 1) == 1
+        x, y = dr.select(odd_x, sizes.width - x, x), dr.select(odd_y, sizes.height - y, y)
+        return x, y, dr.select(odd_x == odd_y, types.Float(1), -1)
+
+    def rows(i: Any, j: Any, k: Any) -> tuple:
+        """Rows of cells [first, last] of the size k that the footprint sees."""
+        square, _, _, ny, inverse, origin = _row_of(types, sizes, k)
+        _, y0, _ = local(i, j, dr.detach(x), dr.detach(y))
+        reach = lookup.cutoff * dr.sqrt(footprint[2] + square)
+        first = dr.maximum(dr.floor((y0 - reach - origin) * inverse), 0)
+        last = dr.minimum(dr.floor((y0 + reach - origin) * inverse), ny - 1)
+        return types.Int(first), types.Int(last)
+
+    def run(i: Any, j: Any, k: Any, row: Any, valid: Any) -> tuple:
+        """Splats [begin, end) of one row of cells inside the ellipse of ``footprint + size^2``."""
+        square, first, nx, _, inverse, origin = _row_of(types, sizes, k)
+        x0, y0, sign = local(i, j, dr.detach(x), dr.detach(y))
+        xx, xy, yy = footprint[0] + square, footprint[1] * sign, footprint[2] + square
+        side = dr.rcp(inverse)
+        low = dr.fma(types.Float(row), side, origin) - y0
+        reach = lookup.cutoff * dr.sqrt(yy)
+        low, high = dr.maximum(low, -reach), dr.minimum(low + side, reach)
+        # At the height dy the ellipse reaches from m dy - h to m dy + h.
+        lean, ratio = xy * dr.rcp(yy), dr.rcp(yy)
+        free = dr.fma(-xy, lean, xx)
+        peak = xy * dr.rsqrt(xx) * lookup.cutoff  # dy of the rightmost point
+
+        def half(dy: Any) -> Any:
+            return dr.safe_sqrt(free * (lookup.cutoff**2 - dy * dy * ratio))
+
+        at_right, at_left = dr.clip(peak, low, high), dr.clip(-peak, low, high)
+        begin = (x0 + lean * at_left - half(at_left) - origin) * inverse
+        end = (x0 + lean * at_right + half(at_right) - origin) * inverse
+        begin = types.Int(dr.clip(dr.floor(begin), 0, nx - 1))
+        end = types.Int(dr.clip(dr.floor(end), 0, nx - 1))
+        cell = types.Int(first) + row * types.Int(nx)
+        valid = valid & (low <= high)
+        return (
+            dr.gather(types.UInt, sizes.starts, types.UInt(cell + begin), valid),
+            dr.gather(types.UInt, sizes.starts, types.UInt(cell + end + 1), valid),
+        )
+
+    def add(
+        n: Any, end: Any, row: Any, stop: Any, k: Any, i: Any, j: Any, x: Any, y: Any, sums: list
+    ) -> tuple:
+        here = (n < end) & (j <= bottom)
+        index = gather_index(types, sizes.splat, n, here)
+        splat = unpack_parameters(packed, index, lookup.number, here)
+        px, py, sign = local(i, j, x, y)
+        seen = [scaled[0], scaled[1] * sign, scaled[2]]
+        shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], seen)
+        (w,) = weights(shape, px, py, (1, 1), limit)
+        part = inside_share(shape, seen, px, py, sizes.width, sizes.height)
+        w = dr.select(here, w * amplitude * part, 0)
+        sums = [dr.fma(w, c, s) for c, s in zip(splat[NUM_SHAPE_PARAMS:], sums, strict=True)]
+        n = n + 1
+        ran = n >= end
+        row = dr.select(ran, row + 1, row)
+        fresh = ran & (row > stop)
+        k, i, j = _advance(fresh, k, i, j, sizes.count, left, right)
+        first, last = rows(i, j, k)
+        row, stop = dr.select(fresh, first, row), dr.select(fresh, last, stop)
+        begin, new_end = run(i, j, k, row, ran & (row <= stop) & (j <= bottom))
+        return (
+            dr.select(ran, begin, n),
+            dr.select(ran, new_end, end),
+            *(row, stop, k, i, j, x, y, sums),
+        )
+
+    k = types.Int(0) + dr.zeros(types.Int, dr.width(x))
+    row, stop = rows(left, top, k)
+    begin, end = run(left, top, k, row, active & (row <= stop))
+    sums = [types.Float(0) for _ in range(lookup.number - NUM_SHAPE_PARAMS)]
+    return dr.while_loop(
+        (begin, end, row, stop, k, left, top, x, y, sums),
+        lambda n, end, row, stop, k, i, j, *rest: j <= bottom,
+        add,
+        label="sum footprints",
+        mode="symbolic",
+        max_iterations=-1,
+    )[-1]
+
+
+def _advance(go: Any, k: Any, i: Any, j: Any, sizes: int, left: Any, right: Any) -> tuple:
+    """Step to the next size, after the last to the next copy, after a row of copies to the next."""
+    k = dr.select(go, k + 1, k)
+    over = k >= sizes
+    k, i = dr.select(over, 0, k), dr.select(over, i + 1, i)
+    over = i > right
+    return k, dr.select(over, left, i), dr.select(over, j + 1, j)
+
+
+def _row_of(types: Any, sizes: SizeClasses, k: Any) -> list:
+    """Row k of the table of sizes."""
+    row = gather_run(types, sizes.table, types.UInt(k), 8, True)  # 8: packets of a power of two
+    return row[:6]

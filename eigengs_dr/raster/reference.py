@@ -1,0 +1,104 @@
+"""Slow renderers with the meaning of the fast one: what tests and benchmarks compare against."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ..backend.arrays import types_of
+from .evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, weights
+from .tiles import TileLists
+
+
+def render_plain(values: list, background: list, lists: TileLists, cutoff: float = 3.0) -> Any:
+    """Render as a first Dr.Jit program would: one lane a pixel, derivatives by Dr.Jit alone.
+
+    Parameters
+    ----------
+    values : list of Float, shape (N,)
+        Mean x, mean y, a, b, c (see `eigengs_dr.raster.evaluate`), then the channels.
+    background : list of Float
+    lists : TileLists
+    cutoff : float, optional
+
+    Returns
+    -------
+    Float, shape (height * width * channels,)
+        Row after row. Cost: for every pixel the whole list of its tile, one gather a parameter; in
+        reverse one atomic addition a parameter.
+    """
+    types = types_of(values[0])
+    grid = lists.grid
+    pixel = dr.arange(types.UInt, grid.width * grid.height)
+    column, row = pixel % grid.width, pixel // grid.width
+    x, y = types.Float(column) + 0.5, types.Float(row) + 0.5
+    slot = _slots(lists, types.UInt, column // grid.tile[0] + row // grid.tile[1] * grid.nx)
+    begin, end = dr.gather(types.UInt, lists.begin, slot), dr.gather(types.UInt, lists.end, slot)
+    scaled = [
+        *values[:2],
+        *[v * EXP2_SCALE for v in values[2:NUM_SHAPE_PARAMS]],
+        *values[NUM_SHAPE_PARAMS:],
+    ]
+
+    def add(i: Any, sums: list) -> tuple:
+        active = i < end
+        n = dr.gather(types.UInt, lists.splat, i, active)
+        p = [dr.gather(types.Float, v, n, active) for v in scaled]
+        (w,) = weights(p[:NUM_SHAPE_PARAMS], x, y, (1, 1), (EXP2_SCALE * cutoff) ** 2)
+        return i + 1, [dr.fma(w, c, s) for c, s in zip(p[NUM_SHAPE_PARAMS:], sums, strict=True)]
+
+    _, sums = dr.while_loop(
+        (types.UInt(begin), [types.Float(0) for _ in background]),
+        lambda i, sums: i < end,
+        add,
+        label="plain",
+        max_iterations=-1,
+    )
+    return dr.ravel(types.FloatX([s + b for s, b in zip(sums, background, strict=True)]), order="F")
+
+
+def _slots(lists: TileLists, UInt: Any, tile: Any) -> Any:
+    """Positions of tiles in the lists."""
+    slot = dr.empty(UInt, lists.grid.tiles)
+    dr.scatter(slot, dr.arange(UInt, lists.grid.tiles), lists.order)
+    return dr.gather(UInt, slot, tile)
+
+
+def render_exact(
+    mean: np.ndarray,
+    factor: np.ndarray,
+    color: np.ndarray,
+    background: np.ndarray,
+    width: int,
+    height: int,
+    cutoff: float = np.inf,
+) -> np.ndarray:
+    """Sum all splats at all pixels in float64, without tiles and by default without a cutoff.
+
+    Parameters
+    ----------
+    mean : ndarray, shape (N, 2)
+    factor : ndarray, shape (N, 3)
+        a, b, c of ``F = [[a, b], [0, c]]``.
+    color : ndarray, shape (N, C)
+    background : ndarray, shape (C,)
+    width, height : int
+    cutoff : float, optional
+        In standard deviations.
+
+    Returns
+    -------
+    ndarray, float64, shape (height, width, C)
+        Cost: N * width * height exponentials.
+    """
+    x = np.arange(width) + 0.5
+    y = (np.arange(height) + 0.5)[:, None]
+    image = np.tile(np.asarray(background, np.float64), (height, width, 1))
+    for (mx, my), (a, b, c), value in zip(
+        mean.astype(np.float64), factor.astype(np.float64), color.astype(np.float64), strict=True
+    ):
+        q = (a * (x - mx) + b * (y - my)) ** 2 + (c * (y - my)) ** 2
+        image += np.where(q <= cutoff**2, np.exp(-0.5 * q), 0.0)[..., None] * value
+    return image

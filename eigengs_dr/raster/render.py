@@ -1,0 +1,239 @@
+"""`render`: Gaussians to an image, differentiable in both modes for every parameter."""
+
+from __future__ import annotations
+
+from operator import index
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from ..backend.arrays import ArrayTypes, types_of, upload
+from ..gaussian.gaussians import Gaussians
+from ..image.color import decode, to_coded
+from .evaluate import EXP2_SCALE
+from .kernels import adjoint, channel_sums, forward
+from .layout import gather_run, pack_parameters
+from .tiles import Grid, TileLists, build_lists
+
+CUTOFF = 3.0
+"""Default cutoff in standard deviations. What is left out of a splat is at any point below
+``exp(-cutoff^2 / 2)`` of its amplitude: 1.1 % at 3, 0.034 % at 4, 3.7e-6 at 5."""
+
+MAX_CUTOFF = 12.0
+"""``exp(-72)`` is below the precision of any format here; the fast exponential needs a bound."""
+
+
+def render(
+    gaussians: Gaussians,
+    width: int | None = None,
+    height: int | None = None,
+    cutoff: float = CUTOFF,
+) -> Any:
+    """Render a set of Gaussians at any size.
+
+    Differentiable with respect to mean, factor, color and background, in forward and reverse mode.
+    Sets in YCbCr come out as RGB, sets in linear light in linear light (`picture_of` codes them as
+    sRGB), data as it is; nothing is clamped.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    width, height : int, optional
+        Size of the image in pixels; the native size by default. One of the two gives the other by
+        the native aspect ratio.
+    cutoff : float, optional
+        Standard deviations after which a splat ends, up to 12. The error at a point is at most
+        ``exp(-cutoff^2 / 2)`` times the sum of the absolute colours of the splats that are cut off
+        there.
+
+    Returns
+    -------
+    TensorXf, shape (height, width, C)
+        Dr.Jit tensor of the backend and precision of the set; 1 is white.
+
+    Raises
+    ------
+    ValueError
+        If a side is not positive or the cutoff not in (0, 12].
+
+    Notes
+    -----
+    The order of summation is a function of the input: renderings on one machine and backend are
+    bit-equal. A splat whose mean or factor is not finite is not drawn; a colour that is not finite
+    spoils the tiles that its splat touches. Building tile lists reads sizes back, which
+    `drjit.freeze` does not allow: freeze a function that takes `bin_gaussians`'s result and calls
+    `rasterize`, as `eigengs_dr.fitting.optimizers.descent` does.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg
+    >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
+    >>> eg.render(g).shape, eg.render(g, width=16).shape
+    ((8, 8, 1), (16, 16, 1))
+    """
+    width, height = _size(gaussians, width, height)
+    scaled = gaussians.scaled(width, height)
+    cutoff = float(cutoff)  # a NumPy scalar would promote everything to float64
+    values, background = kernel_parameters(scaled)
+    lists = bin_gaussians(scaled, cutoff)
+    return to_tensor(rasterize(values, background, lists, cutoff), lists.grid, len(background))
+
+
+def picture_of(
+    gaussians: Gaussians,
+    width: int | None = None,
+    height: int | None = None,
+    cutoff: float = CUTOFF,
+) -> NDArray[Any]:
+    """Render what is looked at and compared: `render`, but linear light coded as sRGB.
+
+    Parameters and errors as for `render`.
+
+    Returns
+    -------
+    ndarray, shape (height, width, C)
+        1 is white. Light below 0 is black; nothing else is clamped.
+    """
+    image = render(dr.detach(gaussians), width, height, cutoff).numpy()
+    return to_coded(np.maximum(image, 0)) if gaussians.space == "linear" else image
+
+
+def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[int, int]:
+    for name, side in (("width", width), ("height", height)):
+        if side is not None and index(side) < 1:
+            raise ValueError(f"{name} is {side}; it must be at least 1 pixel")
+    if width is None and height is None:
+        return gaussians.width, gaussians.height
+    if width is None:
+        assert height is not None
+        width = max(1, round(height * gaussians.width / gaussians.height))
+    if height is None:
+        height = max(1, round(width * gaussians.height / gaussians.width))
+    return index(width), index(height)
+
+
+def kernel_parameters(gaussians: Gaussians) -> tuple[list, list]:
+    """Return the parameters as the kernels take them, and the background.
+
+    Colours are decoded here: the conversion is linear, so that N splats are converted and not
+    H W pixels.
+    """
+    black = decode(gaussians.space, [0.0] * gaussians.channels)
+    color = [
+        c - k for c, k in zip(decode(gaussians.space, list(gaussians.color)), black, strict=True)
+    ]
+    background = decode(gaussians.space, list(gaussians.background))
+    return [*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor], *color], background
+
+
+def bin_gaussians(gaussians: Gaussians, cutoff: float = CUTOFF, pad: float = 0.0) -> TileLists:
+    """List the splats of every tile of the image at native size; see `eigengs_dr.raster.tiles`.
+
+    Raises
+    ------
+    ValueError
+        If the cutoff is not in (0, 12].
+    """
+    if not 0 < cutoff <= MAX_CUTOFF:
+        raise ValueError(f"cutoff is {cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}")
+    types = types_of(gaussians.mean)
+    shape = [*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor]]
+    n = len(gaussians)
+    shape = [dr.detach(v) + dr.zeros(types.Float, n) for v in shape]
+    return build_lists(shape, EXP2_SCALE * cutoff, Grid(gaussians.width, gaussians.height), pad)
+
+
+def rasterize(values: list, background: list, lists: TileLists, cutoff: float = CUTOFF) -> Any:
+    """Sum splats to an image in tile layout; the differentiable operation behind `render`.
+
+    Parameters
+    ----------
+    values : list of Float, shape (N,)
+        From `kernel_parameters`.
+    background : list of Float, shape (1,)
+    lists : TileLists
+        Of these splats, or of where they were a few small steps ago.
+    cutoff : float, optional
+
+    Returns
+    -------
+    Float, shape (tiles * pixels * channels,)
+        See `eigengs_dr.raster.kernels` for the layout, `to_tensor` for an image.
+    """
+    return dr.custom(_Rasterize, values, background, lists, EXP2_SCALE * cutoff)
+
+
+class _Rasterize(dr.CustomOp):
+    """``I = background + sum_n c_n w_n`` with the kernels' own derivatives.
+
+    With ``w_n = 2^-q_n``, reverse mode gives every splat the sum over its pixels of ``dL/dI`` times
+    the derivative of its contribution; forward mode sums the derivatives of the contributions.
+    """
+
+    def eval(self, values: list, background: list, lists: TileLists, radius: float) -> Any:
+        self.lists, self.radius, self.channels = lists, radius, len(background)
+        self.packed = pack_parameters(values)
+        return forward(self.packed, background, lists, radius * radius)
+
+    def forward(self) -> None:
+        tangent = pack_parameters(self.grad_in("values"))
+        start = self.grad_in("background")
+        self.set_grad_out(
+            forward(self.packed, start, self.lists, self.radius * self.radius, tangent)
+        )
+
+    def backward(self) -> None:
+        delta = self.grad_out()
+        gradient = adjoint(self.packed, delta, self.channels, self.lists, self.radius)
+        self.set_grad_in("values", gradient)
+        self.set_grad_in("background", channel_sums(delta, self.channels, self.lists.grid))
+
+
+def to_tensor(image: Any, grid: Grid, channels: int) -> Any:
+    """Bring an image from tile layout to a tensor (height, width, channels); differentiable."""
+    types = types_of(image)
+    shape = (grid.ny * grid.tile[1], grid.nx * grid.tile[0], channels)
+    whole = types.Tensor(dr.custom(_Rows, image, grid, channels), shape)
+    if shape[:2] == (grid.height, grid.width):
+        return whole
+    return whole[: grid.height, : grid.width]
+
+
+class _Rows(dr.CustomOp):
+    """Permute tile layout to rows; its transpose permutes back. Copies runs of pixels."""
+
+    def eval(self, image: Any, grid: Grid, channels: int) -> Any:
+        types = types_of(image)
+        runs = dr.arange(types.UInt, grid.nx * grid.ny * grid.tile[1])
+        column, row = runs % grid.nx, runs // grid.nx
+        tile_row, inner = row // grid.tile[1], row % grid.tile[1]
+        self.by_row = runs
+        self.by_tile = (tile_row * grid.nx + column) * grid.tile[1] + inner
+        self.run = grid.tile[0] * channels
+        return self._permute(image, self.by_tile, self.by_row)
+
+    def forward(self) -> None:
+        self.set_grad_out(self._permute(self.grad_in("image"), self.by_tile, self.by_row))
+
+    def backward(self) -> None:
+        self.set_grad_in("image", self._permute(self.grad_out(), self.by_row, self.by_tile))
+
+    def _permute(self, values: Any, source: Any, target: Any) -> Any:
+        types = types_of(values)
+        result = dr.empty(types.Float, self.run * dr.width(source))
+        dr.scatter(result, types.FloatX(gather_run(types, values, source, self.run, True)), target)
+        return result
+
+
+def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
+    """Upload an image (height, width, channels) in tile layout; overhanging pixels are 0."""
+    height, width, channels = image.shape
+    tile_width, tile_height = grid.tile
+    over = (grid.ny * tile_height - height, grid.nx * tile_width - width)
+    padded = np.pad(image, [(0, over[0]), (0, over[1]), (0, 0)]) if any(over) else image
+    # A row of a tile is copied as one run.
+    tiled = padded.reshape(grid.ny, tile_height, grid.nx, tile_width * channels)
+    flat = tiled.transpose(0, 2, 1, 3).reshape(-1)
+    return upload(types.Float, flat)

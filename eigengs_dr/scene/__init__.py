@@ -1,0 +1,1 @@
+"""What cameras see of a texture in a Mitsuba scene."""

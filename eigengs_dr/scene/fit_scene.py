@@ -1,0 +1,295 @@
+"""No more Gaussians than the cameras of a scene can tell from the full image.
+
+The image is replaced by the smoothest texture that the cameras take for it
+(`eigengs_dr.scene.back_projection`). Then the smallest number of Gaussians is sought whose picture,
+as the cameras see it, is as close to that of the image as was asked for.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
+
+from ..fitting.initializers import dark_weight
+from ..fitting.optimizers.descent import descend
+from ..fitting.placement.adaptive import place_adaptive
+from ..fitting.presets import PRESETS
+from ..fitting.solvers.conjugate_gradient import solve
+from ..gaussian.gaussians import Gaussians
+from ..image.color import to_coded, to_linear
+from ..image.io import check_image
+from ..image.metrics import psnr as psnr_of
+from ..plugins.cone import PIXEL
+from ..raster.render import CUTOFF, render
+from .back_projection import back_project, extrapolate
+from .visibility import Visibility, visibility
+
+COLORS = ("linear", "data")
+"""What textures hold."""
+
+BLURS = (0.4, 0.25, 0.15, 0.1)
+"""Standard deviations, in pixels, by which the target is blurred before it gets back what pixels
+miss: the first that leaves `MARGIN` is taken."""
+
+MARGIN = 6.0
+"""Decibels by which the target is closer to the image than its Gaussians have to be."""
+
+PIXELS = 4
+"""Pixels a Gaussian, where the search begins."""
+
+CLOSE = 1.1
+"""Ratio of two numbers of Gaussians, one too few and one enough, at which the search ends."""
+
+ENOUGH = 2.0
+"""Texels a pixel below which the image is enlarged, as a bitmap is between its texels: else what
+Gaussians do there is not seen."""
+
+FINER = 3
+"""Times that it is enlarged; odd, so that texels stay samples."""
+
+EVEN = 2.0
+"""Texels over which weights are averaged: rays meet texels unevenly."""
+
+Image = NDArray[np.float32]
+
+
+class SceneFit(NamedTuple):
+    """Result of `fit_for_scene`.
+
+    Attributes
+    ----------
+    gaussians : Gaussians
+        Of the size of the image; none that touches only what no camera sees.
+    psnr : tuple of float
+        For each camera that sees the texture, in the order of the scene, the PSNR of what it sees
+        of the Gaussians, against what it sees of the image.
+    resolution : Resolution
+        What the cameras see of the texels of the image.
+    tried : list of (int, float)
+        Numbers of Gaussians, and the lowest PSNR of a camera with them, as they were tried.
+    """
+
+    gaussians: Gaussians
+    psnr: tuple[float, ...]
+    visibility: Visibility
+    tried: list[tuple[int, float]]
+
+
+def fit_for_scene(
+    scene: Any,
+    texture: str,
+    image: ArrayLike,
+    psnr: float = 40.0,
+    color: str = "linear",
+    most: int | None = None,
+    iterations: int = 100,
+    wrap_mode: str = "repeat",
+) -> SceneFit:
+    """Find the fewest Gaussians that the cameras of a scene see as they would see an image.
+
+    Parameters
+    ----------
+    scene : mitsuba.Scene
+        With all its cameras, and any bitmap or ``gaussian_texture`` in the place of the texture.
+    texture : str
+        Name of the texture among the parameters of the scene, such as
+        ``"poster.bsdf.reflectance"``.
+    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
+        What the texture shall show, float in [0, 1] or unsigned integers; row 0 at v = 0.
+    psnr : float, optional
+        Decibels that every camera has to see at least. Compared are the means over pixels of the
+        texture itself, clamped as the texture clamps it, in even light and without noise: as 8-bit
+        sRGB for light, as they are for data.
+    color : {"linear", "data"}, optional
+        Whether the image is a colour, which is decoded to light, or data.
+    most : int, optional
+        Most Gaussians; by default as many as there are texels that are seen.
+    iterations : int, optional
+        Steps of refinement for each number of Gaussians that is tried.
+    wrap_mode : {"repeat", "mirror", "clamp"}, optional
+        See `eigengs_dr.scene.visibility.visibility`.
+
+    Returns
+    -------
+    SceneFit
+
+    Raises
+    ------
+    ValueError
+        If the image or an argument is unusable, the scene has no such texture, no pixel sees it, or
+        not even the most Gaussians are enough; one line.
+
+    Examples
+    --------
+    With a scene whose poster holds any texture (`examples/fit_for_scene.py` is a whole one)::
+
+        room = mi.load_file("room.xml")
+        found = eg.fit_for_scene(room, "poster.bsdf.reflectance", eg.load_image("poster.jpg"))
+        poster = texture_of(found.gaussians)
+    """
+    if color not in COLORS:
+        raise ValueError(f"color {color!r} is unknown; textures hold {' or '.join(COLORS)}")
+    if not 0 < psnr < 60:  # 8 bits are read without an error from 59 dB on
+        raise ValueError(f"psnr is {psnr:g}; it must be above 0 and below 60 decibels")
+    if iterations < 0 or (most is not None and most < 1):
+        raise ValueError("iterations must be at least 0, and most at least 1")
+    pixels = check_image(image, keep_grey=color == "data").clip(0, 1)
+    height, width = pixels.shape[:2]
+    values = to_linear(pixels) if color == "linear" else pixels
+    found = visibility(scene, texture, width, height, wrap_mode)
+    times = FINER if found.footprint.min() < ENOUGH * PIXEL else 1
+    fine = found
+    if times > 1:
+        values = zoom(values, (times, times, 1), order=1, mode="nearest", grid_mode=True)
+        fine = visibility(scene, texture, times * width, times * height, wrap_mode)
+    values, fine, corner = _crop_to_seen(values, fine)
+    goal = [_seen_by(values, rows, color) for rows in fine.pixel_to_texel]
+
+    def seen(candidate: Image) -> tuple[float, ...]:
+        space = "rgb" if color == "linear" else "data"
+        pictures = (_seen_by(candidate, rows, color) for rows in fine.pixel_to_texel)
+        return tuple(psnr_of(a, b, space) for a, b in zip(pictures, goal, strict=True))
+
+    target = _target(values, fine, lambda t: min(seen(t)) >= psnr + MARGIN)
+    weight = _weights(fine, target, color)
+
+    def attempt(count: int) -> tuple[Gaussians, tuple[float, ...]]:
+        gaussians = _fit(target, weight, fine.seen, count, iterations, color)
+        return gaussians, seen(render(gaussians).numpy())
+
+    most = min(most or int(found.seen.sum()), fine.seen.size)
+    looks = np.minimum(PIXEL / found.footprint[found.seen], 1) ** 2  # pixels a texel, at most one
+    start = max(1, int(looks.sum()) // PIXELS)
+    gaussians, reached, tried = _search_count(attempt, psnr, start, most)
+    placed = _move(gaussians, corner, times * width, times * height).scaled(width, height)
+    return SceneFit(placed, reached, found, tried)
+
+
+def _crop_to_seen(values: Image, found: Visibility) -> tuple[Image, Visibility, tuple[int, int]]:
+    """Keep the rectangle of what is seen, and return its corner, column and row."""
+    kept = [np.flatnonzero(found.seen.any(axis=axis)) for axis in (1, 0)]
+    part = tuple(slice(k[0], k[-1] + 1) for k in kept)
+    texels = np.arange(found.seen.size).reshape(found.seen.shape)[part].ravel()
+    lookups = [rows[:, texels] for rows in found.pixel_to_texel]
+    cut = Visibility(found.footprint[part], lookups)
+    return np.ascontiguousarray(values[part]), cut, (int(kept[1][0]), int(kept[0][0]))
+
+
+def _move(gaussians: Gaussians, corner: tuple[int, int], width: int, height: int) -> Gaussians:
+    """Put a set in its place in a larger image."""
+    mean = gaussians.mean + type(gaussians.mean)(*corner)
+    return replace(gaussians, mean=mean, width=width, height=height)
+
+
+# --- What is fitted -------------------------------------------------------------------------------
+
+
+def _seen_by(texels: Image, rows: Any, color: str) -> NDArray[Any]:
+    """What the pixels of a camera see of a texture, as a column of pixels, shape (n, 1, C)."""
+    looks = rows @ texels.clip(0, 1).reshape(-1, texels.shape[2])
+    return (to_coded(looks) if color == "linear" else looks)[:, None]
+
+
+def _target(values: Image, found: Visibility, is_close: Callable[[Image], bool]) -> Image:
+    """Find what to fit: the smoothest texture that is close enough, or else the image."""
+    whole = extrapolate(values, found.seen)
+    for share in BLURS:
+        target = back_project(whole, found, share / PIXEL)
+        if is_close(target):
+            return target
+    return whole
+
+
+def _weights(found: Visibility, target: Image, color: str) -> Image:
+    """What errors are multiplied by: the root of how much of the pixels a texel is, 0 unseen."""
+    share = gaussian_filter(found.pixels, EVEN) * found.seen
+    weight = np.sqrt(share / share.max())[..., None]
+    light = dark_weight(target) if color == "linear" else np.ones_like(target)
+    return (weight * light).astype(np.float32)
+
+
+# --- The number ----------------------------------------------------------------------------------
+
+
+def _fit(
+    target: Image,
+    weight: Image,
+    seen: NDArray[np.bool_],
+    count: int,
+    iterations: int,
+    color: str,
+) -> Gaussians:
+    """Fit so many Gaussians, less those that touch nothing that is seen."""
+    height, width, channels = target.shape
+    picture = to_coded(target) if color == "linear" else target
+    mean, factor = place_adaptive(picture, count, np.random.default_rng(0))
+    kept = _reaches_seen(mean, factor, seen)
+    start = Gaussians.from_arrays(
+        mean[kept],
+        factor[kept],
+        np.zeros((int(kept.sum()), channels)),
+        size=(width, height),
+        space=color,
+        backend="cuda" if "cuda" in mi.variant() else "llvm",
+    ).bounded()
+    start = solve(start, target).gaussians
+    schedule = PRESETS["default"].schedule
+    (last,) = deque(descend(start, target, schedule, iterations, weight=weight), maxlen=1)
+    return last
+
+
+def _reaches_seen(
+    mean: NDArray[Any], factor: NDArray[Any], seen: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Tell which splats may reach a texel that is seen, by their longer axes; at least one."""
+    a, b, c = factor.T
+    middle = 0.5 * (a * a + b * b + c * c)
+    least = (a * c) ** 2 / (middle + np.sqrt(np.maximum(middle**2 - (a * c) ** 2, 0)))
+    column = mean[:, 0].astype(int).clip(0, seen.shape[1] - 1)
+    row = mean[:, 1].astype(int).clip(0, seen.shape[0] - 1)
+    away = distance_transform_edt(~seen)[row, column]
+    return away <= np.maximum(CUTOFF / np.sqrt(least), away.min())
+
+
+def _search_count(
+    attempt: Callable[[int], tuple[Gaussians, tuple[float, ...]]],
+    bound: float,
+    start: int,
+    most: int,
+) -> tuple[Gaussians, tuple[float, ...], list[tuple[int, float]]]:
+    """Search the smallest number that is enough: doubled or halved, then between the last two.
+
+    Raises
+    ------
+    ValueError
+        If the most are not enough.
+    """
+    tried: list[tuple[int, float]] = []
+    low, high, best = 0, most, None
+    count = min(start, most)
+    while True:
+        gaussians, reached = attempt(count)
+        lowest = min(reached)
+        tried.append((len(gaussians), lowest))
+        if lowest >= bound:
+            high, best = count, (gaussians, reached)
+        elif count == most:
+            raise ValueError(
+                f"{most} Gaussians reach {lowest:.1f} dB where the cameras are to see {bound:g}; "
+                "ask for less, or allow more Gaussians or iterations"
+            )
+        else:
+            low = count
+        if best is None:
+            count = min(2 * count, most)
+        elif high <= CLOSE * low or high - low <= 1:
+            return *best, tried
+        else:
+            count = round((low * high) ** 0.5) if low else high // 2

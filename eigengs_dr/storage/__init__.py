@@ -1,0 +1,1 @@
+"""Files of arrays, whole or not at all. NumPy only."""
