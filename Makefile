@@ -75,6 +75,7 @@ $(DOCS_READY): $(READY)
 	@touch $@
 
 docs: $(DOCS_READY)
+	rm -rf docs/reference/generated
 	$(BIN)/sphinx-build -E -W --keep-going -n -d build/docs/doctrees docs build/docs/html
 
 bench: $(READY)

@@ -6,7 +6,10 @@ import sys
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
-NAME = re.compile(r"`(eigengs_dr(?:\.\w+)+)`(?:,\s`(\w+)`)?")
+NAME = re.compile(r"`(eigengs_dr(?:\.\w+)+)`(?:, `(\w+)` \|)?")
+
+FORMATS = {f"eigengs_dr.{kind}" for kind in ("gaussians", "eigenbasis", "model", "checkpoint")}
+"""Names of file formats, not of Python."""
 
 
 def exists(name: str) -> bool:
@@ -35,7 +38,8 @@ def missing() -> list[str]:
         for number, line in enumerate(path.read_text().splitlines(), 1):
             for name, second in NAME.findall(line):
                 names = [name, f"{name.rpartition('.')[0]}.{second}"] if second else [name]
-                found += [f"{path.name}:{number}: {n}" for n in names if not exists(n)]
+                wrong = [n for n in names if n not in FORMATS and not exists(n)]
+                found += [f"{path.name}:{number}: {n}" for n in wrong]
     return found
 
 

@@ -4,9 +4,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from sphinx.util import logging
+
 import eigengs_dr as eg
 
-sys.path.insert(0, str(Path(__file__).parent))  # for gallery.py
+sys.path.insert(0, str(Path(__file__).parent))  # for check_names.py and gallery.py
+from check_names import missing
+
+LOGGER = logging.getLogger(__name__)
 
 project = "eigengs_dr"
 author = "the authors of eigengs_dr"
@@ -62,6 +67,15 @@ def skip_tuple_fields(
     return True if is_field else None
 
 
+def check_names(app: Any) -> None:
+    """Warn of public names that the reference leaves out, and of names that do not exist."""
+    listed = set((Path(__file__).parent / "reference" / "python.md").read_text().split())
+    for name in sorted(set(eg.__all__) - listed):
+        LOGGER.warning("reference/python.md: the public name %s is not listed", name)
+    for line in missing():
+        LOGGER.warning("%s does not exist", line)
+
+
 def show_examples_as_code(app: Any, context: Any, lines: list[str]) -> None:
     """Turn the lines of a help text that keep their breaks into a block of code."""
     result: list[str] = []
@@ -78,6 +92,7 @@ def show_examples_as_code(app: Any, context: Any, lines: list[str]) -> None:
 
 def setup(app: Any) -> None:
     """Connect the functions above."""
+    app.connect("builder-inited", check_names)
     app.connect("autodoc-skip-member", skip_tuple_fields)
     app.connect("sphinx-click-process-description", show_examples_as_code)
 
