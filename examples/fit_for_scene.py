@@ -68,7 +68,7 @@ for name, distance in (("far", 24), ("middle", 10), ("near", 3.2)):
     found = eg.fit_for_scene(room(BITMAP, distance), "poster.bsdf.brdf_0.reflectance", photo)
     poster = texture_of(found.gaussians, wrap_mode="clamp")
     full, reduced = photograph(BITMAP, distance), photograph(poster, distance)
-    texels = found.resolution.footprint.min() / 0.4  # a footprint is 0.4 of a pixel
+    texels = found.visibility.footprint.min() / 0.4  # a footprint is 0.4 of a pixel
     print(
         f"{name}: a pixel is {texels:.1f} texels, {len(found.gaussians)} Gaussians; "
         f"PSNR {found.psnr[0]:.1f} dB on the poster, {eg.psnr(full, reduced):.1f} dB rendered"

@@ -17,7 +17,6 @@ import mitsuba as mi
 import numpy as np
 
 from eigengs_dr.image.color import to_linear
-from eigengs_dr.raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS
 from eigengs_dr.raster.layout import pack_parameters
 from eigengs_dr.raster.lookup.footprint import bound_covariance
 from eigengs_dr.raster.lookup.points import (
@@ -31,7 +30,11 @@ from eigengs_dr.raster.lookup.points import (
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
 from eigengs_dr.raster.lookup.pyramid import build_pyramid, is_minified, pyramid_mean, sum_pyramid
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
-from eigengs_dr.raster.render import kernel_parameters
+from eigengs_dr.raster.parameters import (
+    NUM_SHAPE_PARAMS,
+    kernel_radius,
+)
+from eigengs_dr.raster.render import decode_parameters
 
 from .cone import metric
 from .properties import affine, angle, cutoff, raw, source_of, wrap_mode
@@ -96,12 +99,12 @@ def gaussian_texture() -> type:
 
         def parameters_changed(self, keys: list[str]) -> None:
             gaussians = self.source.gaussians()
-            rows, background = kernel_parameters(gaussians)
-            shape, color = rows[:NUM_SHAPE_PARAMS], [_finite(c) for c in rows[NUM_SHAPE_PARAMS:]]
+            parameters = decode_parameters(gaussians)
+            shape, color = parameters.shape, [_finite(c) for c in parameters.color]
             # First what may refuse: old lists of new splats would read beyond their end.
             if not keys or any(key in self.source.shaping for key in keys):
                 self._list([dr.detach(s) for s in shape])
-            self.background = [_finite(b) for b in background]
+            self.background = [_finite(b) for b in parameters.background]
             self.packed = pack_parameters([*shape, *color])
             dr.eval(self.packed, self.background)
             if self.angle:
@@ -114,7 +117,7 @@ def gaussian_texture() -> type:
         def _list(self, shape: list) -> None:
             """List the splats near every cell."""
             size = (self.width, self.height)
-            radius = EXP2_SCALE * self.cutoff
+            radius = kernel_radius(self.cutoff)
             side = cell_side(*size, dr.width(shape))
             cells = list_cells(shape, *size, radius, side)
             if self.angle:
@@ -153,7 +156,7 @@ def gaussian_texture() -> type:
         @uncollected
         def eval_1_grad(self, si: Any, active: Any = True) -> Any:
             (x, sx), (y, sy), active = self._point(si, active)
-            terms = gradient_terms((EXP2_SCALE * self.cutoff) ** 2)
+            terms = gradient_terms(kernel_radius(self.cutoff))
             number = NUM_SHAPE_PARAMS + self.channels
             sums = sum_at_points(
                 self.cells, self.packed, number, x, y, active, terms, 3 * self.channels
@@ -172,10 +175,8 @@ def gaussian_texture() -> type:
             if self.angle:
                 sums = self._filtered(si, (x, sx), (y, sy), active)
             else:
-                number, terms = (
-                    NUM_SHAPE_PARAMS + self.channels,
-                    value_terms((EXP2_SCALE * self.cutoff) ** 2),
-                )
+                number = NUM_SHAPE_PARAMS + self.channels
+                terms = value_terms(kernel_radius(self.cutoff))
                 sums = sum_at_points(
                     self.cells, self.packed, number, x, y, active, terms, self.channels
                 )

@@ -418,7 +418,7 @@ def test_a_search_adds_nothing_where_steps_lead_to_the_goal(monkeypatch):
         added.append(count - len(gaussians))
         return densify(gaussians, target, count, *rest)
 
-    monkeypatch.setattr(budget, "grown", counted)
+    monkeypatch.setattr(budget, "densify", counted)
     result, _ = searched(
         monkeypatch, lambda g, steps: 4 * np.log2(len(g) / 100) + 0.0005 * sum(steps)
     )
@@ -445,7 +445,7 @@ def test_a_search_goes_on_where_the_fit_just_meets_the_goal(monkeypatch):
 def test_a_search_ends_where_no_place_is_left_to_grow(monkeypatch):
     start = initialize(picture(), 60, "adaptive", "natural", PRESETS["default"])
     asked = []
-    monkeypatch.setattr(budget, "grown", lambda gaussians, *rest: asked.append(1) or gaussians)
+    monkeypatch.setattr(budget, "densify", lambda gaussians, *rest: asked.append(1) or gaussians)
     schedule = PRESETS["default"].schedule
     result = search_count(start, lambda g: {"decibels": 18.0}, "decibels", 20.0, 1000, schedule, 40)
     assert result.stopped == "out of reach"

@@ -17,7 +17,6 @@ from test_training import SMALL, random_fields
 import eigengs_dr as eg
 from eigengs_dr.cli.main import main
 from eigengs_dr.eigenbasis import model_file as modelfile
-from eigengs_dr.eigenbasis.components import solve as components
 from eigengs_dr.eigenbasis.components.split import SPLIT_COST, split_reason, wants_split
 from eigengs_dr.eigenbasis.training import TrainOptions, train
 from eigengs_dr.eigenbasis.truncation import (
@@ -279,7 +278,7 @@ def test_the_split_tells_why(backend, monkeypatch):
     assert reason(100, False) == (False, "as asked")
     assert reason(1, True) == (False, "too few Gaussians or components to split")
     assert reason(100, "auto") == (False, "32 pixels a side; auto measures from 512 on")
-    monkeypatch.setattr(components, "SPLIT_FROM", 32)
+    monkeypatch.setattr("eigengs_dr.eigenbasis.components.split.SPLIT_FROM", 32)
     decision, text = reason(100, "auto")
     whole, split = (float(text.split(word)[1].split(" dB")[0]) for word in ("whole ", "split "))
     assert decision == (split > whole - SPLIT_COST)

@@ -154,7 +154,7 @@ def test_what_the_split_may_cost(backend, monkeypatch, split, expected):
     figures = iter([30.0, split])
     monkeypatch.setattr("eigengs_dr.eigenbasis.components.split.SPLIT_FROM", SIDE)
     monkeypatch.setattr(
-        "eigengs_dr.eigenbasis.components.solve.decibels", lambda mse: next(figures)
+        "eigengs_dr.eigenbasis.components.split.psnr_from_mse", lambda mse: next(figures)
     )
     assert wants_split(small_basis(), SPLATS, "auto", backend)[0] == expected
 

@@ -10,13 +10,14 @@ from scipy.special import erf
 
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, widen
+from eigengs_dr.raster.evaluate import widen
 from eigengs_dr.raster.layout import pack_parameters
 from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, bound_covariance, quick_erf
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
+from eigengs_dr.raster.parameters import EXP2_SCALE, NUM_SHAPE_PARAMS
 from eigengs_dr.raster.reference import render_exact
-from eigengs_dr.raster.render import kernel_parameters
+from eigengs_dr.raster.render import decode_parameters
 
 CUTOFF = 5.0
 FINE = 4
@@ -70,7 +71,8 @@ def brute_force(scene, wrap, points, covariance):
 
 def filtered(gaussians, wrap, points, covariance, cutoff=CUTOFF):
     """Rows of what `sum_prefiltered` gives, without the background."""
-    rows, _ = kernel_parameters(gaussians)
+    p = decode_parameters(gaussians)
+    rows = [*p.shape, *p.color]
     types = types_of(gaussians.mean)
     shape = [dr.detach(r) for r in rows[:NUM_SHAPE_PARAMS]]
     sizes = classify_by_size(shape, gaussians.width, gaussians.height, cutoff, wrap)
@@ -172,7 +174,8 @@ class TestSumFiltered:
             total = 0
             for n in range(80):
                 one = scene.permuted([n]).on(backend)
-                rows, _ = kernel_parameters(one)
+                p = decode_parameters(one)
+                rows = [*p.shape, *p.color]
                 scaled = [
                     types.Float(covariance[k] / EXP2_SCALE**2) for k in ((0, 0), (0, 1), (1, 1))
                 ]
@@ -246,7 +249,8 @@ class TestWiden:
         rng = np.random.default_rng(seed)
         scene = random_scene(seed)
         spread = covariances(rng.uniform(0, 30, (1, 2)), rng.uniform(0, np.pi, 1))[0]
-        rows, _ = kernel_parameters(scene.on(backend, bits=64))
+        p = decode_parameters(scene.on(backend, bits=64))
+        rows = [*p.shape, *p.color]
         Float = types_of(rows[0]).Float
         footprint = [Float(spread[k] / EXP2_SCALE**2) for k in ((0, 0), (0, 1), (1, 1))]
         (_, _, a, b, c), amplitude = widen(rows[:NUM_SHAPE_PARAMS], footprint)

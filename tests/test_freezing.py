@@ -16,7 +16,7 @@ import gc
 import numpy as np
 
 from eigengs_dr.backend.selection import select
-from eigengs_dr.backend.recording import frozen
+from eigengs_dr.backend.recording import freeze_program
 
 class Node:
     pass
@@ -30,7 +30,7 @@ gc.collect()
 node = Node()
 node.cycle, node.array = node, Float(np.ones(1_000_000, np.float32))
 del node
-with frozen(program) as call:
+with freeze_program(program) as call:
     print(call(Float(1, 2, 3)), gc.isenabled())
 """
 

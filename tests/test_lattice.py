@@ -7,12 +7,12 @@ from scenes import SIZE, random_scene
 from test_filtered import brute_force, some_points, stacked, tiled
 
 from eigengs_dr.backend.arrays import types_of
-from eigengs_dr.raster.evaluate import NUM_SHAPE_PARAMS
 from eigengs_dr.raster.layout import pack_parameters
 from eigengs_dr.raster.lookup import pyramid as module
 from eigengs_dr.raster.lookup.pyramid import build_pyramid, is_minified, pyramid_mean, sum_pyramid
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
-from eigengs_dr.raster.render import kernel_parameters
+from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS
+from eigengs_dr.raster.render import decode_parameters
 
 CUTOFF = 5.0
 FOOTPRINTS = [
@@ -27,7 +27,8 @@ FOOTPRINTS = [
 
 
 def lattice_of(gaussians, wrap, cutoff=CUTOFF):
-    rows, _ = kernel_parameters(gaussians)
+    p = decode_parameters(gaussians)
+    rows = [*p.shape, *p.color]
     shape = [dr.detach(r) for r in rows[:NUM_SHAPE_PARAMS]]
     sizes = classify_by_size(shape, gaussians.width, gaussians.height, cutoff, wrap)
     return build_pyramid(

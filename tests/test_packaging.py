@@ -44,11 +44,15 @@ def test_wheel(tmp_path):
 
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
+        archive.extractall(tmp_path / "installed")
     assert {name.split("/")[0].split("-")[0] for name in names} == {"eigengs_dr"}
     modules = {path.relative_to(ROOT).as_posix() for path in ROOT.glob("eigengs_dr/**/*.py")}
     plugins = {
         "eigengs_dr/" + path.relative_to(ROOT).as_posix() for path in ROOT.glob("plugins/*.py")
     }
     assert modules | plugins <= set(names)
-    assert "eigengs_dr/data/natural.npz" in names
-    assert find_plugins(tmp_path, wheel) == [str(wheel / "eigengs_dr/plugins/__init__.py"), "None"]
+    for name in ("data/natural.npz", "__init__.pyi", "py.typed"):
+        assert f"eigengs_dr/{name}" in names
+    installed = tmp_path / "installed"
+    where = str(installed / "eigengs_dr/plugins/__init__.py")
+    assert find_plugins(tmp_path, installed) == [where, "None"]

@@ -32,6 +32,7 @@ from eigengs_dr.codec.quantization import (
     log_shapes,
     quantize,
 )
+from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import picture_of
 from eigengs_dr.storage.npz import BadValue
 
@@ -359,10 +360,10 @@ def test_low_bits_take_no_more_memory_than_numbers():
 
 def test_splats_are_bounded(path, monkeypatch):
     """As those of other files are: by the numbers in the widest array."""
-    monkeypatch.setattr(packed, "MOST_ENTRIES", 3 * COUNT)
+    monkeypatch.setattr(packed, "MAX_ENTRIES", 3 * COUNT)
     path.write_bytes(header() + body())
     assert len(eg.Gaussians.load(path)) == COUNT
-    monkeypatch.setattr(packed, "MOST_ENTRIES", 3 * COUNT - 1)
+    monkeypatch.setattr(packed, "MAX_ENTRIES", 3 * COUNT - 1)
     check_refused(path, header() + body(), "more than may be read")
 
 
@@ -427,8 +428,7 @@ def test_without_an_image_the_rendering_is_kept(fitted, path):
     receipt = eg.pack(gaussians, path)
     error = np.mean(
         np.square(
-            eg.color.rgb_to_ycbcr(picture_of(eg.Gaussians.load(path)))
-            - eg.color.rgb_to_ycbcr(picture_of(gaussians))
+            rgb_to_ycbcr(picture_of(eg.Gaussians.load(path))) - rgb_to_ycbcr(picture_of(gaussians))
         )
     )
     allowed = packing.MSE_WITHOUT_IMAGE * (10 ** (packing.BUDGET / 10) - 1)

@@ -11,7 +11,6 @@ from scenes import SIZE, few, random_scene, scenes
 
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS
 from eigengs_dr.raster.layout import pack_parameters
 from eigengs_dr.raster.lookup.points import (
     cell_side,
@@ -21,7 +20,8 @@ from eigengs_dr.raster.lookup.points import (
     sum_at_points,
     value_terms,
 )
-from eigengs_dr.raster.render import kernel_parameters, render
+from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
+from eigengs_dr.raster.render import decode_parameters, render
 
 POINTS = 400
 WIDE = 9.0
@@ -50,7 +50,8 @@ def exact_at(scene, points, cutoff):
 
 def arrays_of(gaussians, points):
     """Packed parameters, shape, background, and x and y of points, as lookups take them."""
-    rows, background = kernel_parameters(gaussians)
+    p = decode_parameters(gaussians)
+    rows, background = [*p.shape, *p.color], p.background
     types = types_of(gaussians.mean)
     x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
     return pack_parameters(rows), [dr.detach(r) for r in rows[:NUM_SHAPE_PARAMS]], background, x, y
@@ -60,9 +61,9 @@ def look_up(gaussians, points, cutoff, side=4, terms=value_terms, number=1):
     """Rows of sums at points, without the background."""
     packed, shape, _, x, y = arrays_of(gaussians, points)
     size, channels = (gaussians.width, gaussians.height), gaussians.channels
-    cells = list_cells(shape, *size, EXP2_SCALE * cutoff, side)
+    cells = list_cells(shape, *size, kernel_radius(cutoff), side)
     active = types_of(x).Bool(True)
-    term = terms((EXP2_SCALE * cutoff) ** 2)
+    term = terms(kernel_radius(cutoff))
     return sum_at_points(
         cells, packed, NUM_SHAPE_PARAMS + channels, x, y, active, term, number * channels
     )
@@ -111,7 +112,7 @@ class TestValues:
                 mean=rng.uniform(0, 1, (count, 2)) * size, factor=np.tile([0.3, 0, 0.3], (count, 1))
             )
             _, shape, *_ = arrays_of(scene.on(backend), some_points(size=size))
-            ends = np.array(list_cells(shape, *size, EXP2_SCALE * 3, 4).ends).reshape(-1, 2)
+            ends = np.array(list_cells(shape, *size, kernel_radius(3), 4).ends).reshape(-1, 2)
             lengths.append(np.mean(ends[:, 1].astype(int) - ends[:, 0]))
         assert lengths[1] < 1.4 * lengths[0]  # fewer cells lie at the border
 
@@ -164,12 +165,10 @@ class TestDerivatives:
         """The loop hands on derivatives of where it is evaluated, which geometry may have."""
         gaussians = random_scene(8).on(backend, bits=64)
         packed, shape, _, x, y = arrays_of(gaussians, some_points())
-        cells = list_cells(shape, *SIZE, EXP2_SCALE * WIDE, 4)
+        cells = list_cells(shape, *SIZE, kernel_radius(WIDE), 4)
         active = types_of(x).Bool(True)
         dr.enable_grad(x, y)
-        sums = sum_at_points(
-            cells, packed, 8, x, y, active, value_terms((EXP2_SCALE * WIDE) ** 2), 3
-        )
+        sums = sum_at_points(cells, packed, 8, x, y, active, value_terms(kernel_radius(WIDE)), 3)
         dr.backward(dr.sum(sums[0]))
         rows = look_up(gaussians, some_points(), WIDE, terms=gradient_terms, number=3)
         np.testing.assert_allclose(np.array(dr.grad(x)), np.array(rows[1]), atol=1e-9)

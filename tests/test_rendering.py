@@ -28,11 +28,11 @@ from eigengs_dr.raster.render import (
     CUTOFF,
     MAX_CUTOFF,
     bin_gaussians,
-    kernel_parameters,
+    decode_parameters,
+    rasterize,
     render,
     to_tensor,
 )
-from eigengs_dr.raster.render import rasterize as splat_operation
 from eigengs_dr.raster.tiles import TILE
 
 SMOOTH = 6.0
@@ -423,18 +423,18 @@ def test_linear_in_colour(backend, scene, other, scale):
 
 def test_operation_behind_render(backend):
     gaussians = random_scene(16).on(backend, space="ycbcr")
-    values, background = kernel_parameters(gaussians)
+    p = decode_parameters(gaussians)
     lists = bin_gaussians(gaussians)
-    image = to_tensor(splat_operation(values, background, lists), lists.grid, 3)
+    image = to_tensor(rasterize(p, lists), lists.grid, 3)
     np.testing.assert_array_equal(image, render(gaussians))
 
 
 def test_padded_lists_make_the_same_picture(backend):
     scene = random_scene(17)
     gaussians = scene.on(backend)
-    values, background = kernel_parameters(gaussians)
+    p = decode_parameters(gaussians)
     lists = bin_gaussians(gaussians, CUTOFF, 2.0)
-    image = to_tensor(splat_operation(values, background, lists), lists.grid, 3).numpy()
+    image = to_tensor(rasterize(p, lists), lists.grid, 3).numpy()
     assert (np.abs(image - render(gaussians).numpy()) <= bound(scene, 1e-5))[
         scene.off_edge(CUTOFF)
     ].all()

@@ -187,7 +187,7 @@ class TestFit:
         )
         assert len(half.gaussians) < 0.75 * len(whole.gaussians)
         assert half.gaussians.to_arrays()["mean"][:, 0].max() < 30
-        assert half.resolution.seen.shape == (48, 48)
+        assert half.visibility.seen.shape == (48, 48)
 
     def test_every_camera_is_content(self):
         scene = scene_of(camera([0, 0, 5.0]), camera([3, 0, 4.0]))
@@ -202,7 +202,7 @@ class TestFit:
             scene_of(camera([0, 0, 5.0])), NAME, data, psnr=BOUND, color="data", iterations=STEPS
         )
         assert found.gaussians.space == "data" and found.gaussians.channels == 1
-        rows = found.resolution.pixel_to_texel[0]
+        rows = found.visibility.pixel_to_texel[0]
         shown = (rows @ p.reshape(-1, 1) for p in (eg.render(found.gaussians).numpy(), data))
         assert eg.psnr(*(s[:, None] for s in shown), space="data") > BOUND - 0.5
 

@@ -8,12 +8,13 @@ import pytest
 
 from eigengs_dr.backend.arrays import _types, types_in, types_of
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.evaluate import EXP2_SCALE, exp2_neg, falloff, weights, weights_vjp
+from eigengs_dr.raster.evaluate import exp2_neg, falloff, weights, weights_vjp
 from eigengs_dr.raster.layout import gather_run, pack_parameters, unpack_parameters
+from eigengs_dr.raster.parameters import EXP2_SCALE, kernel_radius
 
 TILE = (4, 3)
 CUTOFF = 3.0
-LIMIT = (EXP2_SCALE * CUTOFF) ** 2
+RADIUS = kernel_radius(CUTOFF)
 COUNT = 256
 
 
@@ -109,7 +110,7 @@ def test_derivative_of_falloff(types, mode):
 
 def test_weights(types):
     shape, x, y = draw()
-    found = weights(scaled(types, shape), *upload(types, x, y), TILE, LIMIT)
+    found = weights(scaled(types, shape), *upload(types, x, y), TILE, RADIUS)
     assert len(found) == TILE[0] * TILE[1]
     q = squared_distance(shape, x, y)
     exact = np.where(q <= CUTOFF**2, np.exp(-0.5 * q), 0)
@@ -122,8 +123,8 @@ def test_weights(types):
 
 def test_one_point_is_a_block_of_one(types):
     shape, x, y = draw()
-    block = weights(scaled(types, shape), *upload(types, x, y), TILE, LIMIT)
-    [single] = weights(scaled(types, shape), *upload(types, x + 2, y + 1), (1, 1), LIMIT)
+    block = weights(scaled(types, shape), *upload(types, x, y), TILE, RADIUS)
+    [single] = weights(scaled(types, shape), *upload(types, x + 2, y + 1), (1, 1), RADIUS)
     q = squared_distance(shape, x, y)[TILE[0] + 2]
     clear = np.abs(q / CUTOFF**2 - 1) > 1e-4
     error = np.abs(single.numpy() - block[TILE[0] + 2].numpy())[clear]
@@ -135,7 +136,7 @@ def test_one_point_is_a_block_of_one(types):
 def test_weights_are_never_nan(types, position, value):
     shape = scaled(types, [[8.0], [8.0], [0.5], [0.1], [0.5]])
     shape[position] = types.Float(value)
-    found = weights(shape, types.Float(6.5), types.Float(6.5), TILE, LIMIT)
+    found = weights(shape, types.Float(6.5), types.Float(6.5), TILE, RADIUS)
     assert not any(w.numpy().any() for w in found)
 
 
@@ -151,10 +152,10 @@ def test_pullback_is_the_derivative_of_weights(types):
     rng = np.random.default_rng(1)
     upstream = upload(types, *rng.normal(size=(TILE[0] * TILE[1], COUNT)))
     parameters, x, y = scaled(types, shape), *upload(types, x, y)
-    by_hand = weights_vjp(parameters, x, y, TILE, LIMIT, pull_with(upstream))
+    by_hand = weights_vjp(parameters, x, y, TILE, RADIUS, pull_with(upstream))
     dr.enable_grad(parameters)
     total = sum(
-        g * w for g, w in zip(upstream, weights(parameters, x, y, TILE, LIMIT), strict=True)
+        g * w for g, w in zip(upstream, weights(parameters, x, y, TILE, RADIUS), strict=True)
     )
     dr.backward(total)
     for ours, theirs in zip(by_hand, dr.grad(parameters), strict=True):
@@ -165,8 +166,8 @@ def test_pullback_is_the_derivative_of_weights(types):
 
 def test_pullback_against_finite_differences(types):
     shape, x, y = draw()
-    everywhere = 100.0  # a limit beyond all points, so that no step crosses the edge
-    keep = squared_distance(shape, x, y).max(axis=0) * EXP2_SCALE**2 < everywhere
+    everywhere = 10.0  # a cutoff beyond all points, so that no step crosses the edge
+    keep = squared_distance(shape, x, y).max(axis=0) * EXP2_SCALE**2 < everywhere**2
     shape, x, y = shape[:, keep], x[keep], y[keep]
     assert keep.sum() > COUNT / 4
     upstream = np.random.default_rng(1).normal(size=(TILE[0] * TILE[1], keep.sum()))
@@ -202,9 +203,9 @@ def test_pullback_asks_with_the_weights(types):
         asked[k] = w
         return types.Float(0)
 
-    gradient = weights_vjp(parameters, x, y, TILE, LIMIT, pull)
+    gradient = weights_vjp(parameters, x, y, TILE, RADIUS, pull)
     assert not any(g.numpy().any() for g in gradient)
-    expected = weights(parameters, x, y, TILE, LIMIT)
+    expected = weights(parameters, x, y, TILE, RADIUS)
     assert sorted(asked) == list(range(len(expected)))
     for k, w in enumerate(expected):
         np.testing.assert_allclose(asked[k].numpy(), w.numpy(), rtol=0, atol=1e-6)

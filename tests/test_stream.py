@@ -122,14 +122,14 @@ def test_order_is_that_of_the_source_whatever_is_ready_first(tmp_path, monkeypat
         return load_image(path)
 
     monkeypatch.setattr(stream, "load_image", slow)
-    monkeypatch.setattr(stream, "THREADS", 2)
+    monkeypatch.setattr(stream, "DECODE_THREADS", 2)
     np.testing.assert_array_equal(np.concatenate(read(files)), planes(images))
 
 
 def test_few_images_wait_in_memory(tmp_path, monkeypatch):
     started = []
     files = image_files(write(tmp_path, pictures(40)))
-    monkeypatch.setattr(stream, "AHEAD", 5)
+    monkeypatch.setattr(stream, "MAX_WAITING", 5)
     monkeypatch.setattr(stream, "load_image", lambda path: started.append(path) or load_image(path))
     blocks = read_blocks(files, SIZE, "rgb", 2)
     for taken in range(2, 13, 2):

@@ -23,9 +23,9 @@ from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr
 from ..image.io import check_image
 from ..image.samples import sample
-from ..raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS
+from ..raster.parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, KernelParameters
 from ..raster.reference import render_plain
-from ..raster.render import bin_gaussians, kernel_parameters, rasterize, to_tensor
+from ..raster.render import bin_gaussians, decode_parameters, rasterize, to_tensor
 from ..raster.tiles import Grid, TileLists, build_lists
 
 SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
@@ -152,14 +152,16 @@ def programs(
     shown : callable
         ``shown()`` is the picture, ndarray of shape (H, W, C).
     """
-    values, background = kernel_parameters(scene)
+    p = decode_parameters(scene)
+    values, background = [*p.shape, *p.color], p.background
     dr.eval(values)
     if plain:
-        grid, draw = Grid(scene.width, scene.height, PLAIN_TILE), render_plain
+        draw: Any = render_plain
+        grid = Grid(scene.width, scene.height, PLAIN_TILE)
         lists = build_lists(values[:NUM_SHAPE_PARAMS], EXP2_SCALE * cutoff, grid)
         values = [*values[:2], *scene.factor, *values[NUM_SHAPE_PARAMS:]]  # not in `EXP2_SCALE`
     else:
-        draw, lists = rasterize, bin_gaussians(scene, cutoff)
+        draw, lists = _rasterize, bin_gaussians(scene, cutoff)
     shape = (scene.height, scene.width, scene.channels)
     delta = upload(type(values[0]), np.random.default_rng(1).normal(size=math.prod(shape)))
 
@@ -254,3 +256,8 @@ def _growth_figures(
         "early_step_ms": float(np.median(early)),
         "late_step_ms": float(np.median(late)),
     }
+
+
+def _rasterize(values: list, background: list, lists: TileLists, cutoff: float) -> Any:
+    shape, color = values[:NUM_SHAPE_PARAMS], values[NUM_SHAPE_PARAMS:]
+    return rasterize(KernelParameters(shape, color, background), lists, cutoff)

@@ -14,15 +14,7 @@ from ..cli_bench import bench
 from .console import Program
 from .fit import fit
 from .info import info
-from .options import (
-    ANY_PATH,
-    EXISTING,
-    MAX_PIXELS,
-    Size,
-    backend_option,
-    check_pixels,
-    json_option,
-)
+from .options import ANY_PATH, EXISTING, MAX_PIXELS, Size, backend_option, check_pixels, json_option
 from .outputs import check_outputs, name_outputs
 from .pack import pack
 from .scene import scene

@@ -15,7 +15,7 @@ from ..eigenbasis.eigengs import EigenGS
 from ..gaussian.gaussians import Gaussians
 from ..image.color import SPACES
 from ..image.io import check_image
-from ..raster.evaluate import NUM_SHAPE_PARAMS
+from ..raster.parameters import NUM_SHAPE_PARAMS
 from ..raster.render import picture_of
 from .initializers import INITS, initialize
 from .presets import PRESETS

@@ -14,13 +14,6 @@ import drjit as dr
 
 from ..backend.arrays import types_of
 
-EXP2_SCALE = math.sqrt(0.5 / math.log(2))
-"""``exp(-q / 2) = 2^-(UNIT^2 q)``: kernels take factors in these units and save a product."""
-
-NUM_SHAPE_PARAMS = 5
-"""Parameters of a splat before its colour: mean x, mean y, a, b, c."""
-
-
 LN2 = math.log(2)
 
 
@@ -59,8 +52,8 @@ def falloff(q: Any, limit: float) -> Any:
     return dr.replace_grad(value, (-LN2 * value) * q)
 
 
-def weights(shape: list, x: Any, y: Any, tile: tuple[int, int], limit: float) -> list:
-    """Evaluate one splat at a block of pixels: ``2^-|F (x - mu)|^2``, F in units of `EXP2_SCALE`.
+def weights(shape: list, x: Any, y: Any, tile: tuple[int, int], radius: float) -> list:
+    """Evaluate one splat at a block of pixels: ``2^-|F (x - mu)|^2``, F in kernel units.
 
     Everything that evaluates a Gaussian goes through here: the renderer, its derivatives both ways,
     the colour solve and the textures (with a block of one point).
@@ -68,7 +61,7 @@ def weights(shape: list, x: Any, y: Any, tile: tuple[int, int], limit: float) ->
     Parameters
     ----------
     shape : list of 5 Float
-        Mean x, mean y, a, b, c (see `EXP2_SCALE`).
+        Mean x, mean y, a, b, c in the units of the kernels, see `KernelParameters`.
     x, y : Float
         First point of the block.
     tile : (int, int)
@@ -82,6 +75,7 @@ def weights(shape: list, x: Any, y: Any, tile: tuple[int, int], limit: float) ->
         Weights in [0, 1], row after row. Cost: one `exp2_neg`, a comparison and 2 or 3 more
         operations a point.
     """
+    limit = radius * radius
     return [falloff(dr.fma(u, u, v * v), limit) for us, v in _rows(shape, x, y, tile) for u in us]
 
 
@@ -103,10 +97,10 @@ def weights_vjp(
     x: Any,
     y: Any,
     tile: tuple[int, int],
-    limit: float,
-    pull: Callable[[int, Any], Any],
+    radius: float,
+    cotangent: Callable[[int, Any], Any],
 ) -> list:
-    """Gradient of ``sum_k g_k w_k`` with respect to the shape, where ``g_k = pull(k, w_k)``.
+    """Gradient of ``sum_k g_k w_k`` with respect to the shape, where ``g_k = cotangent(k, w_k)``.
 
     Derived by hand beside `weights`, which a test compares it with, because it halves the adjoint:
     with ``e = -2 ln(2) g w``, ``du = e u`` and ``dv = e v``, and (i, j) the place in the block,
@@ -115,11 +109,11 @@ def weights_vjp(
 
     Parameters
     ----------
-    shape, x, y, tile, limit
+    shape, x, y, tile, radius
         As in `weights`.
-    pull : callable
-        ``pull(k, w)`` receives the weight of the k-th point and returns the derivative of the loss
-        with respect to it.
+    cotangent : callable
+        ``cotangent(k, w)`` receives the weight of the k-th point and returns the derivative of the
+        loss with respect to it.
 
     Returns
     -------
@@ -127,12 +121,13 @@ def weights_vjp(
         Derivatives with respect to mean x, mean y, a, b, c.
     """
     mean_x, mean_y, a, b, c = shape
+    limit = radius * radius
     du = dui = duj = dv = dvj = type(mean_x)(0)
     for j, (us, v) in enumerate(_rows(shape, x, y, tile)):
         e_row = u_row = type(mean_x)(0)
         for i, u in enumerate(us):
             w = falloff(dr.fma(u, u, v * v), limit)
-            e = w * pull(j * tile[0] + i, w)
+            e = w * cotangent(j * tile[0] + i, w)
             e_row = e_row + e
             u_row = dr.fma(e, u, u_row)
             if i:
@@ -165,7 +160,7 @@ def widen(shape: list, footprint: list) -> tuple[list, Any]:
     shape : list of 5 Float
         As in `weights`.
     footprint : list of 3 Float
-        xx, xy, yy of ``Sigma_f`` over `EXP2_SCALE` squared.
+        xx, xy, yy of ``Sigma_f``, from `kernel_covariance`.
 
     Returns
     -------

@@ -13,8 +13,9 @@ from typing import Any
 import drjit as dr
 
 from ..backend.arrays import ArrayTypes, types_of
-from .evaluate import NUM_SHAPE_PARAMS, weights, weights_vjp
+from .evaluate import weights, weights_vjp
 from .layout import gather_index, gather_run, unpack_parameters
+from .parameters import NUM_SHAPE_PARAMS
 from .tiles import Grid, TileLists, for_each_tile
 
 # ---------------------------------------------------------------------------------------------
@@ -22,7 +23,7 @@ from .tiles import Grid, TileLists, for_each_tile
 # ---------------------------------------------------------------------------------------------
 
 
-def forward(packed: Any, start: list, lists: TileLists, limit: float, tangent: Any = None) -> Any:
+def forward(packed: Any, start: list, lists: TileLists, radius: float, tangent: Any = None) -> Any:
     """Sum the splats of every tile: the image, or its derivative along `tangent`.
 
     ``I_pc = start_c + sum_n w_n(p) c_nc``. Cost: one gather of the splat's parameters and
@@ -52,7 +53,7 @@ def forward(packed: Any, start: list, lists: TileLists, limit: float, tangent: A
     y = types.Float(lists.order // grid.nx * grid.tile[1]) + 0.5
 
     def contributions(p: list) -> list:
-        spread = weights(p[:NUM_SHAPE_PARAMS], x, y, grid.tile, limit)
+        spread = weights(p[:NUM_SHAPE_PARAMS], x, y, grid.tile, radius)
         return [(w, c) for w in spread for c in p[NUM_SHAPE_PARAMS:]]
 
     def add(i: Any, sums: list) -> tuple:
@@ -125,17 +126,16 @@ def adjoint(
     """
     types = types_of(packed)
     grid = lists.grid
-    limit = radius * radius
     splat = unpack_parameters(packed, lists.splat_order, NUM_SHAPE_PARAMS + channels)
     length = grid.pixels * channels
 
-    def pull_back(tile: Any, column: Any, row: Any, active: Any, sums: list) -> list:
+    def add_tile(tile: Any, column: Any, row: Any, active: Any, sums: list) -> list:
         d = gather_run(types, delta, types.UInt(tile), length, active)
         x = types.Float(column * grid.tile[0]) + 0.5
         y = types.Float(row * grid.tile[1]) + 0.5
         color = sums[-channels:]
 
-        def pull(k: int, w: Any) -> Any:
+        def cotangent(k: int, w: Any) -> Any:
             g = type(w)(0)
             for c in range(channels):
                 color[c] = dr.fma(w, d[k * channels + c], color[c])
@@ -143,10 +143,10 @@ def adjoint(
             return g
 
         if color_only:
-            for k, w in enumerate(weights(splat[:NUM_SHAPE_PARAMS], x, y, grid.tile, limit)):
-                pull(k, w)
+            for k, w in enumerate(weights(splat[:NUM_SHAPE_PARAMS], x, y, grid.tile, radius)):
+                cotangent(k, w)
             return color
-        gradient = weights_vjp(splat[:NUM_SHAPE_PARAMS], x, y, grid.tile, limit, pull)
+        gradient = weights_vjp(splat[:NUM_SHAPE_PARAMS], x, y, grid.tile, radius, cotangent)
         return [s + g for s, g in zip(sums, gradient, strict=False)] + color
 
     number = channels if color_only else NUM_SHAPE_PARAMS + channels
@@ -154,7 +154,7 @@ def adjoint(
         splat[:NUM_SHAPE_PARAMS],
         radius,
         grid,
-        pull_back,
+        add_tile,
         [types.Float(0) for _ in range(number)],
         label="pull back",
     )

@@ -8,7 +8,8 @@ import drjit as dr
 import numpy as np
 
 from ..backend.arrays import types_of
-from .evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, weights
+from .evaluate import weights
+from .parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_radius
 from .tiles import TileLists
 
 
@@ -46,7 +47,7 @@ def render_plain(values: list, background: list, lists: TileLists, cutoff: float
         active = i < end
         n = dr.gather(types.UInt, lists.splat, i, active)
         p = [dr.gather(types.Float, v, n, active) for v in scaled]
-        (w,) = weights(p[:NUM_SHAPE_PARAMS], x, y, (1, 1), (EXP2_SCALE * cutoff) ** 2)
+        (w,) = weights(p[:NUM_SHAPE_PARAMS], x, y, (1, 1), kernel_radius(cutoff))
         return i + 1, [dr.fma(w, c, s) for c, s in zip(p[NUM_SHAPE_PARAMS:], sums, strict=True)]
 
     _, sums = dr.while_loop(

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from ..backend.arrays import ArrayTypes, types_of, upload
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode, to_coded
-from .evaluate import EXP2_SCALE
 from .kernels import adjoint, channel_sums, forward
 from .layout import gather_run, pack_parameters
+from .parameters import KernelParameters, detached_shape, kernel_radius, kernel_shape
 from .tiles import Grid, TileLists, build_lists
 
 CUTOFF = 3.0
@@ -76,9 +76,10 @@ def render(
     width, height = _size(gaussians, width, height)
     scaled = gaussians.scaled(width, height)
     cutoff = float(cutoff)  # a NumPy scalar would promote everything to float64
-    values, background = kernel_parameters(scaled)
+    parameters = decode_parameters(scaled)
     lists = bin_gaussians(scaled, cutoff)
-    return to_tensor(rasterize(values, background, lists, cutoff), lists.grid, len(background))
+    image = rasterize(parameters, lists, cutoff)
+    return to_tensor(image, lists.grid, len(parameters.background))
 
 
 def picture_of(
@@ -114,18 +115,17 @@ def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[
     return index(width), index(height)
 
 
-def kernel_parameters(gaussians: Gaussians) -> tuple[list, list]:
-    """Return the parameters as the kernels take them, and the background.
+def decode_parameters(gaussians: Gaussians) -> KernelParameters:
+    """Return the parameters of a set with its colours decoded to RGB; differentiable.
 
-    Colours are decoded here: the conversion is linear, so that N splats are converted and not
-    H W pixels.
+    Decoding is linear: N colours are converted instead of H W pixels.
     """
     black = decode(gaussians.space, [0.0] * gaussians.channels)
     color = [
         c - k for c, k in zip(decode(gaussians.space, list(gaussians.color)), black, strict=True)
     ]
     background = decode(gaussians.space, list(gaussians.background))
-    return [*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor], *color], background
+    return KernelParameters(kernel_shape(gaussians), color, background)
 
 
 def bin_gaussians(gaussians: Gaussians, cutoff: float = CUTOFF, pad: float = 0.0) -> TileLists:
@@ -138,23 +138,18 @@ def bin_gaussians(gaussians: Gaussians, cutoff: float = CUTOFF, pad: float = 0.0
     """
     if not 0 < cutoff <= MAX_CUTOFF:
         raise ValueError(f"cutoff is {cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}")
-    types = types_of(gaussians.mean)
-    shape = [*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor]]
-    n = len(gaussians)
-    shape = [dr.detach(v) + dr.zeros(types.Float, n) for v in shape]
-    return build_lists(shape, EXP2_SCALE * cutoff, Grid(gaussians.width, gaussians.height), pad)
+    grid = Grid(gaussians.width, gaussians.height)
+    return build_lists(detached_shape(gaussians), kernel_radius(cutoff), grid, pad)
 
 
-def rasterize(values: list, background: list, lists: TileLists, cutoff: float = CUTOFF) -> Any:
-    """Sum splats to an image in tile layout; the differentiable operation behind `render`.
+def rasterize(parameters: KernelParameters, lists: TileLists, cutoff: float = CUTOFF) -> Any:
+    """Sum Gaussians to an image in tile layout; the differentiable operation behind `render`.
 
     Parameters
     ----------
-    values : list of Float, shape (N,)
-        From `kernel_parameters`.
-    background : list of Float, shape (1,)
+    parameters : KernelParameters
     lists : TileLists
-        Of these splats, or of where they were a few small steps ago.
+        Of these Gaussians, or of where they were a few small steps ago.
     cutoff : float, optional
 
     Returns
@@ -162,7 +157,8 @@ def rasterize(values: list, background: list, lists: TileLists, cutoff: float = 
     Float, shape (tiles * pixels * channels,)
         See `eigengs_dr.raster.kernels` for the layout, `to_tensor` for an image.
     """
-    return dr.custom(_Rasterize, values, background, lists, EXP2_SCALE * cutoff)
+    values = [*parameters.shape, *parameters.color]
+    return dr.custom(_Rasterize, values, parameters.background, lists, kernel_radius(cutoff))
 
 
 class _Rasterize(dr.CustomOp):
@@ -175,14 +171,12 @@ class _Rasterize(dr.CustomOp):
     def eval(self, values: list, background: list, lists: TileLists, radius: float) -> Any:
         self.lists, self.radius, self.channels = lists, radius, len(background)
         self.packed = pack_parameters(values)
-        return forward(self.packed, background, lists, radius * radius)
+        return forward(self.packed, background, lists, radius)
 
     def forward(self) -> None:
         tangent = pack_parameters(self.grad_in("values"))
         start = self.grad_in("background")
-        self.set_grad_out(
-            forward(self.packed, start, self.lists, self.radius * self.radius, tangent)
-        )
+        self.set_grad_out(forward(self.packed, start, self.lists, self.radius, tangent))
 
     def backward(self) -> None:
         delta = self.grad_out()

@@ -23,9 +23,9 @@ from ...fitting.optimizers.adan import Adan
 from ...fitting.optimizers.parameterization import CHOLESKY
 from ...fitting.placement.random import place_random
 from ...gaussian.gaussians import Gaussians
-from ...raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS
 from ...raster.kernels import adjoint, forward
 from ...raster.layout import pack_parameters
+from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ...raster.render import CUTOFF, bin_gaussians, to_tiles
 from ...raster.tiles import Grid
 
@@ -209,7 +209,7 @@ def _train(
             for optimizer in (shape, *groups):
                 optimizer.set_learning_rate(rate)
             current = _placed(shape["rows"], state.size)
-            values = [*current.mean, *[f * EXP2_SCALE for f in current.factor]]
+            values = kernel_shape(current)
             # Lists are built every step: less work than to enlarge them so that they last several.
             common = dr.detach(values), share, bin_gaussians(current)
             sums = [dr.opaque(types.Float, 0, dr.width(v)) for v in (*values, 0.0)]
@@ -229,9 +229,9 @@ def _train(
 def _move_group(optimizer: Adan, target: Any, common: tuple, sums: list, told: bool) -> list:
     """Move weights of a group; add its gradients of shapes, and squares if told, to `sums`."""
     shape, share, lists = common
-    Float, radius = type(target), EXP2_SCALE * CUTOFF
+    Float, radius = type(target), kernel_radius(CUTOFF)
     packed = pack_parameters([*shape, *optimizer["rows"]])
-    rendered = forward(packed, [Float(0)] * GROUP, lists, radius * radius)
+    rendered = forward(packed, [Float(0)] * GROUP, lists, radius)
     delta = (rendered - target) * share
     # By hand: backward mode would sum delta over all pixels too, for the backgrounds.
     gradient = adjoint(packed, delta, GROUP, lists, radius)

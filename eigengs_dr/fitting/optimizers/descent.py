@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...backend.arrays import types_of
 from ...backend.recording import freeze_program
 from ...gaussian.gaussians import Gaussians
-from ...raster.evaluate import EXP2_SCALE
+from ...raster.parameters import kernel_parameters
 from ...raster.render import CUTOFF, bin_gaussians, rasterize, to_tiles
 from ...raster.tiles import Grid, TileLists
 from .parameterization import Parameterization
@@ -129,8 +129,7 @@ def step_program(coordinates: Parameterization, cutoff: float, levels: Sequence[
 
 
 def _error(gaussians: Gaussians, target: Any, weights: Any, lists: TileLists, cutoff: float) -> Any:
-    values = [*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor], *gaussians.color]
-    rendered = rasterize(values, list(gaussians.background), lists, cutoff)
+    rendered = rasterize(kernel_parameters(gaussians), lists, cutoff)
     return dr.mean(dr.square((rendered - target) * weights))
 
 

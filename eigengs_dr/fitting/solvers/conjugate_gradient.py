@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from ...backend.arrays import types_of
 from ...backend.recording import freeze_program
 from ...gaussian.gaussians import Gaussians
-from ...raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS
 from ...raster.kernels import adjoint, channel_sums, forward
 from ...raster.layout import pack_parameters
+from ...raster.parameters import NUM_SHAPE_PARAMS, detached_shape, kernel_radius
 from ...raster.render import CUTOFF, MAX_CUTOFF, bin_gaussians, to_tiles
 from ...raster.tiles import TileLists
 
@@ -113,7 +113,7 @@ def inner_products(
         n = len(gaussians)
         lists = bin_gaussians(gaussians, cutoff)
         delta = to_tiles(types, np.asarray(image, np.float32), lists.grid)
-        shape = _shape(gaussians)
+        shape = detached_shape(gaussians)
         product = _apply_squared if squared else _apply_transposed
         rows = product(shape, delta, image.shape[2], lists, cutoff)
         return np.stack([row.numpy()[:n] for row in rows], axis=1)
@@ -126,7 +126,7 @@ def _solve(
     n, channels = len(gaussians), gaussians.channels
     lists = bin_gaussians(gaussians, cutoff)
     inside = to_tiles(types, np.ones(image.shape, np.float32), lists.grid)
-    shape = _shape(gaussians)
+    shape = detached_shape(gaussians)
     if warm_start:
         x = [types.Float(c) + dr.zeros(types.Float, n) for c in gaussians.color]
         constant = [types.Float(b) for b in gaussians.background]
@@ -207,9 +207,7 @@ def _apply(shape: list, unknowns: list, lists: TileLists, inside: Any, cutoff: f
     n = dr.width(shape[0])
     color = [dr.gather(types.Float, u, dr.arange(types.UInt, n)) for u in unknowns]
     background = [dr.gather(types.Float, u, types.UInt(n)) for u in unknowns]
-    image = forward(
-        pack_parameters([*shape, *color]), background, lists, (EXP2_SCALE * cutoff) ** 2
-    )
+    image = forward(pack_parameters([*shape, *color]), background, lists, kernel_radius(cutoff))
     return image * inside
 
 
@@ -219,7 +217,7 @@ def _apply_transposed(
     """``A^T d``: correlate with every splat, and the sum of every channel."""
     types = types_of(delta)
     packed = pack_parameters([*shape, *[types.Float(0)] * channels])
-    color = adjoint(packed, delta, channels, lists, EXP2_SCALE * cutoff, color_only=True)
+    color = adjoint(packed, delta, channels, lists, kernel_radius(cutoff), color_only=True)
     totals = channel_sums(delta, channels, lists.grid)
     return [dr.concat([c, t]) for c, t in zip(color, totals, strict=True)]
 
@@ -238,10 +236,3 @@ def _apply_squared(shape: list, delta: Any, channels: int, lists: TileLists, cut
     narrow = [*shape[:2], *[f * root for f in shape[2:NUM_SHAPE_PARAMS]]]
     reach = min(cutoff * root, MAX_CUTOFF)  # beyond, squares are 0 in any precision
     return _apply_transposed(narrow, delta, channels, lists, reach)
-
-
-def _shape(gaussians: Gaussians) -> list:
-    """Mean and factor as the kernels take them, every row of full length."""
-    zeros = dr.zeros(types_of(gaussians.mean).Float, len(gaussians))
-    shape = [*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor]]
-    return [dr.detach(v) + zeros for v in shape]

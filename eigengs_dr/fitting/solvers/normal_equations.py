@@ -20,9 +20,10 @@ from scipy.sparse.linalg import splu
 
 from ...backend.arrays import types_of, upload
 from ...gaussian.gaussians import Gaussians
-from ...raster.evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, weights
+from ...raster.evaluate import weights
 from ...raster.kernels import adjoint
 from ...raster.layout import pack_parameters, unpack_parameters
+from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ...raster.render import CUTOFF, bin_gaussians, to_tiles
 
 GROUP = 3
@@ -95,8 +96,7 @@ class NormalEquations:
         self.blocks = [self._block(slice(*pair)) for pair in pairwise(ends)]
         with dr.suspend_grad():
             types = types_of(gaussians.mean)
-            shape = [*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor]]
-            self.packed = pack_parameters([*shape, *[types.Float(0)] * GROUP])
+            self.packed = pack_parameters([*kernel_shape(gaussians), *[types.Float(0)] * GROUP])
             self.lists = bin_gaussians(gaussians, cutoff)
 
     def _block(self, rows: slice) -> Block:
@@ -140,7 +140,7 @@ class NormalEquations:
                 padded = np.pad(planes, missing) if len(planes) < GROUP else planes
                 delta = to_tiles(types, np.moveaxis(padded, 0, 2), self.lists.grid)
                 rows = adjoint(
-                    self.packed, delta, GROUP, self.lists, EXP2_SCALE * self.cutoff, True
+                    self.packed, delta, GROUP, self.lists, kernel_radius(self.cutoff), True
                 )
                 dr.eval(rows)
                 for column, row in zip(range(first, first + len(planes)), rows, strict=False):
@@ -235,10 +235,10 @@ def weight_matrix(gaussians: Gaussians, cutoff: float = CUTOFF) -> csr_array:
         return csr_array(size, dtype=np.float32)
     types = types_of(gaussians.mean)
     with dr.suspend_grad():
-        packed = pack_parameters([*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor]])
+        packed = pack_parameters(kernel_shape(gaussians))
         shape = unpack_parameters(packed, upload(types.UInt, splat), NUM_SHAPE_PARAMS)
         px, py = (upload(types.Float, (p + 0.5).astype(np.float32)) for p in (x, y))
-        [values] = weights(shape, px, py, (1, 1), (EXP2_SCALE * cutoff) ** 2)
+        [values] = weights(shape, px, py, (1, 1), kernel_radius(cutoff))
     columns = y * gaussians.width + x
     starts = np.concatenate([[0], np.cumsum(np.bincount(splat, minlength=len(gaussians)))])
     return csr_array((values.numpy(), columns, starts.astype(np.int32)), shape=size)

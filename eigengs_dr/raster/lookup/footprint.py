@@ -7,7 +7,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..evaluate import EXP2_SCALE
+from ..parameters import EXP2_SCALE
 
 MAX_FOOTPRINT = 0.4
 """Largest standard deviation of a footprint, in widths and heights of the texture. One that is as

@@ -16,8 +16,9 @@ from typing import Any
 import drjit as dr
 
 from ...backend.arrays import types_of
-from ..evaluate import LN2, NUM_SHAPE_PARAMS, weights
+from ..evaluate import LN2, weights
 from ..layout import gather_index, unpack_parameters
+from ..parameters import NUM_SHAPE_PARAMS
 from ..tiles import Grid, build_lists
 
 
@@ -178,17 +179,17 @@ def sum_at_points(
     )[-1]
 
 
-def value_terms(limit: float) -> Callable[[list, Any, Any], list]:
+def value_terms(radius: float) -> Callable[[list, Any, Any], list]:
     """Terms of the sum itself: ``c_n w_n(x)``; see `sum_at_points`."""
 
     def terms(splat: list, x: Any, y: Any) -> list:
-        (w,) = weights(splat[:NUM_SHAPE_PARAMS], x, y, (1, 1), limit)
+        (w,) = weights(splat[:NUM_SHAPE_PARAMS], x, y, (1, 1), radius)
         return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
 
     return terms
 
 
-def gradient_terms(limit: float) -> Callable[[list, Any, Any], list]:
+def gradient_terms(radius: float) -> Callable[[list, Any, Any], list]:
     """Terms of the sum and of its derivatives along x and y, three for every channel.
 
     ``grad w = -2 ln(2) w F^T F (x - mu)``, with F in units of
@@ -197,7 +198,7 @@ def gradient_terms(limit: float) -> Callable[[list, Any, Any], list]:
 
     def terms(splat: list, x: Any, y: Any) -> list:
         mean_x, mean_y, a, b, c = splat[:NUM_SHAPE_PARAMS]
-        (w,) = weights(splat[:NUM_SHAPE_PARAMS], x, y, (1, 1), limit)
+        (w,) = weights(splat[:NUM_SHAPE_PARAMS], x, y, (1, 1), radius)
         dx, dy = x - mean_x, y - mean_y
         u, v = dr.fma(a, dx, b * dy), c * dy
         steep = -2 * LN2 * w

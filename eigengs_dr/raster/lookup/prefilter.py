@@ -14,8 +14,9 @@ from typing import Any
 import drjit as dr
 
 from ...backend.arrays import types_of
-from ..evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, weights, widen
+from ..evaluate import weights, widen
 from ..layout import gather_index, gather_run, unpack_parameters
+from ..parameters import NUM_SHAPE_PARAMS, kernel_covariance, kernel_radius
 from .footprint import inside_share
 from .points import sum_at_points
 from .size_classes import SizeClasses
@@ -65,7 +66,7 @@ def sum_prefiltered(
     inner = (x >= reach[0]) & (x + reach[0] <= sides[0])
     inner &= (y >= reach[1]) & (y + reach[1] <= sides[1])
     widest = dr.maximum(*reach) * (1 / FOOTPRINT_REACH)
-    terms = _widened_values(footprint, (EXP2_SCALE * cutoff) ** 2)
+    terms = _widened_values(footprint, kernel_radius(cutoff))
     total = [types.Float(0) for _ in range(number - NUM_SHAPE_PARAMS)]
     for spread, cells in sizes.listed:
         small = active & inner & (widest <= spread)
@@ -78,13 +79,13 @@ def sum_prefiltered(
     return [t + p for t, p in zip(total, part, strict=True)]
 
 
-def _widened_values(footprint: list, limit: float) -> Any:
+def _widened_values(footprint: list, radius: float) -> Any:
     """Terms of the sum seen through a footprint, inside the image; see `points.sum_near`."""
-    scaled = [f * (1 / EXP2_SCALE**2) for f in footprint]
+    scaled = kernel_covariance(footprint)
 
     def terms(splat: list, x: Any, y: Any) -> list:
         shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], scaled)
-        (w,) = weights(shape, x, y, (1, 1), limit)
+        (w,) = weights(shape, x, y, (1, 1), radius)
         w = w * amplitude
         return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
 
@@ -110,8 +111,8 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
     """
     sizes, footprint, packed = lookup.sizes, lookup.footprint, lookup.packed
     types = types_of(packed)
-    limit = (EXP2_SCALE * lookup.cutoff) ** 2
-    scaled = [f * (1 / EXP2_SCALE**2) for f in footprint]
+    radius = kernel_radius(lookup.cutoff)
+    scaled = kernel_covariance(footprint)
     left, top, right, bottom = copies
     bottom = dr.select(active, bottom, top - 1)
 
@@ -171,7 +172,7 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
         px, py, sign = local(i, j, x, y)
         seen = [scaled[0], scaled[1] * sign, scaled[2]]
         shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], seen)
-        (w,) = weights(shape, px, py, (1, 1), limit)
+        (w,) = weights(shape, px, py, (1, 1), radius)
         part = inside_share(shape, seen, px, py, sizes.width, sizes.height)
         w = dr.select(here, w * amplitude * part, 0)
         sums = [dr.fma(w, c, s) for c, s in zip(splat[NUM_SHAPE_PARAMS:], sums, strict=True)]

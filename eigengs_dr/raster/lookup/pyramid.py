@@ -19,8 +19,9 @@ from typing import Any
 import drjit as dr
 
 from ...backend.arrays import ArrayTypes, types_of
-from ..evaluate import EXP2_SCALE, NUM_SHAPE_PARAMS, falloff
+from ..evaluate import falloff
 from ..layout import gather_run
+from ..parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_radius
 from .prefilter import sum_prefiltered
 from .size_classes import SizeClasses
 
@@ -186,7 +187,7 @@ def sum_pyramid(lattice: GaussianPyramid, x: Any, y: Any, footprint: list, activ
         here = i <= stop
         across, down = types.Float(i) - u, types.Float(j) - v
         q = inverse[0] * across * across + (inverse[1] * across + inverse[2] * down) * down
-        w = falloff(dr.maximum(q, 0), 2 * (EXP2_SCALE * SAMPLE_REACH) ** 2) * scale
+        w = falloff(dr.maximum(q, 0), 2 * kernel_radius(SAMPLE_REACH) ** 2) * scale
         column, row = (_fold(types, k, n, lattice.wrap) for k, n in ((i, nx), (j, ny)))
         seen = gather_run(types, lattice.values, first + row * types.UInt(nx) + column, 4, here)
         sums = [dr.fma(w, c, s) for c, s in zip(seen, sums, strict=False)]

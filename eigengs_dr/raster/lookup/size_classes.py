@@ -10,7 +10,8 @@ import drjit as dr
 import numpy as np
 
 from ...backend.arrays import types_of, upload
-from ..evaluate import EXP2_SCALE, widen
+from ..evaluate import widen
+from ..parameters import EXP2_SCALE, kernel_radius
 from .points import Cells, cell_side, list_cells
 
 MIN_CLASS_SIZE = 1.0
@@ -114,7 +115,7 @@ def _cells_for(shape: list, width: int, height: int, cutoff: float, spread: floa
     variance = dr.opaque(types.Float, (spread / EXP2_SCALE) ** 2)
     widened, _ = widen(shape, [variance, types.Float(0), variance])
     side = max(4, cell_side(width, height, dr.width(shape)))
-    return list_cells(widened, width, height, EXP2_SCALE * cutoff, side)
+    return list_cells(widened, width, height, kernel_radius(cutoff), side)
 
 
 def _largest_deviation(a: Any, b: Any, c: Any) -> Any:
