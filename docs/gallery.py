@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
 from sphinx_gallery.scrapers import figure_rst
 
 ORDER = (
@@ -14,6 +15,9 @@ ORDER = (
     "fit_for_scene.py",
 )
 """Scripts in the order of the manual; others follow."""
+
+SMALLEST = 256
+"""Pictures narrower than this are shown at a multiple of their size."""
 
 BUILD = Path(__file__).parent.parent / "build" / "docs" / "examples"
 
@@ -41,5 +45,8 @@ def scrape_pictures(block: Any, block_vars: dict[str, Any], gallery_conf: dict[s
     for path in sorted(new, key=lambda p: (p.stat().st_mtime_ns, p.name)):
         shown.add(path)
         names.append(next(block_vars["image_path_iterator"]))
-        Path(names[-1]).write_bytes(path.read_bytes())
+        with Image.open(path) as picture:
+            times = -(-SMALLEST // picture.width)
+            size = (times * picture.width, times * picture.height)
+            picture.resize(size, Image.Resampling.NEAREST).save(names[-1])
     return figure_rst(names, gallery_conf["src_dir"])

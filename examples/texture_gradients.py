@@ -63,7 +63,8 @@ def room(texture):
     )
 
 
-photo = eg.sample("coffee")[124:252, 244:372]
+photo = eg.sample("coffee")[60:316, 180:436]
+photo = photo.reshape(128, 2, 128, 2, 3).mean(axis=(1, 3))  # half the size
 eg.save_image(folder / "poster.png", photo)
 known = room({"type": "bitmap", "filename": str(folder / "poster.png")})
 targets = [mi.render(known, sensor=k, spp=64) for k in range(2)]
@@ -127,10 +128,10 @@ print(f"PSNR after the coefficients, {len(losses)} steps: {eg.psnr(photo, guess)
 # Stage two: Gaussians
 # --------------------
 #
-# The second stage places 2,000 Gaussians by the first result, in linear light, and then changes all
+# The second stage places 3,000 Gaussians by the first result, in linear light, and then changes all
 # of their parameters. The rates are in units of light, in pixels, and in 1 / pixels.
 
-start = eg.fit(guess, gaussians=2000, iterations=0, color="linear").gaussians
+start = eg.fit(guess, gaussians=3000, iterations=0, color="linear").gaussians
 scene = room(texture_of(start))
 parameters = mi.traverse(scene)
 rates = {f"{NAME}.color": 0.02, f"{NAME}.mean": 0.1, f"{NAME}.factor": 0.005}
@@ -138,7 +139,7 @@ optimizer = mi.ad.Adam(lr=0.02, params={key: parameters[key] for key in rates})
 optimizer.set_learning_rate(rates)
 parameters.update(optimizer)
 
-for _ in range(64):
+for _ in range(104):
     dr.backward(render_loss(scene, parameters))
     optimizer.step()
     # A step may move a Gaussian out of the picture, or make it a spike.
