@@ -9,7 +9,7 @@ number of Gaussians that each camera needs. This page needs Mitsuba: ``pip insta
 import sys
 from pathlib import Path
 
-import eigengs_dr as eg  # isort: skip  (before Mitsuba: the package chooses a libLLVM that works)
+import eigengs_dr as eg  # isort: skip  (before Mitsuba: it finds libLLVM)
 import mitsuba as mi
 import numpy as np
 
@@ -21,7 +21,8 @@ folder.mkdir(parents=True, exist_ok=True)
 mi.set_variant("llvm_ad_rgb")
 eg.register_plugins()
 
-photo = eg.sample("coffee")[124:252, 244:372]
+photo = eg.sample("coffee")[60:316, 180:436]
+photo = photo.reshape(128, 2, 128, 2, 3).mean(axis=(1, 3))  # half the size
 eg.save_image(folder / "budget_photo.png", photo)
 
 # %%

@@ -10,7 +10,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import eigengs_dr as eg  # isort: skip  (before Dr.Jit: the package chooses a libLLVM that works)
+import eigengs_dr as eg  # isort: skip  (before Dr.Jit: it finds libLLVM)
 import drjit as dr
 import numpy as np
 from drjit.auto.ad import ArrayXf, TensorXf
@@ -26,8 +26,8 @@ rocket = eg.fit(photo, gaussians=1500, iterations=100, color="rgb").gaussians
 # -----
 #
 # ``to_arrays`` returns plain arrays with one row a Gaussian: mean (N, 2), factor (N, 3),
-# color (N, 3), and the background (3,). This code mirrors the set: it changes the sign of x, and
-# the sign of the shear b of the factor (a, b, c).
+# color (N, 3), and the background (3,). This code mirrors the set: it reflects x, and
+# changes the sign of the shear b of the factor (a, b, c).
 
 arrays = rocket.to_arrays()
 arrays["mean"][:, 0] = rocket.width - arrays["mean"][:, 0]

@@ -10,7 +10,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import eigengs_dr as eg  # isort: skip  (before Dr.Jit: the package chooses a libLLVM that works)
+import eigengs_dr as eg  # isort: skip  (before Dr.Jit: it finds libLLVM)
 import drjit as dr
 from drjit.auto.ad import Array2f, Float
 from drjit.opt import Adam

@@ -10,7 +10,7 @@ parameters of the Gaussians. This page needs Mitsuba: ``pip install '.[plugins]'
 import sys
 from pathlib import Path
 
-import eigengs_dr as eg  # isort: skip  (before Mitsuba: the package chooses a libLLVM that works)
+import eigengs_dr as eg  # isort: skip  (before Mitsuba: it finds libLLVM)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
