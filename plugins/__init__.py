@@ -6,7 +6,7 @@ try:
     import mitsuba  # noqa: F401
 except ImportError as error:
     raise ImportError(
-        f"the plugins need Mitsuba ({error}): pip install 'eigengs-dr[plugins]'"
+        f"the plugins need Mitsuba ({error}): pip install 'mitsuba==3.9.*'"
     ) from error
 
 from .cone import pixel_angle

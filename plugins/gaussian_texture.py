@@ -30,10 +30,7 @@ from eigengs_dr.raster.lookup.points import (
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
 from eigengs_dr.raster.lookup.pyramid import build_pyramid, is_minified, pyramid_mean, sum_pyramid
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
-from eigengs_dr.raster.parameters import (
-    NUM_SHAPE_PARAMS,
-    kernel_radius,
-)
+from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
 from eigengs_dr.raster.render import decode_parameters
 
 from .cone import metric
@@ -78,14 +75,14 @@ def gaussian_texture() -> type:
             the texture through the pixel's footprint. 0, the default, looks at points. Slopes
             of bump maps (`eval_1_grad`) are those at points.
         cutoff : float
-            Standard deviations after which a splat ends; 3 by default, as for `fit`.
+            Standard deviations after which a splat ends; by default that of the set.
         """
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
             self.source = source_of(props)
             self.raw = raw(props)
-            self.cutoff = cutoff(props)
+            self.cutoff = cutoff(props, self.source.start.cutoff)
             self.angle = angle(props)
             self.wrap = wrap_mode(props)
             self.to_uv, self.from_uv = affine(props)

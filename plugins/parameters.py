@@ -45,6 +45,7 @@ def texture_of(gaussians: Gaussians, **properties: Any) -> dict[str, Any]:
         "width": gaussians.width,
         "height": gaussians.height,
         "space": gaussians.space,
+        "cutoff": gaussians.cutoff,
         **properties,
     }
 

@@ -8,10 +8,10 @@ import mitsuba as mi
 import numpy as np
 
 from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.gaussian.file import MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.gaussian.tensors import FIELDS
 from eigengs_dr.image.color import SPACES
-from eigengs_dr.raster.render import CUTOFF, MAX_CUTOFF
 
 from .parameters import FromModel, FromSet
 
@@ -109,9 +109,9 @@ def _number(props: Any, key: str, default: float) -> float:
     return float(value)
 
 
-def cutoff(props: Any) -> float:
-    """Read ``cutoff``: standard deviations after which a splat ends."""
-    value = _number(props, "cutoff", CUTOFF)
+def cutoff(props: Any, default: float) -> float:
+    """Read ``cutoff`` in standard deviations; `default` is that of the set."""
+    value = _number(props, "cutoff", default)
     if not 0 < value <= MAX_CUTOFF:
         raise ValueError(
             f"gaussian_texture: cutoff is {value}; it must be above 0 and at most {MAX_CUTOFF:g}"

@@ -1,22 +1,54 @@
+"""Backends that tests run on, and what this machine cannot run."""
+
 import signal
+from functools import cache
 
 import pytest
 
-from eigengs_dr.backend.selection import BackendError, select
+pytest.register_assert_rewrite("_helpers")
+
+from eigengs_dr.backend.arrays import _types  # noqa: E402
+from eigengs_dr.backend.selection import BackendError, select  # noqa: E402
+
+NO_GPU = "no CUDA device: the cuda path was not tested"
 
 # A shell that starts the tests in the background has them ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def _is_present(backend):
+@cache
+def has_gpu():
+    """Whether Dr.Jit finds a CUDA device."""
     try:
-        select(backend)
+        select("cuda")
     except BackendError:
         return False
     return True
 
 
-@pytest.fixture(params=[name for name in ("llvm", "cuda") if _is_present(name)])
+@pytest.fixture(params=["llvm", pytest.param("cuda", marks=pytest.mark.gpu)])
 def backend(request):
-    """Name of a backend of this machine: a test that takes it runs once for each."""
+    """Name of a backend: a test that takes it runs once for each."""
     return request.param
+
+
+@pytest.fixture(params=[32, 64])
+def types(backend, request):
+    """Types of a backend in single and in double precision."""
+    return _types(select(backend).__name__, request.param)
+
+
+def pytest_collection_modifyitems(items):
+    """Skip tests that need a GPU where there is none, before any fixture of them runs."""
+    needy = [item for item in items if item.get_closest_marker("gpu")]
+    if needy and not has_gpu():
+        for item in needy:
+            item.add_marker(pytest.mark.skip(reason=NO_GPU))
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Say how much was not tested for want of a GPU."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    count = sum(NO_GPU in str(report.longrepr) for report in skipped)
+    if count:
+        terminalreporter.write_line(f"{count} tests were skipped: {NO_GPU}")

@@ -1,4 +1,4 @@
-"""The scenes and the command that renders them: pictures, measurements, mistakes."""
+"""The scenes: pictures of them, and the scripts beside them."""
 
 import importlib
 import re
@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
+from _helpers.scene_sets import save_halves
 
-import eigengs_dr as eg  # noqa: E402
+mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
 from eigengs_dr.cli.main import main  # noqa: E402
+
+pytestmark = pytest.mark.mitsuba
 
 SCENES = Path(__file__).parent.parent / "scenes"
 SMALL = ["-D", "resolution=32", "--spp", "16", "--variant", "llvm_ad_rgb", "--quiet"]
@@ -31,27 +33,7 @@ def scripts():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Sets under the names that the scenes use, of two halves: red above, blue below."""
-    folder = tmp_path_factory.mktemp("sets")
-
-    def save(name, above, below, space):
-        # Two splats so wide that each is one colour all over its half.
-        gaussians = eg.Gaussians.from_arrays(
-            [[8, 4], [8, 12]],
-            [[0.02, 0, 0.5], [0.02, 0, 0.5]],
-            [above, below],
-            [0.0] * len(above),
-            size=(16, 16),
-            space=space,
-            backend="llvm",
-        )
-        gaussians.save(folder / f"{name}.npz")
-
-    for name in ("floor", "floor-coded", "picture", "poster", "tiles-color"):
-        save(name, [0.9, 0.1, 0.1], [0.1, 0.1, 0.9], "rgb" if name == "poster" else "linear")
-    save("tiles-roughness", [0.2], [0.6], "data")
-    save("tiles-normals", [0.5, 0.5, 1], [0.6, 0.4, 0.9], "data")
-    return folder
+    return save_halves(tmp_path_factory.mktemp("sets"))
 
 
 def run(*arguments):
@@ -73,18 +55,6 @@ def rendered(name, folder, tmp_path, *options):
 
 def redness(pixels):
     return float((pixels[..., 0] - pixels[..., 2]).mean())
-
-
-def assert_refused(result, *words):
-    assert result.exit_code == 2, result.output
-    assert result.stdout == ""
-    assert result.stderr.startswith("eigengs-dr: error: ")
-    assert result.stderr.count("\n") == 1
-    for word in words:
-        assert str(word) in result.stderr
-
-
-# --- The scenes ----------------------------------------------------------------------------------
 
 
 def test_plane_repeats_its_texture_below_the_sky(folder, tmp_path):
@@ -159,132 +129,3 @@ def test_measurement_of_the_plane(folder, monkeypatch, tmp_path):
     assert len(error) == 5
     assert error["Gaussians, prefiltered"] < error["bitmap"] / 4
     assert strip.exists()
-
-
-# --- The command ---------------------------------------------------------------------------------
-
-
-EMPTY = """
-<scene version="3.0.0">
-    <default name="light" value="0.5"/>
-    <integrator type="path"/>
-    <sensor type="perspective">
-        <film type="hdrfilm">
-            <integer name="width" value="8"/>
-            <integer name="height" value="6"/>
-            <rfilter type="box"/>
-        </film>
-        <sampler type="independent"><integer name="sample_count" value="2"/></sampler>
-    </sensor>
-    <emitter type="constant"><float name="radiance" value="$light"/></emitter>
-    INSERT
-</scene>
-"""
-
-
-@pytest.fixture
-def scene(tmp_path):
-    """Write a scene of which one line is given."""
-
-    def write(line="", name="scene.xml", text=EMPTY):
-        path = tmp_path / name
-        path.write_text(text.replace("INSERT", line))
-        return path
-
-    return write
-
-
-def test_says_what_it_did(scene, tmp_path):
-    result = run(scene(), "-o", tmp_path / "x.png", "--variant", "llvm_ad_rgb")
-    assert result.exit_code == 0, result.output
-    assert "8x6, samples a pixel: 2" in result.stdout
-    assert f"wrote {tmp_path / 'x.png'}" in result.stdout
-    assert np.allclose(mi.Bitmap(str(tmp_path / "x.png")), 187.5, atol=0.5)  # 0.5, dithered
-
-
-def test_several_scenes_into_a_folder(scene, tmp_path):
-    scenes = [scene(name="a.xml"), scene(name="b.xml")]
-    result = run(*scenes, "-o", tmp_path / "out", "-D", "light=1", "--spp", 1)
-    assert result.exit_code == 0, result.output
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.png", "b.png"]
-
-
-def test_passes_make_one_picture(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("eigengs_dr.cli.scene.SAMPLES_PER_PASS", 8 * 6 * 2)
-    result = run(scene(), "-o", tmp_path / "x.exr", "--spp", 5)
-    assert "samples a pixel: 5" in result.stdout
-    assert np.allclose(mi.Bitmap(str(tmp_path / "x.exr")), 0.5)
-
-
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ('<shape type="rectangl"/>', ["rectangl", "line 14"]),
-        ('<shape type="sphere">', ["mismatch"]),
-        ('<shape type="sphere"><float name="size" value="$x"/></shape>', ["undefined", "$x"]),
-        (
-            '<texture type="gaussian_texture"><string name="filename" value="no.npz"/></texture>',
-            ["No such file or directory", "no.npz"],
-        ),
-        (
-            '<texture type="gaussian_texture"><float name="prefilter" value="1"/></texture>',
-            ["gaussian_texture: give one of filename"],
-        ),
-    ],
-)
-def test_broken_scene(line, words, scene, tmp_path):
-    path = scene(line)
-    result = run(path, "-o", tmp_path / "x.png", "--variant", "llvm_ad_rgb")
-    assert_refused(result, path, *words)
-    assert "Traceback" not in result.stderr
-    assert "cpp" not in result.stderr
-    assert not (tmp_path / "x.png").exists()
-
-
-def test_mistake_that_shows_while_rendering(scene, folder, tmp_path):
-    path = scene(
-        '<shape type="sphere"><bsdf type="normalmap"><bsdf type="diffuse"/>'
-        '<texture type="gaussian_texture" name="normalmap"><boolean name="raw" value="true"/>'
-        f'<string name="filename" value="{folder / "tiles-roughness.npz"}"/></texture>'
-        "</bsdf></shape>"
-    )
-    result = run(path, "-o", tmp_path / "x.png", "--variant", "llvm_ad_rgb")
-    assert_refused(result, "three channels are asked")
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("", ["No document element"]),
-        ('<scene version="3.0.0"/>', ["no sensor"]),
-        ('<scene version="3.0.0"><sensor type="perspective"/></scene>', ["ntegrator"]),
-        ('<shape version="3.0.0" type="sphere"/>', ["holds no scene"]),
-    ],
-)
-def test_no_scene(text, words, scene, tmp_path):
-    assert_refused(run(scene(text=text), "-o", tmp_path / "x.png"), *words)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["-D", "spp"], ["spp=16"]),
-        (["-D", "path=x"], ["path", "rename"]),
-        (["-D", "other=1"], ["$other"]),
-        (["--variant", "llvm"], ["--variant llvm", "llvm_ad_rgb"]),
-        (["--spp", "0"], ["--spp"]),
-    ],
-)
-def test_mistaken_options(options, words, scene, tmp_path):
-    assert_refused(run(scene(), "-o", tmp_path / "x.png", *options), *words)
-
-
-def test_mistaken_files(scene, tmp_path):
-    assert_refused(run(tmp_path / "no.xml", "-o", tmp_path / "x.png"), "no.xml")
-    assert_refused(run(scene(), "-o", tmp_path / "no" / "x.png"), "no file can be made")
-    assert_refused(run(scene(), "-o", tmp_path / "x.jpg"), ".png or .exr")
-
-
-def test_without_mitsuba(scene, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "mitsuba", None)
-    assert_refused(run(scene(), "-o", tmp_path / "x.png"), "pip install 'eigengs-dr[plugins]'")

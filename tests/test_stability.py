@@ -14,9 +14,9 @@ from eigengs_dr.bench.rows import read
 from eigengs_dr.cli.console import Program
 from eigengs_dr.cli_stability import NAMES
 from eigengs_dr.cli_stability import stability as command
-from eigengs_dr.fitting.placement.random import inverse_factor
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.fitting.refine import MAX_PSNR
+from eigengs_dr.gaussian.covariance import factor_from_covariance
 from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
 
 
@@ -94,7 +94,7 @@ def test_the_condition_is_the_ratio_of_eigenvalues():
         covariance.append(root @ root.T + 0.01 * np.eye(2))
     xx, xy, yy = np.array([[s[0, 0], s[0, 1], s[1, 1]] for s in covariance]).T
     expected = max(np.linalg.cond(s) for s in covariance)
-    assert stability.condition(inverse_factor(xx, xy, yy)) == pytest.approx(expected)
+    assert stability.condition(factor_from_covariance(xx, xy, yy)) == pytest.approx(expected)
     assert stability.condition(np.array([[3.0, 0.0, 3.0]], np.float32)) == 1
 
 

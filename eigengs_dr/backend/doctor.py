@@ -100,7 +100,7 @@ def _details(name: str, trial: dict[str, Any]) -> str:
 def _mitsuba_line(version: str | None, variants: list[str] | None) -> str:
     """What there is of Mitsuba."""
     if version is None:
-        return "not installed; only the plugins need it: pip install mitsuba"
+        return "not installed; only the plugins need it: pip install 'mitsuba==3.9.*'"
     return f"{version}: {', '.join(variants) if variants else 'cannot be imported'}"
 
 

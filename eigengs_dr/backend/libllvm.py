@@ -20,7 +20,10 @@ PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 
 
 MIN_VERSION = 17
-"""The oldest major version of LLVM accepted; 19 and 22 are tested."""
+"""The oldest major version of LLVM accepted."""
+
+TESTED_VERSIONS = (19, 22)
+"""Versions that the tests were run with; they are preferred to all others."""
 
 
 INSTALL_ADVICE = (
@@ -56,7 +59,7 @@ def candidates() -> list[Library]:
     Returns
     -------
     list of Library
-        One entry a file, the newest first, those of unknown version last.
+        One entry a file: tested versions first, then the newest first, unknown versions last.
     """
     found: dict[str, Library] = {}
     for pattern in _patterns():
@@ -65,20 +68,25 @@ def candidates() -> list[Library]:
             # A small file of that name is a linker script, not the library.
             if os.path.isfile(real) and os.path.getsize(real) > 1_000_000:
                 found.setdefault(real, Library(path, _version_in(path) or _version_in(real)))
-    return sorted(found.values(), key=lambda library: -(library.version or 0))
+    return sorted(found.values(), key=_preference)
+
+
+def _preference(library: Library) -> tuple[bool, int]:
+    """Sort key: tested versions first, the newest of each group first."""
+    return library.version not in TESTED_VERSIONS, -(library.version or 0)
 
 
 def select_libllvm() -> None:
-    """Point Dr.Jit to the newest libLLVM that works; called when the package is imported.
+    """Point Dr.Jit to a libLLVM that works, see `candidates`; called when the package is imported.
 
     Sets `PATH_VARIABLE` where it is unset, Dr.Jit is not imported yet and a usable library is
     found. Loads nothing.
     """
     if os.environ.get(PATH_VARIABLE) or "drjit" in sys.modules:
         return
-    newest = next(_usable(), None)
-    if newest:
-        os.environ[PATH_VARIABLE] = newest.path
+    library = next(_usable(), None)
+    if library:
+        os.environ[PATH_VARIABLE] = library.path
 
 
 def _patterns() -> list[str]:
@@ -110,7 +118,7 @@ def _version_in(path: str) -> int | None:
 
 
 def _usable() -> Iterator[Library]:
-    """The candidates that work, the newest first."""
+    """The candidates that work, in the order of `candidates`."""
     return (library for library in candidates() if library.usable)
 
 

@@ -149,7 +149,12 @@ def _silent_stderr() -> Iterator[None]:
     if "drjit" in sys.modules:
         yield
         return
-    saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        saved = os.dup(2)
+    except OSError:  # standard error is closed, as in some daemons: nothing can be shown there
+        yield
+        return
+    null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 2)
     try:
         yield

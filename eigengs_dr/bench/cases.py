@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fitting.placement.random import inverse_factor
+from ..gaussian.covariance import factor_from_covariance
 from ..image.resize import center_crop
 from ..image.samples import sample
 
@@ -154,7 +154,9 @@ def needles(image: Image, count: int, generator: np.random.Generator) -> Shapes:
     cos, sin = np.cos(angle), np.sin(angle)
     long, thin = 30.0**2, 0.3**2
     xx, yy = long * cos**2 + thin * sin**2, long * sin**2 + thin * cos**2
-    return _anywhere(image, count, generator), inverse_factor(xx, (long - thin) * cos * sin, yy)
+    return _anywhere(image, count, generator), factor_from_covariance(
+        xx, (long - thin) * cos * sin, yy
+    )
 
 
 def subpixel(image: Image, count: int, generator: np.random.Generator) -> Shapes:

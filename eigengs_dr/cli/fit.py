@@ -1,86 +1,68 @@
 """``eigengs-dr fit``: images to Gaussians."""
 
+import time
+from collections.abc import Callable
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..backend.selection import select
+from ..fitting.initializers import INITIALIZERS
+from ..fitting.options import DEFAULT_BASIS, FitOptions
+from ..fitting.presets import PRESETS
+from ..image.color import SPACES
 from .console import INTERRUPTED, progress_bar, say
 from .options import (
     ANY_PATH,
-    EXISTING,
     backend_option,
     choice,
     describe_run,
     quiet_option,
     report_option,
-    seed_option,
 )
 from .outputs import check_outputs, name_outputs
 from .report import write_report
 
+if TYPE_CHECKING:
+    from ..fitting.fit import Fit
+
 MISSED = 1
-"""Exit code where a PSNR that was asked for is out of reach."""
+"""Exit code if the target PSNR cannot be reached."""
+
+INPUT = click.Path(exists=True, path_type=Path)
 
 
 @click.command()
-@click.argument("images", nargs=-1, required=True, type=EXISTING, metavar="IMAGE...")
-@click.option("-o", "--output", required=True, type=ANY_PATH, help=".npz file; or a folder.")
+@click.argument("images", nargs=-1, required=True, type=INPUT, metavar="IMAGE...")
 @click.option(
-    "--gaussians",
-    type=click.IntRange(min=1),
-    help="How many; by default 5000, one a pixel where the image has fewer pixels, or as many as "
-    "the basis has.",
+    "-o", "--output", type=ANY_PATH, help=".npz file, or a folder; by default the current folder."
 )
-@click.option(
-    "--target-psnr",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="DB",
-    help="As few Gaussians as reach it, instead of a given number.",
-)
+@click.option("--gaussians", type=int, metavar="N", help="How many.  [default: 5000]")
+@click.option("--target-psnr", type=float, metavar="DB", help="As few Gaussians as reach it.")
 @click.option(
     "--space",
     "target_space",
     type=click.Choice(["ycbcr", "rgb"]),
     default="ycbcr",
     show_default=True,
-    help="Where --target-psnr is measured.",
+    help="Space of --target-psnr.",
 )
-@click.option(
-    "--max-gaussians",
-    type=click.IntRange(min=1),
-    help="Most for --target-psnr; by default 3 for 8 pixels, which have as many numbers.",
-)
-@click.option(
-    "--levels",
-    type=click.IntRange(min=1),
-    help="Levels of detail: the first quarter of the Gaussians makes the image too, and so on.",
-)
-@click.option("--iterations", type=click.IntRange(min=0), default=1000, show_default=True)
-@choice("--init", ["auto", "random", "grid", "adaptive", "eigen"], "Where the Gaussians start.")
+@click.option("--max-gaussians", type=int, metavar="N", help="Largest number for --target-psnr.")
+@click.option("--levels", type=int, metavar="N", help="Levels of detail: each has 4 times more.")
+@click.option("--iterations", type=int, default=1000, show_default=True)
+@choice("--init", ["auto", *INITIALIZERS], "Where the Gaussians start.")
 @click.option(
     "--basis",
-    default="natural",
-    show_default=True,
     metavar="NAME|FILE",
-    help="What --init eigen starts from: a model by name, or as 'train' wrote it.",
+    help=f"Start from this eigenbasis; implies --init eigen.  [default: {DEFAULT_BASIS}]",
 )
-@choice("--preset", ["default", "gaussianimage", "eigengs"], "The method.")
-@choice(
-    "--color",
-    ["ycbcr", "rgb", "linear", "data"],
-    "Where errors are measured and colours are stored: linear for textures, data for normals and "
-    "roughness, as they are.",
-)
-@seed_option
-@click.option(
-    "--preview",
-    type=ANY_PATH,
-    help="Picture of the photo, the fit, and the outlines of its Gaussians; or a folder.",
-)
+@choice("--preset", list(PRESETS), "The method.")
+@choice("--color", list(SPACES), "Space of colours and errors: linear for textures, data as it is.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Only random starts use it.")
+@click.option("--preview", type=ANY_PATH, help="Picture of photo, fit and outlines; or a folder.")
 @backend_option
 @report_option
 @quiet_option
@@ -89,8 +71,8 @@ def fit(
     context: click.Context,
     /,
     images: tuple[Path, ...],
-    output: Path,
-    backend: str | None,
+    output: Path | None,
+    levels: int | None,
     preview: Path | None,
     report: Path | None,
     quiet: bool,
@@ -98,112 +80,111 @@ def fit(
 ) -> None:
     """Fit images by sums of Gaussians.
 
-    For several images OUT and the preview are folders, and the files are named like the images. A
-    preview shows a photo, its fit, and the outlines of at most 2,000 Gaussians at one standard
-    deviation.
-    Ctrl-C keeps the best fit so far: it is written before the command ends with exit code 130.
+    An IMAGE may be a folder: all images in it are fitted. Several images need a folder for -o and
+    for --preview; the files there are named like the images.
 
-    --target-psnr searches for the smallest number of Gaussians, in up to about twice the
-    iterations. A target that is out of reach is said so, the best fit is written, and the exit code
-    is 1.
-
-    With --preset eigengs, the paper's form, the file holds the Gaussians alone, without the mean
-    image, which is kept in the basis.
-
-    With --color data a grey file gives one channel, any other three; psnr_ycbcr in the report is
-    then the PSNR of the data as it is, and psnr_rgb that of 8 bits.
+    Ctrl-C writes the best fit so far and ends with exit code 130. If --target-psnr cannot be
+    reached, the command says so, writes the best fit and ends with exit code 1.
 
     \b
     Examples:
-      eigengs-dr fit photo.jpg -o photo.npz
+      eigengs-dr fit photo.jpg
       eigengs-dr fit photo.jpg -o photo.npz --gaussians 20000 --report photo.json
       eigengs-dr fit photo.jpg -o photo.npz --target-psnr 38
-      eigengs-dr fit photo.jpg -o photo.npz --gaussians 5000 --levels 4
-      eigengs-dr fit photo.jpg -o photo.npz --init eigen --iterations 100
-      eigengs-dr fit *.png -o fits/ --preview previews/ --iterations 300
+      eigengs-dr fit photo.jpg -o photo.npz --basis natural --iterations 100
+      eigengs-dr fit photos/ -o fits/ --preview previews/ --iterations 300
       eigengs-dr fit roughness.png -o roughness.npz --color data
     """
     from ..image.io import SAVE_OPTIONS
 
-    _check_search(**settings)
-    outputs = name_outputs(images, output, [".npz"])
-    previews = name_outputs(images, preview, list(SAVE_OPTIONS)) if preview else []
-    check_outputs([*outputs, *previews, report], images)
-    select(backend)
-
-    resolved = settings | {"basis": _basis(backend, **settings), "backend": backend}
+    options = FitOptions(**settings)
+    _check_levels(options, levels)
+    paths = _expand(images)
+    outputs = name_outputs(paths, output, [".npz"])
+    previews = name_outputs(paths, preview, list(SAVE_OPTIONS)) if preview else []
+    check_outputs([*outputs, *previews, report], paths)
+    select(options.backend)
+    run = _fitter(options, levels)
     records: list[dict[str, Any]] = []
-    for image, target, picture in zip_longest(images, outputs, previews):
-        records.append(_fit_one(image, target, picture, quiet, **resolved))
+    for path, target, picture in zip_longest(paths, outputs, previews):
+        records.append(_fit_one(path, target, picture, quiet, options, run))
         if records[-1]["stopped"] == "interrupted":
             break
     if report:
-        figures = records[0] if len(images) == 1 else {"images": records}
-        write_report(report, {**describe_run(context, backend), **settings, **figures})
-    if records[-1]["stopped"] == "interrupted":
-        say(f"interrupted; the best fit so far is in {records[-1]['output']}")
-        context.exit(INTERRUPTED)
-    missed = [record for record in records if record["stopped"] == "out of reach"]
-    for record in missed:
-        say(_out_of_reach(record, **settings))
-    if missed:
-        context.exit(MISSED)
+        figures = records[0] if len(paths) == 1 else {"images": records}
+        told = {"levels": levels, **settings}
+        write_report(report, {**describe_run(context, options.backend), **told, **figures})
+    _exit(context, records, options)
 
 
-def _check_search(
-    target_psnr: float | None, target_space: str, max_gaussians: int | None, **rest: Any
-) -> None:
-    """Refuse options of a search where none is asked for."""
-    if target_psnr is None and (max_gaussians is not None or target_space != "ycbcr"):
-        raise click.UsageError("--max-gaussians and --space belong to --target-psnr; name it, too")
+def _expand(images: tuple[Path, ...]) -> list[Path]:
+    """Replace folders by the images in them."""
+    from ..image.folder import image_files
+
+    return [file for path in images for file in (image_files(path) if path.is_dir() else [path])]
 
 
-def _basis(backend: str | None, init: str, preset: str, basis: str, **rest: Any) -> Any:
-    """Read the model to start from, once for all images; its name where none is needed."""
-    from ..eigenbasis.registry import load_basis
-    from ..fitting.presets import PRESETS
-
-    method = PRESETS[preset]
-    if (method.init if init == "auto" else init) != "eigen":
-        return basis
-    if method.mean == "dense":
-        say("note: the result is the Gaussians alone; the mean image is kept in the basis")
-    return load_basis(basis, backend)
-
-
-def _fitted(image: Any, levels: int | None, progress: Any, **settings: Any) -> Any:
-    """Fit an image in one way or the other."""
-    import eigengs_dr as eg
-
+def _check_levels(options: FitOptions, levels: int | None) -> None:
+    """Raise ValueError for options that levels of detail do not work with."""
     if levels is None:
-        return eg.fit(image, progress=progress, **settings)
-    if settings["target_psnr"] is not None:
+        return
+    if options.target_psnr is not None:
         raise ValueError("levels and target_psnr exclude each other; give one of them")
-    if settings["preset"] != "default" or settings["init"] not in ("auto", "adaptive"):
+    if options.preset != "default" or options.initializer != "adaptive":
         raise ValueError("levels work with preset 'default' and init 'adaptive' alone")
-    kept = {key: settings[key] for key in ("gaussians", "iterations", "color", "seed", "backend")}
-    return eg.fit_levels(image, levels=levels, progress=progress, **kept)
+
+
+def _fitter(options: FitOptions, levels: int | None) -> Callable[..., "Fit"]:
+    """Return ``run(image, progress)``, which fits one image; a model is read once for all."""
+    import dataclasses
+
+    from ..fitting.fit import fit_image
+    from ..fitting.levels import fit_levels
+
+    if levels is not None:
+        names = ("gaussians", "iterations", "color", "seed", "backend")
+        kept = {name: getattr(options, name) for name in names}
+        return lambda image, progress: fit_levels(image, levels=levels, progress=progress, **kept)
+    if options.initializer == "eigen":
+        from ..eigenbasis.registry import load_basis
+
+        if options.method.mean == "dense":
+            say("note: the file holds the Gaussians alone; the mean image stays in the basis")
+        model = load_basis(options.basis or DEFAULT_BASIS, options.backend)
+        options = dataclasses.replace(options, basis=model)
+    return lambda image, progress: fit_image(image, options, progress)
 
 
 def _fit_one(
-    path: Path, output: Path, preview: Path | None, quiet: bool, **settings: Any
+    path: Path,
+    output: Path,
+    preview: Path | None,
+    quiet: bool,
+    options: FitOptions,
+    run: Callable[..., "Fit"],
 ) -> dict[str, Any]:
-    """Fit one image, write what was asked for, and return its figures."""
+    """Fit one image, write its files, and return its figures."""
     import eigengs_dr as eg
 
-    from ..image.metrics import float_space
+    from ..fitting.fit import FitInterrupted
     from .pictures import comparison
 
-    color = settings["color"]
-    image = eg.load_image(path, keep_grey=color == "data")
+    started = time.perf_counter()
     with progress_bar(quiet) as show:
+        show(f"{path.name}: load", 0, 1)
+        image = eg.load_image(path, keep_grey=options.color == "data")
+        loaded = time.perf_counter()
         try:
-            result = _fitted(image, progress=partial(show, path.name), **settings)
+            result = run(image, progress=partial(show, path.name))
+        except FitInterrupted as interrupt:
+            result = interrupt.result
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-    result.gaussians.save(output)
-    if preview:
-        eg.save_image(preview, comparison(image, result.image, result.gaussians))
+        result.gaussians.save(output)
+        show(f"{path.name}: measure", 0, 1)
+        figures = _measure(image, result, options.color)
+        if preview:
+            eg.save_image(preview, comparison(image, result.image, result.gaussians))
     record = {
         "input": str(path),
         "output": str(output),
@@ -214,33 +195,55 @@ def _fit_one(
         "stopped": result.stopped,
         "seconds": result.seconds,
         "seconds_init": result.seconds_init,
+        "seconds_load": loaded - started,
+        "seconds_total": time.perf_counter() - started,
+        **figures,
+        "trace": result.trace,
+    }
+    if not quiet:
+        click.echo(_summary(record, preview, options.color))
+    return record
+
+
+def _measure(image: Any, result: "Fit", color: str) -> dict[str, float]:
+    """Compare a fit with its image."""
+    import eigengs_dr as eg
+
+    from ..image.metrics import float_space
+
+    return {
         "psnr_ycbcr": eg.psnr(image, result.image, space=float_space(color)),
         "psnr_rgb": eg.psnr(image, result.image, space="rgb"),
         "ssim": eg.ssim(image, result.image),
         "ms_ssim": eg.ms_ssim(image, result.image, space=float_space(color)),
-        "trace": result.trace,
     }
-    if not quiet:
-        click.echo(_summary(record, preview, float_space(color)))
-    return record
 
 
-def _out_of_reach(
-    record: dict[str, Any], target_psnr: float, target_space: str, **rest: Any
-) -> str:
-    """What to do where no number of Gaussians was enough."""
-    return (
-        f"{record['input']}: {target_psnr:g} dB are out of reach: {record['gaussians']} Gaussians "
-        f"have {record['psnr_' + target_space]:.2f}; lower --target-psnr, or allow more by "
-        "--max-gaussians or --iterations"
-    )
+def _exit(context: click.Context, records: list[dict[str, Any]], options: FitOptions) -> None:
+    """Say what did not end well, and end with its exit code."""
+    if records[-1]["stopped"] == "interrupted":
+        say(f"interrupted; the best fit so far is in {records[-1]['output']}")
+        context.exit(INTERRUPTED)
+    missed = [record for record in records if record["stopped"] == "out of reach"]
+    for record in missed:
+        reached = record["psnr_" + options.target_space]
+        say(
+            f"{record['input']}: {options.target_psnr:g} dB are out of reach: "
+            f"{record['gaussians']} Gaussians have {reached:.2f}; lower --target-psnr, or allow "
+            "more by --max-gaussians or --iterations"
+        )
+    if missed:
+        context.exit(MISSED)
 
 
-def _summary(record: dict[str, Any], preview: Path | None, space: str) -> str:
-    """What a fit came to, for a terminal."""
+def _summary(record: dict[str, Any], preview: Path | None, color: str) -> str:
+    """Describe a fit for a terminal."""
+    from ..image.metrics import float_space
+
     text = (
         "{input}: {width}x{height}, {gaussians} Gaussians, {iterations} iterations "
-        "in {seconds:.1f} s\n  psnr_{space} {psnr_ycbcr:.2f} dB, psnr_rgb {psnr_rgb:.2f} dB, "
+        "in {seconds:.1f} s ({seconds_total:.1f} s with loading and measuring)\n"
+        "  psnr_{space} {psnr_ycbcr:.2f} dB, psnr_rgb {psnr_rgb:.2f} dB, "
         "SSIM {ssim:.4f}, MS-SSIM {ms_ssim:.4f}\n  wrote {output}"
-    ).format(**record, space=space)
+    ).format(**record, space=float_space(color))
     return f"{text}\n  wrote {preview} (photo, fit and outlines side by side)" if preview else text

@@ -26,7 +26,7 @@ MAX_PIXELS = 1 << 26
 backend_option = click.option(
     "--backend",
     type=click.Choice(["llvm", "cuda"]),
-    help="Where to compute; by default cuda where there is a GPU.",
+    help="Where to compute.  [default: cuda if there is a GPU]",
 )
 seed_option = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 report_option = click.option("--report", type=ANY_PATH, help="JSON file for all figures.")

@@ -7,37 +7,40 @@ from pathlib import Path
 from ..storage.atomic import require_writable
 
 
-def name_outputs(inputs: Sequence[Path], output: Path, suffixes: Sequence[str]) -> list[Path]:
-    """Name one output file an input.
+def name_outputs(
+    inputs: Sequence[Path], output: Path | None, suffixes: Sequence[str]
+) -> list[Path]:
+    """Name one output file for each input.
 
     Parameters
     ----------
     inputs : sequence of Path
         The files to work on.
-    output : Path
-        The file to write, or a folder to write into: with several inputs it has to be one and is
-        created where it is missing. The files in it are named like the inputs.
+    output : Path or None
+        The file to write, or a folder to write into. Several inputs need a folder, which is made if
+        it is missing. Files in a folder are named like the inputs. None is the current folder.
     suffixes : sequence of str
-        Suffixes that the file may have; in a folder the first is used.
+        Suffixes that the file may have; files in a folder have the first.
 
     Returns
     -------
     list of Path
-        One path an input.
+        One path for each input.
 
     Raises
     ------
     ValueError
-        If the file has another suffix, is no folder although there are several inputs, or two
-        inputs would be written to one file.
+        If the file has another suffix, several inputs have a file as output, or two inputs would be
+        written to one file.
     OSError
-        If the folder cannot be created.
+        If the folder cannot be made.
     """
+    output = Path() if output is None else output
     if len(inputs) == 1 and not output.is_dir():
         if output.suffix.lower() not in suffixes:
             raise ValueError(f"{output}: the name must end in {' or '.join(suffixes)}")
         return [output]
-    if output.exists() and not output.is_dir():
+    if not output.is_dir() and (output.exists() or output.suffix.lower() in suffixes):
         raise ValueError(f"{output}: is a file; several images need a folder")
     names = [path.stem + suffixes[0] for path in inputs]
     twice = next((name for name in names if names.count(name) > 1), None)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..eigenbasis.basis import CHANNELS, Eigenbasis
 from ..eigenbasis.components.solve import with_colors
 from ..eigenbasis.eigengs import EigenGS
+from ..gaussian.covariance import outline
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode
 from ..image.io import to_8bit
@@ -170,13 +171,8 @@ def _outlined(picture: Picture, gaussians: Gaussians, colors: list[Color]) -> Pi
 
 def _outlines(gaussians: Gaussians) -> Picture:
     """Points around every splat at one standard deviation, the first one twice, (N, 25, 2)."""
-    arrays = {name: array.astype(np.float64) for name, array in gaussians.to_arrays().items()}
-    turn = np.linspace(0, 2 * np.pi, 25)
-    a, b, c = arrays["factor"].T[:, :, None]
-    with np.errstate(all="ignore"):  # what is not finite is not in sight
-        y = np.sin(turn) / c
-        x = (np.cos(turn) - b * y) / a
-    return np.stack([x, y], axis=2) + arrays["mean"][:, None]
+    arrays = gaussians.to_arrays()
+    return outline(arrays["factor"]) + arrays["mean"].astype(np.float64)[:, None]
 
 
 def _in_sight(points: Picture, size: tuple[int, int]) -> Picture:

@@ -109,9 +109,7 @@ def _mitsuba(variant: str | None, quiet: bool) -> Any:
     try:
         import mitsuba as mi
     except ImportError as error:
-        raise ValueError(
-            f"scenes need Mitsuba ({error}): pip install 'eigengs-dr[plugins]'"
-        ) from error
+        raise ValueError(f"scenes need Mitsuba ({error}): pip install 'mitsuba==3.9.*'") from error
     from ..plugins import register_plugins
 
     if variant is None:

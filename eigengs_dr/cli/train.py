@@ -137,7 +137,7 @@ def train(
 def _settings(gaussians: int | None, frequency_aware: str, **options: Any) -> Any:
     """Turn options into the settings of a training."""
     from ..eigenbasis.training import TrainOptions
-    from ..fitting.initializers import default_count
+    from ..fitting.options import default_count
 
     width, height = options["size"]
     return TrainOptions(

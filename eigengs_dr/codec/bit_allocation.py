@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import drjit as dr
@@ -20,14 +21,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import types_of
 from ..fitting.refine import MAX_PSNR
+from ..gaussian.covariance import log_shapes, sizes_from_log_shapes
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr, to_coded
 from ..image.io import check_image
 from ..image.metrics import psnr_from_mse
-from ..raster.render import CUTOFF, render
-from .egs import MAX_SECTIONS, EgsContent, to_bytes, write
+from ..raster.render import render
+from .egs import MAX_SECTIONS, SUFFIX, EgsContent, to_bytes, write
 from .error_feedback import quantize_with_feedback, to_gaussians
-from .quantization import Steps, log_shapes, sizes_from_log_shapes
+from .quantization import Steps
 
 Array = NDArray[np.floating]
 
@@ -91,7 +93,7 @@ def pack(
     image: ArrayLike | None = None,
     budget: float = BUDGET,
     sections: Sequence[int] | None = None,
-    cutoff: float = CUTOFF,
+    cutoff: float | None = None,
 ) -> PackResult:
     """Write the smallest ``.egs`` file of a set that keeps its quality but for a budget.
 
@@ -112,7 +114,7 @@ def pack(
         any of them, and the budget holds for what they have then. By default all in one. Inside a
         section splats lie in the order of the curve.
     cutoff : float, optional
-        See `eigengs_dr.render`.
+        Standard deviations after which a Gaussian ends; by default that of the set.
 
     Returns
     -------
@@ -121,7 +123,8 @@ def pack(
     Raises
     ------
     ValueError
-        If the image or an argument does not fit the set, or no file holds the budget.
+        If the image or an argument does not fit the set, the file has another suffix than ``.egs``,
+        or no file holds the budget.
     OSError
         If the file cannot be written; an existing one is then as before.
 
@@ -129,21 +132,25 @@ def pack(
     -----
     The result is a function of the arguments, bit for bit, on one machine and backend.
     """
+    if Path(path).suffix.lower() != SUFFIX:
+        raise ValueError(f"{path}: packed sets end in {SUFFIX}; choose such a name, or use save()")
     rows = _rows(len(gaussians), sections)
     if not 0 < budget <= MAX_PSNR:
         raise ValueError(
             f"pack: budget is {budget}; it must be above 0 and at most {MAX_PSNR:g} dB, such as 0.5"
         )
     gaussians = dr.detach(gaussians)
-    shown = _shown(gaussians, cutoff) if image is None else _compared(gaussians, image)
+    if cutoff is not None:
+        gaussians = replace(gaussians, cutoff=float(cutoff))
+    shown = _shown(gaussians) if image is None else _compared(gaussians, image)
     # The best light for an image is not the best picture: a set that has found it is kept.
     keeps = image is None or gaussians.space == "linear"
-    target = _planes_of(gaussians, cutoff) if keeps else shown
+    target = _planes_of(gaussians) if keeps else shown
     unseen = MSE_WITHOUT_IMAGE if image is None else 0
 
     def errors(found: Gaussians) -> list[float]:
         parts = [*(found[: r.stop] for r in rows[:-1]), found]
-        return [_error(part, shown, cutoff) for part in parts]
+        return [_error(part, shown) for part in parts]
 
     before = [max(error + unseen, MIN_MSE) for error in errors(gaussians)]
     limits = [error * 10 ** (budget / 10) - unseen for error in before]
@@ -151,7 +158,7 @@ def pack(
         raise ValueError(TOO_FINE)
 
     def attempt(steps: Steps) -> _Candidate:
-        packed = quantize_with_feedback(gaussians, target, steps, rows, cutoff)
+        packed = quantize_with_feedback(gaussians, target, steps, rows)
         after = zip(errors(to_gaussians(packed, gaussians)), limits, strict=True)
         # Of all that a reader may stop at the worst counts, on the scale of the whole.
         return packed, max(error * (limits[-1] / limit) for error, limit in after)
@@ -238,16 +245,16 @@ def _compared(gaussians: Gaussians, image: ArrayLike) -> Array:
     return rgb_to_ycbcr(pixels) if gaussians.space == "ycbcr" else pixels
 
 
-def _shown(gaussians: Gaussians, cutoff: float) -> Array:
+def _shown(gaussians: Gaussians) -> Array:
     """Render a set in the space in which it is compared."""
-    planes = _planes_of(gaussians, cutoff)
+    planes = _planes_of(gaussians)
     return to_coded(np.maximum(planes, 0)) if gaussians.space == "linear" else planes
 
 
-def _planes_of(gaussians: Gaussians, cutoff: float) -> Array:
+def _planes_of(gaussians: Gaussians) -> Array:
     """Render the channels of a set as they are."""
-    return render(replace(gaussians, space="data"), cutoff=cutoff).numpy()
+    return render(replace(gaussians, space="data")).numpy()
 
 
-def _error(gaussians: Gaussians, shown: Array, cutoff: float) -> float:
-    return float(np.mean(np.square(_shown(gaussians, cutoff) - shown, dtype=np.float64)))
+def _error(gaussians: Gaussians, shown: Array) -> float:
+    return float(np.mean(np.square(_shown(gaussians) - shown, dtype=np.float64)))

@@ -17,6 +17,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..gaussian.file import CUTOFF, SetData
 from ..image.color import MAX_CHANNELS, SPACES
 from ..storage.atomic import atomic_write
 from ..storage.npz import MAX_ENTRIES, BadValue
@@ -29,7 +30,8 @@ SUFFIX = ".egs"
 MAGIC = b"\x89EGS"
 """First bytes of a file: the first is no letter, so that no text begins so."""
 
-VERSION = 1
+VERSION = 2
+"""Version 2 adds a cutoff after the header; sets with the default one are written as version 1."""
 
 MAX_SECTIONS = 1 << 12
 
@@ -39,6 +41,8 @@ _HEADER = struct.Struct("<4sBBBBHIIii4f")
 
 _SECTION = struct.Struct("<III")
 """Splats, bytes that follow, and their CRC-32."""
+
+_CUTOFF = struct.Struct("<d")
 
 _CHECK = struct.Struct("<I")
 
@@ -56,6 +60,8 @@ class EgsContent(NamedTuple):
         Native width and height.
     space : str
         One of `eigengs_dr.image.color.SPACES`.
+    cutoff : float
+        Standard deviations.
     """
 
     sections: list[Symbols]
@@ -63,6 +69,7 @@ class EgsContent(NamedTuple):
     background: NDArray[np.float32]
     size: tuple[int, int]
     space: str
+    cutoff: float = CUTOFF
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Mean (N, 2), factor (N, 3), color (N, C) and background (C,), all of float32."""
@@ -102,7 +109,7 @@ def to_bytes(packed: EgsContent) -> bytes:
     levels = int((mean - corner).max()).bit_length()
     head = _HEADER.pack(
         MAGIC,
-        VERSION,
+        1 if packed.cutoff == CUTOFF else VERSION,
         SPACES.index(packed.space),
         len(packed.background),
         levels,
@@ -111,6 +118,8 @@ def to_bytes(packed: EgsContent) -> bytes:
         *corner.tolist(),
         *packed.steps,
     )
+    if packed.cutoff != CUTOFF:
+        head += _CUTOFF.pack(packed.cutoff)
     head += packed.background.astype("<f4").tobytes()
     parts = [head, _CHECK.pack(zlib.crc32(head))]
     for section in packed.sections:
@@ -156,6 +165,12 @@ def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsConten
             raise ValueError(f"{path}: {error}") from None
 
 
+def read_set(path: Path, sections: int | None = None) -> SetData:
+    """Read a packed set for `eigengs_dr.Gaussians.load`; parameters and errors as for `read`."""
+    content = read(path, sections)
+    return SetData(content.arrays(), content.size, content.space, content.cutoff)
+
+
 def _body(section: Symbols, corner: NDArray[np.int64], levels: int) -> bytes:
     """The planes of a section."""
     places = hilbert_encode(section.mean - corner, levels)
@@ -176,9 +191,10 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
         raise BadValue(
             f"version is {version}, this package reads up to {VERSION}; upgrade eigengs-dr"
         )
+    more = _exactly(file, _CUTOFF.size) if version > 1 else b""
     background = _exactly(file, 4 * channels)
     (check,) = _CHECK.unpack(_exactly(file, _CHECK.size))
-    if check != zlib.crc32(head + background):
+    if check != zlib.crc32(head + more + background):
         raise BadValue("the header is damaged; copy the file again")
     corner, steps = np.array(rest[:2], np.int64), Steps(*rest[2:])
     _check_header(space, channels, levels, count, steps)
@@ -197,7 +213,12 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
     if wanted is None and file.read(1):
         raise BadValue("something follows the last section; copy the file again")
     return EgsContent(
-        found, steps, np.frombuffer(background, "<f4"), (width, height), SPACES[space]
+        sections=found,
+        steps=steps,
+        background=np.frombuffer(background, "<f4"),
+        size=(width, height),
+        space=SPACES[space],
+        cutoff=_CUTOFF.unpack(more)[0] if more else CUTOFF,
     )
 
 

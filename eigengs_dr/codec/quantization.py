@@ -15,6 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..gaussian.covariance import factors_from_log_shapes, sizes_from_log_shapes
+
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
 
@@ -60,33 +62,6 @@ class Symbols(NamedTuple):
     def select(self, chosen: slice | NDArray[np.integer]) -> Symbols:
         """Return some of the splats."""
         return Symbols(*(part[chosen] for part in self))
-
-
-def log_shapes(factor: Array) -> NDArray[np.float64]:
-    """Turn a, b, c, shape (N, 3), into s, u, v."""
-    a, b, c = np.asarray(factor, np.float64).T
-    half, across, size = 0.5 * (a * a - b * b - c * c), a * b, np.log(a * c)
-    # Eigenvalues of F^T F: their product is (a c)^2, and the larger one does not cancel.
-    largest = 0.5 * (a * a + b * b + c * c) + np.hypot(half, across)
-    length = 0.5 * (np.log(largest) - size)
-    angle = np.arctan2(across, half)
-    return np.stack([0.5 * size, length * np.cos(angle), length * np.sin(angle)], axis=1)
-
-
-def factors_from_log_shapes(shape: Array) -> NDArray[np.float64]:
-    """Turn s, u, v, shape (N, 3), into a, b, c: the inverse of `log_shapes`."""
-    s, u, v = np.asarray(shape, np.float64).T
-    length, angle = np.hypot(u, v), np.arctan2(v, u)
-    # F^T F / exp(2 s) = cosh(2 length) + sinh(2 length) [[cos, sin], [sin, -cos]] of the angle; of
-    # a^2 so written no digits cancel.
-    odd = np.sinh(2 * length)
-    a = np.sqrt(np.exp(-2 * length) + 2 * odd * np.cos(0.5 * angle) ** 2)
-    return np.stack([a, odd * np.sin(angle) / a, 1 / a], axis=1) * np.exp(s)[:, None]
-
-
-def sizes_from_log_shapes(shape: Array) -> NDArray[np.float64]:
-    """Geometric mean of the standard deviations in pixels, shape (N,): ``exp(-s)``."""
-    return np.exp(-np.asarray(shape, np.float64)[:, 0])
 
 
 def quantize(mean: Array, shape: Array, color: Array, steps: Steps) -> Symbols:

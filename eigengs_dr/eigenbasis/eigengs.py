@@ -22,7 +22,7 @@ from ..gaussian.gaussians import Gaussians
 from ..image.folder import to_planes
 from ..image.io import check_image
 from ..image.resize import resample
-from ..storage import npz as archive
+from ..storage import npz
 from .basis import Eigenbasis
 from .components.solve import ComponentFit, State, check_arguments, fit_components, with_colors
 from .components.split import split_reason, wants_split
@@ -307,7 +307,7 @@ class EigenGS:
         OSError
             If the file cannot be written; an existing one is then as before.
         """
-        archive.write(path, FORMAT, VERSION, to_members(self))
+        npz.write(path, FORMAT, VERSION, to_members(self))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], backend: str | None = None) -> EigenGS:
@@ -326,10 +326,8 @@ class EigenGS:
         OSError
             If it cannot be opened.
         """
-        version = archive.read(path, FORMAT, VERSION, {"version": archive.Field("i8", 0)})[
-            "version"
-        ]
-        arrays = archive.read(path, FORMAT, VERSION, layout_of(int(version)))
+        version = npz.read_version(path, FORMAT, VERSION)
+        arrays = npz.read(path, FORMAT, VERSION, layout_of(version))
         try:
             return cls(**from_members(arrays, backend))
         except ValueError as error:

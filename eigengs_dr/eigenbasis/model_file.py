@@ -107,7 +107,10 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
         raise ValueError(f"space is {str(arrays['space'])!r}, expected {' or '.join(BASIS_SPACES)}")
     _require("size", arrays["size"], (2,))
     gaussians = Gaussians.from_arrays(
-        **{key: arrays[key] for key in ("mean", "factor", "color", "background")},
+        arrays["mean"],
+        arrays["factor"],
+        arrays["color"],
+        arrays["background"],
         size=tuple(arrays["size"].tolist()),
         space=str(arrays["space"]),
         backend=backend,

@@ -6,6 +6,7 @@ import os
 from functools import cache
 from pathlib import Path
 
+from ..backend.arrays import types_of
 from .eigengs import EigenGS
 
 SHIPPED = {"natural": Path(__file__).parents[1] / "data" / "natural.npz"}
@@ -24,9 +25,15 @@ def load_basis(basis: str | os.PathLike[str] | EigenGS, backend: str | None = No
     Raises
     ------
     ValueError
-        If there is no such name or file, or the file is no model.
+        If there is no such name or file, the file is no model, or a model is on another backend.
     """
     if isinstance(basis, EigenGS):
+        held = types_of(basis.gaussians.mean).backend
+        if backend not in (None, held):
+            raise ValueError(
+                f"the basis is a model on backend {held!r}, not on {backend!r}; load it with "
+                f"backend={backend!r}, or leave the backend out"
+            )
         return basis
     if basis in SHIPPED:
         return _shipped(str(basis), backend)

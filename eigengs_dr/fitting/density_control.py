@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
 from ..gaussian.gaussians import Gaussians, concatenate
-from ..raster.render import CUTOFF
 from .placement.density import residual_peaks
 from .redistribute import residual
 from .solvers.conjugate_gradient import inner_products, solve
@@ -25,7 +24,6 @@ def removal_cost(
     gaussians: Gaussians,
     target: NDArray[np.float32],
     weight: Array | None = None,
-    cutoff: float = CUTOFF,
 ) -> NDArray[np.float64]:
     """Rise of the squared error if a splat were gone and all others stayed as they are.
 
@@ -39,7 +37,6 @@ def removal_cost(
         The image in the space of the set.
     weight : ndarray, shape (H, W, C), optional
         What errors are multiplied by before they are squared.
-    cutoff : float, optional
 
     Returns
     -------
@@ -47,9 +44,9 @@ def removal_cost(
         Negative where the set would be better without the splat.
     """
     counts = np.ones_like(target) if weight is None else np.square(weight).astype(np.float32)
-    missed = residual(gaussians, target, cutoff) * counts
-    along = inner_products(gaussians, missed, cutoff)
-    own = inner_products(gaussians, counts, cutoff, squared=True)
+    missed = residual(gaussians, target) * counts
+    along = inner_products(gaussians, missed)
+    own = inner_products(gaussians, counts, squared=True)
     color = gaussians.to_arrays()["color"].astype(np.float64)
     return (color * (color * own + 2 * along)).sum(axis=1)
 
@@ -59,18 +56,17 @@ def prune(
     target: NDArray[np.float32],
     count: int,
     weight: Array | None = None,
-    cutoff: float = CUTOFF,
 ) -> Gaussians:
     """Keep the `count` splats that are worth the most, in their order, and solve for the colours.
 
     Parameters are those of `removal_cost`. With a weight colours stay: those that are solved for
     minimise the error without it.
     """
-    value = removal_cost(gaussians, target, weight, cutoff)
+    value = removal_cost(gaussians, target, weight)
     kept = np.sort(np.argsort(-value, kind="stable")[:count])
     if weight is not None:
         return gaussians[kept]
-    return solve(gaussians[kept], target, SOLVE_STEPS, cutoff, warm_start=True).gaussians
+    return solve(gaussians[kept], target, SOLVE_STEPS, warm_start=True).gaussians
 
 
 def densify(
@@ -78,7 +74,6 @@ def densify(
     target: NDArray[np.float32],
     count: int,
     weight: Array | None = None,
-    cutoff: float = CUTOFF,
 ) -> Gaussians:
     """Add round splats where one takes most from the error, until there are `count`.
 
@@ -87,7 +82,7 @@ def densify(
     """
     if count <= len(gaussians):
         return gaussians
-    missed = residual(gaussians, target, cutoff)
+    missed = residual(gaussians, target)
     mean, size, color = residual_peaks(missed, count - len(gaussians), _spacing(gaussians), weight)
     if not len(mean):
         return gaussians
@@ -99,6 +94,7 @@ def densify(
         size=(gaussians.width, gaussians.height),
         space=gaussians.space,
         backend=types_of(gaussians.mean).backend,
+        cutoff=gaussians.cutoff,
     )
     return concatenate([gaussians, added.bounded()])
 

@@ -1,66 +1,94 @@
-"""`fit`: one image to Gaussians, from the placement of splats to the refined set."""
+"""`fit`: one image to Gaussians, from their placement to the refined set."""
 
 from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.interrupt import defer_interrupts
-from ..eigenbasis.eigengs import EigenGS
+from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
-from ..image.color import SPACES
 from ..image.io import check_image
-from ..raster.parameters import NUM_SHAPE_PARAMS
 from ..raster.render import picture_of
-from .initializers import INITS, initialize
-from .presets import PRESETS
-from .refine import MAX_PSNR, FitProgress, measure, refine
+from .initializers import FitProblem, initialize
+from .options import FitOptions, max_gaussians_for
+from .refine import FitProgress, Refinement, measure, refine
 from .search import search_count
 
+if TYPE_CHECKING:
+    from ..eigenbasis.eigengs import EigenGS
+
 PIXELS_PER_FIRST_GAUSSIAN = 64
-"""Pixels a splat of the first try, where the number of splats is searched for."""
+"""Pixels for each Gaussian of the first try, if the number of Gaussians is searched for."""
 
 
-class Fit(NamedTuple):
+@dataclass(frozen=True)
+class Fit:
     """Result of `fit`.
 
     Attributes
     ----------
     gaussians : Gaussians
     trace : list of dict
-        Rows with iteration, seconds, psnr_ycbcr, psnr_rgb, and gaussians where their number was
-        searched for; row 0 is before refinement. Seconds
-        count from the call of `fit`: placement, upload and colour solve are in them, and what it
-        takes to compute the rows. For color "data" psnr_rgb is that of the data, clamped and
-        rounded to 8 bits, and psnr_ycbcr that of the data as it is: no YCbCr is in it.
+        Rows with iteration, seconds, psnr_ycbcr, psnr_rgb; and gaussians, if their number was
+        searched for. Row 0 is before refinement. Seconds count from the call of `fit`: they hold
+        placement, upload, the colour solve, and the time that the rows take. With color "data"
+        psnr_rgb is the PSNR of the data, clamped and rounded to 8 bits, and psnr_ycbcr the PSNR of
+        the data as they are.
     image : ndarray of float32, shape (H, W, 3), or (H, W, 1) for data of one channel
-        The picture that the set makes: RGB, not clamped; of linear light coded as sRGB, its light
-        clamped at 0; or the data.
+        The picture of the set: RGB, not clamped; linear light coded as sRGB, clamped at 0; or the
+        data.
     seconds, seconds_init : float
-        All of it, and the part before refinement.
+        The whole time, and the part before refinement.
     iterations : int
         Steps of refinement taken.
     stopped : str
-        Why it ended: "iterations", "plateau", "interrupted"; or, where a PSNR was asked for, "met"
-        or "out of reach".
+        Why the fit ended: "iterations", "plateau", "interrupted"; with a target PSNR "met" or "out
+        of reach".
     mean_image : ndarray of float32, shape (H, W, 3), or None
-        What renderings of the set are added to, RGB: the preset "eigengs" keeps the mean image of
-        its basis as pixels. It is in `image` already.
+        RGB that renderings of the set are added to: the preset "eigengs" keeps the mean image of
+        its basis as pixels. The attribute `image` has it already.
     """
 
     gaussians: Gaussians
-    trace: list[dict[str, Any]]
-    image: NDArray[np.float32]
+    trace: list[dict[str, Any]] = field(repr=False)
+    image: NDArray[np.float32] = field(repr=False)
     seconds: float
-    seconds_init: float
+    seconds_init: float = field(repr=False)
     iterations: int
     stopped: str
-    mean_image: NDArray[np.float32] | None = None
+    mean_image: NDArray[np.float32] | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        last = self.trace[-1] if self.trace else {}
+        return (
+            f"Fit({len(self.gaussians)} Gaussians, "
+            f"{self.image.shape[1]}x{self.image.shape[0]} pixels, {self.iterations} iterations, "
+            f"psnr_ycbcr={last.get('psnr_ycbcr', np.nan):.2f}, "
+            f"psnr_rgb={last.get('psnr_rgb', np.nan):.2f}, "
+            f"seconds={self.seconds:.2f}, stopped={self.stopped!r})"
+        )
+
+
+class FitInterrupted(KeyboardInterrupt):
+    """Ctrl-C or SIGTERM during a fit.
+
+    Attributes
+    ----------
+    result : Fit
+        The best set so far.
+    """
+
+    def __init__(self, result: Fit) -> None:
+        super().__init__("the fit was interrupted; .result holds the best set so far")
+        self.result = result
 
 
 def fit(
@@ -68,7 +96,7 @@ def fit(
     gaussians: int | None = None,
     iterations: int = 1000,
     init: str = "auto",
-    basis: str | os.PathLike[str] | EigenGS = "natural",
+    basis: str | os.PathLike[str] | EigenGS | None = None,
     preset: str = "default",
     solve_steps: int = 10,
     color: str = "ycbcr",
@@ -78,26 +106,25 @@ def fit(
     target_psnr: float | None = None,
     target_space: str = "ycbcr",
     max_gaussians: int | None = None,
+    cutoff: float = CUTOFF,
 ) -> Fit:
-    """Fit Gaussians to an image: so many, or the fewest that reach a quality.
-
-    Splats are placed, their colours solved for, and all parameters refined by gradient descent on
-    the squared error.
+    """Fit an image by a sum of Gaussians: a given number of them, or as few as a PSNR needs.
 
     Parameters
     ----------
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
-        RGB or grey, float in [0, 1] or unsigned integers.
+        See `eigengs_dr.image.io.check_image`.
     gaussians : int, optional
-        Number of splats, at most one a pixel. By default that of the basis where it places them,
-        else 5000 or one a pixel if these are fewer.
+        Number of Gaussians, at most one a pixel. By default 5000, or one a pixel for smaller
+        images; with an eigenbasis the number that the basis has.
     iterations : int, optional
-        Most steps of refinement; 0 keeps what the colour solve gave.
+        Largest number of refinement steps; 0 keeps the colours of the solve.
     init : {"auto", "adaptive", "grid", "random", "eigen"}, optional
-        Where splats start. "auto" is what the preset does best with: "adaptive" for "default".
+        Where Gaussians start. "auto" is "eigen" if a basis is given, else the initialiser of the
+        preset: "adaptive" for "default".
     basis : str, path-like or EigenGS, optional
-        What "eigen" starts from: the name of a basis of this package, the file of another, or a
-        model.
+        The start of "eigen": the name of a basis of this package, the file of another, or a model.
+        By default "natural", which ships with the package.
     preset : {"default", "gaussianimage", "eigengs"}, optional
         The method, see `eigengs_dr.fitting.presets`.
     solve_steps : int, optional
@@ -107,20 +134,22 @@ def fit(
         sum to linear light, as textures need it; errors weigh more in the dark. "data" takes the
         channels as they are, one or three (roughness, normals, heights).
     seed : int, optional
-        Of the random numbers; one seed gives one result on one machine and backend.
+        Seed of random numbers. Only "random" and the colours of presets without a solve draw any:
+        the preset "default" gives one result for all seeds.
     backend : {"llvm", "cuda"}, optional
-        By default "cuda" where there is a GPU.
+        By default "cuda" if there is a GPU.
     progress : callable, optional
         ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
     target_psnr : float, optional
-        Instead of `gaussians`: decibels to reach with as few splats as possible, see
-        `eigengs_dr.fitting.search`. `iterations` are then those of a fit of a known number; the
-        search takes up to about twice as many.
+        Instead of `gaussians`: decibels to reach with as few Gaussians as possible, see
+        `eigengs_dr.fitting.search`. The search takes up to about twice `iterations` steps.
     target_space : {"ycbcr", "rgb"}, optional
-        Where `target_psnr` is measured, as psnr_ycbcr or as psnr_rgb.
+        Whether `target_psnr` is a psnr_ycbcr or a psnr_rgb.
     max_gaussians : int, optional
-        Most splats for `target_psnr`; by default as many as have as many parameters as the image
-        has numbers, 3 for 8 pixels in colour.
+        Largest number of Gaussians for `target_psnr`. By default the number that has as many
+        parameters as the image has numbers: 3 for 8 pixels in colour.
+    cutoff : float, optional
+        Standard deviations after which a Gaussian ends, in (0, 12]; the set keeps it.
 
     Returns
     -------
@@ -132,6 +161,12 @@ def fit(
         If the image is unusable or an argument out of range; one line.
     BackendError
         If the backend is not there.
+    FitInterrupted
+        After Ctrl-C or SIGTERM: a `KeyboardInterrupt` that holds the best set so far.
+
+    Notes
+    -----
+    One seed gives one result, bit for bit, on one machine and backend.
 
     Examples
     --------
@@ -140,129 +175,107 @@ def fit(
     >>> len(result.gaussians), result.image.shape
     (300, (64, 64, 3))
     """
+    options = FitOptions(
+        gaussians=gaussians,
+        iterations=iterations,
+        init=init,
+        basis=basis,
+        preset=preset,
+        solve_steps=solve_steps,
+        color=color,
+        seed=seed,
+        backend=backend,
+        cutoff=cutoff,
+        target_psnr=target_psnr,
+        target_space=target_space,
+        max_gaussians=max_gaussians,
+    )
+    return fit_image(image, options, progress)
+
+
+def fit_image(image: ArrayLike, options: FitOptions, progress: FitProgress | None = None) -> Fit:
+    """Fit an image with options that were checked; see `fit` for results and errors."""
     started = time.perf_counter()
-    pixels = check_image(image, keep_grey=color == "data")
-    check_options(pixels, gaussians, iterations, init, preset, solve_steps, color, seed)
-    method = PRESETS[preset]
-    if target_psnr is None and (max_gaussians is not None or target_space != "ycbcr"):
-        raise ValueError("max_gaussians and target_space belong to target_psnr; give it, too")
-    if target_psnr is not None:
-        _check_target(gaussians, init, preset, target_psnr, target_space, pixels, max_gaussians)
-        most = max_gaussians or max_gaussians_for(pixels)
-        gaussians = min(
-            most, max(1, pixels.shape[0] * pixels.shape[1] // PIXELS_PER_FIRST_GAUSSIAN)
-        )
+    pixels = check_image(image, keep_grey=options.color == "data")
+    options.check_image(pixels)
     with defer_interrupts() as interrupted:
-        start = initialize(
-            pixels, gaussians, init, basis, method, solve_steps, color, seed, backend=backend
-        )
+        start = initialize(pixels, _first_try(pixels, options))
         seconds_init = time.perf_counter() - started
-        if target_psnr is None:
-            refined = refine(
-                start.gaussians,
-                start.target,
+        if options.target_psnr is None:
+            found = refine(
+                start,
                 pixels,
-                method.schedule,
-                iterations,
+                options.method.schedule,
+                options.iterations,
                 started=started,
-                base_image=start.base_image,
-                weight=start.weight,
-                redistribute=start.redistribute,
                 progress=progress,
                 interrupted=interrupted,
             )
         else:
-            refined = search_count(
-                start,
-                partial(measure, image=pixels, started=started),
-                f"psnr_{target_space}",
-                target_psnr,
-                most,
-                method.schedule,
-                iterations,
-                progress=progress,
-                interrupted=interrupted,
-            )
-    rendered = picture_of(refined.gaussians)
-    return Fit(
-        gaussians=refined.gaussians,
-        trace=refined.trace,
-        image=rendered if start.base_image is None else rendered + start.base_image,
-        seconds=time.perf_counter() - started,
-        seconds_init=seconds_init,
-        iterations=refined.iterations,
-        stopped=refined.stopped,
-        mean_image=start.base_image,
+            found = _search(start, pixels, options, started, progress, interrupted)
+    return finish(found, found.gaussians, start.base_image, started, seconds_init)
+
+
+def _first_try(pixels: NDArray[np.float32], options: FitOptions) -> FitOptions:
+    """Return the options of the start: a search starts with few Gaussians."""
+    if options.target_psnr is None:
+        return options
+    most = options.max_gaussians or max_gaussians_for(pixels)
+    area = pixels.shape[0] * pixels.shape[1]
+    count = min(most, max(1, area // PIXELS_PER_FIRST_GAUSSIAN))
+    return replace(
+        options, gaussians=count, target_psnr=None, max_gaussians=None, target_space="ycbcr"
     )
 
 
-def check_options(
+def _search(
+    start: FitProblem,
     pixels: NDArray[np.float32],
-    gaussians: int | None,
-    iterations: int,
-    init: str = "auto",
-    preset: str = "default",
-    solve_steps: int = 0,
-    color: str = "ycbcr",
-    seed: int = 0,
-) -> None:
-    """Raise ValueError for the first argument of `fit` that is out of range."""
-    counts = {"iterations": iterations, "solve_steps": solve_steps, "seed": seed}
-    if gaussians is not None:
-        counts["gaussians"] = gaussians
-    for name, count in counts.items():
-        if not isinstance(count, (int, np.integer)) or count < 0:
-            raise ValueError(f"{name} is {count!r}; it must be at least 0, and whole")
-    height, width = pixels.shape[:2]
-    if gaussians is not None and not 1 <= gaussians <= width * height:
-        raise ValueError(
-            f"gaussians is {gaussians}; an image of {width}x{height} takes 1 to {width * height}"
-        )
-    for name, value, known in (
-        ("init", init, INITS),
-        ("preset", preset, tuple(PRESETS)),
-        ("color", color, SPACES),
-    ):
-        if value not in known:
-            raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(known)}")
-    if PRESETS[preset].mean == "dense" and init not in ("auto", "eigen"):
-        raise ValueError(f"preset {preset!r} starts from a basis; use init 'auto', not {init!r}")
+    options: FitOptions,
+    started: float,
+    progress: FitProgress | None,
+    interrupted: Callable[[], bool],
+) -> Refinement:
+    """Search for the smallest number of Gaussians that reaches the target PSNR."""
+    assert options.target_psnr is not None
+    return search_count(
+        start,
+        partial(measure, image=pixels, started=started),
+        f"psnr_{options.target_space}",
+        options.target_psnr,
+        options.max_gaussians or max_gaussians_for(pixels),
+        options.method.schedule,
+        options.iterations,
+        progress=progress,
+        interrupted=interrupted,
+    )
 
 
-def max_gaussians_for(pixels: NDArray[np.float32]) -> int:
-    """Splats that have as many parameters as an image has numbers; at least one."""
-    channels = pixels.shape[2]
-    return max(1, pixels.size // (NUM_SHAPE_PARAMS + channels))
+def finish(
+    found: Refinement,
+    gaussians: Gaussians,
+    base_image: NDArray[np.float32] | None,
+    started: float,
+    seconds_init: float,
+) -> Fit:
+    """Render the result of a refinement.
 
-
-def _check_target(
-    gaussians: int | None,
-    init: str,
-    preset: str,
-    target_psnr: float,
-    target_space: str,
-    pixels: NDArray[np.float32],
-    max_gaussians: int | None,
-) -> None:
-    """Raise ValueError where a search for the fewest splats is asked for what it cannot do."""
-    if gaussians is not None:
-        raise ValueError("gaussians and target_psnr exclude each other; give one of them")
-    if preset != "default" or init not in ("auto", "adaptive"):
-        raise ValueError(
-            f"target_psnr works with preset 'default' and init 'adaptive', not with {preset!r} and "
-            f"{init!r}"
-        )
-    if not 0 < target_psnr <= MAX_PSNR:
-        raise ValueError(
-            f"target_psnr is {target_psnr}; it must be above 0 and at most {MAX_PSNR:g}"
-        )
-    if target_space not in ("ycbcr", "rgb"):
-        raise ValueError(f"target_space {target_space!r} is unknown; use ycbcr or rgb")
-    height, width = pixels.shape[:2]
-    if max_gaussians is not None and not (
-        isinstance(max_gaussians, (int, np.integer)) and 1 <= max_gaussians <= width * height
-    ):
-        raise ValueError(
-            f"max_gaussians is {max_gaussians}; an image of {width}x{height} takes 1 to "
-            f"{width * height}"
-        )
+    Raises
+    ------
+    FitInterrupted
+        If the refinement was interrupted.
+    """
+    rendered = picture_of(gaussians)
+    result = Fit(
+        gaussians=gaussians,
+        trace=found.trace,
+        image=rendered if base_image is None else rendered + base_image,
+        seconds=time.perf_counter() - started,
+        seconds_init=seconds_init,
+        iterations=found.iterations,
+        stopped=found.stopped,
+        mean_image=base_image,
+    )
+    if found.stopped == "interrupted":
+        raise FitInterrupted(result)
+    return result

@@ -18,13 +18,12 @@ from numpy.typing import ArrayLike
 from ..backend.interrupt import defer_interrupts
 from ..gaussian.gaussians import Gaussians, concatenate
 from ..image.io import check_image
-from ..raster.render import picture_of
 from .density_control import removal_cost
-from .fit import Fit, check_options
-from .initializers import FitProblem, default_count, initialize
+from .fit import Fit, finish
+from .initializers import FitProblem, initialize
 from .optimizers.descent import descend
 from .optimizers.schedule import Schedule
-from .presets import PRESETS
+from .options import FitOptions
 from .redistribute import place_like, residual
 from .refine import FitProgress, refine
 
@@ -91,40 +90,30 @@ def fit_levels(
         If the backend is not there.
     """
     started = time.perf_counter()
+    options = FitOptions(
+        gaussians=gaussians, iterations=iterations, color=color, seed=seed, backend=backend
+    )
     pixels = check_image(image, keep_grey=color == "data")
-    check_options(pixels, gaussians, iterations, color=color, seed=seed)
-    counts = level_counts(gaussians or default_count(pixels.shape[0] * pixels.shape[1]), levels)
-    method = PRESETS["default"]
+    options.check_image(pixels)
+    counts = level_counts(options.count_for(pixels), levels)
+    schedule = options.method.schedule
     with defer_interrupts() as interrupted:
-        start = initialize(
-            pixels, counts[0], "auto", "natural", method, color=color, seed=seed, backend=backend
-        )
-        placed = _place_levels(
-            start, counts, method.schedule, min(STEPS_PER_LEVEL, iterations), interrupted
-        )
+        start = initialize(pixels, replace(options, gaussians=counts[0]))
+        steps = min(STEPS_PER_LEVEL, iterations)
+        placed = _place_levels(start, counts, schedule, steps, interrupted)
         seconds_init = time.perf_counter() - started
         refined = refine(
-            placed,
-            start.target,
+            start._replace(gaussians=placed, redistribute=None),
             pixels,
-            method.schedule,
+            schedule,
             iterations,
             started=started,
-            weight=start.weight,
             levels=counts[:-1],
             progress=progress,
             interrupted=interrupted,
         )
-    ordered = _sort_levels(refined.gaussians, start, counts)
-    return Fit(
-        gaussians=ordered,
-        trace=refined.trace,
-        image=picture_of(ordered),
-        seconds=time.perf_counter() - started,
-        seconds_init=seconds_init,
-        iterations=refined.iterations,
-        stopped=refined.stopped,
-    )
+        ordered = _sort_levels(refined.gaussians, start, counts)
+    return finish(refined, ordered, None, started, seconds_init)
 
 
 def _place_levels(
@@ -138,7 +127,8 @@ def _place_levels(
     gaussians = start.gaussians
     for level, count in enumerate(counts[1:], 1):
         below = counts[: level - 1]
-        sets = descend(gaussians, start.target, schedule, steps, weight=start.weight, levels=below)
+        problem = start._replace(gaussians=gaussians, redistribute=None)
+        sets = descend(problem, schedule, steps, levels=below)
         for current in sets:
             gaussians = current
             if interrupted():

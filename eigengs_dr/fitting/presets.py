@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
-from .optimizers.adam import Adam
-from .optimizers.adan import Adan
-from .optimizers.parameterization import CHOLESKY
 from .optimizers.schedule import Schedule
 
 
@@ -36,9 +32,9 @@ class Preset:
 # GaussianImage's recipe: one rate for all; it is halved only after 20,000 steps, which no run here
 # reaches.
 _ONE_RATE = Schedule(
-    optimizer=Adan,
+    optimizer="adan",
     rates={"mean": 1e-3, "cholesky": 1e-3, "color": 1e-3},
-    coordinates=CHOLESKY,
+    parameterization="cholesky",
     decay=1.0,
     warm_up=0,
     patience=10_000,
@@ -49,7 +45,8 @@ PRESETS = {
         init="adaptive",
         solves=True,
         schedule=Schedule(
-            optimizer=partial(Adam, beta_1=0.9, beta_2=0.9, epsilon=1e-12),
+            optimizer="adam",
+            settings={"beta_1": 0.9, "beta_2": 0.9, "epsilon": 1e-12},
             rates={"mean": 0.12, "factor": 0.12, "color": 0.015},
         ),
     ),

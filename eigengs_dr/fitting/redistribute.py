@@ -15,6 +15,8 @@ steps.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from pkgutil import resolve_name
 
 import drjit as dr
 import numpy as np
@@ -23,12 +25,47 @@ from numpy.typing import NDArray
 from ..backend.arrays import types_of
 from ..gaussian.gaussians import Gaussians
 from ..image.resize import resample
-from ..raster.render import CUTOFF, render
+from ..raster.render import render
+from .initializers import PLACEMENTS, FitProblem, FitTarget, Placement
+from .options import FitOptions
 from .placement.adaptive import Density, density_from_hessian, place_adaptive
 from .placement.density import target_density
 from .solvers.conjugate_gradient import solve
 
 Array = NDArray[np.floating]
+
+
+def start_from_placement(target: FitTarget, options: FitOptions) -> FitProblem:
+    """Place Gaussians by the image alone; an `eigengs_dr.fitting.initializers.Initializer`."""
+    name, method = options.initializer, options.method
+    place: Placement = resolve_name(PLACEMENTS[name])
+    # Linear light would draw too few Gaussians to the dark.
+    shown = target.pixels if options.color == "linear" else target.values
+    count = options.count_for(target.pixels)
+    generator = np.random.default_rng(options.seed)
+    mean, factor = place(shown, count, generator)
+    shape = (count, target.values.shape[2])
+    start = Gaussians.from_arrays(
+        mean,
+        factor,
+        np.zeros(shape) if method.solves else generator.uniform(0, 1, shape),
+        size=(target.values.shape[1], target.values.shape[0]),
+        space=options.color,
+        backend=options.backend,
+        cutoff=options.cutoff,
+    ).bounded()
+    if not method.solves:
+        return FitProblem(start, target.values, target.weight)
+    solved = solve(start, target.values, options.solve_steps).gaussians
+    again = partial(
+        redistribute,
+        image=shown,
+        target=target.values,
+        weight=target.weight,
+        solve_steps=options.solve_steps,
+    )
+    anew = again if name == "adaptive" else None
+    return FitProblem(solved, target.values, target.weight, redistribute=anew)
 
 
 def redistribute(
@@ -38,7 +75,6 @@ def redistribute(
     target: NDArray[np.float32],
     weight: Array | None = None,
     solve_steps: int = 10,
-    cutoff: float = CUTOFF,
 ) -> Gaussians:
     """Place splats anew, dense where a set left much error, and solve for their colours.
 
@@ -56,15 +92,13 @@ def redistribute(
         What errors are multiplied by before they are squared.
     solve_steps : int, optional
         See `eigengs_dr.fitting.solvers.conjugate_gradient`.
-    cutoff : float, optional
-        See `eigengs_dr.render`.
 
     Returns
     -------
     Gaussians
         Of the old set it has the density and the errors, no splat.
     """
-    missed = residual(gaussians, target, cutoff)
+    missed = residual(gaussians, target)
     error = np.square(missed if weight is None else missed * weight).sum(axis=2)
     old = gaussians.to_arrays()["mean"]
 
@@ -74,7 +108,7 @@ def redistribute(
         here = np.maximum(resample(error[..., None], width, height)[..., 0], 0)
         return target_density(there, here, density_from_hessian(bend, spacing))
 
-    return place_like(gaussians, image, target, count, density, solve_steps, cutoff)
+    return place_like(gaussians, image, target, count, density, solve_steps)
 
 
 def place_like(
@@ -84,7 +118,6 @@ def place_like(
     count: int,
     density: Density | None = None,
     solve_steps: int = 10,
-    cutoff: float = CUTOFF,
 ) -> Gaussians:
     """Place splats by an image and solve for their colours, in the space and size of another set.
 
@@ -99,13 +132,12 @@ def place_like(
         size=(gaussians.width, gaussians.height),
         space=gaussians.space,
         backend=types_of(gaussians.mean).backend,
+        cutoff=gaussians.cutoff,
     )
-    return solve(placed.bounded(), target, solve_steps, cutoff).gaussians
+    return solve(placed.bounded(), target, solve_steps).gaussians
 
 
-def residual(
-    gaussians: Gaussians, target: NDArray[np.float32], cutoff: float = CUTOFF
-) -> NDArray[np.float32]:
+def residual(gaussians: Gaussians, target: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return what a set misses of an image in its own space, shape (H, W, C)."""
-    shown = render(replace(dr.detach(gaussians), space="data"), cutoff=cutoff)
+    shown = render(replace(dr.detach(gaussians), space="data"))
     return np.asarray(target - shown.numpy(), np.float32)

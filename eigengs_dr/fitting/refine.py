@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -12,13 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian.gaussians import Gaussians
-from ..image.metrics import float_space, psnr
-from ..raster.render import CUTOFF, picture_of
-from .optimizers.descent import Redistribute, descend
+from ..image.metrics import MAX_PSNR, float_space, psnr
+from ..raster.render import picture_of
+from .initializers import FitProblem
+from .optimizers.descent import descend
 from .optimizers.schedule import Schedule
-
-MAX_PSNR = 100.0
-"""Decibels above which only rounding is left to fit."""
 
 FitProgress = Callable[[int, int, dict[str, Any]], None]
 
@@ -45,17 +44,12 @@ class Refinement(NamedTuple):
 
 
 def refine(
-    gaussians: Gaussians,
-    target: NDArray[np.float32],
+    problem: FitProblem,
     image: NDArray[np.float32],
     schedule: Schedule,
     iterations: int,
     *,
-    cutoff: float = CUTOFF,
     started: float | None = None,
-    base_image: NDArray[np.float32] | None = None,
-    weight: NDArray[np.float32] | None = None,
-    redistribute: Redistribute | None = None,
     levels: Sequence[int] = (),
     progress: FitProgress | None = None,
     interrupted: Callable[[], bool] = lambda: False,
@@ -64,28 +58,17 @@ def refine(
 
     Parameters
     ----------
-    gaussians : Gaussians
-        Where to start.
-    target : ndarray of float32, shape (H, W, C)
-        The image in the space of the set, at its native size.
+    problem : FitProblem
+        The start and the aim.
     image : ndarray of float32, shape (H, W, 3) or (H, W, 1)
         The image in RGB, or the data, for the trace.
     schedule : Schedule
     iterations : int
-        Most steps to take.
-    cutoff : float, optional
-        See `eigengs_dr.render`.
+        Largest number of steps.
     started : float, optional
         `time.perf_counter()` from which the seconds of the trace count; now by default.
-    base_image : ndarray of float32, shape (H, W, 3), optional
-        What a rendering is base_image to before the trace compares it, RGB: the mean image, where
-        `target` lacks it.
-    weight : ndarray of float32, shape (H, W, C), optional
-        What errors are multiplied by before they are squared.
-    redistribute : callable, optional
-        See `descend`.
     levels : sequence of int, optional
-        Numbers of splats, from the first, that shall make the image too; see `descend`.
+        Numbers of Gaussians, from the first, that shall make the image too; see `descend`.
     progress : callable, optional
         ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
     interrupted : callable, optional
@@ -94,40 +77,42 @@ def refine(
 
     Returns
     -------
-    Refined
-        Never worse than the start. `KeyboardInterrupt` from `progress` also ends it with the best.
+    Refinement
+        Never worse than the start. If it was interrupted, the last row of the trace is of the last
+        step. `KeyboardInterrupt` from `progress` ends it too.
     """
     started = time.perf_counter() if started is None else started
     marks, trace = trace_steps(iterations), list[dict[str, Any]]()
-    best, highest = gaussians, -math.inf
+    best, current, highest = problem.gaussians, problem.gaussians, -math.inf
     stopped, step = "iterations", 0
+
+    def judge() -> None:
+        nonlocal best, highest
+        figures = measure(current, image, started, problem.base_image)
+        trace.append({"iteration": step, **figures})
+        if trace[-1]["psnr_ycbcr"] > highest:
+            best, highest = current, trace[-1]["psnr_ycbcr"]
+
     try:
-        sets = descend(
-            gaussians, target, schedule, iterations, cutoff, weight, redistribute, levels
-        )
-        for step, current in enumerate(sets):
-            if step not in marks:
+        with closing(descend(problem, schedule, iterations, levels)) as sets:
+            for step, reached in enumerate(sets):
+                current = reached
+                if step in marks:
+                    judge()
+                if progress and (step in marks or step % 10 == 0):
+                    dr.sync_thread()  # steps run asynchronously; the bar shows finished ones
+                    progress(step, iterations, trace[-1])
                 if interrupted():
                     break
-                if progress and step % 10 == 0:
-                    dr.sync_thread()  # steps run asynchronously; the bar tells what is done
-                    progress(step, iterations, trace[-1])
-                continue
-            row = {"iteration": step, **measure(current, image, started, base_image, cutoff)}
-            trace.append(row)
-            if row["psnr_ycbcr"] > highest:
-                best, highest = current, row["psnr_ycbcr"]
-            if progress:
-                progress(step, iterations, row)
-            if interrupted():
-                break
-            if _is_plateau(trace, schedule):
-                stopped = "plateau"
-                break
+                if step in marks and _is_plateau(trace, schedule):
+                    stopped = "plateau"
+                    break
         if interrupted():
             stopped = "interrupted"
     except KeyboardInterrupt:
         stopped = "interrupted"
+    if stopped == "interrupted" and step not in marks:
+        judge()
     return Refinement(dr.detach(best), trace, step, stopped)
 
 
@@ -136,10 +121,9 @@ def measure(
     image: NDArray[np.float32],
     started: float,
     base_image: NDArray[np.float32] | None = None,
-    cutoff: float = CUTOFF,
 ) -> dict[str, Any]:
     """Measure a set for a row of a trace: seconds, psnr_ycbcr, psnr_rgb; see `refine`."""
-    rendered = picture_of(gaussians, cutoff=cutoff)
+    rendered = picture_of(gaussians)
     if base_image is not None:
         rendered = rendered + base_image
     return {

@@ -2,7 +2,7 @@
 
 Three stages. *Estimate*: some steps with few splats tell what more would reach, two tries what
 twice as many gain, and each where the splats of the next one belong
-(`eigengs_dr.fitting.redistribute`). *Fit* that number. *Settle*: drop what is worth least while the
+(`eigengs_dr.fitting.redistribute`). *Fit* that number. *Polish*: drop what is worth least while the
 goal is met, add where the error is while it is not (`eigengs_dr.fitting.density_control`), each
 time with a short descent.
 """
@@ -17,61 +17,78 @@ from typing import Any, NamedTuple
 import drjit as dr
 
 from ..gaussian.gaussians import Gaussians
-from ..raster.render import CUTOFF
 from .density_control import densify, prune
 from .initializers import FitProblem
 from .optimizers.descent import descend
 from .optimizers.schedule import Schedule
 from .refine import FitProgress, Refinement
 
-TRY, FIT, SETTLE = 0.1, 0.4, 0.12
-"""Shares of the iterations that a try takes, the fit, and each descent that settles."""
 
-LENGTH = 2
-"""Times the iterations that a search takes at most, if these are not few (some ten)."""
+@dataclass(frozen=True)
+class SearchPolicy:
+    """The numbers of a search; chosen on training photos of ImageNet classes.
 
-TRIES, SETTLING = 4, 5
-"""Most tries, and descents to settle after which a goal that is met is settled enough."""
+    Attributes
+    ----------
+    try_share, fit_share, polish_share : float
+        Shares of the iterations that a try, the fit, and each polishing descent take.
+    max_length : float
+        The search takes at most this multiple of the iterations, unless these are few (some ten).
+    max_tries : int
+        Largest number of tries.
+    max_polishes : int
+        Polishing descents after which a search ends once the goal is met.
+    db_per_doubling : float
+        Gain of twice as many Gaussians, in dB, until two tries of the image measure it; see
+        `eigengs_dr.fitting.placement.density.ERROR_EXPONENT`.
+    doubling_range : (float, float)
+        Range of the measured gain that is believed, in dB; training images gained 1.6 to 8.
+    min_octaves : float
+        Smallest distance of two tries that measures the gain, in doublings.
+    late_share : float
+        Gain of a fit after the steps of a try, as a share of the gain in these steps. Measured with
+        150 to 2,500 Gaussians, to half a decibel.
+    margin : float
+        The fit has this multiple of the estimated number: dropping some settles it better than
+        adding.
+    max_leap : float
+        Largest ratio from one try to the next.
+    try_tolerance, fit_tolerance : float
+        Shares by which the last try, and the fit, may miss the estimated number.
+    max_drop : float
+        Largest share of the Gaussians that are dropped at once.
+    polish_rate : float
+        Share of the learning rates in a polishing descent.
+    polish_gain : float
+        Expected gain of the first polishing descent, in dB; training images gained 0.2.
+    gain_decay : float
+        Expected gain of the next polishing descent, as a share of the gain of the last.
+    surplus : float
+        Decibels above the goal that are not worth another descent.
+    """
 
-OCTAVE = 4.0
-"""Decibels that twice as many splats gain, see
-`eigengs_dr.fitting.placement.density.ERROR_EXPONENT`, until
-two
-tries of this image tell it."""
+    try_share: float = 0.1
+    fit_share: float = 0.4
+    polish_share: float = 0.12
+    max_length: float = 2
+    max_tries: int = 4
+    max_polishes: int = 5
+    db_per_doubling: float = 4.0
+    doubling_range: tuple[float, float] = (2.0, 12.0)
+    min_octaves: float = 0.25
+    late_share: float = 0.25
+    margin: float = 1.09
+    max_leap: float = 16
+    try_tolerance: float = 0.1
+    fit_tolerance: float = 0.35
+    max_drop: float = 0.15
+    polish_rate: float = 0.3
+    polish_gain: float = 0.1
+    gain_decay: float = 0.5
+    surplus: float = 0.02
 
-SLOPES = (2.0, 12.0)
-"""Fewest and most of them that are believed; a training image gained 8, another 1.6."""
 
-APART = 0.25
-"""Octaves between two tries that tell it."""
-
-TO_COME = 0.25
-"""What a fit gains after the steps of a try, as a share of what it gained in them: measured with
-150 to 2,500 splats on training images of ImageNet classes, to half a decibel."""
-
-AIM = 1.09
-"""Times the splats of the estimate that are fitted: dropping some settles it better than adding."""
-
-LEAP = 16
-"""Largest factor from one try to the next."""
-
-CLOSE, FAR = 0.1, 0.35
-"""Shares by which the last try, and the fit, may miss the number that they tell."""
-
-DROP = 0.15
-"""Largest share of the splats that are dropped at once."""
-
-GENTLE = 0.3
-"""Share of the rates in a descent that settles."""
-
-GAIN = 0.1
-"""Decibels that the first of them is believed to gain; on training images it gained 0.2."""
-
-AGAIN = 0.5
-"""Share of what a descent that settles gained, which the next one is believed to gain again."""
-
-SURPLUS = 0.02
-"""Decibels above the goal that are not worth another descent."""
+DEFAULT_POLICY = SearchPolicy()
 
 Row = dict[str, Any]
 
@@ -84,9 +101,9 @@ def search_count(
     most: int,
     schedule: Schedule,
     iterations: int = 1000,
-    cutoff: float = CUTOFF,
     progress: FitProgress | None = None,
     interrupted: Callable[[], bool] = lambda: False,
+    policy: SearchPolicy = DEFAULT_POLICY,
 ) -> Refinement:
     """Find the fewest splats that meet a goal.
 
@@ -105,12 +122,12 @@ def search_count(
     schedule : Schedule
     iterations : int, optional
         Steps that a fit of a known number would take; the search takes up to about twice as many.
-    cutoff : float, optional
-        See `eigengs_dr.render`.
     progress : callable, optional
         ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
     interrupted : callable, optional
-        Asked before every step whether to stop with what there is.
+        Asked before every step whether to stop.
+    policy : SearchPolicy, optional
+        The numbers of the search.
 
     Returns
     -------
@@ -119,16 +136,18 @@ def search_count(
         set that was judged, with iteration, gaussians and the figures; it stopped because the goal
         was "met", is "out of reach", or it was "interrupted".
     """
-    run = _Run(start, measure, figure, goal, schedule, cutoff, progress, interrupted)
-    tries, fit, settle = (max(1, round(share * iterations)) for share in (TRY, FIT, SETTLE))
-    run.planned = TRIES * tries + fit + SETTLING * settle
+    run = _Run(start, measure, figure, goal, schedule, progress, interrupted, policy)
+    shares = (policy.try_share, policy.fit_share, policy.polish_share)
+    tries, fit, polish = (max(1, round(share * iterations)) for share in shares)
+    run.planned = policy.max_tries * tries + fit + policy.max_polishes * polish
     try:
         placed = _estimate(run, most, tries)
         if run.best.missing > 0 or len(run.best.gaussians) > 1:
             trial = _fit_estimate(run, placed, most, fit)
             # Of few iterations the tries have taken all.
-            most_steps = max(LENGTH * iterations, run.step + SETTLING * settle)
-            _settle(run, trial, most, settle, most_steps)
+            longest = round(policy.max_length * iterations)
+            most_steps = max(longest, run.step + policy.max_polishes * polish)
+            _polish(run, trial, most, polish, most_steps)
         pressed = interrupted()
     except KeyboardInterrupt:
         pressed = True
@@ -152,16 +171,17 @@ class _Run:
     figure: str
     goal: float
     schedule: Schedule
-    cutoff: float
     progress: FitProgress | None
     interrupted: Callable[[], bool]
+    policy: SearchPolicy
     planned: int = 0
     step: int = 0
-    db_per_doubling: float = OCTAVE
+    db_per_doubling: float = field(init=False)
     trace: list[Row] = field(default_factory=list)
     best: _Trial = field(init=False)
 
     def __post_init__(self) -> None:
+        self.db_per_doubling = self.policy.db_per_doubling
         self.best = self.score(self.start.gaussians)
 
     def descend(self, gaussians: Gaussians, steps: int, share: float = 1.0) -> _Trial:
@@ -169,9 +189,8 @@ class _Run:
         rates = {name: share * rate for name, rate in self.schedule.rates.items()}
         schedule = replace(self.schedule, rates=rates)
         self.planned = max(self.planned, self.step + steps)
-        sets = descend(
-            gaussians, self.start.target, schedule, steps, self.cutoff, self.start.weight
-        )
+        problem = self.start._replace(gaussians=gaussians, redistribute=None)
+        sets = descend(problem, schedule, steps)
         current = next(sets)
         while not self.interrupted():
             following = next(sets, None)
@@ -205,15 +224,20 @@ def _estimate(run: _Run, most: int, steps: int) -> Gaussians:
     """Place about as many splats as the goal takes, where some steps told that they belong."""
     assert run.start.redistribute is not None
     placed, before, last = run.start.gaussians, run.best, None
-    for _ in range(TRIES):
+    for _ in range(run.policy.max_tries):
         trial = run.descend(placed, steps)
-        run.db_per_doubling = _db_per_doubling(last, trial, run.db_per_doubling)
-        gain = TO_COME * max(0.0, before.missing - trial.missing)
+        _update_slope(run, last, trial)
+        gain = run.policy.late_share * max(0.0, before.missing - trial.missing)
         count = min(
-            most, round(AIM * _count_for_gain(run, len(placed), trial.missing - gain, most))
+            most,
+            round(
+                run.policy.margin * _count_for_gain(run, len(placed), trial.missing - gain, most)
+            ),
         )
         # The first try stands where the image bends, not yet where error was left.
-        close = last is not None and abs(count - len(placed)) <= CLOSE * len(placed)
+        close = last is not None and abs(count - len(placed)) <= run.policy.try_tolerance * len(
+            placed
+        )
         placed = run.start.redistribute(trial.gaussians, count)
         last, before = trial, run.score(placed)
         if close or run.interrupted():
@@ -225,62 +249,66 @@ def _fit_estimate(run: _Run, placed: Gaussians, most: int, steps: int) -> _Trial
     """Fit, and once more where the estimate was far off: to place is better than to mend."""
     trial = run.descend(placed, steps)
     count = _count_for_gain(run, len(placed), trial.missing, most)
-    if run.interrupted() or abs(count - len(placed)) <= FAR * len(placed):
+    if run.interrupted() or abs(count - len(placed)) <= run.policy.fit_tolerance * len(placed):
         return trial
     assert run.start.redistribute is not None
     return run.descend(run.start.redistribute(trial.gaussians, count), steps)
 
 
-def _db_per_doubling(last: _Trial | None, trial: _Trial, octave: float) -> float:
-    """Decibels of twice as many splats, by two tries; as known where they are close."""
+def _update_slope(run: _Run, last: _Trial | None, trial: _Trial) -> None:
+    """Measure the gain of twice as many Gaussians by two tries that are far enough apart."""
     if last is None:
-        return octave
-    apart = math.log2(len(trial.gaussians) / len(last.gaussians))
-    if abs(apart) < APART:
-        return octave
-    return min(max((last.missing - trial.missing) / apart, SLOPES[0]), SLOPES[1])
+        return
+    octaves = math.log2(len(trial.gaussians) / len(last.gaussians))
+    if abs(octaves) >= run.policy.min_octaves:
+        low, high = run.policy.doubling_range
+        run.db_per_doubling = min(max((last.missing - trial.missing) / octaves, low), high)
 
 
 def _count_for_gain(run: _Run, count: int, missing: float, most: int) -> int:
     """Splats that would gain so many decibels more."""
-    octaves = min(max(missing / run.db_per_doubling, -math.log2(LEAP)), math.log2(LEAP))
+    octaves = min(
+        max(missing / run.db_per_doubling, -math.log2(run.policy.max_leap)),
+        math.log2(run.policy.max_leap),
+    )
     return min(most, max(1, round(count * 2**octaves)))
 
 
-def _settle(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) -> None:
+def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) -> None:
     """Drop splats while the goal is met, add some while it is not; `run` keeps the best set.
 
     Where few splats find a place, there would be no end: the steps of the search are limited.
     """
     target, weight = run.start.target, run.start.weight
-    least_growth, rounds, gain = 1.02, 0, GAIN
+    least_growth, rounds, gain = 1.02, 0, run.policy.polish_gain
     while run.step + steps <= most_steps and not run.interrupted():
         count, found = len(trial.gaussians), run.best
-        if found.missing <= 0 and rounds >= SETTLING:
+        if found.missing <= 0 and rounds >= run.policy.max_polishes:
             return
         missing = trial.missing - gain
         if trial.missing <= 0:
             wanted = max(
-                _count_for_gain(run, count, missing, count), math.floor((1 - DROP) * count)
+                _count_for_gain(run, count, missing, count),
+                math.floor((1 - run.policy.max_drop) * count),
             )
-            if wanted == count or -missing < SURPLUS:
+            if wanted == count or -missing < run.policy.surplus:
                 return
-            changed = prune(trial.gaussians, target, wanted, weight, run.cutoff)
+            changed = prune(trial.gaussians, target, wanted, weight)
         elif found.missing <= 0:
             # Between what failed and what was found lies the answer; steps alone may lead there.
             wanted = max(
                 count, _count_for_gain(run, count, missing, (count + len(found.gaussians)) // 2)
             )
-            changed = densify(trial.gaussians, target, wanted, weight, run.cutoff)
+            changed = densify(trial.gaussians, target, wanted, weight)
         else:
             wanted = max(
                 _count_for_gain(run, count, missing, most), math.ceil(least_growth * count)
             )
-            changed = densify(trial.gaussians, target, min(wanted, most), weight, run.cutoff)
+            changed = densify(trial.gaussians, target, min(wanted, most), weight)
             if len(changed) == count:  # no more are allowed, or no place takes from the error
                 return
             least_growth = 2 * least_growth - 1
         rounds += 1
         expected = trial.missing + run.db_per_doubling * math.log2(count / len(changed))
-        trial = run.descend(changed, steps, GENTLE)
-        gain = AGAIN * max(0.0, expected - trial.missing)
+        trial = run.descend(changed, steps, run.policy.polish_rate)
+        gain = run.policy.gain_decay * max(0.0, expected - trial.missing)

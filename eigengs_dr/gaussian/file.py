@@ -3,112 +3,146 @@
 from __future__ import annotations
 
 import os
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codec import egs as packed
 from ..image.color import MAX_CHANNELS, SPACES
-from ..storage import npz as archive
+from ..storage import npz
+from ..storage.npz import BadValue, Field
 
 FORMAT = "eigengs_dr.gaussians"
-VERSION = 1
+VERSION = 2
+"""Version 2 added the cutoff."""
 
-LAYOUT: dict[str, archive.Field] = {
-    "mean": archive.Field("f4", 2),
-    "factor": archive.Field("f4", 2),
-    "color": archive.Field("f4", 2),
-    "background": archive.Field("f4", 1),
-    "size": archive.Field("i8", 1),
-    "space": archive.Field("U", 0),
+CUTOFF = 3.0
+"""Default cutoff in standard deviations. Where a Gaussian is cut off, it has at most
+``exp(-cutoff^2 / 2)`` of its amplitude: 1.1 % at 3, 0.034 % at 4, 3.7e-6 at 5."""
+
+MAX_CUTOFF = 12.0
+"""``exp(-72)`` is below the precision of every format here; the fast exponential needs a bound."""
+
+LAYOUT: dict[str, Field] = {
+    "mean": Field("f4", 2),
+    "factor": Field("f4", 2),
+    "color": Field("f4", 2),
+    "background": Field("f4", 1),
+    "size": Field("i8", 1),
+    "space": Field("U", 0),
 }
-"""What a file holds: the kind and the number of dimensions of each array."""
+"""Arrays of a file of version 1: their kinds and numbers of dimensions."""
+
+CUTOFF_FIELD = Field("f8", 0)
+"""The cutoff, from version 2 on; sets of older files have `CUTOFF`."""
+
+READERS = {b"\x89EGS": "eigengs_dr.codec.egs:read_set"}
+"""Readers of other formats by the first bytes of a file: 'module:function', imported on use.
+``function(path, sections)`` returns a `SetData`."""
 
 Arrays = dict[str, NDArray[Any]]
 
 
-def write(path: str | os.PathLike[str], arrays: Arrays, size: tuple[int, int], space: str) -> None:
-    """Write the arrays of a set, its size and space in single precision, all or nothing.
+class SetData(NamedTuple):
+    """What a file of a set holds.
 
-    Parameters
+    Attributes
     ----------
-    path : path-like
     arrays : dict of ndarray
         Mean (N, 2), factor (N, 3), color (N, C) and background (C,); see `eigengs_dr.Gaussians`.
     size : (int, int)
         Native width and height in pixels.
     space : str
+        One of `eigengs_dr.image.color.SPACES`.
+    cutoff : float
+        Standard deviations.
+    """
+
+    arrays: Arrays
+    size: tuple[int, int]
+    space: str
+    cutoff: float = CUTOFF
+
+
+def write(path: str | os.PathLike[str], data: SetData) -> None:
+    """Write a set in single precision, all or nothing.
 
     Raises
     ------
+    ValueError
+        If the suffix belongs to another format.
     OSError
         If the file cannot be written; an existing one is then as before.
     """
-    members = {name: array.astype(np.float32) for name, array in arrays.items()}
-    members |= {"size": np.array(size, np.int64), "space": np.array(space)}
-    archive.write(path, FORMAT, VERSION, members)
+    if Path(path).suffix.lower() == ".egs":
+        raise ValueError(f"{path}: .egs files are written by eigengs_dr.pack; save as .npz")
+    members = {name: array.astype(np.float32) for name, array in data.arrays.items()}
+    members |= {"size": np.array(data.size, np.int64), "space": np.array(data.space)}
+    npz.write(path, FORMAT, VERSION, members | {"cutoff": np.array(data.cutoff, np.float64)})
 
 
-def read(path: Path, sections: int | None = None) -> tuple[Arrays, tuple[int, int], str]:
-    """Read and check the arrays of a set, its size and space.
-
-    Parameters and errors are those of `eigengs_dr.Gaussians.load`, what is read is as `write` takes
-    it.
-    """
-    if packed.is_egs(path):
-        content = packed.read(path, sections)
-        arrays, size, space = content.arrays(), content.size, content.space
-    elif sections is not None:
-        raise ValueError(f"{path}: has no sections, which only packed files have; leave it out")
-    else:
-        arrays = archive.read(path, FORMAT, VERSION, LAYOUT)
-        size, space = tuple(arrays.pop("size").tolist()), str(arrays.pop("space"))
+def read(path: Path, sections: int | None = None) -> SetData:
+    """Read and check a set; parameters and errors are those of `eigengs_dr.Gaussians.load`."""
+    data = _read(path, sections)
     try:
-        check(arrays, size, space)
-    except archive.BadValue as error:
+        check(data)
+    except BadValue as error:
         raise ValueError(f"{path}: {error}") from None
-    return arrays, (int(size[0]), int(size[1])), space
+    return data
 
 
-def check(arrays: Arrays, size: tuple[int, ...], space: str) -> None:
-    """Raise `archive.BadValue` where arrays, size and space do not make a set.
+def _read(path: Path, sections: int | None) -> SetData:
+    with path.open("rb") as file:
+        start = file.read(max(map(len, READERS)))
+    for magic, reader in READERS.items():
+        if start.startswith(magic):
+            module, function = reader.split(":")
+            data: SetData = getattr(import_module(module), function)(path, sections)
+            return data
+    if sections is not None:
+        raise ValueError(f"{path}: has no sections, which only packed files have; leave it out")
+    version = npz.read_version(path, FORMAT, VERSION)
+    layout = LAYOUT if version < 2 else LAYOUT | {"cutoff": CUTOFF_FIELD}
+    arrays = npz.read(path, FORMAT, VERSION, layout)
+    size, space = tuple(arrays.pop("size").tolist()), str(arrays.pop("space"))
+    cutoff = float(arrays.pop("cutoff", np.array(CUTOFF)))
+    return SetData(arrays, size, space, cutoff)
 
-    Parameters
-    ----------
-    arrays : dict of ndarray
-        Mean, factor, color and background, as `eigengs_dr.Gaussians.from_arrays` takes them.
-    size : tuple of int
-        Width and height, from 1 to 65536 pixels.
-    space : str
-        One of `eigengs_dr.image.color.SPACES`; the number of channels must fit it.
+
+def check(data: SetData) -> None:
+    """Raise `BadValue` where the parts of a set do not fit each other.
+
+    Sides go from 1 to 65536 pixels, the number of channels must fit the space, values are finite, a
+    and c are positive, and the cutoff is in (0, `MAX_CUTOFF`].
     """
+    arrays, size, space, cutoff = data
     mean, factor, color = arrays["mean"], arrays["factor"], arrays["color"]
     if mean.ndim != 2 or mean.shape[1] != 2 or len(mean) == 0:
-        raise archive.BadValue(f"mean has shape {mean.shape}, expected (N, 2) with N >= 1")
+        raise BadValue(f"mean has shape {mean.shape}, expected (N, 2) with N >= 1")
     channels = color.shape[1] if color.ndim == 2 else 3
     if not 1 <= channels <= MAX_CHANNELS:
-        raise archive.BadValue(f"color has {channels} channels, expected 1 to {MAX_CHANNELS}")
+        raise BadValue(f"color has {channels} channels, expected 1 to {MAX_CHANNELS}")
     for name, array, expected in (
         ("factor", factor, (len(mean), 3)),
         ("color", color, (len(mean), channels)),
         ("background", arrays["background"], (channels,)),
     ):
         if array.shape != expected:
-            raise archive.BadValue(f"{name} has shape {array.shape}, expected {expected}")
+            raise BadValue(f"{name} has shape {array.shape}, expected {expected}")
     for name, array in arrays.items():
         if not np.isfinite(array).all():
-            raise archive.BadValue(f"{name} holds values that are not finite")
+            raise BadValue(f"{name} holds values that are not finite")
     if not (factor[:, [0, 2]] > 0).all():
-        raise archive.BadValue("factor has a or c <= 0; both must be positive")
+        raise BadValue("factor has a or c <= 0; both must be positive")
     if len(size) != 2 or not all(side == int(side) and 1 <= side <= 1 << 16 for side in size):
-        raise archive.BadValue(f"size is {size}, expected two sides from 1 to 65536")
+        raise BadValue(f"size is {size}, expected two sides from 1 to 65536")
+    if not 0 < cutoff <= MAX_CUTOFF:
+        raise BadValue(f"cutoff is {cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}")
     if space not in SPACES:
-        raise archive.BadValue(f"space is {space!r}, expected one of {', '.join(SPACES)}")
+        raise BadValue(f"space is {space!r}, expected one of {', '.join(SPACES)}")
     if space in ("ycbcr", "rgb", "linear") and color.shape[1] not in (1, 3, 4):
-        raise archive.BadValue(
-            f"color has {color.shape[1]} channels; space {space!r} has 1, 3 or 4"
-        )
+        raise BadValue(f"color has {color.shape[1]} channels; space {space!r} has 1, 3 or 4")
     if space == "ycbcr" and color.shape[1] != 3:
-        raise archive.BadValue(f"color has {color.shape[1]} channels; space 'ycbcr' has 3")
+        raise BadValue(f"color has {color.shape[1]} channels; space 'ycbcr' has 3")

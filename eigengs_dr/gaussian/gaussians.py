@@ -13,10 +13,10 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.arrays import types_in, types_of, upload_rows
+from ..backend.arrays import types_in, types_of, upload, upload_rows
 from ..backend.selection import select
 from ..storage.npz import BadValue
-from . import file as setfile
+from .file import CUTOFF, SetData, check, read, write
 
 MIN_DEVIATION = 0.25
 """Smallest standard deviation along an axis of the factor, in pixels: what is narrower falls
@@ -47,6 +47,9 @@ class Gaussians:
         Native size in pixels.
     space : str
         What the channels mean, one of `eigengs_dr.image.color.SPACES`.
+    cutoff : float
+        Standard deviations after which a Gaussian ends, in (0, 12]. The error at a point is at most
+        ``exp(-cutoff^2 / 2)`` times the sum of the absolute colours that are left out there.
 
     Examples
     --------
@@ -63,6 +66,7 @@ class Gaussians:
     width: int
     height: int
     space: str = "ycbcr"
+    cutoff: float = CUTOFF
 
     @classmethod
     def from_arrays(
@@ -75,6 +79,7 @@ class Gaussians:
         size: tuple[int, int],
         space: str = "ycbcr",
         backend: str | None = None,
+        cutoff: float = CUTOFF,
     ) -> Gaussians:
         """Upload NumPy arrays.
 
@@ -91,6 +96,8 @@ class Gaussians:
             Native width and height in pixels.
         space : str, optional
         backend : {"llvm", "cuda"}, optional
+        cutoff : float, optional
+            Standard deviations after which a Gaussian ends, in (0, 12].
 
         Raises
         ------
@@ -103,7 +110,7 @@ class Gaussians:
         checked = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
         checked.setdefault("background", np.zeros(checked["color"].shape[1:], np.float32))
         try:
-            setfile.check(checked, size, space)
+            check(SetData(checked, size, space, cutoff))
         except BadValue as error:
             raise ValueError(f"Gaussians: {error}") from None
         types = types_in(select(backend))
@@ -115,6 +122,7 @@ class Gaussians:
             width=index(size[0]),
             height=index(size[1]),
             space=space,
+            cutoff=float(cutoff),  # a NumPy scalar would promote everything to float64
         )
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
@@ -152,7 +160,7 @@ class Gaussians:
         kept = np.atleast_1d(np.arange(len(self), dtype=np.uint32)[selection])
         if not kept.size:
             raise ValueError("Gaussians: the selection is empty; a set has at least one splat")
-        chosen = types.UInt(kept)
+        chosen = upload(types.UInt, kept)
 
         def pick(rows: Any) -> Any:
             whole = [_broadcast(row, len(self)) for row in rows]
@@ -216,10 +224,13 @@ class Gaussians:
 
         Raises
         ------
+        ValueError
+            If the suffix is ``.egs``, which `eigengs_dr.pack` writes.
         OSError
             If the file cannot be written; an existing one is then as before.
         """
-        setfile.write(path, self.to_arrays(), (self.width, self.height), self.space)
+        size = (self.width, self.height)
+        write(path, SetData(self.to_arrays(), size, self.space, self.cutoff))
 
     @classmethod
     def load(
@@ -247,8 +258,8 @@ class Gaussians:
         OSError
             If it cannot be opened.
         """
-        arrays, size, space = setfile.read(Path(path), sections)
-        return cls.from_arrays(**arrays, size=size, space=space, backend=backend)
+        arrays, size, space, cutoff = read(Path(path), sections)
+        return cls.from_arrays(**arrays, size=size, space=space, backend=backend, cutoff=cutoff)
 
 
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
@@ -257,7 +268,7 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     Parameters
     ----------
     sets : sequence of Gaussians
-        At least one; all of the same native size, space, channels and backend.
+        At least one; all of the same native size, space, cutoff, channels and backend.
 
     Raises
     ------
@@ -267,10 +278,10 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     if not sets:
         raise ValueError("concatenate: no sets were given")
     first = sets[0]
-    kinds = {(g.width, g.height, g.space, g.channels, type(g.mean)) for g in sets}
+    kinds = {(g.width, g.height, g.space, g.cutoff, g.channels, type(g.mean)) for g in sets}
     if len(kinds) > 1:
         raise ValueError(
-            "concatenate: sets differ in size, space, channels or backend; "
+            "concatenate: sets differ in size, space, cutoff, channels or backend; "
             "bring them to one size with scaled() first"
         )
     if len(sets) == 1:

@@ -15,6 +15,9 @@ WINDOW = 11
 SIGMA = 1.5
 """Standard deviation of that window, in pixels."""
 
+MAX_PSNR = 100.0
+"""Decibels above which only rounding is left."""
+
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of MS-SSIM from the finest scale to the coarsest, Wang et al. 2003, section 3.2."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from operator import index
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, types_of, upload
+from ..gaussian.file import MAX_CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode, to_coded
 from .kernels import adjoint, channel_sums, forward
@@ -17,19 +19,12 @@ from .layout import gather_run, pack_parameters
 from .parameters import KernelParameters, detached_shape, kernel_radius, kernel_shape
 from .tiles import Grid, TileLists, build_lists
 
-CUTOFF = 3.0
-"""Default cutoff in standard deviations. What is left out of a splat is at any point below
-``exp(-cutoff^2 / 2)`` of its amplitude: 1.1 % at 3, 0.034 % at 4, 3.7e-6 at 5."""
-
-MAX_CUTOFF = 12.0
-"""``exp(-72)`` is below the precision of any format here; the fast exponential needs a bound."""
-
 
 def render(
     gaussians: Gaussians,
     width: int | None = None,
     height: int | None = None,
-    cutoff: float = CUTOFF,
+    cutoff: float | None = None,
 ) -> Any:
     """Render a set of Gaussians at any size.
 
@@ -44,9 +39,7 @@ def render(
         Size of the image in pixels; the native size by default. One of the two gives the other by
         the native aspect ratio.
     cutoff : float, optional
-        Standard deviations after which a splat ends, up to 12. The error at a point is at most
-        ``exp(-cutoff^2 / 2)`` times the sum of the absolute colours of the splats that are cut off
-        there.
+        Standard deviations after which a Gaussian ends, in (0, 12]; by default that of the set.
 
     Returns
     -------
@@ -75,10 +68,10 @@ def render(
     """
     width, height = _size(gaussians, width, height)
     scaled = gaussians.scaled(width, height)
-    cutoff = float(cutoff)  # a NumPy scalar would promote everything to float64
-    parameters = decode_parameters(scaled)
-    lists = bin_gaussians(scaled, cutoff)
-    image = rasterize(parameters, lists, cutoff)
+    if cutoff is not None:
+        scaled = replace(scaled, cutoff=float(cutoff))  # float64 of NumPy would promote everything
+    parameters, lists = decode_parameters(scaled), bin_gaussians(scaled)
+    image = rasterize(parameters, lists, scaled.cutoff)
     return to_tensor(image, lists.grid, len(parameters.background))
 
 
@@ -86,7 +79,7 @@ def picture_of(
     gaussians: Gaussians,
     width: int | None = None,
     height: int | None = None,
-    cutoff: float = CUTOFF,
+    cutoff: float | None = None,
 ) -> NDArray[Any]:
     """Render what is looked at and compared: `render`, but linear light coded as sRGB.
 
@@ -128,7 +121,7 @@ def decode_parameters(gaussians: Gaussians) -> KernelParameters:
     return KernelParameters(kernel_shape(gaussians), color, background)
 
 
-def bin_gaussians(gaussians: Gaussians, cutoff: float = CUTOFF, pad: float = 0.0) -> TileLists:
+def bin_gaussians(gaussians: Gaussians, pad: float = 0.0) -> TileLists:
     """List the splats of every tile of the image at native size; see `eigengs_dr.raster.tiles`.
 
     Raises
@@ -136,13 +129,14 @@ def bin_gaussians(gaussians: Gaussians, cutoff: float = CUTOFF, pad: float = 0.0
     ValueError
         If the cutoff is not in (0, 12].
     """
+    cutoff = gaussians.cutoff
     if not 0 < cutoff <= MAX_CUTOFF:
         raise ValueError(f"cutoff is {cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}")
     grid = Grid(gaussians.width, gaussians.height)
     return build_lists(detached_shape(gaussians), kernel_radius(cutoff), grid, pad)
 
 
-def rasterize(parameters: KernelParameters, lists: TileLists, cutoff: float = CUTOFF) -> Any:
+def rasterize(parameters: KernelParameters, lists: TileLists, cutoff: float) -> Any:
     """Sum Gaussians to an image in tile layout; the differentiable operation behind `render`.
 
     Parameters
@@ -150,7 +144,8 @@ def rasterize(parameters: KernelParameters, lists: TileLists, cutoff: float = CU
     parameters : KernelParameters
     lists : TileLists
         Of these Gaussians, or of where they were a few small steps ago.
-    cutoff : float, optional
+    cutoff : float
+        Standard deviations.
 
     Returns
     -------

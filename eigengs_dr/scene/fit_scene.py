@@ -17,17 +17,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
 
-from ..fitting.initializers import dark_weight
+from ..fitting.initializers import FitProblem, dark_weight
 from ..fitting.optimizers.descent import descend
 from ..fitting.placement.adaptive import place_adaptive
 from ..fitting.presets import PRESETS
 from ..fitting.solvers.conjugate_gradient import solve
+from ..gaussian.covariance import max_deviation
+from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.color import to_coded, to_linear
 from ..image.io import check_image
 from ..image.metrics import psnr as psnr_of
 from ..plugins.cone import PIXEL
-from ..raster.render import CUTOFF, render
+from ..raster.render import render
 from .back_projection import back_project, extrapolate
 from .visibility import Visibility, visibility
 
@@ -241,7 +243,8 @@ def _fit(
     ).bounded()
     start = solve(start, target).gaussians
     schedule = PRESETS["default"].schedule
-    (last,) = deque(descend(start, target, schedule, iterations, weight=weight), maxlen=1)
+    problem = FitProblem(start, target, weight)
+    (last,) = deque(descend(problem, schedule, iterations), maxlen=1)
     return last
 
 
@@ -249,13 +252,10 @@ def _reaches_seen(
     mean: NDArray[Any], factor: NDArray[Any], seen: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Tell which splats may reach a texel that is seen, by their longer axes; at least one."""
-    a, b, c = factor.T
-    middle = 0.5 * (a * a + b * b + c * c)
-    least = (a * c) ** 2 / (middle + np.sqrt(np.maximum(middle**2 - (a * c) ** 2, 0)))
     column = mean[:, 0].astype(int).clip(0, seen.shape[1] - 1)
     row = mean[:, 1].astype(int).clip(0, seen.shape[0] - 1)
     away = distance_transform_edt(~seen)[row, column]
-    return away <= np.maximum(CUTOFF / np.sqrt(least), away.min())
+    return away <= np.maximum(CUTOFF * max_deviation(*factor.T), away.min())
 
 
 def _search_count(

@@ -27,7 +27,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises
     ------
     OSError
-        If the folder is missing or may not be written, or the target is a folder or a device.
+        If the folder is missing or may not be written, the target is a folder or a device, or the
+        disk is full; it names the target.
 
     Examples
     --------
@@ -43,8 +44,11 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         os.replace(temporary, target)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (None, str(temporary)):
+            # A full disk is reported without a name, or with that of the temporary file.
+            raise OSError(error.errno, error.strerror or str(error), str(path)) from error
         raise
 
 

@@ -99,6 +99,11 @@ def read(
         return {key: _member(archive, key, field) for key, field in layout.items()}
 
 
+def read_version(path: str | os.PathLike[str], name: str, version: int) -> int:
+    """Return the version of a file that `write` wrote; parameters and errors as for `read`."""
+    return int(read(path, name, version, {"version": Field("i8", 0)})["version"])
+
+
 def format_of(path: str | os.PathLike[str]) -> str:
     """Return the name of the format of a file that `write` wrote; raises what `read` does."""
     with _opened(Path(path), "eigengs_dr") as archive:

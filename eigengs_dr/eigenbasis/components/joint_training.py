@@ -22,11 +22,12 @@ from ...backend.selection import select
 from ...fitting.optimizers.adan import Adan
 from ...fitting.optimizers.parameterization import CHOLESKY
 from ...fitting.placement.random import place_random
+from ...gaussian.file import CUTOFF
 from ...gaussian.gaussians import Gaussians
 from ...raster.kernels import adjoint, forward
 from ...raster.layout import pack_parameters
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
-from ...raster.render import CUTOFF, bin_gaussians, to_tiles
+from ...raster.render import bin_gaussians, to_tiles
 from ...raster.tiles import Grid
 
 RATE = 1e-3

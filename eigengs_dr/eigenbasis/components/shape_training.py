@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -20,13 +19,12 @@ from numpy.typing import NDArray
 
 from ...backend.arrays import types_of
 from ...backend.recording import freeze_program
-from ...fitting.optimizers.adam import Adam
 from ...fitting.optimizers.descent import step_program
 from ...fitting.optimizers.schedule import Schedule, lr_factor
 from ...fitting.placement.grid import place_grid
 from ...fitting.solvers.conjugate_gradient import solve
 from ...gaussian.gaussians import Gaussians
-from ...raster.render import CUTOFF, bin_gaussians, to_tiles
+from ...raster.render import bin_gaussians, to_tiles
 from ...raster.tiles import Grid
 
 Planes = NDArray[np.float32]
@@ -40,7 +38,8 @@ SOLVE_STEPS = 30
 third."""
 
 SCHEDULE = Schedule(
-    optimizer=partial(Adam, beta_1=0.9, beta_2=0.99, epsilon=1e-12),
+    optimizer="adam",
+    settings={"beta_1": 0.9, "beta_2": 0.99, "epsilon": 1e-12},
     rates={"mean": 0.02, "factor": 0.02},
     warm_up=0,
 )
@@ -127,15 +126,15 @@ def _round(
 ) -> Gaussians:
     """Take steps from the first to before the last, with an optimiser of their own."""
     first, last, steps = span
-    types, coordinates = types_of(gaussians.mean), SCHEDULE.coordinates
+    types, coordinates = types_of(gaussians.mean), SCHEDULE.variables()
     variables = coordinates.encode(gaussians)
-    optimizer = SCHEDULE.optimizer(1.0)
+    optimizer = SCHEDULE.make_optimizer()
     optimizer.update({name: variables[name] for name in SCHEDULE.rates})
     place_grid = Grid(gaussians.width, gaussians.height)
     whole = np.ones((gaussians.height, gaussians.width, len(components)), np.float32)
     inside = to_tiles(types, whole, place_grid)
     current = gaussians
-    with freeze_program(step_program(coordinates, CUTOFF)) as take_step:
+    with freeze_program(step_program(coordinates)) as take_step:
         for step, image in enumerate(samples(components, eigenvalues, seed, first, last), first):
             solved = solve(current, image, SOLVE_STEPS).gaussians
             fixed = replace(gaussians, color=solved.color, background=solved.background)
@@ -144,7 +143,7 @@ def _round(
                 {name: dr.opaque(types.Float, rate * left) for name, rate in SCHEDULE.rates.items()}
             )
             target = to_tiles(types, image, place_grid)
-            take_step(optimizer, fixed, target, inside, [bin_gaussians(current, CUTOFF)])
+            take_step(optimizer, fixed, target, inside, [bin_gaussians(current)])
             current = coordinates.decode(fixed, dict(optimizer))
             dr.eval(current)
     return dr.detach(current)

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
 from ...backend.arrays import types_of
 from ...backend.recording import freeze_program
 from ...gaussian.gaussians import Gaussians
 from ...raster.parameters import kernel_parameters
-from ...raster.render import CUTOFF, bin_gaussians, rasterize, to_tiles
+from ...raster.render import bin_gaussians, rasterize, to_tiles
 from ...raster.tiles import Grid, TileLists
+from ..initializers import FitProblem
 from .parameterization import Parameterization
 from .schedule import MIN_PHASE_RATIO, Schedule, lr_factor
 
@@ -23,67 +23,61 @@ MSE_EPSILON = 1e-10
 """Mean squared error that is not told from none."""
 
 
-Redistribute = Callable[[Gaussians, int], Gaussians]
-
-
 def descend(
-    gaussians: Gaussians,
-    target: NDArray[np.float32],
-    schedule: Schedule,
-    iterations: int,
-    cutoff: float = CUTOFF,
-    weight: NDArray[np.float32] | None = None,
-    redistribute: Redistribute | None = None,
-    levels: Sequence[int] = (),
-) -> Iterator[Gaussians]:
+    problem: FitProblem, schedule: Schedule, iterations: int, levels: Sequence[int] = ()
+) -> Generator[Gaussians, None, None]:
     """Yield the set before the first step and after every step of gradient descent.
 
-    Parameters are those of `eigengs_dr.fitting.refine.refine`. From what `redistribute` makes of
-    the set after `Schedule.redistribute` steps, a descent of its own goes on: splats are placed
-    anew where they left much error. The first so many splats of each of the `levels` make the image
-    too, as well as they can. Steps run asynchronously: what is yielded may not be computed yet.
+    Parameters
+    ----------
+    problem : FitProblem
+        The start and the aim. If it can redistribute, and the run is long enough, a first phase of
+        `Schedule.redistribute_after` steps shows where error is left; Gaussians are then placed
+        anew, and a descent of its own follows.
+    schedule : Schedule
+    iterations : int
+        Steps in all.
+    levels : sequence of int, optional
+        Numbers of Gaussians, from the first, that shall make the image too, as well as they can.
+
+    Yields
+    ------
+    Gaussians
+        Steps run asynchronously: the arrays of a set may not be computed yet.
     """
-    yield gaussians
-    tried = (
-        schedule.redistribute_after
-        if redistribute and iterations >= MIN_PHASE_RATIO * schedule.redistribute_after
-        else 0
-    )
-    if redistribute and tried:
-        for current in _run_phase(gaussians, target, schedule, tried, cutoff, weight):
+    yield problem.gaussians
+    first = schedule.redistribute_after
+    if problem.redistribute and first > 0 and iterations >= MIN_PHASE_RATIO * first:
+        for current in _run_phase(problem, schedule, first):
             yield current
-        gaussians = redistribute(dr.detach(current), len(current))
-    yield from _run_phase(gaussians, target, schedule, iterations - tried, cutoff, weight, levels)
+        anew = problem.redistribute(dr.detach(current), len(current))
+        problem, iterations = problem._replace(gaussians=anew), iterations - first
+    yield from _run_phase(problem, schedule, iterations, levels)
 
 
 def _run_phase(
-    gaussians: Gaussians,
-    target: NDArray[np.float32],
-    schedule: Schedule,
-    iterations: int,
-    cutoff: float,
-    weight: NDArray[np.float32] | None,
-    levels: Sequence[int] = (),
-) -> Iterator[Gaussians]:
+    problem: FitProblem, schedule: Schedule, iterations: int, levels: Sequence[int] = ()
+) -> Generator[Gaussians, None, None]:
     """Yield the set after every step of one descent.
 
-    Between two builds the tile lists are of where the splats were, enlarged by `schedule.pad`.
+    Between two builds the tile lists are of where the Gaussians were, enlarged by `schedule.pad`.
     """
+    gaussians, target, weight = problem.gaussians, problem.target, problem.weight
     types = types_of(gaussians.mean)
-    coordinates = schedule.coordinates
+    coordinates = schedule.variables()
     start = coordinates.encode(gaussians)
-    optimizer = schedule.optimizer(1.0)
+    optimizer = schedule.make_optimizer()
     optimizer.update({name: start[name] for name in schedule.rates})
     current = gaussians
     grid = Grid(gaussians.width, gaussians.height)
     tiles = to_tiles(types, target, grid)
     weights = to_tiles(types, np.ones_like(target) if weight is None else weight, grid)
     zero = dr.opaque(types.Float, 0)
-    with freeze_program(step_program(coordinates, cutoff, levels)) as take_step:
+    with freeze_program(step_program(coordinates, levels)) as take_step:
         for step in range(iterations):
             if step % schedule.rebuild == 0:
                 lists = [
-                    bin_gaussians(prefix(current, count), cutoff, schedule.pad)
+                    bin_gaussians(prefix(current, count), schedule.pad)
                     for count in (*levels, len(current))
                 ]
             left = lr_factor(schedule, step, iterations)
@@ -98,7 +92,7 @@ def _run_phase(
             yield current
 
 
-def step_program(coordinates: Parameterization, cutoff: float, levels: Sequence[int] = ()) -> Any:
+def step_program(coordinates: Parameterization, levels: Sequence[int] = ()) -> Any:
     """Make the function of a step, to be frozen: traced once, replayed without Python.
 
     A program belongs to one run: a replay does not notice that, say, the betas of another optimiser
@@ -114,7 +108,7 @@ def step_program(coordinates: Parameterization, cutoff: float, levels: Sequence[
         """
         current = coordinates.decode(fixed, dict(optimizer))
         errors = [
-            _error(prefix(current, count), target, weights, listed, cutoff)
+            _error(prefix(current, count), target, weights, listed)
             for count, listed in zip((*levels, len(fixed)), lists, strict=True)
         ]
         # Of several, the sum of their decibels: none is sacrificed for another.
@@ -128,8 +122,8 @@ def step_program(coordinates: Parameterization, cutoff: float, levels: Sequence[
     return step
 
 
-def _error(gaussians: Gaussians, target: Any, weights: Any, lists: TileLists, cutoff: float) -> Any:
-    rendered = rasterize(kernel_parameters(gaussians), lists, cutoff)
+def _error(gaussians: Gaussians, target: Any, weights: Any, lists: TileLists) -> Any:
+    rendered = rasterize(kernel_parameters(gaussians), lists, gaussians.cutoff)
     return dr.mean(dr.square((rendered - target) * weights))
 
 

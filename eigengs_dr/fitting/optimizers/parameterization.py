@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 
 from ...backend.arrays import types_of
+from ...gaussian.covariance import cholesky_from_factor, factor_from_cholesky
 from ...gaussian.gaussians import Gaussians
 
 
@@ -76,11 +77,7 @@ CHOLESKY_BOUND = 0.5
 def _encode_cholesky(g: Gaussians) -> dict[str, Any]:
     types = types_of(g.mean)
     x, y = g.mean
-    a, b, c = g.factor
-    # Sigma = F^-1 F^-T = [[1 / a^2 + b^2 / (a c)^2, -b / (a c^2)], [., 1 / c^2]] = L L^T
-    l1 = dr.sqrt(dr.square(1 / a) + dr.square(b / (a * c)))
-    l2 = -b / (a * c * c * l1)
-    l3 = 1 / (a * c * l1)
+    l1, l2, l3 = cholesky_from_factor(*g.factor)
     return {
         "mean": types.Float2(_atanh(2 * x / g.width - 1), _atanh(2 * y / g.height - 1)),
         "cholesky": types.Float3(l1 - CHOLESKY_BOUND, l2, l3 - CHOLESKY_BOUND),
@@ -98,18 +95,12 @@ def _decode_cholesky(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
         x, y = (0.5 * (dr.tanh(v) + 1) for v in variables["mean"])
         parts["mean"] = type(fixed.mean)(x * fixed.width, y * fixed.height)
     if "cholesky" in variables:
-        parts["factor"] = type(fixed.factor)(_inverse_factor(*variables["cholesky"]))
+        l1, l2, l3 = variables["cholesky"]
+        factor = factor_from_cholesky(l1 + CHOLESKY_BOUND, l2, l3 + CHOLESKY_BOUND)
+        parts["factor"] = type(fixed.factor)(factor)
     if "color" in variables:
         parts["color"] = variables["color"]
     return replace(fixed, **parts)
-
-
-def _inverse_factor(l1: Any, l2: Any, l3: Any) -> tuple[Any, Any, Any]:
-    """``F`` with ``F^T F = (L L^T)^-1``; see `inverse_factor` of the placement."""
-    l1, l3 = l1 + CHOLESKY_BOUND, l3 + CHOLESKY_BOUND
-    yy = dr.square(l2) + dr.square(l3)
-    a = dr.sqrt(yy) / dr.abs(l1 * l3)
-    return a, -l1 * l2 / yy * a, dr.rsqrt(yy)
 
 
 def _project_cholesky(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, Any]:

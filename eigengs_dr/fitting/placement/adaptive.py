@@ -14,9 +14,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ...gaussian.covariance import factor_from_covariance
 from ...image.resize import resample
 from .hilbert_scan import hilbert_order
-from .random import inverse_factor
 
 Array = NDArray[np.floating]
 Density = Callable[[Array, float], Array]
@@ -187,7 +187,7 @@ def shapes_from_hessian(
     along, across = variance * ratio, variance / ratio
     angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the direction that bends the most
     cos, sin = np.cos(angle), np.sin(angle)
-    return inverse_factor(
+    return factor_from_covariance(
         across * cos**2 + along * sin**2,
         (across - along) * cos * sin,
         across * sin**2 + along * cos**2,

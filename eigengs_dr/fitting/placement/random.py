@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...gaussian.covariance import factor_from_covariance
+
 
 def place_random(
     image: NDArray[np.floating], count: int, generator: np.random.Generator
@@ -31,18 +33,4 @@ def place_random(
     height, width = image.shape[:2]
     mean = generator.uniform(0, [width, height], (count, 2))
     l1, l2, l3 = (generator.uniform(0, 1, (count, 3)) + np.array([0.5, 0, 0.5])).T
-    return mean, inverse_factor(l1 * l1, l1 * l2, l2 * l2 + l3 * l3)
-
-
-def inverse_factor(
-    xx: NDArray[np.floating], xy: NDArray[np.floating], yy: NDArray[np.floating]
-) -> NDArray[np.float64]:
-    """Factor the inverse of covariances ``[[xx, xy], [xy, yy]]``: ``Sigma^-1 = F^T F``.
-
-    Returns
-    -------
-    ndarray, shape (N, 3)
-        a, b, c of ``F = [[a, b], [0, c]]``.
-    """
-    a = np.sqrt(yy / (xx * yy - xy * xy))
-    return np.stack([a, -xy / yy * a, 1 / np.sqrt(yy)], axis=-1).astype(np.float64)
+    return mean, factor_from_covariance(l1 * l1, l1 * l2, l2 * l2 + l3 * l3)

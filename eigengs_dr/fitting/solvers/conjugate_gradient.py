@@ -21,7 +21,7 @@ from ...gaussian.gaussians import Gaussians
 from ...raster.kernels import adjoint, channel_sums, forward
 from ...raster.layout import pack_parameters
 from ...raster.parameters import NUM_SHAPE_PARAMS, detached_shape, kernel_radius
-from ...raster.render import CUTOFF, MAX_CUTOFF, bin_gaussians, to_tiles
+from ...raster.render import MAX_CUTOFF, bin_gaussians, to_tiles
 from ...raster.tiles import TileLists
 
 RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}
@@ -48,7 +48,6 @@ def solve(
     gaussians: Gaussians,
     image: NDArray[Any],
     steps: int = 10,
-    cutoff: float = CUTOFF,
     warm_start: bool = False,
 ) -> Solution:
     """Find the colours and the background that fit an image best on fixed shapes.
@@ -64,8 +63,6 @@ def solve(
         At the native size, in the space of the set.
     steps : int, optional
         Steps of the method; stopping early regularises where splats overlap much.
-    cutoff : float, optional
-        See `eigengs_dr.render`.
     warm_start : bool, optional
         Start from the colours and background of the set instead of zero and the image's mean.
 
@@ -84,11 +81,11 @@ def solve(
     if steps < 0:
         raise ValueError(f"solve: steps is {steps}; it must be at least 0")
     with dr.suspend_grad():
-        return _solve(gaussians, image, steps, cutoff, warm_start)
+        return _solve(gaussians, image, steps, warm_start)
 
 
 def inner_products(
-    gaussians: Gaussians, image: NDArray[Any], cutoff: float = CUTOFF, squared: bool = False
+    gaussians: Gaussians, image: NDArray[Any], squared: bool = False
 ) -> NDArray[Any]:
     """Inner products of every splat's weights with an image.
 
@@ -98,8 +95,6 @@ def inner_products(
         Its colours do not count.
     image : ndarray, shape (H, W, C)
         At the native size.
-    cutoff : float, optional
-        See `eigengs_dr.render`.
     squared : bool, optional
         Of the squares of the weights.
 
@@ -111,20 +106,18 @@ def inner_products(
     with dr.suspend_grad():
         types = types_of(gaussians.mean)
         n = len(gaussians)
-        lists = bin_gaussians(gaussians, cutoff)
+        lists = bin_gaussians(gaussians)
         delta = to_tiles(types, np.asarray(image, np.float32), lists.grid)
         shape = detached_shape(gaussians)
         product = _apply_squared if squared else _apply_transposed
-        rows = product(shape, delta, image.shape[2], lists, cutoff)
+        rows = product(shape, delta, image.shape[2], lists, gaussians.cutoff)
         return np.stack([row.numpy()[:n] for row in rows], axis=1)
 
 
-def _solve(
-    gaussians: Gaussians, image: NDArray[Any], steps: int, cutoff: float, warm_start: bool
-) -> Solution:
+def _solve(gaussians: Gaussians, image: NDArray[Any], steps: int, warm_start: bool) -> Solution:
     types = types_of(gaussians.mean)
     n, channels = len(gaussians), gaussians.channels
-    lists = bin_gaussians(gaussians, cutoff)
+    lists = bin_gaussians(gaussians)
     inside = to_tiles(types, np.ones(image.shape, np.float32), lists.grid)
     shape = detached_shape(gaussians)
     if warm_start:
@@ -139,11 +132,11 @@ def _solve(
     dr.eval(shape, unknowns)
 
     residual = to_tiles(types, np.asarray(image, np.float32), lists.grid)
-    residual -= _apply(shape, unknowns, lists, inside, cutoff)
+    residual -= _apply(shape, unknowns, lists, inside, gaussians.cutoff)
     scale = 1 / image.size
     squares = [dr.sum(dr.square(residual)) * scale]
-    r = _apply_transposed(shape, residual, channels, lists, cutoff)
-    inverse = _inverse_diagonal(shape, inside, channels, lists, cutoff)
+    r = _apply_transposed(shape, residual, channels, lists, gaussians.cutoff)
+    inverse = _inverse_diagonal(shape, inside, channels, lists, gaussians.cutoff)
     z = [a * b for a, b in zip(r, inverse, strict=True)]
     p, rz = z, [dr.dot(a, b) for a, b in zip(r, z, strict=True)]
     enough = [RELATIVE_TOLERANCE[types.bits] * a for a in rz]
@@ -153,7 +146,7 @@ def _solve(
     ) as take_step:  # for this solve alone: a program does not notice another N
         for _ in range(steps):
             unknowns, residual, p, rz, square = take_step(
-                shape, unknowns, residual, p, rz, enough, inverse, inside, lists, cutoff
+                shape, unknowns, residual, p, rz, enough, inverse, inside, lists, gaussians.cutoff
             )
             squares.append(square * scale)
     index = dr.arange(types.UInt, n)

@@ -24,7 +24,7 @@ from ...raster.evaluate import weights
 from ...raster.kernels import adjoint
 from ...raster.layout import pack_parameters, unpack_parameters
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
-from ...raster.render import CUTOFF, bin_gaussians, to_tiles
+from ...raster.render import bin_gaussians, to_tiles
 
 GROUP = 3
 """Images that are correlated at once: an image's channels, so that one program serves all."""
@@ -76,8 +76,6 @@ class NormalEquations:
         So many splats, the first ones, fit an image with the background, and the others what is
         left. With large splats below small ones that starts some 0.1 dB below the solution for all
         at once, in which both cancel each other in large numbers: it ends 1 dB lower when refined.
-    cutoff : float, optional
-        See `eigengs_dr.render`.
 
     Raises
     ------
@@ -85,10 +83,10 @@ class NormalEquations:
         If the shapes are so alike that the equations are singular to working precision.
     """
 
-    def __init__(self, gaussians: Gaussians, low: int = 0, cutoff: float = CUTOFF) -> None:
-        self.count, self.cutoff = len(gaussians), cutoff
+    def __init__(self, gaussians: Gaussians, low: int = 0) -> None:
+        self.count, self.radius = len(gaussians), kernel_radius(gaussians.cutoff)
         self.width, self.height = gaussians.width, gaussians.height
-        matrix = weight_matrix(gaussians, cutoff)
+        matrix = weight_matrix(gaussians)
         double = matrix.astype(np.float64)
         self.gram = (double @ double.T).tocsr()
         self.coverage = np.asarray(matrix.sum(axis=1), np.float64)
@@ -97,7 +95,7 @@ class NormalEquations:
         with dr.suspend_grad():
             types = types_of(gaussians.mean)
             self.packed = pack_parameters([*kernel_shape(gaussians), *[types.Float(0)] * GROUP])
-            self.lists = bin_gaussians(gaussians, cutoff)
+            self.lists = bin_gaussians(gaussians)
 
     def _block(self, rows: slice) -> Block:
         """Factorise the equations of some splats."""
@@ -139,9 +137,7 @@ class NormalEquations:
                 missing = [(0, GROUP - len(planes)), (0, 0), (0, 0)]
                 padded = np.pad(planes, missing) if len(planes) < GROUP else planes
                 delta = to_tiles(types, np.moveaxis(padded, 0, 2), self.lists.grid)
-                rows = adjoint(
-                    self.packed, delta, GROUP, self.lists, kernel_radius(self.cutoff), True
-                )
+                rows = adjoint(self.packed, delta, GROUP, self.lists, self.radius, True)
                 dr.eval(rows)
                 for column, row in zip(range(first, first + len(planes)), rows, strict=False):
                     result[:-1, column] = row.numpy()
@@ -201,15 +197,13 @@ class NormalEquations:
         return np.maximum(error, 0)
 
 
-def weight_matrix(gaussians: Gaussians, cutoff: float = CUTOFF) -> csr_array:
+def weight_matrix(gaussians: Gaussians) -> csr_array:
     """Weights of every splat at every pixel of the native size: the transpose of A.
 
     Parameters
     ----------
     gaussians : Gaussians
         N splats; colours are not used.
-    cutoff : float, optional
-        See `eigengs_dr.render`.
 
     Returns
     -------
@@ -228,7 +222,7 @@ def weight_matrix(gaussians: Gaussians, cutoff: float = CUTOFF) -> csr_array:
         arrays["factor"].astype(np.float64),
         gaussians.width,
         gaussians.height,
-        cutoff,
+        gaussians.cutoff,
     )
     size = (len(gaussians), gaussians.width * gaussians.height)
     if len(splat) == 0:  # Dr.Jit does not compute with no elements
@@ -238,7 +232,7 @@ def weight_matrix(gaussians: Gaussians, cutoff: float = CUTOFF) -> csr_array:
         packed = pack_parameters(kernel_shape(gaussians))
         shape = unpack_parameters(packed, upload(types.UInt, splat), NUM_SHAPE_PARAMS)
         px, py = (upload(types.Float, (p + 0.5).astype(np.float32)) for p in (x, y))
-        [values] = weights(shape, px, py, (1, 1), kernel_radius(cutoff))
+        [values] = weights(shape, px, py, (1, 1), kernel_radius(gaussians.cutoff))
     columns = y * gaussians.width + x
     starts = np.concatenate([[0], np.cumsum(np.bincount(splat, minlength=len(gaussians)))])
     return csr_array((values.numpy(), columns, starts.astype(np.int32)), shape=size)

@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 
 from ...backend.arrays import types_of, upload
+from ...gaussian.covariance import max_deviation
 from ..evaluate import widen
 from ..parameters import EXP2_SCALE, kernel_radius
 from .points import Cells, cell_side, list_cells
@@ -76,7 +77,7 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
     types = types_of(shape[0])
     x, y, a, b, c = (np.asarray(s.numpy(), np.float64) for s in shape)
     with np.errstate(all="ignore"):
-        size = _largest_deviation(a, b, c)
+        size = EXP2_SCALE * max_deviation(a, b, c)
         drawn = np.isfinite(x + y + size) & (a > 0) & (c > 0)
         rank = np.ceil(np.log(size / MIN_CLASS_SIZE) / math.log(CLASS_RATIO))
     rank = np.where(drawn, np.maximum(rank, 0), 0).astype(np.int64)
@@ -116,11 +117,3 @@ def _cells_for(shape: list, width: int, height: int, cutoff: float, spread: floa
     widened, _ = widen(shape, [variance, types.Float(0), variance])
     side = max(4, cell_side(width, height, dr.width(shape)))
     return list_cells(widened, width, height, kernel_radius(cutoff), side)
-
-
-def _largest_deviation(a: Any, b: Any, c: Any) -> Any:
-    """Largest standard deviation of a splat, from its factor over `EXP2_SCALE`."""
-    ia, t, ic = 1 / a, -b / (a * c), 1 / c
-    middle = 0.5 * (ia * ia + t * t + ic * ic)
-    root = np.sqrt(np.maximum(middle * middle - (ia * ic) ** 2, 0))
-    return EXP2_SCALE * np.sqrt(middle + root)

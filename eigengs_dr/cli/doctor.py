@@ -1,0 +1,26 @@
+"""``eigengs-dr doctor``: what works on this machine."""
+
+import json
+
+import click
+
+from .options import json_option
+
+
+@click.command()
+@json_option
+@click.pass_context
+def doctor(context: click.Context, as_json: bool) -> None:
+    """Show what works on this machine and what to install.
+
+    Ends with exit code 1 where no backend works.
+
+    \b
+    Example:
+      eigengs-dr doctor
+    """
+    from ..backend import doctor as doctor_module
+
+    found = doctor_module.report()
+    click.echo(json.dumps(found, indent=2) if as_json else doctor_module.describe(found))
+    context.exit(0 if found["llvm"]["works"] or found["cuda"]["works"] else 1)

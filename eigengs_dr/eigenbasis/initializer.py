@@ -1,0 +1,77 @@
+"""The start of a fit that an eigenbasis gives: shapes and colours of a model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..fitting.initializers import FitProblem, FitTarget
+from ..fitting.options import DEFAULT_BASIS, FitOptions
+from ..fitting.solvers.conjugate_gradient import solve
+from ..gaussian.gaussians import Gaussians
+from ..image.color import decode
+from ..image.folder import BASIS_SPACES
+from .eigengs import EigenGS
+from .registry import load_basis
+
+
+def start_from_basis(target: FitTarget, options: FitOptions) -> FitProblem:
+    """Take shapes and colours from a model; an `eigengs_dr.fitting.initializers.Initializer`.
+
+    Raises
+    ------
+    ValueError
+        If the model has another number of Gaussians, space or backend than the options ask for.
+    """
+    model = load_basis(options.basis or DEFAULT_BASIS, options.backend)
+    _check_basis(model, target.pixels, options.gaussians, options.color)
+    encoded = _encode(model, target, options)
+    if options.method.mean != "dense":
+        return FitProblem(encoded, target.values, target.weight)
+    dense = model.dense_mean(encoded.width, encoded.height)
+    base_image = _picture(dense, options.color)
+    return FitProblem(encoded, target.values - dense, target.weight, base_image)
+
+
+def _encode(model: EigenGS, target: FitTarget, options: FitOptions) -> Gaussians:
+    solves = options.method.solves
+    colors = "exact" if solves else "projected"
+    start = model.encode(target.pixels, colors, options.method.mean).bounded()
+    start = replace(start, cutoff=float(options.cutoff))
+    same = (start.width, start.height) == (model.gaussians.width, model.gaussians.height)
+    same &= start.cutoff == model.gaussians.cutoff
+    # At another size or cutoff the colours are not exact.
+    if solves and not same:
+        return solve(start, target.values, options.solve_steps, warm_start=True).gaussians
+    return start
+
+
+def _picture(planes: NDArray[np.float32], color: str) -> NDArray[np.float32]:
+    """RGB that planes add to a rendering; that of zeros is in the rendering already."""
+    shown = np.stack(decode(color, list(np.moveaxis(planes, 2, 0))), axis=2)
+    return shown - np.array(decode(color, [0.0] * planes.shape[2]), np.float32)
+
+
+def _check_basis(
+    model: EigenGS, pixels: NDArray[np.float32], gaussians: int | None, color: str
+) -> None:
+    """Raise ValueError where a basis is not what the other arguments ask for."""
+    count, space = len(model.gaussians), model.gaussians.space
+    if gaussians not in (None, count):
+        raise ValueError(
+            f"gaussians is {gaussians}, but the basis has {count}; leave the number out, use "
+            f"init 'adaptive', or train a basis with --gaussians {gaussians}"
+        )
+    height, width = pixels.shape[:2]
+    if count > width * height:
+        raise ValueError(
+            f"the basis has {count} Gaussians, more than an image of {width}x{height} has pixels; "
+            "use init 'adaptive'"
+        )
+    if color != space:
+        trained = f"train a basis with --color {color}" if color in BASIS_SPACES else "another init"
+        raise ValueError(
+            f"color is {color!r}, but the basis is in {space!r}; use color {space!r}, or {trained}"
+        )

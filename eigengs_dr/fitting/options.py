@@ -1,0 +1,143 @@
+"""Everything that decides a fit beside the image: one record, checked once."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..gaussian.file import CUTOFF, MAX_CUTOFF
+from ..image.color import SPACES
+from ..image.metrics import MAX_PSNR
+from .initializers import INITIALIZERS
+from .presets import PRESETS, Preset
+
+if TYPE_CHECKING:
+    from ..eigenbasis.eigengs import EigenGS
+
+DEFAULT_COUNT = 5000
+"""Gaussians if no number is asked for."""
+
+DEFAULT_BASIS = "natural"
+"""The basis if none is named: the one that ships with the package."""
+
+COLOR_PARAMETERS = 5
+"""Parameters of a Gaussian beside its colour: two of the mean and three of the factor."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitOptions:
+    """The options of `eigengs_dr.fit`, which describes each of them.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range or two of them exclude each other; one line that names it.
+    """
+
+    gaussians: int | None = None
+    iterations: int = 1000
+    init: str = "auto"
+    basis: str | os.PathLike[str] | EigenGS | None = None
+    preset: str = "default"
+    solve_steps: int = 10
+    color: str = "ycbcr"
+    seed: int = 0
+    backend: str | None = None
+    cutoff: float = CUTOFF
+    target_psnr: float | None = None
+    target_space: str = "ycbcr"
+    max_gaussians: int | None = None
+
+    def __post_init__(self) -> None:
+        self._check_numbers()
+        for name, value, known in (
+            ("init", self.init, ("auto", *INITIALIZERS)),
+            ("preset", self.preset, tuple(PRESETS)),
+            ("color", self.color, SPACES),
+            ("target_space", self.target_space, ("ycbcr", "rgb")),
+        ):
+            if value not in known:
+                raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(known)}")
+        if self.method.mean == "dense" and self.init not in ("auto", "eigen"):
+            raise ValueError(
+                f"preset {self.preset!r} starts from a basis; use init 'auto', not {self.init!r}"
+            )
+        if self.basis is not None and self.initializer != "eigen":
+            raise ValueError(
+                f"init {self.init!r} uses no basis; leave the basis out, or use init 'eigen'"
+            )
+        self._check_search()
+
+    @property
+    def method(self) -> Preset:
+        """The preset."""
+        return PRESETS[self.preset]
+
+    @property
+    def initializer(self) -> str:
+        """The name of the initialiser: a basis implies "eigen", "auto" is that of the preset."""
+        if self.init != "auto":
+            return self.init
+        return "eigen" if self.basis is not None else self.method.init
+
+    def check_image(self, pixels: NDArray[np.float32]) -> None:
+        """Raise ValueError if an image (H, W, C) has fewer pixels than Gaussians are asked for."""
+        height, width = pixels.shape[:2]
+        for name in ("gaussians", "max_gaussians"):
+            count = getattr(self, name)
+            if count is not None and not 1 <= count <= width * height:
+                raise ValueError(
+                    f"{name} is {count}; an image of {width}x{height} takes 1 to {width * height}"
+                )
+
+    def count_for(self, pixels: NDArray[np.float32]) -> int:
+        """Return the number of Gaussians for an image (H, W, C) that is not searched for."""
+        return self.gaussians or default_count(pixels.shape[0] * pixels.shape[1])
+
+    def _check_numbers(self) -> None:
+        counts = {name: getattr(self, name) for name in ("iterations", "solve_steps", "seed")}
+        for name in ("gaussians", "max_gaussians"):
+            if getattr(self, name) is not None:
+                counts[name] = getattr(self, name)
+        for name, count in counts.items():
+            if not isinstance(count, (int, np.integer)) or count < 0:
+                raise ValueError(f"{name} is {count!r}; it must be at least 0, and whole")
+        if not 0 < self.cutoff <= MAX_CUTOFF:
+            raise ValueError(
+                f"cutoff is {self.cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}"
+            )
+
+    def _check_search(self) -> None:
+        """Refuse what a search for the smallest number of Gaussians cannot do."""
+        if self.target_psnr is None:
+            if self.max_gaussians is not None or self.target_space != "ycbcr":
+                raise ValueError(
+                    "max_gaussians and target_space belong to target_psnr; give it, too"
+                )
+            return
+        if self.gaussians is not None:
+            raise ValueError("gaussians and target_psnr exclude each other; give one of them")
+        if self.preset != "default" or self.initializer != "adaptive":
+            raise ValueError(
+                "target_psnr works with preset 'default' and init 'adaptive', not with "
+                f"{self.preset!r} and {self.initializer!r}"
+            )
+        if not 0 < self.target_psnr <= MAX_PSNR:
+            raise ValueError(
+                f"target_psnr is {self.target_psnr}; it must be above 0 and at most {MAX_PSNR:g}"
+            )
+
+
+def default_count(pixels: int) -> int:
+    """Return the number of Gaussians if none is asked for: `DEFAULT_COUNT`, at most one a pixel."""
+    return min(DEFAULT_COUNT, pixels)
+
+
+def max_gaussians_for(pixels: NDArray[np.float32]) -> int:
+    """Return how many Gaussians have as many parameters as an image (H, W, C) has numbers."""
+    channels = pixels.shape[2]
+    return max(1, pixels.size // (COLOR_PARAMETERS + channels))

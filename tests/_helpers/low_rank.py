@@ -1,0 +1,44 @@
+"""Families of low rank, and what two bases have to share."""
+
+from functools import cache
+
+import numpy as np
+
+from eigengs_dr.eigenbasis.basis import Eigenbasis
+from eigengs_dr.image.folder import to_planes
+from eigengs_dr.image.io import check_image
+
+WIDTH, HEIGHT = SIZE = (14, 11)
+PIXELS = WIDTH * HEIGHT
+
+
+def family(count=60, directions=20, noise=0.004, seed=0, size=SIZE):
+    """RGB images of low rank with falling variances, and noise."""
+    rng = np.random.default_rng(seed)
+    basis = rng.normal(size=(directions, size[1], size[0], 3))
+    weights = rng.normal(size=(count, directions)) * 0.06 * 0.8 ** np.arange(directions)
+    images = (
+        0.5 + np.tensordot(weights, basis, 1) + noise * rng.normal(size=(count, *basis[0].shape))
+    )
+    return np.clip(images, -0.4, 1.4).astype(np.float32)
+
+
+def planes(images, space="ycbcr"):
+    """Images as planes of their channels, shape (count, 3, pixels)."""
+    return np.stack([to_planes(check_image(image), space) for image in images])
+
+
+def assert_same(a, b):
+    """Equal to the last bit."""
+    for name in ("mean", "variance", "examples", "count", "space"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), name)
+    for name in ("components", "eigenvalues"):
+        for x, y in zip(getattr(a, name), getattr(b, name), strict=True):
+            assert x.dtype == y.dtype
+            np.testing.assert_array_equal(x, y, name)
+
+
+@cache
+def basis_of(space):
+    """Components of `family`: 12 of the first channel, 5 of the others."""
+    return Eigenbasis.from_images(family(), SIZE, (12, 5, 5), color=space)

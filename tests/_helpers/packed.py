@@ -1,0 +1,29 @@
+"""What tests of packed sets share."""
+
+import tracemalloc
+from functools import cache
+
+import eigengs_dr as eg
+from _helpers.families import family
+from eigengs_dr.codec.quantization import Steps
+
+STEPS = Steps(0.25, 0.125, 0.0625, 0.03125)
+SPACES = [("ycbcr", 3), ("rgb", 1), ("rgb", 4), ("linear", 3), ("data", 2)]
+"""Spaces of colours, and numbers of channels."""
+
+
+@cache
+def small_fit():
+    """A fit of 100 splats, and its image."""
+    image = family(1, side=32, seed=5)[0]
+    return eg.fit(image, 100, iterations=60, backend="llvm").gaussians, image
+
+
+def peak(work):
+    """Most bytes that Python and NumPy hold at once, beside what they held before."""
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()

@@ -1,0 +1,30 @@
+"""Programs in a Python of their own."""
+
+import os
+import subprocess
+import sys
+
+SELECT = """
+import eigengs_dr
+from eigengs_dr.backend.selection import BackendError, select
+try:
+    types = select("llvm")
+except BackendError as error:
+    print(error)
+else:
+    import drjit as dr
+    print(dr.clip(types.Float(1, 2, 3), 0, 2))
+"""
+
+
+def run_python(code, **environment):
+    """Run code in a fresh interpreter, with environment variables set, or unset by None."""
+    merged = {**os.environ, **environment}
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={key: value for key, value in merged.items() if value is not None},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=250,  # a library that is read for the first time may take minutes
+    )

@@ -1,0 +1,42 @@
+"""A picture of waves and an edge, the start of its refinement, and what is reached."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from _helpers.sets import random_scene
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.image.color import rgb_to_ycbcr
+
+SIDE, SPLATS = 32, 100
+"""Size of the pictures that are fitted, and splats in a fit: one set of kernels."""
+
+presets = pytest.mark.parametrize("preset", PRESETS)
+
+
+def picture(height=SIDE, width=SIDE):
+    """Waves and an edge, in RGB."""
+    y, x = np.indices((height, width)) / SIDE
+    waves = [np.sin(9 * x + 4 * y), np.sin(5 * y * y), np.cos(7 * x * y + 1)]
+    image = 0.5 + 0.3 * np.stack(waves, axis=-1)
+    image[(x - 0.3) ** 2 + (y - 0.6) ** 2 < 0.05] *= 0.4
+    return image.astype(np.float32)
+
+
+def figures(result):
+    """PSNR in YCbCr of all rows of the trace."""
+    return [row["psnr_ycbcr"] for row in result.trace]
+
+
+def start(backend, count=SPLATS, seed=0):
+    """Splats at random places, in YCbCr, and the picture there."""
+    scene = random_scene(seed, count, (SIDE, SIDE))
+    mean = np.clip(scene.mean, 0, SIDE)
+    gaussians = scene._replace(mean=mean, color=0 * scene.color).on(backend, space="ycbcr")
+    return gaussians, rgb_to_ycbcr(picture())
+
+
+def default(**changed):
+    """The schedule of the default preset, changed."""
+    return replace(PRESETS["default"].schedule, **changed)

@@ -1,0 +1,113 @@
+"""Which libLLVM is taken, and that a bad one is an error of one line, never a crash."""
+
+import os
+import sys
+
+import pytest
+
+from _helpers.process import SELECT, run_python
+from eigengs_dr.backend import libllvm as module
+from eigengs_dr.backend.libllvm import PATH_VARIABLE, candidates, select_libllvm
+
+SYSTEMS = ("libllvm19", "Debian", "Ubuntu", "Fedora", "macOS", "Windows")
+
+
+def refusal(library):
+    """What `select` says where `library` is forced; it has to be all that is said."""
+    process = run_python(SELECT, **{PATH_VARIABLE: str(library)})
+    assert process.returncode == 0, process.stderr
+    assert process.stderr == ""
+    assert process.stdout.count("\n") == 1
+    return process.stdout
+
+
+def installed(*versions):
+    return [library.path for library in candidates() if library.version in versions]
+
+
+@pytest.mark.skipif(not installed(15, 16), reason="needs LLVM 15 or 16, which crash Dr.Jit")
+def test_forced_crashing_llvm_is_refused():
+    message = refusal(installed(15, 16)[0])
+    assert "crashes Dr.Jit" in message
+    assert all(name in message for name in SYSTEMS)
+
+
+@pytest.mark.skipif(not installed(14), reason="needs LLVM 14, which Dr.Jit refuses")
+def test_forced_old_llvm_is_refused():
+    message = refusal(installed(14)[0])
+    assert "LLVM 14" in message
+    assert all(name in message for name in SYSTEMS)
+
+
+def test_missing_llvm_is_refused(tmp_path):
+    message = refusal(tmp_path / "libLLVM.so")
+    assert "does not exist" in message
+    assert all(name in message for name in SYSTEMS)
+
+
+def test_other_library_is_refused(tmp_path):
+    (tmp_path / "libLLVM.so").write_bytes(b"INPUT(libLLVM-19.so)")
+    assert "is no libLLVM" in refusal(tmp_path / "libLLVM.so")
+
+
+@pytest.mark.skipif(not installed(*range(17, 30)), reason="needs an LLVM that works")
+def test_newest_installed_llvm_works():
+    process = run_python(SELECT, **{PATH_VARIABLE: None})
+    assert (process.stdout, process.stderr) == ("[1, 2, 2]\n", "")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder that is the only place where libraries are looked for, before Dr.Jit is imported."""
+    monkeypatch.setattr(module, "_patterns", lambda: [str(tmp_path / "libLLVM*.so*")])
+    # Set and removed, so that whatever `select_libllvm` sets is taken back.
+    monkeypatch.setenv(PATH_VARIABLE, "")
+    monkeypatch.delitem(sys.modules, "drjit", raising=False)
+    return tmp_path
+
+
+def add_library(folder, name, size=2_000_000):
+    with open(folder / name, "wb") as file:
+        file.truncate(size)
+
+
+def test_newest_is_chosen(folder):
+    for name in ("libLLVM-14.so.1", "libLLVM.so.19.1", "libLLVM.so.20.1", "libLLVM-15.so.1"):
+        add_library(folder, name)
+    add_library(folder, "libLLVM-22.so", size=30)  # a linker script
+    os.symlink(folder / "gone", folder / "libLLVM-21.so")
+    assert [library.version for library in candidates()] == [20, 19, 15, 14]
+    select_libllvm()
+    assert os.environ[PATH_VARIABLE] == str(folder / "libLLVM.so.20.1")
+
+
+def test_old_ones_are_not_chosen(folder):
+    for name in ("libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM-16.so.1"):
+        add_library(folder, name)
+    select_libllvm()
+    assert os.environ[PATH_VARIABLE] == ""
+
+
+def test_choice_of_the_user_stays(folder, monkeypatch):
+    add_library(folder, "libLLVM.so.19.1")
+    monkeypatch.setenv(PATH_VARIABLE, "/my/libLLVM.so")
+    select_libllvm()
+    assert os.environ[PATH_VARIABLE] == "/my/libLLVM.so"
+
+
+@pytest.mark.parametrize(
+    ("path", "version"),
+    [
+        ("/usr/lib/x86_64-linux-gnu/libLLVM.so.19.1", 19),
+        ("/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1", 15),
+        ("/usr/lib/llvm-14/lib/libLLVM.so", 14),
+        ("/usr/lib64/llvm18/lib64/libLLVM.so", 18),
+        ("/opt/homebrew/opt/llvm@20/lib/libLLVM.dylib", 20),
+        ("/opt/homebrew/Cellar/llvm/21.1.2/lib/libLLVM.dylib", 21),
+        ("/opt/local/libexec/llvm-19/lib/libLLVM.dylib", 19),
+        (r"C:\Program Files\LLVM\bin\LLVM-C.dll", None),
+        ("/opt/conda/lib/libLLVM.so", None),
+    ],
+)
+def test_version_in_names(path, version):
+    assert module._version_in(path) == version

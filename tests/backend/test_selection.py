@@ -1,0 +1,73 @@
+"""Which backend is selected, and what is said where there is none."""
+
+import json
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from _helpers.process import SELECT, run_python
+from eigengs_dr.backend import libllvm as module
+from eigengs_dr.backend.libllvm import PATH_VARIABLE
+from eigengs_dr.backend.selection import BackendError, describe, select
+
+
+def fake_drjit(monkeypatch, *, llvm, version):
+    """Put a Dr.Jit in place that has no GPU, and an LLVM backend or none."""
+    kinds = SimpleNamespace(CUDA="cuda", LLVM="llvm")
+    drjit = SimpleNamespace(
+        JitBackend=kinds,
+        has_backend=lambda kind: llvm and kind == "llvm",
+        detail=SimpleNamespace(llvm_version=lambda: version),
+    )
+    monkeypatch.setitem(sys.modules, "drjit", drjit)
+    monkeypatch.delenv(PATH_VARIABLE, raising=False)
+
+
+def test_machine_without_llvm(monkeypatch):
+    fake_drjit(monkeypatch, llvm=False, version=(-1, -1, -1))
+    monkeypatch.setattr(module, "candidates", lambda: [])
+    with pytest.raises(BackendError, match=r"no libLLVM was found; install LLVM 17.*libllvm19"):
+        select()
+
+
+def test_machine_with_old_llvm_only(monkeypatch):
+    fake_drjit(monkeypatch, llvm=True, version=(15, 0, 6))
+    monkeypatch.setattr(module, "candidates", lambda: [])
+    with pytest.raises(BackendError, match=r"LLVM 15, which crashes.*libllvm19"):
+        select("llvm")
+
+
+def test_cuda_without_gpu(monkeypatch):
+    fake_drjit(monkeypatch, llvm=True, version=(19, 1, 7))
+    with pytest.raises(BackendError, match=r"no CUDA GPU or driver was found; use backend 'llvm'"):
+        select("cuda")
+
+
+def test_drjit_that_cannot_be_imported(tmp_path):
+    # What Dr.Jit 1.5.0 does where libatomic is missing, as on a bare Debian.
+    (tmp_path / "drjit.py").write_text(
+        "try:\n    raise ImportError('libatomic.so.1: cannot open shared object file')\n"
+        "except ImportError:\n    undefined_name\n"
+    )
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n{SELECT}"
+    process = run_python(code)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.count("\n") == 1
+    assert "libatomic.so.1" in process.stdout
+    assert "apt install libatomic1" in process.stdout
+
+
+def test_unknown_backend():
+    with pytest.raises(ValueError, match="'metal' is unknown"):
+        select("metal")
+
+
+def test_describe(backend):
+    found = describe(backend)
+    assert found["backend"] == backend
+    assert found["threads"] >= 1
+    assert found["versions"]["drjit"].startswith("1.")
+    if backend == "llvm":
+        assert int(found["versions"]["libllvm"].split(".")[0]) >= module.MIN_VERSION
+    json.dumps(found)

@@ -1,0 +1,46 @@
+"""Files that commands read and write."""
+
+import pytest
+from PIL import Image
+
+from _helpers.command import SMALL, run, smooth_pixels, succeeded
+from _helpers.photos import random_fields
+
+
+@pytest.fixture
+def photo(tmp_path):
+    path = tmp_path / "photo.png"
+    Image.fromarray(smooth_pixels(32, 32)).save(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def fitted(tmp_path_factory):
+    """The outputs of one small fit; tests read them only."""
+    folder = tmp_path_factory.mktemp("fitted")
+    Image.fromarray(smooth_pixels(32, 24)).save(folder / "photo.png")
+    outputs = ["-o", folder / "fit.npz", "--report", folder / "fit.json"]
+    settings = ["--gaussians", 50, "--iterations", 5, "--preview", folder / "both.png"]
+    result = succeeded(run("fit", folder / "photo.png", *outputs, *settings))
+    return folder, result
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory):
+    """A folder with images, a model of them and all that was said of it; tests read them only."""
+    folder = tmp_path_factory.mktemp("trained")
+    random_fields(folder / "photos", 12)
+    outputs = ["-o", folder / "m.npz", "--report", folder / "m.json", "--preview", folder / "m.png"]
+    result = run("train", folder / "photos", *outputs, *SMALL, "--frequency-aware", "yes")
+    return folder, succeeded(result)
+
+
+@pytest.fixture
+def existing(tmp_path):
+    """An output file of an earlier run, which a refused run has to leave as it is."""
+    path = tmp_path / "existing.npz"
+    path.write_bytes(b"earlier")
+    before = sorted(tmp_path.iterdir())
+    yield path
+    assert path.read_bytes() == b"earlier"
+    assert set(before) <= set(tmp_path.iterdir())

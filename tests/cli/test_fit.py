@@ -1,0 +1,289 @@
+"""The command `fit`: results, reports, and one line and exit code 2 for every mistake."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import eigengs_dr as eg
+from _helpers.command import assert_refused, previewed, run, smooth_pixels, succeeded
+from _helpers.halves import picture
+from eigengs_dr.backend.selection import BackendError, select
+from eigengs_dr.cli.main import main
+from eigengs_dr.eigenbasis import registry as bases
+from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.fitting.initializers import INITS
+from eigengs_dr.image.color import SPACES, YCBCR_TO_RGB
+
+
+def test_fit_says_what_it_did(fitted):
+    folder, result = fitted
+    for word in ("50 Gaussians", "5 iterations", "psnr_ycbcr", "psnr_rgb", folder / "both.png"):
+        assert str(word) in result.stdout
+
+
+def test_fit_report(fitted):
+    folder, _ = fitted
+    report = json.loads((folder / "fit.json").read_text())
+    expected = {"gaussians": 50, "width": 32, "height": 24, "seed": 0, "stopped": "iterations"}
+    assert {key: report[key] for key in expected} == expected
+    assert report["input"] == str(folder / "photo.png")
+    assert report["output"] == str(folder / "fit.npz")
+    assert report["command"].startswith("eigengs-dr fit ")
+    assert "--iterations 5" in report["command"]
+    assert report["backend"] in ("llvm", "cuda")
+    assert report["threads"] >= 1
+    assert report["versions"]["drjit"]
+    assert report["iterations"] == 5
+    assert report["psnr_ycbcr"] > report["psnr_rgb"] > 15
+    assert 0 < report["ssim"] <= 1
+    assert 0 < report["ms_ssim"] <= 1
+    assert 0 <= report["seconds_init"] <= report["seconds"]
+    assert {"iteration", "seconds", "psnr_ycbcr", "psnr_rgb"} <= set(report["trace"][-1])
+
+
+def test_fit_preview_is_photo_fit_and_outlines(fitted):
+    folder, result = fitted
+    photo, fit, outlines = previewed(folder / "both.png")
+    assert photo.shape == fit.shape == outlines.shape == (24, 32, 3)
+    assert np.array_equal(photo, smooth_pixels(32, 24))
+    assert np.abs(fit.astype(int) - photo).mean() < 30
+    assert outlines.mean() > fit.mean() + 20
+    assert "both.png (photo, fit and outlines side by side)" in result.stdout
+
+
+def test_quiet(photo, tmp_path):
+    result = run(
+        "fit", photo, "-o", tmp_path / "x.npz", "--gaussians", 9, "--iterations", 1, "--quiet"
+    )
+    assert succeeded(result).output == ""
+
+
+def test_fit_uses_at_most_one_gaussian_a_pixel_by_default(tmp_path):
+    Image.fromarray(smooth_pixels(6, 4)).save(tmp_path / "small.png")
+    arguments = ["-o", tmp_path / "x.npz", "--iterations", 0]
+    succeeded(run("fit", tmp_path / "small.png", *arguments))
+    info = json.loads(run("info", tmp_path / "x.npz", "--json").stdout)
+    assert info["gaussians"] == 24
+
+
+def test_fit_several_images_into_folders(photo, tmp_path):
+    other = tmp_path / "other.png"
+    Image.fromarray(smooth_pixels(20, 30)).save(other)
+    settings = ["--gaussians", 20, "--iterations", 1, "--report", tmp_path / "r.json"]
+    folders = ["-o", tmp_path / "fits", "--preview", tmp_path / "previews"]
+    succeeded(run("fit", photo, other, *folders, *settings))
+    assert sorted(path.name for path in (tmp_path / "fits").iterdir()) == ["other.npz", "photo.npz"]
+    assert (tmp_path / "previews" / "other.png").exists()
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert [row["width"] for row in report["images"]] == [32, 20]
+    assert "versions" in report
+
+
+SMALL_IMAGES = {
+    "one-pixel": lambda: Image.fromarray(smooth_pixels(1, 1)),
+    "one-row": lambda: Image.fromarray(smooth_pixels(17, 1)),
+    "one-column": lambda: Image.fromarray(smooth_pixels(1, 17)),
+    "grey": lambda: Image.fromarray(smooth_pixels(20, 12, 1)[..., 0]),
+    "16-bit": lambda: Image.fromarray(smooth_pixels(20, 12, 1)[..., 0].astype(np.uint16) * 257),
+    "palette": lambda: Image.fromarray(smooth_pixels(20, 12)).quantize(16),
+    "constant": lambda: Image.new("RGB", (20, 12), (10, 200, 90)),
+    "black": lambda: Image.new("RGB", (20, 12)),
+}
+
+
+@pytest.mark.parametrize("kind", SMALL_IMAGES)
+def test_unusual_images_fit(kind, tmp_path):
+    SMALL_IMAGES[kind]().save(tmp_path / "x.png")
+    fits_without_nan(tmp_path / "x.png", notes=0)
+
+
+def test_cmyk_fits(tmp_path):
+    Image.fromarray(smooth_pixels(20, 12)).convert("CMYK").save(tmp_path / "x.jpg")
+    fits_without_nan(tmp_path / "x.jpg", notes=0)
+
+
+def test_alpha_fits_with_a_note(tmp_path):
+    Image.fromarray(smooth_pixels(20, 12, 4), "RGBA").save(tmp_path / "x.png")
+    assert "white" in fits_without_nan(tmp_path / "x.png", notes=1)
+
+
+def test_animated_fits_with_a_note(tmp_path):
+    first, second = (Image.fromarray(smooth_pixels(20, n)) for n in (12, 12))
+    second.putpixel((0, 0), (0, 0, 0))
+    first.save(tmp_path / "x.gif", save_all=True, append_images=[second])
+    assert "2 frames" in fits_without_nan(tmp_path / "x.gif", notes=1)
+
+
+def fits_without_nan(path, notes):
+    """Fit an image in a few iterations; return what was said on standard error."""
+    output, report = path.parent / "out.npz", path.parent / "out.json"
+    result = succeeded(run("fit", path, "-o", output, "--iterations", 3, "--report", report))
+    assert result.stderr.count("\n") == result.stderr.count("eigengs-dr: note: ") == notes
+    figures = json.loads(report.read_text())
+    # Null stands for infinity, which equal images have.
+    assert figures["psnr_rgb"] is None or figures["psnr_rgb"] > 5
+    with np.load(output, allow_pickle=False) as file:
+        arrays = [file[key] for key in file.files]
+    assert all(np.isfinite(array).all() for array in arrays if array.dtype.kind == "f")
+    return result.stderr
+
+
+def test_missing_image(tmp_path, existing):
+    assert_refused(run("fit", tmp_path / "gone.png", "-o", existing), "gone.png")
+
+
+def test_folder_as_image(tmp_path, existing):
+    assert_refused(run("fit", tmp_path, "-o", existing), tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"this is text, not a picture\n"])
+def test_file_that_is_no_image(tmp_path, existing, content):
+    (tmp_path / "x.png").write_bytes(content)
+    assert_refused(run("fit", tmp_path / "x.png", "-o", existing), "x.png")
+
+
+def test_truncated_image(photo, existing):
+    photo.write_bytes(photo.read_bytes()[:300])
+    assert_refused(run("fit", photo, "-o", existing), photo)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "word"),
+    [
+        ("--gaussians", 0, "gaussians"),
+        ("--gaussians", -5, "gaussians"),
+        ("--gaussians", "many", "gaussians"),
+        ("--gaussians", 1025, "1025"),
+        ("--iterations", -1, "iterations"),
+        ("--init", "nowhere", "init"),
+        ("--seed", -1, "seed"),
+    ],
+)
+def test_bad_settings(photo, existing, option, value, word):
+    assert_refused(run("fit", photo, "-o", existing, option, value), word)
+
+
+def test_cuda_without_gpu(photo, existing):
+    try:
+        select("cuda")
+    except BackendError:
+        assert_refused(run("fit", photo, "-o", existing, "--backend", "cuda"), "CUDA", "llvm")
+    else:
+        pytest.skip("this machine has a GPU")
+
+
+def test_interrupted_fit_is_kept(photo, tmp_path, monkeypatch):
+    complete = eg.fit
+
+    def interrupted(*arguments, **settings):
+        result = complete(*arguments, **settings)
+        return result._replace(stopped="interrupted")
+
+    monkeypatch.setattr(eg, "fit", interrupted)
+    settings = ["--gaussians", 20, "--iterations", 1, "--report", tmp_path / "r.json"]
+    result = run("fit", photo, "-o", tmp_path / "x.npz", *settings)
+    assert result.exit_code == 130
+    assert result.stderr.count("\n") == 1
+    assert "interrupted" in result.stderr
+    assert json.loads((tmp_path / "r.json").read_text())["stopped"] == "interrupted"
+    assert succeeded(run("info", tmp_path / "x.npz"))
+
+
+def test_interrupted_before_there_is_a_fit(photo, existing, monkeypatch):
+    def interrupted(*arguments, **settings):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(eg, "fit", interrupted)
+    result = run("fit", photo, "-o", existing)
+    assert result.exit_code == 130
+    assert result.stderr.strip() == "eigengs-dr: interrupted"
+
+
+def test_fit_from_an_eigenbasis(trained, photo, tmp_path):
+    folder, _ = trained
+    start = ["--init", "eigen", "--basis", folder / "m.npz", "--report", tmp_path / "r.json"]
+    succeeded(run("fit", photo, "-o", tmp_path / "x.npz", *start, "--iterations", 30))
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["gaussians"] == 60
+    assert report["basis"] == str(folder / "m.npz")
+    model = EigenGS.load(folder / "m.npz")
+    image = eg.load_image(photo)
+    encoded = eg.psnr(image, eg.render(model.encode(image)).numpy(), space="ycbcr")
+    assert report["trace"][0]["psnr_ycbcr"] == pytest.approx(encoded, abs=0.1)
+    assert report["psnr_ycbcr"] > encoded
+
+
+def test_the_basis_is_read_once(trained, photo, tmp_path, monkeypatch):
+    folder, _ = trained
+    loaded = []
+    load = EigenGS.load
+    monkeypatch.setattr(EigenGS, "load", lambda *given: loaded.append(given) or load(*given))
+    start = ["--init", "eigen", "--basis", folder / "m.npz", "--iterations", 0]
+    shutil.copy(photo, tmp_path / "other.png")
+    succeeded(run("fit", photo, tmp_path / "other.png", "-o", tmp_path / "fits", *start))
+    assert len(loaded) == 1
+
+
+def test_the_papers_form_lacks_the_mean_image(trained, photo, tmp_path):
+    folder, _ = trained
+    options = ["--preset", "eigengs", "--basis", folder / "m.npz", "--iterations", 2]
+    outputs = ["-o", tmp_path / "x.npz", "--preview", tmp_path / "both.png"]
+    result = succeeded(run("fit", photo, *outputs, *options))
+    assert result.stderr.count("\n") == 1
+    assert "note: " in result.stderr
+    assert "mean image is kept in the basis" in result.stderr
+    _, fit, _ = previewed(tmp_path / "both.png")
+    model = EigenGS.load(folder / "m.npz")
+    added = model.dense_mean(32, 32) @ YCBCR_TO_RGB.T
+    saved = eg.render(eg.Gaussians.load(tmp_path / "x.npz")).numpy()
+    shown = np.clip(saved + added, 0, 1) * 255
+    assert np.abs(shown - fit).max() < 1.5
+
+
+def test_bases_that_do_not_fit(trained, fitted, photo, existing, tmp_path):
+    folder, _ = trained
+    eigen = ["fit", photo, "-o", existing, "--init", "eigen"]
+    model = folder / "m.npz"
+    assert_refused(run(*eigen, "--basis", "nowhere"), "'nowhere'", "natural")
+    assert_refused(run(*eigen, "--basis", fitted[0] / "fit.npz"), "eigengs_dr.gaussians")
+    assert_refused(run(*eigen, "--basis", tmp_path), "basis")
+    assert_refused(run(*eigen, "--basis", model, "--gaussians", 50), photo, "50", "60")
+    assert_refused(run(*eigen, "--basis", model, "--color", "rgb"), photo, "'rgb'", "'ycbcr'")
+
+
+def test_the_names_of_inits_and_bases():
+    [option] = [p for p in main.commands["fit"].params if p.name == "init"]
+    assert tuple(option.type.choices) == INITS
+    [option] = [p for p in main.commands["fit"].params if p.name == "color"]
+    assert tuple(option.type.choices) == SPACES
+    [option] = [p for p in main.commands["fit"].params if p.name == "basis"]
+    assert option.default in bases.SHIPPED
+
+
+def test_command_finds_few_or_says_that_it_cannot(tmp_path):
+    image, out, report = tmp_path / "a.png", tmp_path / "a.npz", tmp_path / "a.json"
+    eg.save_image(image, picture())
+    base = ["fit", image, "-o", out, "--quiet", "--iterations", 40, "--report", report]
+    assert run(*base, "--target-psnr", 26).exit_code == 0
+    told = json.loads(report.read_text())
+    assert told["stopped"] == "met" and told["psnr_ycbcr"] >= 26
+    assert told["gaussians"] == len(eg.Gaussians.load(out))
+
+    result = run(*base, "--target-psnr", 60, "--max-gaussians", 50)
+    assert result.exit_code == 1
+    assert "60 dB are out of reach: 50 Gaussians have" in result.stderr
+    assert len(eg.Gaussians.load(out)) == 50
+
+    assert run(*base, "--target-psnr", 20, "--space", "rgb").exit_code == 0
+    assert json.loads(report.read_text())["psnr_rgb"] >= 20
+
+    for option in (("--space", "rgb"), ("--max-gaussians", 50), ("--levels", 2, "--space", "rgb")):
+        alone = run(*base, *option)
+        assert alone.exit_code == 2 and "belong to --target-psnr" in alone.stderr
+
+    both = run(*base, "--target-psnr", 30, "--gaussians", 9)
+    assert both.exit_code == 2
+    assert "exclude each other" in both.stderr

@@ -1,0 +1,168 @@
+"""The command `train`."""
+
+import json
+import os
+import signal
+from contextlib import contextmanager
+
+import pytest
+
+from _helpers.command import SMALL, assert_refused, run, said, succeeded
+from _helpers.photos import SMALL as SETTINGS
+from _helpers.photos import random_fields
+from eigengs_dr.cli import train as cli_train
+from eigengs_dr.eigenbasis.training import TrainOptions, train
+
+
+def test_target_psnr(tmp_path):
+    folder = tmp_path / "full"
+    folder.mkdir()
+    random_fields(folder / "photos", 30)
+    full = train(folder / "photos", folder / "model.npz", TrainOptions(**SETTINGS))
+    report, model = tmp_path / "r.json", tmp_path / "m.npz"
+    small = ["--size", "32x32", "--components", 6, "--gaussians", 60, "--target-psnr", 21]
+    text = said("train", folder / "photos", "-o", model, "--report", report, *small)
+    assert "not split (32 pixels a side; auto measures from 512 on)" in text
+    figures = json.loads(report.read_text())
+    assert (figures["target_psnr"], figures["split_reason"][:2]) == (21, "32")
+    assert figures["psnr_held_out"][-1] >= 21 > figures["psnr_held_out"][-2]
+    rows = json.loads(said("info", model, "--json"))["fall"]
+    assert rows[0]["components"] == [0, 0, 0] and rows[0]["variance"] == 0
+    assert rows[-1]["components"] == figures["components"]
+    assert rows[-1]["psnr_held_out"] == pytest.approx(figures["psnr_held_out"][-1], abs=1e-3)
+    table = said("info", folder / "model.npz").splitlines()[-7:]
+    assert table[0].split() == ["components", "variance", "training", "held", "out"]
+    assert [int(line.split()[0]) for line in table[1:]] == [0, 1, 2, 5, 10, 18]
+    assert f"{full.model.held_out[-1]:.2f} dB" in table[-1]
+    assert len({len(line) for line in table}) == 1
+
+
+def test_train_says_what_it_did(trained):
+    folder, result = trained
+    words = ("11 images", "6+6+6 components", "60 Gaussians", "psnr_pca", "psnr_init", "m.png")
+    assert all(word in result.stdout for word in words)
+    assert result.stdout.count("\n") == 3
+    assert result.stderr == ""
+    assert not (folder / "m.npz.checkpoint").exists()
+
+
+def test_train_report(trained):
+    folder, _ = trained
+    report = json.loads((folder / "m.json").read_text())
+    expected = {
+        "input": str(folder / "photos"),
+        "output": str(folder / "m.npz"),
+        "size": [32, 32],
+        "components": [6, 6, 6],
+        "most_components": 6,
+        "gaussians": 60,
+        "frequency_aware": True,
+        "energy": None,
+        "preset": "default",
+        "color": "ycbcr",
+        "seed": 0,
+        "resumed": False,
+    }
+    assert {key: report[key] for key in expected} == expected
+    assert report["command"].startswith("eigengs-dr train ")
+    assert report["versions"]["drjit"]
+    for key in ("seconds", "pca_seconds", "shape_seconds", "weight_seconds", "peak_rss_mb"):
+        assert report[key] > 0
+    assert report["psnr_solved"] > report["psnr_init"] > 15
+    assert report["psnr_init"] == pytest.approx(report["psnr_pca"], abs=1.5)
+
+
+def test_train_without_images_to_hold_out(tmp_path):
+    folder = random_fields(tmp_path / "few", 5)
+    outputs = ["-o", tmp_path / "m.npz", "--report", tmp_path / "m.json"]
+    result = succeeded(run("train", folder, *outputs, *SMALL))
+    assert "no image was held out" in result.stdout
+    assert "note: 5 images give at most 4 components" in result.stderr
+    report = json.loads((tmp_path / "m.json").read_text())
+    assert [report[key] for key in ("psnr_pca", "psnr_init", "psnr_solved")] == [None] * 3
+
+
+def test_train_options(trained, tmp_path):
+    folder, _ = trained
+    options = ["--energy", 0.5, "--color", "rgb", "--seed", 3, "--preset", "eigengs", "--steps", 2]
+    size = ["--size", "16x16", "--components", "6,5,4", "--quiet"]
+    outputs = ["-o", tmp_path / "m.npz", "--report", tmp_path / "m.json"]
+    result = succeeded(run("train", folder / "photos", *outputs, *size, *options))
+    assert result.stdout == ""
+    report = json.loads((tmp_path / "m.json").read_text())
+    expected = {"energy": 0.5, "color": "rgb", "seed": 3, "preset": "eigengs", "steps": 2}
+    assert {key: report[key] for key in expected} == expected
+    assert report["gaussians"] == 256  # one a pixel
+    assert report["most_components"] == [6, 5, 4]
+    assert max(report["components"]) < 6
+
+
+def test_train_interrupted_goes_on(trained, tmp_path, monkeypatch):
+    folder, _ = trained
+
+    @contextmanager
+    def presses(quiet):
+        def show(stage, done, total):
+            if stage == "weights":
+                os.kill(os.getpid(), signal.SIGINT)
+
+        yield show
+
+    command = ["train", folder / "photos", "-o", tmp_path / "m.npz", *SMALL]
+    with monkeypatch.context() as patched:
+        patched.setattr(cli_train, "progress_bar", presses)
+        result = run(*command)
+    assert result.exit_code == 130
+    assert result.stderr == "eigengs-dr: interrupted; the same command goes on from here\n"
+    assert result.stdout == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["m.npz.checkpoint"]
+
+    assert_refused(run(*command, "--seed", 1), "m.npz.checkpoint", "seed 0", "delete")
+    succeeded(run(*command, "--report", tmp_path / "m.json"))
+    assert json.loads((tmp_path / "m.json").read_text())["resumed"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m.json", "m.npz"]
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--gaussians", 1025, "--size", "32x32"], "gaussians is 1025"),
+        (["--gaussians", 0], "gaussians"),
+        (["--components", "3,4"], "3,4: expected a number above 0, or three such as 230,60,60"),
+        (["--components", "many"], "many: expected a number"),
+        (["--components", 0], "components"),
+        (["--energy", 0], "energy"),
+        (["--energy", 1.01], "energy"),
+        (["--size", "32"], "such as 1024x768"),
+        (["--size", "0x32"], "0x32"),
+        (["--size", "99999x99999"], "99999x99999"),
+        (["--steps", -1], "steps"),
+        (["--frequency-aware", "perhaps"], "frequency-aware"),
+        (["--preset", "gaussianimage"], "preset"),
+        (["--color", "lab"], "color"),
+    ],
+)
+def test_train_with_bad_settings(trained, existing, options, word):
+    folder, _ = trained
+    before = sorted(existing.parent.iterdir())
+    assert_refused(run("train", folder / "photos", "-o", existing, *options), word)
+    assert sorted(existing.parent.iterdir()) == before
+
+
+def test_train_with_bad_paths(trained, existing, tmp_path):
+    folder, _ = trained
+    photos = folder / "photos"
+    assert_refused(run("train", tmp_path / "gone", "-o", existing), "gone")
+    assert_refused(run("train", photos / "000.png", "-o", existing), "000.png")
+    (tmp_path / "empty").mkdir()
+    assert_refused(run("train", tmp_path / "empty", "-o", existing), "holds no images")
+    assert_refused(run("train", photos, "-o", tmp_path / "m.png"), ".npz")
+    assert_refused(run("train", photos, "-o", tmp_path / "gone" / "m.npz"), "gone")
+    assert_refused(run("train", photos, "-o", existing, "--report", tmp_path / "gone" / "r"), "r")
+    assert_refused(run("train", photos, "-o", existing, "--preview", tmp_path / "p.txt"), ".png")
+    over = run("train", photos, "-o", existing, "--preview", photos / "000.png")
+    assert_refused(over, "000.png", "is read")
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "x.png").write_bytes(b"no picture")
+    assert_refused(run("train", tmp_path / "bad", "-o", existing, *SMALL), "none of 1", "x.png")
+    assert not (existing.parent / "existing.npz.checkpoint").exists()

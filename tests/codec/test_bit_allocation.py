@@ -1,0 +1,166 @@
+"""Packing: the steps that a budget allows."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.packed import SPACES, small_fit
+from _helpers.sets import COUNT, SIZE, random_scene
+from eigengs_dr.codec import bit_allocation as packing
+from eigengs_dr.codec import egs as packed
+from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.raster.render import picture_of
+
+
+@pytest.fixture
+def fitted():
+    return small_fit()
+
+
+def decibels(gaussians, image):
+    return eg.psnr(picture_of(gaussians), image, "ycbcr")
+
+
+@pytest.fixture(scope="module")
+def receipts(tmp_path_factory):
+    """Receipts and files of two budgets."""
+    folder = tmp_path_factory.mktemp("packed")
+    files = {budget: folder / f"{budget}.egs" for budget in (0.5, 2.0)}
+    gaussians, image = small_fit()
+    return {b: (eg.pack(gaussians, file, image, b), file) for b, file in files.items()}
+
+
+@pytest.mark.parametrize("budget", [0.5, 2.0])
+def test_the_budget_holds_and_is_used(fitted, receipts, budget):
+    gaussians, image = fitted
+    receipt, file = receipts[budget]
+    found = eg.Gaussians.load(file)
+    lost = decibels(gaussians, image) - decibels(found, image)
+    assert lost == pytest.approx(receipt.psnr_drop, abs=1e-3)
+    assert 0.7 * budget < lost <= budget + 1e-3
+    assert receipt.psnr == pytest.approx(decibels(found, image), abs=1e-3)
+    assert receipt.bytes == file.stat().st_size
+    assert receipt.bits_per_pixel == 8 * receipt.bytes / 32**2
+    np.testing.assert_array_equal(picture_of(found), picture_of(receipt.gaussians))
+
+
+def test_files_are_small_and_equal_for_equal_arguments(fitted, receipts, path):
+    gaussians, image = fitted
+    (_, file), (_, smaller) = receipts.values()
+    assert smaller.stat().st_size < 0.9 * file.stat().st_size
+    eg.pack(gaussians, path, image)
+    assert path.read_bytes() == file.read_bytes()
+    gaussians.save(path)
+    assert file.stat().st_size < path.stat().st_size / 4
+
+
+def test_without_an_image_the_rendering_is_kept(fitted, path):
+    gaussians, _ = fitted
+    receipt = eg.pack(gaussians, path)
+    error = np.mean(
+        np.square(
+            rgb_to_ycbcr(picture_of(eg.Gaussians.load(path))) - rgb_to_ycbcr(picture_of(gaussians))
+        )
+    )
+    allowed = packing.MSE_WITHOUT_IMAGE * (10 ** (packing.BUDGET / 10) - 1)
+    assert 0.5 * allowed < error <= 1.001 * allowed
+    assert receipt.psnr == pytest.approx(-10 * np.log10(error), abs=1e-2)
+
+
+def test_light_is_compared_as_it_is_shown(fitted, path):
+    image = fitted[1] ** 3  # dark
+    gaussians = eg.fit(image, 60, iterations=40, color="linear", backend="llvm").gaussians
+    found = eg.pack(gaussians, path, image).gaussians
+    before, after = (eg.psnr(picture_of(g), image, "data") for g in (gaussians, found))
+    assert 0.7 * packing.BUDGET < before - after <= packing.BUDGET + 1e-3
+
+
+def test_steps_of_equal_marginal_cost_give_smaller_files(fitted, receipts, path, monkeypatch):
+    gaussians, image = fitted
+    balanced, least = packing._water_fill, receipts[0.5][0].bytes
+
+    def tilted(*arguments):
+        steps = balanced(*arguments)
+        return steps._replace(mean=steps.mean * 4, color=steps.color / 4)
+
+    monkeypatch.setattr(packing, "_water_fill", tilted)
+    assert eg.pack(gaussians, path, image).bytes > 1.05 * least
+
+
+def test_a_perfect_fit_may_be_rounded(path):
+    scene = random_scene(2)
+    gaussians = replace(
+        scene.on("llvm", space="rgb"), background=0.5 + 0 * scene.on("llvm").background
+    )
+    gaussians = replace(gaussians, color=0 * gaussians.color)
+    receipt = eg.pack(gaussians, path, np.full((*SIZE[::-1], 3), 0.5, np.float32))
+    assert receipt.psnr > 89
+    assert receipt.psnr_drop <= packing.BUDGET + 1e-3
+
+
+def test_sections_hold_the_splats_in_their_order(fitted, path):
+    gaussians, image = fitted
+    eg.pack(gaussians, path, image, sections=[10, 30, 60])
+    found = packed.read(path)
+    assert [len(section.mean) for section in found.sections] == [10, 30, 60]
+    first = eg.Gaussians.load(path, sections=1).to_arrays()["mean"]
+    before = gaussians.to_arrays()["mean"][:10]
+    nearest = np.linalg.norm(first[:, None] - before, axis=2).min(axis=1)
+    assert nearest.max() < 3
+
+
+@pytest.mark.parametrize(("space", "channels"), SPACES)
+def test_all_spaces_and_channels(backend, path, space, channels):
+    gaussians = random_scene(3, channels=channels).on(backend, space=space)
+    receipt = eg.pack(gaussians, path)
+    assert 0 < receipt.psnr_drop <= packing.BUDGET + 1e-3
+    found = eg.Gaussians.load(path, backend)
+    assert (found.space, found.channels, len(found)) == (space, channels, COUNT)
+
+
+def edge_cases():
+    scene = random_scene(7)
+    return {
+        "one splat": scene.permuted([0]),
+        "equal splats": scene.permuted([0] * COUNT),
+        "at the corners": scene._replace(
+            mean=np.array([[0, 0], [SIZE[0], 0], [0, SIZE[1]], SIZE] * (COUNT // 4), float)
+        ),
+        "outside": scene._replace(mean=scene.mean * 5 - 30),
+        "black": scene._replace(color=0 * scene.color),
+        "needles": scene._replace(factor=np.array([[0.001, 0.0, 4.0]] * COUNT)),
+        "an image of one pixel": scene._replace(size=(1, 1)),
+    }
+
+
+@pytest.mark.parametrize("name", edge_cases())
+def test_edge_cases(backend, path, name):
+    gaussians = edge_cases()[name].on(backend)
+    receipt = eg.pack(gaussians, path)
+    error = np.square(picture_of(eg.Gaussians.load(path)) - picture_of(gaussians)).mean()
+    assert error <= 1.001 * packing.MSE_WITHOUT_IMAGE * (10 ** (packing.BUDGET / 10) - 1)
+    assert receipt.psnr_drop <= packing.BUDGET + 1e-3
+    assert len(receipt.gaussians) == len(gaussians)
+
+
+def test_mistakes_leave_the_old_file(fitted, path):
+    gaussians, image = fitted
+    path.write_text("old")
+    for words, arguments in {
+        "budget is 0": (None, 0),
+        "no rounding is fine enough": (None, 1e-16),
+        "budget is 10000.*at most 100 dB": (None, 1e4),
+        "budget is nan": (None, math.nan),
+        r"shape \(16, 32, 3\)": (image[:16],),
+        "sections are": (None, 0.5, [50, 49]),
+        "sections are ": (None, 0.5, [0, 100]),
+    }.items():
+        with pytest.raises(ValueError, match=words):
+            eg.pack(gaussians, path, *arguments)
+    far = replace(gaussians, mean=gaussians.mean + 1e9)
+    with pytest.raises(ValueError, match=r"bounded\(\)"):
+        eg.pack(far, path)
+    assert path.read_text() == "old"

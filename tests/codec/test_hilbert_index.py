@@ -1,0 +1,27 @@
+"""Numbers of points along a Hilbert curve."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from eigengs_dr.codec.hilbert_index import MAX_LEVELS, hilbert_decode, hilbert_encode
+
+
+@pytest.mark.parametrize("levels", [0, 1, 2, 5])
+def test_the_curve_visits_every_point_by_single_steps(levels):
+    side = 1 << levels
+    points = np.indices((side, side)).reshape(2, -1).T
+    places = hilbert_encode(points, levels)
+    assert sorted(places) == list(range(side * side))
+    path = points[np.argsort(places)]
+    assert (np.abs(np.diff(path, axis=0)).sum(axis=1) == 1).all()
+    np.testing.assert_array_equal(hilbert_decode(places, levels), points)
+
+
+@given(hnp.arrays(np.int64, (7, 2), elements=st.integers(0, (1 << MAX_LEVELS) - 1)))
+def test_places_on_the_largest_curve_come_back(points):
+    places = hilbert_encode(points, MAX_LEVELS)
+    assert (places >> 2 * MAX_LEVELS == 0).all()
+    np.testing.assert_array_equal(hilbert_decode(places, MAX_LEVELS), points)

@@ -1,0 +1,80 @@
+"""Components as renderings of shared splats."""
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.families import SIDE, SPLATS, small_basis, small_model, splits
+from eigengs_dr.eigenbasis.components.solve import fit_components, psnr_components
+from eigengs_dr.fitting.solvers.normal_equations import NormalEquations
+
+
+@splits
+def test_components_are_rendered(backend, split):
+    """Every component is what its weights make of the splats, the mean image too."""
+    model, basis = small_model(backend, split), small_basis()
+    assert model.components == (12, 6, 6)
+    assert len(model.gaussians) == SPLATS
+    mean = eg.render(model.gaussians).numpy()
+    expected = basis.reconstruct([np.zeros(k) for k in model.components])
+    assert eg.psnr(mean, expected, "ycbcr") > 50
+    # A tenth of 100 splats is few for the first components.
+    assert model.figures["psnr_components"] > (30 if split else 40)
+    none = [np.zeros(k, np.float32) for k in model.components]
+    for channel, j in ((0, 0), (0, 11), (2, 3)):
+        only = [w.copy() for w in none]
+        only[channel][j] = 1
+        shown = eg.render(model.reconstruct(tuple(only))).numpy() - mean
+        wanted = basis.reconstruct(only) - basis.reconstruct(none)
+        share = 0.2 if split and j < model.low_components else 0.03
+        assert np.square(shown - wanted).sum() < share * np.square(wanted).sum()
+
+
+def test_weights_are_the_best(backend):
+    """No change of the weights lowers the error: it is orthogonal to all splats."""
+    model, basis = small_model(backend), small_basis()
+    equations = NormalEquations(model.gaussians)
+    for weights, planes in zip(model.weights, basis.components, strict=True):
+        correlations = equations.correlate(planes)
+        gradient = equations.product(weights.T.astype(float)) - correlations
+        assert np.abs(gradient).max() < 2e-3 * np.abs(correlations).max()
+
+
+def test_psnr_components_is_the_weighted_error(backend):
+    model, basis = small_model(backend), small_basis()
+    error = 0.0
+    for c, values in enumerate(basis.eigenvalues):
+        weights = model.weights[c]
+        shapes = model.gaussians.to_arrays()
+        for j, value in enumerate(values):
+            only = eg.Gaussians.from_arrays(
+                shapes["mean"],
+                shapes["factor"],
+                weights[j, :-1, None],
+                weights[j, -1:],
+                size=(SIDE, SIDE),
+                space="data",
+                backend=backend,
+            )
+            plane = eg.render(only).numpy()[..., 0]
+            error += value * np.square(plane - basis.components[c][j]).sum()
+    found = psnr_components(NormalEquations(model.gaussians), basis, model.weights)
+    assert found == pytest.approx(-10 * np.log10(error / basis.mean.size), abs=0.05)
+
+
+def test_sides_start_apart(backend):
+    """Each side of the paper's training draws a start of its own."""
+    seen = []
+    fit_components(
+        small_basis(), 20, True, "eigengs", 1, 0, backend, save=lambda s: seen.append(s[-1])
+    )
+    assert not np.array_equal(seen[0]["rows"][0, :5, :2], seen[1]["rows"][0, :5, :2])
+
+
+def test_fit_components_default_state(backend):
+    """Without training, what `save` sees is the grid."""
+    seen = []
+    fit_components(
+        small_basis(), SPLATS, True, "default", 0, 0, backend, save=lambda s: seen.append(len(s))
+    )
+    assert seen == [1, 2]

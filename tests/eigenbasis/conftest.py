@@ -1,0 +1,14 @@
+"""A training that several tests look at."""
+
+import pytest
+
+from _helpers.photos import SMALL, random_fields
+from eigengs_dr.eigenbasis.training import TrainOptions, train
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory):
+    """A folder with photos and the model of them, and what `train` returned; only to be read."""
+    folder = tmp_path_factory.mktemp("trained")
+    random_fields(folder / "photos", 30)
+    return folder, train(folder / "photos", folder / "model.npz", TrainOptions(**SMALL))

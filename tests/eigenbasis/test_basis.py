@@ -1,0 +1,377 @@
+"""The eigenbasis: against scikit-learn, in one block and in many, on families of every kind."""
+
+import threading
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.decomposition import PCA
+
+import eigengs_dr.eigenbasis.basis as pca
+from _helpers.errors import one_line
+from _helpers.low_rank import HEIGHT, SIZE, WIDTH, assert_same, basis_of, family, planes
+from eigengs_dr.eigenbasis import incremental_pca as incremental
+from eigengs_dr.eigenbasis.basis import Eigenbasis
+from eigengs_dr.image.folder import image_files
+from eigengs_dr.image.io import ImageError, save_image
+from eigengs_dr.image.resize import resample
+
+
+def exact(images, space="ycbcr"):
+    """PCA by scikit-learn in double precision, one for each channel."""
+    data = planes(images, space).astype(np.float64)
+    return [PCA(svd_solver="full").fit(data[:, c]) for c in range(3)]
+
+
+def subspace_angle(a, b):
+    """Largest angle, in radians, between the spans of orthonormal rows."""
+    a, b = (np.linalg.qr(rows.astype(np.float64).T)[0] for rows in (a, b))
+    return np.linalg.norm(a - b @ (b.T @ a), 2)
+
+
+def flat(components):
+    return components.reshape(len(components), components.shape[1] * components.shape[2])
+
+
+def assert_orthonormal(basis):
+    for components in basis.components:
+        rows = flat(components).astype(np.float64)
+        np.testing.assert_allclose(rows @ rows.T, np.eye(len(rows)), rtol=0, atol=1e-5)
+
+
+def psnr_of(basis, images):
+    errors = [basis.reconstruct(basis.project(image)) - image for image in images]
+    return -10 * np.log10(np.mean(np.square(errors)))
+
+
+@pytest.fixture
+def blocks_of(monkeypatch):
+    """Make `from_images` work in blocks of so many images."""
+    return lambda length: monkeypatch.setattr(incremental, "MAX_BLOCK", length)
+
+
+# ---------------------------------------------------------------- against scikit-learn
+
+
+@pytest.mark.parametrize("space", ["ycbcr", "rgb"])
+def test_one_block_is_exact(space):
+    images = family()
+    basis = Eigenbasis.from_images(images, SIZE, 12, color=space)
+    assert (basis.width, basis.height, basis.channels) == (*SIZE, 3)
+    assert (basis.count, basis.space) == (60, space)
+    assert basis.mean.dtype == basis.components[0].dtype == np.float32
+    assert basis.eigenvalues[0].dtype == basis.variance.dtype == np.float64
+    assert_orthonormal(basis)
+    for c, reference in enumerate(exact(images, space)):
+        np.testing.assert_allclose(basis.mean[c].ravel(), reference.mean_, rtol=0, atol=1e-7)
+        # scikit-learn divides by m - 1, the paper by m.
+        variances = reference.explained_variance_ * 59 / 60
+        np.testing.assert_allclose(basis.eigenvalues[c], variances[:12], rtol=1e-5)
+        np.testing.assert_allclose(basis.variance[c], variances.sum(), rtol=1e-6)
+        assert subspace_angle(flat(basis.components[c]), reference.components_[:12]) < 1e-4
+        for ours, theirs in zip(flat(basis.components[c]), reference.components_, strict=False):
+            assert abs(ours @ theirs) > 1 - 1e-6
+
+
+def test_eigenvalues_are_the_variances_of_the_coefficients():
+    images = family()
+    basis = Eigenbasis.from_images(images, SIZE, 12)
+    coefficients = [basis.project(image) for image in images]
+    for c in range(3):
+        values = np.stack([w[c] for w in coefficients])
+        np.testing.assert_allclose(values.mean(axis=0), 0, atol=1e-5)
+        np.testing.assert_allclose(values.T @ values / 60, np.diag(basis.eigenvalues[c]), atol=1e-5)
+
+
+def test_reconstruction_is_that_of_scikit_learn():
+    images, others = family(), family(seed=1)[:5]
+    basis, references = Eigenbasis.from_images(images, SIZE, 12, color="rgb"), exact(images, "rgb")
+    for image in others:
+        result = basis.reconstruct(basis.project(image))
+        for c, reference in enumerate(references):
+            centred = image[..., c].ravel() - reference.mean_
+            rows = reference.components_[:12]
+            expected = reference.mean_ + rows.T @ (rows @ centred)
+            np.testing.assert_allclose(result[..., c].ravel(), expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("length", [1, 7, 25, 59])
+def test_blocks_are_exact_while_the_rank_suffices(blocks_of, length):
+    images = family(noise=0, directions=8)
+    blocks_of(length)
+    basis = Eigenbasis.from_images(images, SIZE, 8)
+    assert_orthonormal(basis)
+    for c, reference in enumerate(exact(images)):
+        variances = reference.explained_variance_[:8] * 59 / 60
+        np.testing.assert_allclose(basis.mean[c].ravel(), reference.mean_, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(basis.eigenvalues[c], variances, rtol=1e-5)
+        np.testing.assert_allclose(basis.variance[c], variances.sum(), rtol=1e-5)
+        assert subspace_angle(flat(basis.components[c]), reference.components_[:8]) < 1e-3
+
+
+def test_blocks_lose_little_where_the_rank_does_not_suffice(blocks_of):
+    images = family(count=400, directions=60, noise=0.01)
+    whole = Eigenbasis.from_images(images, SIZE, 20)
+    blocks_of(50)
+    parts = Eigenbasis.from_images(images, SIZE, 20)
+    assert_orthonormal(parts)
+    np.testing.assert_allclose(parts.variance, whole.variance, rtol=1e-6)
+    np.testing.assert_allclose(parts.mean, whole.mean, atol=1e-6)
+    for a, b in zip(parts.eigenvalues, whole.eigenvalues, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0.2)
+        np.testing.assert_allclose(a[:10], b[:10], rtol=1e-3)
+        assert (a <= b * (1 + 1e-6)).all()  # a subspace cannot hold more than the best one
+    others = family(count=50, directions=60, noise=0.01, seed=0)
+    assert psnr_of(whole, others) - psnr_of(parts, others) < 0.05
+
+
+# ---------------------------------------------------------------- streaming
+
+
+def test_every_source_gives_the_same_bits(tmp_path, blocks_of):
+    images = np.rint(family(30).clip(0, 1) * 255).astype(np.uint8)
+    for i, image in enumerate(images):
+        save_image(tmp_path / f"{i:03}.png", image)
+    blocks_of(8)
+    first = Eigenbasis.from_images(images, SIZE, 5)
+    for source in (images, tmp_path, image_files(tmp_path), iter(np.split(images, 10))):
+        assert_same(Eigenbasis.from_images(source, SIZE, 5), first)
+
+
+def test_examples_are_training_images_drawn_with_the_seed(blocks_of):
+    images = family(100)
+    first = Eigenbasis.from_images(images, SIZE, 2, seed=5)
+    assert first.examples.shape == (16, HEIGHT, WIDTH, 3) and first.examples.dtype == np.float32
+    distances = np.abs(first.examples[:, None] - images).max(axis=(2, 3, 4))
+    assert (distances.min(axis=1) < 1e-6).all()
+    assert len(set(distances.argmin(axis=1))) == 16
+    blocks_of(9)
+    np.testing.assert_array_equal(
+        Eigenbasis.from_images(images, SIZE, 2, seed=5).examples, first.examples
+    )
+    assert not np.array_equal(
+        Eigenbasis.from_images(images, SIZE, 2, seed=6).examples, first.examples
+    )
+
+
+def test_interruption_leaves_no_thread(tmp_path):
+    for i, image in enumerate(family(30)):
+        save_image(tmp_path / f"{i}.png", image)
+
+    def interrupt(done, total, row):
+        assert (total, row) == (30, {})
+        if done == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Eigenbasis.from_images(tmp_path, SIZE, 2, progress=interrupt)
+    assert not [t for t in threading.enumerate() if t.name.startswith("decode")]
+
+
+def test_interruption_of_a_merge_leaves_no_thread(tmp_path, monkeypatch, blocks_of):
+    for i, image in enumerate(family(30)):
+        save_image(tmp_path / f"{i}.png", image)
+
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    blocks_of(4)
+    monkeypatch.setattr(pca, "merge", interrupted)
+    with pytest.raises(KeyboardInterrupt) as caught:  # its traceback keeps the frames alive
+        Eigenbasis.from_images(tmp_path, SIZE, 2)
+    assert not [t for t in threading.enumerate() if t.name.startswith("decode")]
+    assert caught.type is KeyboardInterrupt
+
+
+# ---------------------------------------------------------------- families of every kind
+
+
+def test_energy_keeps_as_few_as_hold_it():
+    images = family()
+    full = Eigenbasis.from_images(images, SIZE, 59)
+    for shares in full.energy():
+        assert (np.diff(shares) >= 0).all() and shares[-1] == pytest.approx(1, abs=1e-5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        basis = Eigenbasis.from_images(images, SIZE, energy=0.9)
+    for shares, all_shares in zip(basis.energy(), full.energy(), strict=True):
+        k = len(shares)
+        assert shares[-1] >= 0.9 and (k == 1 or shares[-2] < 0.9)
+        np.testing.assert_allclose(shares, all_shares[:k], rtol=1e-6)
+
+
+def test_energy_beyond_the_cap_is_told_by_channel():
+    with pytest.warns(UserWarning) as caught:
+        basis = Eigenbasis.from_images(family(), SIZE, (3, 59, 59), energy=0.99)
+    (message,) = (str(w.message) for w in caught)
+    share = basis.energy()[0][-1]
+    assert message == (
+        f"channel Y: 3 components hold {share:.2%} of the variance, less than 99.00%; "
+        "raise components"
+    )
+    assert len(basis.components[0]) == 3 < len(basis.components[1])
+
+
+def test_all_energy_can_be_had():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        basis = Eigenbasis.from_images(family(20, noise=0, directions=5), SIZE, energy=1)
+    assert [len(c) for c in basis.components] == [5, 5, 5]
+
+
+def test_channels_may_keep_different_numbers():
+    images = family()
+    basis = Eigenbasis.from_images(images, SIZE, (7, 0, 2))
+    assert [c.shape for c in basis.components] == [(k, HEIGHT, WIDTH) for k in (7, 0, 2)]
+    assert [w.shape for w in basis.project(images[0])] == [(7,), (0,), (2,)]
+    assert basis.reconstruct(basis.project(images[0])).shape == (HEIGHT, WIDTH, 3)
+    assert [len(e) for e in basis.energy()] == [7, 0, 2]
+
+
+def test_truncated_is_what_fewer_components_give():
+    images = family()
+    basis = Eigenbasis.from_images(images, SIZE, 12)
+    few = basis.truncated((5, 3, 100))
+    assert [len(c) for c in few.components] == [len(e) for e in few.eigenvalues] == [5, 3, 12]
+    np.testing.assert_array_equal(few.components[1], basis.components[1][:3])
+    np.testing.assert_array_equal(few.variance, basis.variance)
+    assert [len(c) for c in basis.truncated(0).components] == [0, 0, 0]
+    for three in (np.int64(3), [3, 3, 3], np.array([3, 3, 3])):
+        assert [len(c) for c in basis.truncated(three).components] == [3, 3, 3]
+
+
+def test_grey_images_have_no_chroma_components():
+    grey = family()[..., :1].repeat(3, axis=3)
+    basis = Eigenbasis.from_images(grey, SIZE, 5)
+    assert [len(c) for c in basis.components] == [5, 0, 0]
+    np.testing.assert_allclose(basis.mean[1:], 128 / 255, atol=1e-6)
+    result = basis.reconstruct(basis.project(grey[0]))
+    np.testing.assert_allclose(result, result[..., :1].repeat(3, axis=2), atol=1e-5)
+
+
+@pytest.mark.parametrize("length", [3, 1024])
+def test_identical_images_have_no_components(blocks_of, length):
+    image = family(1)[0]
+    blocks_of(length)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        basis = Eigenbasis.from_images(np.stack([image] * 10), SIZE, 5, energy=0.9)
+    assert [len(c) for c in basis.components] == [0, 0, 0]
+    assert [len(e) for e in basis.energy()] == [0, 0, 0]
+    np.testing.assert_allclose(basis.reconstruct(basis.project(image)), image, atol=1e-5)
+
+
+def test_one_image_is_its_own_mean():
+    image = family(1)[0]
+    with pytest.warns(UserWarning, match="1 image gives at most 0 components a channel"):
+        basis = Eigenbasis.from_images(image, SIZE, 5)
+    assert basis.count == 1 and basis.examples.shape == (1, HEIGHT, WIDTH, 3)
+    assert [len(c) for c in basis.components] == [0, 0, 0]
+    np.testing.assert_allclose(basis.reconstruct(basis.project(image)), image, atol=1e-5)
+
+
+def test_few_images_are_spanned(blocks_of):
+    images = family(12)
+    for length in (5, 1024):
+        blocks_of(length)
+        with pytest.warns(UserWarning, match="12 images give at most 11 components a channel"):
+            basis = Eigenbasis.from_images(images, SIZE, 300)
+        assert [len(c) for c in basis.components] == [11, 11, 11]
+        for image in images:
+            np.testing.assert_allclose(basis.reconstruct(basis.project(image)), image, atol=5e-5)
+
+
+def test_copies_of_few_images_span_no_more(blocks_of):
+    """Directions that are nothing but rounding are not taken for components."""
+    for length in (7, 1024):
+        blocks_of(length)
+        basis = Eigenbasis.from_images(family(5)[np.arange(50) % 5], SIZE, 20)
+        assert [len(c) for c in basis.components] == [4, 4, 4]
+        assert_orthonormal(basis)
+
+
+def test_mixed_sizes_and_bad_files(tmp_path):
+    for i, image in enumerate(family(8)):
+        save_image(tmp_path / f"{i}.png", image if i else resample(image, 40, 20))
+    (tmp_path / "7.png").write_bytes(b"damaged")
+    with pytest.warns(UserWarning) as caught:
+        basis = Eigenbasis.from_images(tmp_path, SIZE, 3)
+    assert [str(w.message)[:16] for w in caught] == ["1 of 8 images we"] * 2
+    assert basis.count == 7
+    for path in tmp_path.iterdir():
+        path.write_bytes(b"damaged")
+    with pytest.raises(ImageError, match=r"none of 8 images can be read, as 0\.png"):
+        Eigenbasis.from_images(tmp_path, SIZE, 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"components": -1}, "components is -1; expected no negative"),
+        ({"components": (1, 2)}, r"components is \(1, 2\); expected a number, or three"),
+        ({"components": 1.5}, "components is 1.5; expected"),
+        ({"components": "abc"}, "components is 'abc'; expected"),
+        ({"energy": 0}, "energy is 0; expected a share"),
+        ({"energy": 1.5}, "energy is 1.5; expected a share"),
+        ({"energy": float("nan")}, "energy is nan; expected a share"),
+        ({"size": (0, 3)}, "size is 0x3"),
+        ({"color": "linear"}, "'linear' is unknown; use one of"),
+        ({"seed": -1}, "seed is -1; expected"),
+    ],
+)
+def test_bad_arguments_are_refused_before_an_image_is_read(options, complaint):
+    def never():
+        raise AssertionError
+        yield
+
+    with pytest.raises(ValueError, match=complaint) as error:
+        Eigenbasis.from_images(never(), **{"size": SIZE, **options})
+    one_line(error)
+
+
+# ---------------------------------------------------------------- projecting
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["ycbcr", "rgb"]))
+def test_project_undoes_reconstruct(seed, space):
+    basis = basis_of(space)
+    rng = np.random.default_rng(seed)
+    weights = [rng.uniform(-0.2, 0.2, len(c)) for c in basis.components]
+    image = basis.reconstruct(weights)
+    assert image.dtype == np.float32 and image.shape == (HEIGHT, WIDTH, 3)
+    for found, given_weights in zip(basis.project(image), weights, strict=True):
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, given_weights, atol=2e-5)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_projecting_twice_is_projecting_once_and_brings_no_image_away(seed):
+    basis = basis_of("rgb")
+    image = np.random.default_rng(seed).random((HEIGHT, WIDTH, 3)).astype(np.float32)
+    once = basis.reconstruct(basis.project(image))
+    np.testing.assert_allclose(basis.reconstruct(basis.project(once)), once, atol=2e-5)
+    mean = np.moveaxis(basis.mean, 0, 2)
+    left, moved = np.sum((image - once) ** 2), np.sum((once - mean) ** 2)
+    assert left + moved == pytest.approx(np.sum((image - mean) ** 2), rel=1e-4)  # Pythagoras
+
+
+def test_images_of_any_size_and_type_are_projected():
+    basis = basis_of("ycbcr")
+    large = resample(family(1)[0], 50, 60)
+    fitting = resample(large, WIDTH, HEIGHT)
+    for a, b in zip(basis.project(large), basis.project(fitting), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert len(basis.project(np.zeros((4, 4), np.uint8))[0]) == 12
+    with pytest.raises(ImageError, match="not finite"):
+        basis.project(np.full((4, 4), np.nan))
+
+
+def test_coefficients_of_another_basis_are_refused():
+    for weights in ([np.zeros(12)] * 3, [np.zeros(12)], [np.zeros((12, 1)), np.zeros(5), 0]):
+        with pytest.raises(ValueError, match="coefficients have shapes") as error:
+            basis_of("rgb").reconstruct(weights)
+        one_line(error)

@@ -1,0 +1,392 @@
+"""Training: from a folder to a model, and on from wherever it was stopped, to the same bits."""
+
+import os
+import signal
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from _helpers.photos import SMALL, random_fields
+from eigengs_dr.eigenbasis import training
+from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.eigenbasis.training import Interrupted, TrainOptions, train
+from eigengs_dr.image.io import ImageError, load_image
+from eigengs_dr.image.metrics import psnr
+from eigengs_dr.raster.render import render
+
+FIGURES = {
+    "seconds",
+    "pca_seconds",
+    "shape_seconds",
+    "weight_seconds",
+    "peak_rss_mb",
+    "components",
+    "gaussians",
+}
+MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return random_fields(tmp_path / "photos", 24)
+
+
+@pytest.fixture
+def output(tmp_path):
+    return tmp_path / "model.npz"
+
+
+@pytest.fixture
+def in_pieces(monkeypatch):
+    """Blocks of five images, and a checkpoint of every state of the shapes."""
+    monkeypatch.setattr(training, "block_length", lambda size: 5)
+    monkeypatch.setattr(training, "SAVE_SECONDS", 0)
+
+
+def settings(**changed):
+    return TrainOptions(**{**SMALL, **changed})
+
+
+def checkpoint_of(output):
+    return Path(f"{output}.checkpoint")
+
+
+def assert_same_models(first, second):
+    with np.load(first) as a, np.load(second) as b:
+        assert a.files == b.files
+        for key in a.files:
+            np.testing.assert_array_equal(a[key], b[key], strict=True)
+
+
+class Killed(Exception):
+    pass
+
+
+def killed_at(stage, call):
+    """Progress that ends a training at the n-th report of a stage."""
+    seen = []
+
+    def progress(found, done, total):
+        seen.append(found)
+        if found == stage and seen.count(stage) == call:
+            raise Killed
+
+    return progress
+
+
+def kill(folder, output, stage, call=1, **changed):
+    """Train until a stage, and no further."""
+    with pytest.raises(Killed):
+        train(folder, output, settings(**changed), progress=killed_at(stage, call))
+    assert not output.exists()
+
+
+def test_end_to_end(folder, output):
+    stages = []
+    trained = train(
+        folder, output, settings(), progress=lambda stage, *counts: stages.append((stage, *counts))
+    )
+    figures = trained.figures
+    assert {*FIGURES, *MEASURED} <= set(figures)
+    assert (figures["images"], figures["components"], figures["gaussians"]) == (22, [6] * 3, 60)
+    # Components that are as smooth as these are rendered well by 60 splats.
+    assert figures["psnr_init"] == pytest.approx(figures["psnr_pca"], abs=0.5)
+    assert figures["psnr_solved"] > figures["psnr_pca"] + 5
+    assert 0 < figures["pca_seconds"] <= figures["seconds"]
+    assert 10 < figures["peak_rss_mb"] < 1e5
+    assert ("components", 22, 22) in stages
+    assert [stage for stage, *_ in stages[-3:]] == ["weights", "measure", "measure"]
+    assert all(0 <= done <= total for _, done, total in stages)
+    assert not checkpoint_of(output).exists()
+
+
+def test_the_file_encodes_as_what_was_trained(folder, output):
+    trained = train(folder, output, settings())
+    model = EigenGS.load(output)
+    image = load_image(folder / "009.png")
+    for colors in ("exact", "projected"):
+        pictures = [render(m.encode(image, colors)).numpy() for m in (model, trained.model)]
+        assert psnr(*pictures, "ycbcr") > 50
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"preset": "eigengs", "steps": 3},
+        {"frequency_aware": True},
+        {"color": "rgb"},
+        {"energy": 0.5},
+        {"gaussians": 1024},
+    ],
+    ids=lambda changed: " ".join(changed),
+)
+def test_other_settings(folder, output, changed):
+    figures = train(folder, output, settings(**changed)).figures
+    assert figures["psnr_solved"] > figures["psnr_init"] > 15
+    assert figures["frequency_aware"] == changed.get("frequency_aware", False)
+    assert (figures["components"][0] < 6) == ("energy" in changed)
+    EigenGS.load(output)
+
+
+STOPS = [
+    ("components", 1),  # nothing is saved yet
+    ("components", 6),  # five images are
+    ("components", 15),
+    ("components", 7),  # at the last image
+    ("weights", 1),
+    ("shapes", 2),
+    ("shapes", 2),
+]
+"""Stages at which one run after the other is killed, and which report of it is its last."""
+
+
+@pytest.mark.parametrize(
+    ("changed", "more_stops"),
+    [
+        ({"steps": 50}, []),
+        ({"steps": 50, "preset": "eigengs"}, []),
+        ({"steps": 50, "frequency_aware": True}, [("shapes", 3), ("shapes", 2)]),
+    ],
+    ids=["default", "eigengs", "split"],
+)
+def test_killed_in_every_stage(folder, output, tmp_path, in_pieces, changed, more_stops):
+    train(folder, tmp_path / "whole.npz", settings(**changed))
+    for stage, call in [*STOPS, *more_stops, ("measure", 2)]:
+        kill(folder, output, stage, call, **changed)
+        assert checkpoint_of(output).exists() == ((stage, call) != STOPS[0])
+    assert train(folder, output, settings(**changed)).figures["resumed"]
+    assert_same_models(tmp_path / "whole.npz", output)
+    assert not checkpoint_of(output).exists()
+
+
+def test_killed_by_the_system(folder, output, tmp_path, in_pieces):
+    train(folder, tmp_path / "whole.npz", settings(steps=40))
+    script = f"""
+import os, signal
+from eigengs_dr.eigenbasis import training
+training.block_length, training.SAVE_SECONDS = lambda size: 5, 0
+seen = []
+def progress(stage, done, total):
+    seen.append(stage)
+    if seen.count("shapes") == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+training.train({str(folder)!r}, {str(output)!r}, training.{settings(steps=40)!r}, None, progress)
+"""
+    process = subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parents[2])
+    assert process.returncode == -signal.SIGKILL
+    assert not output.exists()
+    assert train(folder, output, settings(steps=40)).figures["resumed"]
+    assert_same_models(tmp_path / "whole.npz", output)
+
+
+@pytest.mark.parametrize(
+    ("stage", "call", "kept"),
+    [("components", 1, False), ("components", 8, True), ("weights", 1, True), ("shapes", 2, True)],
+)
+def test_ctrl_c(folder, output, in_pieces, stage, call, kept):
+    seen = []
+
+    def press(found, done, total):
+        seen.append(found)
+        if found == stage and seen.count(stage) == call:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(Interrupted, match="goes on from here" if kept else "nothing is saved"):
+        train(folder, output, settings(steps=26), progress=press)
+    assert checkpoint_of(output).exists() == kept
+    assert not output.exists()
+    assert train(folder, output, settings(steps=26)).figures["resumed"] == kept
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"), [({"seed": 1}, "seed 0 instead of 1"), ({"steps": 25}, "steps")]
+)
+def test_other_settings_than_the_checkpoint(folder, output, in_pieces, changed, words):
+    kill(folder, output, "weights", steps=3)
+    with pytest.raises(ValueError, match=words) as caught:
+        train(folder, output, settings(**{"steps": 3, **changed}))
+    assert str(checkpoint_of(output)) in str(caught.value)
+    assert "delete" in str(caught.value)
+    assert train(folder, output, settings(steps=3)).figures["resumed"]
+
+
+def test_another_folder_than_the_checkpoint(folder, output, tmp_path):
+    kill(folder, output, "weights")
+    other = random_fields(tmp_path / "other", 12)
+    with pytest.raises(ValueError, match="folder"):
+        train(other, output, settings())
+
+
+def test_a_folder_that_grew_meanwhile(folder, output, tmp_path, in_pieces):
+    train(folder, tmp_path / "whole.npz", settings())
+    kill(folder, output, "components", 8)
+    (folder / "000a.png").write_bytes((folder / "003.png").read_bytes())
+    with pytest.warns(UserWarning, match="goes on with the 24 that were there"):
+        train(folder, output, settings())
+    assert_same_models(tmp_path / "whole.npz", output)
+
+
+@pytest.mark.parametrize(
+    ("stage", "call", "name"),
+    [
+        ("components", 8, "run.json"),
+        ("components", 8, "pca.npz"),
+        ("weights", 1, "basis.npz"),
+        ("shapes", 3, "shapes.npz"),
+    ],
+)
+def test_damaged_checkpoint(folder, output, in_pieces, stage, call, name):
+    kill(folder, output, stage, call, steps=30)
+    file = checkpoint_of(output) / name
+    content = file.read_bytes()
+    for damaged in (b"", content[: len(content) // 2]):
+        file.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"model\.npz\.checkpoint") as caught:
+            train(folder, output, settings(steps=30))
+        assert "\n" not in str(caught.value)
+
+
+def test_a_file_in_place_of_the_checkpoint(folder, output):
+    checkpoint_of(output).write_text("mine")
+    with pytest.raises(ValueError, match="no readable checkpoint"):
+        train(folder, output, settings())
+    assert checkpoint_of(output).read_text() == "mine"
+
+
+def test_a_model_that_cannot_be_written(folder, output, monkeypatch):
+    def full(model, path):
+        raise OSError("no space left")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(EigenGS, "save", full)
+        with pytest.raises(OSError, match="no space"):
+            train(folder, output, settings())
+    assert sorted(path.name for path in output.parent.iterdir()) == [
+        "model.npz.checkpoint",
+        "photos",
+    ]
+    assert train(folder, output, settings()).figures["resumed"]
+
+
+def test_no_folder_to_write_into(folder, tmp_path):
+    with pytest.raises(OSError, match="gone"):
+        train(folder, tmp_path / "gone" / "model.npz", settings())
+
+
+def test_unreadable_images_are_skipped(folder, output):
+    for name in ("003.png", "009.png"):  # one to train on, one held out
+        (folder / name).write_bytes(b"no picture")
+    with pytest.warns(UserWarning) as notes:
+        figures = train(folder, output, settings()).figures
+    told = [str(note.message) for note in notes]
+    assert "1 of 22 images were skipped: 003.png" in told[0]
+    assert "1 of 2 images held out were skipped, as" in told[1]
+    assert figures["images"] == 21
+    assert figures["psnr_solved"] > 20
+
+
+def test_nothing_but_unreadable_images(folder, output):
+    for path in folder.iterdir():
+        path.write_bytes(b"no picture")
+    with pytest.raises(ImageError, match="none of 22 images"):
+        train(folder, output, settings())
+    assert list(output.parent.iterdir()) == [folder]
+
+
+def test_only_unreadable_images_are_left(folder, output, tmp_path, in_pieces):
+    for path in sorted(folder.iterdir())[8:]:
+        path.write_bytes(b"no picture")
+    with pytest.warns(UserWarning, match="skipped"):
+        train(folder, tmp_path / "whole.npz", settings())
+    kill(folder, output, "components", 12)
+    with pytest.warns(UserWarning, match="skipped"):
+        train(folder, output, settings())
+    assert_same_models(tmp_path / "whole.npz", output)
+
+
+def test_too_few_images_to_hold_one_out(tmp_path, output):
+    folder = random_fields(tmp_path / "few", 9)
+    figures = train(folder, output, settings()).figures
+    assert figures["images"] == 9
+    assert not {*MEASURED} & set(figures)
+
+
+def test_images_of_other_sizes(folder, output):
+    with pytest.warns(UserWarning, match="resized to 20x12"):
+        figures = train(folder, output, settings(size=(20, 12))).figures
+    assert figures["psnr_solved"] > figures["psnr_init"] > 15
+    assert EigenGS.load(output).mean_image.shape == (3, 12, 20)
+
+
+@pytest.mark.parametrize(
+    ("count", "channels", "preset"),
+    [(12, 1, "default"), (12, 1, "eigengs"), (1, 3, "default")],
+    ids=["grey", "grey eigengs", "single"],
+)
+def test_channels_in_which_nothing_varies(tmp_path, output, count, channels, preset):
+    folder = random_fields(tmp_path / "flat", count, channels=channels)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a single image has no components, as is said
+        train(folder, output, settings(preset=preset, steps=3))
+    assert EigenGS.load(output).components[1:] == (0, 0)
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_fewer_splats_than_components(folder, output, count):
+    assert train(folder, output, settings(gaussians=count)).figures["psnr_solved"] > 10
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"gaussians": 1025}, "gaussians is 1025; a basis of 32x32 takes 1 to 1024"),
+        ({"gaussians": 0}, "gaussians is 0"),
+        ({"steps": -1}, "steps is -1"),
+        ({"seed": -1}, "seed is -1"),
+        ({"preset": "none"}, "preset 'none'"),
+        ({"preset": "eigengs", "steps": 0}, "steps is 0"),
+        ({"frequency_aware": "maybe"}, "frequency_aware is 'maybe'"),
+        ({"color": "lab"}, "color 'lab' is unknown; use one of ycbcr, rgb"),
+        ({"size": (0, 1)}, "size is 0x1"),
+        ({"components": -1}, "components is -1"),
+        ({"components": (3, 4)}, "expected a number, or three"),
+        ({"energy": 1.5}, "energy is 1.5"),
+    ],
+    ids=str,
+)
+def test_wrong_settings_leave_nothing(folder, output, changed, words):
+    with pytest.raises(ValueError, match=words):
+        train(folder, output, settings(**changed))
+    assert list(output.parent.iterdir()) == [folder]
+
+
+def test_wrong_numbers_are_refused_before_an_image_is_read(tmp_path, output):
+    with pytest.raises(ValueError, match="gaussians is 1025"):
+        train(tmp_path / "gone", output, settings(gaussians=1025))
+
+
+def test_train_to_a_target(trained, tmp_path):
+    folder, full = trained
+    target = float(full.model.held_out[8]) - 1e-6
+    result = train(folder / "photos", tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=target))
+    counts = result.basis.truncation_curve().counts[-1]
+    assert counts.tolist() == full.basis.truncation_curve().counts[8].tolist()
+    np.testing.assert_allclose(result.model.held_out, full.model.held_out[:9], atol=1e-6)
+    assert result.figures["psnr_pca"] == pytest.approx(target, abs=1e-3)
+    assert result.figures["components"] == counts.tolist()
+
+
+def test_train_without_images_for_a_target(tmp_path):
+    photos = random_fields(tmp_path / "few", 5)
+    with pytest.raises(ValueError, match="images that are held out"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        train(photos, tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=20))
+    assert [path.name for path in tmp_path.iterdir()] == ["few"]
+    with pytest.raises(ValueError, match="give one of them"):
+        train(photos, tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=20, energy=0.9))
+    with pytest.raises(ValueError, match="target_psnr is nan"):
+        train(tmp_path / "gone", tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=np.nan))

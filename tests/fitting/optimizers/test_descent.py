@@ -1,0 +1,114 @@
+"""Descent: the steps, their rates and weights, on any image."""
+
+import drjit as dr
+import drjit.opt
+import numpy as np
+import pytest
+from drjit import JitFlag
+
+from _helpers.sets import random_scene
+from _helpers.waves import SIDE, default, presets, start
+from eigengs_dr.fitting.optimizers.descent import descend, prefix
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.raster.render import render
+
+
+def test_the_first_step_follows_the_gradient(backend):
+    """One step of a size too small to matter lowers the squared error as the gradient says."""
+    gaussians, target = start(backend)
+    rate = 1e-4
+    schedule = default(rates=dict.fromkeys(("mean", "factor", "color"), rate), warm_up=0)
+    before, after = (
+        np.square(render(g.__class__(**{**vars(g), "space": "rgb"})).numpy() - target).mean()
+        for g in descend(gaussians, target, schedule, 1)
+    )
+    assert before * 0.9 < after < before
+
+
+def test_descend_yields_the_start_and_every_step(backend):
+    gaussians, target = start(backend)
+    sets = list(descend(gaussians, target, default(), 5))
+    assert len(sets) == 6
+    for name, value in gaussians.to_arrays().items():
+        np.testing.assert_array_equal(sets[0].to_arrays()[name], value)
+        if name != "background":
+            assert not np.array_equal(sets[5].to_arrays()[name], value)
+
+
+def test_sets_that_were_yielded_stay_as_they_are(backend):
+    """Else the best set so far gets the colours of the last step."""
+    gaussians, target = start(backend)
+    sets, copies = [], []
+    for current in descend(gaussians, target, default(), 6):
+        sets.append(current)
+        copies.append(current.to_arrays())
+    for current, copy in zip(sets, copies, strict=True):
+        for name, value in current.to_arrays().items():
+            np.testing.assert_array_equal(value, copy[name])
+
+
+@presets
+def test_freezing_changes_nothing(backend, preset):
+    """Over several builds of the lists, which grow and shrink."""
+    gaussians, target = start(backend)
+    schedule = PRESETS[preset].schedule
+    frozen = [g.to_arrays() for g in descend(gaussians, target, schedule, 20)]
+    with dr.scoped_set_flag(JitFlag.KernelFreezing, False):
+        traced = [g.to_arrays() for g in descend(gaussians, target, schedule, 20)]
+    for name, value in frozen[-1].items():
+        np.testing.assert_allclose(value, traced[-1][name], rtol=1e-5, atol=1e-5)
+
+
+class Spy(drjit.opt.Adam):
+    """Adam that remembers its rates."""
+
+    def set_learning_rate(self, value=None, /, **named):
+        super().set_learning_rate(value, **named)
+        if isinstance(value, dict):
+            self.seen.append({k: v[0] for k, v in value.items()})
+
+
+@pytest.mark.parametrize("warm_up", [0, 4])
+def test_rates(backend, warm_up):
+    """A linear rise times half a cosine, which ends near what `decay` leaves."""
+    seen, steps = [], 40
+    schedule = default(
+        optimizer=type("Spied", (Spy,), {"seen": seen}),
+        rates={"mean": 0.1, "factor": 0.2, "color": 0.3},
+        decay=0.25,
+        warm_up=warm_up,
+    )
+    list(descend(*start(backend), schedule, steps))
+    assert len(seen) == steps
+    step = np.arange(steps)
+    left = 0.25 + 0.75 * 0.5 * (1 + np.cos(np.pi * step / steps))
+    if warm_up:
+        left *= np.minimum(1, (step + 1) / warm_up)
+    for name, rate in schedule.rates.items():
+        np.testing.assert_allclose([s[name] for s in seen], rate * left, rtol=1e-5)
+
+
+def test_weights(backend):
+    """What weighs nothing may be anything; ones are no weights."""
+    gaussians, target = start(backend)
+    weight, other = np.ones_like(target), target.copy()
+    weight[:, SIDE // 2 :], other[:, SIDE // 2 :] = 0, 7
+
+    def colors(*arguments):
+        *_, last = descend(gaussians, *arguments)
+        return last.to_arrays()["color"]
+
+    left, plain = (colors(target, default(), 10, 3.0, w) for w in (weight, np.ones_like(target)))
+    np.testing.assert_array_equal(colors(other, default(), 10, 3.0, weight), left)
+    np.testing.assert_array_equal(colors(target, default(), 10), plain)
+    assert not np.array_equal(left, plain)
+
+
+def test_first_is_a_slice_and_differentiable(backend):
+    gaussians = random_scene().on(backend)
+    part = prefix(gaussians, 7)
+    np.testing.assert_array_equal(render(part).numpy(), render(gaussians[:7]).numpy())
+    dr.enable_grad(gaussians.color)
+    dr.backward(dr.sum(prefix(gaussians, 7).color, axis=None))
+    grad = dr.grad(gaussians.color).numpy()
+    assert (grad[:, :7] == 1).all() and (grad[:, 7:] == 0).all()

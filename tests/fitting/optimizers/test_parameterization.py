@@ -1,0 +1,84 @@
+"""The variables that optimisers move."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
+from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.optimizers.parameterization import CHOLESKY, CHOLESKY_BOUND, SCALE_RELATIVE
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
+
+
+@few
+@given(scene=scenes())
+@pytest.mark.parametrize("coordinates", [SCALE_RELATIVE, CHOLESKY], ids=["natural", "cholesky"])
+def test_there_and_back(backend, coordinates, scene):
+    """Those of GaussianImage hold means inside the image only."""
+    scene = scene._replace(mean=np.clip(scene.mean, 0.01, np.array(SIZE) - 0.01))
+    gaussians = scene.on(backend)
+    back = coordinates.decode(gaussians, coordinates.encode(gaussians)).to_arrays()
+    np.testing.assert_allclose(back["mean"], scene.mean, atol=1e-3)
+    scale = np.abs(scene.factor).max(axis=1, keepdims=True)
+    assert (np.abs(back["factor"] - scene.factor) <= 1e-4 * scale).all()
+    np.testing.assert_array_equal(back["color"], np.float32(scene.color))
+    np.testing.assert_array_equal(back["background"], np.float32(scene.background))
+
+
+def test_cholesky_coordinates(backend):
+    """``Sigma = L L^T`` with the bound on L's diagonal; means through tanh."""
+    rng = np.random.default_rng(0)
+    variables = {"mean": rng.normal(size=(2, COUNT)), "cholesky": rng.uniform(0, 2, (3, COUNT))}
+    module = select(backend)
+    fixed = random_scene().on(backend)
+    moved = CHOLESKY.decode(
+        fixed,
+        {
+            "mean": module.Array2f(*variables["mean"].astype("f4")),
+            "cholesky": module.Array3f(*variables["cholesky"].astype("f4")),
+            "color": fixed.color,
+        },
+    ).to_arrays()
+    l1, l2, l3 = variables["cholesky"] + np.array([[CHOLESKY_BOUND], [0], [CHOLESKY_BOUND]])
+    lower = np.array([[l1, 0 * l1], [l2, l3]]).transpose(2, 0, 1)
+    a, b, c = moved["factor"].astype(float).T
+    factor = np.array([[a, b], [0 * a, c]]).transpose(2, 0, 1)
+    inverse = np.einsum("nji,njk->nik", factor, factor)
+    np.testing.assert_allclose(
+        np.linalg.inv(inverse), np.einsum("nij,nkj->nik", lower, lower), rtol=1e-4, atol=1e-4
+    )
+    expected = (np.tanh(variables["mean"].T) + 1) / 2 * SIZE
+    np.testing.assert_allclose(moved["mean"], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("coordinates", [SCALE_RELATIVE, CHOLESKY], ids=["natural", "cholesky"])
+def test_what_is_not_a_variable_is_that_of_the_set(backend, coordinates):
+    """As `Coordinates.to` says."""
+    gaussians = random_scene().on(backend)
+    moved = coordinates.decode(gaussians, {"color": gaussians.color * 2}).to_arrays()
+    np.testing.assert_array_equal(moved["mean"], gaussians.to_arrays()["mean"])
+    np.testing.assert_array_equal(moved["factor"], gaussians.to_arrays()["factor"])
+
+
+any_floats = st.floats(width=32, allow_nan=True, allow_infinity=True)
+
+
+@few
+@given(values=hnp.arrays(np.float32, (8, COUNT), elements=any_floats))
+def test_natural_variables_come_back_into_their_bounds(backend, values):
+    module = select(backend)
+    fixed = random_scene().on(backend)
+    variables = {
+        "mean": module.Array2f(*values[:2]),
+        "factor": module.Array3f(*values[2:5]),
+        "color": module.ArrayXf(list(values[5:])),
+    }
+    found = SCALE_RELATIVE.decode(fixed, SCALE_RELATIVE.project(fixed, variables)).to_arrays()
+    slack = 1 + 1e-5  # of going through the units of the variables
+    assert ((found["mean"] >= 0) & (found["mean"] <= np.array(SIZE) * slack)).all()
+    diagonal = found["factor"][:, [0, 2]]
+    assert (diagonal * slack >= 1 / (2 * max(SIZE))).all()
+    assert (np.abs(found["factor"]) <= slack / MIN_DEVIATION).all()
+    assert np.isfinite(found["color"]).all()

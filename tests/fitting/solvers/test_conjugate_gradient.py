@@ -1,0 +1,334 @@
+"""The best colours: against dense least squares, and what conjugate gradients promise."""
+
+import math
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+from drjit import JitFlag
+from hypothesis import given
+
+from _helpers.halves import SIDE, fitted
+from _helpers.sets import COUNT, SIZE, Scene, few, random_scene, scene_of, scenes
+from eigengs_dr.fitting.solvers.conjugate_gradient import inner_products, solve
+from eigengs_dr.raster.render import CUTOFF, render
+
+ROOMY = 12
+"""Splats that overlap little: few steps converge."""
+
+
+def roomy(count=ROOMY, channels=3):
+    """Splats on a lattice, 5 pixels apart, with standard deviations around 2."""
+    rng = np.random.default_rng(count)
+    place = np.stack([np.arange(count) % 4, np.arange(count) // 4], axis=1)
+    mean = place * 5.0 + 3 + rng.uniform(-0.5, 0.5, (count, 2))
+    factor = np.array([0.5, 0, 0.5]) + rng.uniform(-0.1, 0.1, (count, 3))
+    color = rng.uniform(-1, 1, (count, channels))
+    arrays = mean, factor, color, np.linspace(0.1, 0.3, channels)
+    return Scene(*(a.astype(np.float32).astype(float) for a in arrays))
+
+
+def matrix(scene, cutoff=CUTOFF):
+    """Columns: every splat at all pixels, and ones."""
+    unit = scene._replace(color=np.eye(len(scene.mean)), background=np.zeros(len(scene.mean)))
+    pixels = scene.size[0] * scene.size[1]
+    return np.concatenate([unit.exact(cutoff).reshape(pixels, -1), np.ones((pixels, 1))], axis=1)
+
+
+def noise(channels=3, size=SIZE, seed=0):
+    image = np.random.default_rng(seed).uniform(0, 1, (size[1], size[0], channels))
+    return image.astype(np.float32)
+
+
+def rms(values):
+    return math.sqrt(np.mean(np.square(values, dtype=np.float64)))
+
+
+def true_residual(solution, image, cutoff=CUTOFF):
+    """What is left of the image, by the reference renderer on the solution's numbers."""
+    found = solution.gaussians
+    size = found.width, found.height
+    scene = Scene(**{k: v.astype(float) for k, v in found.to_arrays().items()}, size=size)
+    return rms(scene.exact(cutoff) - image)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_least_squares(backend, channels):
+    scene, image = roomy(channels=channels), noise(channels)
+    solution = solve(scene.on(backend), image, steps=40)
+    a, pixels = matrix(scene), image.reshape(-1, channels).astype(float)
+    best = np.linalg.lstsq(a, pixels, rcond=None)[0]
+    found = solution.gaussians.to_arrays()
+    np.testing.assert_allclose(found["color"], best[:-1], atol=1e-4)
+    np.testing.assert_allclose(found["background"], best[-1], atol=1e-5)
+    assert solution.residuals[-1] == pytest.approx(rms(a @ best - pixels), rel=1e-6)
+
+
+def test_least_squares_in_double_precision(backend):
+    scene, image = roomy(), noise()
+    solution = solve(scene.on(backend, 64), image, steps=60)
+    best = np.linalg.lstsq(matrix(scene), image.reshape(-1, 3).astype(float), rcond=None)[0]
+    found = solution.gaussians.to_arrays()
+    assert found["color"].dtype == np.float64
+    np.testing.assert_allclose(found["color"], best[:-1], atol=1e-9)
+
+
+def test_a_picture_made_of_the_same_splats(backend):
+    scene = roomy()
+    gaussians = scene.on(backend)
+    solution = solve(gaussians, render(gaussians).numpy(), steps=40)
+    found = solution.gaussians.to_arrays()
+    np.testing.assert_allclose(found["color"], scene.color, atol=1e-4)
+    np.testing.assert_allclose(found["background"], scene.background, atol=1e-5)
+    assert solution.residuals[-1] < 1e-5
+
+
+def test_what_zero_steps_give(backend):
+    """No colours, over the mean of the image."""
+    image = noise()
+    solution = solve(random_scene().on(backend), image, steps=0)
+    found = solution.gaussians.to_arrays()
+    assert not found["color"].any()
+    np.testing.assert_allclose(found["background"], image.mean(axis=(0, 1)), rtol=1e-6)
+    assert solution.residuals == [pytest.approx(rms(image - image.mean(axis=(0, 1))), rel=1e-6)]
+
+
+def test_background_of_a_large_image(backend):
+    image = np.full((512, 512, 3), 0.3, np.float32)
+    solution = solve(random_scene(size=(512, 512)).on(backend), image, steps=0)
+    np.testing.assert_allclose(solution.gaussians.to_arrays()["background"], 0.3, rtol=1e-6)
+
+
+def test_shapes_stay(backend):
+    gaussians = random_scene().on(backend, space="rgb")
+    before = gaussians.to_arrays()
+    solved = solve(gaussians, noise(), steps=3).gaussians
+    for name in ("mean", "factor"):
+        np.testing.assert_array_equal(solved.to_arrays()[name], before[name])
+    for name, value in gaussians.to_arrays().items():
+        np.testing.assert_array_equal(value, before[name])
+    assert (solved.width, solved.height, solved.space) == (*SIZE, "rgb")
+
+
+@pytest.mark.parametrize("steps", [1, 2, 5])
+@pytest.mark.parametrize("warm_start", [False, True])
+def test_reported_residual_is_the_true_one(backend, steps, warm_start):
+    image = noise()
+    solution = solve(random_scene().on(backend), image, steps, warm_start=warm_start)
+    assert len(solution.residuals) == steps + 1
+    assert solution.residuals[-1] == pytest.approx(true_residual(solution, image), rel=1e-5)
+
+
+@few
+@given(scene=scenes())
+def test_residuals_never_grow(backend, scene):
+    residuals = np.array(solve(scene.on(backend), noise(), steps=20).residuals)
+    assert np.isfinite(residuals).all()
+    assert (np.diff(residuals) <= 1e-6 * residuals[0]).all()
+
+
+def test_many_steps_stay_at_the_solution(backend):
+    scene, image = roomy(), noise()
+    solution = solve(scene.on(backend), image, steps=200)
+    best = np.linalg.lstsq(matrix(scene), image.reshape(-1, 3).astype(float), rcond=None)[0]
+    np.testing.assert_allclose(solution.gaussians.to_arrays()["color"], best[:-1], atol=1e-4)
+
+
+def test_preconditioner(backend):
+    """Splats apart, scaled by the diagonal, leave 3 eigenvalues: only the background couples."""
+    mean = np.array([[3.5, 3.5], [15.5, 4.5], [3.5, 12.5], [14.5, 13.5], [9.5, 8.5]])
+    sharpness = np.array([2.0, 0.75, 1.5, 1.0, 3.0])
+    factor = np.stack([sharpness, 0 * sharpness, sharpness], axis=1)
+    color = np.random.default_rng(0).uniform(0.5, 1, (5, 3))
+    scene = Scene(mean, factor, color, np.array([0.1, 0.2, 0.3]))
+    gaussians = scene.on(backend)
+    residuals = solve(gaussians, render(gaussians).numpy(), steps=3).residuals
+    assert residuals[2] > 1e-3
+    assert residuals[3] < 1e-5
+
+
+def test_warm_start_continues(backend):
+    image = noise()
+    first = solve(random_scene().on(backend), image, steps=5)
+    second = solve(first.gaussians, image, steps=5, warm_start=True)
+    assert second.residuals[0] == pytest.approx(first.residuals[-1], rel=1e-5)
+    assert second.residuals[-1] < first.residuals[-1]
+
+
+def test_warm_start_of_the_solution_stays(backend):
+    scene = roomy()
+    gaussians = scene.on(backend)
+    solution = solve(gaussians, render(gaussians).numpy(), steps=3, warm_start=True)
+    np.testing.assert_allclose(solution.gaussians.to_arrays()["color"], scene.color, atol=1e-5)
+
+
+def test_solutions_are_bit_equal(backend):
+    gaussians = random_scene().on(backend)
+    first, second = (solve(gaussians, noise(), steps=4) for _ in range(2))
+    assert first.residuals == second.residuals
+    for name, value in first.gaussians.to_arrays().items():
+        np.testing.assert_array_equal(value, second.gaussians.to_arrays()[name])
+
+
+def test_freezing_changes_nothing(backend):
+    gaussians = random_scene().on(backend)
+    frozen = solve(gaussians, noise(), steps=4)
+    with dr.scoped_set_flag(JitFlag.KernelFreezing, False):
+        traced = solve(gaussians, noise(), steps=4)
+    assert frozen.residuals == traced.residuals
+
+
+@pytest.mark.parametrize("counts", [(12, 24, 48), (48, 24, 12, 7)], ids=["growing", "shrinking"])
+@pytest.mark.parametrize("steps", [1, 4])
+def test_sets_of_several_sizes_one_after_the_other(backend, counts, steps):
+    """The program of a step is frozen: it must not be replayed for another number of splats."""
+    image = noise()
+    for count in counts:
+        solution = solve(random_scene(count, count).on(backend), image, steps)
+        assert solution.residuals[-1] == pytest.approx(true_residual(solution, image), rel=1e-5)
+
+
+def test_images_of_several_sizes_one_after_the_other(backend):
+    for size in ((22, 17), (16, 16), (5, 9), (22, 17)):
+        image = noise(size=size)
+        solution = solve(random_scene(size=size).on(backend), image, 2)
+        assert solution.residuals[-1] == pytest.approx(true_residual(solution, image), rel=1e-5)
+
+
+@pytest.mark.parametrize("cutoff", [2.0, 5.0, 9.0, 10.0, 12.0])
+def test_cutoffs(backend, cutoff):
+    scene, image = roomy(), noise()
+    solution = solve(scene.on(backend), image, steps=40, cutoff=cutoff)
+    pixels = image.reshape(-1, 3).astype(float)
+    best = np.linalg.lstsq(matrix(scene, cutoff), pixels, rcond=None)[0]
+    np.testing.assert_allclose(solution.gaussians.to_arrays()["color"], best[:-1], atol=1e-4)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (9, 1), (5, 13)])
+def test_sizes(backend, size):
+    scene, image = random_scene(size=size), noise(size=size)
+    solution = solve(scene.on(backend), image, steps=10)
+    assert all(np.isfinite(v).all() for v in solution.gaussians.to_arrays().values())
+    assert solution.residuals[-1] <= solution.residuals[0] + 1e-7
+
+
+def test_splats_outside_the_image(backend):
+    """Nothing is known of their colours: they stay as they were."""
+    scene = random_scene()
+    mean = scene.mean.copy()
+    mean[::2] += 500
+    gaussians = scene._replace(mean=mean).on(backend)
+    cold = solve(gaussians, noise(), steps=10)
+    inside = solve(scene.permuted(slice(1, None, 2)).on(backend), noise(), steps=10)
+    assert not cold.gaussians.to_arrays()["color"][::2].any()
+    np.testing.assert_allclose(cold.residuals, inside.residuals, rtol=1e-5)
+    warm = solve(gaussians, noise(), steps=10, warm_start=True).gaussians.to_arrays()["color"]
+    np.testing.assert_array_equal(warm[::2], np.float32(scene.color[::2]))
+
+
+def test_all_splats_outside(backend):
+    scene = random_scene()
+    image = noise()
+    solution = solve(scene._replace(mean=scene.mean - 500).on(backend), image, steps=3)
+    assert solution.residuals == pytest.approx([rms(image - image.mean(axis=(0, 1)))] * 4)
+
+
+def test_splats_all_the_same(backend):
+    """As good as one of them, after any number of steps."""
+    found = [scene_of(np.full((COUNT, 8), value)) for value in np.linspace(0.3, 0.7, 21)]
+    for scene in (scene_of(np.full((COUNT, 8), 0.52654237)), *found):
+        pixels = noise().reshape(-1, 3).astype(float)
+        a = matrix(scene.permuted([0]))
+        best = rms(a @ np.linalg.lstsq(a, pixels, rcond=None)[0] - pixels)
+        residuals = solve(scene.on(backend), noise(), steps=40).residuals
+        assert residuals[-1] == pytest.approx(best, rel=1e-4)
+        assert (np.diff(residuals) <= 1e-6).all()
+
+
+def test_splats_twice(backend):
+    """A singular system: the picture is what it was, the colours share it."""
+    scene, image = roomy(), noise()
+    twice = scene.permuted([*range(ROOMY), *range(ROOMY)])
+    single = solve(scene.on(backend), image, steps=40)
+    double = solve(twice.on(backend), image, steps=40)
+    color = double.gaussians.to_arrays()["color"]
+    np.testing.assert_allclose(color[:ROOMY], color[ROOMY:], atol=1e-4)
+    np.testing.assert_allclose(color[:ROOMY] * 2, single.gaussians.to_arrays()["color"], atol=1e-3)
+
+
+def test_more_splats_than_pixels(backend):
+    size = (5, 4)
+    residuals = solve(random_scene(0, 60, size).on(backend), noise(size=size), 100).residuals
+    assert np.isfinite(residuals).all()
+    assert residuals[-1] < 0.05 * residuals[0]
+
+
+@pytest.mark.parametrize("value", [0.0, 0.3, 1.0])
+def test_constant_images(backend, value):
+    image = np.full((SIZE[1], SIZE[0], 3), value, np.float32)
+    solution = solve(random_scene().on(backend), image, steps=10)
+    assert max(solution.residuals) < 2e-6
+    np.testing.assert_allclose(render(solution.gaussians), image, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.int64, np.uint8])
+def test_types_of_images(backend, dtype):
+    image = (noise() * 4).astype(dtype)
+    expected = solve(random_scene().on(backend), image.astype(np.float32), steps=3)
+    found = solve(random_scene().on(backend), image, steps=3)
+    assert found.residuals == pytest.approx(expected.residuals, rel=1e-6)
+
+
+def test_a_set_with_derivatives(backend):
+    gaussians = random_scene().on(backend)
+    dr.enable_grad(gaussians.mean, gaussians.color)
+    solution = solve(gaussians, noise(), steps=2)
+    assert not dr.grad_enabled(solution.gaussians.color)
+    assert dr.grad_enabled(gaussians.mean)
+
+
+def test_values_that_all_splats_share(backend):
+    scene = random_scene()._replace(factor=np.tile([0.5, 0.25, 0.75], (COUNT, 1)))
+    gaussians = scene.on(backend)
+    shared = replace(gaussians, factor=type(gaussians.factor)(0.5, 0.25, 0.75))
+    assert solve(shared, noise(), 3).residuals == solve(gaussians, noise(), 3).residuals
+
+
+def test_an_image_that_is_not_finite(backend):
+    """Refused, or at least not called solved."""
+    image = noise()
+    image[3, 4, 1] = np.nan
+    try:
+        residuals = solve(random_scene().on(backend), image, steps=3).residuals
+    except ValueError:
+        return
+    assert not any(r == 0 for r in residuals)
+
+
+@pytest.mark.parametrize("shape", [(17, 22, 1), (22, 17, 3), (17, 22), (16, 22, 3), (17, 22, 4)])
+def test_wrong_shape(backend, shape):
+    with pytest.raises(
+        ValueError, match=r"image has shape .*, the set needs \(17, 22, 3\)"
+    ) as error:
+        solve(random_scene().on(backend), np.zeros(shape))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("name", "value"), [("steps", -1), ("cutoff", 0.0), ("cutoff", 13.0)])
+def test_arguments_out_of_range(backend, name, value):
+    with pytest.raises(ValueError, match=name):
+        solve(random_scene().on(backend), noise(), **{name: value})
+
+
+def test_correlations_are_inner_products():
+    start, target = fitted(20)
+    plain = replace(start.gaussians, space="data")
+    ones = np.ones((SIDE, SIDE, 3), np.float32)
+    for n in (0, 7):
+        one = replace(plain[[n]], color=plain[[n]].color * 0 + 1, background=plain.background * 0)
+        weights = render(one).numpy().astype(np.float64)
+        first = inner_products(plain, target)[n]
+        np.testing.assert_allclose(first, (weights * target).sum((0, 1)), rtol=1e-4, atol=1e-5)
+        own = inner_products(plain, ones, squared=True)[n]
+        np.testing.assert_allclose(own, (weights**2).sum((0, 1)), rtol=1e-4)

@@ -1,0 +1,165 @@
+"""Colours on shared shapes: the factorised equations against dense least squares."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+
+from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
+from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.solvers.normal_equations import RIDGE, NormalEquations, weight_matrix
+from eigengs_dr.raster.render import render
+
+
+def dense_matrix(scene, cutoff=np.inf):
+    """Weights of all splats at all pixels, and a column of ones, in float64: (H W, N + 1)."""
+    distances = scene.distances().reshape(len(scene.mean), -1)
+    weights = np.exp(-0.5 * distances**2) * (distances <= cutoff)
+    return np.vstack([weights, np.ones(weights.shape[1])]).T
+
+
+def images(count=3, seed=0):
+    return np.random.default_rng(seed).uniform(0, 1, (count, SIZE[1], SIZE[0])).astype(np.float32)
+
+
+@pytest.mark.parametrize("cutoff", [2.0, 3.0, 5.0])
+@few
+@given(scene=scenes())
+def test_splat_matrix(backend, cutoff, scene):
+    """Every weight of brute force, and nothing else but on the edge of a cutoff."""
+    matrix = weight_matrix(scene.on(backend), cutoff).toarray()
+    expected = dense_matrix(scene, cutoff)[:, :-1].T
+    away = scene.off_edge(cutoff).ravel()
+    np.testing.assert_allclose(matrix[:, away], expected[:, away], atol=1e-5)
+
+
+def test_splat_matrix_renders(backend):
+    """Its transpose times colours is what the renderer draws."""
+    scene = random_scene(3)
+    picture = weight_matrix(scene.on(backend)).T @ scene.color + scene.background
+    rendered = render(scene.on(backend)).numpy().reshape(-1, 3)
+    np.testing.assert_allclose(picture, rendered, atol=2e-6)
+
+
+def test_splats_outside_have_empty_rows(backend):
+    scene = random_scene()
+    scene.mean[:5] = [-500, 900]
+    matrix = weight_matrix(scene.on(backend))
+    assert matrix.shape == (COUNT, SIZE[0] * SIZE[1])
+    assert (np.diff(matrix.indptr)[:5] == 0).all()
+    equations = NormalEquations(scene.on(backend))
+    solved = equations.solve(equations.correlate(images()))
+    assert np.isfinite(solved).all()
+    np.testing.assert_allclose(solved[:5], 0, atol=1e-6)
+
+
+@few
+@given(scene=scenes())
+def test_correlate(backend, scene):
+    matrix = dense_matrix(scene, 3.0)
+    found = NormalEquations(scene.on(backend)).correlate(images(7))
+    expected = matrix.T @ images(7).reshape(7, -1).T
+    edges = ~scene.off_edge(3.0).ravel()  # where rounding decides
+    slack = 0.012 * edges.sum() + 2e-4
+    np.testing.assert_allclose(found, expected, atol=slack)
+
+
+def test_solve_is_least_squares(backend):
+    """The residual is that of NumPy's least squares: the ridge costs nothing that matters."""
+    scene = random_scene(1)
+    matrix = weight_matrix(scene.on(backend)).toarray().astype(np.float64).T
+    matrix = np.hstack([matrix, np.ones((len(matrix), 1))])
+    targets = images().reshape(3, -1).T
+    best = np.linalg.lstsq(matrix, targets, rcond=None)[0]
+    equations = NormalEquations(scene.on(backend))
+    found = equations.solve(equations.correlate(images()))
+    left, least = (np.square(matrix @ x - targets).sum(axis=0) for x in (found, best))
+    assert (left >= least * (1 - 1e-6)).all()
+    np.testing.assert_allclose(left, least, rtol=1e-3)
+
+
+def test_solve_minimises_what_it_says(backend):
+    """At the solution, the gradient of the ridge problem is 0 for colours and background."""
+    scene = random_scene(2)
+    equations = NormalEquations(scene.on(backend))
+    correlations = equations.correlate(images())
+    found = equations.solve(correlations)
+    ridge = RIDGE * equations.gram.diagonal().mean()
+    gradient = equations.product(found) - correlations
+    gradient[:-1] += ridge * found[:-1]
+    # The factor is in single precision.
+    assert np.abs(gradient).max() < 1e-3 * np.abs(correlations).max()
+
+
+def test_exact_colours_reproduce_a_rendering(backend):
+    scene = random_scene(5)
+    drawn = np.moveaxis(render(scene.on(backend)).numpy(), 2, 0)
+    equations = NormalEquations(scene.on(backend))
+    correlations = equations.correlate(drawn)
+    error = equations.error(
+        equations.solve(correlations), correlations, np.square(drawn).sum((1, 2))
+    )
+    assert (error / drawn[0].size < 1e-5).all()
+
+
+def test_solve_agrees_with_conjugate_gradients(backend):
+    scene = random_scene(6)
+    target = np.moveaxis(images(), 0, 2)
+    equations = NormalEquations(scene.on(backend))
+    correlations = equations.correlate(images())
+    found = equations.solve(correlations)
+    error = equations.error(found, correlations, np.square(target).sum((0, 1)))
+    iterated = solve(scene.on(backend), target, 200)
+    assert np.sqrt(error.sum() / target.size) == pytest.approx(iterated.residuals[-1], rel=1e-3)
+
+
+def test_error_is_that_of_the_rendering(backend):
+    scene = random_scene(7)
+    equations = NormalEquations(scene.on(backend))
+    coefficients = np.random.default_rng(0).normal(size=(COUNT + 1, 3))
+    rendered = (weight_matrix(scene.on(backend)).T @ coefficients[:-1] + coefficients[-1]).T
+    error = np.square(rendered - images().reshape(3, -1)).sum(axis=1)
+    squares = np.square(images(), dtype=np.float64).sum(axis=(1, 2))
+    found = equations.error(coefficients, equations.correlate(images()), squares)
+    np.testing.assert_allclose(found, error, rtol=1e-4)
+
+
+def test_identical_splats(backend):
+    """The ridge shares what one of them could do alone."""
+    scene = random_scene(0)
+    twins = scene.permuted([0] * COUNT)
+    equations = NormalEquations(twins.on(backend))
+    solved = equations.solve(equations.correlate(images()))
+    assert np.isfinite(solved).all()
+    np.testing.assert_allclose(solved[:-1], np.broadcast_to(solved[0], (COUNT, 3)), rtol=0.2)
+
+
+def test_a_constant_needs_the_background_alone(backend):
+    """Splats of a constant image get no colour."""
+    flat = np.full((3, SIZE[1], SIZE[0]), 0.4, np.float32)
+    equations = NormalEquations(random_scene(4).on(backend))
+    solved = equations.solve(equations.correlate(flat))
+    np.testing.assert_allclose(solved[-1], 0.4, atol=1e-3)
+    np.testing.assert_allclose(solved[:-1], 0, atol=1e-2)
+
+
+def test_blocks_fit_what_is_left(backend):
+    """First splats fit the image alone, with the background; the others the difference."""
+    scene, low = random_scene(8), 9
+    both = NormalEquations(scene.on(backend), low)
+    first, rest = (scene.permuted(order).on(backend) for order in (slice(low), slice(low, None)))
+    found = both.solve(both.correlate(images()))
+    alone = NormalEquations(first)
+    coarse = alone.solve(alone.correlate(images()))
+    np.testing.assert_allclose(found[:low], coarse[:-1], atol=1e-4)
+    np.testing.assert_allclose(found[-1], coarse[-1], atol=1e-4)
+    left = images().reshape(3, -1).T - (weight_matrix(first).T @ coarse[:-1] + coarse[-1])
+    matrix = weight_matrix(rest).astype(np.float64)
+    gram = (matrix @ matrix.T).toarray()
+    gram += RIDGE * gram.diagonal().mean() * np.eye(len(gram))
+    np.testing.assert_allclose(found[low:-1], np.linalg.solve(gram, matrix @ left), atol=2e-3)
+
+
+def test_a_matrix_too_large_is_refused(backend, monkeypatch):
+    monkeypatch.setattr("eigengs_dr.fitting.solvers.normal_equations.MAX_WEIGHTS", 100)
+    with pytest.raises(ValueError, match=r"the splats cover [\d,]+ pixels in all, over 100"):
+        NormalEquations(random_scene().on(backend))

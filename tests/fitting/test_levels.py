@@ -1,0 +1,136 @@
+"""Levels of detail: prefixes of a set that make the image too."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.photos import coffee
+from eigengs_dr.codec.bit_allocation import MSE_WITHOUT_IMAGE
+from eigengs_dr.fitting.density_control import removal_cost
+from eigengs_dr.fitting.initializers import initialize
+from eigengs_dr.fitting.levels import fit_levels, level_counts
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.raster.render import picture_of
+
+
+@pytest.fixture(scope="module")
+def image():
+    return coffee(48)
+
+
+@pytest.fixture(scope="module")
+def result(image):
+    return fit_levels(image, 256, levels=3, iterations=150)
+
+
+def reached(gaussians, image):
+    return eg.psnr(picture_of(gaussians), image, space="ycbcr")
+
+
+@pytest.mark.parametrize(
+    ("count", "levels", "expected"),
+    [(5000, 4, [78, 312, 1250, 5000]), (7, 1, [7]), (4, 2, [1, 4]), (17, 3, [1, 4, 17])],
+)
+def test_counts(count, levels, expected):
+    assert level_counts(count, levels) == expected
+
+
+@pytest.mark.parametrize(("count", "levels"), [(3, 2), (5, 0), (63, 4), (9, 10**9)])
+def test_too_many_levels_are_refused(count, levels):
+    with pytest.raises(ValueError, match=f"levels is {levels}; {count} Gaussians make 1 to"):
+        level_counts(count, levels)
+
+
+def test_all_levels_make_the_image(image, result):
+    """Beside fits of their own, levels lose little; of a plain fit, as many are no image."""
+    plain = eg.fit(image, 256, iterations=150).gaussians
+    order = np.argsort(-removal_cost(plain, rgb_to_ycbcr(image)))
+    for count in level_counts(256, 3)[:-1]:
+        own = reached(eg.fit(image, count, iterations=150).gaussians, image)
+        level = reached(result.gaussians[:count], image)
+        assert level > own - 3
+        assert level > reached(plain[order[:count]], image) + 5
+    assert reached(result.gaussians, image) > reached(plain, image) - 3
+
+
+def test_any_number_between_is_better_than_the_level_before(image, result):
+    counts = level_counts(256, 3)
+    for low, high in pairwise(counts):
+        part = reached(result.gaussians[: (low + high) // 2], image)
+        assert reached(result.gaussians[:low], image) < part
+
+
+def test_a_level_is_sorted_by_worth(image, result):
+    target = rgb_to_ycbcr(image)
+    before = 0
+    for count in level_counts(256, 3):
+        value = removal_cost(result.gaussians[:count], target)[before:]
+        assert (np.diff(value) <= 1e-4 * value.max()).all()
+        before = count
+
+
+def test_the_picture_is_that_of_the_whole_set(image, result):
+    np.testing.assert_array_equal(result.image, picture_of(result.gaussians))
+    best = max(row["psnr_ycbcr"] for row in result.trace)
+    assert reached(result.gaussians, image) == pytest.approx(best, abs=1e-3)
+
+
+def test_one_seed_gives_one_result(image):
+    a, b = (fit_levels(image, 64, 2, iterations=5) for _ in range(2))
+    np.testing.assert_array_equal(a.image, b.image)
+
+
+def test_one_level_is_a_set_like_any(image):
+    assert len(fit_levels(image, 10, 1, iterations=2).gaussians) == 10
+
+
+@pytest.mark.parametrize("color", ["linear", "rgb", "data"])
+def test_other_colours(image, color):
+    found = fit_levels(image, 64, 2, iterations=5, color=color)
+    assert found.gaussians.space == color
+    assert np.isfinite(picture_of(found.gaussians[:16])).all()
+
+
+def test_packed_levels_are_read_one_by_one(image, result, tmp_path):
+    counts = level_counts(256, 3)
+    sections = np.diff(counts, prepend=0).tolist()
+    receipt = eg.pack(result.gaussians, tmp_path / "a.egs", image, 1.0, sections)
+    for k, count in enumerate(counts, 1):
+        part = eg.Gaussians.load(tmp_path / "a.egs", sections=k)
+        assert len(part) == count
+        lost = reached(result.gaussians[:count], image) - reached(part, image)
+        assert lost <= 1.0 + 1e-3
+    assert receipt.psnr_drop == pytest.approx(lost, abs=1e-3)
+    assert receipt.psnr_drop > 0.3
+    plain = eg.pack(result.gaussians, tmp_path / "b.egs", image, 1.0)
+    assert plain.bytes < receipt.bytes < 1.5 * plain.bytes
+
+
+def test_packed_levels_without_an_image_keep_what_they_have_of_the_whole(result, tmp_path):
+    counts = level_counts(256, 3)
+    eg.pack(result.gaussians, tmp_path / "a.egs", None, 0.5, np.diff(counts, prepend=0).tolist())
+    whole = rgb_to_ycbcr(picture_of(result.gaussians))
+
+    def error(part):
+        return np.square(rgb_to_ycbcr(picture_of(part)) - whole).mean() + MSE_WITHOUT_IMAGE
+
+    for k, count in enumerate(counts, 1):
+        part = eg.Gaussians.load(tmp_path / "a.egs", sections=k)
+        assert error(part) <= 1.001 * 10**0.05 * error(result.gaussians[:count])
+
+
+def test_levels_keep_the_background(image):
+    """What is added later does not change the levels before: one background serves all."""
+    found = fit_levels(image, 64, 2, iterations=0).gaussians
+    alone = initialize(image, 16, "auto", "natural", PRESETS["default"]).gaussians
+    np.testing.assert_allclose(
+        found.to_arrays()["background"], alone.to_arrays()["background"], atol=1e-6
+    )
+
+
+def test_as_many_as_fit_takes_by_default(image):
+    small = image[:4, :4]
+    assert len(fit_levels(small, levels=2, iterations=0).gaussians) == 16

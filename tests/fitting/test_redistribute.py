@@ -1,0 +1,52 @@
+"""Splats that move to where the error is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from _helpers.halves import SIDE, fitted, picture
+from eigengs_dr.fitting.initializers import initialize
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.redistribute import redistribute
+from eigengs_dr.raster.render import render
+
+
+@pytest.mark.parametrize("side", [32, 150])
+def test_rearranged_has_the_count_and_goes_where_the_error_is(side):
+    """Also where splats are so far apart that they are placed on a smaller image."""
+    image = np.kron(picture(), np.ones((-(-side // SIDE), -(-side // SIDE), 1)))[:side, :side]
+    start = initialize(image.astype(np.float32), 64, "grid", "natural", PRESETS["default"])
+    result = redistribute(start.gaussians, 50, start.target, start.target)
+    left = result.mean.numpy()[0] < side / 2
+    assert len(result) == 50
+    assert left.mean() > 0.6  # half of the area, most of the error
+    assert np.isfinite(render(result).numpy()).all()
+
+
+def test_weights_draw_splats():
+    start, target = fitted()
+    weight = np.ones_like(target)
+    weight[SIDE // 2 :] = 1e-3
+    result = redistribute(start.gaussians, 60, target, target, weight)
+    assert (result.mean.numpy()[1] < SIDE / 2).mean() > 0.7
+
+
+def test_fits_that_are_long_enough_rearrange_once():
+    image = picture()
+    calls = []
+    start = initialize(image, 60, "adaptive", "natural", PRESETS["default"])
+
+    def rearrange(gaussians, count):
+        calls.append(count)
+        return start.redistribute(gaussians, count)
+
+    from eigengs_dr.fitting.optimizers.descent import descend
+    from eigengs_dr.fitting.optimizers.schedule import MIN_PHASE_RATIO
+
+    schedule = replace(PRESETS["default"].schedule, redistribute_after=2)
+    for steps, times in ((2 * MIN_PHASE_RATIO - 1, 0), (2 * MIN_PHASE_RATIO, 1)):
+        calls.clear()
+        sets = list(descend(start.gaussians, start.target, schedule, steps, redistribute=rearrange))
+        assert len(sets) == steps + 1
+        assert calls == [60] * times

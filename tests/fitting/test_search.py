@@ -1,0 +1,225 @@
+"""The search for the fewest splats that reach a PSNR, and `fit` with a target."""
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.halves import SIDE, picture
+from _helpers.photos import coffee
+from eigengs_dr.fitting import search as budget
+from eigengs_dr.fitting.density_control import densify
+from eigengs_dr.fitting.fit import fit, max_gaussians_for
+from eigengs_dr.fitting.initializers import initialize
+from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.search import search_count
+
+
+def test_a_constant_image_takes_one_splat():
+    result = fit(np.full((SIDE, SIDE, 3), 0.4), target_psnr=60, iterations=100)
+    assert (result.stopped, len(result.gaussians)) == ("met", 1)
+
+
+def test_two_colours_take_few():
+    image = np.full((SIDE, SIDE, 3), 0.4, np.float32)
+    image[:, SIDE // 2 :] = (0.9, 0.2, 0.1)
+    result = fit(image, target_psnr=38, iterations=300)
+    assert result.stopped == "met"
+    assert len(result.gaussians) <= 12
+    assert eg.psnr(image, result.image, space="ycbcr") >= 38
+
+
+def test_noise_is_out_of_reach():
+    noise = np.random.default_rng(0).uniform(0, 1, (SIDE, SIDE, 3))
+    result = fit(noise, target_psnr=45, iterations=100)
+    assert result.stopped == "out of reach"
+    assert len(result.gaussians) <= max_gaussians_for(noise) == SIDE * SIDE * 3 // 8
+
+
+@pytest.mark.parametrize("space", ["ycbcr", "rgb"])
+def test_the_target_is_met_in_its_space(space):
+    image = coffee(SIDE)
+    plain = fit(image, gaussians=100, iterations=200)
+    reached = plain.trace[-1][f"psnr_{space}"]
+    found = fit(image, target_psnr=reached, target_space=space, iterations=200)
+    assert found.stopped == "met"
+    assert eg.psnr(image, found.image, space=space) >= reached
+    assert len(found.gaussians) <= 150  # short descents settle less well than one of 200 steps
+    last = [row for row in found.trace if row["gaussians"] == len(found.gaussians)][-1]
+    assert last[f"psnr_{space}"] >= reached
+
+
+def test_one_seed_gives_one_result():
+    image = picture()
+    a, b = (fit(image, target_psnr=28, iterations=60) for _ in range(2))
+    np.testing.assert_array_equal(a.image, b.image)
+
+
+def test_progress_counts_up_to_its_total():
+    seen = []
+    fit(picture(), target_psnr=30, iterations=50, progress=lambda *row: seen.append(row))
+    steps = [row[0] for row in seen]
+    assert steps == sorted(steps) and len(steps) > 3
+    assert all(step <= total for step, total, _ in seen)
+    assert {"gaussians", "psnr_rgb", "psnr_ycbcr", "seconds"} <= seen[-1][2].keys()
+
+
+def test_interrupted_while_it_settles_it_keeps_the_best():
+    """Also by an error, as in a thread or at a second Ctrl-C."""
+    whole = fit(picture(), target_psnr=28, iterations=200)
+    assert whole.stopped == "met"
+    best = [row["gaussians"] for row in whole.trace if row["psnr_ycbcr"] >= 28]
+
+    def press(iteration, iterations, row):
+        if row["psnr_ycbcr"] >= 28:  # the search has met its goal, and settles
+            raise KeyboardInterrupt
+
+    found = fit(picture(), target_psnr=28, iterations=200, progress=press)
+    assert found.stopped == "interrupted"
+    assert found.iterations < whole.iterations
+    assert len(found.gaussians) == best[0]
+    assert eg.psnr(picture(), found.image, space="ycbcr") >= 28
+
+
+def test_interrupted_it_returns_what_there_is():
+    image = picture()
+    start = initialize(image, 60, "adaptive", "natural", PRESETS["default"])
+    asked = []
+
+    def interrupted():
+        asked.append(None)
+        return len(asked) > 7
+
+    def measure(gaussians):
+        return {"decibels": 10.0}
+
+    schedule = PRESETS["default"].schedule
+    result = search_count(
+        start, measure, "decibels", 20.0, 100, schedule, 100, interrupted=interrupted
+    )
+    assert result.stopped == "interrupted"
+    assert result.iterations <= 7
+    assert len(result.gaussians) <= 100
+
+
+def test_a_search_whose_goal_is_not_met_ends():
+    """Where every round adds a splat or two, by the steps that it has taken."""
+    start = initialize(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    result = search_count(
+        start,
+        lambda gaussians: {"decibels": 18.0},
+        "decibels",
+        20.0,
+        10**5,
+        PRESETS["default"].schedule,
+        40,
+    )
+    assert result.stopped == "out of reach" and result.iterations <= 80
+
+
+@pytest.mark.parametrize("octave", [2.5, 4.0, 9.0])
+def test_a_search_learns_what_more_splats_gain(octave):
+    """Where only their number counts: the fewest are found at any slope."""
+    start = initialize(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    schedule = PRESETS["default"].schedule
+
+    def measure(gaussians):
+        return {"decibels": octave * np.log2(len(gaussians) / 150)}
+
+    result = search_count(start, measure, "decibels", 0.0, 1000, schedule, 40)
+    assert result.stopped == "met"
+    assert 150 <= len(result.gaussians) <= 152
+
+
+def searched(monkeypatch, measure):
+    """Search for 0 dB, from 60 splats, with descents that move nothing.
+
+    ``measure(gaussians, steps)`` returns decibels, where `steps` lists those of all descents.
+    """
+    start = initialize(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    steps = []
+
+    def stand(gaussians, target, schedule, count, *rest):
+        steps.append(count)
+        return iter([gaussians] * (count + 1))
+
+    def judge(gaussians):
+        return {"decibels": measure(gaussians, steps)}
+
+    monkeypatch.setattr(budget, "descend", stand)
+    result = search_count(start, judge, "decibels", 0.0, 1000, PRESETS["default"].schedule, 1000)
+    assert result.stopped == "met"
+    return result, steps
+
+
+@pytest.mark.parametrize("octave", [2.0, 4.0, 9.0])
+@pytest.mark.parametrize("needed", [60, 150])
+def test_a_search_tries_more_than_once_and_fits_once(monkeypatch, octave, needed):
+    """Where only their number counts, of which the search begins with 60."""
+    _, steps = searched(monkeypatch, lambda g, _: octave * np.log2(len(g) / needed))
+    assert steps[:2] == [100, 100]
+    assert steps.count(400) == 1
+
+
+def test_a_search_adds_nothing_where_steps_lead_to_the_goal(monkeypatch):
+    """Where every step gains a little: a set that has missed the goal by less is not enlarged."""
+    added = []
+
+    def counted(gaussians, target, count, *rest):
+        added.append(count - len(gaussians))
+        return densify(gaussians, target, count, *rest)
+
+    monkeypatch.setattr(budget, "densify", counted)
+    result, _ = searched(
+        monkeypatch, lambda g, steps: 4 * np.log2(len(g) / 100) + 0.0005 * sum(steps)
+    )
+    assert any(row["decibels"] < 0 and row["iteration"] > 600 for row in result.trace)
+    assert added
+    assert not any(added)
+
+
+def test_a_search_goes_on_where_the_fit_just_meets_the_goal(monkeypatch):
+    """Where the fit ends a hair above the goal, and steps after it gain as much as they do."""
+    fitted = []
+
+    def measure(gaussians, steps):
+        if steps and steps[-1] == 400:
+            fitted.append(len(gaussians))
+        needed = fitted[0] if fitted else 100
+        settled = sum(count for count in steps if count not in (100, 400))
+        return 4 * np.log2(len(gaussians) / needed) + 0.001 + settled / 600
+
+    result, _ = searched(monkeypatch, measure)
+    assert len(result.gaussians) < fitted[0]
+
+
+def test_a_search_ends_where_no_place_is_left_to_grow(monkeypatch):
+    start = initialize(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    asked = []
+    monkeypatch.setattr(budget, "densify", lambda gaussians, *rest: asked.append(1) or gaussians)
+    schedule = PRESETS["default"].schedule
+    result = search_count(start, lambda g: {"decibels": 18.0}, "decibels", 20.0, 1000, schedule, 40)
+    assert result.stopped == "out of reach"
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"gaussians": 10}, "exclude each other"),
+        ({"preset": "gaussianimage"}, "works with preset 'default'"),
+        ({"init": "random"}, "init 'adaptive'"),
+        ({"target_psnr": 0}, "above 0"),
+        ({"target_psnr": np.nan}, "above 0"),
+        ({"target_psnr": 101}, "at most 100"),
+        ({"target_space": "lab"}, "use ycbcr or rgb"),
+        ({"max_gaussians": 0}, "takes 1 to 1024"),
+        ({"max_gaussians": 2000}, "takes 1 to 1024"),
+        ({"max_gaussians": 50.5}, "takes 1 to 1024"),
+        ({"target_psnr": None, "max_gaussians": 50}, "belong to target_psnr"),
+        ({"target_psnr": None, "target_space": "rgb"}, "belong to target_psnr"),
+    ],
+)
+def test_what_cannot_be_searched_for_is_said_in_one_line(settings, told):
+    with pytest.raises(ValueError, match=told) as caught:
+        fit(picture(), **({"target_psnr": 30} | settings))
+    assert "\n" not in str(caught.value)

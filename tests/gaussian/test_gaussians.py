@@ -1,0 +1,301 @@
+"""Sets of splats: arrays in and out, bounds, selection."""
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from _helpers.sets import COUNT, NAMES, SIZE, arrays_of, check_equal, few, random_scene
+from eigengs_dr.backend.selection import select
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION, Gaussians, concatenate
+
+LOW, HIGH = 1 / (2 * max(SIZE)), 1 / MIN_DEVIATION
+"""Bounds of the diagonal of a factor."""
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 7])
+def test_arrays_come_back(backend, channels):
+    scene = random_scene(channels=channels)
+    gaussians = Gaussians.from_arrays(**arrays_of(scene), size=SIZE, space="data", backend=backend)
+    check_equal(gaussians, arrays_of(scene))
+    assert len(gaussians) == COUNT
+    assert gaussians.channels == channels
+    assert type(gaussians.mean) is select(backend).Array2f
+    assert {v.dtype for v in gaussians.to_arrays().values()} == {np.dtype("f4")}
+
+
+def test_what_is_left_out_of_from_arrays(backend):
+    gaussians = Gaussians.from_arrays(
+        [[4, 5]], [[1, 0, 1]], [[1, 2, 3]], size=(np.int64(8), np.int32(9)), backend=backend
+    )
+    assert gaussians.space == "ycbcr"
+    assert not gaussians.to_arrays()["background"].any()
+    assert (type(gaussians.width), gaussians.width, gaussians.height) == (int, 8, 9)
+
+
+@pytest.mark.parametrize("count", [1, COUNT])
+def test_from_arrays_copies(backend, count):
+    """What the caller does to the arrays afterwards does not matter, however busy the device is."""
+    expected = arrays_of(random_scene(count=count))
+    arrays = {k: v.astype(np.float32) for k, v in expected.items()}
+    Float = select(backend).Float
+    busy = Float(0)
+    for k in range(4):
+        busy = busy + dr.sum(dr.sin(dr.arange(Float, 1 << 23) + k))
+        dr.eval(busy)
+    gaussians = Gaussians.from_arrays(**arrays, size=SIZE, space="data", backend=backend)
+    for array in arrays.values():
+        array[:] = 7
+    check_equal(gaussians, expected)
+
+
+def test_arrays_of_values_that_all_splats_share(backend):
+    scene = random_scene()
+    gaussians = replace(scene.on(backend), factor=select(backend).Array3f(0.5, 0.25, 0.75))
+    factor = np.tile([0.5, 0.25, 0.75], (COUNT, 1))
+    check_equal(gaussians, {**arrays_of(scene), "factor": factor})
+    check_equal(gaussians[3:7], arrays_of(scene._replace(factor=factor).permuted(slice(3, 7))))
+
+
+BAD = [
+    ("mean", np.zeros((0, 2)), r"mean has shape \(0, 2\)"),
+    ("mean", np.zeros(2), "mean has shape"),
+    ("mean", np.zeros((COUNT, 3)), "mean has shape"),
+    ("factor", np.ones((COUNT - 1, 3)), "factor has shape"),
+    ("factor", np.ones((COUNT, 2)), "factor has shape"),
+    ("color", np.ones(COUNT), "color has shape"),
+    ("color", np.ones((COUNT + 1, 3)), "color has shape"),
+    ("background", np.ones(2), "background has shape"),
+    ("background", np.ones((1, 3)), "background has shape"),
+    ("mean", np.full((COUNT, 2), np.nan), "mean holds values that are not finite"),
+    ("factor", np.full((COUNT, 3), np.inf), "factor holds values that are not finite"),
+    ("color", np.full((COUNT, 3), -np.inf), "color holds values that are not finite"),
+    ("background", np.full(3, np.nan), "background holds values that are not finite"),
+    ("factor", np.zeros((COUNT, 3)), "a or c <= 0"),
+    ("factor", np.tile([1, 0, -1], (COUNT, 1)), "a or c <= 0"),
+    ("factor", np.full((COUNT, 3), 1e-60), "a or c <= 0"),  # 0 in float32
+    ("size", (0, 5), "size is"),
+    ("size", (5, -1), "size is"),
+    ("size", (5,), "size is"),
+    ("size", (5, 1 << 17), "size is"),
+    ("space", "hsv", "space is 'hsv'"),
+    ("space", "a\nb", "space is"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "message"), BAD)
+def test_arrays_that_make_no_set(name, value, message):
+    good = {**arrays_of(random_scene()), "size": SIZE, "space": "data"}
+    with pytest.raises(ValueError, match=message) as error:
+        Gaussians.from_arrays(**{**good, name: value})
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("space", "channels"), [("ycbcr", 1), ("ycbcr", 4), ("rgb", 2), ("linear", 5)]
+)
+def test_channels_that_a_space_has_not(space, channels):
+    with pytest.raises(ValueError, match=f"space '{space}' has"):
+        Gaussians.from_arrays(**arrays_of(random_scene(channels=channels)), size=SIZE, space=space)
+
+
+def test_a_colour_that_is_a_number():
+    with pytest.raises(ValueError, match="color has shape"):
+        Gaussians.from_arrays([[1, 1]], [[1, 0, 1]], 5.0, size=SIZE, space="data")
+
+
+def test_no_channels():
+    with pytest.raises(ValueError, match="color"):
+        Gaussians.from_arrays([[1, 1]], [[1, 0, 1]], [[]], size=SIZE, space="data")
+
+
+def test_a_size_that_is_no_integer():
+    with pytest.raises((ValueError, TypeError)):
+        Gaussians.from_arrays([[1, 1]], [[1, 0, 1]], [[1]], size=(8.75, 9), space="data")
+
+
+# --- Selection and concatenation ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "index",
+    [
+        slice(None),
+        slice(3, 9),
+        slice(None, None, -2),
+        slice(-4, None),
+        5,
+        -1,
+        [7, 0, 0, -2],
+        np.array([3, 1], np.int16),
+        np.arange(COUNT) % 3 == 0,
+        np.ones(COUNT, bool),
+    ],
+    ids=str,
+)
+def test_selection(backend, index):
+    """As NumPy selects; the background stays."""
+    scene = random_scene()
+    kept = np.atleast_1d(np.arange(COUNT)[index])
+    chosen = scene.on(backend)[index]
+    assert len(chosen) == len(kept)
+    check_equal(chosen, arrays_of(scene.permuted(kept)))
+    assert (chosen.width, chosen.height, chosen.space) == (*SIZE, "data")
+
+
+@pytest.mark.parametrize(
+    "index", [COUNT, -COUNT - 1, [0, COUNT], np.ones(COUNT - 1, bool), "x", 0.5]
+)
+def test_selection_of_what_is_not_there(backend, index):
+    with pytest.raises(IndexError):
+        random_scene().on(backend)[index]
+
+
+@pytest.mark.parametrize("index", [np.array([], int), slice(5, 5), np.zeros(COUNT, bool)], ids=str)
+def test_selection_of_nothing(backend, index):
+    with pytest.raises(ValueError, match="empty"):
+        random_scene().on(backend)[index]
+
+
+def test_concatenation(backend):
+    """Splats one after the other, backgrounds added."""
+    parts = [random_scene(seed, count) for seed, count in ((0, COUNT), (1, 3), (2, 1))]
+    joined = concatenate([p.on(backend) for p in parts])
+    expected = {name: np.concatenate([getattr(p, name) for p in parts]) for name in NAMES[:3]}
+    background = 3 * parts[0].background.astype(np.float32)
+    assert len(joined) == COUNT + 4
+    found = joined.to_arrays()
+    np.testing.assert_allclose(found.pop("background"), background, rtol=1e-6)
+    for name, value in found.items():
+        np.testing.assert_array_equal(value, expected[name])
+
+
+def test_concatenation_of_one(backend):
+    gaussians = random_scene().on(backend)
+    check_equal(concatenate([gaussians]), gaussians.to_arrays())
+
+
+def test_concatenation_of_values_that_all_splats_share(backend):
+    scene = random_scene()
+    gaussians = replace(scene.on(backend), factor=select(backend).Array3f(0.5, 0.25, 0.75))
+    joined = concatenate([gaussians, gaussians])
+    np.testing.assert_array_equal(
+        joined.to_arrays()["factor"], np.tile([0.5, 0.25, 0.75], (2 * COUNT, 1))
+    )
+
+
+def test_concatenation_of_nothing():
+    with pytest.raises(ValueError, match="no sets"):
+        concatenate([])
+
+
+def test_concatenation_of_what_differs(backend):
+    first = random_scene().on(backend)
+    others = [
+        random_scene(size=(9, 9)).on(backend),
+        random_scene(channels=1).on(backend),
+        replace(first, space="rgb"),
+        random_scene().on(backend, 64),
+    ]
+    for other in others:
+        with pytest.raises(ValueError, match="sets differ") as error:
+            concatenate([first, other])
+        assert "\n" not in str(error.value)
+
+
+# --- Size and bounds ---------------------------------------------------------------------------
+
+
+def test_scaled(backend):
+    scene = random_scene()
+    larger = scene.on(backend).scaled(44, 51)
+    assert (larger.width, larger.height) == (44, 51)
+    found = larger.to_arrays()
+    np.testing.assert_allclose(found["mean"], scene.mean * [2, 3], rtol=1e-6)
+    np.testing.assert_allclose(found["factor"], scene.factor / [2, 3, 3], rtol=1e-6)
+    np.testing.assert_array_equal(found["color"], np.float32(scene.color))
+
+
+def test_scaled_there_and_back(backend):
+    scene = random_scene()
+    back = scene.on(backend).scaled(7, 90).scaled(*SIZE)
+    for name, value in back.to_arrays().items():
+        np.testing.assert_allclose(value, getattr(scene, name), rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(0, 1), (1, 0), (-1, -1)])
+def test_scaled_to_nothing(backend, size):
+    with pytest.raises(ValueError, match="at least 1 pixel"):
+        random_scene().on(backend).scaled(*size)
+
+
+any_floats = st.floats(width=32, allow_nan=True, allow_infinity=True)
+
+
+def unbounded(backend, values):
+    """A set with any numbers: values has shape (COUNT, 8)."""
+    scene = random_scene()._replace(mean=values[:, :2], factor=values[:, 2:5], color=values[:, 5:])
+    return scene.on(backend)
+
+
+def check_bounds(arrays):
+    mean, factor = arrays["mean"], arrays["factor"].astype(np.float64)
+    assert ((mean >= 0) & (mean <= SIZE)).all()
+    a, b, c = factor.T
+    for diagonal in (a, c):
+        assert ((diagonal >= LOW * (1 - 1e-6)) & (diagonal <= HIGH)).all()
+    assert (np.abs(b) <= HIGH).all()
+    assert np.isfinite(arrays["color"]).all()
+    inverse = np.array([[a * a, a * b], [a * b, b * b + c * c]]).transpose(2, 0, 1)
+    assert (np.linalg.det(inverse) > 0).all()
+
+
+@few
+@given(values=hnp.arrays(np.float32, (COUNT, 8), elements=any_floats))
+def test_bounds_hold_after_any_step(backend, values):
+    bounded = unbounded(backend, values).bounded()
+    check_bounds(bounded.to_arrays())
+    check_equal(bounded.bounded(), bounded.to_arrays())
+
+
+def test_bounds_leave_alone_what_is_inside(backend):
+    scene = random_scene()
+    scene = scene._replace(mean=np.clip(scene.mean, 0, SIZE))
+    check_equal(scene.on(backend).bounded(), arrays_of(scene))
+
+
+def test_what_replaces_numbers_that_are_not_finite(backend):
+    """A mean by the middle, a factor by its bound, a colour by 0."""
+    for value in (np.nan, np.inf, -np.inf):
+        found = unbounded(backend, np.full((COUNT, 8), value)).bounded().to_arrays()
+        np.testing.assert_array_equal(found["mean"][0], [SIZE[0] / 2, SIZE[1] / 2])
+        np.testing.assert_array_equal(found["factor"][0], [HIGH, 0, HIGH])
+        assert not found["color"].any()
+
+
+def test_bounded_background_is_finite(backend):
+    scene = random_scene()._replace(background=np.array([np.nan, 0, np.inf]))
+    assert np.isfinite(scene.on(backend).bounded().to_arrays()["background"]).all()
+
+
+def test_bounds_of_the_smallest_image(backend):
+    scene = random_scene(size=(1, 1))
+    found = scene.on(backend).bounded().to_arrays()
+    assert ((found["mean"] >= 0) & (found["mean"] <= 1)).all()
+    assert found["factor"][:, [0, 2]].min() >= 0.5
+
+
+def test_sets_are_trees_of_arrays(backend):
+    """Dr.Jit's own functions reach all parameters."""
+    gaussians = random_scene().on(backend)
+    dr.enable_grad(gaussians)
+    assert all(dr.grad_enabled(getattr(gaussians, name)) for name in NAMES)
+    dr.backward(dr.sum(dr.square(gaussians.color)) + dr.sum(gaussians.mean))
+    gradient = dr.grad(gaussians)
+    assert isinstance(gradient, Gaussians)
+    np.testing.assert_allclose(gradient.color, 2 * gaussians.to_arrays()["color"].T, rtol=1e-6)
+    assert not dr.grad_enabled(dr.detach(gaussians).mean)

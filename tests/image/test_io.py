@@ -1,0 +1,359 @@
+"""Reading, checking and writing images: every kind of file, every kind of damage."""
+
+import io
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from PIL import Image
+
+from _helpers.errors import one_line
+from eigengs_dr.image.io import (
+    SAVE_OPTIONS,
+    ImageError,
+    check_image,
+    load_image,
+    save_image,
+    to_8bit,
+)
+
+BYTES = np.array([[[0, 51, 102], [255, 204, 153]]], np.uint8)
+LOSSLESS = [".png", ".tif", ".tiff", ".bmp", ".ppm", ".PNG"]
+
+byte_images = hnp.arrays(
+    np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.sampled_from([1, 3]))
+)
+
+
+def property_of(path, name):
+    """Open a file with Pillow itself and ask it for its mode or format."""
+    with Image.open(path) as file:
+        return getattr(file, name)
+
+
+def png(width, height, depth, kind, rows):
+    """Make a PNG by hand: Pillow writes no 16-bit colour, and no false sizes."""
+
+    def chunk(name, data):
+        checksum = struct.pack(">I", zlib.crc32(name + data))
+        return struct.pack(">I", len(data)) + name + data + checksum
+
+    header = struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, 0)
+    pixels = zlib.compress(b"".join(b"\0" + row.tobytes() for row in rows))
+    chunks = chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunks
+
+
+# ---------------------------------------------------------------- reading
+
+
+def test_8_bit_values_are_exact(tmp_path):
+    Image.fromarray(BYTES).save(tmp_path / "a.png")
+    image = load_image(tmp_path / "a.png")
+    assert image.dtype == np.float32 and image.flags.c_contiguous
+    np.testing.assert_array_equal(image, BYTES / np.float32(255))
+    np.testing.assert_array_equal(load_image(str(tmp_path / "a.png")), image)
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "CMYK", "YCbCr", "I;16", "F"])
+def test_every_mode_of_an_opaque_file(tmp_path, mode):
+    grey = np.array([[0, 255, 0], [255, 255, 0]], np.uint8)
+    image = {
+        "I;16": lambda: Image.fromarray(grey.astype(np.uint16) * 257),
+        "F": lambda: Image.fromarray(grey.astype(np.float32) / 255),
+    }.get(mode, lambda: Image.fromarray(grey).convert(mode))()
+    path = tmp_path / "a.tif"
+    image.save(path)
+    assert property_of(path, "mode") == mode
+    result = load_image(path)
+    assert result.shape == (2, 3, 3)
+    expected = np.repeat(grey[..., None], 3, axis=2) / 255
+    np.testing.assert_allclose(result, expected, atol=0.005 if mode == "YCbCr" else 0)
+    kept = load_image(path, keep_grey=True)
+    channels = 1 if mode in ("1", "L", "I;16", "F") else 3
+    np.testing.assert_array_equal(kept, result[..., :channels])
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".pgm"])
+def test_16_bit_grey_keeps_its_precision(tmp_path, suffix):
+    values = np.array([[0, 1, 257], [65535, 32768, 12345]], np.uint16)
+    Image.fromarray(values).save(tmp_path / f"a{suffix}")
+    image = load_image(tmp_path / f"a{suffix}")
+    np.testing.assert_array_equal(np.rint(image[..., 1] * 65535), values)
+
+
+@pytest.mark.parametrize(("kind", "channels"), [(2, 3), (4, 2), (6, 4)])
+def test_16_bit_colour_keeps_the_upper_8_bits(tmp_path, kind, channels):
+    rows = (np.arange(2 * 3 * channels) * 3000 + 77).astype(">u2").reshape(2, 3, channels)
+    alpha = channels % 2 == 0
+    if alpha:
+        rows[..., -1] = 65535
+    (tmp_path / "a.png").write_bytes(png(3, 2, 16, kind, rows))
+    colors = np.broadcast_to(rows[..., : channels - alpha] >> 8, (2, 3, 3))
+    np.testing.assert_allclose(load_image(tmp_path / "a.png"), colors / 255, atol=1e-7)
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA"])
+def test_alpha_is_composited_over_white(tmp_path, mode):
+    image = Image.new("LA", (2, 1), (51, 255))
+    image.putpixel((1, 0), (51, 102))
+    image.convert(mode).save(tmp_path / "a.png")
+    with pytest.warns(UserWarning, match="over white") as caught:
+        result = load_image(tmp_path / "a.png")
+    assert len(caught) == 1 and "\n" not in str(caught[0].message)
+    np.testing.assert_allclose(result[0, :, 0], [0.2, 0.4 * 0.2 + 0.6], atol=1e-6)
+
+
+def test_palette_with_a_transparent_entry(tmp_path):
+    image = Image.fromarray(np.array([[0, 1]], np.uint8), "P")
+    image.putpalette([255, 0, 0, 0, 0, 255])
+    image.save(tmp_path / "a.png", transparency=1)
+    with pytest.warns(UserWarning, match="over white"):
+        result = load_image(tmp_path / "a.png")
+    np.testing.assert_array_equal(result, [[[1, 0, 0], [1, 1, 1]]])
+
+
+def test_opaque_alpha_is_no_news(tmp_path):
+    Image.fromarray(BYTES).convert("RGBA").save(tmp_path / "a.png")
+    np.testing.assert_allclose(load_image(tmp_path / "a.png"), BYTES / 255, atol=1e-7)
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".png", ".tif"])
+def test_first_frame_of_an_animation(tmp_path, suffix):
+    frames = [Image.new("RGB", (3, 2), color) for color in ("red", "blue", "lime")]
+    path = tmp_path / f"a{suffix}"
+    frames[0].save(path, save_all=True, append_images=frames[1:])
+    with pytest.warns(UserWarning, match="holds 3 frames, the first is used"):
+        result = load_image(path)
+    np.testing.assert_array_equal(result, np.broadcast_to([1.0, 0, 0], (2, 3, 3)))
+
+
+def test_exif_orientation(tmp_path):
+    pixels = np.zeros((8, 16, 3), np.uint8)
+    pixels[:, :8] = 255
+    exif = Image.Exif()
+    exif[0x0112] = 6  # stored lying on its left side: left becomes top
+    Image.fromarray(pixels).save(tmp_path / "a.png", exif=exif)
+    result = load_image(tmp_path / "a.png")
+    assert result.shape == (16, 8, 3)
+    assert result[:8].min() == 1 and result[8:].max() == 0
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (7, 1)])
+def test_thin_images(tmp_path, size):
+    save_image(tmp_path / "a.png", np.full((*size, 3), 0.2))
+    np.testing.assert_allclose(load_image(tmp_path / "a.png"), np.full((*size, 3), 0.2))
+
+
+def test_missing_file_and_folder(tmp_path):
+    with pytest.raises(ImageError, match="no such file") as error:
+        load_image(tmp_path / "nowhere.png")
+    assert "nowhere.png" in one_line(error)
+    with pytest.raises(ImageError, match="is a folder") as error:
+        load_image(tmp_path)
+    one_line(error)
+
+
+def test_files_that_are_no_images(tmp_path):
+    path = tmp_path / "a.png"
+    for content, complaint in ((b"", "empty"), (b"some text\n", "not an image")):
+        path.write_bytes(content)
+        with pytest.raises(ImageError, match=complaint) as error:
+            load_image(path)
+        assert str(path) in one_line(error)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".gif", ".tif", ".webp", ".bmp", ".ppm"])
+def test_truncated_file(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
+    Image.fromarray(noise).save(path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(ImageError) as error:
+        load_image(path)
+    assert str(path) in one_line(error)
+
+
+def test_decompression_bomb(tmp_path):
+    path = tmp_path / "a.png"
+    path.write_bytes(png(30_000, 30_000, 8, 2, []))
+    with pytest.raises(ImageError, match=r"more than [0-9,]+ pixels") as error:
+        load_image(path)
+    one_line(error)
+
+
+@pytest.mark.filterwarnings("ignore")
+@settings(max_examples=40, deadline=None)
+@given(st.data())
+def test_damaged_files_load_or_say_so(tmp_path_factory, data):
+    file = io.BytesIO()
+    noise = np.random.default_rng(0).integers(0, 256, (8, 8, 3), np.uint8)
+    Image.fromarray(noise).save(file, data.draw(st.sampled_from(["PNG", "JPEG", "GIF", "TIFF"])))
+    content = bytearray(file.getvalue())
+    for place in data.draw(st.lists(st.integers(0, min(200, len(content) - 1)), max_size=4)):
+        content[place] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.mktemp("damaged") / "a.png"
+    path.write_bytes(content)
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Image, "MAX_IMAGE_PIXELS", 10_000)
+            image = load_image(path)
+    except ImageError as error:
+        assert "\n" not in str(error)
+    else:
+        assert image.dtype == np.float32 and image.shape[2] == 3
+
+
+# ---------------------------------------------------------------- checking
+
+
+@pytest.mark.parametrize(
+    ("pixel", "expected"),
+    [
+        (np.uint8(51), 0.2),
+        (np.uint16(13107), 0.2),
+        (np.dtype(">u2").type(13107), 0.2),
+        (np.bool_(True), 1),
+        (np.float16(0.5), 0.5),
+        (np.float32(0.2), 0.2),
+        (np.float64(-0.4), -0.4),
+    ],
+)
+@pytest.mark.parametrize("shape", [(2, 5), (2, 5, 1), (2, 5, 3), (1, 1), (1, 9)])
+def test_check_image_scales_and_replicates(pixel, expected, shape):
+    image = np.full(shape, pixel)
+    result = check_image(image)
+    assert result.dtype == np.float32 and result.flags.c_contiguous
+    assert result.shape == (*shape[:2], 3)
+    np.testing.assert_allclose(result, expected, rtol=1e-6)
+    assert not np.shares_memory(result, image)
+
+
+def test_check_image_keeps_rows_columns_and_channels():
+    image = np.random.default_rng(0).random((3, 4, 3)).astype(np.float32)
+    for view in (image, np.asfortranarray(image), image[::-1][::-1], image.tolist()):
+        np.testing.assert_array_equal(check_image(view), image)
+
+
+@pytest.mark.parametrize(
+    ("image", "complaint"),
+    [
+        (np.zeros(5), r"shape \(5,\), expected"),
+        (np.float32(1), r"shape \(\), expected"),
+        (np.zeros((4, 4, 2)), r"shape \(4, 4, 2\), expected"),
+        (np.zeros((4, 4, 4)), r"drop alpha"),
+        (np.zeros((1, 4, 4, 3)), r"shape \(1, 4, 4, 3\), expected"),
+        (np.zeros((0, 4, 3)), "no pixels"),
+        (np.zeros((4, 0)), "no pixels"),
+        (np.zeros((4, 4), np.int64), "pixels are int64"),
+        (np.zeros((4, 4), complex), "pixels are complex128"),
+        (np.full((4, 4), None), "pixels are object"),
+        (np.full((4, 4), "a"), "pixels are <U1"),
+        ([[1, 2], [3]], "not an array"),
+        (np.full((2, 2), 255.0), "from 255 to 255, not 0 to 1; divide by 255"),
+        (np.full((2, 2), 1e300), "scale it first"),
+        (np.array([[-1.0, 1.0]]), "from -1 to 1, not 0 to 1; scale it"),
+    ],
+)
+def test_check_image_refuses(image, complaint):
+    with pytest.raises(ImageError, match=complaint) as error:
+        check_image(image)
+    one_line(error)
+
+
+def test_non_finite_pixels_are_counted_and_placed():
+    image = np.zeros((3, 4, 3))
+    image[1, 2] = np.nan
+    image[2, 0, 1] = np.inf
+    with pytest.raises(ImageError, match=r"2 of 12 pixels .* first at \[1, 2\]") as error:
+        check_image(image)
+    one_line(error)
+
+
+# ---------------------------------------------------------------- writing
+
+
+@pytest.mark.parametrize("suffix", LOSSLESS)
+@settings(max_examples=10, deadline=None)
+@given(image=byte_images)
+def test_lossless_round_trip(tmp_path_factory, suffix, image):
+    path = tmp_path_factory.mktemp("round") / f"a{suffix}"
+    save_image(path, image)
+    np.testing.assert_array_equal(load_image(path), check_image(image))
+    save_image(path, load_image(path))
+    np.testing.assert_array_equal(load_image(path), check_image(image))
+
+
+@pytest.mark.parametrize("suffix", SAVE_OPTIONS)
+def test_every_suffix_is_written_in_its_format(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    image = np.full((8, 8, 3), (0.2, 0.4, 0.6))
+    save_image(path, image)
+    np.testing.assert_allclose(load_image(path), image, atol=0.02)
+    kind = {".jpg": "JPEG", ".tif": "TIFF"}.get(suffix, suffix[1:].upper())
+    assert property_of(path, "format") == kind
+
+
+@pytest.mark.parametrize(("channels", "mode"), [(1, "L"), (3, "RGB")])
+def test_grey_stays_grey(tmp_path, channels, mode):
+    image = np.random.default_rng(0).integers(0, 256, (5, 4, channels), np.uint8)
+    save_image(tmp_path / "a.png", image)
+    assert property_of(tmp_path / "a.png", "mode") == mode
+    kept = load_image(tmp_path / "a.png", keep_grey=True)
+    np.testing.assert_array_equal(kept, check_image(image, keep_grey=True))
+    assert kept.shape == image.shape and kept.flags.c_contiguous
+
+
+def test_saving_clamps_and_rounds(tmp_path):
+    values = np.array([[-3, 0.49 / 255, 0.51 / 255, 0.9999, 7, 1e300]])
+    save_image(tmp_path / "a.png", values)
+    levels = np.rint(load_image(tmp_path / "a.png") * 255)[0, :, 0]
+    np.testing.assert_array_equal(levels, [0, 0, 1, 255, 255, 255])
+    np.testing.assert_array_equal(to_8bit(values)[0], levels)
+
+
+@pytest.mark.parametrize("name", ["a.gif", "a.exr", "a", "a.npz", ".png"])
+def test_unknown_suffix(tmp_path, name):
+    with pytest.raises(ImageError, match=r"is unknown; use one of \.png") as error:
+        save_image(tmp_path / name, BYTES)
+    one_line(error)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failed_write_leaves_everything_as_it_was(tmp_path, monkeypatch):
+    path = tmp_path / "a.png"
+    save_image(path, BYTES)
+    before = path.read_bytes()
+
+    def disk_full(self, target, **options):
+        Path(target).write_bytes(b"half of")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", disk_full)
+    with pytest.raises(ImageError, match="No space left") as error:
+        save_image(path, 1 - BYTES / 255)
+    one_line(error)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_unwritable_targets(tmp_path):
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "file").write_bytes(b"")
+    for target in ("folder.png", "nowhere/a.png", "file/a.png"):
+        with pytest.raises(ImageError, match=r"cannot be written|is a folder") as error:
+            save_image(tmp_path / target, BYTES)
+        assert one_line(error).count("choose another path") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
+
+
+def test_bad_pixels_touch_no_file(tmp_path):
+    for image in (np.full((2, 2), np.nan), np.zeros((2, 2, 5)), np.zeros((0, 0, 3))):
+        with pytest.raises(ImageError):
+            save_image(tmp_path / "a.png", image)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,215 @@
+"""The prefilter in Mitsuba: footprints of the camera, against many samples a pixel."""
+
+import gc
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from _helpers.sets import SIZE, random_scene
+
+mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
+from _helpers.texture import at, gaussians, texture  # noqa: E402
+from eigengs_dr.plugins import pixel_angle, texture_of  # noqa: E402
+from eigengs_dr.plugins.cone import PIXEL, metric  # noqa: E402
+from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, bound_covariance  # noqa: E402
+
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
+
+
+def plane(tex, tiles=60, side=48):
+    """A plane that glows with the texture, receding to the horizon: no lights, no noise."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1},
+            "sensor": {
+                "type": "perspective",
+                "fov": 50,
+                "to_world": mi.ScalarTransform4f().look_at([0, -30, 3], [0, 0, -8], [0, 0, 1]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": side,
+                    "height": side,
+                    "rfilter": {"type": "box"},
+                },
+                "sampler": {"type": "independent", "sample_count": 1},
+            },
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.5}},
+            "plane": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().scale([200, 200, 1]),
+                "emitter": {
+                    "type": "area",
+                    "radiance": {**tex, "to_uv": mi.ScalarTransform4f().scale(tiles)},
+                },
+            },
+        }
+    )
+
+
+def seen(si, angle, inverse=(1.0, 0.0, 0.0, 1.0)):
+    """Standard deviations along u and v of the footprint of a surface interaction."""
+    rows, valid = metric(si, inverse, angle)
+    covariance, blind = bound_covariance(rows)
+    return np.sqrt([np.array(covariance[0]), np.array(covariance[2])]), valid, blind
+
+
+def facing(tilt=0.0, t=10.0):
+    """A surface whose uv are metres, seen under a tilt about its u axis from a distance."""
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.t, si.sh_frame = t, mi.Frame3f([0, 0, 1])
+    si.wi = mi.Vector3f(0, float(np.sin(tilt)), float(np.cos(tilt)))
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    return si
+
+
+class TestCone:
+    @pytest.mark.parametrize("tilt", [0.0, 0.5, 1.4])
+    @pytest.mark.parametrize("t", [1.0, 10.0])
+    def test_is_as_wide_as_a_pixel_and_as_long_as_the_tilt_makes_it(self, tilt, t):
+        width, valid, _ = seen(facing(tilt, t), 0.001)
+        assert valid == [True]
+        expected = np.array([1, 1 / np.cos(tilt)]) * PIXEL * 0.001 * t
+        np.testing.assert_allclose(width.ravel(), expected, rtol=1e-2)
+
+    def test_follows_the_scale_of_uv(self):
+        si = facing()
+        si.dp_du = mi.Vector3f(4, 0, 0)  # a uv unit is 4 m
+        width, _, _ = seen(si, 0.001)
+        np.testing.assert_allclose(width.ravel(), [PIXEL * 0.01 / 4, PIXEL * 0.01], rtol=1e-2)
+
+    def test_follows_to_uv(self):
+        width, _, _ = seen(facing(), 0.001, (1 / 3, 0.0, 0.0, 1.0))
+        np.testing.assert_allclose(width.ravel(), [PIXEL * 0.03, PIXEL * 0.01], rtol=1e-2)
+
+    def test_follows_a_turn_of_to_uv(self):
+        """Against the plain product of matrices, for a transform that is no scale."""
+        si, linear = facing(0.8), np.array([[0.6, 0.9], [-0.3, 1.1]])
+        rows, _ = metric(si, tuple(np.linalg.inv(linear).ravel()), 0.01)
+        covariance = linear @ np.diag([1, 1 / np.cos(0.8)]) ** 2 @ linear.T * (PIXEL * 0.1) ** 2
+        expected = np.linalg.inv(covariance)[[0, 0, 1], [0, 1, 1]]
+        np.testing.assert_allclose(np.ravel(rows), expected, rtol=1e-3)
+
+    def test_at_grazing_angles_it_stays_bounded(self):
+        width, valid, _ = seen(facing(np.pi / 2 - 1e-6), 0.001)
+        assert valid == [True]
+        assert width[1] == pytest.approx(MAX_FOOTPRINT, rel=1e-3)
+
+    @pytest.mark.parametrize("change", ["no uv", "a line", "no distance", "infinite", "nan"])
+    def test_without_a_jacobian_there_is_none(self, change):
+        si = facing()
+        if change == "no uv":
+            si.dp_du = si.dp_dv = mi.Vector3f(0)
+        elif change == "a line":
+            si.dp_dv = mi.Vector3f(si.dp_du)
+        elif change == "nan":
+            si.dp_du = mi.Vector3f(np.nan)
+        else:
+            si.t = 0.0 if change == "no distance" else np.inf
+        _, valid, _ = seen(si, 0.001)
+        assert valid == [False]
+        si.uv = mi.Point2f(0.3, 0.6)
+        filtered, point = (
+            np.array(texture(gaussians(), prefilter=angle).eval(si)) for angle in (0.001, 0.0)
+        )
+        np.testing.assert_allclose(filtered, point, atol=1e-5)
+
+    def test_pixel_angle(self):
+        sensor = plane(texture_of(gaussians())).sensors()[0]
+        assert pixel_angle(sensor) == pytest.approx(2 * np.tan(np.radians(25)) / 48)
+
+    def test_of_a_sensor_without_a_field_of_view(self):
+        with pytest.raises(ValueError, match="has no x_fov"):
+            pixel_angle(mi.load_dict({"type": "orthographic"}))
+
+
+class TestPlane:
+    @pytest.mark.parametrize("wrap", ["repeat", "mirror"])
+    def test_one_filtered_sample_is_closer_to_the_mean_of_many(self, wrap):
+        g = gaussians("linear")
+        g.color *= 4
+        tex = {**texture_of(g), "wrap_mode": wrap}
+        angle = pixel_angle(plane(tex).sensors()[0])
+        reference = np.array(mi.render(plane(tex), spp=512, seed=9))
+        errors = []
+        for prefilter in (angle, 0.0):
+            scene = plane({**tex, "prefilter": prefilter})
+            images = [np.array(mi.render(scene, spp=1, seed=s)) for s in range(4)]
+            errors.append(np.square(images - reference).mean())
+        assert errors[0] < 0.35 * errors[1]
+
+    def test_mirror_and_repeat_agree_on_a_picture_that_is_its_own_mirror(self):
+        """All splats twice, so that the picture is symmetric."""
+        scene = random_scene(3)
+        mirrored = scene._replace(
+            mean=np.array([SIZE[0], 0]) - scene.mean * [1, -1], factor=scene.factor * [1, -1, 1]
+        )
+        both = scene._replace(
+            **{
+                k: np.concatenate([getattr(scene, k), getattr(mirrored, k)])
+                for k in ("mean", "factor", "color")
+            }
+        )
+        g = both._replace(color=0.02 * both.color, background=np.full(3, 0.5)).on(
+            "llvm", space="linear"
+        )
+        v, u = np.mgrid[:20, :20] / 20 + 0.025
+        si = dr.zeros(mi.SurfaceInteraction3f, 400)
+        si.uv = mi.Point2f(mi.Float(np.float32(u.ravel())), mi.Float(np.float32(v.ravel())))
+        si.t, si.sh_frame, si.wi = 1.0, mi.Frame3f([0, 0, 1]), mi.Vector3f(0, 0, 1)
+        si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 100, 0)
+        found = [
+            np.array(texture(g, prefilter=0.3, wrap_mode=wrap).eval(si))
+            for wrap in ("repeat", "mirror")
+        ]
+        inside = np.abs(v.ravel() - 0.5) < 0.4
+        np.testing.assert_allclose(found[0][:, inside], found[1][:, inside], atol=2e-3)
+
+    @pytest.mark.parametrize(("angle", "scale"), [(0.05, 3), (0.3, 3), (0.9, 3), (0.5, 1)])
+    @pytest.mark.parametrize("outside", ["v", "both"])
+    def test_clamped_outside_it_sees_the_border(self, angle, scale, outside):
+        """Blurred along the border, not with what lies inside of it."""
+        g = gaussians("linear")
+        g.color *= 3
+        width = PIXEL * angle / scale
+        along = 0.5 + width * np.linspace(-3, 3, 61) if outside == "v" else np.array([1.7])
+        weight = np.exp(-0.5 * np.linspace(-3, 3, len(along)) ** 2)
+        mirrored = 1 - np.abs(1 - along % 2) if outside == "v" else along
+        border = texture(g, wrap_mode="clamp").eval(at(mi.Float(np.float32(mirrored)), 1.4))
+        expected = np.average(np.array(border), axis=1, weights=weight)
+        si = facing(t=1.0)
+        si.dp_du, si.dp_dv = mi.Vector3f(scale, 0, 0), mi.Vector3f(0, scale, 0)
+        si.uv = mi.Point2f(0.5 if outside == "v" else 1.7, 1.4)
+        found = texture(g, wrap_mode="clamp", prefilter=angle).eval(si)
+        np.testing.assert_allclose(np.ravel(found), expected, atol=0.01)
+
+    def test_a_footprint_that_sees_all_sees_the_mean(self):
+        g = gaussians("linear")
+        tex = texture(g, prefilter=0.5)
+        si = facing(t=1e4)
+        si.uv = mi.Point2f(0.7, 0.1)
+        np.testing.assert_allclose(np.array(tex.eval_1(si)), np.array(tex.mean()), atol=2e-3)
+
+
+def test_the_collector_stays_out_of_lookups():
+    """Scenes that are freed while another one is recorded end the process: see `uncollected`."""
+    seen = []
+    tex = texture(gaussians())
+    look = type(tex)._color
+
+    def spy(self, si, active):
+        seen.append(gc.isenabled())
+        return look(self, si, active)
+
+    type(tex)._color = spy
+    try:
+        assert gc.isenabled()
+        tex.eval(facing())
+        tex.eval_3(facing())
+        with pytest.raises(ValueError, match="three channels"):
+            texture(gaussians("data", channels=1)).eval_3(facing())
+        assert gc.isenabled()
+    finally:
+        type(tex)._color = look
+    assert seen.count(False) == 2

@@ -1,0 +1,307 @@
+"""Derivatives through Mitsuba's integrators, parameters from a model, what optimisers leave."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from _helpers.families import small_model
+from _helpers.sets import SIZE, random_scene
+
+mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
+import eigengs_dr as eg  # noqa: E402
+from _helpers.texture import at, gaussians, picture, small_scene, texel_centres, texture  # noqa: E402
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION  # noqa: E402
+from eigengs_dr.plugins import gaussians_of, keep_in_bounds, texture_of  # noqa: E402
+
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
+
+PARAMETERS = ["mean", "factor", "color", "background"]
+TEXTURE = "wall.bsdf.reflectance"
+SIDE, SPP, SEED = 12, 32, 3
+
+
+def of_texture(scene):
+    parameters = mi.traverse(scene)
+    parameters.keep([f"{TEXTURE}\\..*"])
+    return parameters
+
+
+def wall(g, **properties):
+    return {"type": "diffuse", "reflectance": {**texture_of(g), **properties}}
+
+
+def gradients(scene, weight):
+    """Gradient of ``<weight, image>`` with respect to every parameter, from the integrator."""
+    parameters = of_texture(scene)
+    for key, value in parameters:
+        dr.enable_grad(value)
+        parameters[key] = value
+    parameters.update()
+    scene.integrator().render_backward(scene, parameters, weight, seed=SEED, spp=SPP)
+    return {key.split(".")[-1]: np.array(dr.grad(value)) for key, value in parameters}
+
+
+def difference(scene, name, step, direction, weight):
+    """The same along a direction, by finite differences at the same seed."""
+    parameters, key = of_texture(scene), f"{TEXTURE}.{name}"
+    start, losses = np.array(parameters[key]), []
+    for moved in (start + step * direction, start - step * direction, start):
+        parameters[key] = mi.TensorXf(np.float32(moved))
+        parameters.update()
+        with dr.suspend_grad():
+            image = scene.integrator().render(scene, seed=SEED, spp=SPP)
+        losses.append((np.array(image, np.float64) * np.array(weight)).sum())
+    return (losses[0] - losses[1]) / (2 * step)
+
+
+def direction_like(array):
+    return np.random.default_rng(2).normal(size=array.shape).astype(np.float32)
+
+
+def upstream(shape=(SIDE, SIDE, 3)):
+    return np.random.default_rng(1).normal(size=shape).astype(np.float32)
+
+
+class TestIntegrators:
+    @pytest.mark.parametrize(
+        ("integrator", "prefilter"), [("direct", 0.0), ("path", 0.0), ("prb", 0.0), ("prb", 0.05)]
+    )
+    def test_gradients_are_finite_differences(self, integrator, prefilter):
+        """To 1 %, at equal seeds; a cutoff of 6 leaves no edge for finite differences to cross."""
+        g = gaussians("ycbcr")
+        scene = small_scene(wall(g, cutoff=6.0, prefilter=prefilter), integrator, SIDE, SPP)
+        weight = mi.TensorXf(upstream())
+        found = gradients(scene, weight)
+        assert list(found) == PARAMETERS
+        for name, gradient in found.items():
+            direction = direction_like(gradient)
+            step = {"mean": 2e-2, "factor": 1e-3}.get(name, 2e-3)
+            expected = difference(scene, name, step, direction, weight)
+            assert abs(expected) > 1e-2
+            assert (gradient * direction).sum() == pytest.approx(expected, rel=0.01), name
+
+    @pytest.mark.parametrize("integrator", ["direct", "path", "prb"])
+    def test_no_gradient_is_silently_zero(self, integrator):
+        scene = small_scene(wall(gaussians()), integrator, SIDE, 4)
+        parameters = of_texture(scene)
+        for key, value in parameters:
+            dr.enable_grad(value)
+            parameters[key] = value
+        parameters.update()
+        dr.backward(dr.sum(mi.render(scene, params=parameters, spp=4) * mi.TensorXf(upstream())))
+        for key, value in parameters:
+            assert np.abs(np.array(dr.grad(value))).max() > 1e-4, key
+
+    @pytest.mark.parametrize("integrator", ["direct", "prb"])
+    def test_forward_mode_agrees_with_reverse(self, integrator):
+        """Not of "path", whose loop Dr.Jit cannot carry derivatives of another loop into."""
+        expected = gradients(
+            small_scene(wall(gaussians()), integrator, SIDE, SPP), mi.TensorXf(upstream())
+        )["color"]
+        scene = small_scene(wall(gaussians()), integrator, SIDE, SPP)
+        parameters = of_texture(scene)
+        key, along = f"{TEXTURE}.color", mi.Float(0)
+        dr.enable_grad(along)
+        direction = direction_like(expected)
+        parameters[key] = mi.TensorXf(parameters[key]) + along * mi.TensorXf(direction)
+        parameters.update()
+        # To what the texture made of its parameters, before the integrator isolates itself.
+        dr.forward(along, dr.ADFlag.ClearEdges)
+        image = scene.integrator().render_forward(scene, parameters, seed=SEED, spp=SPP)
+        found = (np.array(image) * upstream()).sum()
+        assert found == pytest.approx((expected * direction).sum(), rel=1e-3)
+
+
+class TestClamp:
+    @pytest.mark.parametrize("space", ["linear", "rgb"])
+    @pytest.mark.parametrize(("outside", "sign"), [(1.7, 1), (-0.4, -1)])
+    def test_colours_out_of_range_feel_the_way_back(self, space, outside, sign):
+        g = gaussians(space)
+        g.background = dr.full(type(g.background), outside, (3, 1))
+        tex = texture(g)
+        parameters = mi.traverse(tex)
+        dr.enable_grad(parameters["background"])
+        parameters.update()
+        value = tex.eval_1(at(0.5, 0.5))
+        assert np.array(value) == pytest.approx(1 if sign > 0 else 0, abs=1e-6)
+        dr.backward(dr.square(value - 0.5))
+        assert (np.sign(np.array(dr.grad(parameters["background"]))) == sign).all()
+
+    def test_a_descent_comes_back(self):
+        g = gaussians("linear")
+        g.background = dr.full(type(g.background), 3.0, (3, 1))
+        tex = texture(g)
+        parameters = mi.traverse(tex)
+        optimizer = mi.ad.Adam(lr=0.2, params={"background": parameters["background"]})
+        for _ in range(40):
+            parameters.update(optimizer)
+            dr.backward(dr.mean(dr.square(tex.eval_1(texel_centres()) - 0.5)))
+            optimizer.step()
+        assert np.array(optimizer["background"]) == pytest.approx(0.5, abs=0.1)
+
+
+class TestBroken:
+    @pytest.mark.parametrize("name", PARAMETERS)
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, -5.0, 1e30, 1e-20])
+    @pytest.mark.parametrize("prefilter", [0.0, 0.01])
+    def test_parameters_leave_a_finite_picture(self, name, value, prefilter):
+        tex = texture(gaussians(), prefilter=prefilter)
+        parameters = mi.traverse(tex)
+        broken = np.array(parameters[name])
+        broken[: max(1, len(broken) // 4)] = value
+        parameters[name] = mi.TensorXf(broken)
+        parameters.update()
+        si = texel_centres()
+        si.t, si.wi = 1.0, mi.Vector3f(0, 0, 1)
+        si.sh_frame = mi.Frame3f([0, 0, 1])
+        si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+        found = np.array(tex.eval(si))
+        assert np.isfinite(found).all()
+        assert found.min() >= 0
+        assert found.max() <= 1
+
+    @pytest.mark.parametrize("factor", [[1e-20, 0, 1], [1e-30, 0, 1e-30], [1, 1e20, 1]])
+    def test_a_set_of_giants_loads(self, factor):
+        g = eg.Gaussians.from_arrays(
+            [[8, 8]], [factor], [[0.5] * 3], size=(16, 16), space="linear", backend="llvm"
+        )
+        assert np.isfinite(np.array(texture(g, prefilter=0.01).eval(at(0.3, 0.4)))).all()
+
+    def test_one_broken_splat_is_as_none(self):
+        scene = random_scene(0)
+        broken = scene.factor.copy()
+        broken[5] = np.nan
+        kept = scene.permuted(np.setdiff1d(np.arange(len(broken)), 5))
+        tex = texture(gaussians(), raw=True)
+        parameters = mi.traverse(tex)
+        parameters["factor"] = mi.TensorXf(broken.astype(np.float32))
+        parameters.update()
+        g = kept._replace(color=0.04 * kept.color, background=np.full(3, 0.5)).on("llvm")
+        np.testing.assert_allclose(
+            picture(tex.eval_3(texel_centres())), eg.render(g).numpy(), atol=1e-5
+        )
+
+    def test_bounds(self):
+        optimizer = mi.ad.Adam(lr=0.1)
+        optimizer["t.mean"] = mi.TensorXf(np.float32([[1, 2], [np.nan, 99], [-3, 4]]))
+        optimizer["t.factor"] = mi.TensorXf(np.float32([[1, 2, 3], [np.nan, 99, -1], [1, 0, 1]]))
+        optimizer["t.color"] = mi.TensorXf(np.float32([[1, 2, 3], [np.nan, 99, -1], [1, 0, 1]]))
+        keep_in_bounds(optimizer, "t", gaussians())
+        high, low = 1 / MIN_DEVIATION, 1 / (2 * max(SIZE))
+        np.testing.assert_allclose(
+            np.array(optimizer["t.mean"]), [[1, 2], [SIZE[0] / 2, SIZE[1]], [0, 4]]
+        )
+        np.testing.assert_allclose(
+            np.array(optimizer["t.factor"]), [[1, 2, 3], [high, high, low], [1, 0, 1]]
+        )
+        np.testing.assert_allclose(
+            np.array(optimizer["t.color"]), [[1, 2, 3], [0, 99, -1], [1, 0, 1]]
+        )
+
+    def test_a_set_is_read_back(self):
+        g = gaussians("linear")
+        scene = small_scene(wall(g), "direct", SIDE, 1)
+        parameters = mi.traverse(scene)
+        parameters[f"{TEXTURE}.color"] = 2 * parameters[f"{TEXTURE}.color"]
+        found = gaussians_of(parameters, TEXTURE, g)
+        assert (found.width, found.height, found.space) == (*SIZE, "linear")
+        np.testing.assert_array_equal(found.to_arrays()["mean"], g.to_arrays()["mean"])
+        np.testing.assert_array_equal(found.to_arrays()["color"], 2 * g.to_arrays()["color"])
+
+
+class TestModel:
+    @pytest.fixture
+    def saved(self, tmp_path):
+        model = small_model("llvm")
+        model.save(tmp_path / "m.npz")
+        return str(tmp_path / "m.npz"), eg.EigenGS.load(tmp_path / "m.npz", "llvm")
+
+    def test_coefficients_give_the_model_s_picture(self, saved):
+        path, model = saved
+        rng = np.random.default_rng(0)
+        rows = [0.1 * rng.normal(size=k).astype(np.float32) for k in model.components]
+        tex = mi.load_dict({"type": "gaussian_texture", "model": path, "raw": True})
+        parameters = mi.traverse(tex)
+        assert [key for key, _ in parameters] == ["coefficients"]
+        assert parameters["coefficients"].shape == (3, max(model.components))
+        table = np.zeros(parameters["coefficients"].shape, np.float32)
+        for padded, row in zip(table, rows, strict=True):
+            padded[: len(row)] = row
+        for given in (table, table * 0):
+            parameters["coefficients"] = mi.TensorXf(given)
+            parameters.update()
+            expected = model.reconstruct(
+                [r[:k] for r, k in zip(given, model.components, strict=True)]
+            )
+            found = picture(tex.eval_3(texel_centres((32, 32))), (32, 32))
+            np.testing.assert_allclose(found, eg.render(expected).numpy(), atol=1e-4)
+
+    def test_coefficients_may_be_given(self, saved):
+        path, model = saved
+        table = np.full((3, max(model.components)), 0.1, np.float32)
+        tex = mi.load_dict(
+            {"type": "gaussian_texture", "model": path, "coefficients": mi.TensorXf(table)}
+        )
+        np.testing.assert_array_equal(np.array(mi.traverse(tex)["coefficients"]), table)
+
+    @pytest.mark.parametrize("integrator", ["direct", "prb"])
+    def test_gradients_are_finite_differences(self, saved, integrator):
+        bsdf = {"type": "diffuse", "reflectance": {"type": "gaussian_texture", "model": saved[0]}}
+        scene = small_scene(bsdf, integrator, SIDE, SPP)
+        weight = mi.TensorXf(upstream())
+        (gradient,) = gradients(scene, weight).values()
+        direction = direction_like(gradient)
+        expected = difference(scene, "coefficients", 1e-2, direction, weight)
+        assert abs(expected) > 1e-2
+        assert (gradient * direction).sum() == pytest.approx(expected, rel=0.01)
+
+    def test_coefficients_of_another_shape(self, saved):
+        with pytest.raises(RuntimeError, match=r"coefficients has shape \(2, 2\), expected \(3, "):
+            mi.load_dict(
+                {
+                    "type": "gaussian_texture",
+                    "model": saved[0],
+                    "coefficients": mi.TensorXf(np.zeros((2, 2), np.float32)),
+                }
+            )
+
+    @pytest.mark.parametrize("value", [np.nan, np.inf])
+    def test_coefficients_that_are_not_finite(self, saved, value):
+        path, model = saved
+        given = {"type": "gaussian_texture", "model": path}
+        broken = np.zeros((3, max(model.components)), np.float32)
+        broken[:, -1] = value
+        with pytest.raises(RuntimeError, match="coefficients has values that are not finite"):
+            mi.load_dict({**given, "coefficients": mi.TensorXf(broken)})
+        tex = mi.load_dict(given)
+        expected = np.array(tex.eval(texel_centres()))
+        parameters = mi.traverse(tex)
+        parameters["coefficients"] = mi.TensorXf(broken)  # as a step of an optimiser may leave
+        parameters.update()
+        np.testing.assert_array_equal(np.array(tex.eval(texel_centres())), expected)
+
+    def test_a_set_is_no_model(self, tmp_path):
+        gaussians().save(tmp_path / "x.npz")
+        with pytest.raises(RuntimeError, match=r"x\.npz"):
+            mi.load_dict({"type": "gaussian_texture", "model": str(tmp_path / "x.npz")})
+
+
+def test_optimising_colours_finds_a_picture():
+    """The whole loop: photographs of one texture, recovered in another."""
+    truth, start = gaussians("linear"), gaussians("linear")
+    truth.color *= 5
+    start.color *= 0
+    target = mi.render(small_scene(wall(truth), "prb", SIDE), spp=256)
+    scene = small_scene(wall(start), "prb", SIDE)
+    parameters = of_texture(scene)
+    key = f"{TEXTURE}.color"
+    optimizer = mi.ad.Adam(lr=0.02, params={key: parameters[key]})
+    for seed in range(40):
+        parameters.update(optimizer)
+        image = mi.render(scene, params=parameters, spp=16, seed=seed)
+        dr.backward(dr.mean(dr.square(image - target), axis=None))
+        optimizer.step()
+        keep_in_bounds(optimizer, TEXTURE, start)
+    found = gaussians_of(optimizer, TEXTURE, start)
+    truth, grey, found = (eg.render(g).numpy() for g in (truth, gaussians("linear")[:1], found))
+    assert np.square(found - truth).mean() < 0.3 * np.square(grey - truth).mean()

@@ -1,0 +1,198 @@
+"""Upsampling of colours to spectra: bounds, round trip through Mitsuba's curves, derivatives."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+mi = pytest.importorskip("mitsuba")
+import drjit as dr  # noqa: E402
+
+from eigengs_dr.plugins import spectrum  # noqa: E402
+
+pytestmark = pytest.mark.mitsuba
+
+
+@pytest.fixture(autouse=True)
+def spectral():
+    """The spectral variant, for the length of a test."""
+    before = mi.variant()
+    try:
+        mi.set_variant("llvm_ad_spectral")
+    except (ImportError, AttributeError) as error:
+        pytest.skip(f"no llvm_ad_spectral: {error}")
+    yield
+    if before is not None:
+        mi.set_variant(before)
+
+
+def evaluate(colors, wavelengths):
+    """Spectra of colours of shape (3, n) at wavelengths of shape (m,): shape (n, m)."""
+    count, samples = colors.shape[1], len(wavelengths)
+    rgb = mi.Color3f(np.repeat(colors, samples, axis=1).astype(np.float32))
+    at = mi.Spectrum(mi.Float(np.tile(wavelengths, count).astype(np.float32)))
+    result = np.array(spectrum.upsample(rgb, at, spectrum.upload_table()))
+    assert np.all(result == result[:1])  # all four components are alike
+    return result[0].reshape(count, samples)
+
+
+def to_srgb(spectra, wavelengths):
+    """Colour under D65 of spectra of shape (n, m), by Mitsuba's curves: shape (3, n)."""
+    count = len(wavelengths)
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.wavelengths = mi.Spectrum(mi.Float(wavelengths.astype(np.float32)))
+    light = np.array(mi.load_dict({"type": "d65"}).eval(si))[0].astype(np.float64)
+    curves = np.array(mi.cie1931_xyz(mi.Float(wavelengths.astype(np.float32))))
+    xyz = (curves[:, None] * (spectra * light)).sum(axis=-1)  # next to nothing at the ends
+    xyz *= (wavelengths[1] - wavelengths[0]) * mi.MI_CIE_Y_NORMALIZATION
+    return np.array(mi.xyz_to_srgb(mi.Color3f(xyz.astype(np.float32))))
+
+
+FINE = np.arange(360, 831.0)
+"""Every nanometre: between the samples of the basis too."""
+
+
+def test_basis_is_a_partition_of_unity():
+    wavelengths, spectra = spectrum.basis()
+    assert wavelengths[0] == mi.MI_CIE_MIN and wavelengths[-1] == mi.MI_CIE_MAX
+    np.testing.assert_allclose(np.diff(wavelengths), spectrum.STEP)
+    assert spectra.shape == (3, len(wavelengths))
+    assert spectra.min() >= 0
+    np.testing.assert_allclose(spectra.sum(axis=0), 1, rtol=0, atol=1e-15)
+
+
+def test_basis_is_smooth():
+    # From 0 to 1 a spectrum takes some 50 nm: no combs, which would round-trip as well.
+    spectra = spectrum.basis()[1]
+    assert np.abs(np.diff(spectra, axis=1)).max() < 0.15
+    assert np.abs(np.diff(spectra, axis=1)).sum(axis=1).max() < 2.2
+
+
+def test_basis_is_shared_and_read_only():
+    assert spectrum.basis()[1] is spectrum.basis()[1]
+    with pytest.raises(ValueError, match="read-only"):
+        spectrum.basis()[1][0, 0] = 1
+
+
+@pytest.mark.parametrize(
+    "colors",
+    [np.eye(3), 1 - np.eye(3), np.random.default_rng(0).uniform(size=(3, 50))],
+    ids=["primaries", "secondaries", "random"],
+)
+def test_round_trip(colors):
+    back = to_srgb(evaluate(colors, FINE), FINE)
+    np.testing.assert_allclose(back, colors, rtol=0, atol=3e-4)
+
+
+def test_spectra_of_colors_are_reflectances():
+    corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
+    colors = np.hstack([corners, np.random.default_rng(1).uniform(size=(3, 50))])
+    spectra = evaluate(colors, np.arange(360, 830.1, 0.25))
+    assert spectra.min() >= -1e-6 and spectra.max() <= 1 + 1e-6
+
+
+def test_greys_are_exact():
+    grey = np.linspace(0, 1, 7, dtype=np.float32)
+    spectra = evaluate(np.broadcast_to(grey, (3, 7)), FINE)
+    assert np.all(spectra == grey[:, None])
+
+
+def test_samples_are_those_of_the_basis():
+    wavelengths, spectra = spectrum.basis()
+    np.testing.assert_allclose(evaluate(np.eye(3), wavelengths), spectra, rtol=0, atol=1e-6)
+
+
+def test_wavelengths_that_are_none():
+    odd = np.array([np.nan, 0, -1, 359.9, 830.1, 1e9, np.inf, -np.inf])
+    assert np.all(evaluate(np.full((3, 1), 0.5), odd) == 0)
+    assert np.all(evaluate(np.full((3, 1), 0.5), np.array([360.0, 830.0])) == 0.5)
+
+
+COLOR = (0.2, 0.7, 0.4)
+AT = (431.0, 502.5, 583.0, np.nan)
+
+
+def colored():
+    """One colour that has a gradient, and its spectrum at one set of four wavelengths."""
+    rgb = mi.Color3f(*COLOR)
+    dr.enable_grad(rgb)
+    at = mi.Spectrum(*AT)
+    return rgb, spectrum.upsample(rgb, at, spectrum.upload_table())
+
+
+def test_derivatives_in_both_modes_are_the_basis():
+    basis = evaluate(np.eye(3), np.array(AT))  # of a linear function: finite differences
+    for k in range(3):
+        rgb, value = colored()
+        rgb[k].grad = 1
+        dr.forward_to(value)
+        np.testing.assert_allclose(np.array(value.grad)[:, 0], basis[k], rtol=0, atol=1e-6)
+    weight = (1.0, -2.0, 3.0, 5.0)
+    rgb, value = colored()
+    value.grad = mi.Spectrum(*weight)
+    dr.backward_to(rgb)
+    np.testing.assert_allclose(np.array(rgb.grad)[:, 0], basis @ weight, rtol=0, atol=1e-5)
+
+
+def define_texture():
+    """A texture of one colour that upsamples, to be called through a BSDF in C++."""
+
+    class Colored(mi.Texture):
+        def __init__(self, props):
+            mi.Texture.__init__(self, props)
+            self.color = mi.Color3f(*COLOR)
+            self.table = spectrum.upload_table()
+
+        def eval(self, si, active=True):
+            return spectrum.upsample(self.color, si.wavelengths, self.table)
+
+        def is_spatially_varying(self):
+            return True
+
+        def traverse(self, callback):
+            callback.put("color", self.color, mi.ParamFlags.Differentiable)
+
+    return Colored
+
+
+def test_inside_a_symbolic_call():
+    mi.register_texture("spectrum_test", lambda props: define_texture()(props))
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "light": {"type": "constant"},
+            "sensor": {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}},
+                "sampler": {"type": "independent"},
+                "fov": 20,
+            },
+            "shape": {
+                "type": "rectangle",
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "spectrum_test"}},
+            },
+            # A second kind of BSDF, so that the call is one of several
+            "other": {
+                "type": "sphere",
+                "center": [9, 0, 0],
+                "bsdf": {"type": "conductor"},
+            },
+        }
+    )
+    key = "shape.bsdf.reflectance.color"
+    params = mi.traverse(scene)
+    dr.enable_grad(params[key])
+    integrator = mi.load_dict({"type": "path", "max_depth": 2})
+    image = mi.render(scene, params, integrator=integrator, spp=2048, seed=1)
+    mean = dr.mean(image, axis=(0, 1))
+    np.testing.assert_allclose(np.array(mean), COLOR, rtol=0, atol=0.02)
+    dr.backward(mean[0])
+    # Linear, and it round-trips: red of the image depends on red of the colour alone.
+    np.testing.assert_allclose(np.array(params[key].grad)[:, 0], [1, 0, 0], rtol=0, atol=0.04)
+
+
+def test_import_needs_no_variant():
+    code = "import eigengs_dr.plugins.spectrum as s; s.basis()"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,216 @@
+"""Sums at scattered points: values, slopes and gradients, against float64 without any lists."""
+
+import math
+
+import drjit as dr
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from _helpers.sets import SIZE, few, random_scene, scenes
+from eigengs_dr.backend.arrays import types_in, types_of
+from eigengs_dr.backend.selection import select
+from eigengs_dr.raster.layout import pack_parameters
+from eigengs_dr.raster.lookup.points import (
+    cell_side,
+    fold,
+    gradient_terms,
+    list_cells,
+    sum_at_points,
+    value_terms,
+)
+from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
+from eigengs_dr.raster.render import decode_parameters, render
+
+POINTS = 400
+WIDE = 9.0
+"""A cutoff at which a splat's edge is nothing: finite differences may cross it."""
+
+precisions = pytest.mark.parametrize(("bits", "rtol"), [(32, 2e-3), (64, 1e-6)])
+
+
+def some_points(count=POINTS, size=SIZE, seed=3):
+    """Points in the image, its corners among them, shape (count, 2)."""
+    points = np.random.default_rng(seed).uniform(0, 1, (count, 2)) * size
+    points[:4] = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size
+    return points.astype(np.float32).astype(np.float64)
+
+
+def exact_at(scene, points, cutoff):
+    """The sum in float64, shape (points, C), and how far each point is from any edge."""
+    delta = points[:, None] - scene.mean
+    a, b, c = scene.factor.T
+    u, v = a * delta[..., 0] + b * delta[..., 1], c * delta[..., 1]
+    distance = np.hypot(u, v)
+    weight = np.where(distance <= cutoff, np.exp(-0.5 * distance**2), 0)
+    off_edge = (np.abs(distance / cutoff - 1) > 1e-4).all(axis=1)
+    return scene.background + weight @ scene.color, off_edge
+
+
+def arrays_of(gaussians, points):
+    """Packed parameters, shape, background, and x and y of points, as lookups take them."""
+    p = decode_parameters(gaussians)
+    rows, background = [*p.shape, *p.color], p.background
+    types = types_of(gaussians.mean)
+    x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
+    return pack_parameters(rows), [dr.detach(r) for r in rows[:NUM_SHAPE_PARAMS]], background, x, y
+
+
+def look_up(gaussians, points, cutoff, side=4, terms=value_terms, number=1):
+    """Rows of sums at points, without the background."""
+    packed, shape, _, x, y = arrays_of(gaussians, points)
+    size, channels = (gaussians.width, gaussians.height), gaussians.channels
+    cells = list_cells(shape, *size, kernel_radius(cutoff), side)
+    active = types_of(x).Bool(True)
+    term = terms(kernel_radius(cutoff))
+    return sum_at_points(
+        cells, packed, NUM_SHAPE_PARAMS + channels, x, y, active, term, number * channels
+    )
+
+
+def stacked(rows):
+    return np.stack([np.array(r) for r in rows], axis=1)
+
+
+class TestValues:
+    @few
+    @given(scene=scenes())
+    def test_sums_all_splats_that_reach_a_point(self, backend, scene):
+        exact, sure = exact_at(scene, some_points(), 3.0)
+        found = stacked(look_up(scene.on(backend), some_points(), 3.0)) + scene.background
+        np.testing.assert_allclose(found[sure], exact[sure], atol=2e-5)
+
+    @pytest.mark.parametrize("side", [1, 2, 8, 64])
+    def test_does_not_depend_on_the_cells(self, backend, side):
+        gaussians = random_scene(1).on(backend)
+        np.testing.assert_allclose(
+            stacked(look_up(gaussians, some_points(), 3.0, side)),
+            stacked(look_up(gaussians, some_points(), 3.0)),
+            atol=1e-6,
+        )
+
+    def test_is_what_render_gives_at_pixel_centres(self, backend):
+        gaussians = random_scene(2).on(backend)
+        y, x = (v.ravel() + 0.5 for v in np.mgrid[: SIZE[1], : SIZE[0]])
+        found = stacked(look_up(gaussians, np.stack([x, y], 1), 3.0))
+        found = found.reshape(SIZE[1], SIZE[0], 3) + gaussians.to_arrays()["background"]
+        np.testing.assert_allclose(found, render(gaussians).numpy(), atol=1e-6)
+
+    def test_in_double_precision(self, backend):
+        scene = random_scene(4)
+        exact, _ = exact_at(scene, some_points(), WIDE)
+        found = stacked(look_up(scene.on(backend, bits=64), some_points(), WIDE))
+        np.testing.assert_allclose(found + scene.background, exact, atol=1e-12)
+
+    def test_costs_what_overlaps_and_not_what_there_is(self, backend):
+        """64 times the splats on 64 times the area: a point has hardly more of them to look at."""
+        lengths = []
+        for count, size in ((50, (64, 64)), (3200, (512, 512))):
+            rng = np.random.default_rng(0)
+            scene = random_scene(0, count, size)._replace(
+                mean=rng.uniform(0, 1, (count, 2)) * size, factor=np.tile([0.3, 0, 0.3], (count, 1))
+            )
+            _, shape, *_ = arrays_of(scene.on(backend), some_points(size=size))
+            ends = np.array(list_cells(shape, *size, kernel_radius(3), 4).ends).reshape(-1, 2)
+            lengths.append(np.mean(ends[:, 1].astype(int) - ends[:, 0]))
+        assert lengths[1] < 1.4 * lengths[0]  # fewer cells lie at the border
+
+    def test_splats_that_are_not_finite_are_not_seen(self, backend):
+        scene = random_scene(5)
+        broken = scene.factor.copy()
+        broken[3, 0], broken[4, 2] = np.nan, np.inf
+        others = np.setdiff1d(np.arange(len(broken)), [3, 4])
+        np.testing.assert_allclose(
+            stacked(look_up(scene._replace(factor=broken).on(backend), some_points(), 3.0)),
+            stacked(look_up(scene.permuted(others).on(backend), some_points(), 3.0)),
+            atol=1e-6,
+        )
+
+
+class TestDerivatives:
+    def test_slopes_are_finite_differences(self, backend):
+        scene, points, step = random_scene(6), some_points(), 1e-5
+        rows = stacked(
+            look_up(scene.on(backend, bits=64), points, WIDE, terms=gradient_terms, number=3)
+        )
+        for k, direction in ((1, [step, 0]), (2, [0, step])):
+            up, down = (exact_at(scene, points + s * np.array(direction), WIDE)[0] for s in (1, -1))
+            np.testing.assert_allclose(rows[:, k::3], (up - down) / (2 * step), atol=1e-8)
+
+    @precisions
+    @pytest.mark.parametrize("name", ["mean", "factor", "color"])
+    def test_gradients_are_finite_differences(self, backend, bits, rtol, name):
+        scene, points = random_scene(7, count=7), some_points()
+        weight = np.random.default_rng(0).normal(size=(POINTS, 3))
+        gaussians = scene.on(backend, bits=bits)
+        dr.enable_grad(getattr(gaussians, name))
+        rows = look_up(gaussians, points, WIDE)
+        Float = types_of(gaussians.mean).Float
+        dr.backward(dr.sum(sum(r * Float(w) for r, w in zip(rows, weight.T.copy(), strict=True))))
+        found = np.array(dr.grad(getattr(gaussians, name))).T
+        exact = np.zeros_like(found, dtype=np.float64)
+        for index in np.ndindex(exact.shape):
+            moved = np.zeros(exact.shape)
+            moved[index] = 1e-6
+            up, down = (
+                (exact_at(scene._replace(**{name: getattr(scene, name) + s * moved}), points, WIDE))
+                for s in (1, -1)
+            )
+            exact[index] = ((up[0] - down[0]) * weight).sum() / 2e-6
+        assert np.abs(exact).max() > 0.1
+        np.testing.assert_allclose(found, exact, atol=rtol * np.abs(exact).max())
+
+    def test_gradient_reaches_the_point(self, backend):
+        """The loop hands on derivatives of where it is evaluated, which geometry may have."""
+        gaussians = random_scene(8).on(backend, bits=64)
+        packed, shape, _, x, y = arrays_of(gaussians, some_points())
+        cells = list_cells(shape, *SIZE, kernel_radius(WIDE), 4)
+        active = types_of(x).Bool(True)
+        dr.enable_grad(x, y)
+        sums = sum_at_points(cells, packed, 8, x, y, active, value_terms(kernel_radius(WIDE)), 3)
+        dr.backward(dr.sum(sums[0]))
+        rows = look_up(gaussians, some_points(), WIDE, terms=gradient_terms, number=3)
+        np.testing.assert_allclose(np.array(dr.grad(x)), np.array(rows[1]), atol=1e-9)
+        np.testing.assert_allclose(np.array(dr.grad(y)), np.array(rows[2]), atol=1e-9)
+
+
+class TestFold:
+    def folded(self, backend, x, wrap, side=10):
+        Float = types_in(select(backend)).Float
+        return tuple(np.array(v) for v in fold(Float(np.asarray(x, np.float32)), side, wrap))
+
+    @pytest.mark.parametrize(
+        ("wrap", "expected", "slope"),
+        [
+            ("repeat", [8, 3, 3, 3, 8], [1, 1, 1, 1, 1]),
+            ("mirror", [2, 3, 7, 3, 8], [-1, 1, -1, 1, 1]),
+            ("clamp", [0, 3, 10, 10, 0], [0, 1, 0, 0, 0]),
+        ],
+    )
+    def test_known_values(self, backend, wrap, expected, slope):
+        found = self.folded(backend, [-2, 3, 13, 23, -12], wrap)
+        np.testing.assert_allclose(found[0], expected)
+        np.testing.assert_allclose(found[1] + np.zeros(5), slope)
+
+    @few
+    @given(
+        x=st.floats(allow_nan=False, allow_infinity=False, width=32),
+        wrap=st.sampled_from(["repeat", "mirror", "clamp"]),
+    )
+    def test_never_leaves_the_image(self, backend, x, wrap):
+        found, slope = self.folded(backend, [x], wrap)
+        assert 0 <= found[0] <= 10
+        assert slope[0] in (-1, 0, 1)
+
+    @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
+    def test_what_is_not_finite_becomes_zero(self, backend, wrap):
+        found, _ = self.folded(backend, [np.nan, np.inf, -np.inf], wrap)
+        np.testing.assert_array_equal(found, 0)
+
+
+@pytest.mark.parametrize(("count", "side"), [(1, 256), (500, 8), (5000, 4), (65536, 1)])
+def test_cells_are_about_as_wide_as_splats_are_apart(count, side):
+    found = cell_side(256, 256, count)
+    assert found == side
+    assert math.log2(found) == int(math.log2(found))

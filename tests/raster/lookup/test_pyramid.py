@@ -1,0 +1,144 @@
+"""Distant views: lattices against brute force and against exact lookups; their gradients."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from _helpers.footprints import CUTOFF, brute_force, some_points, stacked, tiled
+from _helpers.sets import SIZE, random_scene
+from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.raster.layout import pack_parameters
+from eigengs_dr.raster.lookup import pyramid as module
+from eigengs_dr.raster.lookup.pyramid import build_pyramid, is_minified, pyramid_mean, sum_pyramid
+from eigengs_dr.raster.lookup.size_classes import classify_by_size
+from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS
+from eigengs_dr.raster.render import decode_parameters
+
+FOOTPRINTS = [
+    np.diag([1.0, 1.0]),
+    np.diag([4.0, 4.0]),
+    np.array([[9.0, 4.0], [4.0, 3.5]]),
+    np.diag([60.0, 1.5]),
+    np.array([[30.0, -12.0], [-12.0, 14.0]]),
+    np.diag((0.4 * np.array(SIZE)) ** 2),
+]
+"""Covariances in pixels squared that a lattice of one pixel serves, or a coarser one."""
+
+
+def lattice_of(gaussians, wrap, cutoff=CUTOFF):
+    p = decode_parameters(gaussians)
+    rows = [*p.shape, *p.color]
+    shape = [dr.detach(r) for r in rows[:NUM_SHAPE_PARAMS]]
+    sizes = classify_by_size(shape, gaussians.width, gaussians.height, cutoff, wrap)
+    return build_pyramid(
+        sizes, pack_parameters(rows), NUM_SHAPE_PARAMS + gaussians.channels, cutoff
+    )
+
+
+def looked_up(lattice, points, covariance):
+    types = types_of(lattice.values)
+    x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
+    footprint = [types.Float(float(covariance[k])) for k in ((0, 0), (0, 1), (1, 1))]
+    assert np.array(is_minified(lattice, footprint)).all()
+    return sum_pyramid(lattice, x, y, footprint, types.Bool(True))
+
+
+def inner_scene(seed=1, count=60):
+    """Splats whose middles lie inside the image."""
+    scene = random_scene(seed, count)
+    return scene._replace(mean=0.2 * np.array(SIZE) + 0.6 * scene.mean)
+
+
+class TestLookup:
+    @pytest.mark.parametrize("wrap", ["repeat", "mirror"])
+    @pytest.mark.parametrize("k", range(len(FOOTPRINTS)))
+    def test_sees_what_brute_force_sees(self, backend, wrap, k):
+        scene, points = inner_scene(), some_points()
+        exact = brute_force(scene, wrap, points, FOOTPRINTS[k])
+        found = stacked(looked_up(lattice_of(scene.on(backend), wrap), points, FOOTPRINTS[k]))
+        error = np.abs(found + scene.background - exact)
+        assert error.max() < 0.03
+        assert error.mean() < 0.005
+
+    def test_coarser_lattices_agree_with_finer_ones(self, backend, monkeypatch):
+        """One splat a lattice point, seen from afar: every level gives the same."""
+        monkeypatch.setattr(module, "FEWEST", 2)
+        lattice = lattice_of(inner_scene().on(backend), "repeat")
+        assert len(lattice.levels) >= 4
+        covariance, points = np.diag([36.0, 30.0]), some_points()
+        whole = stacked(looked_up(lattice, points, covariance))
+        for number in range(1, 3):
+            part = module.replace(lattice, levels=lattice.levels[:number])
+            found = stacked(looked_up(part, points, covariance))
+            np.testing.assert_allclose(found, whole, atol=0.02)
+
+    def test_clamp_sees_borders_mirrored(self, backend):
+        gaussians = inner_scene().on(backend)
+        found = [
+            stacked(looked_up(lattice_of(gaussians, wrap), some_points(), FOOTPRINTS[1]))
+            for wrap in ("clamp", "mirror")
+        ]
+        np.testing.assert_allclose(*found, atol=1e-6)
+
+    def test_small_footprints_are_not_distant(self, backend):
+        lattice = lattice_of(inner_scene().on(backend), "repeat")
+        Float = types_of(lattice.values).Float
+        for covariance in ([0, 0, 0], [0.5, 0, 100], [50, 49.9, 50]):
+            assert not np.array(is_minified(lattice, [Float(c) for c in covariance])).any()
+
+    def test_inactive_lanes_are_zero(self, backend):
+        lattice = lattice_of(inner_scene().on(backend), "repeat")
+        types = types_of(lattice.values)
+        four = [types.Float(4), types.Float(0), types.Float(4)]
+        active = types.Bool([True, False])
+        rows = sum_pyramid(lattice, types.Float([5, 5]), types.Float([5, 5]), four, active)
+        assert (stacked(rows)[1] == 0).all()
+        assert (stacked(rows)[0] != 0).all()
+
+
+class TestMean:
+    @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
+    def test_is_that_of_a_fine_picture(self, backend, wrap):
+        scene = inner_scene(7)
+        fine = tiled(scene, "repeat", copies=0)[0].mean(axis=(0, 1))
+        found = np.array(pyramid_mean(lattice_of(scene.on(backend), wrap))).ravel()
+        np.testing.assert_allclose(scene.background + found, fine, atol=0.01)
+
+
+class TestGradient:
+    @pytest.mark.parametrize("name", ["mean", "factor", "color"])
+    def test_is_a_finite_difference(self, backend, name):
+        """Through the lattice to the splats behind it, in float64."""
+        scene, points = inner_scene(5, 9), some_points(40)
+        weight = np.random.default_rng(0).normal(size=(40, 3))
+
+        def loss(gaussians):
+            lattice = lattice_of(gaussians, "mirror", 9.0)
+            rows = looked_up(lattice, points, FOOTPRINTS[2])
+            Float = types_of(gaussians.mean).Float
+            seen = sum(r * Float(w) for r, w in zip(rows, weight.T.copy(), strict=True))
+            return dr.sum(seen) + pyramid_mean(lattice)[0]
+
+        gaussians = scene.on(backend, bits=64)
+        dr.enable_grad(getattr(gaussians, name))
+        dr.backward(loss(gaussians))
+        found = np.array(dr.grad(getattr(gaussians, name))).T
+        direction = np.random.default_rng(1).normal(size=found.shape)
+        moved = [
+            scene._replace(**{name: getattr(scene, name) + s * 1e-5 * direction}) for s in (1, -1)
+        ]
+        up, down = (np.array(loss(m.on(backend, bits=64))).item() for m in moved)
+        expected = (up - down) / 2e-5
+        assert abs(expected) > 1e-3
+        assert (found * direction).sum() == pytest.approx(expected, rel=1e-4, abs=1e-6)
+
+
+@pytest.mark.parametrize(("size", "levels"), [((256, 256), 6), ((7, 300), 1), ((64, 33), 3)])
+def test_levels_end_where_points_are_few(backend, size, levels):
+    scene = random_scene(0, 5, size)
+    lattice = lattice_of(scene.on(backend), "repeat")
+    assert len(lattice.levels) == levels
+    for level in lattice.levels:
+        assert level.nx * level.dx == pytest.approx(size[0])
+        assert level.ny * level.dy == pytest.approx(size[1])
+    assert dr.width(lattice.values) == 4 * sum(level.nx * level.ny for level in lattice.levels)

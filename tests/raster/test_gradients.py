@@ -1,0 +1,297 @@
+"""Derivatives of rendering, both ways: against finite differences in float64 and plain autodiff."""
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+from hypothesis import given
+
+from _helpers.sets import SIZE, few, random_scene, scenes
+from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.gaussian.gaussians import concatenate
+from eigengs_dr.image.color import ycbcr_to_rgb
+from eigengs_dr.raster.reference import render_plain
+from eigengs_dr.raster.render import CUTOFF, bin_gaussians, render
+
+COUNT = 7
+NAMES = ("mean", "factor", "color", "background")
+WIDE = 9.0
+"""A cutoff at which a splat's edge, exp(-40), is nothing: finite differences may cross it."""
+
+asked_sizes = pytest.mark.parametrize("asked", [{}, {"width": 33}, {"width": 11, "height": 40}])
+precisions = pytest.mark.parametrize(("bits", "rtol"), [(32, 1e-3), (64, 1e-6)])
+
+
+def upstream(shape, seed=0):
+    """Derivatives of a loss with respect to an image."""
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+def image_of(scene, cutoff, asked, space="data"):
+    """The picture in float64, rendered as `asked`."""
+    width = asked.get("width", scene.size[0])
+    height = asked.get("height", round(width * scene.size[1] / scene.size[0]))
+    sx, sy = width / scene.size[0], height / scene.size[1]
+    scaled = scene._replace(mean=scene.mean * [sx, sy], factor=scene.factor / [sx, sy, sy])
+    image = scaled.exact(cutoff, (width, height))
+    return ycbcr_to_rgb(image) if space == "ycbcr" else image
+
+
+def numeric_gradient(loss, scene, step=1e-6):
+    """Central differences of ``loss(scene)`` for every number of a scene: dict of arrays."""
+    gradient = {}
+    for name in NAMES:
+        value = getattr(scene, name)
+        gradient[name] = np.zeros(value.shape)
+        for index in np.ndindex(value.shape):
+            moved = np.zeros(value.shape)
+            moved[index] = step
+            up, down = (loss(scene._replace(**{name: value + s * moved})) for s in (1, -1))
+            gradient[name][index] = (up - down) / (2 * step)
+    return gradient
+
+
+def attached(gaussians, names=NAMES):
+    for name in names:
+        dr.enable_grad(getattr(gaussians, name))
+    return gaussians
+
+
+def gradient_of(gaussians):
+    """Gradients in the shapes of a scene: dict of float64 arrays."""
+    found = {name: dr.grad(getattr(gaussians, name)).numpy().T.astype(float) for name in NAMES}
+    return {**found, "background": found["background"][0]}
+
+
+def reverse(gaussians, delta=None, **asked):
+    """Gradient of ``sum(delta * image)``."""
+    attached(gaussians)
+    image = render(gaussians, **asked)
+    delta = upstream(image.shape) if delta is None else delta
+    dr.backward(dr.sum(image * type(image)(delta.astype(image.numpy().dtype))))
+    return gradient_of(gaussians)
+
+
+def forward(gaussians, direction, **asked):
+    """Derivative of the image along a direction, given as a scene."""
+    attached(gaussians)
+    along = direction.on(types_of(gaussians.mean).backend, types_of(gaussians.mean).bits)
+    for name in NAMES:
+        dr.set_grad(getattr(gaussians, name), getattr(along, name))
+    image = render(gaussians, **asked)
+    dr.forward_to(image)
+    return dr.grad(image).numpy().astype(np.float64)
+
+
+def check(found, exact, rtol, floor=0.02):
+    """Every number to `rtol`; where it is below `floor` of the largest, to `rtol` of that."""
+    for name in NAMES:
+        scale = np.abs(exact[name]).max()
+        assert scale > 0, name
+        np.testing.assert_allclose(
+            found[name], exact[name], rtol=rtol, atol=floor * rtol * scale, err_msg=name
+        )
+
+
+# --- Against finite differences ----------------------------------------------------------------
+
+
+@precisions
+@asked_sizes
+@pytest.mark.parametrize("seed", [0, 1])
+def test_reverse(backend, bits, rtol, asked, seed):
+    scene = random_scene(seed, COUNT)
+    delta = upstream(image_of(scene, WIDE, asked).shape)
+    exact = numeric_gradient(lambda s: (delta * image_of(s, WIDE, asked)).sum(), scene)
+    check(reverse(scene.on(backend, bits), delta, cutoff=WIDE, **asked), exact, rtol)
+
+
+@precisions
+@asked_sizes
+def test_forward(backend, bits, rtol, asked):
+    scene, direction = random_scene(2, COUNT), random_scene(3, COUNT)
+    step = 1e-6
+    up, down = (
+        image_of(
+            scene._replace(**{n: getattr(scene, n) + s * getattr(direction, n) for n in NAMES}),
+            WIDE,
+            asked,
+        )
+        for s in (step, -step)
+    )
+    exact = (up - down) / (2 * step)
+    found = forward(scene.on(backend, bits), direction, cutoff=WIDE, **asked)
+    np.testing.assert_allclose(found, exact, rtol=rtol, atol=0.02 * rtol * np.abs(exact).max())
+
+
+@pytest.mark.parametrize("channels", [1, 2, 4])
+def test_channels(backend, channels):
+    scene = random_scene(4, COUNT, channels=channels)
+    delta = upstream((SIZE[1], SIZE[0], channels))
+    exact = numeric_gradient(lambda s: (delta * s.exact(WIDE)).sum(), scene)
+    check(reverse(scene.on(backend), delta, cutoff=WIDE), exact, 1e-3)
+
+
+@precisions
+def test_inside_the_cutoff(backend, bits, rtol):
+    """At the default cutoff, on scenes in which no pixel is so close to an edge as to cross it."""
+    drawn = (random_scene(seed, 3) for seed in range(1000))
+    clear = (s for s in drawn if s.off_edge(CUTOFF, 2e-3).all() and s.distances().min() < CUTOFF)
+    for _ in range(3):
+        scene = next(clear)
+        delta = upstream(scene.exact().shape)
+        exact = numeric_gradient(lambda s, d=delta: (d * s.exact(CUTOFF)).sum(), scene)
+        check(reverse(scene.on(backend, bits), delta), exact, rtol)
+
+
+@asked_sizes
+def test_mean_squared_error_of_rgb(backend, asked):
+    """Through the colour conversion, and a loss that is not linear."""
+    scene = random_scene(5, COUNT)
+    target = upstream(image_of(scene, WIDE, asked).shape, seed=1)
+    exact = numeric_gradient(
+        lambda s: np.square(image_of(s, WIDE, asked, "ycbcr") - target).mean(), scene
+    )
+    gaussians = attached(scene.on(backend, space="ycbcr"))
+    image = render(gaussians, cutoff=WIDE, **asked)
+    dr.backward(dr.mean(dr.square(image - type(image)(target))))
+    check(gradient_of(gaussians), exact, 1e-3)
+
+
+# --- Against plain autodiff and each other -----------------------------------------------------
+
+
+def plain_gradient(gaussians, delta, cutoff=CUTOFF):
+    types = types_of(gaussians.mean)
+    attached(gaussians)
+    values = [*gaussians.mean, *gaussians.factor, *gaussians.color]
+    image = render_plain(
+        values, list(gaussians.background), bin_gaussians(gaussians, cutoff), cutoff
+    )
+    dr.backward(dr.sum(image * types.Float(delta.ravel())))
+    return gradient_of(gaussians)
+
+
+@few
+@given(scene=scenes(COUNT))
+def test_plain_autodiff(backend, scene):
+    """The same program but for the adjoint; pixels on an edge are left out of the loss."""
+    delta = upstream(scene.exact().shape) * scene.off_edge(CUTOFF)[..., None]
+    found = reverse(scene.on(backend), delta)
+    expected = plain_gradient(scene.on(backend), delta)
+    for name in NAMES:
+        scale = np.abs(expected[name]).max(initial=1e-3)
+        assert np.abs(found[name] - expected[name]).max() <= 1e-5 * scale, name
+
+
+@few
+@given(scene=scenes(COUNT), direction=scenes(COUNT))
+def test_forward_and_reverse_are_adjoint(backend, scene, direction):
+    """``<J v, w> = <v, J^T w>``."""
+    image_tangent = forward(scene.on(backend), direction)
+    delta = upstream(image_tangent.shape)
+    gradient = reverse(scene.on(backend), delta)
+    terms = [getattr(direction, name) * gradient[name] for name in NAMES]
+    size = sum(np.abs(t).sum() for t in terms) + np.abs(image_tangent * delta).sum()
+    difference = (image_tangent * delta).sum() - sum(t.sum() for t in terms)
+    assert abs(difference) <= 1e-5 * size
+
+
+def test_gradients_are_bit_equal(backend):
+    first, second = (reverse(random_scene(6).on(backend)) for _ in range(2))
+    for name in NAMES:
+        np.testing.assert_array_equal(first[name], second[name])
+
+
+# --- Some parameters, some splats --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_one_parameter_alone(backend, name, mode):
+    """Its derivative is what it is among all; the others have none."""
+    scene = random_scene(7, COUNT)
+    gaussians = attached(scene.on(backend), [name])
+    if mode == "reverse":
+        image = render(gaussians)
+        delta = upstream(image.shape)
+        dr.backward(dr.sum(image * type(image)(delta)))
+        expected = reverse(scene.on(backend), delta)
+        for other, found in gradient_of(gaussians).items():
+            exact = expected[other] if other == name else np.zeros_like(found)
+            np.testing.assert_allclose(found, exact, rtol=1e-5, atol=1e-6)
+    else:
+        direction = random_scene(8, COUNT)
+        others = {n: 0 * getattr(direction, n) for n in NAMES if n != name}
+        dr.set_grad(getattr(gaussians, name), getattr(direction.on(backend), name))
+        image = render(gaussians)
+        dr.forward_to(image)
+        expected = forward(scene.on(backend), direction._replace(**others))
+        np.testing.assert_allclose(dr.grad(image).numpy(), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_splats_that_are_not_drawn_have_no_gradient(backend):
+    scene = random_scene(9, COUNT)
+    mean, factor = scene.mean.copy(), scene.factor.copy()
+    mean[1], mean[3, 0], factor[5, 1] = 1e4, np.nan, np.inf
+    found = reverse(scene._replace(mean=mean, factor=factor).on(backend))
+    drawn = [0, 2, 4, 6]
+    expected = reverse(scene.permuted(drawn).on(backend))
+    for name in NAMES[:3]:
+        assert not found[name][[1, 3, 5]].any()
+        np.testing.assert_allclose(found[name][drawn], expected[name], rtol=1e-5, atol=1e-5)
+
+
+def test_a_value_that_all_splats_share(backend):
+    """Its gradient is the sum of theirs."""
+    scene = random_scene(10, COUNT)._replace(factor=np.tile([0.5, 0.25, 0.75], (COUNT, 1)))
+    gaussians = scene.on(backend)
+    shared = type(gaussians.factor)(0.5, 0.25, 0.75)
+    dr.enable_grad(shared)
+    image = render(replace(gaussians, factor=shared))
+    delta = upstream(image.shape)
+    dr.backward(dr.sum(image * type(image)(delta)))
+    expected = reverse(scene.on(backend), delta)["factor"].sum(axis=0)
+    np.testing.assert_allclose(dr.grad(shared).numpy().ravel(), expected, rtol=1e-4)
+
+
+def test_through_selection_and_concatenation(backend):
+    """A splat that is drawn twice has twice the gradient, one that is left out has none."""
+    scene = random_scene(11, COUNT)
+    gaussians = attached(scene.on(backend))
+    order = [0, 2, 2, 5]
+    image = render(concatenate([gaussians[order], gaussians[[4]]]))
+    delta = upstream(image.shape)
+    dr.backward(dr.sum(image * type(image)(delta)))
+    found = gradient_of(gaussians)
+    expected = reverse(scene.permuted([*order, 4]).on(backend), delta)
+    np.testing.assert_allclose(found["background"], 2 * expected["background"], rtol=1e-5)
+    for name in NAMES[:3]:
+        summed = np.zeros_like(found[name])
+        np.add.at(summed, [*order, 4], expected[name])
+        np.testing.assert_allclose(found[name], summed, rtol=1e-4, atol=1e-4)
+
+
+def test_two_renderings_add_up(backend):
+    scene = random_scene(12, COUNT)
+    gaussians = attached(scene.on(backend))
+    small, large = render(gaussians), render(gaussians, width=33)
+    dr.backward(dr.sum(small) + dr.sum(large))
+    found = gradient_of(gaussians)
+    single = [
+        reverse(scene.on(backend), np.ones(image.shape, np.float32), **asked)
+        for image, asked in ((small, {}), (large, {"width": 33}))
+    ]
+    for name in NAMES:
+        np.testing.assert_allclose(
+            found[name], single[0][name] + single[1][name], rtol=1e-4, atol=1e-3
+        )
+
+
+def test_no_derivatives_without_need(backend):
+    image = render(random_scene(13, COUNT).on(backend))
+    assert not dr.grad_enabled(image)
+    attached_scene = attached(random_scene(13, COUNT).on(backend))
+    with dr.suspend_grad():
+        assert not dr.grad_enabled(render(attached_scene))

@@ -1,0 +1,428 @@
+"""Rendering: against a float64 sum over all pairs, and what must not change the picture."""
+
+import math
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.ndimage import maximum_filter
+
+from _helpers.sets import (
+    COUNT,
+    SIZE,
+    Scene,
+    covariances,
+    distances,
+    factors_of,
+    few,
+    random_scene,
+    scenes,
+)
+from _helpers.waves import SIDE, SPLATS
+from eigengs_dr.gaussian.gaussians import concatenate
+from eigengs_dr.image.color import rgb_to_ycbcr, ycbcr_to_rgb
+from eigengs_dr.raster.reference import render_plain
+from eigengs_dr.raster.render import (
+    CUTOFF,
+    MAX_CUTOFF,
+    bin_gaussians,
+    decode_parameters,
+    picture_of,
+    rasterize,
+    render,
+    to_tensor,
+)
+from eigengs_dr.raster.tiles import TILE
+
+SMOOTH = 6.0
+"""A cutoff whose edge, exp(-18), is below rounding: invariants hold at every pixel."""
+
+
+def bound(scene, rounding):
+    """What rounding may do at a pixel: relative to the sum of what is added there, (H, W, C)."""
+    magnitudes = scene._replace(color=np.abs(scene.color), background=np.abs(scene.background))
+    return rounding * (1e-3 + magnitudes.exact())
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_channels(backend, channels):
+    scene = random_scene(1, channels=channels)
+    image = render(scene.on(backend)).numpy()
+    assert image.shape == (SIZE[1], SIZE[0], channels)
+    assert image.dtype == np.float32
+    clear = scene.off_edge(CUTOFF)
+    assert clear.mean() > 0.9
+    np.testing.assert_allclose(image[clear], scene.exact(CUTOFF)[clear], rtol=0, atol=1e-5)
+
+
+@few
+@given(scene=scenes())
+def test_same_cutoff(backend, scene):
+    clear = scene.off_edge(CUTOFF)
+    error = np.abs(render(scene.on(backend)).numpy() - scene.exact(CUTOFF))
+    assert (error <= bound(scene, 1e-5))[clear].all()
+
+
+@few
+@given(scene=scenes())
+def test_double_precision(backend, scene):
+    image = render(scene.on(backend, 64)).numpy()
+    assert image.dtype == np.float64
+    clear = scene.off_edge(CUTOFF, 1e-9)
+    assert (np.abs(image - scene.exact(CUTOFF)) <= bound(scene, 1e-12))[clear].all()
+
+
+@few
+@given(scene=scenes())
+def test_five_sigma_is_as_good_as_no_cutoff(backend, scene):
+    image = render(scene.on(backend), cutoff=5.0).numpy()
+    assert np.abs(image - scene.exact()).max() <= 1e-4
+
+
+@few
+@given(scene=scenes(), cutoff=st.sampled_from([1.5, CUTOFF]))
+def test_error_of_the_cutoff(backend, scene, cutoff):
+    """At most exp(-cutoff^2 / 2) times the absolute colours of the splats cut off at the point."""
+    image = render(scene.on(backend), cutoff=cutoff).numpy()
+    cut_off = scene.distances() > cutoff * (1 - 1e-4)
+    left_out = np.einsum("nhw,nc->hwc", cut_off, np.abs(scene.color))
+    error = np.abs(image - scene.exact())
+    assert (error <= 1.001 * math.exp(-(cutoff**2) / 2) * left_out + bound(scene, 1e-5)).all()
+
+
+def test_figures_of_the_cutoff():
+    """Those in the documentation of `CUTOFF`."""
+    for cutoff, dropped in ((3, 1.1e-2), (4, 3.4e-4), (5, 3.7e-6)):
+        assert math.exp(-(cutoff**2) / 2) == pytest.approx(dropped, rel=0.02)
+
+
+def plain(gaussians, cutoff=CUTOFF):
+    values = [*gaussians.mean, *gaussians.factor, *gaussians.color]
+    image = render_plain(
+        values, list(gaussians.background), bin_gaussians(gaussians, cutoff), cutoff
+    )
+    return image.numpy().reshape(gaussians.height, gaussians.width, gaussians.channels)
+
+
+@few
+@given(scene=scenes())
+def test_plain_is_the_same(backend, scene):
+    gaussians = scene.on(backend)
+    clear = scene.off_edge(CUTOFF)
+    error = np.abs(render(gaussians).numpy() - plain(gaussians))
+    assert (error <= bound(scene, 1e-5))[clear].all()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (9, 1), (1, 6), (8, 8), (5, 3)])
+def test_sizes(backend, size):
+    scene = random_scene(2, size=size)
+    image = render(scene.on(backend)).numpy()
+    clear = scene.off_edge(CUTOFF)
+    assert image.shape == (size[1], size[0], 3)
+    assert clear.any()
+    np.testing.assert_allclose(image[clear], scene.exact(CUTOFF)[clear], rtol=0, atol=1e-5)
+
+
+def test_stretched_splats(backend):
+    """1:400 at all angles, where boxes and ellipses differ the most."""
+    rng = np.random.default_rng(0)
+    variances = np.tile([[100.0, 0.25]], (COUNT, 1)) ** 2
+    factor = factors_of(covariances(variances, np.linspace(0, np.pi, COUNT))).astype(np.float32)
+    mean = rng.uniform(-20, 40, (COUNT, 2)).astype(np.float32)
+    scene = random_scene(3)._replace(mean=mean, factor=factor)
+    image = render(scene.on(backend)).numpy()
+    clear = scene.off_edge(CUTOFF, 1e-3)
+    assert clear.mean() > 0.9
+    np.testing.assert_allclose(image[clear], scene.exact(CUTOFF)[clear], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("asked", "size"),
+    [
+        ({}, SIZE),
+        ({"width": 44}, (44, 34)),
+        ({"height": 34}, (44, 34)),
+        ({"width": 44, "height": 34}, (44, 34)),
+        ({"width": 10, "height": 30}, (10, 30)),
+        ({"width": 1}, (1, 1)),
+        ({"height": 1}, (1, 1)),
+    ],
+)
+def test_size_arguments(backend, asked, size):
+    """Positions and lengths scale with each side: means by s, factors by 1 / s."""
+    scene = random_scene(4)
+    image = render(scene.on(backend), **asked).numpy()
+    assert image.shape == (size[1], size[0], 3)
+    sx, sy = size[0] / SIZE[0], size[1] / SIZE[1]
+    larger = scene._replace(
+        mean=scene.mean * [sx, sy], factor=scene.factor / [sx, sy, sy], size=size
+    )
+    clear = larger.off_edge(CUTOFF, 1e-3)
+    np.testing.assert_allclose(image[clear], larger.exact(CUTOFF)[clear], rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("cutoff", [0, -1.0, math.nan, math.inf, np.nextafter(12.0, 13)])
+def test_bad_cutoff(backend, cutoff):
+    with pytest.raises(ValueError, match="cutoff") as error:
+        render(random_scene().on(backend), cutoff=cutoff)
+    assert "\n" not in str(error.value)
+
+
+def test_cutoff_that_is_an_integer(backend):
+    gaussians = random_scene().on(backend)
+    np.testing.assert_array_equal(render(gaussians, cutoff=3), render(gaussians, cutoff=3.0))
+
+
+def test_widest_cutoff(backend):
+    scene = random_scene(5)
+    image = render(scene.on(backend), cutoff=MAX_CUTOFF).numpy()
+    assert (np.abs(image - scene.exact()) <= bound(scene, 1e-5)).all()
+
+
+@pytest.mark.parametrize("asked", [{"width": 0}, {"height": 0}, {"width": -3, "height": 5}])
+def test_bad_size(backend, asked):
+    with pytest.raises(ValueError, match="at least 1") as error:
+        render(random_scene().on(backend), **asked)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_cutoff_of_numpy(backend, kind):
+    gaussians = random_scene().on(backend)
+    np.testing.assert_array_equal(render(gaussians, cutoff=kind(3)), render(gaussians, cutoff=3.0))
+
+
+def test_size_of_numpy(backend):
+    gaussians = random_scene().on(backend)
+    image = render(gaussians, width=np.int64(10), height=np.int64(8))
+    np.testing.assert_array_equal(image, render(gaussians, width=10, height=8))
+
+
+def test_one_splat(backend):
+    scene = random_scene(6, count=1)._replace(mean=np.array([[8.5, 9.5]]))
+    image = render(scene.on(backend)).numpy()
+    np.testing.assert_allclose(image[9, 8], scene.background + scene.color[0], atol=1e-6)
+
+
+def test_thousands_of_splats_on_one_pixel(backend):
+    """No cap on the length of a list."""
+    count = 2000
+    rng = np.random.default_rng(0)
+    mean = np.full((count, 2), 6.5) + rng.uniform(-0.4, 0.4, (count, 2))
+    factor = np.tile([1.0, 0.2, 1.0], (count, 1))
+    scene = Scene(mean, factor, rng.uniform(0, 1, (count, 3)), np.zeros(3))
+    image = render(scene.on(backend), cutoff=SMOOTH).numpy()
+    np.testing.assert_allclose(image, scene.exact(SMOOTH), rtol=1e-4, atol=1e-5)
+    assert image[6, 6].min() > 500
+
+
+def test_all_splats_outside(backend):
+    scene = random_scene(7)
+    scene = scene._replace(mean=scene.mean + 1000)
+    image = render(scene.on(backend)).numpy()
+    np.testing.assert_array_equal(image, np.broadcast_to(np.float32(scene.background), image.shape))
+
+
+def with_bad_splat(scene, name, value):
+    """Spoil one number of every splat with an odd index; returns what is left as well."""
+    spoilt = getattr(scene, name).copy()
+    spoilt[1::2, -1] = value
+    return scene._replace(**{name: spoilt}), scene.permuted(slice(0, None, 2))
+
+
+spoil = pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+
+
+@spoil
+@pytest.mark.parametrize("name", ["mean", "factor"])
+def test_splats_that_are_not_finite_are_not_drawn(backend, name, value):
+    spoilt, rest = with_bad_splat(random_scene(8), name, value)
+    np.testing.assert_allclose(render(spoilt.on(backend)), render(rest.on(backend)), atol=1e-6)
+
+
+@spoil
+def test_a_colour_that_is_not_finite_spoils_no_more_than_its_tiles(backend, value):
+    scene = random_scene(8)
+    mean, factor, color = (v.copy() for v in scene[:3])
+    mean[3], factor[3], color[3] = (11, 8), (0.75, 0.25, 1), value
+    scene = scene._replace(mean=mean, factor=factor)
+    image = render(scene.on(backend)).numpy()
+    spoilt = render(scene._replace(color=color).on(backend)).numpy()
+    distance = scene.distances()[3]
+    assert not np.isfinite(spoilt[distance < CUTOFF * 0.999]).any()
+    near = Scene(*scene.permuted([3])[:2], np.ones((1, 1)), np.zeros(1)).exact(CUTOFF)[..., 0] > 0
+    touched = maximum_filter(near, 2 * max(TILE) - 1)  # no pixel of a touched tile is farther away
+    assert 0.1 < touched.mean() < 0.9
+    np.testing.assert_array_equal(spoilt[~touched], image[~touched])
+
+
+@pytest.mark.parametrize("opaque", [False, True])
+def test_a_value_that_all_splats_share(backend, opaque):
+    scene = random_scene(10)._replace(factor=np.tile([0.5, 0.25, 0.75], (COUNT, 1)))
+    gaussians = scene.on(backend)
+    shared = type(gaussians.factor)(0.5, 0.25, 0.75)
+    if opaque:
+        dr.make_opaque(shared)
+    image = render(replace(gaussians, factor=shared))
+    np.testing.assert_array_equal(image, render(gaussians))
+
+
+def test_a_splat_without_end(backend):
+    """Standard deviations far beyond the image are a constant."""
+    scene = random_scene(11, count=1)._replace(factor=np.array([[1e-15, 0, 1e-15]]))
+    image = render(scene.on(backend)).numpy()
+    np.testing.assert_allclose(image, scene.exact(), atol=1e-6)
+
+
+def test_ycbcr_comes_out_as_rgb(backend):
+    scene = random_scene(12)
+    scene = scene._replace(background=np.float32(rgb_to_ycbcr(np.array([0.2, 0.5, 0.9]))))
+    image = render(scene.on(backend, space="ycbcr")).numpy()
+    clear = scene.off_edge(CUTOFF)
+    expected = ycbcr_to_rgb(scene.exact(CUTOFF))
+    np.testing.assert_allclose(image[clear], expected[clear], rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("space", ["rgb", "linear"])
+def test_other_spaces_come_out_as_they_are(backend, space):
+    scene = random_scene(13)
+    image = render(scene.on(backend, space=space))
+    np.testing.assert_array_equal(image, render(scene.on(backend)))
+
+
+def test_renderings_are_bit_equal(backend):
+    gaussians = random_scene(14).on(backend)
+    np.testing.assert_array_equal(render(gaussians), render(gaussians))
+
+
+def test_rendering_leaves_the_set_as_it_was(backend):
+    scene = random_scene(15)
+    gaussians = scene.on(backend)
+    render(gaussians, width=10, height=8).numpy()
+    for name, value in gaussians.to_arrays().items():
+        np.testing.assert_array_equal(value, getattr(scene, name))
+    assert (gaussians.width, gaussians.height) == SIZE
+
+
+@few
+@given(scene=scenes(), order=st.permutations(range(COUNT)))
+def test_splats_permuted(backend, scene, order):
+    image = render(scene.on(backend)).numpy()
+    permuted = render(scene.permuted(list(order)).on(backend)).numpy()
+    assert (np.abs(image - permuted) <= bound(scene, 1e-5)).all()
+
+
+def transposed(scene):
+    """Swap x and y: the covariances are transposed, and their inverses factored again."""
+    a, b, c = scene.factor.T
+    inverse = np.stack([np.stack([b * b + c * c, a * b], -1), np.stack([a * b, a * a], -1)], -2)
+    lower = np.linalg.cholesky(inverse)
+    return scene._replace(
+        mean=scene.mean[:, ::-1],
+        factor=np.stack([lower[:, 0, 0], lower[:, 1, 0], lower[:, 1, 1]], axis=1),
+        size=scene.size[::-1],
+    )
+
+
+@few
+@given(scene=scenes())
+def test_image_transposed(backend, scene):
+    image = render(scene.on(backend), cutoff=SMOOTH).numpy()
+    swapped = render(transposed(scene).on(backend), cutoff=SMOOTH).numpy()
+    assert (np.abs(image - swapped.transpose(1, 0, 2)) <= bound(scene, 3e-5)).all()
+
+
+@few
+@given(scene=scenes())
+def test_set_split_in_two_and_summed(backend, scene):
+    gaussians = scene.on(backend)
+    first, second = gaussians[: COUNT // 2], gaussians[COUNT // 2 :]
+    together = render(gaussians, cutoff=SMOOTH).numpy()
+    parts = [render(g, cutoff=SMOOTH).numpy() for g in (first, second)]
+    limit = bound(scene, 1e-5)
+    assert (np.abs(sum(parts) - scene.background - together) <= limit).all()
+    joined = render(concatenate([first, second]), cutoff=SMOOTH).numpy()
+    assert (np.abs(joined - sum(parts)) <= limit).all()
+
+
+@few
+@given(scene=scenes())
+def test_size_tripled(backend, scene):
+    """The middle of 3x3 pixels of the large picture is the centre of the small one's pixel."""
+    gaussians = scene.on(backend)
+    small = render(gaussians, cutoff=SMOOTH).numpy()
+    large = render(gaussians, width=3 * SIZE[0], cutoff=SMOOTH).numpy()
+    assert (np.abs(large[1::3, 1::3] - small) <= bound(scene, 3e-5)).all()
+
+
+@few
+@given(scene=scenes())
+def test_size_doubled(backend, scene):
+    """A pixel of the large picture is the small one sampled at quarters of a pixel."""
+    large = render(scene.on(backend), width=2 * SIZE[0], cutoff=SMOOTH).numpy()
+    for i, j in ((0, 0), (1, 1)):
+        shift = np.array([i, j]) / 2 - 0.25
+        sampled = scene._replace(mean=scene.mean - shift).exact(SMOOTH)
+        assert (np.abs(large[j::2, i::2] - sampled) <= bound(scene, 3e-5)).all()
+
+
+@few
+@given(scene=scenes())
+def test_moved_by_whole_pixels(backend, scene):
+    image = render(scene.on(backend), cutoff=SMOOTH).numpy()
+    moved = scene._replace(mean=scene.mean + np.array([3, 2])).on(backend)
+    moved = render(moved, cutoff=SMOOTH).numpy()
+    assert (np.abs(moved[2:, 3:] - image[:-2, :-3]) <= bound(scene, 3e-5)[:-2, :-3]).all()
+
+
+@few
+@given(scene=scenes(), other=scenes(), scale=st.floats(-2, 2, width=32))
+def test_linear_in_colour(backend, scene, other, scale):
+    """The shapes are those of the first scene."""
+    second = scene._replace(color=other.color, background=2 * other.background)
+    both = scene._replace(
+        color=scene.color + scale * second.color,
+        background=scene.background + scale * second.background,
+    )
+    images = [render(s.on(backend)).numpy() for s in (scene, second, both)]
+    limit = bound(scene, 1e-5) + abs(scale) * bound(second, 1e-5)
+    assert (np.abs(images[0] + scale * images[1] - images[2]) <= limit).all()
+
+
+def test_operation_behind_render(backend):
+    gaussians = random_scene(16).on(backend, space="ycbcr")
+    p = decode_parameters(gaussians)
+    lists = bin_gaussians(gaussians)
+    image = to_tensor(rasterize(p, lists), lists.grid, 3)
+    np.testing.assert_array_equal(image, render(gaussians))
+
+
+def test_padded_lists_make_the_same_picture(backend):
+    scene = random_scene(17)
+    gaussians = scene.on(backend)
+    p = decode_parameters(gaussians)
+    lists = bin_gaussians(gaussians, CUTOFF, 2.0)
+    image = to_tensor(rasterize(p, lists), lists.grid, 3).numpy()
+    assert (np.abs(image - render(gaussians).numpy()) <= bound(scene, 1e-5))[
+        scene.off_edge(CUTOFF)
+    ].all()
+
+
+def test_lists_are_for_the_native_size(backend):
+    scene = random_scene(18)
+    lists = bin_gaussians(scene.on(backend))
+    assert (lists.grid.width, lists.grid.height) == SIZE
+    inside = (distances(scene.mean, scene.factor, SIZE) < CUTOFF * 0.999).any(axis=(1, 2))
+    assert int((lists.end - lists.begin).numpy().sum()) >= inside.sum()
+
+
+def test_negative_light_is_black(backend):
+    scene = random_scene(0, SPLATS, (SIDE, SIDE))
+    gaussians = scene._replace(background=np.full(3, -0.5)).on(backend, space="linear")
+    light, shown = render(gaussians).numpy(), picture_of(gaussians)
+    assert (light < 0).any()
+    assert (shown[light <= 0] == 0).all()
+    assert np.isfinite(shown).all()

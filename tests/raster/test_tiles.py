@@ -1,0 +1,264 @@
+"""Lists of splats: complete and tight, against a test of every splat with every tile."""
+
+import subprocess
+import sys
+import textwrap
+
+import drjit as dr
+import numpy as np
+import pytest
+from hypothesis import given
+
+from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, random_scene, scenes
+from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.selection import select
+from eigengs_dr.raster.tiles import TILE, Grid, build_lists, for_each_tile
+
+RADIUS = 3.0
+GRID = Grid(*SIZE)
+EDGE = 1e-3
+"""Relative distance to the cutoff within which rounding may decide."""
+
+
+def upload(backend, mean, factor):
+    types = types_in(select(backend))
+    return [types.Float(np.ascontiguousarray(v, np.float32)) for v in (*mean.T, *factor.T)]
+
+
+def lists_of(backend, mean, factor, grid=GRID, pad=0.0):
+    return build_lists(upload(backend, mean, factor), RADIUS, grid, pad)
+
+
+def membership(lists, count=COUNT):
+    """Which splat is in the list of which tile, shape (count, ny, nx); checks order and bounds."""
+    splat, begin, end, order = (
+        v.numpy() for v in (lists.splat, lists.begin, lists.end, lists.order)
+    )
+    grid = lists.grid
+    assert sorted(order) == list(range(grid.tiles))
+    member = np.zeros((count, grid.tiles), bool)
+    for tile, first, last in zip(order, begin, end, strict=True):
+        entries = splat[first:last]
+        assert (np.diff(entries.astype(int)) > 0).all()
+        member[entries, tile] = True
+    assert member.sum() == (end - begin).sum()
+    return member.reshape(count, grid.ny, grid.nx)
+
+
+def touched_by_pixels(distance, grid):
+    """Tiles with a pixel centre nearer than the cutoff, shape (count, ny, nx)."""
+    (width, height), count = grid.tile, len(distance)
+    inside = np.zeros((count, grid.ny * height, grid.nx * width), bool)
+    inside[:, : grid.height, : grid.width] = distance <= RADIUS * (1 - EDGE)
+    return inside.reshape(count, grid.ny, height, grid.nx, width).any(axis=(2, 4))
+
+
+def least_distance(mean, factor, grid):
+    """Least ``|F (x - mean)|`` over the rectangle of a tile's pixel centres, (count, ny, nx).
+
+    The squared distance is convex: its minimum is at the mean or on one of the four sides, where it
+    is a parabola.
+    """
+    a, b, c = (v[:, None, None] for v in np.asarray(factor, np.float64).T)
+    left = np.arange(grid.nx) * grid.tile[0] + 0.5 - mean[:, 0, None, None]
+    top = (np.arange(grid.ny)[:, None] * grid.tile[1] + 0.5) - mean[:, 1, None, None]
+    right, bottom = left + grid.tile[0] - 1, top + grid.tile[1] - 1
+
+    def distance(dx, dy):
+        return np.hypot(a * dx + b * dy, c * dy)
+
+    best = np.where((left <= 0) & (right >= 0) & (top <= 0) & (bottom >= 0), 0, np.inf)
+    for dy in (top, bottom):  # minimum over dx: a dx + b dy = 0
+        best = np.minimum(best, distance(np.clip(-b * dy / a, left, right), dy))
+    for dx in (left, right):  # minimum over dy: (b^2 + c^2) dy = -a b dx
+        best = np.minimum(best, distance(dx, np.clip(-a * b * dx / (b * b + c * c), top, bottom)))
+    return best
+
+
+def check_lists(backend, mean, factor, grid=GRID):
+    """Lists hold every splat with a pixel inside, and none whose ellipse misses the tile."""
+    member = membership(lists_of(backend, mean, factor, grid), len(mean))
+    missing = touched_by_pixels(distances(mean, factor, (grid.width, grid.height)), grid) & ~member
+    assert not missing.any(), np.argwhere(missing)
+    excess = member & (least_distance(mean, factor, grid) > RADIUS * (1 + EDGE))
+    assert not excess.any(), np.argwhere(excess)
+    return member
+
+
+@few
+@given(scene=scenes())
+def test_lists_are_complete_and_tight(backend, scene):
+    check_lists(backend, scene.mean, scene.factor)
+
+
+def needles(rng):
+    """Stretched by up to 1:400, at every angle; the last ones with a weak a and a strong b."""
+    variances = (
+        np.stack([10 ** rng.uniform(0, 2, COUNT), 10 ** rng.uniform(-1.2, 0, COUNT)], 1) ** 2
+    )
+    factor = factors_of(covariances(variances, np.linspace(0, np.pi, COUNT)))
+    factor[-6:] = [[a, b, c] for a in (0.01, 0.1) for b, c in ((4, 4), (-4, 4), (4, 0.05))]
+    return factor.astype(np.float32)
+
+
+def sub_pixel(rng):
+    return np.stack(
+        [rng.uniform(4, 50, COUNT), rng.uniform(-50, 50, COUNT), rng.uniform(4, 50, COUNT)], 1
+    )
+
+
+def huge(rng):
+    return np.stack(
+        [
+            10 ** rng.uniform(-6, -1, COUNT),
+            rng.uniform(-1e-2, 1e-2, COUNT),
+            10 ** rng.uniform(-6, -1, COUNT),
+        ],
+        1,
+    )
+
+
+@pytest.mark.parametrize("shapes", [needles, sub_pixel, huge])
+@pytest.mark.parametrize("spread", [1.0, 3.0])
+def test_lists_of_extreme_shapes(backend, shapes, spread):
+    rng = np.random.default_rng(0)
+    mean = ((rng.uniform(0, 1, (COUNT, 2)) - 0.5) * spread + 0.5) * SIZE
+    mean[:4] = np.floor(mean[:4]) + 0.5  # on pixel centres
+    mean, factor = mean.astype(np.float32), shapes(rng).astype(np.float32)
+    member = check_lists(backend, mean, factor)
+    assert member.any()
+
+
+def test_a_huge_splat_is_in_all_lists(backend):
+    mean, factor = np.full((COUNT, 2), 5.0), np.tile([1e-15, 0, 1e-15], (COUNT, 1))
+    assert membership(lists_of(backend, mean, factor)).all()
+
+
+def test_an_endless_splat_is_in_all_lists(backend):
+    mean, factor = np.full((COUNT, 2), 5.0), np.tile([1e-25, 0, 1e-25], (COUNT, 1))
+    assert membership(lists_of(backend, mean, factor)).all()
+
+
+@pytest.mark.parametrize("slant", [1.0, -1.0])
+def test_an_endless_band(backend, slant):
+    """``|x + slant y| <= radius`` around the mean, at 45 degrees."""
+    mean = np.tile([[11.0, 8.0]], (COUNT, 1))
+    check_lists(backend, mean, np.tile([1.0, slant, 1e-25], (COUNT, 1)))
+
+
+def test_splats_outside_are_in_no_list(backend):
+    scene = random_scene()
+    angle = np.linspace(0, 2 * np.pi, COUNT)
+    mean = np.stack([np.cos(angle), np.sin(angle)], 1) * 1e3 + 10
+    mean[:4] = [[1e30, 5], [5, -1e30], [-1e9, -1e9], [1e9, 5]]
+    lists = lists_of(backend, mean, scene.factor)
+    assert not membership(lists).any()
+    assert not (lists.end - lists.begin).numpy().any()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("position", range(5))
+def test_splats_that_are_not_finite_are_in_no_list(backend, value, position):
+    scene = random_scene(1)
+    parameters = np.concatenate([scene.mean, scene.factor], axis=1)
+    expected = membership(lists_of(backend, scene.mean, scene.factor))
+    parameters[3::5, position] = value
+    expected[3::5] = False
+    found = membership(lists_of(backend, parameters[:, :2], parameters[:, 2:]))
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (8, 4), (5, 5)])
+def test_grids(backend, size):
+    grid = Grid(*size)
+    assert grid.nx == -(-size[0] // TILE[0])
+    assert grid.tiles == grid.nx * grid.ny
+    assert grid.pixels == TILE[0] * TILE[1]
+    scene = random_scene(2)
+    check_lists(backend, scene.mean * np.array(size) / SIZE, scene.factor, grid)
+
+
+@pytest.mark.parametrize("tile", [(1, 1), (8, 8), (3, 5)])
+def test_other_tiles(backend, tile):
+    scene = random_scene(3)
+    check_lists(backend, scene.mean, scene.factor, Grid(*SIZE, tile))
+
+
+def test_sorting_by_length(backend):
+    scene = random_scene(4)
+    lists = lists_of(backend, scene.mean, scene.factor)
+    length = (lists.end - lists.begin).numpy().astype(int)
+    assert (np.diff(length) <= 0).all()
+    tiles = membership(lists).sum(axis=(1, 2))
+    order = lists.splat_order.numpy()
+    assert sorted(order) == list(range(COUNT))
+    assert (np.diff(tiles[order]) <= 0).all()
+
+
+def test_lists_are_deterministic(backend):
+    scene = random_scene(5)
+    first, second = (lists_of(backend, scene.mean, scene.factor) for _ in range(2))
+    for name in ("splat", "begin", "end", "order", "splat_order"):
+        np.testing.assert_array_equal(getattr(first, name).numpy(), getattr(second, name).numpy())
+
+
+@few
+@given(scene=scenes())
+def test_padding_only_adds(backend, scene):
+    tight = membership(lists_of(backend, scene.mean, scene.factor))
+    padded = membership(lists_of(backend, scene.mean, scene.factor, pad=1.5))
+    assert not (tight & ~padded).any()
+
+
+@few
+@given(scene=scenes())
+def test_padded_lists_last_while_splats_move(backend, scene):
+    padded = membership(lists_of(backend, scene.mean, scene.factor, pad=1.5))
+    for angle in range(4):
+        moved = scene.mean + 1.45 * np.array([np.cos(angle), np.sin(angle)])
+        touched = touched_by_pixels(distances(moved, scene.factor, SIZE), GRID)
+        assert not (touched & ~padded).any()
+
+
+def test_the_walk_visits_the_lists(backend):
+    """The adjoint walks instead of reading lists: both must see the same tiles."""
+    scene = random_scene(6)
+    shape = upload(backend, scene.mean, scene.factor)
+    types = types_in(select(backend))
+    visits = dr.zeros(types.UInt, COUNT * GRID.tiles)
+    owner = dr.arange(types.UInt, COUNT)
+
+    def visit(tile, column, row, active, state):
+        dr.scatter_add(visits, types.UInt(1), owner * GRID.tiles + types.UInt(tile), active)
+        return state + dr.select(active, types.UInt(column + row * GRID.nx) - types.UInt(tile), 0)
+
+    wrong = for_each_tile(shape, RADIUS, GRID, visit, dr.zeros(types.UInt, COUNT), label="test")
+    dr.eval(wrong, visits)
+    assert not wrong.numpy().any()
+    expected = membership(lists_of(backend, scene.mean, scene.factor)).reshape(-1)
+    np.testing.assert_array_equal(visits.numpy(), expected)
+
+
+@pytest.mark.slow
+def test_too_many_entries_are_refused():
+    program = """
+        import numpy as np
+        import eigengs_dr as eg
+
+        count, side = 65537, 1024  # each in all 65536 tiles
+        gaussians = eg.Gaussians.from_arrays(
+            np.full((count, 2), side / 2), np.tile([1e-4, 0, 1e-4], (count, 1)),
+            np.ones((count, 1)), size=(side, side), space="data",
+        )
+        try:
+            eg.render(gaussians)
+        except ValueError as error:
+            print("refused:", error)
+    """
+    found = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program)],
+        capture_output=True,
+        text=True,
+        timeout=280,
+    )
+    assert found.stdout.startswith("refused:"), found.returncode

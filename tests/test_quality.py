@@ -1,0 +1,80 @@
+"""A guard on quality: the PSNR of small fits, on llvm, may not fall."""
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.families import family, small_model
+from _helpers.photos import coffee
+
+SLACK = 0.2
+"""Decibels by which a PSNR may lie below the recorded value."""
+
+COUNT = {"gaussians": 300, "iterations": 60}
+NATURAL = {"init": "eigen", "basis": "natural"}
+
+FITS = {
+    "default": ("coffee", COUNT, 41.01, 47.03),
+    "detail": ("face", COUNT, 35.40, 41.64),
+    "rgb": ("face", {**COUNT, "color": "rgb"}, 35.40, 41.51),
+    "linear": ("face", {**COUNT, "color": "linear"}, 34.65, 40.80),
+    "start": ("face", {**COUNT, "iterations": 0}, 29.39, 35.61),
+    "grid": ("face", {**COUNT, "iterations": 0, "init": "grid"}, 25.87, 32.08),
+    "gaussianimage": ("face", {**COUNT, "iterations": 300, "preset": "gaussianimage"}, 9.39, 14.56),
+    "basis": ("astronaut", {**NATURAL, "iterations": 0}, 32.74, 38.85),
+    "basis, 20 steps": ("astronaut", {**NATURAL, "iterations": 20}, 37.08, 43.14),
+}
+"""Image, options of `fit`, and the recorded psnr_rgb and psnr_ycbcr."""
+
+
+def photo(name):
+    """Crops of 64x64 pixels; for the 5,000 Gaussians of the basis 128x128 pixels."""
+    if name == "coffee":
+        return coffee(64)
+    image = eg.sample("astronaut")
+    return image[80:144, 200:264] if name == "face" else image[60:188, 160:288]
+
+
+def check(image, found, psnr_rgb, psnr_ycbcr):
+    assert eg.psnr(image, found, space="rgb") > psnr_rgb - SLACK
+    assert eg.psnr(image, found, space="ycbcr") > psnr_ycbcr - SLACK
+
+
+@pytest.mark.parametrize("name", FITS)
+def test_fit(name):
+    crop, options, *recorded = FITS[name]
+    image = photo(crop)
+    check(image, eg.fit(image, **options, backend="llvm").image, *recorded)
+
+
+def test_search():
+    """The target is reached, by as few Gaussians; another CPU rounds otherwise, so a few more."""
+    image = photo("face")
+    found = eg.fit(image, target_psnr=32, iterations=60, backend="llvm")
+    assert found.stopped == "met"
+    assert eg.psnr(image, found.image, space="ycbcr") >= 32
+    assert len(found.gaussians) <= 1.1 * 42
+
+
+def test_levels():
+    image = photo("face")
+    gaussians = eg.fit_levels(image, 300, 2, iterations=60, backend="llvm").gaussians
+    check(image, eg.picture_of(gaussians[:75]), 28.86, 35.06)
+    check(image, eg.picture_of(gaussians), 35.16, 41.39)
+
+
+@pytest.mark.parametrize(("colors", "recorded"), [("exact", 43.90), ("projected", 24.25)])
+def test_encode(colors, recorded):
+    model, images = small_model("llvm"), family(8, seed=1)
+    shown = [eg.render(model.encode(image, colors)).numpy() for image in images]
+    reached = np.mean([eg.psnr(i, s, "ycbcr") for i, s in zip(images, shown, strict=True)])
+    assert reached > recorded - SLACK
+
+
+def test_pack(tmp_path):
+    """As small a file, and as good a picture."""
+    image = photo("face")
+    gaussians = eg.fit(image, **COUNT, backend="llvm").gaussians
+    packed = eg.pack(gaussians, tmp_path / "x.egs", image)
+    check(image, eg.picture_of(eg.Gaussians.load(tmp_path / "x.egs", "llvm")), 34.97, 41.16)
+    assert packed.bytes <= 1.03 * 1376
