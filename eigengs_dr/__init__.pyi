@@ -4,7 +4,7 @@ from .backend.selection import BackendError
 from .codec.bit_allocation import PackResult, pack
 from .eigenbasis.basis import Eigenbasis
 from .eigenbasis.eigengs import EigenGS
-from .fitting.fit import Fit, fit
+from .fitting.fit import Fit, FitInterrupted, fit
 from .fitting.levels import fit_levels, level_counts
 from .gaussian.gaussians import Gaussians, concatenate
 from .gaussian.tensors import from_tensors, to_tensors
@@ -22,6 +22,7 @@ __all__ = [
     "EigenGS",
     "Eigenbasis",
     "Fit",
+    "FitInterrupted",
     "Gaussians",
     "ImageError",
     "PackResult",

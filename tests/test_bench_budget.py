@@ -20,11 +20,11 @@ from eigengs_dr.bench import budget, budget_tables, rate, rows
 from eigengs_dr.cli import options as cli_shared
 from eigengs_dr.cli.console import Program
 from eigengs_dr.cli_bench import bench as group
-from eigengs_dr.fitting.fit import max_gaussians_for
 from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.optimizers.descent import descend
+from eigengs_dr.fitting.options import max_gaussians_for
 from eigengs_dr.fitting.presets import PRESETS
-from eigengs_dr.fitting.refine import MAX_PSNR
+from eigengs_dr.image.metrics import MAX_PSNR
 from eigengs_dr.raster.render import picture_of
 
 RUN = {"command": "eigengs-dr bench budget", "cpu": "a CPU"}

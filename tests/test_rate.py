@@ -16,7 +16,7 @@ from eigengs_dr import cli_rate
 from eigengs_dr.bench import rate, rate_tables, rows
 from eigengs_dr.cli import options as cli_shared
 from eigengs_dr.cli.console import Program
-from eigengs_dr.fitting.refine import MAX_PSNR
+from eigengs_dr.image.metrics import MAX_PSNR
 
 
 @pytest.fixture

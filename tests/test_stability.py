@@ -15,9 +15,9 @@ from eigengs_dr.cli.console import Program
 from eigengs_dr.cli_stability import NAMES
 from eigengs_dr.cli_stability import stability as command
 from eigengs_dr.fitting.presets import PRESETS
-from eigengs_dr.fitting.refine import MAX_PSNR
 from eigengs_dr.gaussian.covariance import factor_from_covariance
 from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
+from eigengs_dr.image.metrics import MAX_PSNR
 
 
 @click.group(cls=Program)

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fitting.fit import fit, max_gaussians_for
-from ..fitting.initializers import DEFAULT_COUNT, FitProblem, initialize
+from ..fitting.fit import fit
+from ..fitting.initializers import FitProblem, initialize
 from ..fitting.optimizers.schedule import MIN_PHASE_RATIO
+from ..fitting.options import DEFAULT_COUNT, max_gaussians_for
 from ..fitting.presets import PRESETS
 from . import rows
 from .rate import images_of

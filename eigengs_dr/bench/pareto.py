@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 
 from ..eigenbasis.eigengs import EigenGS
 from ..eigenbasis.registry import load_basis
-from ..fitting.initializers import DEFAULT_COUNT, FitProblem, initialize
+from ..fitting.initializers import FitProblem, initialize
+from ..fitting.options import DEFAULT_COUNT
 from ..fitting.presets import PRESETS
+from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.resize import center_crop
 from ..image.samples import sample
-from ..raster.render import CUTOFF, picture_of
+from ..raster.render import picture_of
 from .rows import Job, Row
 from .sets import SETS, model_for, test_images
 from .trial import Moment, decibels, follow, judged, warm_up

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..raster.render import CUTOFF
+from ..gaussian.file import CUTOFF
 from .charts import COLORS, new_figure
 from .pareto import DEFAULT_COMPONENTS
 from .pareto_tables import Point, stored_by_set, text_of

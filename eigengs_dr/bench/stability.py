@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from ..eigenbasis.registry import load_basis
 from ..fitting.initializers import FitProblem, initialize
 from ..fitting.presets import PRESETS, Preset
-from ..fitting.refine import MAX_PSNR, trace_steps
+from ..fitting.refine import trace_steps
 from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr
+from ..image.metrics import MAX_PSNR
 from ..raster.render import picture_of
 from .cases import Case
 from .rows import Job, Row

@@ -15,10 +15,11 @@ from ..fitting.fit import Fit
 from ..fitting.initializers import FitProblem
 from ..fitting.optimizers.descent import descend
 from ..fitting.optimizers.schedule import MIN_PHASE_RATIO, Schedule
-from ..fitting.refine import MAX_PSNR, Refinement
+from ..fitting.refine import Refinement
+from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
-from ..image.metrics import ms_ssim, psnr, ssim
-from ..raster.render import CUTOFF, picture_of
+from ..image.metrics import MAX_PSNR, ms_ssim, psnr, ssim
+from ..raster.render import picture_of
 
 Image = NDArray[np.float32]
 

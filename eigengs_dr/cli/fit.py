@@ -15,14 +15,7 @@ from ..fitting.options import DEFAULT_BASIS, FitOptions
 from ..fitting.presets import PRESETS
 from ..image.color import SPACES
 from .console import INTERRUPTED, progress_bar, say
-from .options import (
-    ANY_PATH,
-    backend_option,
-    choice,
-    describe_run,
-    quiet_option,
-    report_option,
-)
+from .options import ANY_PATH, backend_option, choice, describe_run, quiet_option, report_option
 from .outputs import check_outputs, name_outputs
 from .report import write_report
 

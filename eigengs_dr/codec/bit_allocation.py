@@ -20,12 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import types_of
-from ..fitting.refine import MAX_PSNR
 from ..gaussian.covariance import log_shapes, sizes_from_log_shapes
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr, to_coded
 from ..image.io import check_image
-from ..image.metrics import psnr_from_mse
+from ..image.metrics import MAX_PSNR, psnr_from_mse
 from ..raster.render import render
 from .egs import MAX_SECTIONS, SUFFIX, EgsContent, to_bytes, write
 from .error_feedback import quantize_with_feedback, to_gaussians

@@ -3,7 +3,7 @@
 import numpy as np
 
 from eigengs_dr.fitting.initializers import initialize
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.redistribute import residual
 from eigengs_dr.image.color import rgb_to_ycbcr
 
@@ -22,7 +22,7 @@ def picture(seed=0):
 def fitted(count=60):
     """A fit before its refinement, and its target in YCbCr."""
     image = picture()
-    return initialize(image, count, "adaptive", "natural", PRESETS["default"]), rgb_to_ycbcr(image)
+    return initialize(image, FitOptions(gaussians=count, init="adaptive")), rgb_to_ycbcr(image)
 
 
 def squared_error(gaussians, target, weight=1.0):

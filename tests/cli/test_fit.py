@@ -14,7 +14,7 @@ from eigengs_dr.backend.selection import BackendError, select
 from eigengs_dr.cli.main import main
 from eigengs_dr.eigenbasis import registry as bases
 from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.fitting.initializers import INITS
+from eigengs_dr.fitting.initializers import INITIALIZERS
 from eigengs_dr.image.color import SPACES, YCBCR_TO_RGB
 
 
@@ -256,7 +256,7 @@ def test_bases_that_do_not_fit(trained, fitted, photo, existing, tmp_path):
 
 def test_the_names_of_inits_and_bases():
     [option] = [p for p in main.commands["fit"].params if p.name == "init"]
-    assert tuple(option.type.choices) == INITS
+    assert tuple(option.type.choices) == ("auto", *INITIALIZERS)
     [option] = [p for p in main.commands["fit"].params if p.name == "color"]
     assert tuple(option.type.choices) == SPACES
     [option] = [p for p in main.commands["fit"].params if p.name == "basis"]

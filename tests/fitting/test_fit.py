@@ -10,9 +10,8 @@ import pytest
 
 from _helpers.families import small_model
 from _helpers.waves import SIDE, SPLATS, figures, picture, presets
-from eigengs_dr.fitting import fit as fitting
 from eigengs_dr.fitting import initializers as starting
-from eigengs_dr.fitting.fit import fit
+from eigengs_dr.fitting.fit import FitInterrupted, fit
 from eigengs_dr.fitting.placement.grid import place_grid
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.image.color import to_coded, to_linear
@@ -32,9 +31,10 @@ def check_sound(result, image):
     assert reached >= result.trace[0]["psnr_ycbcr"]
 
 
-@pytest.mark.parametrize("init", starting.INITS)
+@pytest.mark.parametrize("init", ("auto", *starting.INITIALIZERS))
 def test_fit_improves_on_its_start(backend, init):
-    result = fit(picture(), SPLATS, 60, init=init, basis=small_model(backend), backend=backend)
+    basis = small_model(backend) if init == "eigen" else None
+    result = fit(picture(), SPLATS, 60, init=init, basis=basis, backend=backend)
     check_sound(result, picture())
     assert figures(result)[-1] > figures(result)[0] + 1
     assert len(result.gaussians) == SPLATS
@@ -82,7 +82,7 @@ def test_more_solve_steps_start_better(backend):
 @presets
 def test_one_seed_gives_one_result(backend, preset):
     eigen = preset == "eigengs"  # which draws nothing
-    init, basis = ("auto" if eigen else "random"), small_model(backend)
+    init, basis = ("auto", small_model(backend)) if eigen else ("random", None)
 
     def run(iterations, seed):
         return fit(picture(), SPLATS, iterations, init, basis, preset, seed=seed, backend=backend)
@@ -107,7 +107,7 @@ def test_gaussianimage(backend):
 @pytest.mark.parametrize("value", [0.0, 0.3, 1.0])
 def test_constant_images(backend, preset, value):
     image = np.full((SIDE, SIDE, 3), value, np.float32)
-    basis = small_model(backend)
+    basis = small_model(backend) if preset == "eigengs" else None
     result = fit(image, SPLATS, 60, preset=preset, basis=basis, backend=backend)
     check_sound(result, image)
     if preset == "default":
@@ -252,31 +252,47 @@ def test_interruption_keeps_the_best_so_far(backend, when):
         if iteration >= when:
             raise KeyboardInterrupt
 
-    result = fit(picture(), SPLATS, 60, progress=interrupt, backend=backend)
+    with pytest.raises(FitInterrupted) as interruption:
+        fit(picture(), SPLATS, 60, progress=interrupt, backend=backend)
+    result = interruption.value.result
     check_sound(result, picture())
     assert (result.iterations, result.stopped) == (when, "interrupted")
     rows = [row["iteration"] for row in result.trace]
-    assert rows == [m for m in (0, 10, 20, 50) if m <= when]
+    assert rows == sorted({m for m in (0, 10, 20, 50) if m <= when} | {when})
+    assert max(figures(result)) == psnr(picture(), result.image, space="ycbcr")
 
 
 def press_ctrl_c(*arguments):
     signal.raise_signal(signal.SIGINT)
 
 
-def test_ctrl_c(backend):
-    """It ends the run at the next step, and is the caller's again afterwards."""
-    before = signal.getsignal(signal.SIGINT)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals(backend, number):
+    """They end the run at the next step, and are the caller's again afterwards."""
+    before = signal.getsignal(number)
 
     def progress(iteration, iterations, row):
         if iteration == 10:
-            press_ctrl_c()
+            signal.raise_signal(number)
 
-    result = fit(picture(), SPLATS, 60, progress=progress, backend=backend)
+    with pytest.raises(KeyboardInterrupt) as interruption:
+        fit(picture(), SPLATS, 60, progress=progress, backend=backend)
+    result = interruption.value.result
     assert result.stopped == "interrupted"
     assert result.iterations in (10, 11)
     assert [row["iteration"] for row in result.trace] == [0, 10]
     assert all(np.isfinite(v).all() for v in result.gaussians.to_arrays().values())
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(number) is before
+
+
+def test_a_loop_over_images_ends(backend):
+    """Ctrl-C in one fit ends the loop around it."""
+    fitted = []
+    with pytest.raises(KeyboardInterrupt):
+        for k in range(3):
+            progress = press_ctrl_c if k == 1 else None
+            fitted.append(fit(picture(), SPLATS, 10, progress=progress, backend=backend))
+    assert len(fitted) == 1
 
 
 def place_and_press(image, count, generator):
@@ -284,11 +300,17 @@ def place_and_press(image, count, generator):
     return place_grid(image, count, generator)
 
 
+def place_and_fail(image, count, generator):
+    return 1 / 0
+
+
 @pytest.mark.parametrize("iterations", [0, 1, 60])
 def test_ctrl_c_before_refinement(backend, iterations):
-    """The start is returned, and the caller told."""
-    with patch.dict(starting.PLACEMENTS, grid=place_and_press):
-        result = fit(picture(), SPLATS, iterations, init="grid", backend=backend)
+    """The start is kept, and the caller told."""
+    entry = {"grid": f"{__name__}:place_and_press"}
+    with patch.dict(starting.PLACEMENTS, entry), pytest.raises(FitInterrupted) as interruption:
+        fit(picture(), SPLATS, iterations, init="grid", backend=backend)
+    result = interruption.value.result
     check_sound(result, picture())
     assert len(result.trace) == 1
     assert result.stopped == "interrupted"
@@ -296,7 +318,8 @@ def test_ctrl_c_before_refinement(backend, iterations):
 
 def test_ctrl_c_is_the_callers_after_an_error(backend):
     before = signal.getsignal(signal.SIGINT)
-    with patch.dict(starting.PLACEMENTS, grid=lambda *a: 1 / 0), pytest.raises(ZeroDivisionError):
+    entry = {"grid": f"{__name__}:place_and_fail"}
+    with patch.dict(starting.PLACEMENTS, entry), pytest.raises(ZeroDivisionError):
         fit(picture(), SPLATS, 10, init="grid", backend=backend)
     assert signal.getsignal(signal.SIGINT) is before
 
@@ -333,8 +356,8 @@ def test_rates_far_too_high(backend, preset, factor):
     method = PRESETS[preset]
     rates = {name: rate * factor for name, rate in method.schedule.rates.items()}
     wild = replace(method, schedule=replace(method.schedule, rates=rates))
-    with patch.dict(fitting.PRESETS, {preset: wild}):
-        basis = small_model(backend)
+    with patch.dict(PRESETS, {preset: wild}):
+        basis = small_model(backend) if preset == "eigengs" else None
         result = fit(picture(), SPLATS, 100, preset=preset, basis=basis, backend=backend)
     assert np.isfinite(figures(result)).all()
     check_sound(result, picture())

@@ -11,7 +11,7 @@ from eigengs_dr.codec.bit_allocation import MSE_WITHOUT_IMAGE
 from eigengs_dr.fitting.density_control import removal_cost
 from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.levels import fit_levels, level_counts
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import picture_of
 
@@ -125,7 +125,7 @@ def test_packed_levels_without_an_image_keep_what_they_have_of_the_whole(result,
 def test_levels_keep_the_background(image):
     """What is added later does not change the levels before: one background serves all."""
     found = fit_levels(image, 64, 2, iterations=0).gaussians
-    alone = initialize(image, 16, "auto", "natural", PRESETS["default"]).gaussians
+    alone = initialize(image, FitOptions(gaussians=16, init="auto")).gaussians
     np.testing.assert_allclose(
         found.to_arrays()["background"], alone.to_arrays()["background"], atol=1e-6
     )

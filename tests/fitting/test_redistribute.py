@@ -7,6 +7,9 @@ import pytest
 
 from _helpers.halves import SIDE, fitted, picture
 from eigengs_dr.fitting.initializers import initialize
+from eigengs_dr.fitting.optimizers.descent import descend
+from eigengs_dr.fitting.optimizers.schedule import MIN_PHASE_RATIO
+from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.fitting.redistribute import redistribute
 from eigengs_dr.raster.render import render
@@ -16,7 +19,7 @@ from eigengs_dr.raster.render import render
 def test_rearranged_has_the_count_and_goes_where_the_error_is(side):
     """Also where splats are so far apart that they are placed on a smaller image."""
     image = np.kron(picture(), np.ones((-(-side // SIDE), -(-side // SIDE), 1)))[:side, :side]
-    start = initialize(image.astype(np.float32), 64, "grid", "natural", PRESETS["default"])
+    start = initialize(image.astype(np.float32), FitOptions(gaussians=64, init="grid"))
     result = redistribute(start.gaussians, 50, start.target, start.target)
     left = result.mean.numpy()[0] < side / 2
     assert len(result) == 50
@@ -35,18 +38,15 @@ def test_weights_draw_splats():
 def test_fits_that_are_long_enough_rearrange_once():
     image = picture()
     calls = []
-    start = initialize(image, 60, "adaptive", "natural", PRESETS["default"])
+    start = initialize(image, FitOptions(gaussians=60, init="adaptive"))
 
     def rearrange(gaussians, count):
         calls.append(count)
         return start.redistribute(gaussians, count)
 
-    from eigengs_dr.fitting.optimizers.descent import descend
-    from eigengs_dr.fitting.optimizers.schedule import MIN_PHASE_RATIO
-
     schedule = replace(PRESETS["default"].schedule, redistribute_after=2)
     for steps, times in ((2 * MIN_PHASE_RATIO - 1, 0), (2 * MIN_PHASE_RATIO, 1)):
         calls.clear()
-        sets = list(descend(start.gaussians, start.target, schedule, steps, redistribute=rearrange))
+        sets = list(descend(start._replace(redistribute=rearrange), schedule, steps))
         assert len(sets) == steps + 1
         assert calls == [60] * times

@@ -5,6 +5,7 @@ import pytest
 
 from _helpers.sets import Scene
 from _helpers.waves import SIDE, SPLATS, default, figures, picture, presets, start
+from eigengs_dr.fitting.initializers import FitProblem
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.fitting.refine import refine, trace_steps
 from eigengs_dr.image.color import rgb_to_ycbcr
@@ -13,7 +14,7 @@ from eigengs_dr.image.color import rgb_to_ycbcr
 @presets
 def test_refinement_descends(backend, preset):
     gaussians, target = start(backend)
-    result = refine(gaussians, target, picture(), PRESETS[preset].schedule, 100)
+    result = refine(FitProblem(gaussians, target), picture(), PRESETS[preset].schedule, 100)
     psnrs = figures(result)
     assert [row["iteration"] for row in result.trace] == [0, 10, 20, 50, 100]
     assert psnrs == sorted(psnrs)
@@ -24,7 +25,7 @@ def test_refinement_descends(backend, preset):
 def test_refinement_leaves_its_input_alone(backend):
     gaussians, target = start(backend)
     before, copy = gaussians.to_arrays(), target.copy()
-    refine(gaussians, target, picture(), default(), 10)
+    refine(FitProblem(gaussians, target), picture(), default(), 10)
     for name, value in gaussians.to_arrays().items():
         np.testing.assert_array_equal(value, before[name])
     np.testing.assert_array_equal(target, copy)
@@ -33,11 +34,12 @@ def test_refinement_leaves_its_input_alone(backend):
 def test_other_runs_change_nothing(backend):
     """Programs of other counts, sizes and rates between two equal runs."""
     gaussians, target = start(backend)
-    first = figures(refine(gaussians, target, picture(), default(), 10))
+    first = figures(refine(FitProblem(gaussians, target), picture(), default(), 10))
     for count in (200, 50, 1):
-        refine(*start(backend, count), picture(), default(rates=default().rates), 10)
-    refine(gaussians, target, picture(), PRESETS["gaussianimage"].schedule, 10)
-    assert figures(refine(gaussians, target, picture(), default(), 10)) == first
+        problem = FitProblem(*start(backend, count))
+        refine(problem, picture(), default(rates=default().rates), 10)
+    refine(FitProblem(gaussians, target), picture(), PRESETS["gaussianimage"].schedule, 10)
+    assert figures(refine(FitProblem(gaussians, target), picture(), default(), 10)) == first
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -46,7 +48,7 @@ def test_all_splats_on_one_pixel(backend, seed):
     mean, factor = np.full((SPLATS, 2), 16.0), np.tile([0.5, 0, 0.5], (SPLATS, 1))
     color = rng.uniform(0, 1e-3, (SPLATS, 3))
     gaussians = Scene(mean, factor, color, np.zeros(3), (SIDE, SIDE)).on(backend, space="ycbcr")
-    result = refine(gaussians, rgb_to_ycbcr(picture()), picture(), default(), 60)
+    result = refine(FitProblem(gaussians, rgb_to_ycbcr(picture())), picture(), default(), 60)
     assert np.isfinite(figures(result)).all()
     assert all(np.isfinite(v).all() for v in result.gaussians.to_arrays().values())
     assert figures(result)[-1] > figures(result)[0] + 1
@@ -56,7 +58,7 @@ def test_plateau(backend):
     """Ten steps that gain less than a thousand decibels are one."""
     gaussians, target = start(backend)
     schedule = default(patience=10, least_gain=1000.0)
-    result = refine(gaussians, target, picture(), schedule, 100)
+    result = refine(FitProblem(gaussians, target), picture(), schedule, 100)
     assert (result.iterations, result.stopped) == (10, "plateau")
     assert result.trace[-1]["iteration"] == 10
 

@@ -8,8 +8,9 @@ from _helpers.halves import SIDE, picture
 from _helpers.photos import coffee
 from eigengs_dr.fitting import search as budget
 from eigengs_dr.fitting.density_control import densify
-from eigengs_dr.fitting.fit import fit, max_gaussians_for
+from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.initializers import initialize
+from eigengs_dr.fitting.options import FitOptions, max_gaussians_for
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.fitting.search import search_count
 
@@ -82,7 +83,7 @@ def test_interrupted_while_it_settles_it_keeps_the_best():
 
 def test_interrupted_it_returns_what_there_is():
     image = picture()
-    start = initialize(image, 60, "adaptive", "natural", PRESETS["default"])
+    start = initialize(image, FitOptions(gaussians=60, init="adaptive"))
     asked = []
 
     def interrupted():
@@ -103,7 +104,7 @@ def test_interrupted_it_returns_what_there_is():
 
 def test_a_search_whose_goal_is_not_met_ends():
     """Where every round adds a splat or two, by the steps that it has taken."""
-    start = initialize(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    start = initialize(picture(), FitOptions(gaussians=60, init="adaptive"))
     result = search_count(
         start,
         lambda gaussians: {"decibels": 18.0},
@@ -119,7 +120,7 @@ def test_a_search_whose_goal_is_not_met_ends():
 @pytest.mark.parametrize("octave", [2.5, 4.0, 9.0])
 def test_a_search_learns_what_more_splats_gain(octave):
     """Where only their number counts: the fewest are found at any slope."""
-    start = initialize(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    start = initialize(picture(), FitOptions(gaussians=60, init="adaptive"))
     schedule = PRESETS["default"].schedule
 
     def measure(gaussians):
@@ -135,7 +136,7 @@ def searched(monkeypatch, measure):
 
     ``measure(gaussians, steps)`` returns decibels, where `steps` lists those of all descents.
     """
-    start = initialize(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    start = initialize(picture(), FitOptions(gaussians=60, init="adaptive"))
     steps = []
 
     def stand(gaussians, target, schedule, count, *rest):
@@ -193,7 +194,7 @@ def test_a_search_goes_on_where_the_fit_just_meets_the_goal(monkeypatch):
 
 
 def test_a_search_ends_where_no_place_is_left_to_grow(monkeypatch):
-    start = initialize(picture(), 60, "adaptive", "natural", PRESETS["default"])
+    start = initialize(picture(), FitOptions(gaussians=60, init="adaptive"))
     asked = []
     monkeypatch.setattr(budget, "densify", lambda gaussians, *rest: asked.append(1) or gaussians)
     schedule = PRESETS["default"].schedule

@@ -9,10 +9,11 @@ from hypothesis import given
 
 from _helpers.sets import SIZE, few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.color import ycbcr_to_rgb
 from eigengs_dr.raster.reference import render_plain
-from eigengs_dr.raster.render import CUTOFF, bin_gaussians, render
+from eigengs_dr.raster.render import bin_gaussians, render
 
 COUNT = 7
 NAMES = ("mean", "factor", "color", "background")
@@ -167,7 +168,7 @@ def plain_gradient(gaussians, delta, cutoff=CUTOFF):
     attached(gaussians)
     values = [*gaussians.mean, *gaussians.factor, *gaussians.color]
     image = render_plain(
-        values, list(gaussians.background), bin_gaussians(gaussians, cutoff), cutoff
+        values, list(gaussians.background), bin_gaussians(replace(gaussians, cutoff=cutoff)), cutoff
     )
     dr.backward(dr.sum(image * types.Float(delta.ravel())))
     return gradient_of(gaussians)

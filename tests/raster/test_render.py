@@ -22,12 +22,11 @@ from _helpers.sets import (
     scenes,
 )
 from _helpers.waves import SIDE, SPLATS
+from eigengs_dr.gaussian.file import CUTOFF, MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.color import rgb_to_ycbcr, ycbcr_to_rgb
 from eigengs_dr.raster.reference import render_plain
 from eigengs_dr.raster.render import (
-    CUTOFF,
-    MAX_CUTOFF,
     bin_gaussians,
     decode_parameters,
     picture_of,
@@ -102,7 +101,7 @@ def test_figures_of_the_cutoff():
 def plain(gaussians, cutoff=CUTOFF):
     values = [*gaussians.mean, *gaussians.factor, *gaussians.color]
     image = render_plain(
-        values, list(gaussians.background), bin_gaussians(gaussians, cutoff), cutoff
+        values, list(gaussians.background), bin_gaussians(replace(gaussians, cutoff=cutoff)), cutoff
     )
     return image.numpy().reshape(gaussians.height, gaussians.width, gaussians.channels)
 
@@ -396,7 +395,7 @@ def test_operation_behind_render(backend):
     gaussians = random_scene(16).on(backend, space="ycbcr")
     p = decode_parameters(gaussians)
     lists = bin_gaussians(gaussians)
-    image = to_tensor(rasterize(p, lists), lists.grid, 3)
+    image = to_tensor(rasterize(p, lists, CUTOFF), lists.grid, 3)
     np.testing.assert_array_equal(image, render(gaussians))
 
 
@@ -404,8 +403,8 @@ def test_padded_lists_make_the_same_picture(backend):
     scene = random_scene(17)
     gaussians = scene.on(backend)
     p = decode_parameters(gaussians)
-    lists = bin_gaussians(gaussians, CUTOFF, 2.0)
-    image = to_tensor(rasterize(p, lists), lists.grid, 3).numpy()
+    lists = bin_gaussians(gaussians, 2.0)
+    image = to_tensor(rasterize(p, lists, CUTOFF), lists.grid, 3).numpy()
     assert (np.abs(image - render(gaussians).numpy()) <= bound(scene, 1e-5))[
         scene.off_edge(CUTOFF)
     ].all()

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from ...backend.arrays import types_of
 from ...backend.recording import freeze_program
+from ...gaussian.file import MAX_CUTOFF
 from ...gaussian.gaussians import Gaussians
 from ...raster.kernels import adjoint, channel_sums, forward
 from ...raster.layout import pack_parameters
 from ...raster.parameters import NUM_SHAPE_PARAMS, detached_shape, kernel_radius
-from ...raster.render import MAX_CUTOFF, bin_gaussians, to_tiles
+from ...raster.render import bin_gaussians, to_tiles
 from ...raster.tiles import TileLists
 
 RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}

@@ -8,7 +8,9 @@ from drjit import JitFlag
 
 from _helpers.sets import random_scene
 from _helpers.waves import SIDE, default, presets, start
+from eigengs_dr.fitting.initializers import FitProblem
 from eigengs_dr.fitting.optimizers.descent import descend, prefix
+from eigengs_dr.fitting.optimizers.schedule import OPTIMIZERS
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.raster.render import render
 
@@ -20,14 +22,14 @@ def test_the_first_step_follows_the_gradient(backend):
     schedule = default(rates=dict.fromkeys(("mean", "factor", "color"), rate), warm_up=0)
     before, after = (
         np.square(render(g.__class__(**{**vars(g), "space": "rgb"})).numpy() - target).mean()
-        for g in descend(gaussians, target, schedule, 1)
+        for g in descend(FitProblem(gaussians, target), schedule, 1)
     )
     assert before * 0.9 < after < before
 
 
 def test_descend_yields_the_start_and_every_step(backend):
     gaussians, target = start(backend)
-    sets = list(descend(gaussians, target, default(), 5))
+    sets = list(descend(FitProblem(gaussians, target), default(), 5))
     assert len(sets) == 6
     for name, value in gaussians.to_arrays().items():
         np.testing.assert_array_equal(sets[0].to_arrays()[name], value)
@@ -39,7 +41,7 @@ def test_sets_that_were_yielded_stay_as_they_are(backend):
     """Else the best set so far gets the colours of the last step."""
     gaussians, target = start(backend)
     sets, copies = [], []
-    for current in descend(gaussians, target, default(), 6):
+    for current in descend(FitProblem(gaussians, target), default(), 6):
         sets.append(current)
         copies.append(current.to_arrays())
     for current, copy in zip(sets, copies, strict=True):
@@ -52,9 +54,9 @@ def test_freezing_changes_nothing(backend, preset):
     """Over several builds of the lists, which grow and shrink."""
     gaussians, target = start(backend)
     schedule = PRESETS[preset].schedule
-    frozen = [g.to_arrays() for g in descend(gaussians, target, schedule, 20)]
+    frozen = [g.to_arrays() for g in descend(FitProblem(gaussians, target), schedule, 20)]
     with dr.scoped_set_flag(JitFlag.KernelFreezing, False):
-        traced = [g.to_arrays() for g in descend(gaussians, target, schedule, 20)]
+        traced = [g.to_arrays() for g in descend(FitProblem(gaussians, target), schedule, 20)]
     for name, value in frozen[-1].items():
         np.testing.assert_allclose(value, traced[-1][name], rtol=1e-5, atol=1e-5)
 
@@ -69,16 +71,18 @@ class Spy(drjit.opt.Adam):
 
 
 @pytest.mark.parametrize("warm_up", [0, 4])
-def test_rates(backend, warm_up):
+def test_rates(backend, warm_up, monkeypatch):
     """A linear rise times half a cosine, which ends near what `decay` leaves."""
     seen, steps = [], 40
     schedule = default(
-        optimizer=type("Spied", (Spy,), {"seen": seen}),
+        optimizer="spied",
         rates={"mean": 0.1, "factor": 0.2, "color": 0.3},
         decay=0.25,
         warm_up=warm_up,
     )
-    list(descend(*start(backend), schedule, steps))
+    monkeypatch.setitem(OPTIMIZERS, "spied", f"{__name__}:Spy")
+    monkeypatch.setattr(Spy, "seen", seen, raising=False)
+    list(descend(FitProblem(*start(backend)), schedule, steps))
     assert len(seen) == steps
     step = np.arange(steps)
     left = 0.25 + 0.75 * 0.5 * (1 + np.cos(np.pi * step / steps))
@@ -94,13 +98,13 @@ def test_weights(backend):
     weight, other = np.ones_like(target), target.copy()
     weight[:, SIDE // 2 :], other[:, SIDE // 2 :] = 0, 7
 
-    def colors(*arguments):
-        *_, last = descend(gaussians, *arguments)
+    def colors(target, weight=None):
+        *_, last = descend(FitProblem(gaussians, target, weight), default(), 10)
         return last.to_arrays()["color"]
 
-    left, plain = (colors(target, default(), 10, 3.0, w) for w in (weight, np.ones_like(target)))
-    np.testing.assert_array_equal(colors(other, default(), 10, 3.0, weight), left)
-    np.testing.assert_array_equal(colors(target, default(), 10), plain)
+    left, plain = (colors(target, w) for w in (weight, np.ones_like(target)))
+    np.testing.assert_array_equal(colors(other, weight), left)
+    np.testing.assert_array_equal(colors(target), plain)
     assert not np.array_equal(left, plain)
 
 
