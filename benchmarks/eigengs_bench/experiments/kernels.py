@@ -1,0 +1,249 @@
+"""How fast the renderer is: against plain Dr.Jit, against the machine, and as splats stretch."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from eigengs_bench.harness.task import Progress, no_progress
+from eigengs_bench.harness.timing import interleaved
+from eigengs_dr.adaptive import adaptive
+from eigengs_dr.arrays import ArrayTypes, types_in, types_of, upload
+from eigengs_dr.backend import select
+from eigengs_dr.color import rgb_to_ycbcr
+from eigengs_dr.descent import descend
+from eigengs_dr.gaussians import Gaussians
+from eigengs_dr.images import check_image, sample
+from eigengs_dr.presets import PRESETS
+from eigengs_dr.reference import render_plain
+from eigengs_dr.rendering import lists_for, splat, splat_values, to_tensor
+from eigengs_dr.solve import solve
+from eigengs_dr.splat import SHAPE, UNIT
+from eigengs_dr.tiles import Grid, TileLists, build_lists
+
+SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
+"""The scene: splats of equal size, spread evenly at random over a square picture."""
+
+PLAIN_TILE = (8, 8)
+"""Tiles of the plain renderer, the best of 4x4, 8x8 and 16x16 in forward and reverse together."""
+
+WARM_UP, ROUNDS = 3, 15
+"""Rounds that compile and settle, and rounds that are measured."""
+
+STEPS = 1000
+"""Steps of the refinement behind `growth`."""
+
+PEAK_LANES, PEAK_LOOPS, PEAK_UNROLL = 1 << 16, 100, 8
+"""Size of the program that measures the peak."""
+
+
+def run(
+    image: ArrayLike | None = None, backend: str | None = None, progress: Progress = no_progress
+) -> dict[str, float]:
+    """Time the kernels in one run, the variants interleaved; every figure is a median.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W, 3), optional
+        What the refinement behind `growth` fits, at least 512 pixels on each side, of which the
+        middle is cut; by default a photo of scikit-image.
+    backend : {"llvm", "cuda"}, optional
+    progress : Progress, optional
+
+    Returns
+    -------
+    dict of str to float
+        - `plain_ms`, `fast_ms`: forward and reverse together, tile lists given, programs frozen.
+        - `step_ratio`, `forward_ratio`: plain over fast.
+        - `plain_forward_ms`, `fast_forward_ms`, `lists_ms`: the parts.
+        - `peak_evals_per_ns`: `exp`, `select` and 3 `fma` without memory.
+        - `forward_peak_fraction`, `step_peak_fraction`: evaluations inside the cutoff ellipses
+          (once forward, once in reverse) per ns, over the peak.
+        - `growth`: median time of the steps 900 to 1,000 of a refinement with 20,000 splats over
+          that of the steps 50 to 150; `early_step_ms`, `late_step_ms`: the two.
+        - `growth_with_lists`: the same of the means, in which building the lists counts.
+
+    Raises
+    ------
+    ValueError
+        If the image is too small.
+    """
+    picture = _middle(sample("astronaut") if image is None else check_image(image))
+    types = types_in(select(backend))
+    figures = kernel_figures(types, random_scene(types), progress)
+    return {**figures, **_growth_figures(picture, types, progress)}
+
+
+def _middle(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    top, left = ((side - SIDE) // 2 for side in image.shape[:2])
+    if top < 0 or left < 0:
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        raise ValueError(f"image is {size}; it must be at least {SIDE}x{SIDE}")
+    return image[top : top + SIDE, left : left + SIDE]
+
+
+def random_scene(types: ArrayTypes) -> Gaussians:
+    """Make the scene that is timed."""
+    generator = np.random.default_rng(0)
+    return Gaussians.from_arrays(
+        generator.uniform(0, SIDE, (COUNT, 2)),
+        np.tile([1 / SIGMA, 0, 1 / SIGMA], (COUNT, 1)),
+        generator.uniform(0, 1, (COUNT, 3)),
+        size=(SIDE, SIDE),
+        space="rgb",
+        backend=types.backend,
+    )
+
+
+def time_programs(
+    timed: dict[str, Callable[[], Any]], progress: Progress = no_progress
+) -> dict[str, float]:
+    """Median milliseconds of programs that take turns."""
+
+    def show(done: int) -> None:
+        progress("kernels", done, WARM_UP + ROUNDS)
+
+    return interleaved(timed, WARM_UP, ROUNDS, show)
+
+
+def kernel_figures(
+    types: ArrayTypes, scene: Gaussians, progress: Progress = no_progress
+) -> dict[str, float]:
+    """Time both renderers, the lists and the peak on a scene."""
+    plain_forward, plain_step, _ = programs(scene, CUTOFF, plain=True)
+    fast_forward, fast_step, _ = programs(scene, CUTOFF, plain=False)
+    seeds = dr.linspace(types.Float, 0, 1, PEAK_LANES)
+    dr.eval(seeds)
+    timed: dict[str, Callable[[], Any]] = {
+        "plain_ms": plain_step,
+        "fast_ms": fast_step,
+        "plain_forward_ms": plain_forward,
+        "fast_forward_ms": fast_forward,
+        "lists_ms": lambda: lists_for(scene, CUTOFF),
+        "peak_ms": lambda: _peak(seeds),
+    }
+    ms = time_programs(timed, progress)
+    for program in (plain_forward, plain_step, fast_forward, fast_step):
+        program.func.clear()  # left to the garbage collector, it may go while another is traced
+    useful = pixels_inside(scene)
+    peak = PEAK_LANES * PEAK_LOOPS * PEAK_UNROLL / (ms.pop("peak_ms") * 1e6)
+    return {
+        **ms,
+        "step_ratio": ms["plain_ms"] / ms["fast_ms"],
+        "forward_ratio": ms["plain_forward_ms"] / ms["fast_forward_ms"],
+        "peak_evals_per_ns": peak,
+        "forward_peak_fraction": useful / (ms["fast_forward_ms"] * 1e6) / peak,
+        "step_peak_fraction": 2 * useful / (ms["fast_ms"] * 1e6) / peak,
+    }
+
+
+def programs(
+    scene: Gaussians, cutoff: float, plain: bool
+) -> tuple[Any, Any, Callable[[], NDArray[Any]]]:
+    """Make frozen programs that draw a scene, forward and with reverse, and what shows it.
+
+    Parameters
+    ----------
+    scene : Gaussians
+    cutoff : float
+        In standard deviations.
+    plain : bool
+        By `render_plain` instead of `splat`; tile lists are built here in both cases.
+
+    Returns
+    -------
+    forward, step : functools.partial
+        Called without arguments; ``func.clear()`` frees the program.
+    shown : callable
+        ``shown()`` is the picture, ndarray of shape (H, W, C).
+    """
+    values, background = splat_values(scene)
+    dr.eval(values)
+    if plain:
+        grid, draw = Grid(scene.width, scene.height, PLAIN_TILE), render_plain
+        lists = build_lists(values[:SHAPE], UNIT * cutoff, grid)
+        values = [*values[:2], *scene.factor, *values[SHAPE:]]  # not in `UNIT`
+    else:
+        draw, lists = splat, lists_for(scene, cutoff)
+    shape = (scene.height, scene.width, scene.channels)
+    delta = upload(type(values[0]), np.random.default_rng(1).normal(size=math.prod(shape)))
+
+    @dr.freeze
+    def forward(values: list, background: list, lists: TileLists) -> Any:
+        return draw(values, background, lists, cutoff)
+
+    @dr.freeze
+    def step(values: list, background: list, lists: TileLists, delta: Any) -> list:
+        dr.enable_grad(values)
+        dr.backward(dr.dot(draw(values, background, lists, cutoff), delta))
+        return dr.grad(values)
+
+    def shown() -> NDArray[Any]:
+        image = draw(values, background, lists, cutoff)
+        if plain:
+            return image.numpy().reshape(shape)
+        return to_tensor(image, lists.grid, shape[2]).numpy()
+
+    frozen = partial(step, values, background, lists, delta)
+    return partial(forward, values, background, lists), frozen, shown
+
+
+def _peak(q: Any) -> Any:
+    """`exp`, `select` and 3 `fma` from and to registers, in independent chains."""
+    types = types_of(q)
+
+    def body(i: Any, q: Any, sums: list) -> tuple:
+        for _ in range(PEAK_UNROLL):
+            w = dr.select(q < 4.5, dr.exp(-q), 0)
+            sums = [dr.fma(w, q, s) for s in sums]
+            q = q + 1e-3
+        return i + 1, q, sums
+
+    start = (types.UInt(0), types.Float(q), [types.Float(0) for _ in range(3)])
+    sums = dr.while_loop(start, lambda i, *_: i < PEAK_LOOPS, body, label="peak")[-1]
+    return sum(sums)
+
+
+def pixels_inside(scene: Gaussians) -> int:
+    """Count pairs of a splat and a pixel of the picture inside its cutoff ellipse."""
+    mean = scene.to_arrays()["mean"].astype(np.float64)
+    reach = int(CUTOFF * SIGMA) + 1
+    near = np.arange(-reach, reach + 1)
+    x, y = (np.floor(mean[:, k])[:, None] + near + 0.5 for k in (0, 1))
+    dx2, dy2 = (x - mean[:, :1]) ** 2, (y - mean[:, 1:]) ** 2
+    dx2[(x < 0) | (x > SIDE)] = np.inf
+    dy2[(y < 0) | (y > SIDE)] = np.inf
+    return int((dx2[:, :, None] + dy2[:, None, :] <= (CUTOFF * SIGMA) ** 2).sum())
+
+
+def _growth_figures(
+    image: NDArray[np.float32], types: ArrayTypes, progress: Progress
+) -> dict[str, float]:
+    """Time every step of a refinement: splats stretch, and a poor renderer slows down."""
+    target = rgb_to_ycbcr(image)
+    mean, factor = adaptive(target, COUNT, np.random.default_rng(0))
+    start = Gaussians.from_arrays(
+        mean, factor, np.zeros((COUNT, 3)), size=(SIDE, SIDE), backend=types.backend
+    ).bounded()
+    start = solve(start, target).gaussians
+    ends = []
+    for step, _ in enumerate(descend(start, target, PRESETS["default"].schedule, STEPS)):
+        dr.sync_thread()
+        ends.append(time.perf_counter())
+        if step % 10 == 0:
+            progress("growth", step, STEPS)
+    ms = np.diff(ends) * 1e3
+    early, late = ms[50:150], ms[900:1000]
+    return {
+        "growth": float(np.median(late) / np.median(early)),
+        "growth_with_lists": float(late.mean() / early.mean()),
+        "early_step_ms": float(np.median(early)),
+        "late_step_ms": float(np.median(late)),
+    }

@@ -1,0 +1,206 @@
+"""Hard cases: images, starts and settings under which a descent might fail; no files are needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eigengs_bench.harness.timing import Image
+from eigengs_dr.images import sample
+from eigengs_dr.place import inverse_factor
+from eigengs_dr.resampling import cropped
+
+Shapes = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+SIDE = 256
+"""Pixels of a side where the case is not about size."""
+
+GAUSSIANS = 5000
+"""Splats on such an image: the paper's number, and that of the basis that ships."""
+
+ITERATIONS = 1000
+
+SMOOTH_SIDE, SMOOTH_GAUSSIANS = 512, 5000
+"""Splats lie 7 pixels apart, which shows; the paper's 20,000 lie under 4 apart."""
+
+LARGE_SIDE, LARGE_GAUSSIANS, LARGE_ITERATIONS = 4096, 20000, 20
+
+LONG_ITERATIONS = 10_000
+
+STRIPE = 3
+"""Rows of a stripe of the image that is foreign to a basis."""
+
+
+class Case(NamedTuple):
+    """One thing that may go wrong.
+
+    Attributes
+    ----------
+    name : str
+    image : callable
+        ``image()`` makes it: float32, shape (H, W, 3), RGB.
+    gaussians : int
+        Splats; a start from a basis has those of the basis.
+    iterations : int
+    place : callable or None
+        Means and factors to start from, called as those of `eigengs_dr.place` are and brought
+        inside their bounds as those are; None for those of the preset.
+    rates : float
+        What the rates of the preset are multiplied by.
+    alone : bool
+        Whether it is measured in a process of its own, which tells its memory.
+    """
+
+    name: str
+    image: Callable[[], Image]
+    gaussians: int = GAUSSIANS
+    iterations: int = ITERATIONS
+    place: Callable[..., Shapes] | None = None
+    rates: float = 1.0
+    alone: bool = False
+
+
+def photo(width: int = SIDE, height: int = SIDE) -> Image:
+    """Bring a photo of a cat to a size in pixels; enlarged, it is smooth."""
+    return np.clip(cropped(sample("chelsea"), width, height), 0, 1)
+
+
+def flat(red: float, green: float, blue: float) -> Image:
+    """Fill an image with one colour, 1 is white."""
+    return np.broadcast_to(np.array([red, green, blue], np.float32), (SIDE, SIDE, 3)).copy()
+
+
+def impulse() -> Image:
+    """Set one pixel to white on black."""
+    image = flat(0, 0, 0)
+    image[SIDE // 2, SIDE // 2] = 1
+    return image
+
+
+def checkerboard() -> Image:
+    """Alternate black and white pixels: nothing is finer."""
+    return _grey(np.indices((SIDE, SIDE)).sum(axis=0) % 2)
+
+
+def lines() -> Image:
+    """Draw a fan of white lines, one pixel wide and not smoothed, on black."""
+    from PIL import Image, ImageDraw
+
+    canvas = Image.new("L", (SIDE, SIDE))
+    draw = ImageDraw.Draw(canvas)
+    for end in range(0, SIDE, 12):
+        draw.line([(0, 0), (SIDE - 1, end)], fill=255)
+        draw.line([(0, 0), (end, SIDE - 1)], fill=255)
+    return _grey(np.asarray(canvas) / 255)
+
+
+def text() -> Image:
+    """Write small black letters on white."""
+    from PIL import Image, ImageDraw
+
+    canvas = Image.new("L", (SIDE, SIDE), 255)
+    words = "\n".join(["Sphinx of black quartz, judge my vow. 0123456789"] * 23)
+    ImageDraw.Draw(canvas).multiline_text((2, 2), words, fill=0, spacing=1)
+    return _grey(np.asarray(canvas) / 255)
+
+
+def smooth() -> Image:
+    """Let colours run linearly from side to side."""
+    y, x = np.indices((SMOOTH_SIDE, SMOOTH_SIDE), np.float32) / (SMOOTH_SIDE - 1)
+    return np.stack([0.15 + 0.7 * x, 0.2 + 0.5 * y, 0.75 - 0.3 * x - 0.2 * y], axis=2)
+
+
+def saturated() -> Image:
+    """Put squares of the eight corners of the RGB cube side by side."""
+    row, column = np.indices((SIDE, SIDE)) // 16
+    corner = (row + 3 * column) % 8
+    return np.stack([corner >> bit & 1 for bit in range(3)], axis=2).astype(np.float32)
+
+
+def noise() -> Image:
+    """Add noise of standard deviation 0.3 to a photo."""
+    drawn = np.random.default_rng(0).normal(0, 0.3, (SIDE, SIDE, 3))
+    return np.clip(photo() + drawn, 0, 1).astype(np.float32)
+
+
+def foreign() -> Image:
+    """Invert every other stripe of a photo: a basis of smooth components cannot follow."""
+    inverted = np.indices((SIDE, SIDE))[0] // STRIPE % 2 == 1
+    return np.where(inverted[..., None], 1 - photo(), photo())
+
+
+def _grey(plane: NDArray[np.number]) -> Image:
+    return np.repeat(plane[..., None], 3, axis=2).astype(np.float32)
+
+
+def needles(image: Image, count: int, generator: np.random.Generator) -> Shapes:
+    """Stretch splats a hundredfold, in all directions: condition 10,000."""
+    angle = generator.uniform(0, np.pi, count)
+    cos, sin = np.cos(angle), np.sin(angle)
+    long, thin = 30.0**2, 0.3**2
+    xx, yy = long * cos**2 + thin * sin**2, long * sin**2 + thin * cos**2
+    return _anywhere(image, count, generator), inverse_factor(xx, (long - thin) * cos * sin, yy)
+
+
+def subpixel(image: Image, count: int, generator: np.random.Generator) -> Shapes:
+    """Make splats so narrow that pixel centres miss most; bounds widen them to a quarter pixel."""
+    return _anywhere(image, count, generator), _round(count, 0.05)
+
+
+def heap(image: Image, count: int, generator: np.random.Generator) -> Shapes:
+    """Put equal splats on one point: there is no telling them apart."""
+    height, width = image.shape[:2]
+    return np.tile([width // 2 + 0.5, height // 2 + 0.5], (count, 1)), _round(count, 1.0)
+
+
+def outside(image: Image, count: int, generator: np.random.Generator) -> Shapes:
+    """Put splats around the image, where no pixel sees them; bounds bring them to its edges."""
+    height, width = image.shape[:2]
+    angle, radius = generator.uniform(0, 2 * np.pi, count), generator.uniform(1, 2, count)
+    mean = 0.5 + np.stack([np.cos(angle), np.sin(angle)], axis=1) * radius[:, None]
+    return mean * [width, height], _round(count, 2.0)
+
+
+def _anywhere(image: Image, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
+    return generator.uniform(0, [image.shape[1], image.shape[0]], (count, 2))
+
+
+def _round(count: int, sigma: float) -> NDArray[np.float64]:
+    return np.tile([1 / sigma, 0.0, 1 / sigma], (count, 1))
+
+
+_ALL = (
+    Case("photo", photo),  # what the others are compared with
+    Case("constant", partial(flat, 0.2, 0.4, 0.6)),  # whole 8-bit levels
+    Case("black", partial(flat, 0.0, 0.0, 0.0)),
+    Case("white", partial(flat, 1.0, 1.0, 1.0)),
+    Case("impulse", impulse),
+    Case("checkerboard", checkerboard),
+    Case("lines", lines),
+    Case("text", text),
+    Case("smooth", smooth, SMOOTH_GAUSSIANS),
+    Case("saturated", saturated),
+    Case("noise", noise),
+    Case("1x512", partial(photo, 512, 1), 128),
+    Case(
+        "large",
+        partial(photo, LARGE_SIDE, LARGE_SIDE),
+        LARGE_GAUSSIANS,
+        LARGE_ITERATIONS,
+        alone=True,
+    ),
+    Case("foreign", foreign),
+    Case("needles", photo, place=needles),
+    Case("subpixel", photo, place=subpixel),
+    Case("heap", photo, place=heap),
+    Case("outside", photo, place=outside),
+    Case("fast", photo, rates=10.0),
+    Case("long", photo, iterations=LONG_ITERATIONS),
+)
+
+CASES = {case.name: case for case in _ALL}
+"""Cases by name. What half precision costs is measured in each."""

@@ -1,0 +1,163 @@
+"""Clocks: a descent that is looked at on its way, and programs that take turns."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeVar
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from eigengs_dr.descent import LONG, Schedule, descend
+from eigengs_dr.fitting import Fit
+from eigengs_dr.gaussians import Gaussians
+from eigengs_dr.metrics import ms_ssim, psnr, ssim
+from eigengs_dr.refine import EXACT, Refined
+from eigengs_dr.rendering import CUTOFF, picture_of
+from eigengs_dr.starting import Start
+
+Image = NDArray[np.float32]
+"""RGB, shape (H, W, 3), 1 is white."""
+
+Fitted = TypeVar("Fitted", Fit, Refined)
+
+
+class Moment(NamedTuple):
+    """State of a descent.
+
+    Attributes
+    ----------
+    iteration : int
+        Steps taken.
+    seconds : float
+        Since before the start was made, without the time that the observer took.
+    gaussians : Gaussians
+    picture : ndarray of float32, shape (H, W, 3)
+        RGB, not clamped.
+    """
+
+    iteration: int
+    seconds: float
+    gaussians: Gaussians
+    picture: Image
+
+
+def follow(
+    begin: Callable[[], Start],
+    schedule: Schedule,
+    iterations: int,
+    marks: Collection[int],
+    cutoff: float = CUTOFF,
+) -> Iterator[Moment]:
+    """Run a descent to its last step and yield its state at some steps.
+
+    Unlike `eigengs_dr.fit` it takes all steps, also where nothing is gained any more, and shows the
+    set as it is, not the best so far. The clock stops between two moments.
+
+    Parameters
+    ----------
+    begin : callable
+        Makes the start; its time counts.
+    schedule : Schedule
+    iterations : int
+    marks : collection of int
+        Steps after which to yield; 0 is the start.
+    cutoff : float, optional
+    """
+    spent, resumed = 0.0, time.perf_counter()
+    start = begin()
+    sets = descend(
+        start.gaussians, start.target, schedule, iterations, cutoff, start.weight, start.rearrange
+    )
+    for iteration, current in enumerate(sets):
+        if iteration not in marks:
+            continue
+        dr.eval(current)
+        dr.sync_thread()  # steps run asynchronously
+        spent += time.perf_counter() - resumed
+        picture = picture_of(current, cutoff=cutoff)
+        if start.added is not None:
+            picture = picture + start.added
+        yield Moment(iteration, spent, current, picture)
+        resumed = time.perf_counter()
+
+
+def warm_up(
+    begin: Callable[[], Start], schedule: Schedule, iterations: int, cutoff: float = CUTOFF
+) -> None:
+    """Compile the programs of a descent of so many steps, also those that place splats anew.
+
+    Parameters are those of `follow`.
+    """
+    steps = min(LONG, iterations)
+    list(follow(begin, replace(schedule, rearrange=1), steps, (0, steps), cutoff))
+
+
+def require_complete(fitted: Fitted) -> Fitted:
+    """Return a fit that was not broken off: the state after Ctrl-C is no measurement.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If it was.
+    """
+    if fitted.stopped == "interrupted":
+        raise KeyboardInterrupt
+    return fitted
+
+
+def decibels(picture: Image, image: Image, space: str) -> float:
+    """Return a PSNR for a row, in dB and at most `EXACT`. NaN is left to fits that have failed.
+
+    Parameters are those of `eigengs_dr.psnr`.
+    """
+    return min(psnr(picture, image, space), EXACT)
+
+
+def score(moment: Moment, image: Image) -> dict[str, Any]:
+    """Turn a moment into a row: iteration, seconds, psnr_ycbcr, psnr_rgb, ssim, ms_ssim."""
+    return {
+        "iteration": moment.iteration,
+        "seconds": moment.seconds,
+        "psnr_ycbcr": decibels(moment.picture, image, "ycbcr"),
+        "psnr_rgb": decibels(moment.picture, image, "rgb"),
+        "ssim": ssim(moment.picture, image),
+        "ms_ssim": ms_ssim(moment.picture, image),
+    }
+
+
+def interleaved(
+    programs: dict[str, Callable[[], Any]],
+    warm_up: int,
+    rounds: int,
+    progress: Callable[[int], None] = lambda done: None,
+) -> dict[str, float]:
+    """Time programs in turns: one of each a round, after rounds that compile and settle.
+
+    Parameters
+    ----------
+    programs : dict of str to callable
+        Each returns Dr.Jit arrays, which are evaluated.
+    warm_up, rounds : int
+        Rounds that are not measured, and rounds that are.
+    progress : callable, optional
+        ``progress(done)`` after every round.
+
+    Returns
+    -------
+    dict of str to float
+        Median milliseconds by name.
+    """
+    times: dict[str, list[float]] = {name: [] for name in programs}
+    for done in range(warm_up + rounds):
+        for name, program in programs.items():
+            started = time.perf_counter()
+            dr.eval(program())
+            dr.sync_thread()
+            if done >= warm_up:
+                times[name].append((time.perf_counter() - started) * 1e3)
+        progress(done + 1)
+    return {name: float(np.median(ms)) for name, ms in times.items()}
