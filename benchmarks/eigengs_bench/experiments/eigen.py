@@ -1,0 +1,105 @@
+"""What a model is worth on images that it was not trained on, and as the start of a fit."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from eigengs_bench.harness.task import Progress, no_progress
+from eigengs_bench.harness.timing import Image, require_complete
+from eigengs_dr.color import rgb_to_ycbcr
+from eigengs_dr.eigengs import EigenGS
+from eigengs_dr.fitting import fit
+from eigengs_dr.gaussians import Gaussians
+from eigengs_dr.metrics import psnr
+from eigengs_dr.presets import PRESETS
+from eigengs_dr.refine import refine
+from eigengs_dr.rendering import render
+from eigengs_dr.solve import solve
+
+SOLVE_STEPS = 10
+"""Steps of conjugate gradients, those of `eigengs_dr.fit`."""
+
+PLACED = ("grid", "adaptive")
+"""Starts that look at the image alone."""
+
+
+def run(
+    model: EigenGS,
+    images: Sequence[Image],
+    iterations: int = 100,
+    progress: Progress = no_progress,
+) -> dict[str, float]:
+    """Compare starts of a fit: those of a model, and as many splats placed by the image alone.
+
+    Parameters
+    ----------
+    model : EigenGS
+    images : sequence of ndarray of float32, shape (H, W, 3)
+        RGB; with at least one pixel a splat of the model.
+    iterations : int, optional
+        Steps of refinement by the preset "default"; 0 measures the starts.
+    progress : Progress, optional
+        Called after every image.
+
+    Returns
+    -------
+    dict of str to float
+        For every start S, ``S_psnr_ycbcr`` and ``S_psnr_rgb`` in dB, means over the images, and
+        ``S_seconds``, medians, the start included. S is "projected" or "exact" (`EigenGS.encode`),
+        "solved" (projected, then conjugate gradients), or one of `PLACED`. ``encode_exact_ms`` and
+        ``encode_projected_ms`` are medians of `EigenGS.encode` alone. What is done once a model is
+        not counted.
+    """
+    for colors in ("exact", "projected"):  # factors, and kernels
+        model.encode(images[0], colors)
+    rows: dict[str, list[float]] = {}
+    for done, image in enumerate(images, 1):
+        for name, value in _measure(model, image, iterations):
+            rows.setdefault(name, []).append(value)
+        progress("eigen", done, len(images))
+    return {
+        name: float(np.mean(values) if "psnr" in name else np.median(values))
+        for name, values in rows.items()
+    }
+
+
+def _measure(model: EigenGS, image: Image, iterations: int) -> Any:
+    """Names and figures of one image."""
+    space = model.gaussians.space
+    target = rgb_to_ycbcr(image) if space == "ycbcr" else image
+    for colors in ("exact", "projected"):
+        started = time.perf_counter()
+        model.encode(image, colors)
+        yield f"encode_{colors}_ms", 1e3 * (time.perf_counter() - started)
+
+    def solved() -> Gaussians:
+        return solve(model.encode(image, "projected"), target, SOLVE_STEPS, warm_start=True)[0]
+
+    starts: dict[str, Callable[[], Gaussians]] = {
+        "projected": lambda: model.encode(image, "projected"),
+        "exact": lambda: model.encode(image),
+        "solved": solved,
+    }
+    schedule = PRESETS["default"].schedule
+    for name, start in starts.items():
+        started = time.perf_counter()
+        refined = require_complete(
+            refine(start().bounded(), target, image, schedule, iterations, started=started)
+        )
+        picture = render(refined.gaussians).numpy()
+        yield from _row(name, image, picture, time.perf_counter() - started)
+    for name in PLACED:
+        fitted = require_complete(
+            fit(image, len(model.gaussians), iterations, init=name, color=space)
+        )
+        yield from _row(name, image, fitted.image, fitted.seconds)
+
+
+def _row(name: str, image: Image, picture: Image, seconds: float) -> Any:
+    for space in ("ycbcr", "rgb"):
+        yield f"{name}_psnr_{space}", psnr(image, picture, space)
+    yield f"{name}_seconds", seconds

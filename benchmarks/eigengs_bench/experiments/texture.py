@@ -1,0 +1,161 @@
+"""How fast a texture of Gaussians is in Mitsuba: against a bitmap on the same ball."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from eigengs_bench.harness.task import Progress, no_progress
+from eigengs_bench.harness.timing import interleaved, require_complete
+from eigengs_dr.color import to_linear
+from eigengs_dr.fitting import fit
+from eigengs_dr.images import sample
+from eigengs_dr.rendering import picture_of, render
+
+SIDE, TEXELS, SPP = 512, 1024, 16
+"""Of the picture, of the bitmap, and samples a pixel."""
+
+COUNTS = (500, 5_000, 20_000)
+"""Splats of the textures."""
+
+SETTLED = 5_000
+"""Splats of the texture that is also prefiltered, differentiated and changed."""
+
+STEPS, WARM_UP, ROUNDS = 100, 2, 9
+"""Steps of the fits, rounds that compile and settle, and rounds that are measured."""
+
+
+def run(variant: str = "llvm_ad_rgb", progress: Progress = no_progress) -> dict[str, float]:
+    """Time a material ball with each texture in turn, in one run; every figure is a median.
+
+    Parameters
+    ----------
+    variant : str, optional
+        Of Mitsuba.
+    progress : Progress, optional
+
+    Returns
+    -------
+    dict of str to float
+        - `bitmap_ms`, `gaussians_N_ms`: rendering with a bitmap, and with N Gaussians.
+        - `ratio_N`: the second over the first.
+        - `prefiltered_ms`, `ratio_prefiltered`: with 5,000 splats and the prefilter.
+        - `step_bitmap_ms`, `step_gaussians_ms`, `ratio_step`: picture and gradient of all
+          parameters by `prb`; 3 million texels, or 5,000 splats.
+        - `change_ms`: taking over changed parameters, which lists the splats anew.
+        - `difference`: the largest between texture and `eigengs_dr.render` at texel centres.
+    """
+    import mitsuba as mi
+
+    from eigengs_dr.plugins import pixel_angle, register_plugins, texture_of
+
+    mi.set_variant(variant)
+    register_plugins()
+    picture = sample("coffee")[:400, 100:500]
+    sets = {}
+    for count in COUNTS:
+        sets[count] = require_complete(fit(picture, count, STEPS)).gaussians
+        progress("fits", len(sets), len(COUNTS))
+    coded = np.clip(picture_of(sets[SETTLED], TEXELS, TEXELS), 0, 1)
+    bitmap = {
+        "type": "bitmap",
+        "data": mi.TensorXf(to_linear(coded).astype(np.float32)),
+        "raw": True,
+    }
+    plain = ball(mi, bitmap)
+    angle = pixel_angle(plain.sensors()[0])
+    scenes = {f"gaussians_{count}": ball(mi, texture_of(g)) for count, g in sets.items()}
+    filtered = ball(mi, texture_of(sets[SETTLED], prefilter=angle))
+    settled = scenes[f"gaussians_{SETTLED}"]
+    variants: dict[str, Callable[[], Any]] = {
+        "bitmap": partial(mi.render, plain),
+        **{name: partial(mi.render, scene) for name, scene in scenes.items()},
+        "prefiltered": partial(mi.render, filtered),
+        "step_bitmap": _step(mi, plain),
+        "step_gaussians": _step(mi, settled),
+        "change": partial(_change, mi, settled),
+    }
+    rounds = WARM_UP + ROUNDS
+    timed = interleaved(variants, WARM_UP, ROUNDS, lambda done: progress("texture", done, rounds))
+    ms = {f"{name}_ms": taken for name, taken in timed.items()}
+    ratios = {f"ratio_{count}": ms[f"gaussians_{count}_ms"] / ms["bitmap_ms"] for count in COUNTS}
+    return {
+        **ms,
+        **ratios,
+        "ratio_prefiltered": ms["prefiltered_ms"] / ms["bitmap_ms"],
+        "ratio_step": ms["step_gaussians_ms"] / ms["step_bitmap_ms"],
+        "difference": _difference(mi, sets[SETTLED], texture_of(sets[SETTLED], raw=True)),
+    }
+
+
+def ball(mi: Any, texture: dict[str, Any]) -> Any:
+    """Load a ball with a textured coat on a grey floor, under a lamp and the sky."""
+    transform = mi.ScalarTransform4f()
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 5},
+            "sensor": {
+                "type": "perspective",
+                "fov": 32,
+                "to_world": transform.look_at([0, 1.2, 4.2], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": SIDE, "height": SIDE},
+                "sampler": {"type": "independent", "sample_count": SPP},
+            },
+            "ball": {
+                "type": "sphere",
+                "bsdf": {"type": "principled", "base_color": texture, "roughness": 0.3},
+            },
+            "floor": {
+                "type": "rectangle",
+                "to_world": transform.translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(6),
+            },
+            "lamp": {
+                "type": "sphere",
+                "center": [3, 4, 3],
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 20.0}},
+            },
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.4}},
+        }
+    )
+
+
+def _step(mi: Any, scene: Any) -> Callable[[], Any]:
+    """Render and differentiate with respect to the texture, as a step of a descent does."""
+    integrator = mi.load_dict({"type": "prb", "max_depth": 5})
+    parameters = mi.traverse(scene)
+    parameters.keep(r".*base_color\.(data|mean|factor|color|background)")
+
+    def step() -> Any:
+        for name, value in parameters:
+            dr.enable_grad(value)
+            parameters[name] = value
+        parameters.update()
+        dr.backward(dr.mean(mi.render(scene, parameters, integrator=integrator), axis=None))
+        return [dr.grad(value) for _, value in parameters]
+
+    return step
+
+
+def _change(mi: Any, scene: Any) -> Any:
+    """Tell the texture that its shapes have changed."""
+    parameters = mi.traverse(scene)
+    parameters.keep(r".*base_color\.factor")
+    ((key, factor),) = parameters
+    parameters[key] = dr.detach(factor) + 0
+    parameters.update()
+    return parameters[key]
+
+
+def _difference(mi: Any, gaussians: Any, texture: dict[str, Any]) -> float:
+    """Largest difference between texture and rendering at the centres of texels."""
+    width, height = gaussians.width, gaussians.height
+    index = dr.arange(mi.UInt32, width * height)
+    si = dr.zeros(mi.SurfaceInteraction3f, width * height)
+    si.uv = (mi.Point2f(index % width, index // width) + 0.5) / mi.Point2f(width, height)
+    found = np.stack([np.array(c) for c in mi.load_dict(texture).eval_3(si)], -1)
+    return float(np.abs(found.reshape(height, width, -1) - render(gaussians).numpy()).max())

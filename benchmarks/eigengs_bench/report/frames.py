@@ -1,0 +1,161 @@
+"""Rows as data frames, figures as cells, and tables that say where their rows come from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from eigengs_bench.harness.store import Row, code_name
+
+MISSING = "-"
+"""Cell of a figure that is not there."""
+
+
+class Table(NamedTuple):
+    """Cells as they are read.
+
+    Attributes
+    ----------
+    caption : str
+        What the cells are, with their unit, and what they were measured on.
+    frame : DataFrame
+        Texts; the first column says what a row is about.
+    """
+
+    caption: str
+    frame: pd.DataFrame
+
+
+class Chart(NamedTuple):
+    """A drawing: the stem of its file, and what it shows."""
+
+    name: str
+    caption: str
+    figure: Figure
+
+
+class Told(NamedTuple):
+    """Tables and charts of rows, and the points of the charts, by the stem of their file."""
+
+    tables: Sequence[Table] = ()
+    charts: Sequence[Chart] = ()
+    points: dict[str, pd.DataFrame] = {}  # noqa: RUF012  never written to
+
+
+def frame_of(rows: Iterable[Row], key: str = "") -> pd.DataFrame:
+    """Lay rows out as a frame.
+
+    Parameters
+    ----------
+    rows : iterable of dict
+        As `eigengs_bench.harness.store.measure` returns them.
+    key : str, optional
+        A list in the rows, of which each entry becomes a line; rows without it are left out. By
+        default a row is a line.
+
+    Returns
+    -------
+    DataFrame
+        Columns are the fields of the jobs, the figures, and "code", the name of the code. Figures
+        of fits that have failed, null in the file, are NaN.
+    """
+    lines = []
+    for row in rows:
+        figures = {k: v for k, v in row.items() if k not in ("job", "run", key)}
+        shared = {**row["job"], **figures, "code": code_name(row["run"])}
+        lines += [{**shared, **entry} for entry in (row.get(key, []) if key else [{}])]
+    return pd.DataFrame([{k: math.nan if v is None else v for k, v in ln.items()} for ln in lines])
+
+
+def table(
+    caption: str,
+    columns: Sequence[str],
+    lines: Iterable[Sequence[Any]],
+    codes: Iterable[str] = (),
+) -> Table:
+    """Make a table of lines of texts.
+
+    Parameters
+    ----------
+    caption : str
+    columns : sequence of str
+    lines : iterable of sequence of str
+    codes : iterable of str, optional
+        Names of the code of all rows behind the table; see `remark`.
+    """
+    return Table(caption + remark(codes), pd.DataFrame(list(lines), columns=list(columns)))
+
+
+def remark(codes: Iterable[str]) -> str:
+    """Say that rows are of several commits, or of a tree that was not clean; "" where all is well.
+
+    Parameters
+    ----------
+    codes : iterable of str
+        As `eigengs_bench.harness.store.code_name` writes them.
+    """
+    known = list(dict.fromkeys(codes))
+    if len(known) > 1 or any("uncommitted" in code for code in known):
+        kind = "different code" if len(known) > 1 else "code that is in no commit"
+        return f" [rows of {kind}: {'; '.join(known)}]"
+    return ""
+
+
+def code_remark(rows: Iterable[Row]) -> str:
+    """Return `remark` of the code of some rows."""
+    return remark(code_name(row["run"]) for row in rows)
+
+
+def as_text(table: Table, style: str = "simple") -> str:
+    """Lay a table out for a terminal, or for Markdown with the style "pipe"."""
+    if table.frame.empty:
+        return f"{table.caption}: none"
+    sides = ["left"] + ["right"] * (len(table.frame.columns) - 1)
+    laid = table.frame.to_markdown(
+        index=False, tablefmt=style, colalign=sides, disable_numparse=True
+    )
+    return f"{table.caption}\n\n{laid}"
+
+
+def number(value: float | None, decimals: int = 1) -> str:
+    """Write a figure; `MISSING` for None and NaN, "inf" for infinity."""
+    if value is None or math.isnan(value):
+        return MISSING
+    return f"{value:,.{decimals}f}"
+
+
+def mean(values: pd.Series, decimals: int = 1) -> str:
+    """Write the mean of figures; NaN is of fits that have failed, and counted: "46.3 (2 failed)"."""
+    failed = int(values.isna().sum())
+    return number(values.mean(), decimals) + (f" ({failed} failed)" if failed else "")
+
+
+def spread(values: pd.Series, decimals: int = 1) -> str:
+    """Write mean and standard deviation (of a sample) of figures, "46.3 ± 2.1"; see `mean`."""
+    if values.count() < 2:
+        return mean(values, decimals)
+    first, *failed = mean(values, decimals).split(" ", 1)
+    return " ".join([f"{first} ± {number(values.std(), decimals)}", *failed])
+
+
+def quartiles(values: pd.Series, decimals: int = 2) -> str:
+    """Write the median of times and the range of the middle half: "2.80 (2.71-2.95)"."""
+    low, middle, high = (number(values.quantile(q), decimals) for q in (0.25, 0.5, 0.75))
+    return middle if len(values) < 2 else f"{middle} ({low}-{high})"
+
+
+def span(values: pd.Series, decimals: int) -> tuple[str, str]:
+    """Write the median of values, and the least and the greatest: "37" and "12 to 55"."""
+    if values.empty:
+        return MISSING, MISSING
+    ends = f"{number(values.min(), decimals)} to {number(values.max(), decimals)}"
+    return number(values.median(), decimals), ends
+
+
+def counted(count: int, noun: str) -> str:
+    """Write a number of things: "1 image", "3 images"."""
+    return f"{count} {noun}{'s'[: count != 1]}"
