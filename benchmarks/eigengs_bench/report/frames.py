@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -129,7 +130,7 @@ def number(value: float | None, decimals: int = 1) -> str:
 
 
 def mean(values: pd.Series, decimals: int = 1) -> str:
-    """Write the mean of figures; NaN is of fits that have failed, and counted: "46.3 (2 failed)"."""
+    """Write the mean of figures. NaN is of fits that have failed: "46.3 (2 failed)"."""
     failed = int(values.isna().sum())
     return number(values.mean(), decimals) + (f" ({failed} failed)" if failed else "")
 
@@ -159,3 +160,16 @@ def span(values: pd.Series, decimals: int) -> tuple[str, str]:
 def counted(count: int, noun: str) -> str:
     """Write a number of things: "1 image", "3 images"."""
     return f"{count} {noun}{'s'[: count != 1]}"
+
+
+def smallest(curve: Mapping[Any, float], target: float) -> float:
+    """Interpolate the size at a PSNR, which is taken as linear in the logarithm of the size.
+
+    Between the first two neighbours, by their sizes (splats, or bits), that have the PSNR between
+    them; NaN where there are none.
+    """
+    for (few, low), (many, high) in pairwise(sorted(curve.items())):
+        if low <= target <= high:
+            share = (target - low) / (high - low) if high > low else 0.0
+            return float(few * (many / few) ** share)
+    return math.nan

@@ -22,7 +22,7 @@ from eigengs_bench.report.frames import (
     spread,
     table,
 )
-from eigengs_bench.report.paper import ABLATION, PRINTED
+from eigengs_bench.report.sections.paper import ABLATION, PRINTED
 
 
 def _seconds(values: pd.Series) -> str:
@@ -212,7 +212,7 @@ def _reaches(found: pd.DataFrame) -> Iterator[Table]:
     lines = []
     for (name, iterations), part in groups_of(found).items():
         some = part.dropna(subset="share")
-        times = (quartiles(some.seconds, 3), quartiles(some.share, 4)) if len(some) else ("-", "-")
+        times = quartiles(some.seconds, 3), quartiles(some.share, 4)
         worst = number(some.share.max(), 4)
         lines.append((name, f"{iterations:,}", f"{len(some)} of {len(part)}", *times, worst))
     caption = "Time in which default has what gaussianimage has at its last step, from the start"

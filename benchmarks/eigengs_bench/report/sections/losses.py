@@ -9,7 +9,7 @@ import pandas as pd
 
 from eigengs_bench.harness.store import Row
 from eigengs_bench.report.frames import MISSING, Table, frame_of, number, table
-from eigengs_bench.report.methods import groups_of, methods_of
+from eigengs_bench.report.sections.methods import groups_of, methods_of
 
 Line = tuple[str, ...]
 
