@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from eigengs_bench.cli_rows import budget, figures, pareto, rate, stability, tables
-from eigengs_bench.names import CONDITIONS
+from eigengs_bench.harness.store import Task
+from eigengs_bench.names import CONDITIONS, FIGURES, NATURAL, PAPER_SETS, PRESETS, SETS, TABLES
 from eigengs_bench.options import (
     about,
-    chain,
+    chosen_sets,
     count_option,
+    data_argument,
     many_option,
+    measures_rows,
     output_option,
-    print_figures,
-    run_options,
+    prints_figures,
     save,
+    set_options,
 )
 from eigengs_dr.backend import select
 from eigengs_dr.cli_shared import (
@@ -26,118 +29,262 @@ from eigengs_dr.cli_shared import (
     backend_option,
     quiet_option,
     report_option,
+    seed_option,
 )
-from eigengs_dr.console import progress_bar
+from eigengs_dr.console import progress_bar, say
 from eigengs_dr.outputs import check_outputs
 from eigengs_dr.report import write_report
 
-figure_options = chain(report_option, quiet_option, click.pass_context)
+Names = tuple[str, ...]
 
 
 @click.group()
 def bench() -> None:
     """Measure speed and accuracy.
 
-    \b
-    Example:
-      eigengs-dr bench kernels --report kernels.json
+    Commands that take -o FOLDER keep their measurements there as lines of JSON: the same command
+    goes on after a break, and one with more sets or images adds lines. DATA has a folder a set
+    (faces256, cats512, cars256, natural256), with images to train on in train/ and others in test/;
+    kodak has no parts.
     """
 
 
-for command in (tables, pareto, rate, budget, stability, figures):
-    bench.add_command(command)
+@bench.command()
+@click.argument("data", type=FOLDER, metavar="DATA")
+@many_option("--set", "names", SETS, "Which images, by default all but kodak")
+@many_option("--table", "tables", TABLES, "Which tables, by default all")
+@count_option("--images", 20, "Of each set.")
+@measures_rows("tables.jsonl")
+def tables(task: Task, names: Names, tables: Names) -> Any:
+    """Measure every method on images that nothing was trained or tuned on.
+
+    \b
+    main      gaussianimage, default, and eigengs with its own and with the universal basis
+    ablation  eigengs in YCbCr or RGB, with and without the frequency-aware split
+    cross     eigengs with the basis of other images
+    reach     how soon default has the PSNR that gaussianimage ends with
+
+    Trained bases and models are kept in models/ of the folder: about a gigabyte a set.
+
+    \b
+    Examples:
+      eigengs-dr bench tables data/ -o results/ --set natural256 --images 3
+      eigengs-dr bench tables data/ -o results/ --images 4 --iterations 10000 --table main
+    """
+    from eigengs_bench.experiments.tables import run
+    from eigengs_bench.report.sections.methods import tell
+
+    return tell(run(task, tuple(dict.fromkeys(names)) or PAPER_SETS, tables or TABLES))
 
 
 @bench.command()
+@set_options(3)
+@measures_rows("pareto.jsonl")
+def pareto(task: Task, names: Names) -> Any:
+    """Measure speed against accuracy: fits that differ from the default one in one setting.
+
+    FOLDER gets a chart and a CSV file a set, and charts of the renderer and of storage. An image
+    takes some two minutes.
+
+    \b
+    Example:
+      eigengs-dr bench pareto data/ -o pareto/ --set samples --set faces256
+    """
+    from eigengs_bench.experiments.pareto import run
+    from eigengs_bench.report.sections.pareto import tell
+
+    return tell(run(task, chosen_sets(names, task.data)))
+
+
+@bench.command()
+@set_options(3)
+@measures_rows("rate.jsonl")
+def rate(task: Task, names: Names) -> Any:
+    """Compare packed fits with JPEG and WebP at equal size.
+
+    FOLDER gets a chart a set. An image of 256x256 pixels takes a minute.
+
+    \b
+    Example:
+      eigengs-dr bench rate data/ -o rate/ --set kodak --set natural256
+    """
+    from eigengs_bench.experiments.rate import run
+    from eigengs_bench.report.sections.rate import tell
+
+    return tell(run(task, chosen_sets(names, task.data)))
+
+
+@bench.command()
+@set_options(20, f"{NATURAL}, or samples without DATA")
 @click.option(
-    "--image",
-    type=EXISTING,
-    help="Image to refine, 512x512 or larger; by default a photo of scikit-image.",
+    "--target",
+    "targets",
+    multiple=True,
+    type=click.FloatRange(0, 100, min_open=True),
+    default=(32.0, 36.0, 40.0),
+    show_default=True,
+    metavar="DB",
+    help="PSNR in YCbCr to reach; may be repeated.",
 )
+@measures_rows("budget.jsonl")
+def budget(task: Task, names: Names, targets: tuple[float, ...]) -> Any:
+    """Measure how many Gaussians a PSNR takes: of fits of fixed numbers, and by the search.
+
+    \b
+    On every image, in this order:
+      fits of fixed numbers, splats placed once, until two enclose each target
+      the search of fit --target-psnr, and a default fit of the number it found
+      fits of one number, splats placed once, and placed anew on the way
+
+    FOLDER gets a chart and a CSV file a set. An image of 256x256 pixels takes a minute or two.
+
+    \b
+    Example:
+      eigengs-dr bench budget data/ -o budget/ --set natural256 --target 36
+    """
+    from eigengs_bench.experiments.budget import run
+    from eigengs_bench.report.sections.budget import tell
+
+    if any(target != target for target in targets):  # NaN is inside every click.FloatRange
+        raise ValueError("--target is nan; it must be above 0 and at most 100")
+    return tell(run(task, chosen_sets(names, task.data, NATURAL), tuple(dict.fromkeys(targets))))
+
+
+@bench.command()
+@click.option("--case", "cases", multiple=True, help="By default all; may be repeated.")
+@many_option("--preset", "presets", PRESETS, "By default all")
+@measures_rows("stability.jsonl", iterations=None)
+def stability(task: Task, names: Names, cases: Names, presets: Names) -> Any:
+    """Try every preset on hard cases: odd images, odd starts, rates too high.
+
+    Draws stability-tiles.png where the case "smooth" is among them: what tiling looks like. All
+    cases take some ten minutes; the case "large" takes gigabytes.
+
+    \b
+    Example:
+      eigengs-dr bench stability -o quick/ --case black --preset default --iterations 100
+    """
+    from eigengs_bench.experiments.stability import run, tiles_of
+    from eigengs_bench.experiments.stability_cases import chosen_cases
+    from eigengs_bench.report.charts import save_figure, tiles_chart
+    from eigengs_bench.report.page import TILES
+    from eigengs_bench.report.sections.stability import tell
+
+    chosen = chosen_cases(cases, task.iterations)
+    rows = run(task, chosen, tuple(dict.fromkeys(presets)) or PRESETS)
+    for smooth in (case for case in chosen if case.name == "smooth"):
+        save_figure(task.folder / TILES, tiles_chart(smooth.image(), tiles_of(task, smooth)))
+    return tell(rows)
+
+
+@bench.command()
+@data_argument
+@many_option("--figure", "figures", FIGURES, "What to draw, by default all")
+@count_option("--images", 8, "Test images a set, for curves and radii.")
+@measures_rows("curves.jsonl")
+def figures(task: Task, names: Names, figures: Names) -> Any:
+    """Draw the pictures of the paper, with our fits.
+
+    \b
+    iterations  fits at iterations 0, 10, 100 and the last, by every preset
+    colors      fits in YCbCr and in RGB, and their errors
+    curves      PSNR every 50 iterations
+    radii       how large Gaussians are, with the frequency-aware split and without
+    split       what Gaussians for low and for high frequencies render alone
+    cross       images projected on bases of other images
+
+    Without DATA photos of scikit-image are fitted, and figures that need more are left out.
+    FOLDER/figures.json lists the pictures with captions and credits.
+
+    \b
+    Example:
+      eigengs-dr bench figures data/ -o figures/ --figure curves --images 20
+    """
+    from eigengs_bench.experiments.figures import run
+    from eigengs_bench.report.frames import Told, table
+
+    lines = [(task.folder / figure.path, figure.caption) for figure in run(task, figures, say)]
+    return Told([table("Pictures", ("file", "caption"), lines)])
+
+
+@bench.command()
+@click.argument("folder", type=FOLDER, metavar="FOLDER")
+@output_option
+@quiet_option
+def report(folder: Path, output: Path, quiet: bool) -> None:
+    """Write a page of what the other commands of bench left in a folder.
+
+    Writes index.html, one file that needs no other, and README.md with pictures/ beside it. Every
+    section names the commands, days, machines, versions and commits behind its figures.
+
+    \b
+    Example:
+      eigengs-dr bench report results/ -o page/
+    """
+    from eigengs_bench.report.page import write_page
+
+    write_page(folder, output)
+    if not quiet:
+        click.echo(f"wrote {output / 'index.html'} and {output / 'README.md'}")
+
+
+@bench.command()
+@click.option("--image", type=EXISTING, help="512x512 or larger; by default a photo.")
 @backend_option
-@figure_options
-def kernels(
-    context: click.Context,
-    image: Path | None,
-    backend: str | None,
-    report: Path | None,
-    quiet: bool,
-) -> None:
+@prints_figures
+def kernels(show: Any, image: Path | None, backend: str | None) -> Any:
     """Time the renderer and its derivatives against plain Dr.Jit and the machine's peak.
 
     \b
     Example:
       eigengs-dr bench kernels --report kernels.json
     """
-    check_outputs([report], [])
     select(backend)
     from eigengs_bench.experiments.kernels import run
     from eigengs_dr.images import load_image
 
-    picture = load_image(image) if image else None
-    with progress_bar(quiet) as show:
-        figures = run(picture, backend, show)
-    print_figures(figures, about(context, backend), report, quiet)
+    return backend, {}, run(load_image(image) if image else None, backend, show)
 
 
 @bench.command()
 @click.argument("basis", metavar="NAME|FILE")
 @click.argument("folder", type=FOLDER, metavar="FOLDER")
 @count_option("--images", 20, "The first ones of the folder.")
-@count_option("--iterations", 100, least=0)
+@count_option("--iterations", 100, "With 0 the starts themselves are measured.", 0)
 @backend_option
-@figure_options
+@prints_figures
 def eigen(
-    context: click.Context,
-    basis: str,
-    folder: Path,
-    images: int,
-    iterations: int,
-    backend: str | None,
-    report: Path | None,
-    quiet: bool,
-) -> None:
+    show: Any, basis: str, folder: Path, images: int, iterations: int, backend: str | None
+) -> Any:
     """Compare the starts of a fit that a model gives with those the image alone gives.
 
-    With --iterations 0 the starts themselves are measured.
-
     \b
-    Examples:
-      eigengs-dr bench eigen natural photos/ --iterations 0
+    Example:
       eigengs-dr bench eigen faces.npz faces-test/ --images 50 --report eigen.json
     """
-    from eigengs_dr.images import image_files, load_image
-
-    files = image_files(folder)[:images]
-    check_outputs([report], files)
     select(backend)
     from eigengs_bench.experiments.eigen import run
     from eigengs_dr.bases import load_basis
+    from eigengs_dr.images import image_files, load_image
 
-    model = load_basis(basis, backend)
-    with progress_bar(quiet) as show:
-        figures = run(model, [load_image(file) for file in files], iterations, show)
-    settings = {"basis": basis, "images": len(files), "iterations": iterations}
-    print_figures(figures, {**about(context, backend), **settings}, report, quiet)
+    pictures = [load_image(file) for file in image_files(folder)[:images]]
+    settings = {"basis": basis, "images": len(pictures), "iterations": iterations}
+    return backend, settings, run(load_basis(basis, backend), pictures, iterations, show)
 
 
 @bench.command()
 @click.option("--variant", default="llvm_ad_rgb", show_default=True, help="Of Mitsuba.")
-@figure_options
-def texture(context: click.Context, variant: str, report: Path | None, quiet: bool) -> None:
+@prints_figures
+def texture(show: Any, variant: str) -> Any:
     """Time a material ball with textures of Gaussians against one with a bitmap, in Mitsuba.
 
     \b
     Example:
       eigengs-dr bench texture --report texture.json
     """
-    check_outputs([report], [])
     from eigengs_bench.experiments.texture import run
 
-    with progress_bar(quiet) as show:
-        figures = run(variant, show)
-    run_about = about(context, "cuda" if "cuda" in variant else "llvm")
-    print_figures(figures, {**run_about, "variant": variant}, report, quiet)
+    return "cuda" if "cuda" in variant else "llvm", {"variant": variant}, run(variant, show)
 
 
 @bench.command()
@@ -147,18 +294,15 @@ def texture(context: click.Context, variant: str, report: Path | None, quiet: bo
 @count_option("--steps", 200, least=2)
 @backend_option
 @click.option("--chart", type=ANY_PATH, help=".png, .svg or .pdf: PSNR over steps and seconds.")
-@click.option(
-    "--strip",
-    type=ANY_PATH,
-    metavar="S.png",
-    help="Film strips, .png or .jpg, one a condition: S-cameras.png and so on.",
-)
-@figure_options
+@click.option("--strip", type=ANY_PATH, metavar="S.png", help="Film strips: S-cameras.png, ...")
+@report_option
+@quiet_option
+@click.pass_context
 def inverse(
     context: click.Context,
     image: Path,
     basis: str,
-    conditions: tuple[str, ...],
+    conditions: Names,
     steps: int,
     backend: str | None,
     chart: Path | None,
@@ -172,8 +316,7 @@ def inverse(
     All conditions take some ten minutes.
 
     \b
-    Examples:
-      eigengs-dr bench inverse photo.jpg --condition hidden --strip strip.png
+    Example:
       eigengs-dr bench inverse cat.jpg --basis cats.npz --report inverse.json --chart inverse.png
     """
     names = tuple(dict.fromkeys(conditions)) or CONDITIONS
@@ -213,61 +356,29 @@ def inverse(
 @count_option("--gaussians", 5000)
 @count_option("--levels", 4)
 @count_option("--iterations", 1000)
-@run_options
+@seed_option
+@backend_option
+@quiet_option
 def levels(
-    context: click.Context,
-    image: Path | None,
-    output: Path,
-    gaussians: int,
-    levels: int,
-    iterations: int,
-    seed: int,
-    backend: str | None,
-    quiet: bool,
+    image: Path | None, output: Path, gaussians: int, levels: int, quiet: bool, **settings: Any
 ) -> None:
-    """Chart PSNR over how many Gaussians of a set are drawn.
+    """Chart PSNR over how many Gaussians of a set are drawn: levels.svg and levels.csv in FOLDER.
 
-    Without IMAGE a photo of scikit-image is fitted, at 256x256 pixels. FOLDER gets the chart
-    levels.svg and the same as levels.csv.
+    Without IMAGE a photo of scikit-image is fitted, at 256x256 pixels.
 
     \b
-    Examples:
-      eigengs-dr bench levels -o levels/
+    Example:
       eigengs-dr bench levels photo.jpg -o levels/ --gaussians 20000 --levels 5
     """
+    output.mkdir(parents=True, exist_ok=True)
+    check_outputs([output / "levels.svg", output / "levels.csv"], [image] if image else [])
+    select(settings["backend"])
     from eigengs_bench.experiments.levels import SAMPLE, SIDE, run
     from eigengs_bench.report.sections.levels import tell
     from eigengs_dr.images import load_image, sample
     from eigengs_dr.resampling import cropped
 
-    output.mkdir(parents=True, exist_ok=True)
-    files = [output / "levels.svg", output / "levels.csv"]
-    check_outputs(files, [image] if image else [])
-    select(backend)
     pixels = load_image(image) if image else cropped(sample(SAMPLE), SIDE, SIDE)
     with progress_bar(quiet) as show:
-        rows = run(pixels, gaussians, levels, iterations, seed, backend, show)
+        rows = run(pixels, gaussians, levels, show, **settings)
     save(tell(rows, image.name if image else SAMPLE), output, quiet)
-
-
-@bench.command()
-@click.argument("folder", type=FOLDER, metavar="FOLDER")
-@output_option
-@quiet_option
-def report(folder: Path, output: Path, quiet: bool) -> None:
-    """Write a page of what the other commands of bench left in a folder.
-
-    Writes index.html, one file that needs no other, and README.md with pictures/ beside it. Every
-    section names the commands, days, machines, versions and commits behind its figures.
-
-    \b
-    Example:
-      eigengs-dr bench stability -o results/
-      eigengs-dr bench pareto -o results/
-      eigengs-dr bench report results/ -o page/
-    """
-    from eigengs_bench.report.page import write_page
-
-    write_page(folder, output)
-    if not quiet:
-        click.echo(f"wrote {output / 'index.html'} and {output / 'README.md'}")

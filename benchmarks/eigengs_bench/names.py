@@ -4,17 +4,7 @@ from typing import NamedTuple
 
 
 class ImageSet(NamedTuple):
-    """Images of one kind and size.
-
-    Attributes
-    ----------
-    folder : str
-        Where they are, below the folder of data.
-    width, height : int
-        Pixels. The largest centred part of an image is brought to this size.
-    gaussians : int
-        Splats that the paper uses at this size.
-    """
+    """A folder of images, the size in pixels they are brought to, and the paper's splats for it."""
 
     folder: str
     width: int
@@ -30,26 +20,11 @@ SETS = {
     "cats512": ImageSet("cats512", 512, 512, 20000),
     "kodak": ImageSet("kodak", 768, 512, 20000),
 }
-"""The sets by name: the paper's kinds of images at its two sizes, and photos that may be shown."""
-
 PAPER_SETS = tuple(name for name in SETS if name != "kodak")
-"""Sets of the paper's kinds of images."""
-
-NATURAL = "natural256"
-"""Photos of all kinds. The paper's "universal" basis is trained on them."""
-
-SAMPLES = "samples"
-"""Photos of scikit-image, a set that needs no data."""
+NATURAL, CATS = "natural256", "cats256"
+SAMPLES = "samples"  # photos of scikit-image, a set that needs no data
 
 PRESETS = ("default", "gaussianimage", "eigengs")
-"""Presets of `eigengs_dr.fit`."""
-
 TABLES = ("main", "ablation", "cross", "reach")
-"""What `tables` measures: the methods; colour spaces and the split; bases of other sets; and how
-soon "default" has the PSNR that "gaussianimage" ends with."""
-
 FIGURES = ("iterations", "colors", "curves", "radii", "split", "cross")
-"""The paper's figures."""
-
 CONDITIONS = ("cameras", "grazing", "hidden", "noise")
-"""What the photos of `inverse` are like."""

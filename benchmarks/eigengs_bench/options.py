@@ -1,18 +1,25 @@
-"""Options that the commands share, and what surrounds a measurement."""
+"""What makes a command of an experiment: its options, its folder, and how it tells its rows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
 import click
 
-from eigengs_bench.harness.store import Row, code_state, other_code
+from eigengs_bench.harness.store import Row, Task, code_state, other_code
 from eigengs_bench.names import SAMPLES, SETS
 from eigengs_dr.backend import select
-from eigengs_dr.cli_shared import FOLDER, backend_option, described, quiet_option, seed_option
+from eigengs_dr.cli_shared import (
+    FOLDER,
+    backend_option,
+    described,
+    quiet_option,
+    report_option,
+    seed_option,
+)
 from eigengs_dr.console import progress_bar, say
 from eigengs_dr.outputs import check_outputs
 from eigengs_dr.report import write_report
@@ -28,17 +35,6 @@ output_option = click.option(
 data_argument = click.argument("data", type=FOLDER, required=False, metavar="[DATA]")
 
 
-def chain(*decorators: Any) -> Callable[[Any], Any]:
-    """Join decorators of click, the first outermost."""
-
-    def decorate(command: Any) -> Any:
-        for decorator in reversed(decorators):
-            command = decorator(command)
-        return command
-
-    return decorate
-
-
 def count_option(name: str, default: int | None, text: str = "", least: int = 1) -> Any:
     """Make an option that takes a number of things."""
     kind = click.IntRange(min=least)
@@ -51,29 +47,14 @@ def many_option(name: str, to: str, values: Any, text: str) -> Any:
     return click.option(name, to, multiple=True, type=click.Choice(list(values)), help=text)
 
 
-run_options = chain(seed_option, backend_option, quiet_option, click.pass_context)
-
-
-def set_options(usual: str, images: int) -> Any:
+def set_options(images: int, usual: str = f"{SAMPLES}, photos of scikit-image") -> Any:
     """Make what the commands that fit sets of images take: where they are, which, how many."""
-    return chain(
-        data_argument,
-        output_option,
-        many_option("--set", "names", [SAMPLES, *SETS], f"Images to fit, by default {usual}"),
-        count_option("--images", images, "Of each set."),
-        count_option("--iterations", 1000),
-        run_options,
-    )
+    names = many_option("--set", "names", [SAMPLES, *SETS], f"Images to fit, by default {usual}")
+    return _chain(data_argument, names, count_option("--images", images, "Of each set."))
 
 
 def chosen_sets(names: tuple[str, ...], data: Path | None, usual: str = SAMPLES) -> tuple[str, ...]:
-    """Sets to measure on, each once; without data `SAMPLES` alone.
-
-    Raises
-    ------
-    ValueError
-        If a set is named that needs data.
-    """
+    """Sets to measure on, each once; without data `SAMPLES` alone, `ValueError` for others."""
     wanted = tuple(dict.fromkeys(names)) or (SAMPLES if data is None else usual,)
     if data is None and set(wanted) - {SAMPLES}:
         raise ValueError("--set needs DATA, the folder that holds the set, for all but samples")
@@ -85,69 +66,87 @@ def about(context: click.Context, backend: str | None) -> Row:
     return {**described(context, backend), **code_state()}
 
 
-@contextmanager
-def measuring(
-    context: click.Context,
-    output: Path,
-    file: str,
-    backend: str | None,
-    quiet: bool,
-    **settings: Any,
-) -> Iterator[Any]:
-    """Prepare a folder for rows, and yield the `Task` of an experiment while a bar is shown.
+def measures_rows(file: str, iterations: int | None = 1000) -> Any:
+    """Make a function of a task into a command that keeps rows in a file of a folder.
 
-    Parameters
-    ----------
-    context : click.Context
-    output : Path
-        The folder, made where it is missing.
-    file : str
-        The file of rows in it. A note is printed if it holds rows of other code.
-    backend : {"llvm", "cuda"} or None
-    quiet : bool
-    **settings
-        The other fields of the task.
+    The function returns a `Told`: its tables are printed, and its charts and points are written to
+    the folder. A note is printed if the file holds rows of other code.
     """
-    output.mkdir(parents=True, exist_ok=True)
-    check_outputs([output / file], [])
-    select(backend)
-    from eigengs_bench.harness.task import Task
 
-    run = about(context, backend)
-    if note := other_code(output / file, run):
-        say(f"note: {note}")
-    with progress_bar(quiet) as show:
-        yield Task(output, about=run, backend=backend, progress=show, **settings)
+    def decorate(command: Callable[..., Any]) -> Any:
+        @wraps(command)
+        def wrapped(
+            context: click.Context,
+            output: Path,
+            seed: int,
+            backend: str | None,
+            quiet: bool,
+            data: Path | None = None,
+            images: int = 0,
+            iterations: int | None = None,
+            names: tuple[str, ...] = (),
+            **settings: Any,
+        ) -> None:
+            chosen_sets(names if data is None else (), data)
+            output.mkdir(parents=True, exist_ok=True)
+            check_outputs([output / file], [])
+            select(backend)
+            run = about(context, backend)
+            if note := other_code(output / file, run):
+                say(f"note: {note}")
+            with progress_bar(quiet) as show:
+                task = Task(output, data, run, images, iterations, seed, backend, show)
+                told = command(task, names=names, **settings)
+            save(told, output, quiet)
+
+        steps = count_option("--iterations", iterations, "Steps of every fit, or the most.", 0)
+        options = (output_option, steps, seed_option, backend_option, quiet_option)
+        return _chain(*options, click.pass_context)(wrapped)
+
+    return decorate
 
 
 def save(told: Any, output: Path, quiet: bool) -> None:
-    """Write charts as SVG and their points as CSV into a folder; print the tables.
-
-    Parameters
-    ----------
-    told : eigengs_bench.report.frames.Told
-    output : Path
-    quiet : bool
-    """
+    """Write charts as SVG and their points as CSV into a folder; print the tables."""
     from eigengs_bench.report.charts import save_figure
     from eigengs_bench.report.frames import as_text
     from eigengs_dr.atomic import replacing
 
-    drawings = [output / f"{chart.name}.svg" for chart in told.charts]
-    for path, chart in zip(drawings, told.charts, strict=True):
-        save_figure(path, chart.figure)
+    for name, (_, figure) in told.charts.items():
+        save_figure(output / f"{name}.svg", figure)
     for name, points in told.points.items():
         with replacing(output / f"{name}.csv") as temporary:
             points.to_csv(temporary, index=False)
     if not quiet:
         click.echo("\n\n".join(map(as_text, told.tables)))
-        if drawings:
-            click.echo(f"\ncharts: {', '.join(map(str, drawings))}")
+        click.echo("".join(f"\nchart: {output / name}.svg" for name in told.charts))
 
 
-def print_figures(figures: dict[str, float], run: Row, report: Path | None, quiet: bool) -> None:
-    """Write figures and what is known of their run to a file, and print the figures."""
-    if report:
-        write_report(report, {**run, **figures})
-    if not quiet:
-        click.echo("\n".join(f"{key:24} {value:.4g}" for key, value in figures.items()))
+def prints_figures(command: Callable[..., Any]) -> Any:
+    """Make a function into a command that prints the figures that it returns, and reports them.
+
+    It is called with ``show``, see `progress_bar`, and returns the backend, settings and figures.
+    """
+
+    @wraps(command)
+    def wrapped(context: click.Context, report: Path | None, quiet: bool, **settings: Any) -> None:
+        check_outputs([report], [])
+        with progress_bar(quiet) as show:
+            backend, told, figures = command(show=show, **settings)
+        if report:
+            write_report(report, {**about(context, backend), **told, **figures})
+        if not quiet:
+            click.echo("\n".join(f"{key:24} {value:.4g}" for key, value in figures.items()))
+
+    return _chain(report_option, quiet_option, click.pass_context)(wrapped)
+
+
+def _chain(*decorators: Any) -> Callable[[Any], Any]:
+    """Join decorators of click, the first outermost."""
+
+    def decorate(command: Any) -> Any:
+        for decorator in reversed(decorators):
+            command = decorator(command)
+        return command
+
+    return decorate

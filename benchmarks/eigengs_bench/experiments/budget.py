@@ -1,4 +1,8 @@
-"""No more splats than needed: fits of fixed numbers, and what the search for the fewest finds."""
+"""No more splats than needed: fits of fixed numbers, and what the search for the fewest finds.
+
+The job of a fit has "gaussians" and "rearranged", and its row the figures of `score`. The job of a
+search has "target", and its row gaussians, stopped, iterations, seconds, psnr_ycbcr and psnr_rgb.
+"""
 
 from __future__ import annotations
 
@@ -8,22 +12,13 @@ from functools import partial
 
 import numpy as np
 
-from eigengs_bench.harness.datasets import images_of
-from eigengs_bench.harness.store import Row
-from eigengs_bench.harness.task import Task
-from eigengs_bench.harness.timing import (
-    Image,
-    decibels,
-    follow,
-    require_complete,
-    score,
-    warm_up,
-)
-from eigengs_bench.names import SETS
+from eigengs_bench.harness.datasets import images_of, usual_count
+from eigengs_bench.harness.store import Row, Task
+from eigengs_bench.harness.timing import Image, decibels, follow, require_complete, score, warm_up
 from eigengs_dr.descent import LONG
 from eigengs_dr.fitting import fit, most_gaussians
 from eigengs_dr.presets import PRESETS
-from eigengs_dr.starting import GAUSSIANS, Start, begin
+from eigengs_dr.starting import Start, begin
 
 FILE = "budget.jsonl"
 
@@ -33,48 +28,17 @@ SPARSEST = 1024
 STEPS_AN_OCTAVE = 2
 """Fixed numbers from one to twice as many, at least."""
 
-Fit = Callable[[int, bool], Row]
-"""``fitted(count, rearranged)``: the row of a fit of ``count`` splats, placed anew on the way or
-not."""
-
-Search = Callable[[float], Row]
-"""``searched(target)``: the row of a search for the fewest splats."""
-
 
 def run(task: Task, names: Sequence[str], targets: Sequence[float]) -> list[Row]:
-    """Measure sets, image by image, what is compared in turn.
-
-    Parameters
-    ----------
-    task : Task
-        With fewer iterations than `LONG` times `Schedule.rearrange`, no fit places its splats anew.
-    names : sequence of str
-        Of `SETS`, or `SAMPLES`.
-    targets : sequence of float
-        Decibels of psnr_ycbcr.
-
-    Returns
-    -------
-    list of dict
-        Rows of all `parts`, a fit that two of them need twice, with "job": set, image, iterations,
-        seed. The job of a fit has also gaussians and rearranged, and its row the figures of
-        `score`. The job of a search has also target, and its row gaussians, stopped, iterations,
-        seconds (all of `fit`, what it measures on its way included), psnr_ycbcr and psnr_rgb.
-
-    Raises
-    ------
-    ValueError
-        If a set is not there.
-    """
+    """Measure sets, image by image; a fit that two of the `parts` need is in the rows twice."""
     found: list[Row] = []
     for name in names:
         pictures = images_of(task, name)
-        usual = SETS[name].gaussians if name in SETS else GAUSSIANS
         total, done = len(pictures) * (3 * len(targets) + 2), 0
-        task.progress(name, done, total)
         for file, image in pictures:
-            measured = _measured(task, name, file, image)
-            count = min(usual, image.shape[0] * image.shape[1])
+            about = {"set": name, "image": file, "iterations": task.iterations, "seed": task.seed}
+            count = min(usual_count(name), image.shape[0] * image.shape[1])
+            measured = _measured(task, about, image)
             for part in parts(grid(image), targets, count, *measured):
                 found += part
                 done += 1
@@ -83,11 +47,7 @@ def run(task: Task, names: Sequence[str], targets: Sequence[float]) -> list[Row]
 
 
 def grid(image: Image) -> list[int]:
-    """Fixed numbers of splats for an image of shape (H, W, C), ascending.
-
-    From one for `SPARSEST` pixels to the most that a search uses, each at most the root of two
-    times the one before.
-    """
+    """Fixed numbers of splats: from one for `SPARSEST` pixels to the most that a search uses."""
     most = most_gaussians(image)
     least = min(most, math.ceil(image.shape[0] * image.shape[1] / SPARSEST))
     steps = math.ceil(STEPS_AN_OCTAVE * math.log2(most / least))
@@ -95,7 +55,11 @@ def grid(image: Image) -> list[int]:
 
 
 def parts(
-    counts: Sequence[int], targets: Sequence[float], usual: int, fitted: Fit, searched: Search
+    counts: Sequence[int],
+    targets: Sequence[float],
+    usual: int,
+    fitted: Callable[[int, bool], Row],
+    searched: Callable[[float], Row],
 ) -> Iterator[list[Row]]:
     """Compare on one image, and yield the rows of each of ``3 len(targets) + 2`` parts.
 
@@ -124,28 +88,24 @@ def bisect(counts: Sequence[int], target: float, fitted: Callable[[int], Row]) -
     while high - low > 1:
         middle = (low + high) // 2
         looked.append(fitted(counts[middle]))
-        value = looked[-1]["psnr_ycbcr"]  # null in JSON where a fit has failed
-        if value is not None and value >= target:
-            high = middle
-        else:
-            low = middle
+        value = looked[-1]["psnr_ycbcr"]  # None where a fit has failed
+        low, high = (low, middle) if value is not None and value >= target else (middle, high)
     return looked
 
 
-def _measured(task: Task, name: str, file: str, image: Image) -> tuple[Fit, Search]:
+def _measured(
+    task: Task, about: Row, image: Image
+) -> tuple[Callable[[int, bool], Row], Callable[[float], Row]]:
     """Functions that measure on one image what the file does not hold yet."""
-    shared = {"set": name, "image": file, "iterations": task.iterations, "seed": task.seed}
-
-    def one(job: Row, work: Callable[[], Row]) -> Row:
-        (row,) = task._replace(progress=lambda *_: None).measure(FILE, [(job, work)], name)
-        return row
+    quiet = task._replace(progress=lambda *_: None)
 
     def fitted(count: int, rearranged: bool) -> Row:
-        job = {**shared, "gaussians": count, "rearranged": rearranged}
-        return one(job, partial(_fit, task, image, count, rearranged))
+        job = {**about, "gaussians": count, "rearranged": rearranged}
+        return quiet.measure(FILE, [(job, partial(_fit, task, image, count, rearranged))], "")[0]
 
     def searched(target: float) -> Row:
-        return one({**shared, "target": float(target)}, partial(_search, task, image, target))
+        job = {**about, "target": float(target)}
+        return quiet.measure(FILE, [(job, partial(_search, task, image, target))], "")[0]
 
     return fitted, searched
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from eigengs_bench.harness.task import Progress, no_progress
+from eigengs_bench.harness.store import Progress
 from eigengs_bench.harness.timing import Image, require_complete
 from eigengs_dr.color import rgb_to_ycbcr
 from eigengs_dr.eigengs import EigenGS
@@ -31,28 +31,14 @@ def run(
     model: EigenGS,
     images: Sequence[Image],
     iterations: int = 100,
-    progress: Progress = no_progress,
+    progress: Progress = lambda *_: None,
 ) -> dict[str, float]:
     """Compare starts of a fit: those of a model, and as many splats placed by the image alone.
 
-    Parameters
-    ----------
-    model : EigenGS
-    images : sequence of ndarray of float32, shape (H, W, 3)
-        RGB; with at least one pixel a splat of the model.
-    iterations : int, optional
-        Steps of refinement by the preset "default"; 0 measures the starts.
-    progress : Progress, optional
-        Called after every image.
-
-    Returns
-    -------
-    dict of str to float
-        For every start S, ``S_psnr_ycbcr`` and ``S_psnr_rgb`` in dB, means over the images, and
-        ``S_seconds``, medians, the start included. S is "projected" or "exact" (`EigenGS.encode`),
-        "solved" (projected, then conjugate gradients), or one of `PLACED`. ``encode_exact_ms`` and
-        ``encode_projected_ms`` are medians of `EigenGS.encode` alone. What is done once a model is
-        not counted.
+    For every start S, ``S_psnr_ycbcr`` and ``S_psnr_rgb`` in dB are means over the images, and
+    ``S_seconds`` medians, the start included. S is "projected" or "exact" (`EigenGS.encode`),
+    "solved" (projected, then conjugate gradients), or one of `PLACED`. ``encode_S_ms`` are medians
+    of `EigenGS.encode` alone. With 0 iterations the starts themselves are measured.
     """
     for colors in ("exact", "projected"):  # factors, and kernels
         model.encode(images[0], colors)

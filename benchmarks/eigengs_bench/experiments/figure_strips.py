@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eigengs_bench.harness.datasets import has_training_images, images_of, model_for
-from eigengs_bench.harness.task import Task
+from eigengs_bench.harness.datasets import images_of, is_trained, model_for
+from eigengs_bench.harness.store import Task
 from eigengs_bench.harness.timing import Image, Moment, follow
-from eigengs_bench.names import NATURAL, SETS
-from eigengs_bench.report.strips import Cell, Line, save_strip, strip
+from eigengs_bench.names import CATS, NATURAL, SETS
+from eigengs_bench.report.strips import save_strip, strip
 from eigengs_dr.bases import load_basis
 from eigengs_dr.eigengs import EigenGS
 from eigengs_dr.gaussians import Gaussians
@@ -29,8 +29,8 @@ from eigengs_dr.rendering import picture_of
 from eigengs_dr.resampling import cropped
 from eigengs_dr.starting import begin
 
-CATS, CREDIT = "cats256", "AFHQ, NAVER Corp., CC BY-NC 4.0"
-"""The set that is shown, and the credit of all pictures of it."""
+CREDIT = "AFHQ, NAVER Corp., CC BY-NC 4.0"
+"""Of all pictures of cats."""
 
 COMPONENTS = 300
 """Of every channel of the models that are trained: those of the paper's comparisons."""
@@ -45,31 +45,46 @@ METHODS = {
 }
 """The presets that are compared, and what stands above their pictures."""
 
-MAGNIFIED = 8
-"""Factor of an error before it is added to mid-grey."""
-
-MARGIN = 0.08
-"""Around the middle of a picture, in its sides: splats there reach into it."""
+MAGNIFIED = 8  # factor of an error before it is added to mid-grey
+MARGIN = 0.08  # around the middle of a picture, in its sides: splats there reach into it
 
 
 class Figure(NamedTuple):
-    """A file with a picture.
-
-    Attributes
-    ----------
-    name : str
-        What it shows, one of `FIGURES`.
-    path : str
-        The file, in the folder of the figures.
-    caption : str
-    credit : str
-        Whose images these are, where they must be named.
-    """
+    """A file with a picture: one of `FIGURES`, the name of the file, and whose images these are."""
 
     name: str
     path: str
     caption: str
     credit: str = ""
+
+
+def is_present(task: Task, name: str) -> bool:
+    """Tell whether a set is there, with images to train on where models are trained on them."""
+    if task.data is None:
+        return False
+    folder = task.data / SETS[name].folder
+    if name == "kodak":
+        return folder.is_dir()
+    return is_trained(task.data, name) and (folder / "test").is_dir()
+
+
+def descent(
+    task: Task,
+    image: Image,
+    model: EigenGS,
+    preset: str,
+    marks: Sequence[int],
+    color: str = "ycbcr",
+) -> Iterator[Moment]:
+    """Fit an image by a preset with as many splats as a model has; "eigengs" starts from it."""
+    method, settings = PRESETS[preset], {"seed": task.seed, "backend": task.backend}
+    start = partial(begin, image, len(model.gaussians), "auto", model, method, color=color)
+    return follow(partial(start, **settings), method.schedule, task.iterations, marks)
+
+
+def to_size(image: Image, model: EigenGS) -> Image:
+    """Bring the largest centred part of an image to the size of a model."""
+    return cropped(image, model.gaussians.width, model.gaussians.height)
 
 
 def iterations(task: Task) -> Iterator[Figure]:
@@ -80,15 +95,12 @@ def iterations(task: Task) -> Iterator[Figure]:
         for done, (preset, heading) in enumerate(METHODS.items()):
             task.progress(path, done, len(METHODS))
             cells = [
-                Cell(f"{_at(moment)}: {_decibels(image, moment.picture)}", moment.picture)
+                (f"{_at(moment)}: {_decibels(image, moment.picture)}", moment.picture)
                 for moment in descent(task, image, model, preset, marks)
             ]
-            table.append(Line(heading, [*cells, Cell("photo", image)]))
+            table.append((heading, [*cells, ("photo", image)]))
         save_strip(task.folder / path, strip(table, credit))
-        caption = (
-            f"{words} {_size(model)}, after {_listed(marks)} iterations of three methods; PSNR in "
-            "YCbCr."
-        )
+        caption = f"{words} {_size(model)}, after {_listed(marks)} iterations; PSNR in YCbCr."
         yield Figure("iterations", path, caption, credit)
 
 
@@ -97,11 +109,11 @@ def _subjects(task: Task) -> Iterator[tuple[str, Image, EigenGS, str, str]]:
     shipped = load_basis("natural", task.backend)
     words = 'A photo of scikit-image and the basis "natural".'
     yield f"iterations-{PHOTO}.jpg", to_size(sample(PHOTO), shipped), shipped, words, ""
-    if present(task, "kodak"):
+    if is_present(task, "kodak"):
         [(file, image)] = images_of(task, "kodak", 1)
         words = 'A Kodak photo and the basis "natural".'
         yield f"iterations-{Path(file).stem}.jpg", to_size(image, shipped), shipped, words, ""
-    if present(task, CATS):
+    if is_present(task, CATS):
         [(_, image)] = images_of(task, CATS, 1)
         words = f"A cat and a basis of other cats with {COMPONENTS} components a channel."
         model = model_for(task, CATS, CATS, COMPONENTS)
@@ -115,20 +127,18 @@ def colors(task: Task) -> Iterator[Figure]:
     marks, table = sorted({min(10, task.iterations), task.iterations}), []
     for done, (color, heading) in enumerate({"ycbcr": "YCbCr", "rgb": "RGB"}.items()):
         task.progress("colors", done, 2)
-        cells = [Cell("photo", image)]
+        cells = [("photo", image)]
         for moment in descent(task, image, model, "default", marks, color):
             one, other = (psnr(moment.picture, image, space) for space in ("ycbcr", "rgb"))
             error = 0.5 + MAGNIFIED * (moment.picture - image)
-            cells += [
-                Cell(f"{_at(moment)}: {one:.1f} / {other:.1f}", moment.picture),
-                Cell(f"{MAGNIFIED} x its error", error),
-            ]
-        table.append(Line(f"fitted in {heading}; PSNR in YCbCr / in RGB, in dB", cells))
+            cells.append((f"{_at(moment)}: {one:.1f} / {other:.1f}", moment.picture))
+            cells.append((f"{MAGNIFIED} x its error", error))
+        table.append((f"fitted in {heading}; PSNR in YCbCr / in RGB, in dB", cells))
     save_strip(task.folder / "colors.jpg", strip(table))
     caption = (
-        f'A photo of scikit-image, fitted by the preset "default" in YCbCr and in RGB: '
-        f"{_size(model)}, after {_listed(marks)} iterations; PSNR in YCbCr / in RGB, and the "
-        f"error, magnified {MAGNIFIED} times, around grey."
+        'A photo of scikit-image, fitted by the preset "default" in YCbCr and in RGB: '
+        f"{_size(model)}, after {_listed(marks)} iterations; the error is magnified {MAGNIFIED} "
+        "times, around grey."
     )
     yield Figure("colors", "colors.jpg", caption)
 
@@ -141,21 +151,19 @@ def split(task: Task) -> Iterator[Figure]:
     whole, low = picture_of(encoded), picture_of(encoded[: model.low])
     high = 0.5 + whole - low
     top = [
-        Cell("photo", image),
-        Cell(f"{model.low:,} for low frequencies", low),
-        Cell(f"{len(encoded) - model.low:,} for high, around grey", high),
+        ("photo", image),
+        (f"{model.low:,} for low frequencies", low),
+        (f"{len(encoded) - model.low:,} for high, around grey", high),
     ]
     bottom = [
-        Cell(f"both: {_decibels(image, whole)}", whole),
-        Cell("their outlines in the middle, x 2", _outlines(encoded[: model.low], low)),
-        Cell("their outlines in the middle, x 2", _outlines(encoded[model.low :], high)),
+        (f"both: {_decibels(image, whole)}", whole),
+        ("their outlines in the middle, x 2", _outlines(encoded[: model.low], low)),
+        ("their outlines in the middle, x 2", _outlines(encoded[model.low :], high)),
     ]
-    save_strip(
-        task.folder / "cats-split.png", strip([Line("", top), Line("", bottom)], CREDIT, 256)
-    )
+    save_strip(task.folder / "cats-split.png", strip([("", top), ("", bottom)], CREDIT, 256))
     caption = (
-        "A cat encoded by a model with the frequency-aware split: what its Gaussians for low and "
-        "for high frequencies render alone, and their outlines at one standard deviation."
+        "A cat encoded by a model with the frequency-aware split: pictures of its Gaussians for "
+        "low and for high frequencies alone, and their outlines at one standard deviation."
     )
     yield Figure("split", "cats-split.png", caption, CREDIT)
 
@@ -168,13 +176,13 @@ def cross(task: Task) -> Iterator[Figure]:
         '"natural"': load_basis("natural", task.backend),
     }
     heading = "photos, and at iteration 0 from bases of cats, of ImageNet, and the one that ships"
-    table = list[Line]()
+    table = []
     for _, image in images_of(task, CATS, 3):
-        cells = [Cell("photo", image)]
+        cells = [("photo", image)]
         for words, model in bases.items():
             shown = picture_of(model.encode(image, "projected"))
-            cells.append(Cell(f"{words}: {_decibels(image, shown)}", shown))
-        table.append(Line("" if table else heading, cells))
+            cells.append((f"{words}: {_decibels(image, shown)}", shown))
+        table.append(("" if table else heading, cells))
     save_strip(task.folder / "cats-cross.png", strip(table, CREDIT))
     caption = (
         "Cats at iteration 0: projected on bases of other cats, of photos of ImageNet classes "
@@ -192,38 +200,7 @@ def _outlines(gaussians: Gaussians, picture: NDArray[np.float32]) -> NDArray[np.
     return overlay(near, large)[height : 3 * height, width : 3 * width]
 
 
-def present(task: Task, name: str) -> bool:
-    """Tell whether a set is there, with images to train on where models are trained on them."""
-    if task.data is None:
-        return False
-    folder = task.data / SETS[name].folder
-    if name == "kodak":
-        return folder.is_dir()
-    return has_training_images(task.data, name) and (folder / "test").is_dir()
-
-
-def descent(
-    task: Task,
-    image: Image,
-    model: EigenGS,
-    preset: str,
-    marks: Sequence[int],
-    color: str = "ycbcr",
-) -> Iterator[Moment]:
-    """Fit an image by a preset with as many splats as a model has; "eigengs" starts from it."""
-    method = PRESETS[preset]
-    settings = (len(model.gaussians), "auto", model, method)
-    start = partial(begin, image, *settings, color=color, seed=task.seed, backend=task.backend)
-    return follow(start, method.schedule, task.iterations, marks)
-
-
-def to_size(image: Image, model: EigenGS) -> Image:
-    """Bring the largest centred part of an image to the size of a model."""
-    return cropped(image, model.gaussians.width, model.gaussians.height)
-
-
 def _size(model: EigenGS) -> str:
-    """Write how many splats fits have, and their size."""
     shapes = model.gaussians
     return f"{len(shapes):,} Gaussians, {shapes.width}x{shapes.height} pixels"
 

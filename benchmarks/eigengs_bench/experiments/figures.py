@@ -3,25 +3,50 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
-from eigengs_bench.experiments.figure_charts import PANELS, curves, radii
+import numpy as np
+from numpy.typing import NDArray
+
 from eigengs_bench.experiments.figure_strips import (
-    CATS,
+    COMPONENTS,
+    METHODS,
     Figure,
     colors,
     cross,
+    descent,
+    is_present,
     iterations,
-    present,
     split,
+    to_size,
 )
-from eigengs_bench.harness.store import Row, today
-from eigengs_bench.harness.task import Task
-from eigengs_bench.names import FIGURES, NATURAL
+from eigengs_bench.harness.datasets import images_of, model_for
+from eigengs_bench.harness.store import Job, Row, Task, today
+from eigengs_bench.harness.timing import Image
+from eigengs_bench.names import CATS, FIGURES, NATURAL
+from eigengs_bench.report.charts import curves_chart, radii_chart, save_figure
+from eigengs_bench.report.frames import code_remark
+from eigengs_dr.bases import load_basis
+from eigengs_dr.eigengs import EigenGS
+from eigengs_dr.gaussians import Gaussians
+from eigengs_dr.metrics import psnr
 from eigengs_dr.report import write_report
 
-LIST = "figures.json"
+LIST, FILE = "figures.json", "curves.jsonl"
+
+PANELS = {
+    "faces256": "faces",
+    "cats256": "cats",
+    "cars256": "cars",
+    "natural256": "ImageNet",
+    "kodak": 'Kodak, basis "natural"',
+}
+"""Sets of the chart of PSNR, and their titles."""
+
+EVERY = 50
+"""Iterations between two points of a curve."""
 
 USED: dict[str, tuple[Sequence[str], int]] = {
     "iterations": (("kodak", CATS), 0),
@@ -37,33 +62,12 @@ USED: dict[str, tuple[Sequence[str], int]] = {
 def run(
     task: Task, names: Collection[str] = (), note: Callable[[str], None] = lambda text: None
 ) -> list[Figure]:
-    """Draw figures into a folder, and list them in its ``figures.json``.
+    """Draw figures into a folder, by default all, and list them in its ``figures.json``.
 
-    Models are kept in ``models/``, measurements in ``curves.jsonl``: a second run goes on with
-    both.
-
-    Parameters
-    ----------
-    task : Task
-    names : collection of str, optional
-        Of `FIGURES`; all by default.
-    note : callable, optional
-        Told in one line which sets were left out because they are not there.
-
-    Returns
-    -------
-    list of Figure
-        In the order of `FIGURES`.
-
-    Raises
-    ------
-    ValueError
-        If nothing can be drawn.
-    OSError
-        If the folder cannot be written.
+    `note` is told in one line which sets are not there. `ValueError` if nothing can be drawn.
     """
     wanted = [name for name in FIGURES if not names or name in names]
-    lacking = {name: [s for s in USED[name][0] if not present(task, s)] for name in wanted}
+    lacking = {name: [s for s in USED[name][0] if not is_present(task, s)] for name in wanted}
     if any(lacking.values()):
         parts = [f"{name} ({', '.join(missing)})" for name, missing in lacking.items() if missing]
         why = f"no such sets in {task.data}" if task.data else "no folder DATA was named"
@@ -72,10 +76,9 @@ def run(
     if not drawn:
         raise ValueError("no figure can be drawn without these sets; --figure colors needs none")
     listed = read_list(task.folder / LIST)  # a damaged list is told now, not after minutes
-    studies = (iterations, colors, curves, radii, split, cross)
-    by_name = dict(zip(FIGURES, studies, strict=True))
-    made = [figure for name in drawn for figure in by_name[name](task)]
-    fresh = [{**figure._asdict(), "run": {"date": today(), **task.about}} for figure in made]
+    studies = dict(zip(FIGURES, (iterations, colors, curves, radii, split, cross), strict=True))
+    made = [figure for name in drawn for figure in studies[name](task)]
+    fresh = [{**figure._asdict(), "run": {"date": today(), **task.run}} for figure in made]
     kept = [entry for entry in listed if entry["name"] not in drawn]
     entries = sorted(kept + fresh, key=lambda entry: FIGURES.index(entry["name"]))
     write_report(task.folder / LIST, {"figures": entries})
@@ -83,13 +86,7 @@ def run(
 
 
 def read_list(path: Path) -> list[Row]:
-    """Read the figures that runs have listed, each with its "run"; none where there is no list.
-
-    Raises
-    ------
-    ValueError
-        If the file is damaged.
-    """
+    """Read the listed figures, each with its "run"; `ValueError` if the file is damaged."""
     if not path.exists():
         return []
     try:
@@ -97,3 +94,72 @@ def read_list(path: Path) -> list[Row]:
         return [{key: figure[key] for key in (*Figure._fields, "run")} for figure in found]
     except (ValueError, KeyError, TypeError):
         raise ValueError(f"{path}: is damaged; delete it, and draw the figures again") from None
+
+
+def curves(task: Task) -> Iterator[Figure]:
+    """Draw PSNR over iterations of every preset: the paper's figure of curves."""
+    marks = sorted({*range(0, task.iterations + 1, EVERY), task.iterations})
+    panels, rows = dict[str, dict[str, list[float]]](), list[Row]()
+    for name in (name for name in PANELS if is_present(task, name)):
+        jobs = _curve_jobs(task, name, marks)
+        measured = task.measure(FILE, jobs, f"curves of {name}")
+        rows += measured
+        panels[PANELS[name]] = {
+            preset: _mean([row for row in measured if row["job"]["preset"] == preset])
+            for preset in METHODS
+        }
+    chart = curves_chart(panels, marks, "iterations", "PSNR (YCbCr) / dB")
+    save_figure(task.folder / "curves.svg", chart)
+    caption = (
+        f"PSNR in YCbCr every {EVERY} iterations, mean of up to {task.images} test images a set. "
+        "eigengs starts from a basis of each set's own training images, for Kodak from the one "
+        f"that ships.{code_remark(rows)}"
+    )
+    yield Figure("curves", "curves.svg", caption)
+
+
+def _curve_jobs(task: Task, name: str, marks: Sequence[int]) -> Iterator[Job]:
+    settings = {"iterations": task.iterations, "every": EVERY, "seed": task.seed}
+    model = load_basis("natural", task.backend)
+    if name != "kodak":
+        model = model_for(task, name, name, COMPONENTS)
+    for file, image in images_of(task, name):
+        for preset in METHODS:
+            label = {"set": name, "image": file, "preset": preset, **settings}
+            yield label, partial(_curve, task, to_size(image, model), model, preset, marks)
+
+
+def _curve(task: Task, image: Image, model: EigenGS, preset: str, marks: Sequence[int]) -> Row:
+    moments = descent(task, image, model, preset, marks)
+    return {"psnr_ycbcr": [psnr(moment.picture, image, "ycbcr") for moment in moments]}
+
+
+def _mean(measured: list[Row]) -> list[float]:
+    # A fit that has failed is None in a file, and NaN here.
+    return list(np.mean(np.array([row["psnr_ycbcr"] for row in measured], float), axis=0))
+
+
+def radii(task: Task) -> Iterator[Figure]:
+    """Draw how large splats are, with and without the split by frequency: the paper's figure."""
+    images, panels = images_of(task, CATS), {}
+    for whole, title in ((False, "no split"), (True, "frequency-aware split")):
+        model = model_for(task, CATS, CATS, COMPONENTS, split=whole)
+        found = []
+        for done, (_, image) in enumerate(images):
+            task.progress(f"radii, {title}", done, len(images))
+            *_, last = descent(task, image, model, "eigengs", [task.iterations])
+            found.append(radii_of(last.gaussians))
+        panels[title] = np.split(np.stack(found), [model.low], axis=1)
+    save_figure(task.folder / "radii.svg", radii_chart(panels))
+    caption = (
+        "Radii of the Gaussians (geometric mean of the two standard deviations) after "
+        f'{task.iterations:,} iterations of the preset "eigengs", mean of {len(images)} cats. '
+        "Right, a tenth of the Gaussians serve the first 50 components."
+    )
+    yield Figure("radii", "radii.svg", caption)
+
+
+def radii_of(gaussians: Gaussians) -> NDArray[np.float64]:
+    """Geometric mean of the standard deviations of every splat, in pixels, shape (N,)."""
+    factor = gaussians.to_arrays()["factor"].astype(np.float64)
+    return 1 / np.sqrt(factor[:, 0] * factor[:, 2])  # det F = a c

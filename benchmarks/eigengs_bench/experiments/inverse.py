@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from eigengs_bench.experiments.inverse_representations import METHODS
 from eigengs_bench.experiments.inverse_scene import (
@@ -20,8 +20,7 @@ from eigengs_bench.experiments.inverse_scene import (
     photograph,
     scene_of,
 )
-from eigengs_bench.harness.store import Row
-from eigengs_bench.harness.task import Progress, no_progress
+from eigengs_bench.harness.store import Progress, Row
 from eigengs_bench.harness.timing import Image
 from eigengs_dr.backend import select
 from eigengs_dr.bases import SHIPPED, load_basis
@@ -29,14 +28,9 @@ from eigengs_dr.metrics import psnr
 from eigengs_dr.plugins import register_plugins
 from eigengs_dr.resampling import cropped
 
-SAMPLES = 4
-"""Samples a pixel of a step's rendering."""
-
-LAST_RATE = 0.05
-"""Rates fall by a cosine to this share."""
-
-GOAL = 25.0
-"""PSNR (YCbCr) up to which steps and seconds are counted."""
+SAMPLES = 4  # a pixel of a step's rendering
+LAST_RATE = 0.05  # rates fall by a cosine to this share
+GOAL = 25.0  # PSNR (YCbCr) up to which steps and seconds are counted
 
 STRIP = (0, 3, 10, 30, 100)
 """Steps of which pictures are kept, beside the last."""
@@ -44,15 +38,7 @@ STRIP = (0, 3, 10, 30, 100)
 
 @dataclass
 class Trace:
-    """How one method went on.
-
-    Attributes
-    ----------
-    steps, seconds, psnr_ycbcr, psnr_rgb : list
-        At the steps that are measured; seconds without compiling and measuring.
-    pictures : dict of int to ndarray
-        The poster as recovered, by step.
-    """
+    """A method at the steps that are measured; seconds without compiling and measuring."""
 
     steps: list[int] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
@@ -62,17 +48,7 @@ class Trace:
 
 
 class Result(NamedTuple):
-    """One condition.
-
-    Attributes
-    ----------
-    photos : ndarray of float32, shape (side, cameras x side, 3)
-        Linear light.
-    truth : ndarray of float32, shape (height, width, 3)
-        The poster from the front, RGB.
-    traces : dict of str to Trace
-        By method.
-    """
+    """One condition: photos in linear light, the true poster in RGB, traces by method."""
 
     photos: Image
     truth: Image
@@ -80,37 +56,16 @@ class Result(NamedTuple):
 
 
 def run(
-    basis: str | os.PathLike[str],
+    basis: str,
     image: Image,
     conditions: Sequence[str] = tuple(CONDITIONS),
     steps: int = 200,
     backend: str | None = None,
-    progress: Progress = no_progress,
+    progress: Progress = lambda *_: None,
 ) -> dict[str, Result]:
-    """Recover an image on a poster by every method, in as many steps, under some conditions.
+    """Recover the largest square of an image by every method, in at least 2 steps.
 
-    Sets Mitsuba's variant.
-
-    Parameters
-    ----------
-    basis : str or path-like
-        A name of `eigengs_dr.bases.SHIPPED` or a file.
-    image : ndarray of float32, shape (H, W, 3)
-        RGB; its largest square is hung up.
-    conditions : sequence of str, optional
-        Keys of `CONDITIONS`; all by default.
-    steps : int, optional
-        For each method, at least 2.
-    backend : {"llvm", "cuda"}, optional
-    progress : Progress, optional
-        Called after every step.
-
-    Raises
-    ------
-    ValueError
-        If there is no such basis.
-    BackendError
-        If the backend is not there.
+    Sets Mitsuba's variant. `basis` is a name of `eigengs_dr.bases.SHIPPED` or a file.
     """
     module = select(backend)
     mi.set_variant("cuda_ad_rgb" if "cuda" in module.__name__ else "llvm_ad_rgb")
@@ -132,9 +87,8 @@ def run(
 
             # Once for the kernels, which are compiled and kept, and once for the figures.
             recover(condition, photos, stages(model, file, 2), truth, 2)
-            traces[method] = recover(
-                condition, photos, stages(model, file, steps), truth, steps, told
-            )
+            found = stages(model, file, steps)
+            traces[method] = recover(condition, photos, found, truth, steps, told)
         results[name] = Result(photos.numpy(), truth, traces)
     return results
 
@@ -149,19 +103,8 @@ def recover(
 ) -> Trace:
     """Run the stages of a method: descent by Adam on squared errors of the rendering.
 
-    Parameters
-    ----------
-    condition : Condition
-    photos : TensorXf
-    stages : iterable of (unknown, int)
-        What is optimised, and the step at which that ends. The next stage is asked for then, so
-        that it can go on from there.
-    truth : ndarray of float32, shape (height, width, 3)
-        What the recovered poster is compared with.
-    steps : int
-        Where the last stage ends.
-    told : callable, optional
-        ``told(step, trace)`` after every step.
+    A stage is a representation and the step at which it ends. The next one is asked for then, so
+    that it can go on from there. ``told(step, trace)`` is called after every step.
     """
     trace, step, measuring, started = Trace(), 0, 0.0, time.perf_counter()
 
@@ -216,34 +159,21 @@ def marks(steps: int) -> set[int]:
 def figures_of(results: dict[str, Result]) -> list[Row]:
     """Boil results down to a row a condition and method.
 
-    Returns
-    -------
-    list of dict
-        "condition", "method", "psnr_ycbcr", "psnr_rgb" and "seconds" after all steps; "goal_steps"
-        and "goal_seconds" up to `GOAL`, None for never; "visible" and "hidden", the PSNR in YCbCr
-        of the halves of a poster of which one is hidden, else None.
+    "goal_steps" and "goal_seconds" count up to `GOAL`, None for never; "visible" and "hidden" are
+    the PSNR in YCbCr of the halves of a poster of which one is hidden, else None.
     """
     rows = []
-    for name, result in results.items():
-        for method, trace in result.traces.items():
+    for name, (_, truth, traces) in results.items():
+        middle = truth.shape[1] // 2
+        for method, trace in traces.items():
+            last = {key: getattr(trace, key)[-1] for key in ("psnr_ycbcr", "psnr_rgb", "seconds")}
             at = next((k for k, db in enumerate(trace.psnr_ycbcr) if db >= GOAL), None)
-            picture, middle = trace.pictures[trace.steps[-1]], result.truth.shape[1] // 2
-            halves: Row = {"visible": None, "hidden": None}
-            if CONDITIONS[name].hidden:
-                for half, columns in (("visible", slice(middle)), ("hidden", slice(middle, None))):
-                    halves[half] = psnr(picture[:, columns], result.truth[:, columns], "ycbcr")
-            rows.append(
-                {
-                    "condition": name,
-                    "method": method,
-                    "psnr_ycbcr": trace.psnr_ycbcr[-1],
-                    "psnr_rgb": trace.psnr_rgb[-1],
-                    "seconds": trace.seconds[-1],
-                    "goal_steps": None if at is None else trace.steps[at],
-                    "goal_seconds": None if at is None else trace.seconds[at],
-                    **halves,
-                }
-            )
+            last["goal_steps"] = None if at is None else trace.steps[at]
+            last["goal_seconds"] = None if at is None else trace.seconds[at]
+            for half, columns in {"visible": np.s_[:middle], "hidden": np.s_[middle:]}.items():
+                seen = trace.pictures[trace.steps[-1]][:, columns], truth[:, columns]
+                last[half] = psnr(*seen, "ycbcr") if CONDITIONS[name].hidden else None
+            rows.append({"condition": name, "method": method, **last})
     return rows
 
 
@@ -251,9 +181,6 @@ def traces_of(results: dict[str, Result]) -> Row:
     """Lists of steps, seconds and PSNRs, by condition and method."""
     names = ("steps", "seconds", "psnr_ycbcr", "psnr_rgb")
     return {
-        condition: {
-            method: {name: getattr(trace, name) for name in names}
-            for method, trace in result.traces.items()
-        }
+        condition: {m: {n: getattr(trace, n) for n in names} for m, trace in result.traces.items()}
         for condition, result in results.items()
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -17,7 +16,7 @@ from eigengs_dr.gaussians import Gaussians
 from eigengs_dr.plugins import keep_in_bounds, texture_of
 
 GREY = 0.5
-"""What texels and Gaussians start from, coded."""
+"""Coded value that texels and Gaussians start from."""
 
 TEXEL_RATES = {256: 0.08, 1024: 0.3}
 """Linear light a step, by the side of the bitmap, for the texel with the largest gradient."""
@@ -27,18 +26,6 @@ SPLAT_RATES = {"mean": 0.2, "factor": 0.03, "color": 0.01, "background": 0.005}
 
 COEFFICIENT_RATE = 0.4
 """Standard deviations of the first component a step, for the largest gradient."""
-
-ADAM_TEXELS = {"uniform": True}
-"""Steps in proportion to gradients (Nicolet et al. 2021): with a rate for each, noise moves texels
-that no photo shows well."""
-
-ADAM_SPLATS = {"beta_2": 0.99, "epsilon": 0.01}
-"""Splats do best with a rate for each, in which much smaller gradients than this do not count:
-without, what a blurred photo hardly tells of is made up."""
-
-ADAM_COEFFICIENTS = {"beta_1": 0.5, "uniform": True}
-"""Components are orthonormal, so that one rate fits all coefficients; a problem so well
-conditioned needs less momentum than 0.9, which overshoots."""
 
 DAMPING = 0.05
 """Variance, of that of the first component, below which components move less and less: so few
@@ -54,21 +41,21 @@ FIRST_STAGE = 0.04
 """Share of the steps that the coefficients get before all Gaussians are freed."""
 
 
-class Representation:
-    """What is optimised: some parameters of the poster's texture, as they are.
+class Texels:
+    """A square bitmap in linear light, from grey.
 
-    Attributes
-    ----------
-    texture : mitsuba.Texture
-    rates : dict of str to float
-        By the name of a parameter in the scene.
-    adam : dict
-        Options of `mitsuba.ad.Adam`.
+    Every representation has its Mitsuba texture, rates by the name of a parameter in the scene,
+    options of Adam, a prior that is added to the sum of squared errors, and bounds.
     """
 
-    texture: Any
-    rates: dict[str, float]
-    adam: dict[str, Any]
+    # Steps in proportion to gradients (Nicolet et al. 2021): with a rate for each, noise moves
+    # texels that no photo shows well.
+    adam: dict[str, Any] = {"uniform": True}  # noqa: RUF012
+
+    def __init__(self, side: int) -> None:
+        linear = float(to_linear(np.float64(GREY)))
+        self.texture: Any = bitmap(np.full((side, side, 3), linear, np.float32))
+        self.rates: dict[str, float] = {f"{POSTER}.data": TEXEL_RATES[side]}
 
     def begin(self, parameters: Any) -> dict[str, Any]:
         """Values to optimise, by name."""
@@ -80,41 +67,21 @@ class Representation:
             parameters[key] = values[key]
 
     def prior(self, values: Any, count: int) -> Any:
-        """What is added to the sum of squared errors of so many numbers."""
+        """Return what is added to the sum of squared errors of so many numbers."""
         return 0
 
     def bound(self, values: Any) -> None:
         """Bring the values back inside their bounds."""
-
-
-class Texels(Representation):
-    """A square bitmap in linear light, from grey."""
-
-    adam = ADAM_TEXELS
-
-    def __init__(self, side: int) -> None:
-        linear = float(to_linear(np.float64(GREY)))
-        self.texture = bitmap(np.full((side, side, 3), linear, np.float32))
-        self.rates = {f"{POSTER}.data": TEXEL_RATES[side]}
-
-    def bound(self, values: Any) -> None:
-        """Bring the texels back to [0, 1]."""
         for key in self.rates:
             values[key] = dr.clip(values[key], 0, 1)
 
 
-class Splats(Representation):
-    """All parameters of a set of Gaussians; what no photo sees gets no gradient and stays.
+class Splats(Texels):
+    """All parameters of a set of Gaussians, whose colours are pulled to where they start."""
 
-    Parameters
-    ----------
-    gaussians : Gaussians
-        Where they start.
-    pull : float, optional
-        Weight of the squared distance of colours from there.
-    """
-
-    adam = ADAM_SPLATS
+    # A rate for each, in which gradients below epsilon do not count: without, what a blurred photo
+    # hardly tells of is made up.
+    adam = {"beta_2": 0.99, "epsilon": 0.01}  # noqa: RUF012
 
     def __init__(self, gaussians: Gaussians, pull: float = 0.0) -> None:
         self.texture = mi.load_dict(texture_of(gaussians))
@@ -132,15 +99,17 @@ class Splats(Representation):
         keep_in_bounds(values, POSTER, self.start)
 
 
-class Coefficients(Representation):
+class Coefficients(Texels):
     """Coefficients of a model, in standard deviations of the first, from the mean image.
 
     To a PCA the family's images are normally distributed: that is the prior.
     """
 
-    adam = ADAM_COEFFICIENTS
+    # Components are orthonormal, so that one rate fits all coefficients; a problem so well
+    # conditioned needs less momentum than 0.9, which overshoots.
+    adam = {"beta_1": 0.5, "uniform": True}  # noqa: RUF012
 
-    def __init__(self, model: EigenGS, file: str | os.PathLike[str]) -> None:
+    def __init__(self, model: EigenGS, file: Any) -> None:
         self.model = model
         self.texture = mi.load_dict({"type": "gaussian_texture", "model": str(file)})
         variances = np.zeros((len(model.components), max(model.components)))
@@ -161,6 +130,9 @@ class Coefficients(Representation):
         """Minus the logarithm of the probability of the coefficients, up to a factor."""
         return PRIOR * count * dr.sum(self.precisions * dr.square(values[self.key]), axis=None)
 
+    def bound(self, values: Any) -> None:
+        """Leave them as they are."""
+
     def gaussians(self) -> Gaussians:
         """The Gaussians that the coefficients stand for now."""
         rows = dr.detach(mi.traverse(self.texture)["coefficients"]).numpy()
@@ -168,32 +140,16 @@ class Coefficients(Representation):
         return self.model.reconstruct(tuple(row[:k] for row, k in kept))
 
 
-Stages = Iterator[tuple[Representation, int]]
+Stages = Iterator[tuple[Texels, int]]
 """What is optimised, and the step at which that ends; each made when the one before is through."""
-
-
-def _texels(side: int) -> Callable[[EigenGS, Any, int], Stages]:
-    def stages(model: EigenGS, file: Any, steps: int) -> Stages:
-        yield Texels(side), steps
-
-    return stages
 
 
 def _splats(model: EigenGS, file: Any, steps: int) -> Stages:
     """The model's shapes, without colour on grey."""
     shapes = model.gaussians.to_arrays()
-    blank = Gaussians.from_arrays(
-        shapes["mean"],
-        shapes["factor"],
-        np.zeros_like(shapes["color"]),
-        rgb_to_ycbcr(np.full(3, GREY)),
-        size=(model.gaussians.width, model.gaussians.height),
-    )
-    yield Splats(blank), steps
-
-
-def _coefficients(model: EigenGS, file: Any, steps: int) -> Stages:
-    yield Coefficients(model, file), steps
+    mean, factor, color = (shapes[key] for key in ("mean", "factor", "color"))
+    grey, size = rgb_to_ycbcr(np.full(3, GREY)), (model.gaussians.width, model.gaussians.height)
+    yield Splats(Gaussians.from_arrays(mean, factor, np.zeros_like(color), grey, size=size)), steps
 
 
 def _both(model: EigenGS, file: Any, steps: int) -> Stages:
@@ -203,10 +159,10 @@ def _both(model: EigenGS, file: Any, steps: int) -> Stages:
 
 
 METHODS: dict[str, Callable[[EigenGS, Any, int], Stages]] = {
-    "texels1024": _texels(1024),
-    "texels256": _texels(256),
+    "texels1024": lambda model, file, steps: iter([(Texels(1024), steps)]),
+    "texels256": lambda model, file, steps: iter([(Texels(256), steps)]),
     "gaussians": _splats,
-    "coefficients": _coefficients,
+    "coefficients": lambda model, file, steps: iter([(Coefficients(model, file), steps)]),
     "both": _both,
 }
 """How to recover a poster, from a model, its file and the number of steps."""

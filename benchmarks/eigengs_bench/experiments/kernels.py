@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eigengs_bench.harness.task import Progress, no_progress
+from eigengs_bench.harness.store import Progress
 from eigengs_bench.harness.timing import interleaved
 from eigengs_dr.adaptive import adaptive
 from eigengs_dr.arrays import ArrayTypes, types_in, types_of, upload
@@ -45,35 +45,15 @@ PEAK_LANES, PEAK_LOOPS, PEAK_UNROLL = 1 << 16, 100, 8
 
 
 def run(
-    image: ArrayLike | None = None, backend: str | None = None, progress: Progress = no_progress
+    image: ArrayLike | None = None, backend: str | None = None, progress: Progress = lambda *_: None
 ) -> dict[str, float]:
-    """Time the kernels in one run, the variants interleaved; every figure is a median.
+    """Time the kernels in one run, the variants in turns; every figure is a median.
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W, 3), optional
-        What the refinement behind `growth` fits, at least 512 pixels on each side, of which the
-        middle is cut; by default a photo of scikit-image.
-    backend : {"llvm", "cuda"}, optional
-    progress : Progress, optional
-
-    Returns
-    -------
-    dict of str to float
-        - `plain_ms`, `fast_ms`: forward and reverse together, tile lists given, programs frozen.
-        - `step_ratio`, `forward_ratio`: plain over fast.
-        - `plain_forward_ms`, `fast_forward_ms`, `lists_ms`: the parts.
-        - `peak_evals_per_ns`: `exp`, `select` and 3 `fma` without memory.
-        - `forward_peak_fraction`, `step_peak_fraction`: evaluations inside the cutoff ellipses
-          (once forward, once in reverse) per ns, over the peak.
-        - `growth`: median time of the steps 900 to 1,000 of a refinement with 20,000 splats over
-          that of the steps 50 to 150; `early_step_ms`, `late_step_ms`: the two.
-        - `growth_with_lists`: the same of the means, in which building the lists counts.
-
-    Raises
-    ------
-    ValueError
-        If the image is too small.
+    `plain_ms` and `fast_ms` are forward and reverse together, with lists given and programs frozen,
+    the ratios plain over fast. `peak_evals_per_ns` counts `exp`, `select` and 3 `fma` without
+    memory; the fractions are evaluations inside the cutoff ellipses over that peak. `growth` is the
+    median time of the steps 900 to 1,000 of a refinement of the middle of an image over that of the
+    steps 50 to 150, and `growth_with_lists` the same of the means, in which building lists counts.
     """
     picture = _middle(sample("astronaut") if image is None else check_image(image))
     types = types_in(select(backend))
@@ -103,7 +83,7 @@ def random_scene(types: ArrayTypes) -> Gaussians:
 
 
 def time_programs(
-    timed: dict[str, Callable[[], Any]], progress: Progress = no_progress
+    timed: dict[str, Callable[[], Any]], progress: Progress = lambda *_: None
 ) -> dict[str, float]:
     """Median milliseconds of programs that take turns."""
 
@@ -114,7 +94,7 @@ def time_programs(
 
 
 def kernel_figures(
-    types: ArrayTypes, scene: Gaussians, progress: Progress = no_progress
+    types: ArrayTypes, scene: Gaussians, progress: Progress = lambda *_: None
 ) -> dict[str, float]:
     """Time both renderers, the lists and the peak on a scene."""
     plain_forward, plain_step, _ = programs(scene, CUTOFF, plain=True)
@@ -149,20 +129,7 @@ def programs(
 ) -> tuple[Any, Any, Callable[[], NDArray[Any]]]:
     """Make frozen programs that draw a scene, forward and with reverse, and what shows it.
 
-    Parameters
-    ----------
-    scene : Gaussians
-    cutoff : float
-        In standard deviations.
-    plain : bool
-        By `render_plain` instead of `splat`; tile lists are built here in both cases.
-
-    Returns
-    -------
-    forward, step : functools.partial
-        Called without arguments; ``func.clear()`` frees the program.
-    shown : callable
-        ``shown()`` is the picture, ndarray of shape (H, W, C).
+    ``program.func.clear()`` frees a program. `plain` is `render_plain` instead of `splat`.
     """
     values, background = splat_values(scene)
     dr.eval(values)

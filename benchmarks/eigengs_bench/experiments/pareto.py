@@ -1,4 +1,9 @@
-"""Speed against accuracy: fits that differ from the default one in one setting at a time."""
+"""Speed against accuracy: fits that differ from the default one in one setting at a time.
+
+The row of a variant has "gaussians", their number, and "trace", a list of `score` at each number of
+steps, with "psnr_wide", the PSNR in YCbCr of the same splats at the cutoff `WIDE`. The row of the
+knob "precision" has "stored", see `stored`; the last row has "kernels", see `_kernels`.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eigengs_bench.experiments.kernels import COUNT, SIDE, programs, random_scene, time_programs
-from eigengs_bench.harness.datasets import has_training_images, images_of, model_for
-from eigengs_bench.harness.store import Job, Row
-from eigengs_bench.harness.task import Task
+from eigengs_bench.harness.datasets import images_of, is_trained, model_for, usual_count
+from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.timing import Image, Moment, decibels, follow, score, warm_up
-from eigengs_bench.names import SETS
 from eigengs_dr.arrays import types_in
 from eigengs_dr.backend import select
 from eigengs_dr.bases import load_basis
@@ -25,7 +28,7 @@ from eigengs_dr.eigengs import EigenGS
 from eigengs_dr.gaussians import Gaussians
 from eigengs_dr.presets import PRESETS
 from eigengs_dr.rendering import CUTOFF, picture_of, render
-from eigengs_dr.starting import GAUSSIANS, Start, begin
+from eigengs_dr.starting import Start, begin
 
 FILE = "pareto.jsonl"
 
@@ -49,28 +52,6 @@ CUTOFFS = (2.5, 3.0, 3.5, 4.0, 5.0)
 """Of the renderer."""
 
 
-class Subject(NamedTuple):
-    """Images to fit, and the models that fits may start from.
-
-    Attributes
-    ----------
-    name : str
-    images : list of (str, ndarray of float32, shape (H, W, 3))
-    gaussians : int
-        Splats of the default fit.
-    basis : EigenGS
-        Start of "eigen" and of the preset "eigengs".
-    others : dict of int to EigenGS
-        Models of other numbers of components; none where none are trained.
-    """
-
-    name: str
-    images: list[tuple[str, Image]]
-    gaussians: int
-    basis: EigenGS
-    others: dict[int, EigenGS]
-
-
 class Variant(NamedTuple):
     """A fit with one setting, the knob, at another value; the other fields are those of `fit`.
 
@@ -88,38 +69,22 @@ class Variant(NamedTuple):
 
 
 def run(task: Task, names: Sequence[str]) -> list[Row]:
-    """Measure all variants on sets of images, and the renderer.
+    """Measure all variants on sets of images, and the renderer."""
+    jobs = [job for name in names for job in _jobs(task, name, variants(task, name))]
+    jobs.append(({"set": "kernels", "side": SIDE, "gaussians": COUNT}, partial(_kernels, task)))
+    return task.measure(FILE, jobs, "pareto")
 
-    Returns
-    -------
-    list of dict
-        The row of a variant has "gaussians", their number, and "trace", a list of `score` at each
-        number of steps, with "psnr_wide", the PSNR in YCbCr of the same splats at the cutoff
-        `WIDE`. The row of the knob "precision" has "stored", see `stored`. The last row has
-        "kernels", see `kernel_job`.
+
+def variants(task: Task, name: str) -> list[Variant]:
+    """List the fits that are compared on a set, the default one first.
+
+    Their models are trained where they are missing; sets without images to train on use the basis
+    that ships, in one size.
     """
-    subjects = [subject_of(task, name) for name in names]
-    jobs = [job for subject in subjects for job in jobs_of(task, subject)]
-    return task.measure(FILE, [*jobs, kernel_job(task.backend)], "pareto")
-
-
-def subject_of(task: Task, name: str) -> Subject:
-    """Load the first images of a set, and its models, which are trained where they are missing.
-
-    Sets without images to train on use the basis that ships.
-    """
-    shipped = load_basis("natural", task.backend)
-    images = images_of(task, name)
-    count = SETS[name].gaussians if name in SETS else GAUSSIANS
-    if not has_training_images(task.data, name):
-        return Subject(name, images, count, shipped, {})
-    trained = {k: model_for(task, name, name, k) for k in (DEFAULT_COMPONENTS, *COMPONENTS)}
-    return Subject(name, images, count, trained.pop(DEFAULT_COMPONENTS), trained)
-
-
-def variants(subject: Subject) -> list[Variant]:
-    """List the fits that are compared on a set, the default one first."""
-    count, basis = subject.gaussians, subject.basis
+    count, models = usual_count(name), dict[int, EigenGS]()
+    if is_trained(task.data, name):
+        models = {k: model_for(task, name, name, k) for k in (DEFAULT_COMPONENTS, *COMPONENTS)}
+    basis = models.pop(DEFAULT_COMPONENTS, None) or load_basis("natural", task.backend)
     return [
         Variant("preset", "default", count),
         Variant("preset", "gaussianimage", count, "gaussianimage"),
@@ -130,19 +95,14 @@ def variants(subject: Subject) -> list[Variant]:
         *(Variant("solve steps", k, count, solve_steps=k) for k in (0, 2, 5, 30)),
         *(Variant("cutoff", k, count, cutoff=k) for k in (2.5, 3.5, 4.0, 5.0)),
         *(Variant("gaussians", round(k * count), round(k * count)) for k in (0.25, 0.5, 2, 4)),
-        *(
-            Variant("components", k, None, "eigengs", basis=model)
-            for k, model in subject.others.items()
-        ),
+        *(Variant("components", k, None, "eigengs", basis=model) for k, model in models.items()),
     ]
 
 
-def jobs_of(task: Task, subject: Subject) -> Iterator[Job]:
-    """Name the measurements on a set: for each image all variants, then how its set is stored."""
-    for name, image in subject.images:
-        about = {"set": subject.name, "image": name}
-        about |= {"iterations": task.iterations, "seed": task.seed}
-        fits = variants(subject)
+def _jobs(task: Task, name: str, fits: Sequence[Variant]) -> Iterator[Job]:
+    """For each image all variants, then how its default fit is stored."""
+    for file, image in images_of(task, name):
+        about = {"set": name, "image": file, "iterations": task.iterations, "seed": task.seed}
         for fit in fits:
             yield {**about, "knob": fit.knob, "value": fit.value}, partial(trace, task, fit, image)
         label = {**about, "knob": "precision", "value": "all"}
@@ -190,11 +150,8 @@ def _stored(task: Task, fit: Variant, image: Image) -> Row:
 def stored(gaussians: Gaussians, image: Image, backend: str | None = None) -> list[Row]:
     """Store a set in fewer bits and judge the set that is read back.
 
-    Returns
-    -------
-    list of dict
-        "precision" ("8 bits" to "float32"), "bytes" (parameters, and the two ends of the range of
-        each where it is cut into steps; the background stays float32), psnr_ycbcr and psnr_rgb.
+    "bytes" are those of the parameters, and of the two ends of the range of each where it is cut
+    into steps; the background stays float32.
     """
     arrays, rows = gaussians.to_arrays(), []
     background, size = arrays.pop("background"), (gaussians.width, gaussians.height)
@@ -224,20 +181,13 @@ def quantized(values: NDArray[np.float64], bits: int) -> NDArray[np.float64]:
     return low + step * np.rint((values - low) / step)
 
 
-def kernel_job(backend: str | None = None) -> Job:
-    """Name the measurement of the renderer: its time, and what its cutoff leaves out.
+def _kernels(task: Task) -> Row:
+    """Time the renderer, and measure what its cutoff leaves out.
 
-    The scene is that of `eigengs_bench.experiments.kernels`. The row has "kernels", a list of dicts
-    with "renderer" ("fast" or "plain"), "cutoff", "forward_ms" and "step_ms" (forward and reverse),
-    lists given, programs frozen, medians of rounds in which all take turns, and "largest_error" and
-    "rms_error" over the values of all pixels, against a rendering in float64 at the cutoff
-    `WIDEST`.
+    Milliseconds are of frozen programs with lists given, forward and with reverse ("step"); errors
+    are of all pixels, against a rendering in float64 at the cutoff `WIDEST`.
     """
-    return {"set": "kernels", "side": SIDE, "gaussians": COUNT}, partial(_kernels, backend)
-
-
-def _kernels(backend: str | None) -> Row:
-    module = select(backend)
+    module = select(task.backend)
     scene = random_scene(types_in(module))
     double = replace(
         scene,

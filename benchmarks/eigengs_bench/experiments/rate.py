@@ -1,4 +1,9 @@
-"""Rate against distortion: packed fits beside JPEG and WebP of as many bytes."""
+"""Rate against distortion: packed fits beside JPEG and WebP of as many bytes.
+
+A row has "points": setting (the number of Gaussians, or the quality), bytes, bits_per_pixel,
+psnr_rgb, psnr_ycbcr, ssim and seconds, those of encoding; that of a packed fit also fit_seconds,
+which are among them, and unpacked_rgb, the PSNR before.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +13,14 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as pillow
 
 from eigengs_bench.harness.datasets import images_of
-from eigengs_bench.harness.store import Job, Row
-from eigengs_bench.harness.task import Task
+from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.timing import Image, decibels, require_complete
 from eigengs_dr.fitting import fit
 from eigengs_dr.images import to_8bit
@@ -24,9 +28,7 @@ from eigengs_dr.metrics import ssim
 from eigengs_dr.packing import pack
 from eigengs_dr.rendering import picture_of
 
-FILE = "rate.jsonl"
-
-OURS = "packed Gaussians"
+FILE, OURS = "rate.jsonl", "packed Gaussians"
 
 PIXELS = (256, 128, 64, 32, 16, 8)
 """Pixels a splat of the fits that are packed."""
@@ -38,43 +40,18 @@ these had the best PSNR at equal size on training photos, by little."""
 WARM_UP = 6
 """Untimed steps before a fit, that compile its programs."""
 
+QUALITIES = (2, 5, 10, 15, 20, 30, 40, 50, 60, 70, 80, 85, 90, 95)
 
-class Codec(NamedTuple):
-    """A codec of Pillow.
-
-    Attributes
-    ----------
-    format : str
-        Pillow's name.
-    options : dict
-        Options of `PIL.Image.Image.save`, beside the quality.
-    qualities : tuple of int
-    """
-
-    format: str
-    options: dict[str, Any]
-    qualities: tuple[int, ...] = (2, 5, 10, 15, 20, 30, 40, 50, 60, 70, 80, 85, 90, 95)
-
-
-CODECS = {
-    "JPEG 4:2:0": Codec("JPEG", {"optimize": True, "subsampling": 2}),
-    "JPEG 4:4:4": Codec("JPEG", {"optimize": True, "subsampling": 0}),
-    "WebP": Codec("WEBP", {"method": 6}),
+CODECS: dict[str, tuple[str, dict[str, Any]]] = {
+    "JPEG 4:2:0": ("JPEG", {"optimize": True, "subsampling": 2}),
+    "JPEG 4:4:4": ("JPEG", {"optimize": True, "subsampling": 0}),
+    "WebP": ("WEBP", {"method": 6}),
 }
-"""What packed fits are compared with, at the slowest and best setting of the encoder."""
+"""Pillow's names and options of other codecs, at the slowest and best setting of the encoder."""
 
 
 def run(task: Task, names: Sequence[str]) -> list[Row]:
-    """Measure on each image a packed fit of each size, and the codecs.
-
-    Returns
-    -------
-    list of dict
-        A row has "points", a list of dictionaries: setting (the number of Gaussians, or the
-        quality), bytes, bits_per_pixel, psnr_rgb, psnr_ycbcr, ssim and seconds, those of encoding;
-        that of a packed fit also fit_seconds, which are among them, and unpacked_rgb, the PSNR
-        before.
-    """
+    """Measure on each image a packed fit of each size, and the codecs."""
     jobs = [job for name in names for job in _jobs(task, name, images_of(task, name))]
     return task.measure(FILE, jobs, "rate")
 
@@ -88,7 +65,7 @@ def _jobs(task: Task, name: str, images: list[tuple[str, Image]]) -> Iterator[Jo
             label = {**about, "codec": OURS, "gaussians": count, **settings}
             yield label, partial(_packed, task, image, count)
         for title, codec in CODECS.items():
-            yield {**about, "codec": title}, partial(_coded, image, codec)
+            yield {**about, "codec": title}, partial(_coded, image, *codec)
 
 
 def _packed(task: Task, image: Image, count: int) -> Row:
@@ -100,30 +77,26 @@ def _packed(task: Task, image: Image, count: int) -> Row:
     between = time.perf_counter()
     with TemporaryDirectory() as folder:
         receipt = pack(fitted.gaussians, Path(folder) / "fit.egs", image, BUDGET)
-    seconds = {
-        "seconds": time.perf_counter() - started,
-        "fit_seconds": between - started,
-        "unpacked_rgb": decibels(fitted.image, image, "rgb"),
-    }
-    return {"points": [_point(count, receipt.bytes, picture_of(receipt.gaussians), image, seconds)]}
+    seconds = {"seconds": time.perf_counter() - started, "fit_seconds": between - started}
+    point = _point(count, receipt.bytes, picture_of(receipt.gaussians), image)
+    before = decibels(fitted.image, image, "rgb")
+    return {"points": [{**point, **seconds, "unpacked_rgb": before}]}
 
 
-def _coded(image: Image, codec: Codec) -> Row:
+def _coded(image: Image, kind: str, options: dict[str, Any]) -> Row:
     """Write an image in all qualities, and judge what is read back."""
     source, points = pillow.fromarray(to_8bit(image).astype(np.uint8)), []
-    for quality in codec.qualities:
+    for quality in QUALITIES:
         file = io.BytesIO()
         started = time.perf_counter()
-        source.save(file, codec.format, quality=quality, **codec.options)
-        seconds = {"seconds": time.perf_counter() - started}
+        source.save(file, kind, quality=quality, **options)
+        seconds = time.perf_counter() - started
         shown = np.asarray(pillow.open(file).convert("RGB"), np.float32) / 255
-        points.append(_point(quality, file.tell(), shown, image, seconds))
+        points.append({**_point(quality, file.tell(), shown, image), "seconds": seconds})
     return {"points": points}
 
 
-def _point(
-    setting: int, size: int, shown: NDArray[Any], image: Image, more: dict[str, float]
-) -> Row:
+def _point(setting: int, size: int, shown: NDArray[Any], image: Image) -> Row:
     return {
         "setting": setting,
         "bytes": size,
@@ -131,5 +104,4 @@ def _point(
         "psnr_rgb": decibels(shown, image, "rgb"),
         "psnr_ycbcr": decibels(shown, image, "ycbcr"),
         "ssim": ssim(shown, image),
-        **more,
     }

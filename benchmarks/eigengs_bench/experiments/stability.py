@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eigengs_bench.experiments.stability_cases import Case
-from eigengs_bench.harness.store import Job, Row
-from eigengs_bench.harness.task import Task
+from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.tiling import tiling
 from eigengs_bench.harness.timing import Image, Moment, decibels, follow
 from eigengs_dr.bases import load_basis
@@ -40,16 +39,7 @@ presets, and how many times the steps of the case they take."""
 
 
 def run(task: Task, cases: Iterable[Case], presets: Sequence[str]) -> list[Row]:
-    """Measure every cell of the matrix, case by case; see `measure_cell` for the rows.
-
-    Parameters
-    ----------
-    task : Task
-        Each case has its own number of steps.
-    cases : iterable of Case
-    presets : sequence of str
-        Names of `PRESETS`.
-    """
+    """Measure every cell of the matrix, case by case."""
     return task.measure(FILE, jobs(cases, presets, task.seed, task.backend), "stability")
 
 
@@ -68,13 +58,7 @@ def jobs(
 
 
 def tiles_of(task: Task, smooth: Case) -> dict[str, Image]:
-    """Fit the case "smooth" for a picture of tiles.
-
-    Returns
-    -------
-    dict of str to ndarray of float32, shape (H, W, 3)
-        RGB by what is said of it, as listed in `TILES`.
-    """
+    """Fit the case "smooth" for a picture of tiles: pictures by what is said of them."""
     image, shown = smooth.image(), {}
     for done, (name, times) in enumerate(TILES):
         task.progress("tiles", done, len(TILES))
@@ -87,16 +71,10 @@ def tiles_of(task: Task, smooth: Case) -> dict[str, Image]:
 def measure_cell(case: Case, preset: str, seed: int, backend: str | None) -> Row:
     """Run a case by a preset and score it: one cell.
 
-    Returns
-    -------
-    dict
-        ``needs``, what is missing, alone where the preset cannot run. Else ``finite``, whether all
-        parameters and pixels were at all marks of `rows_at`; ``start_S``, ``end_S`` and
-        ``half_S``, the PSNR in dB of the first and of the last moment and of the last set in half
-        precision, with S one of ycbcr and rgb, at most `EXACT`; ``drop_S``, from the best moment to
-        the last; ``condition``, the highest of a covariance at a mark; ``tiling``, see that module;
-        ``gaussians``, how many; ``seconds``, without what the judgement takes; and, of a case that
-        is alone, ``peak_gib``, the most memory that the process had, pictures to judge included.
+    "needs", alone, says what a preset lacks. Else "finite" tells whether all parameters and pixels
+    were at all marks of `rows_at`; start, end and half are PSNRs of the first and of the last
+    moment and of the last set in half precision, drop those from the best moment to the last;
+    "condition" is the highest of a covariance, "peak_gib" the memory of a case in its own process.
     """
     image = case.image()
     most = image.shape[0] * image.shape[1]
@@ -123,11 +101,6 @@ def condition(factor: NDArray[np.floating]) -> float:
 
     With t the trace and ``d = (a c)^2`` the determinant of ``F^T F``, its larger eigenvalue is
     ``l = (t + sqrt(t^2 - 4 d)) / 2``, and the ratio of both is ``l^2 / d``.
-
-    Parameters
-    ----------
-    factor : ndarray, shape (N, 3)
-        a, b, c.
     """
     a, b, c = factor.astype(np.float64).T
     t = a * a + b * b + c * c
@@ -180,16 +153,12 @@ def _score(followed: list[Moment], image: Image) -> Row:
 def _round_to_half(gaussians: Gaussians) -> Gaussians:
     """Round all parameters to half precision."""
 
-    def half(values: Any) -> Any:
+    def half(name: str) -> Any:
+        values = getattr(gaussians, name)
         return type(values)(dr.float16_array_t(type(values))(values))
 
-    return replace(
-        gaussians,
-        mean=half(gaussians.mean),
-        factor=half(gaussians.factor),
-        color=half(gaussians.color),
-        background=half(gaussians.background),
-    )
+    names = ("mean", "factor", "color", "background")
+    return replace(gaussians, **{name: half(name) for name in names})
 
 
 def _measure_alone(case: Case, preset: str, seed: int, backend: str | None) -> Row:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as pillow
+from PIL import ImageDraw
 
 from eigengs_bench.harness.timing import Image
 from eigengs_dr.images import sample
@@ -16,20 +18,11 @@ from eigengs_dr.resampling import cropped
 
 Shapes = tuple[NDArray[np.float64], NDArray[np.float64]]
 
-SIDE = 256
-"""Pixels of a side where the case is not about size."""
+SIDE, GAUSSIANS, ITERATIONS = 256, 5000, 1000
+"""Pixels of a side, splats (the paper's number, and that of the basis that ships), and steps."""
 
-GAUSSIANS = 5000
-"""Splats on such an image: the paper's number, and that of the basis that ships."""
-
-ITERATIONS = 1000
-
-SMOOTH_SIDE, SMOOTH_GAUSSIANS = 512, 5000
+SMOOTH_SIDE = 512
 """Splats lie 7 pixels apart, which shows; the paper's 20,000 lie under 4 apart."""
-
-LARGE_SIDE, LARGE_GAUSSIANS, LARGE_ITERATIONS = 4096, 20000, 20
-
-LONG_ITERATIONS = 10_000
 
 STRIPE = 3
 """Rows of a stripe of the image that is foreign to a basis."""
@@ -38,21 +31,9 @@ STRIPE = 3
 class Case(NamedTuple):
     """One thing that may go wrong.
 
-    Attributes
-    ----------
-    name : str
-    image : callable
-        ``image()`` makes it: float32, shape (H, W, 3), RGB.
-    gaussians : int
-        Splats; a start from a basis has those of the basis.
-    iterations : int
-    place : callable or None
-        Means and factors to start from, called as those of `eigengs_dr.place` are and brought
-        inside their bounds as those are; None for those of the preset.
-    rates : float
-        What the rates of the preset are multiplied by.
-    alone : bool
-        Whether it is measured in a process of its own, which tells its memory.
+    ``image()`` makes the image. `place` returns means and factors to start from, called as the
+    functions of `eigengs_dr.place` are; None for the start of the preset. `rates` multiplies the
+    rates of the preset. A case `alone` is measured in a process of its own, for its memory.
     """
 
     name: str
@@ -88,21 +69,16 @@ def checkerboard() -> Image:
 
 def lines() -> Image:
     """Draw a fan of white lines, one pixel wide and not smoothed, on black."""
-    from PIL import Image, ImageDraw
-
-    canvas = Image.new("L", (SIDE, SIDE))
-    draw = ImageDraw.Draw(canvas)
+    canvas = pillow.new("L", (SIDE, SIDE))
     for end in range(0, SIDE, 12):
-        draw.line([(0, 0), (SIDE - 1, end)], fill=255)
-        draw.line([(0, 0), (end, SIDE - 1)], fill=255)
+        for corner in ((SIDE - 1, end), (end, SIDE - 1)):
+            ImageDraw.Draw(canvas).line([(0, 0), corner], fill=255)
     return _grey(np.asarray(canvas) / 255)
 
 
 def text() -> Image:
     """Write small black letters on white."""
-    from PIL import Image, ImageDraw
-
-    canvas = Image.new("L", (SIDE, SIDE), 255)
+    canvas = pillow.new("L", (SIDE, SIDE), 255)
     words = "\n".join(["Sphinx of black quartz, judge my vow. 0123456789"] * 23)
     ImageDraw.Draw(canvas).multiline_text((2, 2), words, fill=0, spacing=1)
     return _grey(np.asarray(canvas) / 255)
@@ -173,34 +149,31 @@ def _round(count: int, sigma: float) -> NDArray[np.float64]:
     return np.tile([1 / sigma, 0.0, 1 / sigma], (count, 1))
 
 
+_PLACES = (needles, subpixel, heap, outside)
+
 _ALL = (
     Case("photo", photo),  # what the others are compared with
     Case("constant", partial(flat, 0.2, 0.4, 0.6)),  # whole 8-bit levels
     Case("black", partial(flat, 0.0, 0.0, 0.0)),
     Case("white", partial(flat, 1.0, 1.0, 1.0)),
-    Case("impulse", impulse),
-    Case("checkerboard", checkerboard),
-    Case("lines", lines),
-    Case("text", text),
-    Case("smooth", smooth, SMOOTH_GAUSSIANS),
-    Case("saturated", saturated),
-    Case("noise", noise),
+    *(Case(make.__name__, make) for make in (impulse, checkerboard, lines, text, smooth)),
+    *(Case(make.__name__, make) for make in (saturated, noise)),
     Case("1x512", partial(photo, 512, 1), 128),
-    Case(
-        "large",
-        partial(photo, LARGE_SIDE, LARGE_SIDE),
-        LARGE_GAUSSIANS,
-        LARGE_ITERATIONS,
-        alone=True,
-    ),
+    Case("large", partial(photo, 4096, 4096), 20000, 20, alone=True),
     Case("foreign", foreign),
-    Case("needles", photo, place=needles),
-    Case("subpixel", photo, place=subpixel),
-    Case("heap", photo, place=heap),
-    Case("outside", photo, place=outside),
+    *(Case(place.__name__, photo, place=place) for place in _PLACES),
     Case("fast", photo, rates=10.0),
-    Case("long", photo, iterations=LONG_ITERATIONS),
+    Case("long", photo, iterations=10_000),
 )
 
 CASES = {case.name: case for case in _ALL}
 """Cases by name. What half precision costs is measured in each."""
+
+
+def chosen_cases(names: Sequence[str], iterations: int | None = None) -> list[Case]:
+    """Return cases by name, by default all, with at most so many steps."""
+    if unknown := [name for name in names if name not in CASES]:
+        raise ValueError(f"case {unknown[0]!r} is unknown; use one of {', '.join(CASES)}")
+    chosen = [CASES[name] for name in dict.fromkeys(names or CASES)]
+    most = np.inf if iterations is None else iterations
+    return [case._replace(iterations=int(min(case.iterations, most))) for case in chosen]

@@ -1,4 +1,8 @@
-"""The paper's tables on sets of images: every method on every image, step by step."""
+"""The paper's tables on sets of images: every method on every image, step by step.
+
+A row has "job" with set, image, seed, iterations, gaussians and the fields of `Method`, and
+"moments", a list of `score`. A row of the table "reach" has the figures of `_reach`.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from typing import NamedTuple
 
-from eigengs_bench.harness.datasets import has_training_images, images_of, model_for
-from eigengs_bench.harness.store import Job, Row
-from eigengs_bench.harness.task import Task
+from eigengs_bench.harness.datasets import images_of, is_trained, model_for
+from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.timing import Image, follow, score, warm_up
 from eigengs_bench.names import NATURAL, SETS, TABLES
 from eigengs_dr.descent import LONG
@@ -33,81 +36,38 @@ SOLVE_STEPS = (1, 2, 3, 5, 10)
 
 
 class Method(NamedTuple):
-    """One method; the fields are part of a measurement's name.
-
-    Attributes
-    ----------
-    preset : str
-    source : str
-        The set whose training images the basis is of; "" without a basis.
-    components : int
-        Of each channel.
-    color : str
-    split : str
-        "auto", "split" or "whole": `frequency_aware` of `EigenGS.fit`.
-    """
+    """A preset, and the model it starts from: of the training images of `source`, "" for none."""
 
     preset: str
     source: str = ""
     components: int = 0
     color: str = "ycbcr"
-    split: str = "auto"
+    split: str = "auto"  # or "split" or "whole": frequency_aware of EigenGS.fit
+
+
+Ready = Callable[[Method], Callable[..., Start]]
 
 
 def methods(name: str, table: str, sources: Sequence[str]) -> list[Method]:
-    """List the methods that a table compares on a set.
-
-    Parameters
-    ----------
-    name : str
-        One of `SETS`.
-    table : str
-        One of `TABLES`.
-    sources : sequence of str
-        Sets that have images to train on.
-    """
+    """List the methods that a table compares on a set; `sources` are the sets with a basis."""
     own = [name] if name in sources else []
-    if table == "ablation":
-        return [
-            Method("eigengs", name, COMPONENTS[0], color, split)
-            for _ in own
-            for color in ("ycbcr", "rgb")
-            for split in ("split", "whole")
-        ]
     lent = [LENT[name]] if LENT.get(name) in sources else []
-    if NATURAL in sources and name != NATURAL:
-        lent.append(NATURAL)
+    universal = [NATURAL] if NATURAL in sources and name != NATURAL else []
+    plain, count = [Method("gaussianimage")], COMPONENTS[0]
+    if table == "ablation":
+        pairs = [(color, split) for color in ("ycbcr", "rgb") for split in ("split", "whole")]
+        return [Method("eigengs", name, count, *pair) for _ in own for pair in pairs]
     if table == "cross":
-        plain = [Method("gaussianimage")] if lent else []
-        return plain + [Method("eigengs", source, COMPONENTS[0]) for source in lent]
-    universal = [source for source in lent if source == NATURAL]
-    bases = [Method("eigengs", s, count) for s in own + universal for count in COMPONENTS]
-    return [Method("gaussianimage"), Method("default"), *(bases if table == "main" else [])]
+        others = [Method("eigengs", source, count) for source in lent + universal]
+        return plain + others if others else []
+    bases = [Method("eigengs", source, k) for source in own + universal for k in COMPONENTS]
+    return [*plain, Method("default"), *(bases if table == "main" else [])]
 
 
 def run(task: Task, names: Sequence[str], tables: Sequence[str] = TABLES) -> list[Row]:
-    """Measure what tables need, image by image, its methods in turn.
-
-    Parameters
-    ----------
-    task : Task
-        Fits are looked at after those of `ITERATIONS` up to its number of steps, and at the end.
-    names, tables : sequence of str
-        Of `SETS` and `TABLES`.
-
-    Returns
-    -------
-    list of dict
-        A row has "job" with set, image, seed, iterations and the fields of `Method`, and
-        "moments", see `score`; or, for "reach", the figures of `_reach`.
-
-    Raises
-    ------
-    ImageError
-        If a set has no images.
-    """
+    """Measure what tables need on sets, image by image, the methods in turn."""
     found = []
-    sources = [name for name in SETS if has_training_images(task.data, name)]
+    sources = [name for name in SETS if is_trained(task.data, name)]
     for name in names:
         compared = list(dict.fromkeys(m for table in tables for m in methods(name, table, sources)))
         pictures = images_of(task, name)
@@ -122,9 +82,6 @@ def run(task: Task, names: Sequence[str], tables: Sequence[str] = TABLES) -> lis
             }
             found += task.measure(FILE, _reach_jobs(task, name, pictures, goals, ready), name)
     return found
-
-
-Ready = Callable[[Method], Callable[..., Start]]
 
 
 def _preparation(task: Task, name: str, picture: Image) -> Ready:
@@ -192,8 +149,7 @@ def _reach_jobs(
 def _reach(start: Callable[[int], Start], image: Image, goal: Row) -> Row:
     """Time until "default" has the PSNR of a goal: by its start, stopped early, or after it.
 
-    Returns `solve_steps` and `iteration` where that was, `seconds`, `psnr_ycbcr`, and as `share`
-    the seconds over those of the goal.
+    "share" is that time over the time of the goal; None alone where it is never reached.
     """
     schedule = PRESETS["default"].schedule
     for depth in SOLVE_STEPS:
@@ -201,11 +157,7 @@ def _reach(start: Callable[[int], Start], image: Image, goal: Row) -> Row:
         for moment in follow(partial(start, depth), schedule, steps, range(steps + 1)):
             reached = psnr(moment.picture, image, "ycbcr")
             if reached >= goal["psnr_ycbcr"]:
-                return {
-                    "solve_steps": depth,
-                    "iteration": moment.iteration,
-                    "seconds": moment.seconds,
-                    "psnr_ycbcr": reached,
-                    "share": moment.seconds / goal["seconds"],
-                }
+                found = {"solve_steps": depth, "iteration": moment.iteration}
+                found |= {"seconds": moment.seconds, "psnr_ycbcr": reached}
+                return {**found, "share": moment.seconds / goal["seconds"]}
     return {"share": None}

@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from eigengs_bench.harness.task import Progress, no_progress
+from eigengs_bench.harness.store import Progress
 from eigengs_bench.harness.timing import interleaved, require_complete
 from eigengs_dr.color import to_linear
 from eigengs_dr.fitting import fit
@@ -29,25 +29,13 @@ STEPS, WARM_UP, ROUNDS = 100, 2, 9
 """Steps of the fits, rounds that compile and settle, and rounds that are measured."""
 
 
-def run(variant: str = "llvm_ad_rgb", progress: Progress = no_progress) -> dict[str, float]:
+def run(variant: str = "llvm_ad_rgb", progress: Progress = lambda *_: None) -> dict[str, float]:
     """Time a material ball with each texture in turn, in one run; every figure is a median.
 
-    Parameters
-    ----------
-    variant : str, optional
-        Of Mitsuba.
-    progress : Progress, optional
-
-    Returns
-    -------
-    dict of str to float
-        - `bitmap_ms`, `gaussians_N_ms`: rendering with a bitmap, and with N Gaussians.
-        - `ratio_N`: the second over the first.
-        - `prefiltered_ms`, `ratio_prefiltered`: with 5,000 splats and the prefilter.
-        - `step_bitmap_ms`, `step_gaussians_ms`, `ratio_step`: picture and gradient of all
-          parameters by `prb`; 3 million texels, or 5,000 splats.
-        - `change_ms`: taking over changed parameters, which lists the splats anew.
-        - `difference`: the largest between texture and `eigengs_dr.render` at texel centres.
+    `ratio_N` is rendering with N Gaussians over rendering with a bitmap, `ratio_prefiltered` with
+    5,000 and the prefilter, `ratio_step` picture and gradient of all parameters by `prb`. `change`
+    takes over changed parameters; `difference` is the largest between texture and
+    `eigengs_dr.render` at texel centres.
     """
     import mitsuba as mi
 

@@ -1,11 +1,11 @@
 """Measurements as lines of JSON, added one by one: a run that was broken off goes on later.
 
-A row holds the name of its job, its figures, and the run: the date, the command, the machine, the
-versions, and the commit of the code with a flag for a clean tree.
+A row has "job", its name; its figures; and "run": the date, the command, the machine, the versions,
+and the "commit" of the code with "clean", whether no tracked file differed from it.
 
 Rows of another machine or of other versions are refused, as their seconds mean something else. Rows
-of other code are used, as nobody wants to measure an hour again after a change of a comment. But
-this is always said: by `other_code` when a file is continued, and by the caption of every table.
+of other code are used, as nobody wants to measure an hour again after a change of a comment; this
+is always said: in one line when a file is continued, and in the caption of every table.
 """
 
 from __future__ import annotations
@@ -16,52 +16,47 @@ import subprocess
 from collections import Counter
 from collections.abc import Callable, Iterable
 from datetime import datetime, timezone
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from eigengs_dr.atomic import replacing
 from eigengs_dr.report import plain
 
 Row = dict[str, Any]
-
-Job = tuple[Row, Callable[[], Row]]
-"""What names a measurement (the seed is part of it), and the function that makes it."""
+Job = tuple[Row, Callable[[], Row]]  # what names a measurement, its seed too, and what makes it
+Progress = Callable[..., None]  # progress(label, done, total), see eigengs_dr.console
 
 NOT_MACHINE = ("command", "date", "commit", "clean")
-"""Keys of a run that do not tell machines and versions apart."""
+
+
+class Task(NamedTuple):
+    """What experiments share: `folder` of rows and models, `data` of image sets, `run` of rows."""
+
+    folder: Path
+    data: Path | None
+    run: Row
+    images: int = 20
+    iterations: int = 1000
+    seed: int = 0
+    backend: str | None = None
+    progress: Progress = lambda *_: None
+
+    def measure(self, file: str, jobs: Iterable[Job], label: str) -> list[Row]:
+        """Continue a file of the folder; see the function `measure`."""
+        return measure(self.folder / file, jobs, self.run, partial(self.progress, label))
 
 
 def measure(
-    path: Path,
-    jobs: Iterable[Job],
-    run: Row,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    path: Path, jobs: Iterable[Job], run: Row, progress: Progress = lambda *_: None
 ) -> list[Row]:
-    """Do the jobs that a file does not hold yet; add a line after each.
-
-    Parameters
-    ----------
-    path : Path
-        Made where it is missing.
-    jobs : iterable of Job
-        In the order in which they are measured.
-    run : dict
-        "command", what tells machines and versions apart, and `code_state`.
-    progress : callable, optional
-        ``progress(done, total)`` before every job and after the last.
-
-    Returns
-    -------
-    list of dict
-        The rows of these jobs in their order, old ones and new ones.
+    """Do the jobs that a file does not hold yet, and add a line after each; return their rows.
 
     Raises
     ------
     ValueError
         If the file is damaged, or was written on another machine or with other versions.
-    OSError
-        If it cannot be written.
     """
     known = {_key(row["job"]): row for row in read(path)}
     for row in known.values():
@@ -83,17 +78,13 @@ def measure(
 
 
 def read(path: Path) -> list[Row]:
-    """Read the rows of a file, none where there is none. A last line that is cut short is dropped.
+    """Read the rows of a file, none where there is none; `ValueError` names a damaged line.
 
-    Raises
-    ------
-    ValueError
-        If another line is not a row of `measure`.
+    A last line that was cut short is dropped.
     """
     if not path.exists():
         return []
     found = []
-    # What follows the last line break is not whole.
     for number, line in enumerate(path.read_text("utf-8", "replace").split("\n")[:-1], 1):
         try:
             row = json.loads(line)
@@ -113,14 +104,7 @@ def today() -> str:
 
 
 def code_state() -> Row:
-    """Find which code runs.
-
-    Returns
-    -------
-    dict
-        "commit", the hash, and "clean", whether no tracked file differs from it. Both are None
-        where the package does not lie in a git tree: its version then stands for its code.
-    """
+    """Find the commit of the code, and whether its tree is clean; both are None without git."""
     spec = find_spec("eigengs_dr")
     folder = Path(str(spec and spec.origin)).parent
 
@@ -137,16 +121,15 @@ def code_state() -> Row:
 
 
 def code_name(run: Row) -> str:
-    """Name the code of a run: "commit 0a1b2c3d4", with a remark where its tree was not clean."""
+    """Name the code of a run: "commit 0a1b2c3d4", and whether its tree was not clean."""
     if not run.get("commit"):
         return f"version {run.get('versions', {}).get('eigengs_dr', 'unknown')}, commit unknown"
     return f"commit {run['commit'][:9]}" + ("" if run["clean"] else " with uncommitted changes")
 
 
-def codes(runs: Iterable[Row]) -> str:
-    """Count the rows of each code, the most frequent first: "commit 0a1b2c3d4 (12), ..."."""
-    counted = Counter(map(code_name, runs)).most_common()
-    return ", ".join(f"{name} ({count})" for name, count in counted)
+def count_codes(runs: Iterable[Row]) -> str:
+    """Count the rows of each code: "commit 0a1b2c3d4 (12), ..."."""
+    return ", ".join(f"{name} ({n})" for name, n in Counter(map(code_name, runs)).most_common())
 
 
 def other_code(path: Path, run: Row) -> str:
@@ -155,7 +138,7 @@ def other_code(path: Path, run: Row) -> str:
     if not others:
         return ""
     return (
-        f"{path}: rows of other code are used as they are: {codes(others)}; now it is "
+        f"{path}: rows of other code are used as they are: {count_codes(others)}; now it is "
         f"{code_name(run)}. To measure all of them again, write to another folder"
     )
 

@@ -19,25 +19,12 @@ from eigengs_dr.refine import EXACT, Refined
 from eigengs_dr.rendering import CUTOFF, picture_of
 from eigengs_dr.starting import Start
 
-Image = NDArray[np.float32]
-"""RGB, shape (H, W, 3), 1 is white."""
-
+Image = NDArray[np.float32]  # RGB, shape (H, W, 3), 1 is white
 Fitted = TypeVar("Fitted", Fit, Refined)
 
 
 class Moment(NamedTuple):
-    """State of a descent.
-
-    Attributes
-    ----------
-    iteration : int
-        Steps taken.
-    seconds : float
-        Since before the start was made, without the time that the observer took.
-    gaussians : Gaussians
-    picture : ndarray of float32, shape (H, W, 3)
-        RGB, not clamped.
-    """
+    """A descent after some steps: seconds since before its start, RGB that is not clamped."""
 
     iteration: int
     seconds: float
@@ -52,20 +39,10 @@ def follow(
     marks: Collection[int],
     cutoff: float = CUTOFF,
 ) -> Iterator[Moment]:
-    """Run a descent to its last step and yield its state at some steps.
+    """Run a descent to its last step and yield its state after the steps in `marks`.
 
     Unlike `eigengs_dr.fit` it takes all steps, also where nothing is gained any more, and shows the
-    set as it is, not the best so far. The clock stops between two moments.
-
-    Parameters
-    ----------
-    begin : callable
-        Makes the start; its time counts.
-    schedule : Schedule
-    iterations : int
-    marks : collection of int
-        Steps after which to yield; 0 is the start.
-    cutoff : float, optional
+    set as it is, not the best so far. The time of `begin` counts; the clock stops between moments.
     """
     spent, resumed = 0.0, time.perf_counter()
     start = begin()
@@ -88,32 +65,20 @@ def follow(
 def warm_up(
     begin: Callable[[], Start], schedule: Schedule, iterations: int, cutoff: float = CUTOFF
 ) -> None:
-    """Compile the programs of a descent of so many steps, also those that place splats anew.
-
-    Parameters are those of `follow`.
-    """
+    """Compile the programs of a descent of so many steps, also those that place splats anew."""
     steps = min(LONG, iterations)
     list(follow(begin, replace(schedule, rearrange=1), steps, (0, steps), cutoff))
 
 
 def require_complete(fitted: Fitted) -> Fitted:
-    """Return a fit that was not broken off: the state after Ctrl-C is no measurement.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If it was.
-    """
+    """Return a fit, or raise `KeyboardInterrupt` if it was broken off: it is no measurement."""
     if fitted.stopped == "interrupted":
         raise KeyboardInterrupt
     return fitted
 
 
 def decibels(picture: Image, image: Image, space: str) -> float:
-    """Return a PSNR for a row, in dB and at most `EXACT`. NaN is left to fits that have failed.
-
-    Parameters are those of `eigengs_dr.psnr`.
-    """
+    """Return a PSNR for a row, in dB and at most `EXACT`; NaN is left to fits that have failed."""
     return min(psnr(picture, image, space), EXACT)
 
 
@@ -135,29 +100,14 @@ def interleaved(
     rounds: int,
     progress: Callable[[int], None] = lambda done: None,
 ) -> dict[str, float]:
-    """Time programs in turns: one of each a round, after rounds that compile and settle.
-
-    Parameters
-    ----------
-    programs : dict of str to callable
-        Each returns Dr.Jit arrays, which are evaluated.
-    warm_up, rounds : int
-        Rounds that are not measured, and rounds that are.
-    progress : callable, optional
-        ``progress(done)`` after every round.
-
-    Returns
-    -------
-    dict of str to float
-        Median milliseconds by name.
-    """
+    """Time programs in turns, one of each a round; return median milliseconds by name."""
     times: dict[str, list[float]] = {name: [] for name in programs}
     for done in range(warm_up + rounds):
         for name, program in programs.items():
             started = time.perf_counter()
             dr.eval(program())
             dr.sync_thread()
-            if done >= warm_up:
+            if done >= warm_up:  # the first rounds compile and settle
                 times[name].append((time.perf_counter() - started) * 1e3)
         progress(done + 1)
     return {name: float(np.median(ms)) for name, ms in times.items()}

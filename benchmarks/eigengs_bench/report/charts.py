@@ -1,19 +1,18 @@
-"""What all charts share: files that two runs write alike, colours, axes; and charts of figures."""
+"""Charts: files that two runs write alike, colours and axes, and charts of pictures."""
 
 from __future__ import annotations
 
 import os
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from eigengs_bench.harness.tiling import tiling
 from eigengs_bench.harness.timing import Image
@@ -24,47 +23,29 @@ COLORS = {"default": "#0b6e99", "gaussianimage": "#b5442f", "eigengs": "#5a8f3c"
 
 INK = "#222222"
 
-LOW_COLOR, HIGH_COLOR = "#d66014", "#1e5aa0"
-"""Bars of the splats for low frequencies, and of all others, as in pictures of outlines."""
-
 MAGNIFIED = 20
 """Factor by which the errors of tiles are shown."""
 
 
-def new_figure(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float, title: str = "") -> Figure:
     """Make an empty figure, sides in inches, that arranges its parts itself."""
-    return Figure(figsize=(width, height), layout="constrained")  # not pyplot: it wants a screen
+    figure = Figure(figsize=(width, height), layout="constrained")  # not pyplot: no screen
+    figure.suptitle(title) if title else None
+    return figure
 
 
 def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
-    """Write a chart, whole or not at all; equal charts give equal files.
-
-    Parameters
-    ----------
-    path : path-like
-        Ends in .svg, .png or .pdf.
-    figure : matplotlib.figure.Figure
-
-    Raises
-    ------
-    ValueError
-        If the suffix is another.
-    OSError
-        If the file cannot be written.
-    """
-    suffix = Path(path).suffix.lower()
-    if suffix not in (".svg", ".png", ".pdf"):
-        raise ValueError(f"{path}: the name must end in .svg, .png or .pdf")
+    """Write a chart as .svg, .png or .pdf, whole or not at all."""
     with replacing(path) as temporary:
-        temporary.write_bytes(drawn(figure, suffix[1:]))
+        temporary.write_bytes(draw(figure, Path(path).suffix.lower()))
 
 
-def drawn(figure: Figure, kind: str = "svg") -> bytes:
-    """Return the file of a chart."""
+def draw(figure: Figure, suffix: str = ".svg") -> bytes:
+    """Return the file of a chart; equal charts give equal files."""
     # Names in an SVG file are else drawn at random.
-    metadata: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+    metadata: dict[str, Any] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
     with rc_context({"svg.hashsalt": "eigengs_dr"}), BytesIO() as file:
-        figure.savefig(file, format=kind, dpi=90, metadata=metadata.get(kind))
+        figure.savefig(file, format=suffix[1:], dpi=90, metadata=metadata.get(suffix))
         return file.getvalue()
 
 
@@ -74,97 +55,63 @@ def data_uri(content: bytes, suffix: str) -> str:
     return f"data:image/{kind};base64,{b64encode(content).decode()}"
 
 
-def logarithmic(axis: Axes, sides: str = "x", subs: Sequence[int] = (3,)) -> None:
-    """Give axes logarithmic scales with plain numbers."""
-    for side in sides:
+def label_axes(
+    axis: Axes, x: str, y: str, logarithmic: str = "x", subs: Sequence[int] = (3,), **rest: Any
+) -> None:
+    """Name the axes, and give some of them logarithmic scales with plain numbers."""
+    for side in logarithmic:
         getattr(axis, f"set_{side}scale")("log", subs=list(subs))
-        scale = getattr(axis, f"{side}axis")
-        scale.set_major_formatter("{x:,g}")
-        scale.set_minor_formatter("{x:,g}")
+        getattr(axis, f"{side}axis").set_major_formatter("{x:,g}")
+        getattr(axis, f"{side}axis").set_minor_formatter("{x:,g}")
+    axis.set(xlabel=x, ylabel=y, **rest)
+    axis.grid(alpha=0.3)
 
 
-class Curve(NamedTuple):
-    """A line of a chart: its name, and y over x."""
-
-    name: str
-    x: Sequence[float]
-    y: Sequence[float]
-
-
-class Radii(NamedTuple):
-    """A panel of a histogram.
-
-    Attributes
-    ----------
-    title : str
-    low, high : ndarray of float, shape (N,)
-        Radii in pixels of the splats for low frequencies (none where all serve all components), and
-        of all others; of all images together.
-    images : int
-        How many.
-    """
-
-    title: str
-    low: NDArray[Any]
-    high: NDArray[Any]
-    images: int
-
-
-def curves_chart(panels: dict[str, list[Curve]], x_label: str, y_label: str) -> Figure:
-    """Draw lines in the colours of the presets, one panel a title; all panels with equal names."""
+def curves_chart(
+    panels: Mapping[str, Mapping[str, Sequence[float]]], x: Sequence[float], x_name: str, name: str
+) -> Figure:
+    """Draw lines in the colours of the presets, one panel a title, lines by preset."""
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
     figure = new_figure(3.2 * columns, 2.7 * rows + 0.5)
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    for axis, (title, curves) in zip(axes.flat, panels.items(), strict=False):
-        for curve in curves:
-            axis.plot(curve.x, curve.y, label=curve.name, color=COLORS.get(curve.name))
-        axis.set_title(title, fontsize=10)
-        axis.grid(alpha=0.3)
-    for axis in axes.flat[len(panels) :]:
+    axes = figure.subplots(rows, columns, squeeze=False, sharey=True).flatten()
+    for axis, (title, curves) in zip(axes, panels.items(), strict=False):
+        for preset, values in curves.items():
+            axis.plot(x, values, label=preset, color=COLORS[preset])
+        label_axes(axis, x_name, name, "", title=title)
+    for axis in axes[len(panels) :]:
         axis.set_axis_off()
-    for axis in axes.flat[len(panels) - columns : len(panels)]:  # also with no panel below
-        axis.tick_params(labelbottom=True)
-    figure.supxlabel(x_label, fontsize=10)
-    figure.supylabel(y_label, fontsize=10)
-    handles = axes[0, 0].get_lines()
+    handles = axes[0].get_lines()
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=9)
     return figure
 
 
-def radii_chart(panels: Sequence[Radii]) -> Figure:
-    """Draw histograms of radii side by side; numbers of splats on a logarithmic axis."""
+def radii_chart(panels: Mapping[str, Sequence[Any]]) -> Figure:
+    """Draw histograms of radii in pixels side by side, on a logarithmic axis.
+
+    A panel has the radii of the splats for low frequencies, shape (images, N), none where all serve
+    all components, and those of all others.
+    """
     figure = new_figure(3.8 * len(panels), 3.2)
     axes = figure.subplots(1, len(panels), squeeze=False, sharex=True, sharey=True)[0]
-    radii = np.concatenate([part for panel in panels for part in (panel.low, panel.high)])
-    bins = np.linspace(0, 1.05 * radii.max(), 60)
-    for axis, panel in zip(axes, panels, strict=True):
-        for name, part, color in (
-            ("high frequencies" if len(panel.low) else "all", panel.high, HIGH_COLOR),
-            ("low frequencies", panel.low, LOW_COLOR),
-        ):
-            if len(part):
-                weights = np.full(len(part), 1 / panel.images)
-                label = f"{name}: {len(part) // panel.images:,} Gaussians"
-                axis.hist(part, bins, weights=weights, color=color, alpha=0.8, label=label)
-        axis.set(title=panel.title, yscale="log", xlabel="radius / pixels")
+    bins = np.linspace(0, 1.05 * max(part.max() for _, part in panels.values()), 60)
+    for axis, (title, (low, high)) in zip(axes, panels.items(), strict=True):
+        name = "high frequencies" if low.size else "all"
+        for part, label, color in ((high, name, "#1e5aa0"), (low, "low frequencies", "#d66014")):
+            if part.size:
+                style: Any = {"weights": np.full(part.size, 1 / len(part)), "color": color}
+                label = f"{label}: {part.shape[1]:,} Gaussians"
+                axis.hist(part.ravel(), bins, label=label, alpha=0.8, **style)
         axis.margins(y=0.35)  # room for the legend
-        axis.grid(alpha=0.3)
+        label_axes(axis, "radius / pixels", "Gaussians of an image", "", title=title, yscale="log")
         axis.legend(fontsize=8)
-    axes[0].set_ylabel("Gaussians of an image")
     return figure
 
 
-def tiles_chart(image: Image, pictures: dict[str, Image], side: int = 128) -> Figure:
+def tiles_chart(image: Image, pictures: Mapping[str, Image], side: int = 128) -> Figure:
     """Show the middle of pictures of one image, and below their errors magnified around mid-grey.
 
-    Parameters
-    ----------
-    image : ndarray of float, shape (H, W, 3)
-    pictures : dict of str to ndarray of float, shape (H, W, 3)
-        By name, which stands above with its `tiling`.
-    side : int, optional
-        Pixels of a side of what is shown.
+    Pictures stand below their name and their `tiling`.
     """
     height, width = (min(side, length) for length in image.shape[:2])
     top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2

@@ -17,52 +17,25 @@ MISSING = "-"
 
 
 class Table(NamedTuple):
-    """Cells as they are read.
-
-    Attributes
-    ----------
-    caption : str
-        What the cells are, with their unit, and what they were measured on.
-    frame : DataFrame
-        Texts; the first column says what a row is about.
-    """
+    """Texts under headings; the caption says what they are, and what they were measured on."""
 
     caption: str
     frame: pd.DataFrame
 
 
-class Chart(NamedTuple):
-    """A drawing: the stem of its file, and what it shows."""
-
-    name: str
-    caption: str
-    figure: Figure
-
-
 class Told(NamedTuple):
-    """Tables and charts of rows, and the points of the charts, by the stem of their file."""
+    """Tables of rows, charts with their captions, and points of charts, by the stem of a file."""
 
     tables: Sequence[Table] = ()
-    charts: Sequence[Chart] = ()
-    points: dict[str, pd.DataFrame] = {}  # noqa: RUF012  never written to
+    charts: Mapping[str, tuple[str, Figure]] = {}
+    points: Mapping[str, pd.DataFrame] = {}
 
 
 def frame_of(rows: Iterable[Row], key: str = "") -> pd.DataFrame:
-    """Lay rows out as a frame.
+    """Lay rows out: a line a row, or a line an entry of the list `key` of the rows that have it.
 
-    Parameters
-    ----------
-    rows : iterable of dict
-        As `eigengs_bench.harness.store.measure` returns them.
-    key : str, optional
-        A list in the rows, of which each entry becomes a line; rows without it are left out. By
-        default a row is a line.
-
-    Returns
-    -------
-    DataFrame
-        Columns are the fields of the jobs, the figures, and "code", the name of the code. Figures
-        of fits that have failed, null in the file, are NaN.
+    Columns are the fields of the jobs, the figures, and "code", the name of the code. Figures of
+    fits that have failed, null in the file, are NaN.
     """
     lines = []
     for row in rows:
@@ -73,32 +46,14 @@ def frame_of(rows: Iterable[Row], key: str = "") -> pd.DataFrame:
 
 
 def table(
-    caption: str,
-    columns: Sequence[str],
-    lines: Iterable[Sequence[Any]],
-    codes: Iterable[str] = (),
+    caption: str, columns: Iterable[str], lines: Iterable[Sequence[Any]], codes: Iterable[str] = ()
 ) -> Table:
-    """Make a table of lines of texts.
-
-    Parameters
-    ----------
-    caption : str
-    columns : sequence of str
-    lines : iterable of sequence of str
-    codes : iterable of str, optional
-        Names of the code of all rows behind the table; see `remark`.
-    """
+    """Make a table of lines of texts; `codes` names the code of all rows behind it."""
     return Table(caption + remark(codes), pd.DataFrame(list(lines), columns=list(columns)))
 
 
 def remark(codes: Iterable[str]) -> str:
-    """Say that rows are of several commits, or of a tree that was not clean; "" where all is well.
-
-    Parameters
-    ----------
-    codes : iterable of str
-        As `eigengs_bench.harness.store.code_name` writes them.
-    """
+    """Say that rows are of several commits, or of a tree that was not clean; else ""."""
     known = list(dict.fromkeys(codes))
     if len(known) > 1 or any("uncommitted" in code for code in known):
         kind = "different code" if len(known) > 1 else "code that is in no commit"
@@ -124,9 +79,7 @@ def as_text(table: Table, style: str = "simple") -> str:
 
 def number(value: float | None, decimals: int = 1) -> str:
     """Write a figure; `MISSING` for None and NaN, "inf" for infinity."""
-    if value is None or math.isnan(value):
-        return MISSING
-    return f"{value:,.{decimals}f}"
+    return MISSING if value is None or math.isnan(value) else f"{value:,.{decimals}f}"
 
 
 def mean(values: pd.Series, decimals: int = 1) -> str:
@@ -137,10 +90,9 @@ def mean(values: pd.Series, decimals: int = 1) -> str:
 
 def spread(values: pd.Series, decimals: int = 1) -> str:
     """Write mean and standard deviation (of a sample) of figures, "46.3 ± 2.1"; see `mean`."""
-    if values.count() < 2:
-        return mean(values, decimals)
     first, *failed = mean(values, decimals).split(" ", 1)
-    return " ".join([f"{first} ± {number(values.std(), decimals)}", *failed])
+    deviation = [f"± {number(values.std(), decimals)}"] if values.count() > 1 else []
+    return " ".join([first, *deviation, *failed])
 
 
 def quartiles(values: pd.Series, decimals: int = 2) -> str:
@@ -151,13 +103,11 @@ def quartiles(values: pd.Series, decimals: int = 2) -> str:
 
 def span(values: pd.Series, decimals: int) -> tuple[str, str]:
     """Write the median of values, and the least and the greatest: "37" and "12 to 55"."""
-    if values.empty:
-        return MISSING, MISSING
     ends = f"{number(values.min(), decimals)} to {number(values.max(), decimals)}"
-    return number(values.median(), decimals), ends
+    return number(values.median(), decimals), MISSING if values.empty else ends
 
 
-def counted(count: int, noun: str) -> str:
+def counted(count: int, noun: str = "image") -> str:
     """Write a number of things: "1 image", "3 images"."""
     return f"{count} {noun}{'s'[: count != 1]}"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,46 +19,16 @@ from eigengs_dr.strips import GAP, joined, line
 CELL, LETTERS, HEADING = 160, 13, 15
 """Longer side of a picture, and heights of the letters below it and above a row, in pixels."""
 
-QUALITY, PALETTE = 88, 256
-"""Of JPEG files; colours of PNG files, of which photos in all their colours would be large."""
-
 Picture = NDArray[Any]
+Cell = tuple[str, Picture]  # the line below a picture, and the picture: RGB, not clamped
 
 
-class Cell(NamedTuple):
-    """A picture of a strip: RGB, shape (H, W, 3), not clamped, and the line below it."""
-
-    caption: str
-    picture: Picture
-
-
-class Line(NamedTuple):
-    """Pictures side by side, and the line above them."""
-
-    heading: str
-    cells: Sequence[Cell]
-
-
-def strip(lines: Sequence[Line], credit: str = "", side: int = CELL, gap: int = GAP) -> Picture:
-    """Put rows of pictures below each other.
-
-    Parameters
-    ----------
-    lines : sequence of Line
-    credit : str, optional
-        A last line: whose images these are.
-    side : int, optional
-        Longer side of a picture, in pixels.
-    gap : int, optional
-        White pixels between pictures.
-
-    Returns
-    -------
-    ndarray of float, shape (H, W, 3)
-        RGB on white, not clamped.
-    """
+def strip(
+    rows: Sequence[tuple[str, Sequence[Cell]]], credit: str = "", side: int = CELL, gap: int = GAP
+) -> Picture:
+    """Put rows of pictures below each other, each below its heading; RGB on white, not clamped."""
     drawn = []
-    for heading, cells in lines:
+    for heading, cells in rows:
         row = joined([_cell(*cell, side) for cell in cells], 1, gap)
         above = [line(heading, row.shape[1], HEADING)] if heading else []
         drawn.append(joined([*above, row], 0, 2))
@@ -68,26 +38,13 @@ def strip(lines: Sequence[Line], credit: str = "", side: int = CELL, gap: int = 
 
 
 def save_strip(path: str | os.PathLike[str], picture: Picture) -> None:
-    """Write a strip, small: a JPEG of moderate quality, or a PNG of 256 colours.
-
-    Parameters
-    ----------
-    path : path-like
-        Ends in .jpg or .png.
-    picture : ndarray of float, shape (H, W, 3)
-        RGB, clamped.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
-    """
+    """Write a strip, small: a .jpg of moderate quality, or a .png of 256 colours."""
     image = pillow.fromarray(to_8bit(picture).astype(np.uint8))
     with replacing(path) as temporary:
-        if Path(path).suffix == ".png":
-            image.quantize(PALETTE).save(temporary, optimize=True)
+        if Path(path).suffix.lower() == ".png":
+            image.quantize(256).save(temporary, optimize=True)
         else:
-            image.save(temporary, quality=QUALITY)
+            image.save(temporary, quality=88)
 
 
 def _cell(caption: str, picture: Picture, side: int) -> Picture:

@@ -1,58 +1,36 @@
 """PSNR over how many splats of a set are drawn, from the rows that `levels` measured."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import pandas as pd
 
 from eigengs_bench.harness.store import Row
-from eigengs_bench.report.charts import new_figure
-from eigengs_bench.report.frames import (
-    Chart,
-    Told,
-    number,
-    table,
-)
+from eigengs_bench.report.charts import label_axes, new_figure
+from eigengs_bench.report.frames import Told, number, table
+
+LINES = {
+    "levels": ("the first of one set, fitted in levels", "o-"),
+    "alone": ("a fit of as many", "o--"),
+    "sorted": ("the most valuable of one set without levels", "s:"),
+}
 
 
 def tell(rows: Sequence[Row], name: str) -> Told:
-    """Lay out PSNR over splats that are drawn.
-
-    Parameters
-    ----------
-    rows : sequence of dict
-        Of `eigengs_bench.experiments.levels.run`.
-    name : str
-        The image.
-    """
+    """Lay out PSNR over splats that are drawn of an image."""
     points = pd.DataFrame(rows)
-
-    def lines() -> Iterator[tuple[str, ...]]:
-        for point in points.itertuples():
-            values = (point.levels, point.alone, point.sorted)
-            star = " *" if point.level else ""
-            yield f"{point.splats:,}{star}", *(number(value, 2) for value in values)
-
-    caption = (
-        f"{name}: PSNR in YCbCr by splats drawn (* a level ends): the first of a set in levels, a "
-        "fit of as many, and the most valuable ones of a fit without levels"
-    )
-    told = table(caption, ("splats", "levels", "fit of as many", "sorted fit"), lines())
-    figure = new_figure(6.4, 4.6)
+    lines = [
+        (f"{row['splats']:,}{' *' * row['level']}", *(number(row[key], 2) for key in LINES))
+        for row in rows
+    ]
+    words = ", ".join(words for words, _ in LINES.values())
+    caption = f"{name}: PSNR in YCbCr by splats drawn (* a level ends): {words}"
+    figure = new_figure(6.4, 4.6, f"Levels of detail: {name}; lines mark where levels end")
     axis = figure.subplots()
-    for field, label, style in (
-        ("alone", "a fit of as many", "o--"),
-        ("levels", "the first of one set, fitted in levels", "o-"),
-        ("sorted", "the most valuable of one set without levels", "s:"),
-    ):
-        axis.plot(points.splats, points[field], style, ms=4, label=label)
+    for key, (label, style) in LINES.items():
+        axis.plot(points.splats, points[key], style, ms=4, label=label)
     for end in points.splats[points.level]:
         axis.axvline(end, color="#888888", lw=0.6)
-    axis.set_xscale("log", base=2)
-    axis.xaxis.set_major_formatter("{x:,.0f}")
-    axis.set(xlabel="Gaussians drawn", ylabel="PSNR in YCbCr / dB")
-    axis.grid(alpha=0.3)
+    label_axes(axis, "Gaussians drawn", "PSNR in YCbCr / dB", subs=(2, 5))
     axis.legend(fontsize=9)
-    figure.suptitle(f"Levels of detail: {name}; lines mark where levels end")
-    return Told([told], [Chart("levels", caption, figure)], {"levels": points})
+    told = table(caption, ("splats", *LINES), lines)
+    return Told([told], {"levels": (caption, figure)}, {"levels": points})

@@ -8,29 +8,18 @@ import numpy as np
 import pandas as pd
 
 from eigengs_bench.harness.store import Row
-from eigengs_bench.report.frames import MISSING, Table, frame_of, number, table
+from eigengs_bench.report.frames import MISSING, Told, frame_of, number, table
 from eigengs_bench.report.sections.methods import groups_of, methods_of
 
 Line = tuple[str, ...]
 
 
-def where_default_loses(fits: Sequence[Row], cells: Sequence[Row]) -> Table:
-    """List what "default" loses, by psnr_ycbcr.
+def where_default_loses(fits: Sequence[Row], cells: Sequence[Row]) -> Told:
+    """List what "default" loses, by psnr_ycbcr, in rows of `tables` and of `stability`.
 
-    Parameters
-    ----------
-    fits : sequence of dict
-        Of `eigengs_bench.experiments.tables.run`. Means over images are compared, of the methods of
-        the main table with the same images: after as many steps, and after as many seconds
-        (medians), when default has its best of all steps that it has taken by then. Before its
-        first set is there, it has none.
-    cells : sequence of dict
-        Of `eigengs_bench.experiments.stability.run`: ends are compared.
-
-    Returns
-    -------
-    Table
-        No lines where default is ahead everywhere.
+    Means over images are compared, of the methods of the main table with the same images: after as
+    many steps, and after as many seconds (medians), when default has its best of all steps that it
+    has taken by then. Before its first set is there, it has none. Of hard cases ends are compared.
     """
     measured, cases = frame_of(fits, "moments"), frame_of(cells)
     lines = [line for key, some in groups_of(measured).items() for line in _of_set(*key, some)]
@@ -38,36 +27,32 @@ def where_default_loses(fits: Sequence[Row], cells: Sequence[Row]) -> Table:
     columns = ("images or case", "when", "who is ahead", "its dB", "dB of default")
     caption = "Where another preset is ahead of default: PSNR YCbCr / dB"
     codes = [code for frame in (measured, cases) if len(frame) for code in frame.code]
-    return table(caption, columns, lines, codes)
+    return Told([table(caption, columns, lines, codes)])
 
 
 def _of_set(name: str, iterations: int, fits: pd.DataFrame) -> Iterator[Line]:
-    fits = methods_of(fits, name, "main")
+    fits, where = methods_of(fits, name, "main"), f"{name}, {iterations:,} steps"
     default = fits[fits.method == "default"]
     ours = _course(default)
-    first = ours.seconds.min() if len(ours) else 0.0
     for method, part in fits[fits.method != "default"].groupby("method", observed=True):
         if set(part.image) != set(default.image):
             continue
-        course, said = _course(part), (f"{name}, {iterations:,} steps",)
+        course, first = _course(part), ours.seconds.min()
         early = course.psnr[(course.seconds < first) & (course.psnr > -np.inf)]
         if len(early):
-            yield *said, f"until {number(first, 3)} s", str(method), number(early.max()), MISSING
+            yield where, f"until {number(first, 3)} s", method, number(early.max()), MISSING
         for step, seconds, theirs in course.itertuples():
             if theirs > ours.psnr[step]:
-                yield *said, f"{step:,} steps", str(method), number(theirs), _told(ours.psnr[step])
-            reached = ours.psnr[ours.seconds <= seconds]
-            if len(reached) and theirs > reached.max():
-                when = f"{number(seconds, 3)} s"
-                yield *said, when, str(method), number(theirs), _told(reached.max())
+                yield where, f"{step:,} steps", method, number(theirs), _told(ours.psnr[step])
+            best = ours.psnr[ours.seconds <= seconds].max()  # NaN before the first
+            if theirs > best:
+                yield where, f"{number(seconds, 3)} s", method, number(theirs), _told(best)
 
 
 def _course(fits: pd.DataFrame) -> pd.DataFrame:
     """Median seconds and mean PSNR by steps. A fit that has failed is behind all others."""
-    known = fits.assign(psnr_ycbcr=fits.psnr_ycbcr.fillna(-np.inf))
-    return known.groupby("iteration").agg(
-        seconds=("seconds", "median"), psnr=("psnr_ycbcr", "mean")
-    )
+    known = fits.assign(psnr=fits.psnr_ycbcr.fillna(-np.inf))
+    return known.groupby("iteration").agg({"seconds": "median", "psnr": "mean"})
 
 
 def _told(decibels: float) -> str:
@@ -76,10 +61,8 @@ def _told(decibels: float) -> str:
 
 def _of_cases(cells: pd.DataFrame) -> Iterator[Line]:
     same = ["case", "iterations", "seed"]
-    ours = cells[cells.preset == "default"].set_index(same).end_ycbcr.fillna(-np.inf)
-    for cell in cells.itertuples():
-        key = (cell.case, cell.iterations, cell.seed)
-        if key in ours.index and cell.end_ycbcr > ours[key]:
-            steps = f"{cell.iterations:,} steps"
-            decibels = number(cell.end_ycbcr), _told(ours[key])
-            yield f"case {cell.case}", steps, cell.preset, *decibels
+    default = cells[cells.preset == "default"].assign(ours=lambda f: f.end_ycbcr.fillna(-np.inf))
+    both = cells.merge(default[[*same, "ours"]], on=same)
+    for cell in both[both.end_ycbcr > both.ours].itertuples():
+        decibels = number(cell.end_ycbcr), _told(cell.ours)
+        yield f"case {cell.case}", f"{cell.iterations:,} steps", cell.preset, *decibels

@@ -7,7 +7,7 @@ from functools import partial
 
 import pandas as pd
 
-from eigengs_bench.experiments.tables import COMPONENTS, ITERATIONS, Method, methods
+from eigengs_bench.experiments.tables import ITERATIONS, Method, methods
 from eigengs_bench.harness.store import Row
 from eigengs_bench.names import NATURAL, SETS
 from eigengs_bench.report.frames import (
@@ -47,92 +47,76 @@ LINES: dict[str, tuple[str, Callable[[pd.Series], str]]] = {
 }
 """Lines of a method: their figures, and what writes a cell of the values of all images."""
 
-CROSS_LINES = ("PSNR YCbCr / dB", "MS-SSIM", f"% above {THRESHOLDS[-1]} dB YCbCr")
+KINDS = {
+    "main": ("Methods", list(LINES)),
+    "cross": ("Bases of other images", ["PSNR YCbCr / dB", "MS-SSIM", "% above 40 dB YCbCr"]),
+    "ablation": ("Colour space and split", ["PSNR YCbCr / dB", "PSNR RGB / dB", "MS-SSIM"]),
+}
+"""Titles and lines of tables; the paper compares each fit in the space it was made in."""
 
 
 def tell(rows: Sequence[Row]) -> Told:
     """Make all tables that rows are enough for.
 
-    Parameters
-    ----------
-    rows : sequence of dict
-        As `eigengs_bench.experiments.tables.run` returns them, of any sets and lengths.
-
-    Returns
-    -------
-    Told
-        All sets at a glance; for each set and number of steps the methods, and bases of other sets;
-        the ablation of all sets; and how soon "default" has what "gaussianimage" has at the end.
+    All sets at a glance; for each set and number of steps the `KINDS`; the paper's figures; and how
+    soon "default" has what "gaussianimage" has at the end.
     """
     groups = groups_of(frame_of(rows, "moments"))
-    made = list(_glances(groups))
+    made, printed = list(_glances(groups)), {}
     for (name, iterations), fits in groups.items():
-        for kind, title in (("main", "Methods"), ("cross", "Bases of other images")):
+        for kind, (title, lines) in KINDS.items():
             chosen = methods_of(fits, name, kind)
-            if chosen.preset.nunique() > 1:
-                lines = list(LINES) if kind == "main" else CROSS_LINES
+            if chosen.method.nunique() > 1:
                 where = f"{_images(name, chosen)}, {iterations:,} steps"
                 made.append(_over_steps(f"{title}: {where}", chosen, lines))
-                made += _printed(name, iterations) if kind == "main" else []
-    return Told([*made, *_ablations(groups), *_reaches(frame_of(r for r in rows if "share" in r))])
+                printed |= {name: PRINTED[name]} if kind == "main" and name in PRINTED else {}
+                printed |= {kind: ABLATION} if kind == "ablation" else {}
+    made += [
+        table(f"What the paper prints, like {name}: PSNR / dB", *p) for name, p in printed.items()
+    ]
+    return Told([*made, *_reaches(frame_of(row for row in rows if "share" in row))])
 
 
 def groups_of(fits: pd.DataFrame) -> dict[tuple[str, int], pd.DataFrame]:
     """Gather the fits of each set and number of steps, in the order of `SETS`."""
-    if fits.empty:
-        return {}
-    groups = dict(iter(fits.groupby(["set", "iterations"])))
-    order = sorted(groups, key=lambda key: (list(SETS).index(key[0]), key[1]))
-    return {(name, int(steps)): groups[name, steps] for name, steps in order}
+    groups = dict(iter(fits.groupby(["set", "iterations"]))) if len(fits) else {}
+    return {
+        key: groups[key] for key in sorted(groups, key=lambda k: (list(SETS).index(k[0]), k[1]))
+    }
 
 
 def methods_of(fits: pd.DataFrame, name: str, kind: str) -> pd.DataFrame:
-    """Choose the fits of a table, with their label as a column "method", ordered as in the table.
-
-    Parameters
-    ----------
-    fits : DataFrame
-        Those of one set and number of steps.
-    name : str
-        The set.
-    kind : str
-        One of `TABLES`.
-    """
+    """Choose the fits of a table of a set, with ordered labels as a column "method"."""
     labels = {method: label(method, name) for method in methods(name, kind, list(SETS))}
     keys = fits[list(Method._fields)].itertuples(index=False, name=None)
     shown = [labels.get(Method(*key)) for key in keys]
-    known = list(dict.fromkeys(labels.values()))
-    chosen = fits.assign(method=pd.Categorical(shown, known, ordered=True))
-    chosen = chosen.dropna(subset="method")
-    return chosen.assign(method=chosen.method.cat.remove_unused_categories())
+    order = pd.CategoricalDtype([text for text in labels.values() if text in shown], ordered=True)
+    return fits.assign(method=pd.Series(shown, fits.index).astype(order)).dropna(subset="method")
 
 
 def label(method: Method, name: str) -> str:
     """Name of a method on a set, for a reader."""
     if not method.source:
         return method.preset
-    basis = "own" if method.source == name else "universal"
-    if method.source not in (name, NATURAL):
-        basis = method.source
+    basis = {name: "own", NATURAL: "universal"}.get(method.source, method.source)
     text = f"{method.preset}, {method.components} components, {basis} basis"
-    return text if method.split == "auto" else f"{text}, {method.color}, {method.split}"
+    return text if method.split == "auto" else f"{method.preset}, {method.color}, {method.split}"
 
 
 def _glances(groups: dict[tuple[str, int], pd.DataFrame]) -> Iterator[Table]:
     """One line a set and method: means of the PSNR over steps, and the time of all of them."""
     for length in sorted({steps for _, steps in groups}):
         steps, lines, codes = [*(s for s in ITERATIONS if s < length), length], [], list[str]()
-        for (name, own), fits in groups.items():
-            chosen = methods_of(fits, name, "main") if own == length else fits[:0]
+        for name in (name for name, own in groups if own == length):
+            chosen = methods_of(groups[name, length], name, "main")
             codes += chosen.code.tolist()
-            for method, part in chosen.groupby("method", observed=True) if len(chosen) else ():
-                looked = {step: part[part.iteration == step] for step in steps}
-                means = (mean(looked[step].psnr_ycbcr) for step in steps)
-                images = str(part.image.nunique())
-                lines.append((name, method, images, *means, _seconds(looked[length].seconds)))
+            for method, part in chosen.groupby("method", observed=True):
+                means = (mean(part.psnr_ycbcr[part.iteration == step]) for step in steps)
+                seconds = _seconds(part.seconds[part.iteration == length])
+                lines.append((name, method, str(part.image.nunique()), *means, seconds))
         if lines:
             caption = (
-                f"PSNR YCbCr / dB by steps, means over images, and seconds of all {length:,} steps"
+                f"PSNR YCbCr / dB by steps, means over images, and seconds of {length:,} steps"
             )
             columns = ("set", "method", "images", *(f"{s:,}" for s in steps), "seconds")
             yield table(caption, columns, lines, codes)
@@ -141,80 +125,30 @@ def _glances(groups: dict[tuple[str, int], pd.DataFrame]) -> Iterator[Table]:
 def _images(name: str, fits: pd.DataFrame) -> str:
     """What was fitted, for a caption."""
     chosen, counts = SETS[name], fits.groupby("method", observed=True).image.nunique()
-    images = counted(counts.max(), "image")
-    if counts.min() < counts.max():
-        images = f"{counts.min()} to {images}"
-    return f"{name}, {images} of {chosen.width}x{chosen.height}, {chosen.gaussians:,} Gaussians"
+    least = f"{counts.min()} to " if counts.min() < counts.max() else ""
+    size = f"{chosen.width}x{chosen.height}"
+    return f"{name}, {least}{counted(counts.max())} of {size}, {chosen.gaussians:,} Gaussians"
 
 
 def _over_steps(caption: str, fits: pd.DataFrame, lines: Sequence[str]) -> Table:
     """One line a method and figure, one column a step."""
     groups = fits.groupby(["method", "iteration"], observed=True)
     cells = {line: groups[LINES[line][0]].agg(LINES[line][1]).unstack() for line in lines}
-    frame = pd.concat(cells, names=["figure", "method"]).swaplevel().fillna(MISSING)
-    frame = frame.reindex(pd.MultiIndex.from_product([fits.method.cat.categories, list(lines)]))
-    frame.columns = [f"{step:,}" for step in frame.columns]
-    frame.index.names = ["method", "figure"]
-    frame = frame.reset_index()
-    return table(caption, frame.columns, frame.to_numpy(), fits.code)
-
-
-def _printed(name: str, iterations: int) -> list[Table]:
-    """What the paper prints for images of that kind."""
-    if name not in PRINTED:
-        return []
-    steps = sorted({step for row in PRINTED[name] for step in row.psnr if step <= iterations})
-    cells = [
-        (row.images, row.method, *(number(row.psnr.get(step)) for step in steps))
-        for row in PRINTED[name]
-    ]
-    caption = f"What the paper prints for images like {name}: PSNR YCbCr / dB"
-    return [table(caption, ("images", "method", *(f"{step:,}" for step in steps)), cells)]
-
-
-def _ablations(groups: dict[tuple[str, int], pd.DataFrame]) -> Iterator[Table]:
-    """Colour space and split at the last step, and what the PSNR itself makes of the spaces."""
-    made = False
-    for length in sorted({steps for _, steps in groups}):
-        cells, codes = [], list[str]()
-        for (name, steps), fits in groups.items():
-            own = methods_of(fits, name, "ablation")
-            own = own[own.iteration == own.iterations]
-            if steps != length or own.method.nunique() < 4:
-                continue
-            codes += own.code.tolist()
-            for _, part in own.groupby("method", observed=True):
-                split, color = part.split.iloc[0], part.color.iloc[0]
-                figures = [spread(part[f"psnr_{space}"]) for space in ("ycbcr", "rgb", color)]
-                figures.insert(2, spread(part.ms_ssim, 3))
-                cells.append((name, split, color, *figures))
-        if cells:
-            made = True
-            caption = (
-                f"Colour space and split: eigengs, {COMPONENTS[0]} components, after {length:,} "
-                "steps, dB; 'as compared': each fit in the space it was made in"
-            )
-            psnrs = ("PSNR YCbCr", "PSNR RGB", "MS-SSIM", "as compared")
-            yield table(caption, ("set", "split", "fitted in", *psnrs), cells, codes)
-    if made:
-        columns = list(next(iter(ABLATION.values())))
-        lines = [
-            (split, color, *(number(figures[column]) for column in columns))
-            for (color, split), figures in ABLATION.items()
-        ]
-        caption = "Colour space and split in the paper, after 10,000 steps: PSNR / dB"
-        yield table(caption, ("split", "fitted in", *columns), lines)
+    order = pd.MultiIndex.from_product([fits.method.cat.categories, lines])
+    frame = pd.concat(cells).swaplevel().reindex(order).fillna(MISSING)
+    texts = frame.rename_axis(["method", "figure"]).reset_index()
+    return table(
+        caption, ["method", "figure", *(f"{s:,}" for s in frame)], texts.to_numpy(), fits.code
+    )
 
 
 def _reaches(found: pd.DataFrame) -> Iterator[Table]:
-    if found.empty:
-        return
     lines = []
     for (name, iterations), part in groups_of(found).items():
         some = part.dropna(subset="share")
-        times = quartiles(some.seconds, 3), quartiles(some.share, 4)
-        worst = number(some.share.max(), 4)
-        lines.append((name, f"{iterations:,}", f"{len(some)} of {len(part)}", *times, worst))
+        times = quartiles(some.seconds, 3), quartiles(some.share, 4), number(some.share.max(), 4)
+        lines.append((name, f"{iterations:,}", f"{len(some)} of {len(part)}", *times))
     caption = "Time in which default has what gaussianimage has at its last step, from the start"
     columns = ("set", "its steps", "images", "seconds", "share of its time", "largest share")
-    yield table(caption, columns, lines, found.code)
+    if lines:
+        yield table(caption, columns, lines, found.code)

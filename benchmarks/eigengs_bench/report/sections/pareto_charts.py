@@ -10,48 +10,33 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from eigengs_bench.experiments.pareto import DEFAULT_COMPONENTS
-from eigengs_bench.report.charts import COLORS, INK, logarithmic, new_figure
+from eigengs_bench.report.charts import COLORS, INK, label_axes, new_figure
 from eigengs_bench.report.frames import counted
-from eigengs_dr.rendering import CUTOFF
 
 KNOBS = {
-    "init": ("Where splats start", "#8a4f9e", "s"),
-    "solve steps": ("Steps of the colour solve", "#c27c0e", "^"),
-    "cutoff": ("Cutoff in standard deviations", "#7a5c43", "D"),
-    "gaussians": ("Number of Gaussians", "#1f9e89", "v"),
-    "components": ("Components a channel of eigengs", "#5a8f3c", "P"),
+    "init": ("Where splats start", "#8a4f9e", "s", "adaptive"),
+    "solve steps": ("Steps of the colour solve", "#c27c0e", "^", "10"),
+    "cutoff": ("Cutoff in standard deviations", "#7a5c43", "D", "3"),
+    "gaussians": ("Number of Gaussians", "#1f9e89", "v", ""),
+    "components": ("Components a channel of eigengs", "#5a8f3c", "P", "300"),
 }
-"""What a knob is, its colour and its marker; presets have lines of their own."""
+"""What a knob is, its colour and marker, and its value in the default fit (or that of eigengs)."""
 
-DEFAULTS = {
-    "init": "adaptive",
-    "solve steps": "10",
-    "cutoff": f"{CUTOFF:g}",
-    "components": str(DEFAULT_COMPONENTS),
-}
-"""Values of the knobs in the default fit, and in that of the preset "eigengs"."""
+LABELS = ("seconds, start included", "PSNR in YCbCr / dB")
 
 
 def set_chart(points: pd.DataFrame, name: str) -> Figure:
-    """Draw all fits of a set and their front, and below a panel a setting.
-
-    Parameters
-    ----------
-    points : DataFrame
-        From `eigengs_bench.report.sections.pareto.points_of`.
-    name : str
-        The set, for the title.
-    """
+    """Draw all fits of a set (see `points_of`) and their front, and below a panel a setting."""
     knobs = [knob for knob in KNOBS if (points.knob == knob).any()]
-    figure = new_figure(10, 11.5)
+    images = counted(points.images.max())
+    figure = new_figure(
+        10, 11.5, f"Speed against accuracy: {name}, {images}; up and left is better"
+    )
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.1, 1))[:, 0]
-    images = counted(points.images.max(), "image")
-    figure.suptitle(f"Speed against accuracy: {name}, {images}; up and left is better")
     axis = upper.subplots()
     _overview(axis, points)
     upper.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
-    axes = lower.subplots(2, 3 if len(knobs) > 4 else 2).flatten()
+    axes = lower.subplots(2, 3).flatten()
     for axis, knob in zip(axes, knobs, strict=False):
         _panel(axis, points, knob)
     for axis in axes[len(knobs) :]:
@@ -61,72 +46,46 @@ def set_chart(points: pd.DataFrame, name: str) -> Figure:
 
 def _overview(axis: Axes, points: pd.DataFrame) -> None:
     """All points, the lines of the methods, and the front with its names."""
-    for knob, (title, color, marker) in KNOBS.items():
-        some = points[points.knob == knob]
-        if len(some):
-            style: Any = {"color": color, "marker": marker, "linestyle": "none"}
-            axis.plot(some.seconds, some.psnr_ycbcr, **style, ms=5, alpha=0.75, label=title)
+    for knob, (title, color, marker, _) in KNOBS.items():
+        if len(some := points[points.knob == knob]):
+            _plot(axis, some, title, color=color, marker=marker, ls="none", ms=5, alpha=0.75)
     for preset, color in COLORS.items():
-        line = _line(points, "preset", preset)
-        if len(line):
-            axis.plot(line.seconds, line.psnr_ycbcr, color=color, marker="o", lw=1.5, label=preset)
-    for column, style in (
-        ("front_same", {"lw": 1.2, "ls": "--"}),
-        ("front", {"lw": 8, "alpha": 0.18}),
-    ):
-        edge = points[points[column] == 1].sort_values(["seconds", "psnr_ycbcr"])
-        label = "front: none is better"
-        if column == "front_same" and len(edge):
-            label = f"front of those with {edge.gaussians.iloc[0]:,} splats"
-        axis.plot(edge.seconds, edge.psnr_ycbcr, color=INK, label=label, **style)
-    _label_axes(axis)
+        if len(line := _line(points, "preset", preset)):
+            _plot(axis, line, preset, color=color, marker="o")
+    same = points[points.front_same == 1].sort_values("seconds")
+    label = f"front of those with {same.gaussians.max():,} splats"
+    _plot(axis, same, label, color=INK, lw=1.2, ls="--")
+    edge = points[points.front == 1].sort_values("seconds")
+    _plot(axis, edge, "front: none is better", color=INK, lw=8, alpha=0.18)
+    label_axes(axis, *LABELS)
     axis.set_xlim(points.seconds.min() / 6)  # room for names on the left of the points
-    _name(axis, edge)
-
-
-def _name(axis: Axes, edge: pd.DataFrame) -> None:
-    """Write beside the points of the front what they are: above and left of it nothing lies."""
     low, high = axis.get_ylim()
     taken = np.inf
-    for point in edge[::-1].itertuples():
+    for point in edge[::-1].itertuples():  # above and left of the front nothing lies
         if taken - point.psnr_ycbcr > 0.03 * (high - low):
-            value = _text(point.value)
-            named = {"gaussians": f"{value} splats", "preset": value}
-            axis.annotate(
-                f"{named.get(point.knob, f'{point.knob} {value}')}, {point.iteration:,} steps",
-                (point.seconds, point.psnr_ycbcr),
-                (-6, 3),
-                textcoords="offset points",
-                ha="right",
-                fontsize=8.5,
-                color=INK,
-            )
-            taken = point.psnr_ycbcr
+            named = f"{point.knob} {_text(point.value)}, {point.iteration:,} steps"
+            place, taken = (point.seconds, point.psnr_ycbcr), point.psnr_ycbcr
+            style: Any = {"textcoords": "offset points", "ha": "right", "fontsize": 8.5}
+            axis.annotate(named, place, (-6, 3), **style)
 
 
 def _panel(axis: Axes, points: pd.DataFrame, knob: str) -> None:
     """The fits that differ in one setting, and the one that they differ from."""
-    title, color, marker = KNOBS[knob]
+    title, color, marker, usual = KNOBS[knob]
     base = "eigengs" if knob == "components" else "default"
     values = points.value[points.knob == knob].unique()
     for value, strength in zip(values, np.linspace(0.35, 1, len(values)), strict=True):
-        line = _line(points, knob, value)
         shade = tuple(1 - float(strength) * (1 - part) for part in to_rgb(color))
-        style: Any = {"color": shade, "marker": marker, "ms": 4}
-        axis.plot(line.seconds, line.psnr_ycbcr, **style, label=_text(value))
+        _plot(axis, _line(points, knob, value), _text(value), color=shade, marker=marker, ms=4)
     line = _line(points, "preset", base)
-    usual = DEFAULTS.get(knob) or _text(line.gaussians.iloc[0])
-    axis.plot(line.seconds, line.psnr_ycbcr, color=INK, lw=2.5, label=f"{usual} ({base})")
-    axis.set_title(title, fontsize=10)
+    usual = usual or _text(line.gaussians.iloc[0])
+    _plot(axis, line, f"{usual} ({base})", color=INK, lw=2.5)
+    label_axes(axis, *LABELS, title=title)
     axis.legend(fontsize=8, framealpha=0.6)
-    _label_axes(axis)
 
 
-def _label_axes(axis: Axes) -> None:
-    logarithmic(axis)
-    axis.set_xlabel("seconds, start included", fontsize=9)
-    axis.set_ylabel("PSNR in YCbCr / dB", fontsize=9)
-    axis.grid(alpha=0.3)
+def _plot(axis: Axes, points: pd.DataFrame, label: str, **style: Any) -> None:
+    axis.plot(points.seconds, points.psnr_ycbcr, label=label, **style)
 
 
 def _line(points: pd.DataFrame, knob: str, value: str | float) -> pd.DataFrame:
@@ -138,38 +97,20 @@ def _text(value: str | float) -> str:
 
 
 def kernels_chart(kernels: pd.DataFrame) -> Figure:
-    """Draw what the cutoff leaves out of a picture over the time that it takes.
-
-    Parameters
-    ----------
-    kernels : DataFrame
-        See `eigengs_bench.experiments.pareto.kernel_job`.
-    """
+    """Draw what the cutoff leaves out of a picture over the time that it takes."""
     figure = new_figure(10, 4.6)
     panels = {"forward_ms": "Forward", "step_ms": "Forward and reverse"}
     for axis, (what, title) in zip(figure.subplots(1, 2, sharey=True), panels.items(), strict=True):
-        for renderer, color, whose in (
-            ("fast", COLORS["default"], "our kernels"),
-            ("plain", COLORS["gaussianimage"], "plain Dr.Jit"),
-        ):
+        for renderer, color in (("fast", COLORS["default"]), ("plain", COLORS["gaussianimage"])):
             mine = kernels[kernels.renderer == renderer]
-            for error, style, label in (
-                ("largest_error", "o-", "largest"),
-                ("rms_error", "s--", "root mean square"),
-            ):
-                axis.plot(mine[what], mine[error], style, color=color, label=f"{whose}, {label}")
+            for error, style in (("largest_error", "o-"), ("rms_error", "s--")):
+                label = f"{renderer}, {error.replace('_', ' ')}"
+                axis.plot(mine[what], mine[error], style, color=color, label=label)
             for row in mine.itertuples():
                 place = (getattr(row, what), row.largest_error)
-                text = f"{row.cutoff:g} sigma"
-                axis.annotate(text, place, (5, 4), textcoords="offset points", fontsize=8.5)
-        logarithmic(axis)
-        axis.set(yscale="log", xlabel="milliseconds", title=title)
-        axis.margins(0.2, 0.08)
-        axis.grid(alpha=0.3)
-    first = figure.axes[0]
-    first.set_ylabel("error of a picture (1 is white)")
-    handles, labels = first.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9)
+                axis.annotate(f"{row.cutoff:g} sigma", place, fontsize=8.5)
+        label_axes(axis, "milliseconds", "error (1 is white)", title=title, yscale="log")
+    figure.axes[0].legend(fontsize=9)
     return figure
 
 
@@ -178,21 +119,14 @@ def storage_chart(stored: pd.DataFrame) -> Figure:
     figure = new_figure(8, 4.6)
     axis = figure.subplots()
     groups = stored.groupby(["set", "precision"], sort=False)
-    means = groups.agg(bytes=("bytes", "first"), psnr=("psnr_ycbcr", "mean")).reset_index()
-    means["size"] = means.bytes / 1024
+    means = groups.agg({"bytes": "first", "psnr_ycbcr": "mean"}).reset_index()
     for name, part in means.groupby("set", sort=False):
         bits = part[part.precision.str.contains("bits")]
         floats = part[part.precision.str.contains("float")]
-        (line,) = axis.plot(bits["size"], bits.psnr, "o-", label=name)
-        axis.plot(floats["size"], floats.psnr, "D", mfc="none", color=line.get_color())
-    highest = means.groupby(["precision", "size"], sort=False).psnr.max()
-    for (precision, size), decibels in highest.items():
-        # 16 bits and float16 take as much: one is named on the left, one on the right.
-        away, side = ((8, -3), "left") if "float" in precision else ((-5, 5), "right")
-        place = (size, decibels)
-        axis.annotate(precision, place, away, textcoords="offset points", ha=side, fontsize=9)
-    axis.set(xlabel="KiB", ylabel="PSNR in YCbCr / dB")
-    axis.margins(0.15, 0.12)
-    axis.grid(alpha=0.3)
+        (line,) = axis.plot(bits.bytes / 1024, bits.psnr_ycbcr, "o-", label=name)
+        axis.plot(floats.bytes / 1024, floats.psnr_ycbcr, "D", mfc="none", color=line.get_color())
+        for row in part.itertuples():
+            axis.annotate(row.precision, (row.bytes / 1024, row.psnr_ycbcr), fontsize=9)
+    label_axes(axis, "KiB", "PSNR in YCbCr / dB", "")
     axis.legend(fontsize=9)
     return figure

@@ -9,10 +9,9 @@ from matplotlib.figure import Figure
 
 from eigengs_bench.experiments.rate import CODECS, OURS
 from eigengs_bench.harness.store import Row
-from eigengs_bench.report.charts import logarithmic, new_figure
+from eigengs_bench.report.charts import label_axes, new_figure
 from eigengs_bench.report.frames import (
     MISSING,
-    Chart,
     Table,
     Told,
     counted,
@@ -27,65 +26,47 @@ from eigengs_bench.report.frames import (
 LEVELS = (28.0, 32.0, 36.0)
 """Decibels of PSNR in 8-bit RGB at which the sizes of files are compared."""
 
-CODEC_STYLES = {
-    OURS: ("#0b6e99", "o-"),
-    "JPEG 4:2:0": ("#c27c0e", "s--"),
-    "JPEG 4:4:4": ("#b5442f", "D--"),
-    "WebP": ("#5a8f3c", "^--"),
-}
+STYLES = dict(
+    zip(
+        (OURS, *CODECS),
+        (("#0b6e99", "o-"), ("#c27c0e", "s--"), ("#b5442f", "D--"), ("#5a8f3c", "^--")),
+        strict=True,
+    )
+)
 """Colours and markers of the curves."""
+
+CAPTION = "Means over the images; fits of several numbers of Gaussians, packed."
 
 
 def tell(rows: Sequence[Row]) -> Told:
-    """Lay out the bits a pixel that each codec takes for a PSNR: a table and a chart a set.
-
-    Parameters
-    ----------
-    rows : sequence of dict
-        Of `eigengs_bench.experiments.rate.run`.
-    """
-    points = frame_of(rows, "points")
-    tables, charts = [], []
-    for name, part in points.groupby("set", sort=False):
-        tables.append(_table(str(name), part))
-        caption = "Means over the images; fits of several numbers of Gaussians, packed."
-        caption += remark(part.code)
-        charts.append(Chart(f"rate-{name}", caption, _chart(part, str(name))))
+    """Lay out the bits a pixel that each codec takes for a PSNR: a table and a chart a set."""
+    tables, charts = [], {}
+    for name, part in frame_of(rows, "points").groupby("set", sort=False):
+        tables.append(_table(name, part))
+        charts[f"rate-{name}"] = CAPTION + remark(part.code), _chart(part, name)
     return Told(tables, charts)
 
 
-def rates(points: pd.DataFrame) -> pd.DataFrame:
-    """Interpolate the bits a pixel at `LEVELS`, a line an image, columns codec and level.
-
-    NaN where a curve does not reach a level.
-    """
-    found = {}
-    for (image, codec), part in points.groupby(["image", "codec"], sort=False):
-        curve = dict(zip(part.bits_per_pixel, part.psnr_rgb, strict=True))
-        for level in LEVELS:
-            found[image, codec, level] = smallest(curve, level)
-    return pd.Series(found).unstack([1, 2])
+def rates(points: pd.DataFrame, level: float) -> pd.DataFrame:
+    """Interpolate bits a pixel at a PSNR: a line an image that all codecs reach it on."""
+    found = {
+        key: smallest(dict(zip(part.bits_per_pixel, part.psnr_rgb, strict=True)), level)
+        for key, part in points.groupby(["image", "codec"], sort=False)
+    }
+    return pd.Series(found).unstack().dropna()
 
 
 def _table(name: str, points: pd.DataFrame) -> Table:
-    found, counts, means = rates(points), list[str](), {}
-    for level in LEVELS:
-        of_level = found.xs(level, axis=1, level=1).dropna()
-        counts.append(str(len(of_level)))
-        means[level] = of_level
-    lines = [
-        (
-            codec,
-            *(_compared(means[level], codec) for level in LEVELS),
-            quartiles(points.seconds[points.codec == codec]),
-        )
-        for codec in (OURS, *CODECS)
-    ]
-    lines.append(("images that all reach", *counts, MISSING))
+    found = [rates(points, level) for level in LEVELS]
+    lines = []
+    for codec in STYLES:
+        seconds = quartiles(points.seconds[points.codec == codec])
+        lines.append((codec, *(_compared(sizes, codec) for sizes in found), seconds))
+    lines.append(("images that all reach", *(str(len(sizes)) for sizes in found), MISSING))
     caption = (
-        f"{name}, {counted(points.image.nunique(), 'image')}: bits a pixel for a PSNR in 8-bit "
-        "RGB, interpolated; in brackets those of JPEG and WebP over ours, and on how many images "
-        "ours are fewer (images that were JPEG files once suit JPEG)"
+        f"{name}, {counted(points.image.nunique())}: bits a pixel for a PSNR in 8-bit RGB, "
+        "interpolated; in brackets those of JPEG and WebP over ours, and on how many images ours "
+        "are fewer (images that were JPEG files once suit JPEG)"
     )
     columns = ("codec", *(f"{level:g} dB" for level in LEVELS), "s")
     return table(caption, columns, lines, points.code)
@@ -95,31 +76,25 @@ def _compared(sizes: pd.DataFrame, codec: str) -> str:
     """Mean bits a pixel; of another codec also over ours, and how often ours are fewer."""
     if sizes.empty:
         return MISSING
-    mean = number(sizes[codec].mean(), 2)
-    if codec == OURS:
-        return mean
-    fewer = int((sizes[OURS] < sizes[codec]).sum())
-    return f"{mean} ({sizes[codec].mean() / sizes[OURS].mean():.2f}, {fewer})"
+    mean, ours = sizes[codec].mean(), sizes[OURS]
+    fewer = int((ours < sizes[codec]).sum())
+    more = "" if codec == OURS else f" ({mean / ours.mean():.2f}, {fewer})"
+    return number(mean, 2) + more
 
 
 def _chart(points: pd.DataFrame, name: str) -> Figure:
     """Draw PSNR in RGB and SSIM over bits a pixel: means over the images, a point a setting."""
-    figure = new_figure(10, 4.8)
-    labels = {"psnr_rgb": "PSNR in 8-bit RGB / dB", "ssim": "SSIM"}
+    images = counted(points.image.nunique())
+    figure = new_figure(10, 4.8, f"Rate against distortion: {name}, {images}")
     points = points.sort_values("setting", kind="stable")
     # Fits have other numbers of splats on images of other sizes: the n-th are one point.
-    rank = points.groupby(["codec", "image"]).cumcount()
+    rank = points.groupby(["codec", "image"]).cumcount().rename("rank")
+    means = points.groupby(["codec", rank])[["bits_per_pixel", "psnr_rgb", "ssim"]].mean()
+    labels = {"psnr_rgb": "PSNR in 8-bit RGB / dB", "ssim": "SSIM"}
     for axis, (what, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
-        for codec, (color, style) in CODEC_STYLES.items():
-            mine = points[points.codec == codec]
-            means = mine.groupby(rank)[["bits_per_pixel", what]].agg(
-                lambda values: values.mean(skipna=False)
-            )
-            axis.plot(*means.to_numpy().T, style, color=color, ms=4, label=codec)
-        logarithmic(axis, "x", (2, 5))
-        axis.set(xlabel="bits a pixel", ylabel=label)
-        axis.grid(alpha=0.3)
+        for codec, (color, style) in STYLES.items():
+            curve = means.loc[codec]
+            axis.plot(curve.bits_per_pixel, curve[what], style, color=color, ms=4, label=codec)
+        label_axes(axis, "bits a pixel", label, "x", (2, 5))
     figure.axes[0].legend(fontsize=9)
-    images = counted(points.image.nunique(), "image")
-    figure.suptitle(f"Rate against distortion: {name}, {images}")
     return figure

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 
 import pandas as pd
 
@@ -19,27 +17,20 @@ NOT_FINITE = "not finite"
 
 
 def tell(rows: Sequence[Row]) -> Told:
-    """Lay the matrix out.
-
-    Parameters
-    ----------
-    rows : sequence of dict
-        As `eigengs_bench.experiments.stability.run` returns them.
-    """
+    """Lay the matrix out, and list what is wrong with default."""
     counts = sorted({row["job"]["iterations"] for row in rows})
     steps = " or ".join(f"{count:,}" for count in counts)
-    return Told([_matrix(f"{caption}; {steps} steps", cell, rows) for caption, cell in FIGURES])
+    matrix = [_matrix(f"{caption}; {steps} steps", cell, rows) for caption, cell in FIGURES]
+    found = [(line,) for line in defects(rows)]
+    caption = "Cells of default that are not finite, or end below their start"
+    codes = (code_name(row["run"]) for row in rows)
+    return Told([*matrix, table(caption, ("cell",), found, codes)])
 
 
 def defects(rows: Iterable[Row], preset: str = "default") -> list[str]:
-    """Name the cells of a preset that are not finite, or end below their start: one line each.
-
-    An end counts as below if its psnr_ycbcr is by more than `TOLERANCE`, both at most `EXACT`.
-    """
+    """Name the cells of a preset that are not finite, or end below their start: one line each."""
     found = []
-    for row in rows:
-        if row["job"]["preset"] != preset or "needs" in row:
-            continue
+    for row in (row for row in rows if row["job"]["preset"] == preset and "needs" not in row):
         if not row["finite"]:
             found.append(f"{row['job']['case']}: {NOT_FINITE}")
         elif (lost := row["start_ycbcr"] - row["end_ycbcr"]) > TOLERANCE:
@@ -51,11 +42,10 @@ def _matrix(caption: str, cell: Callable[[Row], str], rows: Sequence[Row]) -> Ta
     """Put a figure of every case and preset into a matrix; of equal ones the last is shown."""
     written = pd.DataFrame([{**row["job"], "cell": cell(row)} for row in rows])
     written = written.drop_duplicates(["case", "preset"], keep="last")
-    matrix = written.pivot(index="case", columns="preset", values="cell").fillna(MISSING)
+    matrix = written.pivot(index="case", columns="preset", values="cell")
     matrix = matrix.reindex(index=written.case.unique(), columns=written.preset.unique())
     matrix = matrix.fillna(MISSING).reset_index()
-    codes = (code_name(row["run"]) for row in rows)
-    return table(caption, matrix.columns, matrix.to_numpy(), codes)
+    return table(caption, matrix, matrix.to_numpy(), (code_name(row["run"]) for row in rows))
 
 
 def _ends(row: Row) -> str:
@@ -70,16 +60,12 @@ def _decibels(value: float | None) -> str:
     return "exact" if value == EXACT else number(value)
 
 
-def _ratio(value: float | None) -> str:
+def _ratio(row: Row) -> str:
+    value = row.get("condition")
     return number(value, 0) if value is None or value < 1e5 else f"{value:.1e}"
 
 
-def _of(key: str, write: Callable[[float | None], str]) -> Callable[[Row], str]:
-    """Make the writer of a figure that may be missing."""
-    return lambda row: write(row.get(key))
-
-
-def _stored(row: Row) -> str:
+def _half(row: Row) -> str:
     """Decibels that half precision takes from the end."""
     if row.get("half_rgb") is None:
         return MISSING
@@ -87,17 +73,17 @@ def _stored(row: Row) -> str:
 
 
 def _cost(row: Row) -> str:
-    memory = row.get("peak_gib") or math.nan
-    return number(row.get("seconds"), 1) + (f" ({memory:.1f} GiB)" if memory == memory else "")
+    memory = row.get("peak_gib")
+    return number(row.get("seconds"), 1) + (f" ({memory:.1f} GiB)" if memory else "")
 
 
 FIGURES: tuple[tuple[str, Callable[[Row], str]], ...] = (
     ("PSNR in dB, YCbCr, at the end, from the start", _ends),
-    ("PSNR in dB, 8-bit RGB, at the end", _of("end_rgb", _decibels)),
-    ("dB from the best moment to the last, YCbCr", _of("drop_ycbcr", partial(number, decimals=2))),
-    ("dB that half precision takes, 8-bit RGB", _stored),
-    ("Highest condition number of a covariance", _of("condition", _ratio)),
-    ("Tiling, 8-bit levels", _of("tiling", partial(number, decimals=2))),
+    ("PSNR in dB, 8-bit RGB, at the end", lambda row: _decibels(row.get("end_rgb"))),
+    ("dB from the best moment to the last, YCbCr", lambda row: number(row.get("drop_ycbcr"), 2)),
+    ("dB that half precision takes, 8-bit RGB", _half),
+    ("Highest condition number of a covariance", _ratio),
+    ("Tiling, 8-bit levels", lambda row: number(row.get("tiling"), 2)),
     ("Seconds, and the peak of memory", _cost),
 )
 """Captions of the tables, and what writes a cell of each."""
