@@ -5,12 +5,13 @@ What the commands need is imported inside them, so that ``--help`` and mistakes 
 
 import json
 import math
+from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 import click
 
 from .backend import select
-from .cli_bench import bench
 from .cli_fit import fit
 from .cli_info import info
 from .cli_pack import pack
@@ -48,8 +49,32 @@ main.add_command(fit)
 main.add_command(train)
 main.add_command(info)
 main.add_command(pack)
-main.add_command(bench)
 main.add_command(scene)
+
+
+class Benchmarks(click.Group):
+    """The commands of the benchmarks, a distribution of its own, loaded when one is used."""
+
+    def list_commands(self, context: click.Context) -> list[str]:
+        """Names of the commands."""
+        return _benchmarks().list_commands(context)
+
+    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+        """One of the commands; None where none has this name."""
+        return _benchmarks().get_command(context, name)
+
+
+main.add_command(Benchmarks("bench", help="Measure speed and accuracy."))
+
+
+def _benchmarks() -> Any:
+    """Load the group of commands that the installed benchmarks offer."""
+    for entry in entry_points(group="eigengs_dr.commands", name="bench"):
+        return entry.load()
+    raise click.UsageError(
+        "the benchmarks are not installed; in a checkout of eigengs-dr, run: "
+        "pip install ./benchmarks"
+    )
 
 
 @main.command()

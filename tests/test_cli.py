@@ -203,7 +203,7 @@ def test_doctor():
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["fit"], ["train"], ["render"], ["info"], ["doctor"], ["bench"]]
+    "command", [[], ["fit"], ["train"], ["render"], ["info"], ["doctor"]]
 )
 def test_help_has_an_example(command):
     text = succeeded(run(*command, "--help")).stdout
@@ -328,14 +328,6 @@ def test_unwritable_outputs(photo, existing, tmp_path, monkeypatch):
 def test_outputs_of_the_wrong_kind(photo, existing, tmp_path):
     assert_refused(run("fit", photo, "-o", tmp_path / "x.png"), "x.png", ".npz")
     assert_refused(run("fit", photo, "-o", existing, "--preview", tmp_path / "p.txt"), ".png")
-
-
-@pytest.mark.parametrize(
-    "command",
-    ["pareto", "rate", "budget", "levels", "stability", "figures", "tables .", "report ."],
-)
-def test_results_into_a_file(photo, command):
-    assert_refused(run("bench", *command.split(), "-o", photo), "'-o'", photo, "is a file")
 
 
 def test_outputs_that_would_overwrite_each_other(photo, existing, tmp_path):

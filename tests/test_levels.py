@@ -1,6 +1,5 @@
 """Levels of detail: prefixes of a set that make the image too."""
 
-import csv
 import json
 from itertools import pairwise
 
@@ -179,32 +178,3 @@ def test_levels_keep_the_background(image):
 def test_as_many_as_fit_takes_by_default(image):
     small = image[:4, :4]
     assert len(fit_levels(small, levels=2, iterations=0).gaussians) == 16
-
-
-def test_bench_draws_what_prefixes_are_worth(image, tmp_path):
-    photo, out = tmp_path / "a.png", tmp_path / "out"
-    eg.save_image(photo, image)
-    settings = ["--gaussians", 64, "--levels", 3, "--iterations", 20]
-    done = run("bench", "levels", photo, "-o", out, *settings)
-    assert done.exit_code == 0, done.stderr
-    lines = list(csv.DictReader((out / "levels.csv").open()))
-    assert [int(line["splats"]) for line in lines] == [4, 8, 16, 32, 64]
-    assert [line["level"] for line in lines] == ["True", "False", "True", "False", "True"]
-    own = reached(eg.fit(image, 8, iterations=20).gaussians, image)
-    assert float(lines[1]["alone"]) == pytest.approx(own, abs=1e-6)
-    # All of a set, in whatever order.
-    assert float(lines[-1]["alone"]) == pytest.approx(float(lines[-1]["sorted"]), abs=1e-4)
-    assert float(lines[0]["levels"]) > float(lines[0]["sorted"])
-    assert "8   " in done.stdout and (out / "levels.svg").stat().st_size > 1000
-
-
-def test_bench_ends_with_a_fit_that_was_broken_off(image, tmp_path, monkeypatch):
-    from eigengs_dr.bench import levels
-
-    broken = fit_levels(image, 16, 2, iterations=0)._replace(stopped="interrupted")
-    monkeypatch.setattr(levels, "fit_levels", lambda *rest, **settings: broken)
-    photo, out = tmp_path / "a.png", tmp_path / "out"
-    eg.save_image(photo, image)
-    settings = ["--gaussians", 16, "--levels", 2]
-    assert run("bench", "levels", photo, "-o", out, *settings).exit_code == 130
-    assert not list(out.iterdir())

@@ -99,7 +99,8 @@ def measures_rows(file: str, iterations: int | None = 1000) -> Any:
                 told = command(task, names=names, **settings)
             save(told, output, quiet)
 
-        steps = count_option("--iterations", iterations, "Steps of every fit, or the most.", 0)
+        least = 0 if iterations is None else 1
+        steps = count_option("--iterations", iterations, "Steps of every fit, or the most.", least)
         options = (output_option, steps, seed_option, backend_option, quiet_option)
         return _chain(*options, click.pass_context)(wrapped)
 

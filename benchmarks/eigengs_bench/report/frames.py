@@ -109,7 +109,7 @@ def span(values: pd.Series, decimals: int) -> tuple[str, str]:
 
 def counted(count: int, noun: str = "image") -> str:
     """Write a number of things: "1 image", "3 images"."""
-    return f"{count} {noun}{'s'[: count != 1]}"
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def smallest(curve: Mapping[Any, float], target: float) -> float:

@@ -78,8 +78,8 @@ def _savings(name: str, points: pd.DataFrame) -> Table:
         cells += [quartiles(some.ratio), number(some.fit_psnr.median(skipna=False), 2)]
         lines.append((f"{target:g} dB", *cells))
     caption = (
-        f"{name}, {counted(points.image.nunique())}: the smallest fixed number of splats for a PSNR "
-        "in YCbCr, placed once, and what the search finds; seconds of the search, also over those "
+        f"{name}, {counted(points.image.nunique())}: the smallest fixed number of splats for a "
+        "PSNR in YCbCr, placed once, and what the search finds; seconds of the search, also over those "
         "of a default fit of as many, and what that fit reaches"
     )
     columns = ("PSNR", "fixed", "found", "% fewer", "range", "images", "% met", "s", "over a fit")

@@ -61,6 +61,7 @@ def _told(decibels: float) -> str:
 
 def _of_cases(cells: pd.DataFrame) -> Iterator[Line]:
     same = ["case", "iterations", "seed"]
+    cells = cells.reindex(columns=[*same, "preset", "end_ycbcr"])
     default = cells[cells.preset == "default"].assign(ours=lambda f: f.end_ycbcr.fillna(-np.inf))
     both = cells.merge(default[[*same, "ours"]], on=same)
     for cell in both[both.end_ycbcr > both.ours].itertuples():
