@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def test_fixed_numbers_span_all_that_a_search_may_use(height, width):
     counts = budget.grid(image)
     assert counts == sorted(set(counts)) and counts[-1] == most_gaussians(image)
     assert counts[0] == min(counts[-1], math.ceil(height * width / 1024))
-    for few, many in zip(counts, counts[1:], strict=False):  # as they were before rounding
+    for few, many in pairwise(counts):  # as they were before rounding
         assert (many - 0.5) / (few + 0.5) <= math.sqrt(2) + 1e-9
 
 

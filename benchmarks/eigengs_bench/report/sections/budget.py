@@ -91,7 +91,7 @@ def gains(fits: pd.DataFrame, searches: pd.DataFrame) -> pd.DataFrame:
 
     The number is that which most images of a set have such pairs of, but not for a search.
     """
-    fits = fits.drop_duplicates([*FIT, "rearranged"])
+    fits = fits.drop_duplicates([*FIT, "rearranged"], keep="last")
     anew = fits.rearranged.astype(bool)
     pairs = fits[~anew].merge(fits[anew], on=FIT, suffixes=("_once", ""))
     sought = pairs.merge(searches[FIT].drop_duplicates(), on=FIT, how="left", indicator="from")
