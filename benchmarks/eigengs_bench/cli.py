@@ -65,11 +65,6 @@ def tables(task: Task, names: Names, tables: Names) -> Any:
     reach     how soon default has the PSNR that gaussianimage ends with
 
     Trained bases and models are kept in models/ of the folder: about a gigabyte a set.
-
-    \b
-    Examples:
-      eigengs-dr bench tables data/ -o results/ --set natural256 --images 3
-      eigengs-dr bench tables data/ -o results/ --images 4 --iterations 10000 --table main
     """
     from eigengs_bench.experiments.tables import run
     from eigengs_bench.report.sections.methods import tell
@@ -85,10 +80,6 @@ def pareto(task: Task, names: Names) -> Any:
 
     FOLDER gets a chart and a CSV file a set, and charts of the renderer and of storage. An image
     takes some two minutes.
-
-    \b
-    Example:
-      eigengs-dr bench pareto data/ -o pareto/ --set samples --set faces256
     """
     from eigengs_bench.experiments.pareto import run
     from eigengs_bench.report.sections.pareto import tell
@@ -103,10 +94,6 @@ def rate(task: Task, names: Names) -> Any:
     """Compare packed fits with JPEG and WebP at equal size.
 
     FOLDER gets a chart a set. An image of 256x256 pixels takes a minute.
-
-    \b
-    Example:
-      eigengs-dr bench rate data/ -o rate/ --set kodak --set natural256
     """
     from eigengs_bench.experiments.rate import run
     from eigengs_bench.report.sections.rate import tell
@@ -137,10 +124,6 @@ def budget(task: Task, names: Names, targets: tuple[float, ...]) -> Any:
       fits of one number, splats placed once, and placed anew on the way
 
     FOLDER gets a chart and a CSV file a set. An image of 256x256 pixels takes a minute or two.
-
-    \b
-    Example:
-      eigengs-dr bench budget data/ -o budget/ --set natural256 --target 36
     """
     from eigengs_bench.experiments.budget import run
     from eigengs_bench.report.sections.budget import tell
@@ -153,16 +136,12 @@ def budget(task: Task, names: Names, targets: tuple[float, ...]) -> Any:
 @bench.command()
 @click.option("--case", "cases", multiple=True, help="By default all; may be repeated.")
 @many_option("--preset", "presets", PRESETS, "By default all")
-@measures_rows("stability.jsonl", iterations=None)
+@measures_rows("stability.jsonl", iterations=10_000, least=0)
 def stability(task: Task, names: Names, cases: Names, presets: Names) -> Any:
     """Try every preset on hard cases: odd images, odd starts, rates too high.
 
     Draws stability-tiles.png where the case "smooth" is among them: what tiling looks like. All
     cases take some ten minutes; the case "large" takes gigabytes.
-
-    \b
-    Example:
-      eigengs-dr bench stability -o quick/ --case black --preset default --iterations 100
     """
     from eigengs_bench.experiments.stability import run, tiles_of
     from eigengs_bench.experiments.stability_cases import chosen_cases
@@ -195,10 +174,6 @@ def figures(task: Task, names: Names, figures: Names) -> Any:
 
     Without DATA photos of scikit-image are fitted, and figures that need more are left out.
     FOLDER/figures.json lists the pictures with captions and credits.
-
-    \b
-    Example:
-      eigengs-dr bench figures data/ -o figures/ --figure curves --images 20
     """
     from eigengs_bench.experiments.figures import run
     from eigengs_bench.report.frames import Told, table
@@ -216,10 +191,6 @@ def report(folder: Path, output: Path, quiet: bool) -> None:
 
     Writes index.html, one file that needs no other, and README.md with pictures/ beside it. Every
     section names the commands, days, machines, versions and commits behind its figures.
-
-    \b
-    Example:
-      eigengs-dr bench report results/ -o page/
     """
     from eigengs_bench.report.page import write_page
 
@@ -229,21 +200,14 @@ def report(folder: Path, output: Path, quiet: bool) -> None:
 
 
 @bench.command()
-@click.option("--image", type=EXISTING, help="512x512 or larger; by default a photo.")
 @backend_option
 @prints_figures
-def kernels(show: Any, image: Path | None, backend: str | None) -> Any:
-    """Time the renderer and its derivatives against plain Dr.Jit and the machine's peak.
-
-    \b
-    Example:
-      eigengs-dr bench kernels --report kernels.json
-    """
+def kernels(show: Any, backend: str | None) -> Any:
+    """Time the renderer and its derivatives against plain Dr.Jit and the machine's peak."""
     select(backend)
     from eigengs_bench.experiments.kernels import run
-    from eigengs_dr.images import load_image
 
-    return backend, {}, run(load_image(image) if image else None, backend, show)
+    return backend, {}, run(backend, show)
 
 
 @bench.command()
@@ -256,12 +220,7 @@ def kernels(show: Any, image: Path | None, backend: str | None) -> Any:
 def eigen(
     show: Any, basis: str, folder: Path, images: int, iterations: int, backend: str | None
 ) -> Any:
-    """Compare the starts of a fit that a model gives with those the image alone gives.
-
-    \b
-    Example:
-      eigengs-dr bench eigen faces.npz faces-test/ --images 50 --report eigen.json
-    """
+    """Compare the starts of a fit that a model gives with those the image alone gives."""
     select(backend)
     from eigengs_bench.experiments.eigen import run
     from eigengs_dr.bases import load_basis
@@ -276,12 +235,7 @@ def eigen(
 @click.option("--variant", default="llvm_ad_rgb", show_default=True, help="Of Mitsuba.")
 @prints_figures
 def texture(show: Any, variant: str) -> Any:
-    """Time a material ball with textures of Gaussians against one with a bitmap, in Mitsuba.
-
-    \b
-    Example:
-      eigengs-dr bench texture --report texture.json
-    """
+    """Time a material ball with textures of Gaussians against one with a bitmap, in Mitsuba."""
     from eigengs_bench.experiments.texture import run
 
     return "cuda" if "cuda" in variant else "llvm", {"variant": variant}, run(variant, show)
@@ -314,10 +268,6 @@ def inverse(
 
     The image hangs on a wall in Mitsuba, and every method gets as many steps of gradient descent.
     All conditions take some ten minutes.
-
-    \b
-    Example:
-      eigengs-dr bench inverse cat.jpg --basis cats.npz --report inverse.json --chart inverse.png
     """
     names = tuple(dict.fromkeys(conditions)) or CONDITIONS
     strips = {name: strip.with_stem(f"{strip.stem}-{name}") for name in names} if strip else {}
@@ -365,10 +315,6 @@ def levels(
     """Chart PSNR over how many Gaussians of a set are drawn: levels.svg and levels.csv in FOLDER.
 
     Without IMAGE a photo of scikit-image is fitted, at 256x256 pixels.
-
-    \b
-    Example:
-      eigengs-dr bench levels photo.jpg -o levels/ --gaussians 20000 --levels 5
     """
     output.mkdir(parents=True, exist_ok=True)
     check_outputs([output / "levels.svg", output / "levels.csv"], [image] if image else [])

@@ -35,7 +35,7 @@ output_option = click.option(
 data_argument = click.argument("data", type=FOLDER, required=False, metavar="[DATA]")
 
 
-def count_option(name: str, default: int | None, text: str = "", least: int = 1) -> Any:
+def count_option(name: str, default: int, text: str = "", least: int = 1) -> Any:
     """Make an option that takes a number of things."""
     kind = click.IntRange(min=least)
     return click.option(name, type=kind, default=default, show_default=True, help=text)
@@ -66,7 +66,7 @@ def about(context: click.Context, backend: str | None) -> Row:
     return {**described(context, backend), **code_state()}
 
 
-def measures_rows(file: str, iterations: int | None = 1000) -> Any:
+def measures_rows(file: str, iterations: int = 1000, least: int = 1) -> Any:
     """Make a function of a task into a command that keeps rows in a file of a folder.
 
     The function returns a `Told`: its tables are printed, and its charts and points are written to
@@ -78,12 +78,12 @@ def measures_rows(file: str, iterations: int | None = 1000) -> Any:
         def wrapped(
             context: click.Context,
             output: Path,
+            iterations: int,
             seed: int,
             backend: str | None,
             quiet: bool,
             data: Path | None = None,
             images: int = 0,
-            iterations: int | None = None,
             names: tuple[str, ...] = (),
             **settings: Any,
         ) -> None:
@@ -99,7 +99,6 @@ def measures_rows(file: str, iterations: int | None = 1000) -> Any:
                 told = command(task, names=names, **settings)
             save(told, output, quiet)
 
-        least = 0 if iterations is None else 1
         steps = count_option("--iterations", iterations, "Steps of every fit, or the most.", least)
         options = (output_option, steps, seed_option, backend_option, quiet_option)
         return _chain(*options, click.pass_context)(wrapped)

@@ -65,12 +65,6 @@ def test_pixels_inside_are_counted_as_by_hand(scene):
     assert kernels.pixels_inside(scene) == inside
 
 
-def test_a_small_image_is_refused(tmp_path):
-    save_image(tmp_path / "a.png", np.zeros((100, 600, 3), np.float32))
-    told = run("bench", "kernels", "--image", tmp_path / "a.png")
-    assert told.exit_code == 2 and "image is 600x100; it must be at least 512x512" in told.stderr
-
-
 @pytest.mark.parametrize("iterations", [0, 10])
 def test_starts_are_compared(backend, iterations):
     """Figures are those of the functions they are named after."""

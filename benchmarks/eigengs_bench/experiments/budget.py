@@ -22,11 +22,8 @@ from eigengs_dr.starting import Start, begin
 
 FILE = "budget.jsonl"
 
-SPARSEST = 1024
-"""Pixels a splat of the smallest fixed number."""
-
-STEPS_AN_OCTAVE = 2
-"""Fixed numbers from one to twice as many, at least."""
+SPARSEST = 1024  # pixels a splat of the smallest fixed number
+STEPS_AN_OCTAVE = 2  # fixed numbers from one to twice as many, at least
 
 
 def run(task: Task, names: Sequence[str], targets: Sequence[float]) -> list[Row]:

@@ -20,11 +20,8 @@ from eigengs_dr.refine import refine
 from eigengs_dr.rendering import render
 from eigengs_dr.solve import solve
 
-SOLVE_STEPS = 10
-"""Steps of conjugate gradients, those of `eigengs_dr.fit`."""
-
-PLACED = ("grid", "adaptive")
-"""Starts that look at the image alone."""
+SOLVE_STEPS = 10  # steps of conjugate gradients, those of `eigengs_dr.fit`
+PLACED = ("grid", "adaptive")  # starts that look at the image alone
 
 
 def run(

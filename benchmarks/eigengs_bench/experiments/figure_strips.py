@@ -17,7 +17,7 @@ from eigengs_bench.harness.datasets import images_of, is_trained, model_for
 from eigengs_bench.harness.store import Task
 from eigengs_bench.harness.timing import Image, Moment, follow
 from eigengs_bench.names import CATS, NATURAL, SETS
-from eigengs_bench.report.strips import save_strip, strip
+from eigengs_bench.report.strips import Cell, save_strip, strip
 from eigengs_dr.bases import load_basis
 from eigengs_dr.eigengs import EigenGS
 from eigengs_dr.gaussians import Gaussians
@@ -29,22 +29,16 @@ from eigengs_dr.rendering import picture_of
 from eigengs_dr.resampling import cropped
 from eigengs_dr.starting import begin
 
-CREDIT = "AFHQ, NAVER Corp., CC BY-NC 4.0"
-"""Of all pictures of cats."""
-
+CREDIT = "AFHQ, NAVER Corp., CC BY-NC 4.0"  # of all pictures of cats
+# Of every channel of the models that are trained: those of the paper's comparisons.
 COMPONENTS = 300
-"""Of every channel of the models that are trained: those of the paper's comparisons."""
-
-PHOTO = "coffee"
-"""Photo of scikit-image that the basis "natural" was not trained on."""
-
+PHOTO = "coffee"  # photo of scikit-image that the basis "natural" was not trained on
+# The presets that are compared, and what stands above their pictures.
 METHODS = {
     "gaussianimage": "gaussianimage: random start",
     "eigengs": "eigengs: start from the basis",
     "default": "default: placed by the image, colours solved",
 }
-"""The presets that are compared, and what stands above their pictures."""
-
 MAGNIFIED = 8  # factor of an error before it is added to mid-grey
 MARGIN = 0.08  # around the middle of a picture, in its sides: splats there reach into it
 
@@ -176,7 +170,7 @@ def cross(task: Task) -> Iterator[Figure]:
         '"natural"': load_basis("natural", task.backend),
     }
     heading = "photos, and at iteration 0 from bases of cats, of ImageNet, and the one that ships"
-    table = []
+    table = list[tuple[str, list[Cell]]]()
     for _, image in images_of(task, CATS, 3):
         cells = [("photo", image)]
         for words, model in bases.items():

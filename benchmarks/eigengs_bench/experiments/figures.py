@@ -36,6 +36,7 @@ from eigengs_dr.report import write_report
 
 LIST, FILE = "figures.json", "curves.jsonl"
 
+# Sets of the chart of PSNR, and their titles.
 PANELS = {
     "faces256": "faces",
     "cats256": "cats",
@@ -43,11 +44,8 @@ PANELS = {
     "natural256": "ImageNet",
     "kodak": 'Kodak, basis "natural"',
 }
-"""Sets of the chart of PSNR, and their titles."""
-
-EVERY = 50
-"""Iterations between two points of a curve."""
-
+EVERY = 50  # iterations between two points of a curve
+# Sets that a figure shows, and how many of them it cannot do without.
 USED: dict[str, tuple[Sequence[str], int]] = {
     "iterations": (("kodak", CATS), 0),
     "colors": ((), 0),
@@ -56,7 +54,6 @@ USED: dict[str, tuple[Sequence[str], int]] = {
     "split": ((CATS,), 1),
     "cross": ((CATS, NATURAL), 2),
 }
-"""Sets that a figure shows, and how many of them it cannot do without."""
 
 
 def run(

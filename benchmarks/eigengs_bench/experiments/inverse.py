@@ -32,8 +32,7 @@ SAMPLES = 4  # a pixel of a step's rendering
 LAST_RATE = 0.05  # rates fall by a cosine to this share
 GOAL = 25.0  # PSNR (YCbCr) up to which steps and seconds are counted
 
-STRIP = (0, 3, 10, 30, 100)
-"""Steps of which pictures are kept, beside the last."""
+STRIP = (0, 3, 10, 30, 100)  # steps of which pictures are kept, beside the last
 
 
 @dataclass

@@ -15,30 +15,19 @@ from eigengs_dr.eigengs import EigenGS
 from eigengs_dr.gaussians import Gaussians
 from eigengs_dr.plugins import keep_in_bounds, texture_of
 
-GREY = 0.5
-"""Coded value that texels and Gaussians start from."""
-
+GREY = 0.5  # coded value that texels and Gaussians start from
+# Linear light a step, by the side of the bitmap, for the texel with the largest gradient.
 TEXEL_RATES = {256: 0.08, 1024: 0.3}
-"""Linear light a step, by the side of the bitmap, for the texel with the largest gradient."""
-
+# Pixels, 1 / pixels and coded values a step.
 SPLAT_RATES = {"mean": 0.2, "factor": 0.03, "color": 0.01, "background": 0.005}
-"""Pixels, 1 / pixels and coded values a step."""
-
+# Standard deviations of the first component a step, for the largest gradient.
 COEFFICIENT_RATE = 0.4
-"""Standard deviations of the first component a step, for the largest gradient."""
-
+# Variance, of that of the first component, below which components move less and less: so few steps
+# find what the first ones say of hidden parts, and the last ones are left to the splats.
 DAMPING = 0.05
-"""Variance, of that of the first component, below which components move less and less: so few
-steps find what the first ones say of hidden parts, and the last ones are left to the splats."""
-
-PRIOR = 1e-5
-"""Weight of ``sum a^2 / lambda`` against the mean squared error of the photos."""
-
-PULL = 0.5
-"""Weight of the squared distance of colours from those of the first stage."""
-
-FIRST_STAGE = 0.04
-"""Share of the steps that the coefficients get before all Gaussians are freed."""
+PRIOR = 1e-5  # weight of ``sum a^2 / lambda`` against the mean squared error of the photos
+PULL = 0.5  # weight of the squared distance of colours from those of the first stage
+FIRST_STAGE = 0.04  # share of the steps that the coefficients get before all Gaussians are freed
 
 
 class Texels:
@@ -140,8 +129,8 @@ class Coefficients(Texels):
         return self.model.reconstruct(tuple(row[:k] for row, k in kept))
 
 
+# What is optimised, and the step at which that ends; each made when the one before is through.
 Stages = Iterator[tuple[Texels, int]]
-"""What is optimised, and the step at which that ends; each made when the one before is through."""
 
 
 def _splats(model: EigenGS, file: Any, steps: int) -> Stages:
@@ -158,6 +147,7 @@ def _both(model: EigenGS, file: Any, steps: int) -> Stages:
     yield Splats(first.gaussians(), PULL), steps
 
 
+# How to recover a poster, from a model, its file and the number of steps.
 METHODS: dict[str, Callable[[EigenGS, Any, int], Stages]] = {
     "texels1024": lambda model, file, steps: iter([(Texels(1024), steps)]),
     "texels256": lambda model, file, steps: iter([(Texels(256), steps)]),
@@ -165,4 +155,3 @@ METHODS: dict[str, Callable[[EigenGS, Any, int], Stages]] = {
     "coefficients": lambda model, file, steps: iter([(Coefficients(model, file), steps)]),
     "both": _both,
 }
-"""How to recover a poster, from a model, its file and the number of steps."""

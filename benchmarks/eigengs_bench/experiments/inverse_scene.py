@@ -14,8 +14,8 @@ from eigengs_dr.color import to_coded, to_linear
 DEPTH = 3  # longest path: from the lamp to the poster at once, or over the floor
 SUBPIXELS = 2  # lookups along a side of a pixel of the recovered poster
 
+# Places of cameras; the poster spans -1 to 1 along x and y.
 LEFT, FRONT, RIGHT, GRAZING = (-2.4, 0.4, 3.0), (0, 0, 3.8), (2.4, -0.4, 3.0), (3.5, 0.3, 1.4)
-"""Places of cameras; the poster spans -1 to 1 along x and y."""
 
 
 class Condition(NamedTuple):
@@ -39,8 +39,7 @@ CONDITIONS = {
     "noise": Condition(samples=4),
 }
 
-POSTER = "poster.bsdf.reflectance"
-"""Name of the unknown texture among the parameters of a scene."""
+POSTER = "poster.bsdf.reflectance"  # name of the unknown texture among the parameters of a scene
 
 
 def scene_of(condition: Condition, texture: Any) -> Any:
@@ -90,11 +89,10 @@ def head_on(texture: Any, width: int, height: int) -> NDArray[np.float32]:
 
 
 def _cameras(condition: Condition) -> dict[str, Any]:
-    side, lens = condition.side, {"type": "perspective"}
+    side, lens = condition.side, dict[str, Any](type="perspective")
     if condition.aperture:
-        focus = {"aperture_radius": condition.aperture, "focus_distance": 2.0}
-        lens = {"type": "thinlens", **focus}
-    film = {"type": "hdrfilm", "pixel_format": "rgb", "width": side, "height": side}
+        lens = {"type": "thinlens", "aperture_radius": condition.aperture, "focus_distance": 2.0}
+    film: dict[str, Any] = {"type": "hdrfilm", "pixel_format": "rgb", "width": side, "height": side}
     film["rfilter"] = {"type": "box"}  # every sample counts for its own pixel alone
     batch: dict[str, Any] = {"type": "batch"}
     batch["film"] = {**film, "width": len(condition.cameras) * side}

@@ -10,7 +10,7 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from eigengs_bench.harness.store import Progress
 from eigengs_bench.harness.timing import interleaved
@@ -20,7 +20,7 @@ from eigengs_dr.backend import select
 from eigengs_dr.color import rgb_to_ycbcr
 from eigengs_dr.descent import descend
 from eigengs_dr.gaussians import Gaussians
-from eigengs_dr.images import check_image, sample
+from eigengs_dr.images import sample
 from eigengs_dr.presets import PRESETS
 from eigengs_dr.reference import render_plain
 from eigengs_dr.rendering import lists_for, splat, splat_values, to_tensor
@@ -28,45 +28,27 @@ from eigengs_dr.solve import solve
 from eigengs_dr.splat import SHAPE, UNIT
 from eigengs_dr.tiles import Grid, TileLists, build_lists
 
+# The scene: splats of equal size, spread evenly at random over a square picture.
 SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
-"""The scene: splats of equal size, spread evenly at random over a square picture."""
-
+# Tiles of the plain renderer, the best of 4x4, 8x8 and 16x16 in forward and reverse together.
 PLAIN_TILE = (8, 8)
-"""Tiles of the plain renderer, the best of 4x4, 8x8 and 16x16 in forward and reverse together."""
-
-WARM_UP, ROUNDS = 3, 15
-"""Rounds that compile and settle, and rounds that are measured."""
-
-STEPS = 1000
-"""Steps of the refinement behind `growth`."""
-
-PEAK_LANES, PEAK_LOOPS, PEAK_UNROLL = 1 << 16, 100, 8
-"""Size of the program that measures the peak."""
+WARM_UP, ROUNDS = 3, 15  # rounds that compile and settle, and rounds that are measured
+STEPS = 1000  # steps of the refinement behind `growth`
+PEAK_LANES, PEAK_LOOPS, PEAK_UNROLL = 1 << 16, 100, 8  # size of the program that measures the peak
 
 
-def run(
-    image: ArrayLike | None = None, backend: str | None = None, progress: Progress = lambda *_: None
-) -> dict[str, float]:
+def run(backend: str | None = None, progress: Progress = lambda *_: None) -> dict[str, float]:
     """Time the kernels in one run, the variants in turns; every figure is a median.
 
     `plain_ms` and `fast_ms` are forward and reverse together, with lists given and programs frozen,
     the ratios plain over fast. `peak_evals_per_ns` counts `exp`, `select` and 3 `fma` without
     memory; the fractions are evaluations inside the cutoff ellipses over that peak. `growth` is the
-    median time of the steps 900 to 1,000 of a refinement of the middle of an image over that of the
-    steps 50 to 150, and `growth_with_lists` the same of the means, in which building lists counts.
+    median time of the steps 900 to 1,000 of a refinement over that of the steps 50 to 150, and
+    `growth_with_lists` the same of the means, in which building lists counts.
     """
-    picture = _middle(sample("astronaut") if image is None else check_image(image))
     types = types_in(select(backend))
     figures = kernel_figures(types, random_scene(types), progress)
-    return {**figures, **_growth_figures(picture, types, progress)}
-
-
-def _middle(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    top, left = ((side - SIDE) // 2 for side in image.shape[:2])
-    if top < 0 or left < 0:
-        size = f"{image.shape[1]}x{image.shape[0]}"
-        raise ValueError(f"image is {size}; it must be at least {SIDE}x{SIDE}")
-    return image[top : top + SIDE, left : left + SIDE]
+    return {**figures, **_growth_figures(types, progress)}
 
 
 def random_scene(types: ArrayTypes) -> Gaussians:
@@ -190,11 +172,11 @@ def pixels_inside(scene: Gaussians) -> int:
     return int((dx2[:, :, None] + dy2[:, None, :] <= (CUTOFF * SIGMA) ** 2).sum())
 
 
-def _growth_figures(
-    image: NDArray[np.float32], types: ArrayTypes, progress: Progress
-) -> dict[str, float]:
+def _growth_figures(types: ArrayTypes, progress: Progress) -> dict[str, float]:
     """Time every step of a refinement: splats stretch, and a poor renderer slows down."""
-    target = rgb_to_ycbcr(image)
+    photo = sample("astronaut")
+    top, left = ((side - SIDE) // 2 for side in photo.shape[:2])
+    target = rgb_to_ycbcr(photo[top : top + SIDE, left : left + SIDE])
     mean, factor = adaptive(target, COUNT, np.random.default_rng(0))
     start = Gaussians.from_arrays(
         mean, factor, np.zeros((COUNT, 3)), size=(SIDE, SIDE), backend=types.backend

@@ -16,8 +16,8 @@ from eigengs_dr.levels import fit_levels, level_counts
 from eigengs_dr.metrics import psnr
 from eigengs_dr.rendering import picture_of
 
+# The photo of scikit-image that is fitted by default, and the side of its middle in pixels.
 SAMPLE, SIDE = "coffee", 256
-"""The photo of scikit-image that is fitted by default, and the side of its middle in pixels."""
 
 
 def run(

@@ -32,24 +32,18 @@ from eigengs_dr.starting import Start, begin
 
 FILE = "pareto.jsonl"
 
+# Steps of runs of a method whose rates fall: each number is a run of its own.
 HORIZONS = (0, 10, 100, 300, 1000)
-"""Steps of runs of a method whose rates fall: each number is a run of its own."""
-
+# Steps after which the one run is looked at where rates stay: it stands for all shorter ones.
 MARKS = (0, 10, 20, 50, 100, 200, 500, 1000)
-"""Steps after which the one run is looked at where rates stay: it stands for all shorter ones."""
-
+# Components a channel of the models that all fits start from, and of others.
 DEFAULT_COMPONENTS, COMPONENTS = 300, (50, 100, 500)
-"""Components a channel of the models that all fits start from, and of others."""
-
+# How finished sets are stored: each parameter in as many equal steps of its range, or as it is.
 BITS, FLOATS = (8, 10, 12, 16), ("float16", "float32")
-"""How finished sets are stored: each parameter in as many equal steps of its range, or as it is."""
-
+# Cutoffs that stand for none in single precision (1.5e-8 of an amplitude is left), and in double
+# precision (1.3e-14).
 WIDE, WIDEST = 6.0, 8.0
-"""Cutoffs that stand for none in single precision (1.5e-8 of an amplitude is left), and in double
-precision (1.3e-14)."""
-
-CUTOFFS = (2.5, 3.0, 3.5, 4.0, 5.0)
-"""Of the renderer."""
+CUTOFFS = (2.5, 3.0, 3.5, 4.0, 5.0)  # of the renderer
 
 
 class Variant(NamedTuple):

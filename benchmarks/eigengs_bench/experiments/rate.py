@@ -30,24 +30,19 @@ from eigengs_dr.rendering import picture_of
 
 FILE, OURS = "rate.jsonl", "packed Gaussians"
 
-PIXELS = (256, 128, 64, 32, 16, 8)
-"""Pixels a splat of the fits that are packed."""
-
+PIXELS = (256, 128, 64, 32, 16, 8)  # pixels a splat of the fits that are packed
+# Decibels that packing may lose: of fits of all numbers of splats, some below and some above,
+# these had the best PSNR at equal size on training photos, by little.
 BUDGET = 0.8
-"""Decibels that packing may lose: of fits of all numbers of splats, some below and some above,
-these had the best PSNR at equal size on training photos, by little."""
-
-WARM_UP = 6
-"""Untimed steps before a fit, that compile its programs."""
-
+WARM_UP = 6  # untimed steps before a fit, that compile its programs
 QUALITIES = (2, 5, 10, 15, 20, 30, 40, 50, 60, 70, 80, 85, 90, 95)
 
+# Pillow's names and options of other codecs, at the slowest and best setting of the encoder.
 CODECS: dict[str, tuple[str, dict[str, Any]]] = {
     "JPEG 4:2:0": ("JPEG", {"optimize": True, "subsampling": 2}),
     "JPEG 4:4:4": ("JPEG", {"optimize": True, "subsampling": 0}),
     "WebP": ("WEBP", {"method": 6}),
 }
-"""Pillow's names and options of other codecs, at the slowest and best setting of the encoder."""
 
 
 def run(task: Task, names: Sequence[str]) -> list[Row]:

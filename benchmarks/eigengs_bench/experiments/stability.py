@@ -30,12 +30,10 @@ from eigengs_dr.starting import Start, begin
 
 FILE = "stability.jsonl"
 
-BASIS = "natural"
-"""Where presets that need a basis start."""
-
+BASIS = "natural"  # where presets that need a basis start
+# Pictures of the case "smooth" that are shown side by side, with gross tiles, faint ones and none:
+# presets, and how many times the steps of the case they take.
 TILES = (("gaussianimage", 1), ("gaussianimage", 3), ("default", 1))
-"""Pictures of the case "smooth" that are shown side by side, with gross tiles, faint ones and none:
-presets, and how many times the steps of the case they take."""
 
 
 def run(task: Task, cases: Iterable[Case], presets: Sequence[str]) -> list[Row]:

@@ -18,14 +18,10 @@ from eigengs_dr.resampling import cropped
 
 Shapes = tuple[NDArray[np.float64], NDArray[np.float64]]
 
+# Pixels of a side, splats (the paper's number, and that of the basis that ships), and steps.
 SIDE, GAUSSIANS, ITERATIONS = 256, 5000, 1000
-"""Pixels of a side, splats (the paper's number, and that of the basis that ships), and steps."""
-
-SMOOTH_SIDE = 512
-"""Splats lie 7 pixels apart, which shows; the paper's 20,000 lie under 4 apart."""
-
-STRIPE = 3
-"""Rows of a stripe of the image that is foreign to a basis."""
+SMOOTH_SIDE = 512  # splats lie 7 pixels apart, which shows; the paper's 20,000 lie under 4 apart
+STRIPE = 3  # rows of a stripe of the image that is foreign to a basis
 
 
 class Case(NamedTuple):
@@ -166,14 +162,13 @@ _ALL = (
     Case("long", photo, iterations=10_000),
 )
 
+# Cases by name. What half precision costs is measured in each.
 CASES = {case.name: case for case in _ALL}
-"""Cases by name. What half precision costs is measured in each."""
 
 
-def chosen_cases(names: Sequence[str], iterations: int | None = None) -> list[Case]:
+def chosen_cases(names: Sequence[str], iterations: int) -> list[Case]:
     """Return cases by name, by default all, with at most so many steps."""
     if unknown := [name for name in names if name not in CASES]:
         raise ValueError(f"case {unknown[0]!r} is unknown; use one of {', '.join(CASES)}")
     chosen = [CASES[name] for name in dict.fromkeys(names or CASES)]
-    most = np.inf if iterations is None else iterations
-    return [case._replace(iterations=int(min(case.iterations, most))) for case in chosen]
+    return [case._replace(iterations=min(case.iterations, iterations)) for case in chosen]

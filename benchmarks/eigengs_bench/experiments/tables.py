@@ -22,17 +22,12 @@ from eigengs_dr.starting import Start, begin
 
 FILE = "tables.jsonl"
 
+# Where the paper's tables look, and 0 and 10 beside.
 ITERATIONS = (0, 10, 100, 500, 1000, 5000, 10000)
-"""Where the paper's tables look, and 0 and 10 beside."""
-
-COMPONENTS = (300, 500)
-"""Components a channel in the paper's tables."""
-
-LENT = {"faces256": "cats256", "cats256": "faces256"}
-"""The sets that lend each other their basis."""
-
+COMPONENTS = (300, 500)  # components a channel in the paper's tables
+LENT = {"faces256": "cats256", "cats256": "faces256"}  # the sets that lend each other their basis
+# Depths of the colour solve that are tried for the earliest start that is good enough.
 SOLVE_STEPS = (1, 2, 3, 5, 10)
-"""Depths of the colour solve that are tried for the earliest start that is good enough."""
 
 
 class Method(NamedTuple):
@@ -157,7 +152,7 @@ def _reach(start: Callable[[int], Start], image: Image, goal: Row) -> Row:
         for moment in follow(partial(start, depth), schedule, steps, range(steps + 1)):
             reached = psnr(moment.picture, image, "ycbcr")
             if reached >= goal["psnr_ycbcr"]:
-                found = {"solve_steps": depth, "iteration": moment.iteration}
-                found |= {"seconds": moment.seconds, "psnr_ycbcr": reached}
-                return {**found, "share": moment.seconds / goal["seconds"]}
+                where = {"solve_steps": depth, "iteration": moment.iteration}
+                share = moment.seconds / goal["seconds"]
+                return {**where, "seconds": moment.seconds, "psnr_ycbcr": reached, "share": share}
     return {"share": None}

@@ -16,17 +16,10 @@ from eigengs_dr.fitting import fit
 from eigengs_dr.images import sample
 from eigengs_dr.rendering import picture_of, render
 
-SIDE, TEXELS, SPP = 512, 1024, 16
-"""Of the picture, of the bitmap, and samples a pixel."""
-
-COUNTS = (500, 5_000, 20_000)
-"""Splats of the textures."""
-
-SETTLED = 5_000
-"""Splats of the texture that is also prefiltered, differentiated and changed."""
-
-STEPS, WARM_UP, ROUNDS = 100, 2, 9
-"""Steps of the fits, rounds that compile and settle, and rounds that are measured."""
+SIDE, TEXELS, SPP = 512, 1024, 16  # of the picture, of the bitmap, and samples a pixel
+COUNTS = (500, 5_000, 20_000)  # splats of the textures
+SETTLED = 5_000  # splats of the texture that is also prefiltered, differentiated and changed
+STEPS, WARM_UP, ROUNDS = 100, 2, 9  # of the fits; rounds that compile, and that are measured
 
 
 def run(variant: str = "llvm_ad_rgb", progress: Progress = lambda *_: None) -> dict[str, float]:
@@ -43,23 +36,18 @@ def run(variant: str = "llvm_ad_rgb", progress: Progress = lambda *_: None) -> d
 
     mi.set_variant(variant)
     register_plugins()
-    picture = sample("coffee")[:400, 100:500]
-    sets = {}
+    picture, sets = sample("coffee")[:400, 100:500], {}
     for count in COUNTS:
         sets[count] = require_complete(fit(picture, count, STEPS)).gaussians
         progress("fits", len(sets), len(COUNTS))
     coded = np.clip(picture_of(sets[SETTLED], TEXELS, TEXELS), 0, 1)
-    bitmap = {
-        "type": "bitmap",
-        "data": mi.TensorXf(to_linear(coded).astype(np.float32)),
-        "raw": True,
-    }
-    plain = ball(mi, bitmap)
-    angle = pixel_angle(plain.sensors()[0])
+    data = mi.TensorXf(to_linear(coded).astype(np.float32))
+    plain = ball(mi, {"type": "bitmap", "data": data, "raw": True})
     scenes = {f"gaussians_{count}": ball(mi, texture_of(g)) for count, g in sets.items()}
+    angle = pixel_angle(plain.sensors()[0])
     filtered = ball(mi, texture_of(sets[SETTLED], prefilter=angle))
     settled = scenes[f"gaussians_{SETTLED}"]
-    variants: dict[str, Callable[[], Any]] = {
+    programs: dict[str, Callable[[], Any]] = {
         "bitmap": partial(mi.render, plain),
         **{name: partial(mi.render, scene) for name, scene in scenes.items()},
         "prefiltered": partial(mi.render, filtered),
@@ -67,46 +55,35 @@ def run(variant: str = "llvm_ad_rgb", progress: Progress = lambda *_: None) -> d
         "step_gaussians": _step(mi, settled),
         "change": partial(_change, mi, settled),
     }
-    rounds = WARM_UP + ROUNDS
-    timed = interleaved(variants, WARM_UP, ROUNDS, lambda done: progress("texture", done, rounds))
-    ms = {f"{name}_ms": taken for name, taken in timed.items()}
-    ratios = {f"ratio_{count}": ms[f"gaussians_{count}_ms"] / ms["bitmap_ms"] for count in COUNTS}
+    total = WARM_UP + ROUNDS
+    timed = interleaved(programs, WARM_UP, ROUNDS, lambda done: progress("texture", done, total))
     return {
-        **ms,
-        **ratios,
-        "ratio_prefiltered": ms["prefiltered_ms"] / ms["bitmap_ms"],
-        "ratio_step": ms["step_gaussians_ms"] / ms["step_bitmap_ms"],
+        **{f"{name}_ms": ms for name, ms in timed.items()},
+        **{f"ratio_{n}": timed[f"gaussians_{n}"] / timed["bitmap"] for n in COUNTS},
+        "ratio_prefiltered": timed["prefiltered"] / timed["bitmap"],
+        "ratio_step": timed["step_gaussians"] / timed["step_bitmap"],
         "difference": _difference(mi, sets[SETTLED], texture_of(sets[SETTLED], raw=True)),
     }
 
 
 def ball(mi: Any, texture: dict[str, Any]) -> Any:
     """Load a ball with a textured coat on a grey floor, under a lamp and the sky."""
-    transform = mi.ScalarTransform4f()
+    at = mi.ScalarTransform4f()
+    camera = at.look_at([0, 1.2, 4.2], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": SIDE, "height": SIDE}
+    sampler = {"type": "independent", "sample_count": SPP}
+    sensor = {"type": "perspective", "fov": 32, "to_world": camera, "film": film}
+    coat = {"type": "principled", "base_color": texture, "roughness": 0.3}
+    floor = at.translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(6)
+    light = {"type": "area", "radiance": {"type": "rgb", "value": 20.0}}
     return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "path", "max_depth": 5},
-            "sensor": {
-                "type": "perspective",
-                "fov": 32,
-                "to_world": transform.look_at([0, 1.2, 4.2], [0, 0, 0], [0, 1, 0]),
-                "film": {"type": "hdrfilm", "width": SIDE, "height": SIDE},
-                "sampler": {"type": "independent", "sample_count": SPP},
-            },
-            "ball": {
-                "type": "sphere",
-                "bsdf": {"type": "principled", "base_color": texture, "roughness": 0.3},
-            },
-            "floor": {
-                "type": "rectangle",
-                "to_world": transform.translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(6),
-            },
-            "lamp": {
-                "type": "sphere",
-                "center": [3, 4, 3],
-                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 20.0}},
-            },
+            "sensor": {**sensor, "sampler": sampler},
+            "ball": {"type": "sphere", "bsdf": coat},
+            "floor": {"type": "rectangle", "to_world": floor},
+            "lamp": {"type": "sphere", "center": [3, 4, 3], "emitter": light},
             "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.4}},
         }
     )

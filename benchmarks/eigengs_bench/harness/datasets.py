@@ -19,8 +19,8 @@ from eigengs_dr.starting import GAUSSIANS
 
 SAMPLE_NAMES, SAMPLE_SIDE = ("chelsea", "coffee", "astronaut"), 256
 
+# Components that are computed of every set: models of fewer take the first of them.
 MAX_COMPONENTS = 500
-"""Components that are computed of every set: models of fewer take the first of them."""
 
 
 def images_of(task: Task, name: str, count: int | None = None) -> list[tuple[str, Image]]:

@@ -18,13 +18,11 @@ from eigengs_bench.harness.tiling import tiling
 from eigengs_bench.harness.timing import Image
 from eigengs_dr.atomic import replacing
 
+# Lines of the presets: told apart also where red and green look alike, by their lightness.
 COLORS = {"default": "#0b6e99", "gaussianimage": "#b5442f", "eigengs": "#5a8f3c"}
-"""Lines of the presets: told apart also where red and green look alike, by their lightness."""
-
 INK = "#222222"
 
-MAGNIFIED = 20
-"""Factor by which the errors of tiles are shown."""
+MAGNIFIED = 20  # factor by which the errors of tiles are shown
 
 
 def new_figure(width: float, height: float, title: str = "") -> Figure:

@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 
 from eigengs_bench.harness.store import Row, code_name
 
-MISSING = "-"
-"""Cell of a figure that is not there."""
+MISSING = "-"  # cell of a figure that is not there
 
 
 class Table(NamedTuple):

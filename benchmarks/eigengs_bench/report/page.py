@@ -13,62 +13,21 @@ from markupsafe import Markup
 from eigengs_bench.experiments.figures import LIST, read_list
 from eigengs_bench.harness.store import Row, count_codes, read
 from eigengs_bench.report.charts import data_uri, draw
-from eigengs_bench.report.frames import Table, Told, as_text, code_remark
+from eigengs_bench.report.frames import Told, as_text, code_remark
 from eigengs_bench.report.sections import budget, methods, pareto, rate, stability
 from eigengs_bench.report.sections.losses import where_default_loses
 from eigengs_dr.atomic import replacing
 
 TILES = "stability-tiles.png"
 
-
-class Section(NamedTuple):
-    """A question: rows of some files, what makes tables and charts of them, and a short text."""
-
-    title: str
-    text: str
-    files: tuple[str, ...]
-    tell: Callable[..., Told]
-
-
-SECTIONS = (
-    Section(
-        "The methods",
-        "Columns are steps of descent; column 0 is the start. The rates of default fall over a "
-        "run, so a shorter run ends better than the column of its steps says.",
-        ("tables.jsonl",),
-        methods.tell,
-    ),
-    Section(
-        "Speed against accuracy",
-        "Each point is the default fit, or one with a single setting changed, after some number of "
-        "steps. Seconds of few images scatter by a tenth. The basis that ships was trained on all "
-        "samples but coffee: fits that start from it are flattered there.",
-        ("pareto.jsonl",),
-        pareto.tell,
-    ),
-    Section(
-        "Where methods fail",
-        "Every case is made by code, most of them on the photo chelsea. PSNR above 100 dB is "
-        "rounding and counts as exact. Tiling is the root mean square of the fine part of the "
-        "errors where the image is smooth.",
-        ("stability.jsonl",),
-        stability.tell,
-    ),
-    Section(
-        "Where default loses",
-        "Another preset has a higher PSNR than default after as many steps, after as much time, or "
-        "at the end of a hard case. The training of the model that eigengs starts from is not "
-        "counted.",
-        ("tables.jsonl", "stability.jsonl"),
-        where_default_loses,
-    ),
-    Section(
-        "Gaussians that a PSNR takes",
-        "Fits of fixed numbers whose splats are placed once, and the search fit --target-psnr.",
-        ("budget.jsonl",),
-        budget.tell,
-    ),
-    Section("Bytes that a PSNR takes", "Packed fits, JPEG and WebP.", ("rate.jsonl",), rate.tell),
+# Titles, the files of their rows, and what makes tables and charts of the rows.
+SECTIONS: tuple[tuple[str, tuple[str, ...], Callable[..., Told]], ...] = (
+    ("The methods", ("tables.jsonl",), methods.tell),
+    ("Speed against accuracy", ("pareto.jsonl",), pareto.tell),
+    ("Where methods fail", ("stability.jsonl",), stability.tell),
+    ("Where default loses", ("tables.jsonl", "stability.jsonl"), where_default_loses),
+    ("Gaussians that a PSNR takes", ("budget.jsonl",), budget.tell),
+    ("Bytes that a PSNR takes", ("rate.jsonl",), rate.tell),
 )
 
 
@@ -91,29 +50,25 @@ def write_page(folder: Path, output: Path) -> None:
     `ValueError` if the folder holds no results, or damaged ones.
     """
     sections = []
-    for title, text, files, tell in SECTIONS:
+    for title, files, tell in SECTIONS:
         rows = [rows_of(folder / file) for file in files]
         if any(rows):
-            told, runs = tell(*rows), [row["run"] for some in rows for row in some]
-            pictures = [
-                Picture(f"{name}.svg", draw(figure), caption)
-                for name, (caption, figure) in told.charts.items()
-            ]
+            told = tell(*rows)
+            charts = told.charts.items()
+            shown = [Picture(f"{name}.svg", draw(figure), text) for name, (text, figure) in charts]
             if files == ("stability.jsonl",) and (folder / TILES).exists():
                 caption = f'Tiles in the case "smooth", and errors.{code_remark(rows[0])}'
-                pictures.append(Picture(TILES, (folder / TILES).read_bytes(), caption))
-            sections.append((title, text, told.tables, pictures, source_of(runs)))
+                shown.append(Picture(TILES, (folder / TILES).read_bytes(), caption))
+            runs = [row["run"] for some in rows for row in some]
+            sections.append((title, told.tables, shown, source_of(runs)))
     if listed := read_list(folder / LIST):
         shown = [
             Picture(f["path"], (folder / f["path"]).read_bytes(), f"{f['caption']} {f['credit']}")
             for f in listed
         ]
-        text = "Photos of scikit-image, of Kodak, and cats of AFHQ: those that may be shown."
-        sections.append(("Pictures", text, [], shown, source_of([f["run"] for f in listed])))
+        sections.append(("Pictures", (), shown, source_of([f["run"] for f in listed])))
     if not sections:
-        raise ValueError(
-            f"{folder}: holds no results; run bench tables, pareto, stability or figures first"
-        )
+        raise ValueError(f"{folder}: holds no results; run bench tables, pareto or stability first")
     (output / "pictures").mkdir(parents=True, exist_ok=True)
     for picture in (picture for *_, pictures, _ in sections for picture in pictures):
         with replacing(output / "pictures" / picture.name) as temporary:
@@ -121,7 +76,8 @@ def write_page(folder: Path, output: Path) -> None:
     loader = PackageLoader("eigengs_bench.report", ".")
     for name, escaped in (("index.html", True), ("README.md", False)):
         pages = Environment(loader=loader, autoescape=escaped, trim_blocks=True, lstrip_blocks=True)
-        pages.filters.update(markdown=lambda table: as_text(table, "pipe"), html=_html)
+        pages.filters["markdown"] = lambda table: as_text(table, "pipe")
+        pages.filters["html"] = lambda table: Markup(table.frame.to_html(index=False, border=0))
         with replacing(output / name) as temporary:
             text = pages.get_template(f"{name}.j2").render(sections=sections)
             temporary.write_text(text + "\n", encoding="utf-8")
@@ -150,10 +106,5 @@ def source_of(runs: Sequence[Row]) -> list[str]:
     for run in runs:
         versions = {k: v for k, v in run["versions"].items() if v and not k.endswith("_path")}
         told = ", ".join(f"{name} {version}" for name, version in versions.items())
-        machine = f"{run['cpu']}, {run['threads']} threads, backend {run['backend']}; {told}"
-        lines += [machine] if machine not in lines else []
-    return [*lines, f"rows of {count_codes(runs)}"]
-
-
-def _html(table: Table) -> Markup:
-    return Markup(table.frame.to_html(index=False, border=0))
+        lines.append(f"{run['cpu']}, {run['threads']} threads, backend {run['backend']}; {told}")
+    return [*dict.fromkeys(lines), f"rows of {count_codes(runs)}"]

@@ -16,8 +16,8 @@ from eigengs_dr.images import to_8bit
 from eigengs_dr.resampling import resampled
 from eigengs_dr.strips import GAP, joined, line
 
+# Longer side of a picture, and heights of the letters below it and above a row, in pixels.
 CELL, LETTERS, HEADING = 160, 13, 15
-"""Longer side of a picture, and heights of the letters below it and above a row, in pixels."""
 
 Picture = NDArray[Any]
 Cell = tuple[str, Picture]  # the line below a picture, and the picture: RGB, not clamped

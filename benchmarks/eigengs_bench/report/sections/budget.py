@@ -9,23 +9,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from eigengs_bench.harness.store import Row
+from eigengs_bench.report import frames as fr
 from eigengs_bench.report.charts import INK, label_axes, new_figure
-from eigengs_bench.report.frames import (
-    Table,
-    Told,
-    counted,
-    frame_of,
-    number,
-    quartiles,
-    remark,
-    smallest,
-    span,
-    table,
-)
+from eigengs_bench.report.frames import Told
 
+# Colours and markers of the targets, in turn.
 STYLES = (("#c27c0e", "^"), ("#0b6e99", "o"), ("#8a4f9e", "s"), ("#5a8f3c", "D"))
-"""Colours and markers of the targets, in turn."""
-
 CAPTION = "Every point is an image and a target: Gaussians found over the smallest number."
 
 FIT = ["set", "image", "gaussians"]
@@ -33,13 +22,13 @@ FIT = ["set", "image", "gaussians"]
 
 def tell(rows: Sequence[Row]) -> Told:
     """Lay out how many Gaussians a PSNR takes: a table and a chart a set, and one of the starts."""
-    fits = frame_of(row for row in rows if "rearranged" in row["job"])
-    searches = frame_of(row for row in rows if "target" in row["job"])
+    fits = fr.frame_of(row for row in rows if "rearranged" in row["job"])
+    searches = fr.frame_of(row for row in rows if "target" in row["job"])
     tables, charts, drawn = [], {}, {}
     if len(fits) and len(searches):
         for name, part in points_of(fits, searches).groupby("set", sort=False):
             tables.append(_savings(name, part))
-            charts[f"budget-{name}"] = CAPTION + remark(part.code), _chart(part, name)
+            charts[f"budget-{name}"] = CAPTION + fr.remark(part.code), _chart(part, name)
             drawn[f"budget-{name}"] = part.drop(columns="code")
         tables.append(_gains(gains(fits, searches)))
     return Told(tables, charts, drawn)
@@ -62,28 +51,28 @@ def points_of(fits: pd.DataFrame, searches: pd.DataFrame) -> pd.DataFrame:
     # A search without its fit is of an image that a run was stopped at.
     points = searches.merge(same, on=FIT).rename(columns={"gaussians": "found"})
     keys = zip(points.set, points.image, points.target, strict=True)
-    points["fixed"] = [smallest(once.get((name, image), {}), goal) for name, image, goal in keys]
+    points["fixed"] = [fr.smallest(once.get((name, image), {}), goal) for name, image, goal in keys]
     points["met"] = points.stopped == "met"
     points["saving"] = (100 * (1 - points.found / points.fixed)).where(points.met)
     points["ratio"] = points.seconds / points.fit_seconds
     return points
 
 
-def _savings(name: str, points: pd.DataFrame) -> Table:
+def _savings(name: str, points: pd.DataFrame) -> fr.Table:
     lines = []
     for target, some in points.groupby("target", sort=False):
         both = some.dropna(subset="saving")
-        cells = [quartiles(both.fixed, 0), quartiles(both.found, 0), *span(both.saving, 0)]
-        cells += [str(len(both)), f"{100 * some.met.mean():.0f}", quartiles(some.seconds)]
-        cells += [quartiles(some.ratio), number(some.fit_psnr.median(skipna=False), 2)]
+        cells = [fr.quartiles(both.fixed, 0), fr.quartiles(both.found, 0), *fr.span(both.saving, 0)]
+        cells += [str(len(both)), f"{100 * some.met.mean():.0f}", fr.quartiles(some.seconds)]
+        cells += [fr.quartiles(some.ratio), fr.number(some.fit_psnr.median(skipna=False), 2)]
         lines.append((f"{target:g} dB", *cells))
     caption = (
-        f"{name}, {counted(points.image.nunique())}: the smallest fixed number of splats for a "
-        "PSNR in YCbCr, placed once, and what the search finds; seconds of the search, also over those "
-        "of a default fit of as many, and what that fit reaches"
+        f"{name}, {fr.counted(points.image.nunique())}: the smallest fixed number of splats for a "
+        "PSNR in YCbCr, placed once, and what the search finds; seconds of the search, also over "
+        "those of a default fit of as many, and what that fit reaches"
     )
     columns = ("PSNR", "fixed", "found", "% fewer", "range", "images", "% met", "s", "over a fit")
-    return table(caption, (*columns, "fit, dB"), lines, points.code)
+    return fr.table(caption, (*columns, "fit, dB"), lines, points.code)
 
 
 def gains(fits: pd.DataFrame, searches: pd.DataFrame) -> pd.DataFrame:
@@ -101,15 +90,15 @@ def gains(fits: pd.DataFrame, searches: pd.DataFrame) -> pd.DataFrame:
     return pairs.merge(best[["set", "gaussians"]], on=["set", "gaussians"])
 
 
-def _gains(pairs: pd.DataFrame) -> Table:
+def _gains(pairs: pd.DataFrame) -> fr.Table:
     lines = []
     for name, part in pairs.groupby("set", sort=False):
         cells = [f"{part.gaussians.iloc[0]:,}", str(len(part))]
-        cells += [*span(part.psnr_ycbcr - part.psnr_ycbcr_once, 2)]
-        lines.append((name, *cells, quartiles(part.seconds_once), quartiles(part.seconds)))
+        cells += [*fr.span(part.psnr_ycbcr - part.psnr_ycbcr_once, 2)]
+        lines.append((name, *cells, fr.quartiles(part.seconds_once), fr.quartiles(part.seconds)))
     caption = "As many splats placed once, and placed anew on the way: gain in dB of PSNR in YCbCr"
     columns = ("set", "splats", "images", "gain, dB", "range", "s, once", "s, anew")
-    return table(caption, columns, lines, [*pairs.code, *pairs.code_once])
+    return fr.table(caption, columns, lines, [*pairs.code, *pairs.code_once])
 
 
 def _chart(points: pd.DataFrame, name: str) -> Figure:
@@ -119,7 +108,7 @@ def _chart(points: pd.DataFrame, name: str) -> Figure:
     styles = zip(points.groupby("target", sort=False), cycle(STYLES), strict=False)
     for (target, some), (color, marker) in styles:
         both = some.dropna(subset="saving")
-        label = f"{target:g} dB, {len(both)} of {counted(len(some))}"
+        label = f"{target:g} dB, {len(both)} of {fr.counted(len(some))}"
         axis.plot(both.fixed, both.found, marker, color=color, ms=5, alpha=0.8, label=label)
     ends = (1.0, 10.0)
     if len(known):

@@ -18,8 +18,7 @@ TITLES = {
     "both": "coefficients, then Gaussians",
 }
 
-SIDE, GAP = 96, 4
-"""Side of a picture in a strip, and white pixels between two, in pixels."""
+SIDE, GAP = 96, 4  # side of a picture in a strip, and white pixels between two, in pixels
 
 
 def results_table(results: dict[str, Result]) -> Table:

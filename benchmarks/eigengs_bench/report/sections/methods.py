@@ -4,55 +4,43 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Any
 
 import pandas as pd
 
 from eigengs_bench.experiments.tables import ITERATIONS, Method, methods
 from eigengs_bench.harness.store import Row
 from eigengs_bench.names import NATURAL, SETS
-from eigengs_bench.report.frames import (
-    MISSING,
-    Table,
-    Told,
-    counted,
-    frame_of,
-    mean,
-    number,
-    quartiles,
-    spread,
-    table,
-)
+from eigengs_bench.report import frames as fr
+from eigengs_bench.report.frames import Told
 from eigengs_bench.report.sections.paper import ABLATION, PRINTED
 
 
 def _seconds(values: pd.Series) -> str:
     """Median of the time, to the millisecond where it is short."""
-    return quartiles(values, 3 if values.max() < 0.1 else 2)
+    return fr.quartiles(values, 3 if values.max() < 0.1 else 2)
 
 
 def _percent_above(limit: float, values: pd.Series) -> str:
-    return number(100 * (values > limit).mean(), 0)
+    return fr.number(100 * (values > limit).mean(), 0)
 
 
-THRESHOLDS = (35, 40)
-"""Decibels of psnr_ycbcr: the paper counts the images above."""
-
+THRESHOLDS = (35, 40)  # decibels of psnr_ycbcr: the paper counts the images above
+# Lines of a method: their figures, and what writes a cell of the values of all images.
 LINES: dict[str, tuple[str, Callable[[pd.Series], str]]] = {
-    "PSNR YCbCr / dB": ("psnr_ycbcr", spread),
-    "PSNR RGB / dB": ("psnr_rgb", spread),
-    "SSIM": ("ssim", partial(spread, decimals=3)),
-    "MS-SSIM": ("ms_ssim", partial(spread, decimals=3)),
+    "PSNR YCbCr / dB": ("psnr_ycbcr", fr.spread),
+    "PSNR RGB / dB": ("psnr_rgb", fr.spread),
+    "SSIM": ("ssim", partial(fr.spread, decimals=3)),
+    "MS-SSIM": ("ms_ssim", partial(fr.spread, decimals=3)),
     "seconds": ("seconds", _seconds),
     **{f"% above {t} dB YCbCr": ("psnr_ycbcr", partial(_percent_above, t)) for t in THRESHOLDS},
 }
-"""Lines of a method: their figures, and what writes a cell of the values of all images."""
-
+# Titles and lines of tables; the paper compares each fit in the space it was made in.
 KINDS = {
     "main": ("Methods", list(LINES)),
     "cross": ("Bases of other images", ["PSNR YCbCr / dB", "MS-SSIM", "% above 40 dB YCbCr"]),
     "ablation": ("Colour space and split", ["PSNR YCbCr / dB", "PSNR RGB / dB", "MS-SSIM"]),
 }
-"""Titles and lines of tables; the paper compares each fit in the space it was made in."""
 
 
 def tell(rows: Sequence[Row]) -> Told:
@@ -61,8 +49,8 @@ def tell(rows: Sequence[Row]) -> Told:
     All sets at a glance; for each set and number of steps the `KINDS`; the paper's figures; and how
     soon "default" has what "gaussianimage" has at the end.
     """
-    groups = groups_of(frame_of(rows, "moments"))
-    made, printed = list(_glances(groups)), {}
+    groups = groups_of(fr.frame_of(rows, "moments"))
+    made, printed = list(_glances(groups)), dict[str, Any]()
     for (name, iterations), fits in groups.items():
         for kind, (title, lines) in KINDS.items():
             chosen = methods_of(fits, name, kind)
@@ -72,9 +60,10 @@ def tell(rows: Sequence[Row]) -> Told:
                 printed |= {name: PRINTED[name]} if kind == "main" and name in PRINTED else {}
                 printed |= {kind: ABLATION} if kind == "ablation" else {}
     made += [
-        table(f"What the paper prints, like {name}: PSNR / dB", *p) for name, p in printed.items()
+        fr.table(f"What the paper prints, like {name}: PSNR / dB", *p)
+        for name, p in printed.items()
     ]
-    return Told([*made, *_reaches(frame_of(row for row in rows if "share" in row))])
+    return Told([*made, *_reaches(fr.frame_of(row for row in rows if "share" in row))])
 
 
 def groups_of(fits: pd.DataFrame) -> dict[tuple[str, int], pd.DataFrame]:
@@ -103,7 +92,7 @@ def label(method: Method, name: str) -> str:
     return text if method.split == "auto" else f"{method.preset}, {method.color}, {method.split}"
 
 
-def _glances(groups: dict[tuple[str, int], pd.DataFrame]) -> Iterator[Table]:
+def _glances(groups: dict[tuple[str, int], pd.DataFrame]) -> Iterator[fr.Table]:
     """One line a set and method: means of the PSNR over steps, and the time of all of them."""
     for length in sorted({steps for _, steps in groups}):
         steps, lines, codes = [*(s for s in ITERATIONS if s < length), length], [], list[str]()
@@ -111,7 +100,7 @@ def _glances(groups: dict[tuple[str, int], pd.DataFrame]) -> Iterator[Table]:
             chosen = methods_of(groups[name, length], name, "main")
             codes += chosen.code.tolist()
             for method, part in chosen.groupby("method", observed=True):
-                means = (mean(part.psnr_ycbcr[part.iteration == step]) for step in steps)
+                means = (fr.mean(part.psnr_ycbcr[part.iteration == step]) for step in steps)
                 seconds = _seconds(part.seconds[part.iteration == length])
                 lines.append((name, method, str(part.image.nunique()), *means, seconds))
         if lines:
@@ -119,7 +108,7 @@ def _glances(groups: dict[tuple[str, int], pd.DataFrame]) -> Iterator[Table]:
                 f"PSNR YCbCr / dB by steps, means over images, and seconds of {length:,} steps"
             )
             columns = ("set", "method", "images", *(f"{s:,}" for s in steps), "seconds")
-            yield table(caption, columns, lines, codes)
+            yield fr.table(caption, columns, lines, codes)
 
 
 def _images(name: str, fits: pd.DataFrame) -> str:
@@ -127,28 +116,32 @@ def _images(name: str, fits: pd.DataFrame) -> str:
     chosen, counts = SETS[name], fits.groupby("method", observed=True).image.nunique()
     least = f"{counts.min()} to " if counts.min() < counts.max() else ""
     size = f"{chosen.width}x{chosen.height}"
-    return f"{name}, {least}{counted(counts.max())} of {size}, {chosen.gaussians:,} Gaussians"
+    return f"{name}, {least}{fr.counted(counts.max())} of {size}, {chosen.gaussians:,} Gaussians"
 
 
-def _over_steps(caption: str, fits: pd.DataFrame, lines: Sequence[str]) -> Table:
+def _over_steps(caption: str, fits: pd.DataFrame, lines: Sequence[str]) -> fr.Table:
     """One line a method and figure, one column a step."""
     groups = fits.groupby(["method", "iteration"], observed=True)
     cells = {line: groups[LINES[line][0]].agg(LINES[line][1]).unstack() for line in lines}
     order = pd.MultiIndex.from_product([fits.method.cat.categories, lines])
-    frame = pd.concat(cells).swaplevel().reindex(order).fillna(MISSING)
+    frame = pd.concat(cells).swaplevel().reindex(order).fillna(fr.MISSING)
     texts = frame.rename_axis(["method", "figure"]).reset_index()
-    return table(
+    return fr.table(
         caption, ["method", "figure", *(f"{s:,}" for s in frame)], texts.to_numpy(), fits.code
     )
 
 
-def _reaches(found: pd.DataFrame) -> Iterator[Table]:
+def _reaches(found: pd.DataFrame) -> Iterator[fr.Table]:
     lines = []
     for (name, iterations), part in groups_of(found).items():
         some = part.dropna(subset="share")
-        times = quartiles(some.seconds, 3), quartiles(some.share, 4), number(some.share.max(), 4)
+        times = (
+            fr.quartiles(some.seconds, 3),
+            fr.quartiles(some.share, 4),
+            fr.number(some.share.max(), 4),
+        )
         lines.append((name, f"{iterations:,}", f"{len(some)} of {len(part)}", *times))
     caption = "Time in which default has what gaussianimage has at its last step, from the start"
     columns = ("set", "its steps", "images", "seconds", "share of its time", "largest share")
     if lines:
-        yield table(caption, columns, lines, found.code)
+        yield fr.table(caption, columns, lines, found.code)

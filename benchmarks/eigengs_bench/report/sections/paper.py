@@ -5,6 +5,7 @@ Tai et al., "EigenGS Representation", CVPR 2025: tables 1 (FFHQ), 2 (transfer) a
 
 STEPS = ("images", "method", "0", "100", "500", "1,000", "5,000", "10,000")
 
+# Rows of tables 1 and 2, by the set of ours that comes closest.
 PRINTED = {
     "cats512": (
         STEPS,
@@ -27,8 +28,7 @@ PRINTED = {
         [("Cats, 256x256", "of ImageNet", "29.6", "37.6", "41.1", "42.9", "45.9", "46.6")],
     ),
 }
-"""Rows of tables 1 and 2, by the set of ours that comes closest."""
-
+# Rows of table 3, after 10,000 steps.
 ABLATION = (
     ("fitted in", "split", "CelebA", "FFHQ", "Cats", "Cars"),
     [
@@ -38,4 +38,3 @@ ABLATION = (
         ("rgb", "whole", "39.9", "33.3", "38.9", "35.1"),
     ],
 )
-"""Rows of table 3, after 10,000 steps."""

@@ -9,18 +9,8 @@ import pandas as pd
 
 from eigengs_bench.experiments.pareto import WIDE
 from eigengs_bench.harness.store import Row
-from eigengs_bench.report.frames import (
-    MISSING,
-    Table,
-    Told,
-    counted,
-    frame_of,
-    number,
-    quartiles,
-    remark,
-    spread,
-    table,
-)
+from eigengs_bench.report import frames as fr
+from eigengs_bench.report.frames import Told
 from eigengs_bench.report.sections.pareto_charts import kernels_chart, set_chart, storage_chart
 
 PSNRS = ["psnr_ycbcr", "psnr_rgb", "psnr_wide"]
@@ -33,16 +23,16 @@ SET_CAPTION = (
 
 def tell(rows: Sequence[Row]) -> Told:
     """Lay out what was measured: a table and a chart a set, of storage, and of the renderer."""
-    fits, tables, charts, drawn = frame_of(rows, "trace"), [], {}, {}
+    fits, tables, charts, drawn = fr.frame_of(rows, "trace"), [], {}, {}
     for name, part in fits.groupby("set", sort=False) if len(fits) else ():
         stem = f"pareto-{name}"
         drawn[stem] = points_of(part)
         tables.append(_variants_table(name, part, drawn[stem]))
-        charts[stem] = SET_CAPTION + remark(part.code), set_chart(drawn[stem], name)
-    if len(stored := frame_of(rows, "stored")):
+        charts[stem] = SET_CAPTION + fr.remark(part.code), set_chart(drawn[stem], name)
+    if len(stored := fr.frame_of(rows, "stored")):
         tables.append(_storage_table(stored))
         charts["pareto-storage"] = tables[-1].caption, storage_chart(stored)
-    if len(kernels := frame_of(rows, "kernels")):
+    if len(kernels := fr.frame_of(rows, "kernels")):
         tables.append(_kernels_table(kernels))
         charts["pareto-kernels"] = tables[-1].caption, kernels_chart(kernels)
     return Told(tables, charts, drawn)
@@ -82,42 +72,46 @@ def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     return kept
 
 
-def _variants_table(name: str, fits: pd.DataFrame, points: pd.DataFrame) -> Table:
+def _variants_table(name: str, fits: pd.DataFrame, points: pd.DataFrame) -> fr.Table:
     lines, steps = [], fits.iteration.max()
     for (knob, value), part in fits.groupby(["knob", "value"], sort=False):
         first, last = part[part.iteration == part.iteration.min()], part[part.iteration == steps]
         mine = points[(points.knob == knob) & (points.value == value)]
         on = [mine.iteration[mine[key] == 1] for key in ("front", "front_same")]
-        cells = [quartiles(first.seconds, 3), spread(first.psnr_ycbcr), quartiles(last.seconds)]
-        cells += [spread(last[key]) for key in PSNRS]
-        cells += [", ".join(f"{step:,}" for step in steps) or MISSING for steps in on]
+        cells = [
+            fr.quartiles(first.seconds, 3),
+            fr.spread(first.psnr_ycbcr),
+            fr.quartiles(last.seconds),
+        ]
+        cells += [fr.spread(last[key]) for key in PSNRS]
+        cells += [", ".join(f"{step:,}" for step in steps) or fr.MISSING for steps in on]
         named = value if isinstance(value, str) else f"{value:,g}"
         lines += [(f"{knob} {named}", *cells)] if len(last) else []
     caption = (
-        f"{name}, {counted(fits.image.nunique())}: seconds and PSNR at the start and after "
+        f"{name}, {fr.counted(fits.image.nunique())}: seconds and PSNR at the start and after "
         f"{steps:,} steps; after how many steps a fit is on the front of all fits, and of those "
         "with as many Gaussians; settings not named are the default ones"
     )
     uncut, start = f"YCbCr at {WIDE:g} sigma", ("s, start", "YCbCr, start")
     columns = ("fit", *start, "s", "YCbCr", "RGB", uncut, "on front", "as many")
-    return table(caption, columns, lines, fits.code)
+    return fr.table(caption, columns, lines, fits.code)
 
 
-def _storage_table(stored: pd.DataFrame) -> Table:
+def _storage_table(stored: pd.DataFrame) -> fr.Table:
     lines = []
     for (name, precision), part in stored.groupby(["set", "precision"], sort=False):
-        size = number(part.bytes.iloc[0] / 1024)
-        lines.append((f"{name} {precision}", size, *(spread(part[key]) for key in PSNRS[:2])))
+        size = fr.number(part.bytes.iloc[0] / 1024)
+        lines.append((f"{name} {precision}", size, *(fr.spread(part[key]) for key in PSNRS[:2])))
     caption = "The default fits, stored in fewer bits a parameter: PSNR / dB"
-    return table(caption, ("stored as", "KiB", "YCbCr", "RGB"), lines, stored.code)
+    return fr.table(caption, ("stored as", "KiB", "YCbCr", "RGB"), lines, stored.code)
 
 
-def _kernels_table(kernels: pd.DataFrame) -> Table:
+def _kernels_table(kernels: pd.DataFrame) -> fr.Table:
     lines = []
     for row in kernels.sort_values("renderer", kind="stable").itertuples():
-        times = number(row.forward_ms, 2), number(row.step_ms, 2)
+        times = fr.number(row.forward_ms, 2), fr.number(row.step_ms, 2)
         errors = f"{row.largest_error:.1e}", f"{row.rms_error:.1e}"
         lines.append((f"{row.renderer} {row.cutoff:g}", *times, *errors))
     columns = ("cutoff", "forward, ms", "and reverse, ms", "largest error", "RMS error")
     caption = "The renderer: time, and what its cutoff leaves out of a picture (1 is white)"
-    return table(caption, columns, lines, kernels.code)
+    return fr.table(caption, columns, lines, kernels.code)

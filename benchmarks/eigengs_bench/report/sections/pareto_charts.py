@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from eigengs_bench.report.charts import COLORS, INK, label_axes, new_figure
 from eigengs_bench.report.frames import counted
 
+# What a knob is, its colour and marker, and its value in the default fit (or that of eigengs).
 KNOBS = {
     "init": ("Where splats start", "#8a4f9e", "s", "adaptive"),
     "solve steps": ("Steps of the colour solve", "#c27c0e", "^", "10"),
@@ -20,8 +21,6 @@ KNOBS = {
     "gaussians": ("Number of Gaussians", "#1f9e89", "v", ""),
     "components": ("Components a channel of eigengs", "#5a8f3c", "P", "300"),
 }
-"""What a knob is, its colour and marker, and its value in the default fit (or that of eigengs)."""
-
 LABELS = ("seconds, start included", "PSNR in YCbCr / dB")
 
 

@@ -10,9 +10,7 @@ from eigengs_bench.harness.store import Row, code_name
 from eigengs_bench.report.frames import MISSING, Table, Told, number, table
 from eigengs_dr.refine import EXACT
 
-TOLERANCE = 0.01
-"""Decibels that an end may lie below its start."""
-
+TOLERANCE = 0.01  # decibels that an end may lie below its start
 NOT_FINITE = "not finite"
 
 
@@ -77,6 +75,7 @@ def _cost(row: Row) -> str:
     return number(row.get("seconds"), 1) + (f" ({memory:.1f} GiB)" if memory else "")
 
 
+# Captions of the tables, and what writes a cell of each.
 FIGURES: tuple[tuple[str, Callable[[Row], str]], ...] = (
     ("PSNR in dB, YCbCr, at the end, from the start", _ends),
     ("PSNR in dB, 8-bit RGB, at the end", lambda row: _decibels(row.get("end_rgb"))),
@@ -86,4 +85,3 @@ FIGURES: tuple[tuple[str, Callable[[Row], str]], ...] = (
     ("Tiling, 8-bit levels", lambda row: number(row.get("tiling"), 2)),
     ("Seconds, and the peak of memory", _cost),
 )
-"""Captions of the tables, and what writes a cell of each."""
