@@ -11,7 +11,7 @@ dr = pytest.importorskip("drjit")
 
 from eigengs_bench.experiments import inverse, inverse_representations  # noqa: E402
 from eigengs_bench.experiments import inverse_scene as scenery  # noqa: E402
-from eigengs_bench.experiments.inverse_representations import METHODS, Coefficients  # noqa: E402
+from eigengs_bench.experiments.inverse_representations import COEFFICIENTS, METHODS, coefficients  # noqa: E402
 from eigengs_bench.names import CONDITIONS  # noqa: E402
 from eigengs_dr.color import to_linear  # noqa: E402
 from eigengs_dr.eigengs import EigenGS  # noqa: E402
@@ -115,16 +115,16 @@ def test_what_is_hidden_stays(basis):
 
 def test_gradients_reach_the_coefficients(basis):
     """The derivative of a rendering is that of finite differences."""
-    unknown = Coefficients(EigenGS.load(basis, "llvm"), basis)
+    unknown = coefficients(EigenGS.load(basis, "llvm"), basis)
     scene = scenery.scene_of(TINY, unknown.texture)
     parameters = mi.traverse(scene)
 
     def brightness(first):
-        start = np.zeros(unknown.precisions.shape, np.float32)
+        start = np.zeros(unknown.scale.shape, np.float32)
         start[0, 0] = first
         value = mi.TensorXf(start)
         dr.enable_grad(value)
-        unknown.put({unknown.key: value}, parameters)
+        unknown.put({COEFFICIENTS: value}, parameters)
         parameters.update()
         return value, dr.mean(mi.render(scene, params=parameters, spp=256, seed=1), axis=None)
 

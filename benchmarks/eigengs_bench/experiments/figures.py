@@ -45,15 +45,6 @@ PANELS = {
     "kodak": 'Kodak, basis "natural"',
 }
 EVERY = 50  # iterations between two points of a curve
-# Sets that a figure shows, and how many of them it cannot do without.
-USED: dict[str, tuple[Sequence[str], int]] = {
-    "iterations": (("kodak", CATS), 0),
-    "colors": ((), 0),
-    "curves": (tuple(PANELS), 1),
-    "radii": ((CATS,), 1),
-    "split": ((CATS,), 1),
-    "cross": ((CATS, NATURAL), 2),
-}
 
 
 def run(
@@ -61,25 +52,31 @@ def run(
 ) -> list[Figure]:
     """Draw figures into a folder, by default all, and list them in its ``figures.json``.
 
-    `note` is told in one line which sets are not there. `ValueError` if nothing can be drawn.
+    `note` is told in one line which ones are left out because they show image sets that are not
+    there. `ValueError` if nothing can be drawn.
     """
-    wanted = [name for name in FIGURES if not names or name in names]
-    lacking = {name: [s for s in USED[name][0] if not is_present(task, s)] for name in wanted}
-    if any(lacking.values()):
-        parts = [f"{name} ({', '.join(missing)})" for name, missing in lacking.items() if missing]
-        why = f"no such sets in {task.data}" if task.data else "no folder DATA was named"
-        note(f"left out: {'; '.join(parts)}: {why}")
-    drawn = [name for name in wanted if len(USED[name][0]) - len(lacking[name]) >= USED[name][1]]
-    if not drawn:
-        raise ValueError("no figure can be drawn without these sets; --figure colors needs none")
     listed = read_list(task.folder / LIST)  # a damaged list is told now, not after minutes
     studies = dict(zip(FIGURES, (iterations, colors, curves, radii, split, cross), strict=True))
+    wanted = [name for name in FIGURES if not names or name in names]
+    drawn = [name for name in wanted if name in ("iterations", "colors") or _has_sets(task, name)]
+    if left := [name for name in wanted if name not in drawn]:
+        where = f"no such sets in {task.data}" if task.data else "no folder DATA was named"
+        note(f"left out: {', '.join(left)}: {where}")
+    if not drawn:
+        raise ValueError("no figure can be drawn without image sets; --figure colors needs none")
     made = [figure for name in drawn for figure in studies[name](task)]
     fresh = [{**figure._asdict(), "run": {"date": today(), **task.run}} for figure in made]
     kept = [entry for entry in listed if entry["name"] not in drawn]
     entries = sorted(kept + fresh, key=lambda entry: FIGURES.index(entry["name"]))
     write_report(task.folder / LIST, {"figures": entries})
     return made
+
+
+def _has_sets(task: Task, name: str) -> bool:
+    """Whether the sets that a figure shows are there; of curves, any."""
+    if name == "curves":
+        return any(is_present(task, panel) for panel in PANELS)
+    return all(is_present(task, used) for used in ((CATS, NATURAL) if name == "cross" else (CATS,)))
 
 
 def read_list(path: Path) -> list[Row]:

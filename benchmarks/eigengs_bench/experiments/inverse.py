@@ -123,7 +123,8 @@ def recover(
     for unknown, last in stages:
         first, scene = step, scene_of(condition, unknown.texture)
         parameters = mi.traverse(scene)
-        values = mi.ad.Adam(unknown.rates, unknown.begin(parameters), **unknown.adam)
+        begin = {key: parameters[key] for key in unknown.rates}
+        values = mi.ad.Adam(unknown.rates, begin, **unknown.adam)
         unknown.put(values, parameters)
         parameters.update()
         if not step:
