@@ -202,9 +202,7 @@ def test_doctor():
     assert found["llvm"]["works"] or found["cuda"]["works"]
 
 
-@pytest.mark.parametrize(
-    "command", [[], ["fit"], ["train"], ["render"], ["info"], ["doctor"]]
-)
+@pytest.mark.parametrize("command", [[], ["fit"], ["train"], ["render"], ["info"], ["doctor"]])
 def test_help_has_an_example(command):
     text = succeeded(run(*command, "--help")).stdout
     assert "Example" in text

@@ -1,7 +1,5 @@
 """``eigengs-dr bench``: one command a question. What a command needs is imported inside it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

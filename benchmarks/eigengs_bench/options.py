@@ -1,7 +1,5 @@
 """What makes a command of an experiment: its options, its folder, and how it tells its rows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path

@@ -4,8 +4,6 @@ The job of a fit has "gaussians" and "rearranged", and its row the figures of `s
 search has "target", and its row gaussians, stopped, iterations, seconds, psnr_ycbcr and psnr_rgb.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """What a model is worth on images that it was not trained on, and as the start of a fit."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -3,8 +3,6 @@
 Everything has the size of the model that is used, 256x256 pixels, and as many Gaussians as it has.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path

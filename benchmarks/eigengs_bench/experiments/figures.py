@@ -1,7 +1,5 @@
 """The pictures of the paper: which there are, what they need, and the list of them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Recover a poster from photos: texels, Gaussians, and coefficients of an eigenbasis, compared."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence

@@ -1,7 +1,5 @@
 """Representations of a poster: texels, Gaussians, or coefficients of an eigenbasis."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -34,8 +32,8 @@ FIRST_STAGE = 0.04  # share of the steps that the coefficients get before all Ga
 class Representation(NamedTuple):
     """A texture, and what is optimised of it: rates by the name of a parameter in the scene.
 
-    Parameters are the values, times `scale` if there is one. ``prior(values, count)`` is added to the sum of
-    squared errors of so many numbers; ``bound(values)`` brings values back inside their bounds.
+    Parameters are the values, times `scale` if there is one. ``prior(values, count)`` is added to
+    the sum of squared errors of so many numbers; ``bound(values)`` brings values inside bounds.
     """
 
     texture: Any

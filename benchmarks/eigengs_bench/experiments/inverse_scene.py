@@ -1,7 +1,5 @@
 """A poster on a wall, under a lamp, and photos of it: the scene of `inverse`."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import drjit as dr

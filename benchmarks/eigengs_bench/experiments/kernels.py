@@ -1,7 +1,5 @@
 """How fast the renderer is: against plain Dr.Jit, against the machine, and as splats stretch."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

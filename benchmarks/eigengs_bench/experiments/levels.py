@@ -1,7 +1,5 @@
 """What levels of detail are worth: PSNR over how many splats of a set are drawn."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

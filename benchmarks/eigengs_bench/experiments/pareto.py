@@ -5,8 +5,6 @@ steps, with "psnr_wide", the PSNR in YCbCr of the same splats at the cutoff `WID
 knob "precision" has "stored", see `stored`; the last row has "kernels", see `_kernels`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace

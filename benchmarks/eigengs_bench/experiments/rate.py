@@ -5,8 +5,6 @@ psnr_rgb, psnr_ycbcr, ssim and seconds, those of encoding; that of a packed fit 
 which are among them, and unpacked_rgb, the PSNR before.
 """
 
-from __future__ import annotations
-
 import io
 import time
 from collections.abc import Iterator, Sequence

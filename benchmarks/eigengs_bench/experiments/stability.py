@@ -1,7 +1,5 @@
 """Hard cases times presets: which stay finite, and which end no worse than they started."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor

@@ -1,7 +1,5 @@
 """Hard cases: images, starts and settings under which a descent might fail; no files are needed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple

@@ -4,8 +4,6 @@ A row has "job" with set, image, seed, iterations, gaussians and the fields of `
 "moments", a list of `score`. A row of the table "reach" has the figures of `_reach`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from typing import NamedTuple

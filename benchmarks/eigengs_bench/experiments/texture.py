@@ -1,7 +1,5 @@
 """How fast a texture of Gaussians is in Mitsuba: against a bitmap on the same ball."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

@@ -4,8 +4,6 @@ A folder of data has one folder a set, with images to train on in ``train/`` and
 on, in ``test/``; or, where nothing is trained, with the images themselves.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from eigengs_bench.harness.store import Task

@@ -8,8 +8,6 @@ of other code are used, as nobody wants to measure an hour again after a change 
 is always said: in one line when a file is continued, and in the caption of every table.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

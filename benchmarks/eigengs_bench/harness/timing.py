@@ -1,7 +1,5 @@
 """Clocks: a descent that is looked at on its way, and programs that take turns."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace

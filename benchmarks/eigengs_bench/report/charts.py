@@ -1,7 +1,5 @@
 """Charts: files that two runs write alike, colours and axes, and charts of pictures."""
 
-from __future__ import annotations
-
 import os
 from base64 import b64encode
 from collections.abc import Mapping, Sequence

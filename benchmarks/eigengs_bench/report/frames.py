@@ -1,7 +1,5 @@
 """Rows as data frames, figures as cells, and tables that say where their rows come from."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise

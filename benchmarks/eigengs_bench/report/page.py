@@ -1,7 +1,5 @@
 """The page of all that benchmarks left in a folder: one HTML file, and Markdown with pictures."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Strips of pictures with captions: rows of fits, and the posters of `inverse`."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

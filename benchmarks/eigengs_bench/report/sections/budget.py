@@ -1,7 +1,5 @@
 """How many Gaussians a PSNR takes, from the rows that `budget` measured."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import cycle
 

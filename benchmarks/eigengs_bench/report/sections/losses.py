@@ -1,7 +1,5 @@
 """Where another preset is ahead of "default": said plainly, from what was measured."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

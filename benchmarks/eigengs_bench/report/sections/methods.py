@@ -1,7 +1,5 @@
 """The rows of `tables` as the paper prints them: means over images, a column a step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any

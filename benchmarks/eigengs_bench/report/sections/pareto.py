@@ -1,7 +1,5 @@
 """Speed against accuracy, from the rows that `pareto` measured: points, fronts and tables."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Charts of speed against accuracy."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

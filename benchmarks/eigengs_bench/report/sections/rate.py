@@ -1,7 +1,5 @@
 """How many bytes a quality takes, from the rows that `rate` measured."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import pandas as pd

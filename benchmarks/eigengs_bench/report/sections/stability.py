@@ -1,7 +1,5 @@
 """The rows of `stability` as tables: cases down, presets across, one table a figure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 
 import pandas as pd
