@@ -223,7 +223,8 @@ def test_the_command_measures_draws_and_goes_on(small, backend, tmp_path):
     assert len(rows) == 3 + 2
     assert {(row["job"]["seed"], row["job"]["iterations"]) for row in rows[:-1]} == {(0, 3)}
     points = list(csv.DictReader(kept["pareto-samples.csv"].decode().splitlines()))
-    assert {point["front"] for point in points} == {"0", "1"} and points[0]["iteration"] == "0"
+    assert {"1"} <= {point["front"] for point in points} <= {"0", "1"}
+    assert points[0]["iteration"] == "0"
     assert b"front: none is better" in kept["pareto-samples.svg"]
     assert run("bench", "pareto", *arguments).stdout == told.stdout
     assert kept == {name: (out / name).read_bytes() for name in files}

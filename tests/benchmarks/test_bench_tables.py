@@ -147,6 +147,13 @@ def test_the_ablation_shows_both_spaces():
     assert lines_of(printed)[0][:3] == ("ycbcr", "split", "47.2")
 
 
+def test_labels_tell_whose_basis_it_is():
+    method = tables.Method("eigengs", "natural256", 300)
+    assert methods.label(method, "natural256") == "eigengs, 300 components, own basis"
+    assert methods.label(method, "cats256") == "eigengs, 300 components, universal basis"
+    assert "faces256 basis" in methods.label(method._replace(source="faces256"), "cats256")
+
+
 def test_what_is_never_reached_is_said():
     job = {"set": "faces256", "iterations": 1000}
     rows = [

@@ -85,7 +85,7 @@ def label(method: Method, name: str) -> str:
     """Name of a method on a set, for a reader."""
     if not method.source:
         return method.preset
-    basis = {name: "own", NATURAL: "universal"}.get(method.source, method.source)
+    basis = {NATURAL: "universal", name: "own"}.get(method.source, method.source)
     text = f"{method.preset}, {method.components} components, {basis} basis"
     return text if method.split == "auto" else f"{method.preset}, {method.color}, {method.split}"
 
