@@ -33,18 +33,19 @@ help:
 	@echo "make test-slow  the tests that take minutes"
 	@echo "make docs       build the manual, build/docs/html/index.html; every warning is an error"
 	@echo "make bench      time the renderer"
-	@echo "make report     measure a part of all and write docs/results, in half an hour; goes on after a break"
+	@echo "make report     measure a part of all and write build/results, in half an hour; goes on after a break"
 	@echo "make basis      train the basis that ships, again"
 	@echo "make setup      only set up .venv, and libLLVM where none works"
 	@echo "make clean      remove what these made"
 
 setup: $(READY)
 
-$(READY): pyproject.toml
+$(READY): pyproject.toml benchmarks/pyproject.toml
 	@$(APT_INSTALL); $(PYTHON) -c 'import ensurepip' 2>/dev/null \
 		|| apt_install python3-venv "$(VENV_ADVICE)"
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --editable '.[dev]'
+	$(BIN)/python -m pip install --editable ./benchmarks
 	@$(APT_INSTALL); $(BIN)/eigengs-dr doctor >/dev/null \
 		|| apt_install "libllvm19 libatomic1" "$(LLVM_ADVICE)"
 	$(BIN)/eigengs-dr doctor
@@ -92,7 +93,7 @@ report: $(READY)
 	$(BIN)/eigengs-dr bench figures $(wildcard $(DATA)) -o $(RESULTS) --images 2
 	$(if $(wildcard $(DATA)),$(BIN)/eigengs-dr bench tables $(DATA) -o $(RESULTS) --images 4 \
 		--set faces256 --set cats256 --set cars256 --set natural256)
-	$(BIN)/eigengs-dr bench report $(RESULTS) -o docs/results
+	$(BIN)/eigengs-dr bench report $(RESULTS) -o build/results
 
 basis: $(READY)
 	$(BIN)/python tools/train_natural.py eigengs_dr/data/natural.npz

@@ -5,7 +5,7 @@ What the commands need is imported inside them, so that ``--help`` and mistakes 
 
 import click
 
-from ..cli_bench import bench
+from .bench import bench
 from .console import Program
 from .doctor import doctor
 from .fit import fit

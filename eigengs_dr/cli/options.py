@@ -14,12 +14,6 @@ EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 ANY_PATH = click.Path(path_type=Path)
 
-SETS = ("faces256", "cats256", "cars256", "natural256", "cats512", "kodak")
-"""Of benchmarks, without importing their module, which imports Dr.Jit."""
-
-SAMPLES = "samples"
-"""Photos of scikit-image, a set that needs no data."""
-
 MAX_PIXELS = 1 << 26
 """Largest picture that is rendered, thin ones counted in whole tiles: it takes some 6 GiB."""
 
@@ -78,30 +72,3 @@ def choice(name: str, values: list[str], text: str) -> Any:
 def describe_run(context: click.Context, backend: str | None) -> dict[str, Any]:
     """What every report says of its run: the command as it was typed, and the machine."""
     return {"command": shlex.join([NAME, *context.obj]), **describe(backend)}
-
-
-def folder_option(text: str) -> Any:
-    """Make the option that names the folder of what a command writes."""
-    kind = click.Path(file_okay=False, path_type=Path)
-    text = f"{text}; made where it is missing."
-    return click.option("-o", "--output", required=True, type=kind, metavar="FOLDER", help=text)
-
-
-def set_option(text: str) -> Any:
-    """Make the option that names sets of images."""
-    kind = click.Choice([SAMPLES, *SETS])
-    return click.option("--set", "names", multiple=True, type=kind, help=text)
-
-
-def chosen_sets(names: tuple[str, ...], data: Path | None, usual: str = SAMPLES) -> tuple[str, ...]:
-    """Sets to measure on, each once; without data `SAMPLES` alone.
-
-    Raises
-    ------
-    ValueError
-        If a set is named that needs data.
-    """
-    wanted = tuple(dict.fromkeys(names)) or (SAMPLES if data is None else usual,)
-    if data is None and set(wanted) - {SAMPLES}:
-        raise ValueError("--set needs DATA, the folder that holds the set, for all but samples")
-    return wanted

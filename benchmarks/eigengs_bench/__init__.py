@@ -1,0 +1,1 @@
+"""Measurements of eigengs_dr: what is fast, what is accurate, and where methods fail."""

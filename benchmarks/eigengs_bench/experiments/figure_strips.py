@@ -1,0 +1,218 @@
+"""The paper's figures that are rows of pictures: fits on their way, and what splats are for.
+
+Everything has the size of the model that is used, 256x256 pixels, and as many Gaussians as it has.
+"""
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eigengs_bench.harness.datasets import images_of, is_trained, model_for
+from eigengs_bench.harness.store import Task
+from eigengs_bench.harness.timing import Image, Moment, follow
+from eigengs_bench.names import CATS, NATURAL, SETS
+from eigengs_bench.report.strips import Cell, save_strip, strip
+from eigengs_dr.cli.pictures import overlay
+from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.eigenbasis.registry import load_basis
+from eigengs_dr.fitting.initializers import initialize
+from eigengs_dr.fitting.options import FitOptions
+from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.image.metrics import psnr
+from eigengs_dr.image.resize import center_crop
+from eigengs_dr.image.samples import sample
+from eigengs_dr.raster.render import picture_of
+
+CREDIT = "AFHQ, NAVER Corp., CC BY-NC 4.0"  # of all pictures of cats
+# Of every channel of the models that are trained: those of the paper's comparisons.
+COMPONENTS = 300
+PHOTO = "coffee"  # photo of scikit-image that the basis "natural" was not trained on
+# The presets that are compared, and what stands above their pictures.
+METHODS = {
+    "gaussianimage": "gaussianimage: random start",
+    "eigengs": "eigengs: start from the basis",
+    "default": "default: placed by the image, colours solved",
+}
+MAGNIFIED = 8  # factor of an error before it is added to mid-grey
+MARGIN = 0.08  # around the middle of a picture, in its sides: splats there reach into it
+
+
+class Figure(NamedTuple):
+    """A file with a picture: one of `FIGURES`, the name of the file, and whose images these are."""
+
+    name: str
+    path: str
+    caption: str
+    credit: str = ""
+
+
+def is_present(task: Task, name: str) -> bool:
+    """Tell whether a set is there, with images to train on where models are trained on them."""
+    if task.data is None:
+        return False
+    folder = task.data / SETS[name].folder
+    if name == "kodak":
+        return folder.is_dir()
+    return is_trained(task.data, name) and (folder / "test").is_dir()
+
+
+def descent(
+    task: Task,
+    image: Image,
+    model: EigenGS,
+    preset: str,
+    marks: Sequence[int],
+    color: str = "ycbcr",
+) -> Iterator[Moment]:
+    """Fit an image by a preset with as many splats as a model has; "eigengs" starts from it."""
+    options = FitOptions(
+        gaussians=len(model.gaussians),
+        basis=model if preset == "eigengs" else None,
+        preset=preset,
+        color=color,
+        seed=task.seed,
+        backend=task.backend,
+    )
+    start = partial(initialize, image, options)
+    return follow(start, options.method.schedule, task.iterations, marks)
+
+
+def to_size(image: Image, model: EigenGS) -> Image:
+    """Bring the largest centred part of an image to the size of a model."""
+    return center_crop(image, model.gaussians.width, model.gaussians.height)
+
+
+def iterations(task: Task) -> Iterator[Figure]:
+    """Show the first iterations of every preset: the paper's figures of convergence."""
+    marks = sorted({0, 10, 100, task.iterations} & set(range(task.iterations + 1)))
+    for path, image, model, words, credit in _subjects(task):
+        table = []
+        for done, (preset, heading) in enumerate(METHODS.items()):
+            task.progress(path, done, len(METHODS))
+            cells = [
+                (f"{_at(moment)}: {_decibels(image, moment.picture)}", moment.picture)
+                for moment in descent(task, image, model, preset, marks)
+            ]
+            table.append((heading, [*cells, ("photo", image)]))
+        save_strip(task.folder / path, strip(table, credit))
+        caption = f"{words} {_size(model)}, after {_listed(marks)} iterations; PSNR in YCbCr."
+        yield Figure("iterations", path, caption, credit)
+
+
+def _subjects(task: Task) -> Iterator[tuple[str, Image, EigenGS, str, str]]:
+    """Files, images, models, words and credits of what `iterations` shows."""
+    shipped = load_basis("natural", task.backend)
+    words = 'A photo of scikit-image and the basis "natural".'
+    yield f"iterations-{PHOTO}.jpg", to_size(sample(PHOTO), shipped), shipped, words, ""
+    if is_present(task, "kodak"):
+        [(file, image)] = images_of(task, "kodak", 1)
+        words = 'A Kodak photo and the basis "natural".'
+        yield f"iterations-{Path(file).stem}.jpg", to_size(image, shipped), shipped, words, ""
+    if is_present(task, CATS):
+        [(_, image)] = images_of(task, CATS, 1)
+        words = f"A cat and a basis of other cats with {COMPONENTS} components a channel."
+        model = model_for(task, CATS, CATS, COMPONENTS)
+        yield "cats-iterations-1.png", image, model, words, CREDIT
+
+
+def colors(task: Task) -> Iterator[Figure]:
+    """Compare fits in YCbCr and in RGB: the paper's figures of colour spaces."""
+    model = load_basis("natural", task.backend)
+    image = to_size(sample(PHOTO), model)
+    marks, table = sorted({min(10, task.iterations), task.iterations}), []
+    for done, (color, heading) in enumerate({"ycbcr": "YCbCr", "rgb": "RGB"}.items()):
+        task.progress("colors", done, 2)
+        cells = [("photo", image)]
+        for moment in descent(task, image, model, "default", marks, color):
+            one, other = (psnr(moment.picture, image, space) for space in ("ycbcr", "rgb"))
+            error = 0.5 + MAGNIFIED * (moment.picture - image)
+            cells.append((f"{_at(moment)}: {one:.1f} / {other:.1f}", moment.picture))
+            cells.append((f"{MAGNIFIED} x its error", error))
+        table.append((f"fitted in {heading}; PSNR in YCbCr / in RGB, in dB", cells))
+    save_strip(task.folder / "colors.jpg", strip(table))
+    caption = (
+        'A photo of scikit-image, fitted by the preset "default" in YCbCr and in RGB: '
+        f"{_size(model)}, after {_listed(marks)} iterations; the error is magnified {MAGNIFIED} "
+        "times, around grey."
+    )
+    yield Figure("colors", "colors.jpg", caption)
+
+
+def split(task: Task) -> Iterator[Figure]:
+    """Show what splats for low and for high frequencies make: the paper's figure of both."""
+    model = model_for(task, CATS, CATS, COMPONENTS, split=True)
+    [(_, image)] = images_of(task, CATS, 1)
+    encoded = model.encode(image)
+    whole, low = picture_of(encoded), picture_of(encoded[: model.low])
+    high = 0.5 + whole - low
+    top = [
+        ("photo", image),
+        (f"{model.low:,} for low frequencies", low),
+        (f"{len(encoded) - model.low:,} for high, around grey", high),
+    ]
+    bottom = [
+        (f"both: {_decibels(image, whole)}", whole),
+        ("their outlines in the middle, x 2", _outlines(encoded[: model.low], low)),
+        ("their outlines in the middle, x 2", _outlines(encoded[model.low :], high)),
+    ]
+    save_strip(task.folder / "cats-split.png", strip([("", top), ("", bottom)], CREDIT, 256))
+    caption = (
+        "A cat encoded by a model with the frequency-aware split: pictures of its Gaussians for "
+        "low and for high frequencies alone, and their outlines at one standard deviation."
+    )
+    yield Figure("split", "cats-split.png", caption, CREDIT)
+
+
+def cross(task: Task) -> Iterator[Figure]:
+    """Show cats projected on bases of other images: the paper's figure of cross-dataset starts."""
+    bases = {
+        "cats": model_for(task, CATS, CATS, COMPONENTS),
+        "ImageNet": model_for(task, NATURAL, NATURAL, COMPONENTS),
+        '"natural"': load_basis("natural", task.backend),
+    }
+    heading = "photos, and at iteration 0 from bases of cats, of ImageNet, and the one that ships"
+    table = list[tuple[str, list[Cell]]]()
+    for _, image in images_of(task, CATS, 3):
+        cells = [("photo", image)]
+        for words, model in bases.items():
+            shown = picture_of(model.encode(image, "projected"))
+            cells.append((f"{words}: {_decibels(image, shown)}", shown))
+        table.append(("" if table else heading, cells))
+    save_strip(task.folder / "cats-cross.png", strip(table, CREDIT))
+    caption = (
+        "Cats at iteration 0: projected on bases of other cats, of photos of ImageNet classes "
+        f"({COMPONENTS} components a channel each), and on the one that ships; PSNR in YCbCr."
+    )
+    yield Figure("cross", "cats-cross.png", caption, CREDIT)
+
+
+def _outlines(gaussians: Gaussians, picture: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Outlines over the middle quarter of a picture, which has room for all of them."""
+    height, width = picture.shape[:2]
+    away = np.abs(gaussians.to_arrays()["mean"] / (width, height) - 0.5)
+    near = gaussians[(away < 0.25 + MARGIN).all(axis=1)]
+    large = picture.repeat(4, axis=0).repeat(4, axis=1)
+    return overlay(near, large)[height : 3 * height, width : 3 * width]
+
+
+def _size(model: EigenGS) -> str:
+    shapes = model.gaussians
+    return f"{len(shapes):,} Gaussians, {shapes.width}x{shapes.height} pixels"
+
+
+def _listed(marks: Sequence[int]) -> str:
+    """Write numbers as a list: "0, 10 and 1,000"."""
+    *first, last = (f"{mark:,}" for mark in marks)
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def _at(moment: Moment) -> str:
+    return f"iteration {moment.iteration:,}"
+
+
+def _decibels(image: Image, picture: Image) -> str:
+    return f"{psnr(picture, image, 'ycbcr'):.1f} dB"

@@ -1,0 +1,100 @@
+"""Rate against distortion: packed fits beside JPEG and WebP of as many bytes.
+
+A row has "points": setting (the number of Gaussians, or the quality), bytes, bits_per_pixel,
+psnr_rgb, psnr_ycbcr, ssim and seconds, those of encoding; that of a packed fit also fit_seconds,
+which are among them, and unpacked_rgb, the PSNR before.
+"""
+
+import io
+import time
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as pillow
+
+from eigengs_bench.harness.datasets import images_of
+from eigengs_bench.harness.store import Job, Row, Task
+from eigengs_bench.harness.timing import Image, decibels
+from eigengs_dr.codec.bit_allocation import pack
+from eigengs_dr.fitting.fit import fit
+from eigengs_dr.image.io import to_8bit
+from eigengs_dr.image.metrics import ssim
+from eigengs_dr.raster.render import picture_of
+
+FILE, OURS = "rate.jsonl", "packed Gaussians"
+
+PIXELS = (256, 128, 64, 32, 16, 8)  # pixels a splat of the fits that are packed
+# Decibels that packing may lose: of fits of all numbers of splats, some below and some above,
+# these had the best PSNR at equal size on training photos, by little.
+BUDGET = 0.8
+WARM_UP = 6  # untimed steps before a fit, that compile its programs
+QUALITIES = (2, 5, 10, 15, 20, 30, 40, 50, 60, 70, 80, 85, 90, 95)
+
+# Pillow's names and options of other codecs, at the slowest and best setting of the encoder.
+CODECS: dict[str, tuple[str, dict[str, Any]]] = {
+    "JPEG 4:2:0": ("JPEG", {"optimize": True, "subsampling": 2}),
+    "JPEG 4:4:4": ("JPEG", {"optimize": True, "subsampling": 0}),
+    "WebP": ("WEBP", {"method": 6}),
+}
+
+
+def run(task: Task, names: Sequence[str]) -> list[Row]:
+    """Measure on each image a packed fit of each size, and the codecs."""
+    jobs = [job for name in names for job in _jobs(task, name, images_of(task, name))]
+    return task.measure(FILE, jobs, "rate")
+
+
+def _jobs(task: Task, name: str, images: list[tuple[str, Image]]) -> Iterator[Job]:
+    settings = {"iterations": task.iterations, "budget": BUDGET, "seed": task.seed}
+    for photo, image in images:
+        about = {"set": name, "image": photo}
+        for pixels in PIXELS:
+            count = max(1, image.shape[0] * image.shape[1] // pixels)
+            label = {**about, "codec": OURS, "gaussians": count, **settings}
+            yield label, partial(_packed, task, image, count)
+        for title, codec in CODECS.items():
+            yield {**about, "codec": title}, partial(_coded, image, *codec)
+
+
+def _packed(task: Task, image: Image, count: int) -> Row:
+    """Fit, pack, and judge the picture that the file holds."""
+    made = partial(fit, image, count, seed=task.seed, backend=task.backend)
+    made(iterations=min(WARM_UP, task.iterations))
+    started = time.perf_counter()
+    fitted = made(iterations=task.iterations)
+    between = time.perf_counter()
+    with TemporaryDirectory() as folder:
+        receipt = pack(fitted.gaussians, Path(folder) / "fit.egs", image, BUDGET)
+    seconds = {"seconds": time.perf_counter() - started, "fit_seconds": between - started}
+    point = _point(count, receipt.bytes, picture_of(receipt.gaussians), image)
+    before = decibels(fitted.image, image, "rgb")
+    return {"points": [{**point, **seconds, "unpacked_rgb": before}]}
+
+
+def _coded(image: Image, kind: str, options: dict[str, Any]) -> Row:
+    """Write an image in all qualities, and judge what is read back."""
+    source, points = pillow.fromarray(to_8bit(image).astype(np.uint8)), []
+    for quality in QUALITIES:
+        file = io.BytesIO()
+        started = time.perf_counter()
+        source.save(file, kind, quality=quality, **options)
+        seconds = time.perf_counter() - started
+        shown = np.asarray(pillow.open(file).convert("RGB"), np.float32) / 255
+        points.append({**_point(quality, file.tell(), shown, image), "seconds": seconds})
+    return {"points": points}
+
+
+def _point(setting: int, size: int, shown: NDArray[Any], image: Image) -> Row:
+    return {
+        "setting": setting,
+        "bytes": size,
+        "bits_per_pixel": 8 * size / (image.shape[0] * image.shape[1]),
+        "psnr_rgb": decibels(shown, image, "rgb"),
+        "psnr_ycbcr": decibels(shown, image, "ycbcr"),
+        "ssim": ssim(shown, image),
+    }

@@ -1,0 +1,169 @@
+"""Hard cases times presets: which stay finite, and which end no worse than they started."""
+
+import sys
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from eigengs_bench.experiments.stability_cases import Case
+from eigengs_bench.harness.store import Job, Row, Task
+from eigengs_bench.harness.tiling import tiling
+from eigengs_bench.harness.timing import Image, Moment, decibels, follow
+from eigengs_dr.eigenbasis.registry import load_basis
+from eigengs_dr.fitting.initializers import FitProblem, initialize
+from eigengs_dr.fitting.options import FitOptions
+from eigengs_dr.fitting.presets import PRESETS, Preset
+from eigengs_dr.fitting.refine import trace_steps
+from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.gaussian.covariance import condition_number
+from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.raster.render import picture_of
+
+FILE = "stability.jsonl"
+
+BASIS = "natural"  # where presets that need a basis start
+# Pictures of the case "smooth" that are shown side by side, with gross tiles, faint ones and none:
+# presets, and how many times the steps of the case they take.
+TILES = (("gaussianimage", 1), ("gaussianimage", 3), ("default", 1))
+
+
+def run(task: Task, cases: Iterable[Case], presets: Sequence[str]) -> list[Row]:
+    """Measure every cell of the matrix, case by case."""
+    return task.measure(FILE, jobs(cases, presets, task.seed, task.backend), "stability")
+
+
+def jobs(
+    cases: Iterable[Case], presets: Sequence[str], seed: int = 0, backend: str | None = None
+) -> list[Job]:
+    """Name the cells of the matrix."""
+    return [
+        (
+            {"case": case.name, "preset": name, "seed": seed, "iterations": case.iterations},
+            partial(_measure_alone if case.alone else measure_cell, case, name, seed, backend),
+        )
+        for case in cases
+        for name in presets
+    ]
+
+
+def tiles_of(task: Task, smooth: Case) -> dict[str, Image]:
+    """Fit the case "smooth" for a picture of tiles: pictures by what is said of them."""
+    image, shown = smooth.image(), {}
+    for done, (name, times) in enumerate(TILES):
+        task.progress("tiles", done, len(TILES))
+        longer = smooth._replace(iterations=times * smooth.iterations)
+        last = moments(longer, image, name, task.seed, task.backend)[-1]
+        shown[f"{name}, {last.iteration:,} steps"] = last.picture
+    return shown
+
+
+def measure_cell(case: Case, preset: str, seed: int, backend: str | None) -> Row:
+    """Run a case by a preset and score it: one cell.
+
+    "needs", alone, says what a preset lacks. Else "finite" tells whether all parameters and pixels
+    were at all marks of `trace_steps`; start, end and half are PSNRs of the first and of the last
+    moment and of the last set in half precision, drop those from the best moment to the last;
+    "condition" is the highest of a covariance, "peak_gib" the memory of a case in its own process.
+    """
+    image = case.image()
+    most = image.shape[0] * image.shape[1]
+    if _encodes(case, PRESETS[preset]) and len(load_basis(BASIS, backend).gaussians) > most:
+        return {"needs": f"a basis with at most {most} splats"}
+    followed = moments(case, image, preset, seed, backend)
+    memory = {"peak_gib": _peak()} if case.alone else {}  # before the judgement takes its own
+    return {**_score(followed, image), **memory}
+
+
+def moments(
+    case: Case, image: Image, preset: str, seed: int, backend: str | None = None
+) -> list[Moment]:
+    """Follow the descent of a preset on the image of a case, at the marks of `trace_steps`."""
+    method = PRESETS[preset]
+    rates = {name: case.rates * rate for name, rate in method.schedule.rates.items()}
+    schedule = replace(method.schedule, rates=rates)
+    start = partial(_start, case, image, preset, seed, backend)
+    return list(follow(start, schedule, case.iterations, trace_steps(case.iterations)))
+
+
+def _encodes(case: Case, method: Preset) -> bool:
+    return method.init == "eigen" and case.place is None
+
+
+def _start(case: Case, image: Image, preset: str, seed: int, backend: str | None) -> FitProblem:
+    """Start as the preset does, or in its way from the shapes of the case."""
+    method = PRESETS[preset]
+    if case.place is None:
+        count = None if _encodes(case, method) else case.gaussians
+        options = FitOptions(gaussians=count, preset=preset, seed=seed, backend=backend)
+        return initialize(image, options)
+    target, generator = rgb_to_ycbcr(image), np.random.default_rng(seed)
+    mean, factor = case.place(image, case.gaussians, generator)
+    size, shape = (image.shape[1], image.shape[0]), (case.gaussians, 3)
+    colors = np.zeros(shape) if method.solves else generator.uniform(0, 1, shape)
+    start = Gaussians.from_arrays(mean, factor, colors, size=size, backend=backend).bounded()
+    return FitProblem(solve(start, target).gaussians if method.solves else start, target)
+
+
+def _score(followed: list[Moment], image: Image) -> Row:
+    first, last = followed[0], followed[-1]
+    arrays = [moment.gaussians.to_arrays() for moment in followed]
+    finite = [np.isfinite(moment.picture).all() for moment in followed]
+    finite += [np.isfinite(values).all() for kept in arrays for values in kept.values()]
+    # What a descent adds to its set, the dense mean, is not stored with it.
+    added = last.picture - picture_of(last.gaussians)
+    half = picture_of(_round_to_half(last.gaussians)) + added
+    row: Row = {
+        "finite": all(finite),
+        "condition": max(float(condition_number(kept["factor"]).max()) for kept in arrays),
+        "tiling": tiling(last.picture, image),
+        "gaussians": len(first.gaussians),
+        "seconds": last.seconds,
+    }
+    for space in ("ycbcr", "rgb"):
+        # Above EXACT there is rounding only: no drop. NaN stays.
+        seen = [decibels(m.picture, image, space) for m in followed]
+        row[f"start_{space}"], row[f"end_{space}"] = float(seen[0]), float(seen[-1])
+        row[f"drop_{space}"] = float(np.max(seen) - seen[-1])
+        row[f"half_{space}"] = decibels(half, image, space)
+    return row
+
+
+def _round_to_half(gaussians: Gaussians) -> Gaussians:
+    """Round all parameters to half precision."""
+
+    def half(name: str) -> Any:
+        values = getattr(gaussians, name)
+        return type(values)(dr.float16_array_t(type(values))(values))
+
+    names = ("mean", "factor", "color", "background")
+    return replace(gaussians, **{name: half(name) for name in names})
+
+
+def _measure_alone(case: Case, preset: str, seed: int, backend: str | None) -> Row:
+    """Measure a cell in a new process, whose peak of memory is then that of the cell."""
+    try:
+        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+            return pool.submit(measure_cell, case, preset, seed, backend).result()
+    except BrokenProcessPool:
+        raise ValueError(
+            f"case {case.name!r}: its process was ended, as it is where memory runs out; "
+            "free some, or leave the case out"
+        ) from None
+
+
+def _peak() -> float | None:
+    """Most memory that this process has had, in GiB; None on Windows, which does not tell."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    unit = 1 if sys.platform == "darwin" else 1 << 10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / (1 << 30)

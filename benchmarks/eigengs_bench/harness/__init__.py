@@ -1,0 +1,1 @@
+"""How experiments measure: clocks, rows in files, sets of images."""

@@ -1,0 +1,90 @@
+"""The sets of images that benchmarks run on, and the models trained on them.
+
+A folder of data has one folder a set, with images to train on in ``train/`` and others, to measure
+on, in ``test/``; or, where nothing is trained, with the images themselves.
+"""
+
+from pathlib import Path
+
+from eigengs_bench.harness.store import Task
+from eigengs_bench.harness.timing import Image
+from eigengs_bench.names import SAMPLES, SETS
+from eigengs_dr.eigenbasis.basis import Eigenbasis
+from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.fitting.options import DEFAULT_COUNT
+from eigengs_dr.image.folder import image_files
+from eigengs_dr.image.io import load_image
+from eigengs_dr.image.resize import center_crop
+from eigengs_dr.image.samples import sample
+
+SAMPLE_NAMES, SAMPLE_SIDE = ("chelsea", "coffee", "astronaut"), 256
+
+# Components that are computed of every set: models of fewer take the first of them.
+MAX_COMPONENTS = 500
+
+
+def images_of(task: Task, name: str, count: int | None = None) -> list[tuple[str, Image]]:
+    """Load names and pixels of the first images of a set, by default `task.images` of them.
+
+    Portraits have the size of the set turned by a quarter. `ValueError` if the set is not there.
+    """
+    count = task.images if count is None else count
+    if name == SAMPLES:
+        names = SAMPLE_NAMES[:count]
+        return [(photo, center_crop(sample(photo), SAMPLE_SIDE, SAMPLE_SIDE)) for photo in names]
+    if task.data is None:
+        raise ValueError(f"set {name!r} needs DATA, the folder that holds it")
+    folder, sides = task.data / SETS[name].folder, SETS[name][1:3]
+    files = image_files(folder / "test" if (folder / "test").is_dir() else folder)[:count]
+    found = []
+    for file in files:
+        picture = load_image(file)
+        upright = picture.shape[0] > picture.shape[1]
+        size = (min(sides), max(sides)) if upright else sides
+        found.append((file.name, center_crop(picture, *size)))
+    return found
+
+
+def usual_count(name: str) -> int:
+    """Return the number of splats of fits on a set."""
+    return SETS[name].gaussians if name in SETS else DEFAULT_COUNT
+
+
+def is_trained(data: Path | None, name: str) -> bool:
+    """Tell whether a folder of data has images of a set to train on."""
+    return bool(data and name in SETS and (data / SETS[name].folder / "train").is_dir())
+
+
+def model_for(
+    task: Task,
+    name: str,
+    source: str,
+    components: int,
+    color: str = "ycbcr",
+    split: bool | str = "auto",
+) -> EigenGS:
+    """Load a model of the training images of the set `source`, for images of the set `name`.
+
+    It is trained first if it is not in ``models/`` of the task's folder. `components` are those of
+    each channel; `split` is `frequency_aware` of `EigenGS.fit`.
+    """
+    used, models = SETS[name], task.folder / "models"
+    stem = f"{source}-{used.width}x{used.height}-{color}"
+    kind = "auto" if isinstance(split, str) else "split" if split else "whole"
+    path = models / f"{stem}-{components}-{used.gaussians}-{kind}.npz"
+    if not path.exists():
+        models.mkdir(parents=True, exist_ok=True)
+        basis = models / f"{stem}-basis.npz"
+        if not basis.exists():
+            Eigenbasis.from_images(
+                Path(task.data or "") / SETS[source].folder / "train",
+                (used.width, used.height),
+                MAX_COMPONENTS,
+                color=color,
+                progress=lambda done, total, row: task.progress(basis.stem, done, total or 0),
+            ).save(basis)
+        task.progress(path.stem, 0, 1)
+        kept = Eigenbasis.load(basis).truncated(components)
+        EigenGS.fit(kept, used.gaussians, frequency_aware=split, backend=task.backend).save(path)
+    # Weights are stored in half precision: the file is used in the first run too.
+    return EigenGS.load(path, task.backend)

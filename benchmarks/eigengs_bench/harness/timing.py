@@ -1,0 +1,94 @@
+"""Clocks: a descent that is looked at on its way, and programs that take turns."""
+
+import time
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from eigengs_dr.fitting.initializers import FitProblem
+from eigengs_dr.fitting.optimizers.descent import descend
+from eigengs_dr.fitting.optimizers.schedule import MIN_PHASE_RATIO, Schedule
+from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.image.metrics import MAX_PSNR, ms_ssim, psnr, ssim
+from eigengs_dr.raster.render import picture_of
+
+Image = NDArray[np.float32]  # RGB, shape (H, W, 3), 1 is white
+
+
+class Moment(NamedTuple):
+    """A descent after some steps: seconds since before its start, RGB that is not clamped."""
+
+    iteration: int
+    seconds: float
+    gaussians: Gaussians
+    picture: Image
+
+
+def follow(
+    begin: Callable[[], FitProblem], schedule: Schedule, iterations: int, marks: Collection[int]
+) -> Iterator[Moment]:
+    """Run a descent to its last step and yield its state after the steps in `marks`.
+
+    Unlike `eigengs_dr.fit` it takes all steps, also where nothing is gained any more, and shows the
+    set as it is, not the best so far. The time of `begin` counts; the clock stops between moments.
+    """
+    spent, resumed = 0.0, time.perf_counter()
+    start = begin()
+    sets = descend(start, schedule, iterations)
+    for iteration, current in enumerate(sets):
+        if iteration not in marks:
+            continue
+        dr.eval(current)
+        dr.sync_thread()  # steps run asynchronously
+        spent += time.perf_counter() - resumed
+        picture = picture_of(current)
+        if start.base_image is not None:
+            picture = picture + start.base_image
+        yield Moment(iteration, spent, current, picture)
+        resumed = time.perf_counter()
+
+
+def warm_up(begin: Callable[[], FitProblem], schedule: Schedule, iterations: int) -> None:
+    """Compile the programs of a descent of so many steps, also those that place splats anew."""
+    steps = min(MIN_PHASE_RATIO, iterations)
+    list(follow(begin, replace(schedule, redistribute_after=1), steps, (0, steps)))
+
+
+def decibels(picture: Image, image: Image, space: str) -> float:
+    """Return a PSNR for a row, in dB, at most `MAX_PSNR`; a fit that failed has NaN."""
+    return min(psnr(picture, image, space), MAX_PSNR)
+
+
+def score(moment: Moment, image: Image) -> dict[str, Any]:
+    """Turn a moment into a row: iteration, seconds, psnr_ycbcr, psnr_rgb, ssim, ms_ssim."""
+    return {
+        "iteration": moment.iteration,
+        "seconds": moment.seconds,
+        "psnr_ycbcr": decibels(moment.picture, image, "ycbcr"),
+        "psnr_rgb": decibels(moment.picture, image, "rgb"),
+        "ssim": ssim(moment.picture, image),
+        "ms_ssim": ms_ssim(moment.picture, image),
+    }
+
+
+def interleaved(
+    programs: dict[str, Callable[[], Any]],
+    warm_up: int,
+    rounds: int,
+    progress: Callable[[int], None] = lambda done: None,
+) -> dict[str, float]:
+    """Time programs in turns, one of each a round; return median milliseconds by name."""
+    times: dict[str, list[float]] = {name: [] for name in programs}
+    for done in range(warm_up + rounds):
+        for name, program in programs.items():
+            started = time.perf_counter()
+            dr.eval(program())
+            dr.sync_thread()
+            if done >= warm_up:  # the first rounds compile and settle
+                times[name].append((time.perf_counter() - started) * 1e3)
+        progress(done + 1)
+    return {name: float(np.median(ms)) for name, ms in times.items()}

@@ -1,0 +1,1 @@
+"""How rows are told: tables, charts, and the page of both."""
