@@ -1,4 +1,4 @@
-"""``eigengs-dr doctor``: what works on this machine."""
+"""The command ``eigengs-dr doctor``: check this machine."""
 
 import json
 
@@ -13,11 +13,12 @@ from .options import json_option
 def doctor(context: click.Context, as_json: bool) -> None:
     """Show what works on this machine and what to install.
 
-    Ends with exit code 1 where no backend works.
+    The exit code is 1 if no backend works.
 
     \b
-    Example:
+    Examples:
       eigengs-dr doctor
+      eigengs-dr doctor --json
     """
     from ..backend import doctor as doctor_module
 
