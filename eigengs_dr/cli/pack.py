@@ -95,7 +95,8 @@ def pack(
         space = "sRGB" if gaussians.space == "linear" else gaussians.space
         click.echo(
             f"{file}: {len(gaussians):,} Gaussians, {file.stat().st_size:,} bytes\n"
-            f"  wrote {target}: {receipt.bytes:,} bytes, {receipt.bits_per_pixel:.3f} bits per pixel"
-            f"\n  lost {receipt.psnr_drop:.2f} dB: {receipt.psnr:.2f} dB in {space} "
+            f"  wrote {target}: {receipt.bytes:,} bytes, "
+            f"{receipt.bits_per_pixel:.3f} bits per pixel\n"
+            f"  lost {receipt.psnr_drop:.2f} dB: {receipt.psnr:.2f} dB in {space} "
             f"against {against}"
         )
