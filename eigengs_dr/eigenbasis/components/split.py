@@ -85,7 +85,7 @@ def split_reason(
     if count < 2 or low_component_count(basis) < 1:
         return "too few Gaussians or components to split"
     if isinstance(frequency_aware, bool):
-        return "as asked"
+        return "frequency_aware is set"
     if figures:
         whole, split = figures["psnr_whole"], figures["psnr_split"]
         return f"whole {whole:.2f} dB, split {split:.2f} dB, may cost {SPLIT_COST:g}"
