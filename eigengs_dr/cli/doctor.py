@@ -22,6 +22,6 @@ def doctor(context: click.Context, as_json: bool) -> None:
     """
     from ..backend import doctor as doctor_module
 
-    found = doctor_module.report()
-    click.echo(json.dumps(found, indent=2) if as_json else doctor_module.describe(found))
-    context.exit(0 if found["llvm"]["works"] or found["cuda"]["works"] else 1)
+    facts = doctor_module.report()
+    click.echo(json.dumps(facts, indent=2) if as_json else doctor_module.describe(facts))
+    context.exit(0 if facts["llvm"]["works"] or facts["cuda"]["works"] else 1)

@@ -150,8 +150,8 @@ def _fitter(options: FitOptions, levels: int | None) -> Callable[..., "Fit"]:
 
     if levels is not None:
         names = ("gaussians", "iterations", "color", "seed", "backend")
-        kept = {name: getattr(options, name) for name in names}
-        return lambda image, progress: fit_levels(image, levels=levels, progress=progress, **kept)
+        common = {name: getattr(options, name) for name in names}
+        return lambda image, progress: fit_levels(image, levels=levels, progress=progress, **common)
     if options.initializer == "eigen":
         from ..eigenbasis.registry import load_basis
 
@@ -231,15 +231,15 @@ def _exit(context: click.Context, records: list[dict[str, Any]], options: FitOpt
     if records[-1]["stopped"] == "interrupted":
         say(f"interrupted; the best fit so far is in {records[-1]['output']}")
         context.exit(INTERRUPTED)
-    missed = [record for record in records if record["stopped"] == "out of reach"]
-    for record in missed:
-        reached = record["psnr_" + options.target_space]
+    failures = [record for record in records if record["stopped"] == "out of reach"]
+    for record in failures:
+        psnr = record["psnr_" + options.target_space]
         say(
             f"{record['input']}: {options.target_psnr:g} dB are out of reach: "
-            f"{record['gaussians']} Gaussians have {reached:.2f}; lower --target-psnr, or raise "
+            f"{record['gaussians']} Gaussians have {psnr:.2f}; lower --target-psnr, or raise "
             "--max-gaussians or --iterations"
         )
-    if missed:
+    if failures:
         context.exit(MISSED)
 
 

@@ -55,10 +55,12 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
         modelfile.FORMAT: ("model", EigenGS.load, _describe_model, component_sheet),
     }
     file = SHIPPED.get(str(file), file)
-    found = setfile.FORMAT if packed.is_egs(file) else archive.format_of(file)
-    if found not in kinds:
-        raise ValueError(f"{file}: format is {found[:40]!r}, expected one of {', '.join(kinds)}")
-    kind, load, describe, draw = kinds[found]
+    file_format = setfile.FORMAT if packed.is_egs(file) else archive.format_of(file)
+    if file_format not in kinds:
+        raise ValueError(
+            f"{file}: format is {file_format[:40]!r}, expected one of {', '.join(kinds)}"
+        )
+    kind, load, describe, draw = kinds[file_format]
     content = load(file)
     facts = {"file": str(file), "kind": kind, "bytes": file.stat().st_size, **describe(content)}
     if kind == "image":
@@ -131,10 +133,10 @@ def _text(fall: Any = (), **facts: Any) -> str:
         lines += ["", f"components{'':16} {'variance':>8} {'training':>9} {'held out':>9}"]
     for row in fall:
         each = "+".join(map(str, row["components"]))
-        tested = f"{row['psnr_held_out']:6.2f} dB" if "psnr_held_out" in row else "-"
+        held_out = f"{row['psnr_held_out']:6.2f} dB" if "psnr_held_out" in row else "-"
         lines.append(
             f"{sum(row['components']):10} = {each:13} {row['variance']:8.2%} "
-            f"{row['psnr_training']:6.2f} dB {tested:>9}"
+            f"{row['psnr_training']:6.2f} dB {held_out:>9}"
         )
     return "\n".join(lines)
 

@@ -109,7 +109,7 @@ def chosen_sets(names: tuple[str, ...], data: Path | None, usual: str = SAMPLES)
     ValueError
         If a set needs data and there are none.
     """
-    wanted = tuple(dict.fromkeys(names)) or (SAMPLES if data is None else usual,)
-    if data is None and set(wanted) - {SAMPLES}:
+    sets = tuple(dict.fromkeys(names)) or (SAMPLES if data is None else usual,)
+    if data is None and set(sets) - {SAMPLES}:
         raise ValueError("--set: all sets but samples need DATA, the folder of the sets; name it")
-    return wanted
+    return sets

@@ -43,9 +43,9 @@ def name_outputs(
     if not output.is_dir() and (output.exists() or output.suffix.lower() in suffixes):
         raise ValueError(f"{output}: is a file; several images need a folder")
     names = [path.stem + suffixes[0] for path in inputs]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice:
-        raise ValueError(f"{output / twice}: two images have this name; rename one of them")
+    duplicate = next((name for name in names if names.count(name) > 1), None)
+    if duplicate:
+        raise ValueError(f"{output / duplicate}: two images have this name; rename one of them")
     output.mkdir(parents=True, exist_ok=True)
     return [output / name for name in names]
 
@@ -67,12 +67,12 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> Non
     OSError
         If a file cannot be written.
     """
-    taken = {os.path.realpath(path): "is read" for path in inputs}
+    uses = {os.path.realpath(path): "is read" for path in inputs}
     for output in outputs:
         if output is None:
             continue
         real = os.path.realpath(output)
-        if real in taken:
-            raise ValueError(f"{output}: {taken[real]} too; write to another file")
-        taken[real] = "is written"
+        if real in uses:
+            raise ValueError(f"{output}: {uses[real]} too; write to another file")
+        uses[real] = "is written"
         require_writable(output)

@@ -127,10 +127,10 @@ def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
         RGB.
     """
     # Regular picks would draw stripes if the Gaussians lie on a grid.
-    chosen = np.random.default_rng(0).permutation(len(gaussians))[:MAX_OUTLINES]
+    picks = np.random.default_rng(0).permutation(len(gaussians))[:MAX_OUTLINES]
     under = LIGHTER + (1 - LIGHTER) * np.clip(picture, 0, 1)
-    drawn = gaussians[chosen]
-    return _outlined(under, drawn, [HIGH_COLOR] * len(drawn))
+    subset = gaussians[picks]
+    return _outlined(under, subset, [HIGH_COLOR] * len(subset))
 
 
 def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Picture:
@@ -188,10 +188,12 @@ def _in_sight(points: Picture, size: tuple[int, int]) -> Picture:
 def _require_same(model: EigenGS, basis: Eigenbasis) -> None:
     """Raise ValueError unless a basis has the size, space and components of a model."""
     shapes = model.gaussians
-    made = (shapes.width, shapes.height, shapes.space, model.components)
-    given = (basis.width, basis.height, basis.space, tuple(map(len, basis.components)))
-    if made != given:
-        raise ValueError(f"basis is {given}, the model {made}; pass the basis it was fitted to")
+    expected = (shapes.width, shapes.height, shapes.space, model.components)
+    actual = (basis.width, basis.height, basis.space, tuple(map(len, basis.components)))
+    if expected != actual:
+        raise ValueError(
+            f"basis is {actual}, the model {expected}; pass the basis it was fitted to"
+        )
 
 
 def _mean(model: EigenGS, basis: Eigenbasis | None) -> Picture:
@@ -205,19 +207,19 @@ def _mean(model: EigenGS, basis: Eigenbasis | None) -> Picture:
 def _components(model: EigenGS, basis: Eigenbasis | None) -> list[Picture]:
     """Draw one column for each component of the sheet."""
     space = model.gaussians.space
-    chosen = [
+    picks = [
         (channel, number - 1)
         for channel, count in enumerate(model.components)
         for number in (OTHERS if channel else FIRST)
         if number <= count
     ]
-    if not chosen:
+    if not picks:
         return []
     # There are at most 13 channels, so one program renders all.
-    weights = np.stack([model.weights[channel][j] for channel, j in chosen], axis=1)
+    weights = np.stack([model.weights[channel][j] for channel, j in picks], axis=1)
     rendered = render(with_colors(model.gaussians, weights, "data")).numpy()
     columns = []
-    for (channel, j), plane in zip(chosen, np.moveaxis(rendered, 2, 0), strict=True):
+    for (channel, j), plane in zip(picks, np.moveaxis(rendered, 2, 0), strict=True):
         planes = [plane] if basis is None else [basis.components[channel][j], plane]
         # A quantile, because one bright pixel must not make everything else grey.
         scale = 0.5 / (np.quantile(np.abs(planes[0]), 0.999) or 1)
@@ -240,8 +242,8 @@ def _parts_of_mean(model: EigenGS) -> list[Picture]:
 
 def _hue(space: str, channel: int) -> NDArray[np.float32]:
     """Return the RGB direction of one channel of a space; its largest entry is 1."""
-    added = np.subtract(decode(space, list(np.eye(3)[channel])), decode(space, [0.0] * 3))
-    return (added / np.abs(added).max()).astype(np.float32)
+    difference = np.subtract(decode(space, list(np.eye(3)[channel])), decode(space, [0.0] * 3))
+    return (difference / np.abs(difference).max()).astype(np.float32)
 
 
 def _within(longest: int, width: int, height: int) -> tuple[int, int]:

@@ -118,16 +118,16 @@ def train(
     settings = _settings(**options)
     try:
         with progress_bar(quiet) as show:
-            trained = training.train(folder, output, settings, backend, show)
+            result = training.train(folder, output, settings, backend, show)
     except training.Interrupted as error:
         say(f"interrupted; {error}")
         context.exit(INTERRUPTED)
     if picture:
-        _save_sheet(picture, trained)
-    record = {"input": str(folder), "output": str(output), **_figures(trained.figures)}
+        _save_sheet(picture, result)
+    record = {"input": str(folder), "output": str(output), **_figures(result.figures)}
     if report:
-        chosen = {**vars(settings), "most_components": settings.components}
-        write_report(report, {**describe_run(context, backend), **chosen, **record})
+        choices = {**vars(settings), "most_components": settings.components}
+        write_report(report, {**describe_run(context, backend), **choices, **record})
     if not quiet:
         click.echo(_summary(record, picture))
 

@@ -175,9 +175,9 @@ class Eigenbasis:
         there is not one coefficient for each component.
         """
         weights = [np.asarray(w, np.float32) for w in coefficients]
-        given, kept = [w.shape for w in weights], [(len(c),) for c in self.components]
-        if given != kept:
-            raise ValueError(f"coefficients have shapes {given}; expected {kept}")
+        actual, expected = [w.shape for w in weights], [(len(c),) for c in self.components]
+        if actual != expected:
+            raise ValueError(f"coefficients have shapes {actual}; expected {expected}")
         pairs = zip(weights, self.components, strict=True)
         return _rgb(self.mean + np.stack([np.tensordot(w, c, 1) for w, c in pairs]), self.space)
 
@@ -205,8 +205,8 @@ class Eigenbasis:
         rows = [self._left(image) for image in images]
         if not rows:
             raise ValueError("there are no images to measure the basis on; pass at least one")
-        left = [np.stack(channel) for channel in zip(*rows, strict=True)]
-        return curve_from_residuals(self.eigenvalues, left, self.mean.size)
+        residuals = [np.stack(channel) for channel in zip(*rows, strict=True)]
+        return curve_from_residuals(self.eigenvalues, residuals, self.mean.size)
 
     def truncated(self, components: int | Sequence[int]) -> Eigenbasis:
         """Return the basis of the first components; `components` is one number, or one per channel.
@@ -239,8 +239,8 @@ class Eigenbasis:
 
     def _centred(self, image: ArrayLike) -> NDArray[np.float32]:
         """Resample and convert an image and subtract the mean; shape (C, H, W)."""
-        fitting = resample(check_image(image), self.width, self.height)
-        planes = to_planes(fitting, self.space) - self.mean.reshape(self.channels, -1)
+        pixels = resample(check_image(image), self.width, self.height)
+        planes = to_planes(pixels, self.space) - self.mean.reshape(self.channels, -1)
         return planes.reshape(self.mean.shape)
 
     def _coefficients(self, planes: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
@@ -273,10 +273,10 @@ def check_components(
 
 def _keep_energy(basis: Eigenbasis, most: Sequence[int], energy: float) -> Eigenbasis:
     """Keep the fewest components that hold a share of the variance."""
-    enough = []
+    ranks = []
     for name, shares, cap in zip(CHANNELS[basis.space], basis.energy(), most, strict=True):
-        enough.append(int(np.searchsorted(shares, energy)) + 1)
-        varies = basis.variance[len(enough) - 1] > 0
+        ranks.append(int(np.searchsorted(shares, energy)) + 1)
+        varies = basis.variance[len(ranks) - 1] > 0
         share = shares[-1] if len(shares) else 0.0
         if varies and len(shares) == cap and share < energy - ENERGY_TOLERANCE:
             warnings.warn(
@@ -284,7 +284,7 @@ def _keep_energy(basis: Eigenbasis, most: Sequence[int], energy: float) -> Eigen
                 f"less than {energy:.2%}; raise components",
                 stacklevel=3,
             )
-    return basis.truncated(enough)
+    return basis.truncated(ranks)
 
 
 def _cumulative_share(eigenvalues: NDArray[np.float64], variance: float) -> NDArray[np.float64]:

@@ -117,16 +117,18 @@ class EigenGS:
         steps = check_arguments(
             (basis.width, basis.height), gaussians, frequency_aware, seed, preset, steps
         )
-        split, compared = wants_split(basis, gaussians, frequency_aware, backend)
+        split, figures = wants_split(basis, gaussians, frequency_aware, backend)
         total = steps * (2 if split else 1)
 
         def save(states: list[State]) -> None:
             if progress:
                 progress(sum(int(state["step"]) for state in states), total, {})
 
-        fitted = fit_components(basis, gaussians, split, preset, steps, seed, backend, save=save)
-        reason = split_reason(basis, gaussians, frequency_aware, compared)
-        return cls.from_fit(basis, fitted, compared, split_reason=reason)
+        component_fit = fit_components(
+            basis, gaussians, split, preset, steps, seed, backend, save=save
+        )
+        reason = split_reason(basis, gaussians, frequency_aware, figures)
+        return cls.from_fit(basis, component_fit, figures, split_reason=reason)
 
     @classmethod
     def from_fit(
@@ -209,12 +211,12 @@ class EigenGS:
         ValueError
             If there is not one array for each channel, or one has over k_c coefficients.
         """
-        given = [np.shape(values) for values in coefficients]
-        if len(given) != len(self.weights) or not all(
+        shapes = [np.shape(values) for values in coefficients]
+        if len(shapes) != len(self.weights) or not all(
             len(shape) == 1 and shape[0] <= k
-            for shape, k in zip(given, self.components, strict=True)
+            for shape, k in zip(shapes, self.components, strict=True)
         ):
-            raise ValueError(f"coefficients have shapes {given}; expected up to {self.components}")
+            raise ValueError(f"coefficients have shapes {shapes}; expected up to {self.components}")
         return self._colored(self._mean_coefficients + self._sum(coefficients), size)
 
     def encode(
@@ -251,12 +253,12 @@ class EigenGS:
         UserWarning
             If all components miss the target; the result then uses all of them.
         """
-        for name, value, known in (
+        for name, value, valid in (
             ("colors", colors, ("exact", "projected")),
             ("mean", mean, ("gaussians", "dense")),
         ):
-            if value not in known:
-                raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(known)}")
+            if value not in valid:
+                raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(valid)}")
         if colors == "exact" and target_psnr is not None:
             raise ValueError("target_psnr chooses components; use it with colors 'projected'")
         pixels = check_image(image)
@@ -267,10 +269,10 @@ class EigenGS:
         correlations = self.equations.correlate(planes)
         if colors == "exact":
             return self._colored(self.equations.solve(correlations), size)
-        found = self._coefficients(planes, correlations, mean == "dense", target_psnr)
+        coefficients = self._coefficients(planes, correlations, mean == "dense", target_psnr)
         if mean == "dense":
-            return self._colored(self._sum(found), size)
-        return self.reconstruct(found, size)
+            return self._colored(self._sum(coefficients), size)
+        return self.reconstruct(coefficients, size)
 
     def dense_mean(self, width: int, height: int) -> Planes:
         """Return the pixels of the mean image, shape (height, width, C), in the model's space."""
@@ -348,13 +350,13 @@ class EigenGS:
         target_psnr: float | None,
     ) -> tuple[Planes, ...]:
         """Solve least squares on the rendered components; `centred` planes lack the mean image."""
-        seen = correlations if centred else correlations - self._mean_product
+        products = correlations if centred else correlations - self._mean_product
         if target_psnr is None:
-            return self._projector.coefficients(seen)
+            return self._projector.coefficients(products)
         lengths = squared_norms(planes)
         if not centred:
             lengths = self.equations.error(self._mean_coefficients, correlations, lengths)
-        return self._projector.coefficients_for_psnr(seen, lengths, planes.size, target_psnr)
+        return self._projector.coefficients_for_psnr(products, lengths, planes.size, target_psnr)
 
     def _sum(self, coefficients: tuple[Any, ...]) -> NDArray[np.float64]:
         """Return ``sum_j a_j psi_nj`` of each channel, shape (N + 1, C)."""

@@ -73,12 +73,12 @@ def evaluate(
     """
     rows, bad = [], list[str]()
     for image in _readable(files, basis, watch, bad):
-        shown = {
+        pictures = {
             "psnr_pca": basis.reconstruct(basis.project(image)),
             "psnr_init": render(model.encode(image, "projected")).numpy(),
             "psnr_solved": render(model.encode(image, "exact")).numpy(),
         }
-        rows.append({name: psnr(image, picture, "ycbcr") for name, picture in shown.items()})
+        rows.append({name: psnr(image, picture, "ycbcr") for name, picture in pictures.items()})
     if bad:
         message = f"{len(bad)} of {len(files)} images held out were skipped, as {bad[0]}"
         warnings.warn(message, stacklevel=2)

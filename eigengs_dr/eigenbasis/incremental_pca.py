@@ -155,9 +155,9 @@ def merge(state: EigenState, block: NDArray[np.float32], rank: Sequence[int]) ->
         squares.append(np.trace(gram[len(state.rows[c]) :, len(state.rows[c]) :]))
         values, weights = _largest_eigenpairs(gram, most, FLOOR * (n + b) * block.shape[2])
         weights[: len(state.rows[c])] *= np.sqrt(state.scatter[c])[:, None]
-        found = _rotate(state.rows[c], block[:, c], weights.T.astype(np.float32))
-        found, values = _orthonormalize(found, values)
-        rows.append(found)
+        directions = _rotate(state.rows[c], block[:, c], weights.T.astype(np.float32))
+        directions, values = _orthonormalize(directions, values)
+        rows.append(directions)
         scatter.append(values)
     return EigenState(
         count=n + b,
@@ -196,8 +196,8 @@ def _largest_eigenpairs(
     """Return the largest eigenvalues, descending, and the weights of rows in unit eigenvectors."""
     values, vectors = np.linalg.eigh(gram, UPLO="L")
     values, vectors = values[::-1][:most], vectors[:, ::-1][:, :most]
-    kept = values > max(floor, NOISE * np.trace(gram))
-    return values[kept], vectors[:, kept] / np.sqrt(values[kept])
+    significant = values > max(floor, NOISE * np.trace(gram))
+    return values[significant], vectors[:, significant] / np.sqrt(values[significant])
 
 
 def _rotate(

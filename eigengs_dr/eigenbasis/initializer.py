@@ -50,8 +50,8 @@ def _encode(model: EigenGS, target: FitTarget, options: FitOptions) -> Gaussians
 
 def _picture(planes: NDArray[np.float32], color: str) -> NDArray[np.float32]:
     """Return the RGB that planes add to a rendering, which already holds the RGB of zeros."""
-    shown = np.stack(decode(color, list(np.moveaxis(planes, 2, 0))), axis=2)
-    return shown - np.array(decode(color, [0.0] * planes.shape[2]), np.float32)
+    rgb = np.stack(decode(color, list(np.moveaxis(planes, 2, 0))), axis=2)
+    return rgb - np.array(decode(color, [0.0] * planes.shape[2]), np.float32)
 
 
 def _check_basis(
@@ -71,7 +71,7 @@ def _check_basis(
             "use init 'adaptive'"
         )
     if color != space:
-        trained = f"train a basis with --color {color}" if color in BASIS_SPACES else "another init"
+        advice = f"train a basis with --color {color}" if color in BASIS_SPACES else "another init"
         raise ValueError(
-            f"color is {color!r}, but the basis is in {space!r}; use color {space!r}, or {trained}"
+            f"color is {color!r}, but the basis is in {space!r}; use color {space!r}, or {advice}"
         )

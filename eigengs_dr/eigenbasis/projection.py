@@ -55,11 +55,11 @@ class ComponentProjector:
         -------
         tuple of C ndarrays of float32, shape (k_c,)
         """
-        found = []
-        for seen, factor in zip(self._inner_products(correlations), self.factors, strict=True):
-            solved = cho_solve(factor, seen, check_finite=False) if len(seen) else seen
-            found.append(solved.astype(np.float32))
-        return tuple(found)
+        result = []
+        for rhs, factor in zip(self._inner_products(correlations), self.factors, strict=True):
+            solution = cho_solve(factor, rhs, check_finite=False) if len(rhs) else rhs
+            result.append(solution.astype(np.float32))
+        return tuple(result)
 
     def coefficients_for_psnr(
         self,
@@ -88,20 +88,20 @@ class ComponentProjector:
             With ``m_c <= k_c``.
         """
         halves = [
-            solve_triangular(factor[0], seen, lower=True, check_finite=False) if len(seen) else seen
-            for seen, factor in zip(self._inner_products(correlations), self.factors, strict=True)
+            solve_triangular(factor[0], rhs, lower=True, check_finite=False) if len(rhs) else rhs
+            for rhs, factor in zip(self._inner_products(correlations), self.factors, strict=True)
         ]
         pairs = zip(squares, halves, strict=True)
-        left = [residual_energy(total, y.astype(np.float64) ** 2) for total, y in pairs]
-        counts = min_ranks_per_channel(left, entries, target_psnr)
-        found = []
+        residuals = [residual_energy(total, y.astype(np.float64) ** 2) for total, y in pairs]
+        counts = min_ranks_per_channel(residuals, entries, target_psnr)
+        result = []
         for y, factor, k in zip(halves, self.factors, counts, strict=True):
-            solved = y[:k]
+            solution = y[:k]
             if k:
                 lower = factor[0][:k, :k]
-                solved = solve_triangular(lower, solved, "T", lower=True, check_finite=False)
-            found.append(solved.astype(np.float32))
-        return tuple(found)
+                solution = solve_triangular(lower, solution, "T", lower=True, check_finite=False)
+            result.append(solution.astype(np.float32))
+        return tuple(result)
 
     def _inner_products(self, correlations: NDArray[np.float64]) -> list[NDArray[np.float32]]:
         """Return ``Psi~^T x`` of each channel."""

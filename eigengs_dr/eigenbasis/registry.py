@@ -29,10 +29,10 @@ def load_basis(basis: str | os.PathLike[str] | EigenGS, backend: str | None = No
         backend.
     """
     if isinstance(basis, EigenGS):
-        held = types_of(basis.gaussians.mean).backend
-        if backend not in (None, held):
+        current = types_of(basis.gaussians.mean).backend
+        if backend not in (None, current):
             raise ValueError(
-                f"the basis is a model on backend {held!r}, not on {backend!r}; load it with "
+                f"the basis is a model on backend {current!r}, not on {backend!r}; load it with "
                 f"backend={backend!r}, or leave the backend out"
             )
         return basis

@@ -131,8 +131,8 @@ def train(
     )
     folder = Path(folder)
     names = [path.name for path in image_files(folder)]
-    decisive = {**asdict(settings), "steps": steps, "folder": str(folder)}
-    with Checkpoint(output, json.loads(json.dumps(decisive)), names) as checkpoint:
+    record = {**asdict(settings), "steps": steps, "folder": str(folder)}
+    with Checkpoint(output, json.loads(json.dumps(record)), names) as checkpoint:
         if names != checkpoint.files:
             warnings.warn(
                 f"{folder}: the images have changed since this training began; it goes on with "
@@ -151,7 +151,7 @@ def train(
                 model = _model(
                     basis, truncation_curve_on(basis, held_out, run.stop_if_pressed), run
                 )
-                worth = evaluate(model, basis, held_out, partial(run.measure, total=len(held_out)))
+                scores = evaluate(model, basis, held_out, partial(run.measure, total=len(held_out)))
             except ValueError as error:
                 if not checkpoint.holds_work:
                     raise
@@ -168,7 +168,7 @@ def train(
             "steps": steps,
             "pca_seconds": pca_seconds,
             **model.figures,
-            **worth,
+            **scores,
             "peak_rss_mb": _peak_rss(),
             "seconds": time.perf_counter() - started,
         }
@@ -245,7 +245,7 @@ def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS
     settings, checkpoint = run.settings, run.checkpoint
     run.stop_if_pressed()
     run.progress("weights", 0, 1)
-    split, compared = wants_split(basis, settings.gaussians, settings.frequency_aware, run.backend)
+    split, figures = wants_split(basis, settings.gaussians, settings.frequency_aware, run.backend)
     saved = time.perf_counter()
 
     def save(states: list[State]) -> None:
@@ -259,7 +259,7 @@ def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS
                 checkpoint.save("shapes", flat)
         run.stop_if_pressed()
 
-    fitted = fit_components(
+    component_fit = fit_components(
         basis,
         settings.gaussians,
         split,
@@ -272,9 +272,9 @@ def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS
     )
     return EigenGS.from_fit(
         basis,
-        fitted,
-        compared,
-        split_reason=split_reason(basis, settings.gaussians, settings.frequency_aware, compared),
+        component_fit,
+        figures,
+        split_reason=split_reason(basis, settings.gaussians, settings.frequency_aware, figures),
         held_out=np.zeros(0) if fall is None else fall.psnr,
     )
 

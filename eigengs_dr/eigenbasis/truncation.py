@@ -66,10 +66,10 @@ class TruncationCurve(NamedTuple):
             If all components miss the target; the result then has all of them.
         """
         check_target(target_psnr)
-        enough = self.psnr >= target_psnr
-        if not enough.any():
+        reaches = self.psnr >= target_psnr
+        if not reaches.any():
             _warn_out_of_reach(target_psnr, self.counts[-1], self.psnr[-1])
-        return tuple(self.counts[enough.argmax() if enough.any() else -1].tolist())
+        return tuple(self.counts[reaches.argmax() if reaches.any() else -1].tolist())
 
     def explained_variance_ratio(self) -> Values:
         """Return the share of the initial error that the first 0, 1, ..., n components remove.
@@ -106,8 +106,8 @@ def curve_from_residuals(
     channels = range(len(eigenvalues))
     order = np.argsort(-np.concatenate(eigenvalues), kind="stable")
     channel = np.repeat(channels, [len(values) for values in eigenvalues])[order]
-    added = channel[:, None] == np.array(channels)
-    counts = np.vstack([np.zeros(len(channels), np.int64), np.cumsum(added, axis=0)])
+    one_hot = channel[:, None] == np.array(channels)
+    counts = np.vstack([np.zeros(len(channels), np.int64), np.cumsum(one_hot, axis=0)])
     error = sum(rows[..., n] for rows, n in zip(left, counts.T, strict=True)) / entries
     return TruncationCurve(counts, np.atleast_2d(_decibels(error)).mean(axis=0))
 
@@ -129,10 +129,10 @@ def curve_from_eigenvalues(
     TruncationCurve
         The PSNR of the mean error. Other images have a larger error.
     """
-    left = [
+    residuals = [
         residual_energy(total, values) for total, values in zip(variance, eigenvalues, strict=True)
     ]
-    return curve_from_residuals(eigenvalues, left, entries)
+    return curve_from_residuals(eigenvalues, residuals, entries)
 
 
 def min_ranks_per_channel(

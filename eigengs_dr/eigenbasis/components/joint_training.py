@@ -185,11 +185,11 @@ def _start(
     """Draw the rows of an initial state, with moments of 0."""
     generator = np.random.default_rng(seed)
     mean, factor = place_random(np.empty((size[1], size[0], 1)), count, generator)
-    placed = Gaussians.from_arrays(
+    gaussians = Gaussians.from_arrays(
         mean, factor, np.zeros((count, 1)), size=size, space="data", backend=backend
     )
     rows = np.zeros((5, NUM_SHAPE_PARAMS + components, count), np.float32)
-    variables = CHOLESKY.encode(placed)
+    variables = CHOLESKY.encode(gaussians)
     rows[0, :NUM_SHAPE_PARAMS] = [v.numpy() for v in (*variables["mean"], *variables["cholesky"])]
     rows[0, NUM_SHAPE_PARAMS:] = generator.uniform(0, 1, (components, count))
     return rows

@@ -92,8 +92,8 @@ def fit_components(
     sides, states = frequency_bands(basis, count, split), list(states or [])
     train, result = METHODS_BY_PRESET[method]
     for i, side in enumerate(sides):
-        known = states[i] if i < len(states) else None
-        for state in train(side, seed + i, steps, backend, known):
+        previous = states[i] if i < len(states) else None
+        for state in train(side, seed + i, steps, backend, previous):
             states[i:] = [state]
             save(states)
     trained = time.perf_counter()
@@ -187,26 +187,26 @@ def _solve_weights(state: State, side: FrequencyBand, backend: str | None) -> Pa
     height, width = side.components[0].shape[1:]
     shapes = shapes_of(state, (width, height), len(side.components), backend)
     equations = NormalEquations(shapes)
-    solved = [equations.solve(equations.correlate(planes)) for planes in side.components]
-    return equations, shapes, tuple(weights.T.astype(np.float32) for weights in solved)
+    solutions = [equations.solve(equations.correlate(planes)) for planes in side.components]
+    return equations, shapes, tuple(weights.T.astype(np.float32) for weights in solutions)
 
 
 def _train_jointly(
     side: FrequencyBand, seed: int, steps: int, backend: str | None, state: State | None
 ) -> Iterator[State]:
-    known = JointState.from_arrays(state) if state else None
-    for reached in train_jointly(
-        side.components, side.splats, seed, steps, backend=backend, state=known
+    start = JointState.from_arrays(state) if state else None
+    for current in train_jointly(
+        side.components, side.splats, seed, steps, backend=backend, state=start
     ):
-        yield reached.arrays()
+        yield current.arrays()
 
 
 def _weights_of(state: State, side: FrequencyBand, backend: str | None) -> Part:
     """Return the shapes and weights of a state; colours are 0, with all channels."""
-    reached = JointState.from_arrays(state)
+    joint = JointState.from_arrays(state)
     blank = np.zeros((side.splats + 1, len(side.components)))
-    shapes = with_colors(reached.gaussians(backend), blank, "data")
-    return NormalEquations(shapes), shapes, reached.weights()
+    shapes = with_colors(joint.gaussians(backend), blank, "data")
+    return NormalEquations(shapes), shapes, joint.weights()
 
 
 METHODS_BY_PRESET = {
@@ -218,13 +218,13 @@ METHODS_BY_PRESET = {
 
 def _join_weights(first: tuple[Planes, ...], second: tuple[Planes, ...]) -> tuple[Planes, ...]:
     """Join the weights of both bands; weights between the bands are 0."""
-    joined = []
+    result = []
     for low, high in zip(first, second, strict=True):
         right, left = high.shape[1] - 1, low.shape[1] - 1
         above = np.hstack([low[:, :-1], np.zeros((len(low), right), np.float32), low[:, -1:]])
         below = np.hstack([np.zeros((len(high), left), np.float32), high])
-        joined.append(np.vstack([above, below]))
-    return tuple(joined)
+        result.append(np.vstack([above, below]))
+    return tuple(result)
 
 
 def with_colors(gaussians: Gaussians, coefficients: NDArray[np.float64], space: str) -> Gaussians:

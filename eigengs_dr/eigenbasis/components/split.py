@@ -103,11 +103,11 @@ def frequency_bands(basis: Eigenbasis, count: int, split: bool) -> list[Frequenc
     """Divide the Gaussians and components into bands, low frequencies first."""
     if not split:
         return [FrequencyBand(count, basis.components, basis.eigenvalues)]
-    few = max(1, round(LOW_SHARE * count))
+    low = max(1, round(LOW_SHARE * count))
 
     def part(number: int, rows: slice) -> FrequencyBand:
         planes = tuple(c[rows] for c in basis.components)
         return FrequencyBand(number, planes, tuple(e[rows] for e in basis.eigenvalues))
 
     first = low_component_count(basis)
-    return [part(few, slice(first)), part(count - few, slice(first, None))]
+    return [part(low, slice(first)), part(count - low, slice(first, None))]
