@@ -44,7 +44,7 @@ INPUT = click.Path(exists=True, path_type=Path)
     help="Space of --target-psnr.",
 )
 @click.option("--max-gaussians", type=int, metavar="N", help="Limit for --target-psnr.")
-@click.option("--levels", type=int, metavar="N", help="Levels of detail; each has 4 times more.")
+@click.option("--levels", type=int, metavar="N", help="Levels of detail, each 4 times larger.")
 @click.option(
     "--iterations",
     type=int,
@@ -53,7 +53,7 @@ INPUT = click.Path(exists=True, path_type=Path)
     show_default=True,
     help="Steps of optimisation.",
 )
-@choice("--init", ["auto", *INITIALIZERS], "Placement of the first Gaussians.")
+@choice("--init", ["auto", *INITIALIZERS], "Initial placement of the Gaussians.")
 @click.option(
     "--basis",
     metavar="NAME|FILE",
