@@ -1,7 +1,6 @@
-"""Fit the sets of Gaussians that the scenes use: ``python scenes/assets.py [FOLDER]``.
+"""Gaussians for the scenes: ``python scenes/assets.py [FOLDER]``.
 
-They come from photos that ship with scikit-image, and from a pattern that is computed here. What
-is there already is kept.
+The script fits photos of scikit-image and a pattern that it computes. It keeps existing files.
 """
 
 import sys
@@ -15,32 +14,35 @@ import eigengs_dr as eg
 from eigengs_dr.image.resize import resample
 
 FOLDER = Path(__file__).parent.parent / "build" / "scenes"
-"""Where the scenes look for the sets unless told otherwise."""
+"""Default folder of the sets in all scenes."""
 
 PALETTE = np.array([[0.05, 0.23, 0.35], [0.07, 0.42, 0.47], [0.86, 0.80, 0.66], [0.80, 0.45, 0.13]])
-"""Glazes, as sRGB codes them."""
+"""Colours of the glazes, as coded sRGB in [0, 1]."""
 
 JOINT = 0.04
-"""Half of the joint between two tiles, in widths of a tile."""
+"""Half the width of the joint between two tiles, in widths of a tile."""
 
 
 def fitted(folder, name, image, gaussians, color):
-    """Fit a set and save it, unless it is there already.
+    """Fit a set of Gaussians and save it, unless the file exists.
 
     Parameters
     ----------
     folder : Path
-        Must exist.
+        An existing folder.
     name : str
-        Of the file, without suffix.
+        Name of the file without suffix.
     image : ndarray
+        As for `eigengs_dr.fit`.
     gaussians : int
+        Number of Gaussians.
     color : str
         As for `eigengs_dr.fit`.
 
     Returns
     -------
     Path
+        The file.
     """
     path = folder / f"{name}.npz"
     if not path.exists():
@@ -51,35 +53,36 @@ def fitted(folder, name, image, gaussians, color):
 
 
 def floor():
-    """Pixels of the photo that tiles the floor: a square of 400."""
+    """Return the photo of the floor, a square of 400 pixels."""
     return eg.sample("coffee")[:, 100:500]
 
 
 def tiles(count=4, side=256, seed=3):
-    """Draw glazed tiles in staggered rows; the picture repeats.
+    """Draw a periodic picture of glazed tiles in staggered rows.
 
     Parameters
     ----------
     count : int, optional
-        Of rows, even, and of tiles in a row.
+        Number of rows, and of tiles in a row; even.
     side : int, optional
-        In pixels.
+        Side of the picture in pixels.
     seed : int, optional
 
     Returns
     -------
     color : ndarray, shape (side, side, 3)
-        As sRGB codes it.
+        Coded sRGB in [0, 1].
     roughness : ndarray, shape (side, side)
+        In [0, 1].
     normals : ndarray, shape (side, side, 3)
-        Mapped from [-1, 1] to [0, 1], as normal maps are.
+        Normals, mapped from [-1, 1] to [0, 1] as in a normal map.
     """
     random = np.random.default_rng(seed)
     v, u = (np.mgrid[:side, :side] + 0.5) / side * count
     row = np.floor(v).astype(int)
     u = u + 0.5 * (row % 2)
     column = np.floor(u).astype(int) % count
-    # Distance from the edge of the tile, whose corners are round.
+    # The distance from the edge of the tile; its corners are round.
     beyond = [np.maximum(np.abs(x % 1 - 0.5) - 0.38, 0) for x in (u, v)]
     inside = 0.12 - JOINT - np.hypot(*beyond)
     glaze = np.clip(inside / 0.05 + 0.5, 0, 1)
@@ -100,14 +103,14 @@ def tiles(count=4, side=256, seed=3):
 
 
 def main(folder=FOLDER):
-    """Fit what is missing."""
+    """Fit all missing sets."""
     folder.mkdir(parents=True, exist_ok=True)
     color, roughness, normals = tiles()
     cat = eg.sample("chelsea")[:, 100:400]
-    # Brighter than it is, as the only light of a room.
+    # The power brightens the portrait, because it is the only light of a room.
     portrait = resample(eg.sample("astronaut"), 384, 384).clip(0, 1) ** 0.7
-    # Emission and reflectance are light, which sums and filters right as it is. A coded picture
-    # looks the same where it is looked at closely.
+    # Emission and reflectance are linear, so that filters average light. The camera is close to
+    # the poster, where coded colours look the same.
     fitted(folder, "floor", floor(), 4000, "linear")
     fitted(folder, "picture", portrait, 5000, "linear")
     fitted(folder, "poster", cat, 5000, "ycbcr")

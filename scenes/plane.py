@@ -1,7 +1,7 @@
-"""Measure how far one sample a pixel of the plane is from 1,024: ``python scenes/plane.py``.
+"""Error of the plane at one sample per pixel, against 1,024: ``python scenes/plane.py``.
 
-Prints mean squared errors of linear radiance over the whole picture; ``--strip FILE`` writes crops
-of the pictures side by side.
+The script prints mean squared errors of linear radiance over the whole picture. ``--strip FILE``
+writes crops of the pictures side by side.
 """
 
 import time
@@ -21,30 +21,31 @@ from eigengs_dr.plugins import pixel_angle
 SCENE = Path(__file__).parent / "plane.xml"
 
 TEXELS = 1024
-"""Side of the bitmap that the Gaussians are compared with."""
+"""Side in pixels of the bitmap to compare the Gaussians with."""
 
 PASS = 16
-"""Samples a pixel that are taken at once."""
+"""Most samples per pixel in one rendering."""
 
 MORE = 8
-"""Samples a pixel that errors are shown for as well."""
+"""Samples per pixel of the second error in the table."""
 
 CROP = (1 / 10, 1 / 2, 3 / 10, 7 / 10)
-"""What the strip shows: top, bottom, left and right."""
+"""Top, bottom, left and right of the crops, as shares of the picture's side."""
 
 
 def load(name, resolution, bitmap=False, prefilter=False):
-    """Load the plane.
+    """Load the scene of the plane.
 
     Parameters
     ----------
     name : str
-        Of the texture's file, without suffix.
+        Name of the texture's file without suffix.
     resolution : int
-        Of the picture.
+        Side of the picture in pixels.
     bitmap : bool, optional
-        Take Mitsuba's own texture, of the same properties, and the file that ends in .exr.
+        Use Mitsuba's bitmap texture with the same properties, and the .exr file.
     prefilter : bool, optional
+        Filter the Gaussians by the footprint of a pixel.
 
     Returns
     -------
@@ -63,7 +64,7 @@ def load(name, resolution, bitmap=False, prefilter=False):
 
 
 def image_of(scene, spp, seed):
-    """Mean of `spp` samples a pixel: linear radiance, float64, shape (H, W, 3)."""
+    """Return the mean of `spp` samples per pixel: linear radiance, float64, shape (H, W, 3)."""
     passes = range(0, spp, PASS)
     return sum(
         np.array(mi.render(scene, spp=min(PASS, spp), seed=seed + i), np.float64) for i in passes
@@ -72,11 +73,11 @@ def image_of(scene, spp, seed):
 
 @click.command()
 @click.option("--resolution", type=int, default=600, show_default=True)
-@click.option("--reference", type=int, default=1024, show_default=True, help="Samples a pixel.")
-@click.option("--seeds", type=int, default=8, show_default=True, help="Pictures a mean is of.")
+@click.option("--reference", type=int, default=1024, show_default=True, help="Samples per pixel.")
+@click.option("--seeds", type=int, default=8, show_default=True, help="Pictures per mean.")
 @click.option("--strip", type=click.Path(path_type=Path), help="Picture of crops side by side.")
 def main(resolution, reference, seeds, strip):
-    """Measure what one sample a pixel is worth, and print it as a table."""
+    """Measure the error at one sample per pixel, and print a table."""
     mi.set_variant("cuda_ad_rgb" if "cuda" in select().__name__ else "llvm_ad_rgb")
     eg.register_plugins()
     FOLDER.mkdir(parents=True, exist_ok=True)
@@ -92,7 +93,7 @@ def main(resolution, reference, seeds, strip):
         "coded Gaussians": ("floor-coded", {}),
         "coded Gaussians, prefiltered": ("floor-coded", {"prefilter": True}),
     }
-    # Seeds that none of the pictures has.
+    # The seed of the reference differs from the seeds of all pictures.
     truth = {
         name: image_of(load(name, resolution), reference, 10_000)
         for name in ("floor", "floor-coded")

@@ -1,8 +1,8 @@
-"""The basis "natural", which ships with the package: ``python tools/train_natural.py FILE``.
+"""Training of the basis "natural" of the package: ``python tools/train_natural.py FILE``.
 
-It is trained on random crops of the photos inside scikit-image. At many sizes and places, mirrored
-both ways, they make a family without a preferred place: its components are close to waves of
-rising frequency, of which any image holds some.
+The training images are random crops of the photos in scikit-image, of many sizes and positions,
+mirrored at random. No position is special in this family of images, so its components are close
+to waves of rising frequency, and every image contains such waves.
 """
 
 from __future__ import annotations
@@ -18,33 +18,34 @@ from eigengs_dr.image.resize import resample
 from eigengs_dr.image.samples import SAMPLES, sample
 
 DEMO = "coffee"
-"""The photo of ``make demo``: not trained on, so that the demo shows what others can expect."""
+"""The photo of ``make demo``. It is no training image, so the demo shows a typical result."""
 
 CROPS = 4000
-"""Number of training images, taken from the photos in turn."""
+"""Number of training images; the photos take turns."""
 
 SMALLEST = 0.3
-"""Side of the smallest crops, as a share of the photo's shorter side; sizes are log-uniform."""
+"""Side of the smallest crop, as a share of the shorter side of the photo. Sizes are log-uniform."""
 
 SIDE = 256
 """Side of the basis in pixels."""
 
 COMPONENTS = (230, 60, 60)
-"""Components of Y, Cb and Cr: as many as 4 MB hold, and chroma needs fewer."""
+"""Number of components of Y, Cb and Cr. They fill 4 MB; chroma needs fewer than luma."""
 
 
 def crops(count: int = CROPS, seed: int = 0) -> Iterator[NDArray[np.float32]]:
-    """Cut random squares out of the photos that ship with scikit-image.
+    """Yield random square crops of the photos of scikit-image.
 
     Parameters
     ----------
     count : int, optional
+        Number of crops.
     seed : int, optional
 
     Yields
     ------
     ndarray of float32, shape (256, 256, 3)
-        RGB, bicubic.
+        RGB, resampled by bicubic interpolation.
     """
     generator = np.random.default_rng(seed)
     photos = [sample(name) for name in SAMPLES if name != DEMO]
@@ -60,7 +61,7 @@ def crops(count: int = CROPS, seed: int = 0) -> Iterator[NDArray[np.float32]]:
 
 
 def main(path: str) -> None:
-    """Train the basis and write it to a file; it takes a minute."""
+    """Train the basis in about a minute and write it to a file."""
     from eigengs_dr.cli.console import progress_bar
     from eigengs_dr.eigenbasis.basis import Eigenbasis
     from eigengs_dr.eigenbasis.eigengs import EigenGS

@@ -1,4 +1,4 @@
-"""How the command line speaks: one line for an error or a note, a bar for progress."""
+"""Messages of the command line: one line for an error or a note, a bar for progress."""
 
 import sys
 import warnings
@@ -11,20 +11,20 @@ import click
 from ..backend.selection import BackendError
 
 NAME = "eigengs-dr"
-"""Name of the program, in front of all that it says on standard error."""
+"""Name of the program; every line on standard error starts with it."""
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C, by the convention of shells."""
+"""Exit code after Ctrl-C, as shells define it."""
 
 
 class Program(click.Group):
-    """A group of commands that says what went wrong in one line and exits with code 2.
+    """A group of commands that reports an error in one line and exits with code 2.
 
-    ``context.obj`` is the list of arguments, for reports.
+    ``context.obj`` holds the list of arguments, for reports.
     """
 
     def main(self, args: Sequence[str] | None = None, *rest: Any, **extra: Any) -> Any:
-        """Run the command that the arguments name, then exit; see `click.Command.main`."""
+        """Run a command and exit; see `click.Command.main`."""
         arguments = sys.argv[1:] if args is None else list(args)
         extra.update(prog_name=NAME, standalone_mode=False, obj=list(arguments))
         try:
@@ -38,12 +38,12 @@ class Program(click.Group):
         except click.ClickException as error:
             say(f"error: {error.format_message()}")
         except OSError as error:
-            told = error.filename is not None and error.strerror is not None
-            say(f"error: {error.filename}: {error.strerror}" if told else f"error: {error}")
+            complete = error.filename is not None and error.strerror is not None
+            say(f"error: {error.filename}: {error.strerror}" if complete else f"error: {error}")
         except (ValueError, BackendError) as error:
             say(f"error: {error}")
         except RuntimeError as error:
-            # What Dr.Jit makes of a second Ctrl-C, inside a program that is being traced.
+            # Dr.Jit raises this error for a second Ctrl-C while it traces a program.
             if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
                 raise
             say("interrupted")
@@ -57,14 +57,14 @@ def say(text: str) -> None:
     Parameters
     ----------
     text : str
-        Whatever lines it has are joined.
+        Several lines are joined to one.
     """
     click.echo(f"{NAME}: {' '.join(text.split())}", err=True)
 
 
 @contextmanager
 def progress_bar(quiet: bool) -> Iterator[Callable[..., None]]:
-    """Show a bar on standard error while a block runs, where that is a terminal.
+    """Show a bar while a block runs, if standard error is a terminal.
 
     Parameters
     ----------
@@ -74,9 +74,9 @@ def progress_bar(quiet: bool) -> Iterator[Callable[..., None]]:
     Yields
     ------
     callable
-        ``show(label, done, total, row)``: what is being worked on, the steps done, the steps in
-        all, and, if there is one, a row of figures, of which ``psnr_rgb`` is shown. Another label
-        starts the bar anew.
+        ``show(label, done, total, row)``: the task, the number of finished steps, the number of
+        all steps and, optionally, a row of figures. The bar shows ``psnr_rgb`` of the row. A new
+        label restarts the bar.
     """
     from tqdm import tqdm
 
@@ -99,7 +99,7 @@ def progress_bar(quiet: bool) -> Iterator[Callable[..., None]]:
 
 @contextmanager
 def _notes() -> Iterator[None]:
-    """Show warnings as one line each, without the line of code that raised them."""
+    """Show each warning in one line, without the line of code that raised it."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = lambda message, *_: say(f"note: {message}")

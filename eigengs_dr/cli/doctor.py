@@ -1,4 +1,4 @@
-"""``eigengs-dr doctor``: what works on this machine."""
+"""The command ``eigengs-dr doctor``: check this machine."""
 
 import json
 
@@ -13,14 +13,15 @@ from .options import json_option
 def doctor(context: click.Context, as_json: bool) -> None:
     """Show what works on this machine and what to install.
 
-    Ends with exit code 1 where no backend works.
+    The exit code is 1 if no backend works.
 
     \b
-    Example:
+    Examples:
       eigengs-dr doctor
+      eigengs-dr doctor --json
     """
     from ..backend import doctor as doctor_module
 
-    found = doctor_module.report()
-    click.echo(json.dumps(found, indent=2) if as_json else doctor_module.describe(found))
-    context.exit(0 if found["llvm"]["works"] or found["cuda"]["works"] else 1)
+    facts = doctor_module.report()
+    click.echo(json.dumps(facts, indent=2) if as_json else doctor_module.describe(facts))
+    context.exit(0 if facts["llvm"]["works"] or facts["cuda"]["works"] else 1)

@@ -1,4 +1,4 @@
-"""``eigengs-dr fit``: images to Gaussians."""
+"""The command ``eigengs-dr fit``: fit images by Gaussians."""
 
 import time
 from collections.abc import Callable
@@ -32,10 +32,10 @@ INPUT = click.Path(exists=True, path_type=Path)
 @click.command()
 @click.argument("images", nargs=-1, required=True, type=INPUT, metavar="IMAGE...")
 @click.option(
-    "-o", "--output", type=ANY_PATH, help=".npz file, or a folder; by default the current folder."
+    "-o", "--output", type=ANY_PATH, help=".npz file or folder.  [default: the current folder]"
 )
-@click.option("--gaussians", type=int, metavar="N", help="How many.  [default: 5000]")
-@click.option("--target-psnr", type=float, metavar="DB", help="As few Gaussians as reach it.")
+@click.option("--gaussians", type=int, metavar="N", help="Number of Gaussians.  [default: 5000]")
+@click.option("--target-psnr", type=float, metavar="DB", help="Find the fewest for this PSNR.")
 @click.option(
     "--space",
     "target_space",
@@ -44,19 +44,33 @@ INPUT = click.Path(exists=True, path_type=Path)
     show_default=True,
     help="Space of --target-psnr.",
 )
-@click.option("--max-gaussians", type=int, metavar="N", help="Largest number for --target-psnr.")
-@click.option("--levels", type=int, metavar="N", help="Levels of detail: each has 4 times more.")
-@click.option("--iterations", type=int, default=1000, show_default=True)
-@choice("--init", ["auto", *INITIALIZERS], "Where the Gaussians start.")
+@click.option("--max-gaussians", type=int, metavar="N", help="Limit for --target-psnr.")
+@click.option("--levels", type=int, metavar="N", help="Levels of detail, each 4 times larger.")
+@click.option(
+    "--iterations",
+    type=int,
+    metavar="N",
+    default=1000,
+    show_default=True,
+    help="Steps of optimisation.",
+)
+@choice("--init", ["auto", *INITIALIZERS], "Initial placement of the Gaussians.")
 @click.option(
     "--basis",
     metavar="NAME|FILE",
-    help=f"Start from this eigenbasis; implies --init eigen.  [default: {DEFAULT_BASIS}]",
+    help=f"Basis for --init eigen, which it implies.  [default: {DEFAULT_BASIS}]",
 )
-@choice("--preset", list(PRESETS), "The method.")
-@choice("--color", list(SPACES), "Space of colours and errors: linear for textures, data as it is.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Only random starts use it.")
-@click.option("--preview", type=ANY_PATH, help="Picture of photo, fit and outlines; or a folder.")
+@choice("--preset", list(PRESETS), "Our method, or that of a paper.")
+@choice("--color", list(SPACES), "Colour space; linear for textures, data for other values.")
+@click.option(
+    "--seed",
+    type=int,
+    metavar="N",
+    default=0,
+    show_default=True,
+    help="Seed of --init random.",
+)
+@click.option("--preview", type=ANY_PATH, help="Picture (or folder) of photo, fit and outlines.")
 @backend_option
 @report_option
 @quiet_option
@@ -74,11 +88,11 @@ def fit(
 ) -> None:
     """Fit images by sums of Gaussians.
 
-    An IMAGE may be a folder: all images in it are fitted. Several images need a folder for -o and
-    for --preview; the files there are named like the images.
+    An IMAGE may be a folder of images. For several images, -o and --preview name folders, and the
+    files in them have the names of the images.
 
-    Ctrl-C writes the best fit so far and ends with exit code 130. If --target-psnr cannot be
-    reached, the command says so, writes the best fit and ends with exit code 1.
+    Ctrl-C writes the best fit so far and exits with code 130. If --target-psnr cannot be reached,
+    the command says so, writes the best fit and exits with code 1.
 
     \b
     Examples:
@@ -106,8 +120,8 @@ def fit(
             break
     if report:
         figures = records[0] if len(paths) == 1 else {"images": records}
-        told = describe_run(context, options.backend) | _decisive(options, levels)
-        write_report(report, told | figures)
+        run_figures = describe_run(context, options.backend) | _decisive(options, levels)
+        write_report(report, run_figures | figures)
     _exit(context, records, options)
 
 
@@ -128,24 +142,24 @@ def _expand(images: tuple[Path, ...]) -> list[Path]:
 
 
 def _check_levels(options: FitOptions, levels: int | None) -> None:
-    """Raise ValueError for options that levels of detail do not work with."""
+    """Raise ValueError if the other options exclude levels of detail."""
     if levels is None:
         return
     if options.target_psnr is not None:
         raise ValueError("levels and target_psnr exclude each other; give one of them")
     if options.preset != "default" or options.initializer != "adaptive":
-        raise ValueError("levels work with preset 'default' and init 'adaptive' alone")
+        raise ValueError("levels needs preset 'default' and init 'adaptive'; leave the others out")
 
 
 def _fitter(options: FitOptions, levels: int | None) -> Callable[..., "Fit"]:
-    """Return ``run(image, progress)``, which fits one image; a model is read once for all."""
+    """Return ``run(image, progress)``, which fits one image; read the model once for all."""
     from ..fitting.fit import fit_image
     from ..fitting.levels import fit_levels
 
     if levels is not None:
         names = ("gaussians", "iterations", "color", "seed", "backend")
-        kept = {name: getattr(options, name) for name in names}
-        return lambda image, progress: fit_levels(image, levels=levels, progress=progress, **kept)
+        common = {name: getattr(options, name) for name in names}
+        return lambda image, progress: fit_levels(image, levels=levels, progress=progress, **common)
     if options.initializer == "eigen":
         from ..eigenbasis.registry import load_basis
 
@@ -221,19 +235,19 @@ def _measure(image: Any, result: "Fit", color: str) -> dict[str, float]:
 
 
 def _exit(context: click.Context, records: list[dict[str, Any]], options: FitOptions) -> None:
-    """Say what did not end well, and end with its exit code."""
+    """Report an interrupted or failed fit, and exit with its code."""
     if records[-1]["stopped"] == "interrupted":
         say(f"interrupted; the best fit so far is in {records[-1]['output']}")
         context.exit(INTERRUPTED)
-    missed = [record for record in records if record["stopped"] == "out of reach"]
-    for record in missed:
-        reached = record["psnr_" + options.target_space]
+    failures = [record for record in records if record["stopped"] == "out of reach"]
+    for record in failures:
+        psnr = record["psnr_" + options.target_space]
         say(
             f"{record['input']}: {options.target_psnr:g} dB are out of reach: "
-            f"{record['gaussians']} Gaussians have {reached:.2f}; lower --target-psnr, or allow "
-            "more by --max-gaussians or --iterations"
+            f"{record['gaussians']} Gaussians have {psnr:.2f}; lower --target-psnr, or raise "
+            "--max-gaussians or --iterations"
         )
-    if missed:
+    if failures:
         context.exit(MISSED)
 
 

@@ -1,4 +1,4 @@
-"""``eigengs-dr info``: what a file holds."""
+"""The command ``eigengs-dr info``: show the contents of a file."""
 
 import json
 from pathlib import Path
@@ -14,19 +14,20 @@ from .outputs import check_outputs, name_outputs
 @click.command()
 @click.argument("file", type=ANY_PATH, metavar="NAME|FILE")
 @json_option
-@click.option("--preview", type=ANY_PATH, help="Picture of what the file holds.")
+@click.option("--preview", type=ANY_PATH, help="Picture of the contents.")
 def info(file: Path, as_json: bool, preview: Path | None) -> None:
-    """Show what a fitted image or a model holds; NAME is that of a basis that ships.
+    """Show the contents of a fitted image or a model.
 
-    Of a fitted image also the bits a pixel (bpp) of its file; of a packed one the bits that tell
-    the values of a parameter apart, and the steps between them.
+    NAME is a basis of the package, such as natural. For a fitted image, bpp is the size of the
+    file in bits per pixel. For a packed image, the command also shows the bits per value and the
+    quantisation step of each parameter.
 
-    Of a model also how the error falls with the number of components, those of all channels taken
-    by falling variance: the share of the variance of the training images that the first ones hold,
-    and the PSNR of PCA by them, of the training images and, on the mean, of images held out.
+    For a model, a table shows the first components of all channels in order of variance: their
+    share of the variance, and the PSNR of PCA with them, for the training images and for the
+    images held out.
 
-    The preview of a fitted image is its rendering. That of a model shows the mean image, some
-    components and the outlines of the Gaussians.
+    The preview shows the rendered image, or the mean image, some components and the outlines of
+    the Gaussians of a model.
 
     \b
     Examples:
@@ -54,10 +55,12 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
         modelfile.FORMAT: ("model", EigenGS.load, _describe_model, component_sheet),
     }
     file = SHIPPED.get(str(file), file)
-    found = setfile.FORMAT if packed.is_egs(file) else archive.format_of(file)
-    if found not in kinds:
-        raise ValueError(f"{file}: format is {found[:40]!r}, expected one of {', '.join(kinds)}")
-    kind, load, describe, draw = kinds[found]
+    file_format = setfile.FORMAT if packed.is_egs(file) else archive.format_of(file)
+    if file_format not in kinds:
+        raise ValueError(
+            f"{file}: format is {file_format[:40]!r}, expected one of {', '.join(kinds)}"
+        )
+    kind, load, describe, draw = kinds[file_format]
     content = load(file)
     facts = {"file": str(file), "kind": kind, "bytes": file.stat().st_size, **describe(content)}
     if kind == "image":
@@ -81,7 +84,7 @@ def _describe_image(gaussians: Any) -> dict[str, Any]:
 
 
 def _describe_packed(content: Any) -> dict[str, Any]:
-    """Bits that tell the values of a parameter apart, and the steps that they count."""
+    """Return the bits per value and the quantisation step of each parameter."""
     return {
         "sections": [len(section.mean) for section in content.sections],
         **{f"{name}_bits": bits for name, bits in content.widths().items()},
@@ -106,7 +109,7 @@ def _describe_model(model: Any) -> dict[str, Any]:
 
 
 def _rows(fall: Any, held_out: Any) -> list[dict[str, Any]]:
-    """How the error falls, at 1, 2, 5, 10, ... components and all."""
+    """Return the truncation curve at 0, 1, 2, 5, 10, ... and all components."""
     last = len(fall.psnr) - 1
     round_numbers = [m * 10**e for e in range(len(str(last))) for m in (1, 2, 5)]
     rows = []
@@ -123,17 +126,17 @@ def _rows(fall: Any, held_out: Any) -> list[dict[str, Any]]:
 
 
 def _text(fall: Any = (), **facts: Any) -> str:
-    """Facts as lines, and below them how the error falls as a table."""
+    """Format facts as lines, and the truncation curve as a table below."""
     width = max(map(len, facts)) + 1
     lines = [f"{key:{width}} {value}" for key, value in facts.items()]
     if fall:
         lines += ["", f"components{'':16} {'variance':>8} {'training':>9} {'held out':>9}"]
     for row in fall:
         each = "+".join(map(str, row["components"]))
-        tested = f"{row['psnr_held_out']:6.2f} dB" if "psnr_held_out" in row else "-"
+        held_out = f"{row['psnr_held_out']:6.2f} dB" if "psnr_held_out" in row else "-"
         lines.append(
             f"{sum(row['components']):10} = {each:13} {row['variance']:8.2%} "
-            f"{row['psnr_training']:6.2f} dB {tested:>9}"
+            f"{row['psnr_training']:6.2f} dB {held_out:>9}"
         )
     return "\n".join(lines)
 

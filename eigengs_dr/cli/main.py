@@ -1,6 +1,6 @@
-"""The command line, ``eigengs-dr``: thin, every command calls one function of the package.
+"""The program ``eigengs-dr``: each command calls one function of the package.
 
-What the commands need is imported inside them, so that ``--help`` and mistakes answer at once.
+Commands import heavy modules when they run, so that ``--help`` and mistakes answer at once.
 """
 
 import click
@@ -22,12 +22,14 @@ def main() -> None:
     """Fit images with 2D Gaussians and render them at any size.
 
     \b
-    Examples:
-      eigengs-dr fit photo.jpg -o photo.npz --preview photo-fit.png
-      eigengs-dr render photo.npz -o large.png --scale 2
-      eigengs-dr pack photo.npz -o photo.egs --image photo.jpg
-      eigengs-dr train photos/ -o photos.npz
-      eigengs-dr doctor
+    Examples, in the order to run them first:
+      eigengs-dr doctor                                     Check this machine.
+      eigengs-dr fit photo.jpg --preview fit.png            Write photo.npz.
+      eigengs-dr info photo.npz                             Show what it holds.
+      eigengs-dr render photo.npz -o large.png --scale 2    Render it larger.
+      eigengs-dr pack photo.npz -o photo.egs                Make it small.
+
+    "eigengs-dr COMMAND --help" describes a command.
     """
 
 

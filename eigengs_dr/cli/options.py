@@ -1,4 +1,4 @@
-"""What the commands share: their options, and what every report says of its run."""
+"""Options of several commands, and the record of a run in a report."""
 
 import re
 import shlex
@@ -15,16 +15,24 @@ FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 ANY_PATH = click.Path(path_type=Path)
 
 MAX_PIXELS = 1 << 26
-"""Largest picture that is rendered, thin ones counted in whole tiles: it takes some 6 GiB."""
+"""Pixels of the largest picture to render, with 3 more on each axis for the tiles of thin
+pictures; the largest takes some 6 GiB."""
 
 backend_option = click.option(
     "--backend",
     type=click.Choice(["llvm", "cuda"]),
-    help="Where to compute.  [default: cuda if there is a GPU]",
+    help="Processor.  [default: cuda if present]",
 )
-seed_option = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-report_option = click.option("--report", type=ANY_PATH, help="JSON file for all figures.")
-quiet_option = click.option("--quiet", is_flag=True, help="No progress and no summary.")
+seed_option = click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    metavar="N",
+    default=0,
+    show_default=True,
+    help="Seed of random numbers.",
+)
+report_option = click.option("--report", type=ANY_PATH, help="JSON file of all figures.")
+quiet_option = click.option("--quiet", is_flag=True, help="Show no progress and no summary.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 
@@ -34,7 +42,7 @@ class Size(click.ParamType):
     name = "WxH"
 
     def convert(self, value: Any, param: Any, context: Any) -> tuple[int, int]:
-        """Turn the text of an option into two numbers."""
+        """Parse the text of an option as two numbers."""
         match = re.fullmatch(r"(\d+)x(\d+)", value)
         if not match:
             self.fail(f"{value}: expected width and height, such as 1024x768", param, context)
@@ -42,12 +50,12 @@ class Size(click.ParamType):
 
 
 class Counts(click.ParamType):
-    """A number for every channel, or three with commas, as in "230,60,60"."""
+    """One number for all channels, or three with commas, as in "230,60,60"."""
 
     name = "K"
 
     def convert(self, value: Any, param: Any, context: Any) -> int | tuple[int, ...]:
-        """Turn the text of an option into one number or three."""
+        """Parse the text of an option as one number or three."""
         if isinstance(value, int):  # the default
             return value
         if not re.fullmatch(r"\d+(,\d+,\d+)?", value) or not any(map(int, value.split(","))):
@@ -57,18 +65,18 @@ class Counts(click.ParamType):
 
 
 def check_pixels(width: int, height: int) -> tuple[int, int]:
-    """Return the sides of a picture; refuse one that is too large to be made."""
+    """Return the width and height of a picture; refuse one that is too large to render."""
     if width < 1 or height < 1 or (width + 3) * (height + 3) > MAX_PIXELS:
         raise click.UsageError(f"{width}x{height}: expected 1 to {MAX_PIXELS:,} pixels")
     return width, height
 
 
 def choice(name: str, values: list[str], text: str) -> Any:
-    """Make an option that takes one of some words, by default the first."""
+    """Make an option that takes one of several words; the first is the default."""
     kind = click.Choice(values)
     return click.option(name, type=kind, default=values[0], show_default=True, help=text)
 
 
 def describe_run(context: click.Context, backend: str | None) -> dict[str, Any]:
-    """What every report says of its run: the command as it was typed, and the machine."""
+    """Return the command as typed and the machine, for a report."""
     return {"command": shlex.join([NAME, *context.obj]), **describe(backend)}

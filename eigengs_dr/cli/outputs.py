@@ -1,4 +1,4 @@
-"""Where results go: file names, checked before the work starts."""
+"""Names of output files, checked before the work starts."""
 
 import os
 from collections.abc import Iterable, Sequence
@@ -15,12 +15,12 @@ def name_outputs(
     Parameters
     ----------
     inputs : sequence of Path
-        The files to work on.
+        The input files.
     output : Path or None
-        The file to write, or a folder to write into. Several inputs need a folder, which is made if
-        it is missing. Files in a folder are named like the inputs. None is the current folder.
+        The output file or folder. Several inputs need a folder; it is created if it is missing.
+        Files in a folder have the names of the inputs. None is the current folder.
     suffixes : sequence of str
-        Suffixes that the file may have; files in a folder have the first.
+        Valid suffixes of the file; files in a folder get the first.
 
     Returns
     -------
@@ -30,10 +30,10 @@ def name_outputs(
     Raises
     ------
     ValueError
-        If the file has another suffix, several inputs have a file as output, or two inputs would be
-        written to one file.
+        If the file has another suffix, the output of several inputs is a file, or two inputs have
+        one output.
     OSError
-        If the folder cannot be made.
+        If the folder cannot be created.
     """
     output = Path() if output is None else output
     if len(inputs) == 1 and not output.is_dir():
@@ -43,9 +43,9 @@ def name_outputs(
     if not output.is_dir() and (output.exists() or output.suffix.lower() in suffixes):
         raise ValueError(f"{output}: is a file; several images need a folder")
     names = [path.stem + suffixes[0] for path in inputs]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice:
-        raise ValueError(f"{output / twice}: two of the images have this name; rename one of them")
+    duplicate = next((name for name in names if names.count(name) > 1), None)
+    if duplicate:
+        raise ValueError(f"{output / duplicate}: two images have this name; rename one of them")
     output.mkdir(parents=True, exist_ok=True)
     return [output / name for name in names]
 
@@ -56,23 +56,23 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> Non
     Parameters
     ----------
     outputs : iterable of Path or None
-        The files to write; None for one that was not asked for.
+        The files to write; None is skipped.
     inputs : iterable of Path
-        The files that are read.
+        The files to read.
 
     Raises
     ------
     ValueError
-        If one file is named twice.
+        If one file occurs twice.
     OSError
         If a file cannot be written.
     """
-    taken = {os.path.realpath(path): "is read" for path in inputs}
+    uses = {os.path.realpath(path): "is read" for path in inputs}
     for output in outputs:
         if output is None:
             continue
         real = os.path.realpath(output)
-        if real in taken:
-            raise ValueError(f"{output}: {taken[real]} too; write to another file")
-        taken[real] = "is written"
+        if real in uses:
+            raise ValueError(f"{output}: {uses[real]} too; write to another file")
+        uses[real] = "is written"
         require_writable(output)

@@ -1,4 +1,4 @@
-"""``eigengs-dr pack``: a fitted image in few bytes."""
+"""The command ``eigengs-dr pack``: compress a fitted image."""
 
 from pathlib import Path
 
@@ -10,27 +10,31 @@ from .outputs import check_outputs, name_outputs
 from .report import write_report
 
 SUFFIX, BUDGET = ".egs", 0.5
-"""Those of `eigengs_dr.codec`, without importing Dr.Jit."""
+"""Suffix of packed files and default loss in dB; copies, because `eigengs_dr.codec` imports
+Dr.Jit."""
 
 
 @click.command()
 @click.argument("file", type=EXISTING, metavar="X.npz")
-@click.option("-o", "--output", required=True, type=ANY_PATH, metavar="Y.egs")
-@click.option("--image", type=EXISTING, help="What was fitted: the loss is measured against it.")
+@click.option(
+    "-o", "--output", required=True, type=ANY_PATH, metavar="Y.egs", help="File to write."
+)
+@click.option("--image", type=EXISTING, help="The original image, to measure the loss with.")
 @click.option(
     "--budget",
     type=float,
     default=BUDGET,
     show_default=True,
     metavar="DB",
-    help="Decibels of PSNR that may be lost.",
+    help="Allowed loss of PSNR.",
 )
 @click.option(
     "--levels",
     type=click.IntRange(min=1),
+    metavar="N",
     default=1,
-    help="Those that the set was fitted with: readers may stop after each of them, and what they "
-    "read is a picture. Without it the order of the levels is lost.",
+    help="Levels of the fit. Readers may stop after any level and have a picture. Without this "
+    "option, the order of the levels is lost.",
 )
 @backend_option
 @report_option
@@ -47,15 +51,17 @@ def pack(
     report: Path | None,
     quiet: bool,
 ) -> None:
-    """Store a fitted image in as few bytes as a loss of PSNR allows.
+    """Compress a fitted image to few bytes.
 
-    Parameters are rounded in steps that fit the image, and coded; all that reads .npz files of
-    images reads .egs files too. Without the image the loss is that of a fit of 40 dB.
+    The command quantises the parameters as coarsely as the allowed loss of PSNR permits, and
+    codes them. Every command that reads the .npz file of an image reads .egs files too. Without
+    --image, the command assumes that the fit has 40 dB.
 
     \b
     Examples:
       eigengs-dr pack photo.npz -o photo.egs --image photo.jpg
       eigengs-dr pack photo.npz -o photo.egs --budget 0.1
+      eigengs-dr pack levels.npz -o levels.egs --levels 4
     """
     [target] = name_outputs([file], output, [SUFFIX])
     check_outputs([target, report], [file, *([image] if image else [])])
@@ -85,11 +91,12 @@ def pack(
     if report:
         write_report(report, {**describe_run(context, backend), **figures})
     if not quiet:
-        against = "the image" if image else "the rendering before"
+        against = "the image" if image else "the rendering of the input"
         space = "sRGB" if gaussians.space == "linear" else gaussians.space
         click.echo(
             f"{file}: {len(gaussians):,} Gaussians, {file.stat().st_size:,} bytes\n"
-            f"  wrote {target}: {receipt.bytes:,} bytes, {receipt.bits_per_pixel:.3f} bits a pixel"
-            f"\n  lost {receipt.psnr_drop:.2f} dB: {receipt.psnr:.2f} dB in {space} "
+            f"  wrote {target}: {receipt.bytes:,} bytes, "
+            f"{receipt.bits_per_pixel:.3f} bits per pixel\n"
+            f"  lost {receipt.psnr_drop:.2f} dB: {receipt.psnr:.2f} dB in {space} "
             f"against {against}"
         )

@@ -1,4 +1,4 @@
-"""Pictures of models and of fits: what the components look like, and where the splats lie."""
+"""Pictures of models and fits: components, and outlines of the Gaussians."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from ..image.resize import resample
 from ..raster.render import render
 
 FIRST = (1, 2, 3, 5, 10, 20, 50, 100, 200)
-"""Components of the first channel that are shown, counted from 1."""
+"""Numbers of the components to show of the first channel, counted from 1."""
 
 OTHERS = (1, 2)
-"""Components of the other channels that are shown."""
+"""Numbers of the components to show of the other channels."""
 
 CELL = 240
 """Longer side of a component in a sheet, in pixels."""
@@ -34,36 +34,37 @@ OUTLINES = 800
 """Longer side of a picture of ellipses, in pixels."""
 
 MAX_OUTLINES = 2000
-"""Outlines over a picture: with more of them, single ones cannot be told apart."""
+"""Most outlines over a picture; more of them hide each other."""
 
 MIN_SIDE = 512
-"""A picture whose longer side is shorter is enlarged before outlines are drawn over it."""
+"""Shortest longer side of a picture under outlines, in pixels; smaller pictures are enlarged."""
 
 LIGHTER = 0.6
-"""How far a picture below outlines is brought to white."""
+"""Share of white that lightens a picture under outlines."""
 
 MAX_REACH = 100
-"""Outlines that reach farther than so many pictures are not drawn: in it they are straight lines,
-and Pillow takes no larger numbers."""
+"""Farthest reach of an outline to draw, in longer sides of the picture. A longer outline would
+look straight, and Pillow takes no larger coordinates."""
 
 LOW_COLOR, HIGH_COLOR = (214, 96, 20), (30, 90, 160)
-"""Outlines of the splats for low frequencies, orange, and of all others, blue."""
+"""Colours of outlines: orange for the Gaussians of low frequencies, blue for all others."""
 
 Picture = NDArray[Any]
 Color = tuple[int, int, int]
 
 
 def component_sheet(model: EigenGS, basis: Eigenbasis | None = None) -> Picture:
-    """Draw the mean image and some components of a model, and the outlines of its splats.
+    """Draw the mean image, some components and the outlines of the Gaussians of a model.
 
-    Components are signed: they are shown around mid-grey, those of a colour difference in the
-    colours between which they change.
+    Components are signed, so mid-grey is zero. A component of a colour difference has the two
+    colours of that difference.
 
     Parameters
     ----------
     model : EigenGS
     basis : Eigenbasis, optional
-        What the model was fitted to: shown above what the Gaussians render, on the same scale.
+        The basis that the model was fitted to. The sheet shows its components above the rendered
+        ones, on the same scale.
 
     Returns
     -------
@@ -73,7 +74,7 @@ def component_sheet(model: EigenGS, basis: Eigenbasis | None = None) -> Picture:
     Raises
     ------
     ValueError
-        If the basis has another size, space or number of components than the model.
+        If the basis and the model differ in size, space or number of components.
     """
     if basis is not None:
         _require_same(model, basis)
@@ -89,18 +90,19 @@ def component_sheet(model: EigenGS, basis: Eigenbasis | None = None) -> Picture:
 
 
 def ellipses(gaussians: Gaussians, low: int = 0) -> Picture:
-    """Draw the outline of every splat at one standard deviation.
+    """Draw the outline of every Gaussian at one standard deviation.
 
     Parameters
     ----------
     gaussians : Gaussians
     low : int, optional
-        So many splats, the first ones, are drawn in orange over the others in blue.
+        Number of Gaussians of low frequencies. These first Gaussians are orange and on top, all
+        others are blue.
 
     Returns
     -------
     ndarray of float, shape (H, W, 3)
-        RGB on white, the longer side 800 pixels.
+        RGB on white; the longer side has 800 pixels.
     """
     width, height = _within(OUTLINES, gaussians.width, gaussians.height)
     colors = [LOW_COLOR] * low + [HIGH_COLOR] * (len(gaussians) - low)
@@ -108,9 +110,9 @@ def ellipses(gaussians: Gaussians, low: int = 0) -> Picture:
 
 
 def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
-    """Draw the outlines of splats at one standard deviation over a lightened picture.
+    """Draw the outlines of Gaussians at one standard deviation over a lightened picture.
 
-    Of more than 2,000 splats as many are drawn, chosen at random, the same ones each time.
+    The function draws at most 2,000 Gaussians. It picks them at random, with a fixed seed.
 
     Parameters
     ----------
@@ -124,28 +126,28 @@ def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
     ndarray of float, shape (H, W, 3)
         RGB.
     """
-    # One of every few would draw stripes where splats lie on a grid.
-    chosen = np.random.default_rng(0).permutation(len(gaussians))[:MAX_OUTLINES]
+    # Regular picks would draw stripes if the Gaussians lie on a grid.
+    picks = np.random.default_rng(0).permutation(len(gaussians))[:MAX_OUTLINES]
     under = LIGHTER + (1 - LIGHTER) * np.clip(picture, 0, 1)
-    drawn = gaussians[chosen]
-    return _outlined(under, drawn, [HIGH_COLOR] * len(drawn))
+    subset = gaussians[picks]
+    return _outlined(under, subset, [HIGH_COLOR] * len(subset))
 
 
 def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Picture:
-    """Put an image, its fit, and the outlines of splats over the fit side by side.
+    """Put an image, its fit, and the fit under outlines of its Gaussians side by side.
 
     Parameters
     ----------
     image, picture : ndarray of float, shape (H, W, 3) or (H, W, 1)
-        RGB or grey, of one size.
+        The image and its fit, RGB or grey, of one size.
     gaussians : Gaussians
-        Those that make the picture.
+        The Gaussians of the fit.
 
     Returns
     -------
     ndarray of float, shape (k * H, 3 * k * W, 3)
-        RGB. Every pixel is repeated k times along both axes, so often that the longer side of each
-        part has at least 512 pixels.
+        RGB. Every pixel is repeated k times along both axes; k is the smallest number that gives
+        each part a longer side of at least 512 pixels.
     """
     times = -(-MIN_SIDE // max(image.shape[:2]))
     shape = (*image.shape[:2], 3)
@@ -155,11 +157,11 @@ def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Pictur
 
 
 def _outlined(picture: Picture, gaussians: Gaussians, colors: list[Color]) -> Picture:
-    """Draw outlines at one standard deviation in one colour each, the first splats on top."""
+    """Draw outlines at one standard deviation, the first Gaussian on top."""
     from PIL import Image, ImageDraw
 
     height, width = picture.shape[:2]
-    # Lines are drawn at twice the size and averaged: Pillow's have jagged edges.
+    # Lines of Pillow have jagged edges; at twice the size, averaging smooths them.
     under = np.broadcast_to(to_8bit(picture), (height, width, 3)).astype(np.uint8)
     image = Image.fromarray(under.repeat(2, axis=0).repeat(2, axis=1))
     draw = ImageDraw.Draw(image)
@@ -170,13 +172,13 @@ def _outlined(picture: Picture, gaussians: Gaussians, colors: list[Color]) -> Pi
 
 
 def _outlines(gaussians: Gaussians) -> Picture:
-    """Points around every splat at one standard deviation, the first one twice, (N, 25, 2)."""
+    """Return closed outlines at one standard deviation, shape (N, 25, 2)."""
     arrays = gaussians.to_arrays()
     return outline(arrays["factor"]) + arrays["mean"].astype(np.float64)[:, None]
 
 
 def _in_sight(points: Picture, size: tuple[int, int]) -> Picture:
-    """Tell whose outlines may cross a picture, and are small enough for Pillow to draw."""
+    """Tell which outlines may cross a picture and are small enough for Pillow."""
     low, high = points.min(axis=1), points.max(axis=1)
     longest = MAX_REACH * max(size)
     near = (low > -longest) & (high < longest)
@@ -184,16 +186,18 @@ def _in_sight(points: Picture, size: tuple[int, int]) -> Picture:
 
 
 def _require_same(model: EigenGS, basis: Eigenbasis) -> None:
-    """Raise ValueError for a basis that the model was not fitted to."""
+    """Raise ValueError unless a basis has the size, space and components of a model."""
     shapes = model.gaussians
-    made = (shapes.width, shapes.height, shapes.space, model.components)
-    given = (basis.width, basis.height, basis.space, tuple(map(len, basis.components)))
-    if made != given:
-        raise ValueError(f"basis is {given}, the model {made}; pass the basis it was fitted to")
+    expected = (shapes.width, shapes.height, shapes.space, model.components)
+    actual = (basis.width, basis.height, basis.space, tuple(map(len, basis.components)))
+    if expected != actual:
+        raise ValueError(
+            f"basis is {actual}, the model {expected}; pass the basis it was fitted to"
+        )
 
 
 def _mean(model: EigenGS, basis: Eigenbasis | None) -> Picture:
-    """Column of the mean image."""
+    """Draw the column of the mean image."""
     pictures = [render(model.gaussians).numpy()]
     if basis is not None:
         pictures.insert(0, np.stack(decode(basis.space, list(basis.mean)), axis=2))
@@ -201,23 +205,23 @@ def _mean(model: EigenGS, basis: Eigenbasis | None) -> Picture:
 
 
 def _components(model: EigenGS, basis: Eigenbasis | None) -> list[Picture]:
-    """One column a component that is shown."""
+    """Draw one column for each component of the sheet."""
     space = model.gaussians.space
-    chosen = [
+    picks = [
         (channel, number - 1)
         for channel, count in enumerate(model.components)
         for number in (OTHERS if channel else FIRST)
         if number <= count
     ]
-    if not chosen:
+    if not picks:
         return []
-    # At most 13 channels, so one program renders all.
-    weights = np.stack([model.weights[channel][j] for channel, j in chosen], axis=1)
+    # There are at most 13 channels, so one program renders all.
+    weights = np.stack([model.weights[channel][j] for channel, j in picks], axis=1)
     rendered = render(with_colors(model.gaussians, weights, "data")).numpy()
     columns = []
-    for (channel, j), plane in zip(chosen, np.moveaxis(rendered, 2, 0), strict=True):
+    for (channel, j), plane in zip(picks, np.moveaxis(rendered, 2, 0), strict=True):
         planes = [plane] if basis is None else [basis.components[channel][j], plane]
-        # One bright pixel must not make everything else grey.
+        # A quantile, because one bright pixel must not make everything else grey.
         scale = 0.5 / (np.quantile(np.abs(planes[0]), 0.999) or 1)
         hue = _hue(space, channel)
         pictures = [_cell(0.5 + scale * plane[..., None] * hue) for plane in planes]
@@ -226,7 +230,7 @@ def _components(model: EigenGS, basis: Eigenbasis | None) -> list[Picture]:
 
 
 def _parts_of_mean(model: EigenGS) -> list[Picture]:
-    """What the splats for low and for high frequencies add to the mean image."""
+    """Draw the shares of the Gaussians of low and of high frequencies in the mean image."""
     low = render(model.gaussians[: model.low]).numpy()
     high = render(model.gaussians).numpy() - low
     rest = len(model.gaussians) - model.low
@@ -237,23 +241,23 @@ def _parts_of_mean(model: EigenGS) -> list[Picture]:
 
 
 def _hue(space: str, channel: int) -> NDArray[np.float32]:
-    """RGB that one channel of a space adds, its largest entry 1."""
-    added = np.subtract(decode(space, list(np.eye(3)[channel])), decode(space, [0.0] * 3))
-    return (added / np.abs(added).max()).astype(np.float32)
+    """Return the RGB direction of one channel of a space; its largest entry is 1."""
+    difference = np.subtract(decode(space, list(np.eye(3)[channel])), decode(space, [0.0] * 3))
+    return (difference / np.abs(difference).max()).astype(np.float32)
 
 
 def _within(longest: int, width: int, height: int) -> tuple[int, int]:
-    """Width and height of the same shape with a given longer side."""
+    """Scale width and height to a given longer side."""
     scale = longest / max(width, height)
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def _cell(picture: Picture) -> Picture:
-    """Bring a picture to the size of a sheet."""
+    """Resize a picture for a sheet."""
     width, height = _within(CELL, picture.shape[1], picture.shape[0])
     return resample(picture.astype(np.float32), width, height)
 
 
 def _captioned(text: str, *pictures: Picture) -> Picture:
-    """Put pictures on top of each other, below a line of text."""
+    """Stack pictures below a line of text."""
     return join_pictures([text_line(text, pictures[0].shape[1]), *pictures], 0)

@@ -1,4 +1,4 @@
-"""``eigengs-dr render``: a set of Gaussians to a picture."""
+"""The command ``eigengs-dr render``: render Gaussians to a picture."""
 
 import math
 from pathlib import Path
@@ -20,14 +20,16 @@ from .outputs import check_outputs, name_outputs
 
 @click.command()
 @click.argument("file", type=EXISTING, metavar="X.npz")
-@click.option("-o", "--output", required=True, type=ANY_PATH, metavar="Y.png")
-@click.option("--scale", type=float, metavar="S", help="Times the native size, such as 2 or 0.5.")
+@click.option(
+    "-o", "--output", required=True, type=ANY_PATH, metavar="Y.png", help="Picture to write."
+)
+@click.option("--scale", type=float, metavar="S", help="Factor on the native size, such as 0.5.")
 @click.option("--size", type=Size(), help="Width and height in pixels, such as 1024x768.")
 @click.option(
     "--first",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Draw the first N Gaussians alone; for sets that were fitted in --levels.",
+    help="Draw the first N Gaussians alone; for fits with --levels.",
 )
 @backend_option
 @quiet_option
@@ -40,9 +42,10 @@ def render(
     backend: str | None,
     quiet: bool,
 ) -> None:
-    """Render a fitted image, at its native size or at any other.
+    """Render a fitted image at any size.
 
-    Linear light is written as sRGB, data as it is: grey where it has one channel.
+    Without --scale and --size, the picture has the native size. A fit in linear light is written
+    as sRGB. A fit of data is written unchanged; one channel gives a grey picture.
 
     \b
     Examples:
@@ -72,7 +75,7 @@ def render(
 
 
 def _scaled(width: int, height: int, scale: float | None) -> tuple[int, int]:
-    """Width and height in pixels that a scale asks for."""
+    """Return the scaled width and height in pixels."""
     scale = 1.0 if scale is None else scale
     if not (math.isfinite(scale) and scale > 0):
         raise click.UsageError(f"--scale {scale}: expected a number above 0, such as 2 or 0.5")

@@ -1,4 +1,4 @@
-"""Reports: all figures of a run as JSON, one stable key a figure."""
+"""Reports: all figures of a run as JSON, with one stable key for each figure."""
 
 import json
 import math
@@ -9,20 +9,20 @@ from ..storage.atomic import atomic_write
 
 
 def write_report(path: str | os.PathLike[str], figures: dict[str, Any]) -> None:
-    """Write figures as JSON, in one step.
+    """Write figures as JSON, all or nothing.
 
     Parameters
     ----------
     path : str or os.PathLike
         The file to write.
     figures : dict
-        Strings, numbers (NumPy's too), lists and dictionaries. Infinity and NaN, which JSON does
-        not have, become null: the PSNR of two equal images is one.
+        Strings, numbers (NumPy's too), lists and dictionaries. Infinity (the PSNR of two equal
+        images) and NaN become null, because JSON has neither.
 
     Raises
     ------
     OSError
-        If the file cannot be written; one that was there is then unchanged.
+        If the file cannot be written; an existing file is then unchanged.
     """
     text = json.dumps(plain(figures), indent=2, allow_nan=False)
     with atomic_write(path) as temporary:
@@ -30,7 +30,7 @@ def write_report(path: str | os.PathLike[str], figures: dict[str, Any]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Turn a value into one that JSON has: NumPy to lists, infinity and NaN to None."""
+    """Convert a value to types of JSON: arrays to lists, infinity and NaN to None."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""``eigengs-dr scene``: Mitsuba scenes that use the plugins."""
+"""The command ``eigengs-dr scene``: render Mitsuba scenes that use the plugins."""
 
 import re
 import time
@@ -16,17 +16,17 @@ from .options import ANY_PATH, EXISTING, quiet_option
 from .outputs import check_outputs, name_outputs
 
 SUFFIXES = (".png", ".exr")
-"""What is written: PNG as sRGB, clamped; EXR as it is."""
+"""Suffixes of pictures: PNG is clamped sRGB, EXR is linear."""
 
 MADE = "build/scenes/"
 """Folder of the sets that the scenes of the repository use."""
 
 SAMPLES_PER_PASS = 1 << 24
-"""Most samples that are taken at once: their state is some 20 bytes each, and between two passes
-there is progress to show and Ctrl-C to listen to."""
+"""Most samples in one pass. The state of a sample takes some 20 bytes; progress and Ctrl-C wait
+for the end of a pass."""
 
 RESERVED = ("path", "parallel", "optimize")
-"""Names that `mitsuba.load_file` takes for itself."""
+"""Names of arguments of `mitsuba.load_file`, which no scene parameter can have."""
 
 
 class Definition(click.ParamType):
@@ -35,32 +35,37 @@ class Definition(click.ParamType):
     name = "KEY=VALUE"
 
     def convert(self, value: Any, param: Any, context: Any) -> tuple[str, str]:
-        """Turn the text of an option into a name and a value."""
+        """Parse the text of an option as a name and a value."""
         key, sign, text = value.partition("=")
         if not (key and sign):
             self.fail(f"{value}: expected a name and a value, such as spp=16", param, context)
         if key in RESERVED:
-            self.fail(f"{key}: Mitsuba takes this name for itself; rename it in the scene", param)
+            self.fail(f"{key}: Mitsuba reserves this name; rename it in the scene", param)
         return key, text
 
 
 @click.command()
 @click.argument("scenes", nargs=-1, required=True, type=EXISTING, metavar="SCENE.xml...")
-@click.option("-o", "--output", required=True, type=ANY_PATH, help=".png or .exr; or a folder.")
+@click.option(
+    "-o", "--output", required=True, type=ANY_PATH, help=".png or .exr file, or a folder."
+)
 @click.option(
     "--variant",
     metavar="NAME",
-    help="Of Mitsuba; by default cuda_ad_rgb where there is a GPU, else llvm_ad_rgb.",
+    help="Mitsuba variant.  [default: cuda_ad_rgb if there is a GPU, else llvm_ad_rgb]",
 )
 @click.option(
-    "--spp", type=click.IntRange(min=1), help="Samples a pixel; by default those of the scene."
+    "--spp",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Samples per pixel.  [default: from the scene]",
 )
 @click.option(
     "-D",
     "definitions",
     multiple=True,
     type=Definition(),
-    help="Set a <default> of the scene; may be repeated.",
+    help="Set a <default> of the scene; repeat for more.",
 )
 @quiet_option
 def scene(
@@ -71,10 +76,11 @@ def scene(
     definitions: tuple[tuple[str, str], ...],
     quiet: bool,
 ) -> None:
-    """Render Mitsuba scenes that use the texture gaussian_texture.
+    """Render Mitsuba scenes with Gaussian textures.
 
-    The mitsuba executable does not know it: plugins that are written in Python are registered from
-    Python. For several scenes -o names a folder, and the files are named like the scenes.
+    The mitsuba executable does not know the texture gaussian_texture, because it is a plugin in
+    Python; this command does. For several scenes, -o names a folder, and the pictures have the
+    names of the scenes.
 
     \b
     Examples:
@@ -93,14 +99,14 @@ def scene(
                 pixels, samples = _render(
                     mi, path, spp, dict(definitions), partial(show, str(path))
                 )
-        # Mitsuba raises many types, and only its messages tell mistakes in a scene from others.
+        # Mitsuba raises many types for mistakes in a scene; only the message says what is wrong.
         except Exception as error:
             raise _refusal(path, error) from error
         _write(mi, target, pixels)
         if not quiet:
             height, width = pixels.shape[:2]
             click.echo(
-                f"{path}: {width}x{height}, samples a pixel: {samples}, "
+                f"{path}: {width}x{height}, samples per pixel: {samples}, "
                 f"{time.perf_counter() - started:.1f} s\n  wrote {target}"
             )
 
@@ -112,7 +118,8 @@ def _mitsuba(variant: str | None, quiet: bool) -> Any:
     try:
         import mitsuba as mi
     except ImportError as error:
-        raise ValueError(f"scenes need Mitsuba ({error}): pip install 'mitsuba==3.9.*'") from error
+        advice = "install it: pip install 'eigengs-dr[plugins]'"
+        raise ValueError(f"scenes need Mitsuba ({error}); {advice}") from error
     from ..plugins import register_plugins
 
     if variant is None:
@@ -129,12 +136,12 @@ def _mitsuba(variant: str | None, quiet: bool) -> Any:
 def _render(
     mi: Any, path: Path, spp: int | None, parameters: dict[str, str], show: Callable[..., None]
 ) -> tuple[Any, int]:
-    """Render a scene in passes; its pixels, shape (H, W, C), and the number of samples in each."""
+    """Render a scene in passes; return its pixels, shape (H, W, C), and the samples per pixel."""
     import numpy as np
 
     scene = mi.load_file(str(path), **parameters)
     if not isinstance(scene, mi.Scene):
-        raise ValueError("holds no scene; its root must be <scene version='3.0.0'>")
+        raise ValueError("the file holds no scene; its root must be <scene version='3.0.0'>")
     if not scene.sensors():
         raise ValueError("the scene has no sensor; add one")
     sensor = scene.sensors()[0]
@@ -151,9 +158,9 @@ def _render(
 
 
 def _write(mi: Any, path: Path, pixels: Any) -> None:
-    """Write a picture whole or not at all."""
+    """Write a picture, all or nothing."""
     if path.suffix.lower() == ".png":
-        channels = pixels.shape[2] if pixels.shape[2] <= 4 else 3  # what follows colours are AOVs
+        channels = pixels.shape[2] if pixels.shape[2] <= 4 else 3  # AOVs follow the colours
         bitmap = mi.Bitmap(pixels[..., :channels].copy())
         bitmap = bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True)
     else:
@@ -163,13 +170,13 @@ def _write(mi: Any, path: Path, pixels: Any) -> None:
 
 
 def _refusal(path: Path, error: BaseException) -> Exception:
-    """Boil an error of Mitsuba down to one line that says what is wrong."""
-    while error.__cause__:  # Dr.Jit's own says "see above"
+    """Reduce an error of Mitsuba to one line that says what is wrong."""
+    while error.__cause__:  # the outer error of Dr.Jit only says "see above"
         error = error.__cause__
     if isinstance(error, KeyboardInterrupt):
         return click.Abort()
     text = re.sub(r"\[\w+\.cpp:\d+\] ", "", str(error))
-    # Of an error of a plugin Mitsuba tells the whole traceback; the message is its last line.
+    # For an error in a plugin, Mitsuba prints the whole traceback; the last line is the message.
     where, _, trace = text.partition("Traceback (most recent call last):")
     if trace:
         text = where + re.sub(r"^\w+: (\[Errno \d+\] )?", "", trace.strip().splitlines()[-1])

@@ -1,4 +1,4 @@
-"""``eigengs-dr train``: a folder of images to an EigenGS model."""
+"""The command ``eigengs-dr train``: train an EigenGS model on a folder of images."""
 
 from pathlib import Path
 from typing import Any
@@ -23,59 +23,60 @@ from .outputs import check_outputs, name_outputs
 from .report import write_report
 
 FREQUENCY_AWARE: dict[str, bool | str] = {"auto": "auto", "yes": True, "no": False}
-"""What the words of the option stand for."""
+"""Values of the option, by the word on the command line."""
 
 MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
-"""Figures of the images held out; null in the report where there are none."""
+"""Figures of the images held out; null in the report if there are none."""
 
 
 @click.command()
 @click.argument("folder", type=FOLDER, metavar="FOLDER")
-@click.option("-o", "--output", required=True, type=ANY_PATH, metavar="MODEL.npz")
+@click.option(
+    "-o", "--output", required=True, type=ANY_PATH, metavar="MODEL.npz", help="Model to write."
+)
 @click.option(
     "--size",
     type=Size(),
     default="256x256",
     show_default=True,
-    help="Width and height in pixels, to which the images are cropped and resized.",
+    help="Crop and resize to this.",
 )
 @click.option(
     "--components",
     type=Counts(),
     default=300,
     show_default=True,
-    help="The most kept of each colour channel; one number, or three such as 230,60,60.",
+    help="Limit, or one per channel.",
 )
 @click.option(
     "--energy",
     type=click.FloatRange(0, 1, min_open=True),
-    help="Keep as few components as hold this share of a channel's variance, such as 0.99.",
+    metavar="SHARE",
+    help="Keep this share of variance.",
 )
 @click.option(
     "--target-psnr",
     type=click.FloatRange(min=0, min_open=True),
     metavar="DB",
-    help="Keep as few components as the images held out need for this mean PSNR of their PCA.",
+    help="Keep the fewest for this mean PSNR.",
 )
 @click.option(
     "--gaussians",
     type=click.IntRange(min=1),
-    help="How many; by default 5000, or one a pixel where there are fewer pixels.",
+    metavar="N",
+    help="Up to one per pixel. [default: 5000]",
 )
-@choice(
-    "--frequency-aware",
-    list(FREQUENCY_AWARE),
-    "Whether a tenth of the Gaussians serve the first components alone.",
-)
-@choice("--preset", ["default", "eigengs"], "Solve for the weights; or train all, as the paper.")
+@choice("--frequency-aware", list(FREQUENCY_AWARE), "Reserve a tenth for the first components.")
+@choice("--preset", ["default", "eigengs"], "Solve, or train (paper).")
 @click.option(
     "--steps",
     type=click.IntRange(min=0),
-    help="Steps of training; by default 0, or 15000 with --preset eigengs.",
+    metavar="N",
+    help="Training steps.  [default: 0; eigengs: 15000]",
 )
 @choice("--color", ["ycbcr", "rgb"], "Space of the components.")
 @seed_option
-@click.option("--preview", type=ANY_PATH, help="Picture of the components and their Gaussians.")
+@click.option("--preview", type=ANY_PATH, help="Picture of the components.")
 @backend_option
 @report_option
 @quiet_option
@@ -91,22 +92,19 @@ def train(
     quiet: bool,
     **options: Any,
 ) -> None:
-    """Train an eigenbasis of Gaussians on the images of a folder.
+    """Train a model on a folder of images.
 
-    One image in ten is held out, and measured at the end. How many components are enough,
-    --energy tells by the images trained on, --target-psnr by those held out: psnr_ycbcr, or with
-    --color rgb the same of these channels. `eigengs-dr info` shows what fewer would reach.
-
-    What is done is kept in the folder
-    MODEL.npz.checkpoint: after Ctrl-C or a crash, the same command goes on from there.
+    A model is one set of Gaussians that renders all principal components of the images. One image
+    in ten is held out and measured at the end. --energy counts the variance of each channel of
+    the training images; --target-psnr measures PCA, in --color, of the images held out. After
+    Ctrl-C or a crash, the same command resumes from the folder MODEL.npz.checkpoint.
 
     \b
     Examples:
-      eigengs-dr train photos/ -o photos.npz --preview photos.png --report photos.json
-      eigengs-dr train faces/ -o faces.npz --size 128x128 --components 100 --gaussians 2000
-      eigengs-dr train photos/ -o photos.npz --energy 0.95
+      eigengs-dr train photos/ -o photos.npz --preview photos.png
+      eigengs-dr train faces/ -o faces.npz --size 128x128 --components 90,30,30
       eigengs-dr train photos/ -o photos.npz --target-psnr 24
-      eigengs-dr fit photo.jpg -o photo.npz --init eigen --basis photos.npz
+      eigengs-dr fit photo.jpg --basis photos.npz
     """
     from ..image.folder import image_files
     from ..image.io import SAVE_OPTIONS
@@ -120,22 +118,22 @@ def train(
     settings = _settings(**options)
     try:
         with progress_bar(quiet) as show:
-            trained = training.train(folder, output, settings, backend, show)
+            result = training.train(folder, output, settings, backend, show)
     except training.Interrupted as error:
         say(f"interrupted; {error}")
         context.exit(INTERRUPTED)
     if picture:
-        _save_sheet(picture, trained)
-    record = {"input": str(folder), "output": str(output), **_figures(trained.figures)}
+        _save_sheet(picture, result)
+    record = {"input": str(folder), "output": str(output), **_figures(result.figures)}
     if report:
-        chosen = {**vars(settings), "most_components": settings.components}
-        write_report(report, {**describe_run(context, backend), **chosen, **record})
+        choices = {**vars(settings), "most_components": settings.components}
+        write_report(report, {**describe_run(context, backend), **choices, **record})
     if not quiet:
         click.echo(_summary(record, picture))
 
 
 def _settings(gaussians: int | None, frequency_aware: str, **options: Any) -> Any:
-    """Turn options into the settings of a training."""
+    """Turn the options of the command into `TrainOptions`."""
     from ..eigenbasis.training import TrainOptions
     from ..fitting.options import default_count
 
@@ -148,7 +146,7 @@ def _settings(gaussians: int | None, frequency_aware: str, **options: Any) -> An
 
 
 def _figures(figures: dict[str, Any]) -> dict[str, Any]:
-    """All figures of a report, also of what was not measured."""
+    """Return all figures of a report; None for a figure that was not measured."""
     return {**dict.fromkeys(MEASURED), **figures}
 
 
@@ -160,7 +158,7 @@ def _save_sheet(path: Path, trained: Any) -> None:
 
 
 def _summary(record: dict[str, Any], preview: Path | None) -> str:
-    """What a training came to, for a terminal."""
+    """Describe a training for a terminal."""
     components = "+".join(map(str, record["components"]))
     text = (
         f"{record['input']}: {record['images']} images, {components} components, "
@@ -168,7 +166,7 @@ def _summary(record: dict[str, Any], preview: Path | None) -> str:
         f"{'split' if record['frequency_aware'] else 'not split'} ({record['split_reason']})\n  "
     )
     if record["psnr_pca"] is None:
-        text += "no image was held out, so no psnr was measured; that takes 10 images"
+        text += "no image was held out, so no psnr was measured; use at least 10 images"
     else:
         text += "held out: " + ", ".join(f"{name} {record[name]:.2f} dB" for name in MEASURED)
     wrote = f"{record['output']} and {preview}" if preview else record["output"]

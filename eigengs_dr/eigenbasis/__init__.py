@@ -1,1 +1,1 @@
-"""A family of images: PCA, shared Gaussians for all components, models."""
+"""Families of images: PCA, shared Gaussians for all components, models."""

@@ -1,4 +1,4 @@
-"""The eigenbasis of a family of images: PCA of each colour channel, one block at a time."""
+"""The eigenbasis of a family of images: PCA of each colour channel, block by block."""
 
 from __future__ import annotations
 
@@ -26,33 +26,32 @@ from .truncation import (
 )
 
 CHANNELS = {"ycbcr": ("Y", "Cb", "Cr"), "rgb": ("R", "G", "B")}
-"""What the channels of a space are called in warnings."""
+"""Names of the channels of a space, for warnings."""
 
 
 @dataclass(frozen=True, eq=False)
 class Eigenbasis:
-    """The mean of a family of images and the directions in which they differ most.
+    """The mean image and the principal components of a family of images.
 
-    The basis of EigenGS: every channel of an image I is the mean Psi_0 plus a sum of components
-    Psi_j, weighted by w_j = <Psi_j, I - Psi_0>.
+    Each channel of an image I is about ``Psi_0 + sum_j w_j Psi_j`` with w_j = <Psi_j, I - Psi_0>.
 
     Attributes
     ----------
     mean : ndarray of float32, shape (C, H, W)
-        In the colour space of the basis, on a [0, 1] scale.
+        Mean image, in [0, 1], in the space of the basis.
     components : tuple of C ndarrays of float32, shape (k_c, H, W)
-        Orthonormal among the pixels of a channel; the numbers k_c may differ, and be 0.
+        Orthonormal components; the numbers k_c may differ and be 0.
     eigenvalues : tuple of C ndarrays of float64, shape (k_c,)
-        Variance of the training images along each component, descending; the covariance is
-        ``1/m sum v v^T`` over the m images (eq. 1 of the paper).
+        Variance along each component, descending; the covariance is ``1/m sum v v^T`` over the m
+        training images (eq. 1 of the paper).
     variance : ndarray of float64, shape (C,)
-        Total variance: the sum of all eigenvalues, of kept components or not.
+        Total variance: the sum of all eigenvalues, with those of dropped components.
     count : int
-        Training images, m.
+        Number of training images, m.
     space : {"ycbcr", "rgb"}
-        What the C = 3 channels mean.
+        Colour space of the C = 3 channels.
     examples : ndarray of float32, shape (n, H, W, 3)
-        Up to 16 training images as RGB, drawn at random.
+        RGB of up to 16 random training images.
     """
 
     mean: NDArray[np.float32]
@@ -74,10 +73,10 @@ class Eigenbasis:
         seed: int = 0,
         progress: ReadProgress | None = None,
     ) -> Eigenbasis:
-        """Find the eigenbasis of a family of images in one pass, with memory for one block of them.
+        """Find the eigenbasis of a family of images in one pass, with memory for one block.
 
-        Exact for as many images as fit in a block (1,024 of 256x256); beyond, some variance of the
-        last components is lost.
+        The result is exact if all images fit in one block (1,024 of 256x256). With more blocks,
+        the last components lose some variance.
 
         Parameters
         ----------
@@ -86,28 +85,25 @@ class Eigenbasis:
         size : (int, int)
             Width and height of the basis.
         components : int or sequence of 3 ints
-            The most kept of each channel.
+            Most components of each channel.
         energy : float, optional
-            In (0, 1]: keep as few components as hold this share of a channel's variance.
+            Keep the fewest components with this share of a channel's variance, in (0, 1].
         color : {"ycbcr", "rgb"}
             Space of the channels.
         seed : int
-            Draws the examples.
+            Seed of the random examples.
         progress : callable, optional
-            ``progress(done, total, {})`` after every image that was read; `total` may be None.
+            ``progress(done, total, {})`` after every image; `total` may be None.
 
         Raises
         ------
-        ImageError
-            If the source holds no images that can be read.
         ValueError
-            If an argument is none of the above.
+            If an argument is out of range; an `ImageError` if no image can be read.
 
         Warns
         -----
         UserWarning
-            If images were skipped or cropped, there are too few of them, or `components` is too low
-            for the energy.
+            If images are skipped, cropped or too few, or `components` is too low for the energy.
         """
         size = check_size(size)
         most = check_components(components, energy)
@@ -127,7 +123,7 @@ class Eigenbasis:
         energy: float | None = None,
         color: str = "ycbcr",
     ) -> Eigenbasis:
-        """Make the basis of all images that a state has seen; parameters as for `from_images`."""
+        """Build the basis of all images of a state; parameters as for `from_images`."""
         if state.count == 0:
             raise ValueError("no images were merged; merge at least one block first")
         most = check_components(components, energy)
@@ -151,113 +147,71 @@ class Eigenbasis:
 
     @property
     def width(self) -> int:
-        """Columns of pixels."""
+        """Width in pixels."""
         return self.mean.shape[2]
 
     @property
     def height(self) -> int:
-        """Rows of pixels."""
+        """Height in pixels."""
         return self.mean.shape[1]
 
     @property
     def channels(self) -> int:
-        """Colour channels, C."""
+        """Number of colour channels, C."""
         return self.mean.shape[0]
 
     def project(self, image: ArrayLike) -> tuple[NDArray[np.float32], ...]:
-        """Find the coefficients w_j of an image.
+        """Return the coefficients w_j of an image, a tuple of C float32 arrays of shape (k_c,).
 
-        Parameters
-        ----------
-        image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
-            As for `check_image`, of any size: it is resampled to the size of the basis.
-
-        Returns
-        -------
-        tuple of C ndarrays of float32, shape (k_c,)
-
-        Raises
-        ------
-        ImageError
-            If it is not an image.
+        The image, (H, W, 3), (H, W, 1) or (H, W), has any size and is resampled to the basis. The
+        method raises `ImageError` if `eigengs_dr.image.io.check_image` refuses the array.
         """
         return self._coefficients(self._centred(image))
 
     def reconstruct(self, coefficients: Sequence[ArrayLike]) -> NDArray[np.float32]:
-        """Return the image of given coefficients: the inverse of `project` within the basis.
+        """Return the image of C arrays of coefficients, shape (k_c,), as `project` returns them.
 
-        Parameters
-        ----------
-        coefficients : sequence of C array_like, shape (k_c,)
-
-        Returns
-        -------
-        ndarray of float32, shape (H, W, 3)
-            RGB, not clamped.
-
-        Raises
-        ------
-        ValueError
-            If their numbers are not those of the components.
+        The image is RGB, not clamped, float32, shape (H, W, 3). The method raises ValueError if
+        there is not one coefficient for each component.
         """
         weights = [np.asarray(w, np.float32) for w in coefficients]
-        given, kept = [w.shape for w in weights], [(len(c),) for c in self.components]
-        if given != kept:
-            raise ValueError(f"coefficients have shapes {given}; expected {kept}")
+        actual, expected = [w.shape for w in weights], [(len(c),) for c in self.components]
+        if actual != expected:
+            raise ValueError(f"coefficients have shapes {actual}; expected {expected}")
         pairs = zip(weights, self.components, strict=True)
         return _rgb(self.mean + np.stack([np.tensordot(w, c, 1) for w, c in pairs]), self.space)
 
     def energy(self) -> tuple[NDArray[np.float64], ...]:
         """Return the share of the variance that the first 1, 2, ..., k_c components hold.
 
-        Returns
-        -------
-        tuple of C ndarrays of float64, shape (k_c,)
-            Ascending, at most 1.
+        The result is a tuple of C float64 arrays of shape (k_c,), ascending, at most 1.
         """
         pairs = zip(self.eigenvalues, self.variance, strict=True)
         return tuple(_cumulative_share(values, total) for values, total in pairs)
 
     def truncation_curve(self, images: Iterable[ArrayLike] | None = None) -> TruncationCurve:
-        """Tell how the error falls with every component, and with how few it is low enough.
+        """Return the mean PSNR of images over the number of components.
+
+        ``basis.truncated(basis.truncation_curve(images).rank_for_psnr(30))`` reaches 30 dB.
 
         Parameters
         ----------
         images : iterable of array_like, optional
-            As for `project`; best those that the basis was not made of. By default the training
-            images are told of, by the eigenvalues.
-
-        Returns
-        -------
-        Fall
-            ``basis.truncated(basis.truncation_curve(images).rank_for_psnr(30))`` reaches 30 dB,
-            their mean PSNR.
-
-        Raises
-        ------
-        ValueError
-            If there are no images, or one is none.
+            At least one image as for `project` (else ValueError), best not from the training. By
+            default, the eigenvalues give the curve of the training images.
         """
         if images is None:
             return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean.size)
         rows = [self._left(image) for image in images]
         if not rows:
             raise ValueError("there are no images to measure the basis on; pass at least one")
-        left = [np.stack(channel) for channel in zip(*rows, strict=True)]
-        return curve_from_residuals(self.eigenvalues, left, self.mean.size)
+        residuals = [np.stack(channel) for channel in zip(*rows, strict=True)]
+        return curve_from_residuals(self.eigenvalues, residuals, self.mean.size)
 
     def truncated(self, components: int | Sequence[int]) -> Eigenbasis:
-        """Return the basis of the first components.
+        """Return the basis of the first components; `components` is one number, or one per channel.
 
-        Parameters
-        ----------
-        components : int or sequence of C ints
-            The most kept of each channel; a channel that has fewer keeps all.
-
-        Raises
-        ------
-        ValueError
-            If a number is negative, or there is not one a channel.
+        The method raises ValueError for a negative number, or not C numbers.
         """
         most = check_components(components)
         return replace(
@@ -267,13 +221,7 @@ class Eigenbasis:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the basis to an ``.npz`` file, all or nothing.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written; an existing one is then as before.
-        """
+        """Write an ``.npz`` file, all or nothing; after OSError, an old file is unchanged."""
         write_basis(path, self)
 
     @classmethod
@@ -283,17 +231,16 @@ class Eigenbasis:
         Raises
         ------
         ValueError
-            If the file is not one of these, is damaged, newer than this package, or holds values
-            that do not fit together: one line that names file and key.
+            If the file is no basis, damaged, too new or inconsistent; names the file and the key.
         OSError
-            If it cannot be opened.
+            If the file cannot be opened.
         """
         return cls(**read_basis(path))
 
     def _centred(self, image: ArrayLike) -> NDArray[np.float32]:
-        """An image at the size and in the space of the basis, less the mean: shape (C, H, W)."""
-        fitting = resample(check_image(image), self.width, self.height)
-        planes = to_planes(fitting, self.space) - self.mean.reshape(self.channels, -1)
+        """Resample and convert an image and subtract the mean; shape (C, H, W)."""
+        pixels = resample(check_image(image), self.width, self.height)
+        planes = to_planes(pixels, self.space) - self.mean.reshape(self.channels, -1)
         return planes.reshape(self.mean.shape)
 
     def _coefficients(self, planes: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
@@ -301,7 +248,7 @@ class Eigenbasis:
         return tuple(np.tensordot(components, plane) for components, plane in pairs)
 
     def _left(self, image: ArrayLike) -> list[NDArray[np.float64]]:
-        """Squared error of every channel after 0, 1, ..., k_c of its components."""
+        """Return the squared error of each channel after 0, 1, ..., k_c components."""
         planes = self._centred(image)
         lengths = np.einsum("cij,cij->c", planes, planes, dtype=np.float64)
         pairs = zip(lengths, self._coefficients(planes), strict=True)
@@ -311,7 +258,7 @@ class Eigenbasis:
 def check_components(
     components: int | Sequence[int], energy: float | None = None
 ) -> tuple[int, int, int]:
-    """Return the most components of each channel; refuse what is no number, or no share."""
+    """Return the most components of each channel; raise ValueError for bad numbers or energy."""
     if energy is not None and not 0 < energy <= 1:
         raise ValueError(f"energy is {energy}; expected a share of the variance in (0, 1]")
     try:
@@ -325,11 +272,11 @@ def check_components(
 
 
 def _keep_energy(basis: Eigenbasis, most: Sequence[int], energy: float) -> Eigenbasis:
-    """Keep as few components as hold a share of the variance."""
-    enough = []
+    """Keep the fewest components that hold a share of the variance."""
+    ranks = []
     for name, shares, cap in zip(CHANNELS[basis.space], basis.energy(), most, strict=True):
-        enough.append(int(np.searchsorted(shares, energy)) + 1)
-        varies = basis.variance[len(enough) - 1] > 0
+        ranks.append(int(np.searchsorted(shares, energy)) + 1)
+        varies = basis.variance[len(ranks) - 1] > 0
         share = shares[-1] if len(shares) else 0.0
         if varies and len(shares) == cap and share < energy - ENERGY_TOLERANCE:
             warnings.warn(
@@ -337,15 +284,15 @@ def _keep_energy(basis: Eigenbasis, most: Sequence[int], energy: float) -> Eigen
                 f"less than {energy:.2%}; raise components",
                 stacklevel=3,
             )
-    return basis.truncated(enough)
+    return basis.truncated(ranks)
 
 
 def _cumulative_share(eigenvalues: NDArray[np.float64], variance: float) -> NDArray[np.float64]:
-    """Cumulative share of the variance; empty where nothing varies."""
+    """Return the cumulative share of the variance; empty if nothing varies."""
     return np.minimum(np.cumsum(eigenvalues) / (variance or 1), 1)
 
 
 def _rgb(planes: NDArray[np.float32], space: str) -> NDArray[np.float32]:
-    """Turn (C, H, W) in a colour space into RGB (H, W, 3)."""
+    """Convert planes (C, H, W) of a colour space to RGB (H, W, 3)."""
     image = np.ascontiguousarray(np.moveaxis(planes, 0, 2))
     return ycbcr_to_rgb(image) if space == "ycbcr" else image

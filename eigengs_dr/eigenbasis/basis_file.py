@@ -1,4 +1,4 @@
-"""What the file of an eigenbasis holds, and the checks before it is believed."""
+"""The file of an eigenbasis: contents and checks."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from .incremental_pca import EXAMPLES
 FORMAT, VERSION = "eigengs_dr.eigenbasis", 1
 
 ENERGY_TOLERANCE = 1e-5
-"""Share of the variance by which sums of eigenvalues may be off."""
+"""Relative tolerance between the sum of the eigenvalues and the variance."""
 
 MAX_ENTRIES = 1 << 28
-"""Largest of the other arrays: 16 examples of 2,000x2,000 pixels."""
+"""Most elements of an array: 16 examples of 2,000x2,000 pixels have fewer."""
 
 LAYOUT: dict[str, archive.Field] = {
     "mean": archive.Field("f4", 3, MAX_ENTRIES),
@@ -31,7 +31,7 @@ LAYOUT: dict[str, archive.Field] = {
     "examples": archive.Field("f4", 4, MAX_ENTRIES),
     **{f"eigenvalues{c}": archive.Field("f8", 1) for c in range(3)},
 }
-"""What a file holds besides the components, whose shapes follow from these."""
+"""Arrays of a file, except the components, whose shapes follow from these."""
 
 
 def write_basis(path: str | os.PathLike[str], basis: Any) -> None:
@@ -68,7 +68,7 @@ def read_basis(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def _check(head: dict[str, NDArray[Any]]) -> None:
-    """Raise `archive.BadValue` where the arrays of a file do not make a basis."""
+    """Raise `archive.BadValue` unless the arrays of a file make a basis."""
     mean, variance, examples = head["mean"], head["variance"], head["examples"]
     if len(mean) != 3 or 0 in mean.shape:
         raise archive.BadValue(f"mean has shape {mean.shape}, expected (3, H, W)")
@@ -104,7 +104,7 @@ def require_descending(name: str, values: NDArray[np.float64]) -> None:
 def _components(
     path: Path, eigenvalues: Sequence[NDArray[np.float64]], shape: tuple[int, ...]
 ) -> tuple[NDArray[np.float32], ...]:
-    """Read as many components of each channel as there are eigenvalues."""
+    """Read one component for each eigenvalue of each channel."""
     shapes = {f"components{c}": (len(e), *shape[1:]) for c, e in enumerate(eigenvalues)}
     layout = {key: archive.Field("f4", 3, math.prod(s)) for key, s in shapes.items()}
     arrays = archive.read(path, FORMAT, VERSION, layout)

@@ -1,8 +1,8 @@
 """EigenGS: one set of Gaussians for all principal components of a family of images.
 
-A component is rendered as ``Psi~_j(x) = sum_n psi_nj w_n(x) + beta_j``, so an image with the
-coefficients a_j is ``Psi~_0 + sum_j a_j Psi~_j = sum_n (c_n0 + sum_j a_j psi_nj) w_n(x) + const``:
-Gaussians again, whose colours are one matrix product (the paper, eq. 2 and 3).
+The Gaussians render component j as ``Psi~_j(x) = sum_n psi_nj w_n(x) + beta_j``. An image with the
+coefficients a_j is ``Psi~_0 + sum_j a_j Psi~_j = sum_n (c_n0 + sum_j a_j psi_nj) w_n(x) + const``.
+These are the same Gaussians, with colours from one matrix product (eq. 2 and 3 of the paper).
 """
 
 from __future__ import annotations
@@ -36,37 +36,31 @@ TrainProgress = Callable[[int, int, dict[str, Any]], None]
 
 @dataclass(frozen=True, eq=False)
 class EigenGS:
-    """Gaussians that render the mean image and every principal component of a family of images.
+    """Gaussians that render the mean image and all principal components of a family of images.
 
     Attributes
     ----------
     gaussians : Gaussians
-        N splats at the size of the training images, with the colours and the background of the
-        mean image, "component 0".
-    weights : tuple of ndarray of float32, shape (k, N + 1)
-        For every channel, the weight ``psi_nj`` of splat n in component j, in the order of falling
-        eigenvalues; the last column is the background ``beta_j``. Channels may differ in k.
-    eigenvalues : tuple of ndarray of float64, shape (k,)
+        N Gaussians at the size of the training images, with the colours of the mean image.
+    weights : tuple of C ndarrays of float32, shape (k_c, N + 1)
+        Weight ``psi_nj`` of Gaussian n in component j, in the order of falling eigenvalues; the
+        last column is the background ``beta_j``.
+    eigenvalues : tuple of C ndarrays of float64, shape (k_c,)
         Variance along each component.
     mean_image : ndarray of float32, shape (C, H, W)
-        The mean image as pixels, in the space of the Gaussians.
-    low : int
-        Number of splats N_l, the first ones, that serve the low frequencies alone; 0 where all
-        splats serve all components.
-    low_components : int
-        Components of each channel, the first ones, that these splats serve.
+        Pixels of the mean image, in the space of the Gaussians.
+    low, low_components : int
+        The first `low` Gaussians serve the first `low_components` of each channel alone; both are
+        0 if all Gaussians serve all components.
     split_reason : str
-        Why the splats are split or not; empty where an older file does not say.
-    variance : ndarray of float64, shape (C,)
-        Total variance of the training images, see `eigengs_dr.Eigenbasis`; empty, shape (0,), where
-        an older file does not say.
-    held_out : ndarray of float64, shape (n + 1,)
-        The PSNR of `eigengs_dr.eigenbasis.truncation.TruncationCurve`, in dB, mean over images that
-        were not trained on, of their PCA by the first 0, 1, ..., n components; empty where none
-        were held out.
+        Why the Gaussians are split or not; empty in a file of version 1.
+    variance : ndarray of float64, shape (C,) or (0,)
+        See `eigengs_dr.Eigenbasis`; empty in a file of version 1.
+    held_out : ndarray of float64, shape (n + 1,) or (0,)
+        Mean PSNR in dB of PCA with 0, 1, ..., n components, for images held out of the training;
+        see `eigengs_dr.eigenbasis.truncation.TruncationCurve`. Empty if no image was held out.
     figures : dict of str to float
-        What was measured when the model was fitted, see
-        `eigengs_dr.eigenbasis.components.solve.ComponentFit`; not saved.
+        See `eigengs_dr.eigenbasis.components.solve.ComponentFit`; not saved.
     """
 
     gaussians: Gaussians
@@ -98,18 +92,17 @@ class EigenGS:
         ----------
         basis : Eigenbasis
         gaussians : int, optional
-            Number of splats, at most one a pixel.
+            Number of Gaussians, at most one per pixel.
         frequency_aware : {"auto", True, False}, optional
-            Whether a tenth of the splats serve the first 50 components alone, and the others the
-            rest; see `eigengs_dr.eigenbasis.components.split.wants_split`.
+            Whether a tenth of the Gaussians serve the first 50 components alone, and the others
+            the rest; for "auto" see `eigengs_dr.eigenbasis.components.split.wants_split`.
         seed : int, optional
         preset : {"default", "eigengs"}, optional
-            "default" places splats on a grid and solves for the weights of all components at once,
-            by one factorisation; "eigengs" trains shapes and weights together from a random start,
-            with the settings of the paper.
+            "default" places Gaussians on a grid and solves for all weights by one factorisation.
+            "eigengs" trains shapes and weights from a random start, with the paper's settings.
         steps : int, optional
-            Steps of training: of the shapes for "default" (0 by default: 300 gain 0.3 dB), of all
-            for "eigengs" (15,000 by default, which takes hours without a GPU).
+            Training steps. "default" trains the shapes (0 by default; 300 gain 0.3 dB), "eigengs"
+            shapes and weights (15,000 by default, which take hours without a GPU).
         backend : {"llvm", "cuda"}, optional
         progress : callable, optional
             ``progress(step, steps, {})`` after every round of training.
@@ -117,29 +110,31 @@ class EigenGS:
         Raises
         ------
         ValueError
-            If an argument is out of range; one line.
+            If an argument is out of range.
         BackendError
-            If the backend is not there.
+            If the backend does not work.
         """
         steps = check_arguments(
             (basis.width, basis.height), gaussians, frequency_aware, seed, preset, steps
         )
-        split, compared = wants_split(basis, gaussians, frequency_aware, backend)
+        split, figures = wants_split(basis, gaussians, frequency_aware, backend)
         total = steps * (2 if split else 1)
 
         def save(states: list[State]) -> None:
             if progress:
                 progress(sum(int(state["step"]) for state in states), total, {})
 
-        fitted = fit_components(basis, gaussians, split, preset, steps, seed, backend, save=save)
-        reason = split_reason(basis, gaussians, frequency_aware, compared)
-        return cls.from_fit(basis, fitted, compared, split_reason=reason)
+        component_fit = fit_components(
+            basis, gaussians, split, preset, steps, seed, backend, save=save
+        )
+        reason = split_reason(basis, gaussians, frequency_aware, figures)
+        return cls.from_fit(basis, component_fit, figures, split_reason=reason)
 
     @classmethod
     def from_fit(
         cls, basis: Eigenbasis, fitted: ComponentFit, figures: dict[str, float], **notes: Any
     ) -> EigenGS:
-        """Put a model together from what was fitted to a basis, more figures and attributes."""
+        """Build a model from a basis, a fit of its components, more figures and attributes."""
         return cls(
             gaussians=fitted.gaussians,
             weights=fitted.weights,
@@ -154,52 +149,47 @@ class EigenGS:
 
     @property
     def components(self) -> tuple[int, ...]:
-        """Number of components of every channel."""
+        """Number of components of each channel."""
         return tuple(len(w) for w in self.weights)
 
     def truncation_curve(self) -> TruncationCurve | None:
-        """Tell how the error of the training images' PCA falls, component by component.
+        """Return `eigengs_dr.eigenbasis.truncation.curve_from_eigenvalues` of the training images.
 
-        Returns
-        -------
-        Fall or None
-            See `eigengs_dr.eigenbasis.truncation.curve_from_eigenvalues`; None where an older file
-            does not say.
+        The result is None for a file of version 1, which lacks the variance.
         """
         if not len(self.variance):
             return None
         return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean_image.size)
 
     def project(self, image: ArrayLike, target_psnr: float | None = None) -> tuple[Planes, ...]:
-        """Find the coefficients of an image: the closest point on the span of the components.
+        """Find the coefficients of an image by least squares on the rendered components.
 
-        Least squares on the rendered components, ``min_a |Psi~ a - (I - Psi~_0)|^2``; where they
-        render the principal components well, that is PCA's projection. Where there are nearly as
-        many components as splats, these are not independent, and coefficients are large and mean
-        little one by one, though their rendering is right.
+        The function solves ``min_a |Psi~ a - (I - Psi~_0)|^2``. If the Gaussians render the
+        components well, the result is the projection of PCA. With nearly as many components as
+        Gaussians, single coefficients are large and mean little, but their sum renders well.
 
         Parameters
         ----------
         image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
-            Of any size; resampled to that of the model.
+            An image of any size; it is resampled to the size of the model.
         target_psnr : float, optional
-            Use as few components as reach it for this image at the size of the model, in dB, of the
-            channels as in `eigengs_dr.eigenbasis.truncation.TruncationCurve`. All by default.
+            Use the fewest components that reach this PSNR, in dB, for the image at the size of the
+            model; see `eigengs_dr.eigenbasis.truncation.TruncationCurve`. All by default.
 
         Returns
         -------
-        tuple of ndarray of float32, shape (m,)
-            One array a channel; m <= k, and m = k without a target.
+        tuple of C ndarrays of float32, shape (m_c,)
+            ``m_c <= k_c``; without a target ``m_c = k_c``.
 
         Raises
         ------
         ValueError
-            If the image is unusable, or the target no positive number.
+            If the image cannot be used or the target is not a positive number.
 
         Warns
         -----
         UserWarning
-            If all components do not reach the target; they are used.
+            If all components miss the target; the result then has all of them.
         """
         planes = self._planes(check_image(image))
         return self._coefficients(planes, self.equations.correlate(planes), False, target_psnr)
@@ -207,30 +197,26 @@ class EigenGS:
     def reconstruct(
         self, coefficients: tuple[Planes, ...], size: tuple[int, int] | None = None
     ) -> Gaussians:
-        """Turn coefficients into Gaussians: one matrix product a channel.
+        """Turn coefficients into Gaussians, by one matrix product for each channel.
 
         Parameters
         ----------
-        coefficients : tuple of array_like, shape (m,)
-            One array a channel, as from `project`; m <= k leaves out the last components.
+        coefficients : tuple of C array_like, shape (m_c,)
+            Coefficients from `project`; ``m_c < k_c`` leaves out the last components.
         size : (int, int), optional
-            Native width and height of the result; those of the model by default.
-
-        Returns
-        -------
-        Gaussians
+            Native width and height of the result; by default those of the model.
 
         Raises
         ------
         ValueError
-            If there is not one array a channel, or one has more coefficients than components.
+            If there is not one array for each channel, or one has over k_c coefficients.
         """
-        given = [np.shape(values) for values in coefficients]
-        if len(given) != len(self.weights) or not all(
+        shapes = [np.shape(values) for values in coefficients]
+        if len(shapes) != len(self.weights) or not all(
             len(shape) == 1 and shape[0] <= k
-            for shape, k in zip(given, self.components, strict=True)
+            for shape, k in zip(shapes, self.components, strict=True)
         ):
-            raise ValueError(f"coefficients have shapes {given}; expected up to {self.components}")
+            raise ValueError(f"coefficients have shapes {shapes}; expected up to {self.components}")
         return self._colored(self._mean_coefficients + self._sum(coefficients), size)
 
     def encode(
@@ -240,44 +226,39 @@ class EigenGS:
         mean: str = "gaussians",
         target_psnr: float | None = None,
     ) -> Gaussians:
-        """Give an image its Gaussians at once, without optimisation.
+        """Encode an image as Gaussians of its size, without optimisation.
 
         Parameters
         ----------
         image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
-            Of any size and aspect ratio: it is resampled to the size of the model, and the
-            Gaussians are scaled to it.
+            An image of any size and aspect ratio; it is resampled to the size of the model, and
+            the Gaussians are scaled to the size of the image.
         colors : {"exact", "projected"}, optional
-            "exact" are the best colours on these shapes, by back-substitution (where the splats
-            are split, the best of N_l, and of N_h for what is left); "projected" are those of the
-            eigenbasis, which have no more degrees of freedom than there are components.
+            "exact" finds the best colours for the shapes, by back-substitution. With a split, it
+            finds the best colours of the first `low` Gaussians, then those of the others for the
+            residual. "projected" uses as many degrees of freedom as there are components.
         mean : {"gaussians", "dense"}, optional
-            "dense" is the paper's form: the result lacks the mean image, `dense_mean`.
+            "dense" is the form of the paper: the result lacks the mean image, `dense_mean`.
         target_psnr : float, optional
-            With "projected" colours: use as few components as reach it, see `project`.
-
-        Returns
-        -------
-        Gaussians
-            At the size of the image.
+            Use the fewest components that reach this PSNR; for "projected" alone, see `project`.
 
         Raises
         ------
         ValueError
-            If the image is unusable, an option unknown, or the target no positive number or given
-            for exact colours.
+            If the image cannot be used, an option is unknown, or the target is not a positive
+            number or comes with exact colours.
 
         Warns
         -----
         UserWarning
-            If all components do not reach the target; they are used.
+            If all components miss the target; the result then uses all of them.
         """
-        for name, value, known in (
+        for name, value, valid in (
             ("colors", colors, ("exact", "projected")),
             ("mean", mean, ("gaussians", "dense")),
         ):
-            if value not in known:
-                raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(known)}")
+            if value not in valid:
+                raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(valid)}")
         if colors == "exact" and target_psnr is not None:
             raise ValueError("target_psnr chooses components; use it with colors 'projected'")
         pixels = check_image(image)
@@ -288,24 +269,22 @@ class EigenGS:
         correlations = self.equations.correlate(planes)
         if colors == "exact":
             return self._colored(self.equations.solve(correlations), size)
-        found = self._coefficients(planes, correlations, mean == "dense", target_psnr)
+        coefficients = self._coefficients(planes, correlations, mean == "dense", target_psnr)
         if mean == "dense":
-            return self._colored(self._sum(found), size)
-        return self.reconstruct(found, size)
+            return self._colored(self._sum(coefficients), size)
+        return self.reconstruct(coefficients, size)
 
     def dense_mean(self, width: int, height: int) -> Planes:
-        """Return the mean image as pixels, shape (height, width, C), in the space of the model."""
+        """Return the pixels of the mean image, shape (height, width, C), in the model's space."""
         return resample(np.moveaxis(self.mean_image, 0, 2), width, height)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the model as an ``.npz`` file, all or nothing.
-
-        Weights are stored in half precision, each component scaled by its largest weight.
+        """Write an ``.npz`` file, all or nothing; see `eigengs_dr.eigenbasis.model_file`.
 
         Raises
         ------
         OSError
-            If the file cannot be written; an existing one is then as before.
+            If the file cannot be written; an existing file is then unchanged.
         """
         npz.write(path, FORMAT, VERSION, to_members(self))
 
@@ -313,18 +292,13 @@ class EigenGS:
     def load(cls, path: str | os.PathLike[str], backend: str | None = None) -> EigenGS:
         """Read a model that `save` wrote.
 
-        Parameters
-        ----------
-        path : path-like
-        backend : {"llvm", "cuda"}, optional
-
         Raises
         ------
         ValueError
-            If the file is not one of these, is damaged, newer than this package, or holds values
-            that are not finite or do not fit together: one line that names file and key.
+            If the file is no model, is damaged, is newer than this package, or holds values that
+            are not finite or do not fit together; the message names the file and the key.
         OSError
-            If it cannot be opened.
+            If the file cannot be opened.
         """
         version = npz.read_version(path, FORMAT, VERSION)
         arrays = npz.read(path, FORMAT, VERSION, layout_of(version))
@@ -334,7 +308,7 @@ class EigenGS:
             raise ValueError(f"{Path(path)}: {error}") from None
 
     def _planes(self, pixels: Planes) -> Planes:
-        """Bring an RGB image to the size and space of the model, shape (C, H, W)."""
+        """Convert an RGB image to the size and space of the model, shape (C, H, W)."""
         width, height = self.gaussians.width, self.gaussians.height
         if pixels.shape[:2] != (height, width):
             pixels = resample(pixels, width, height)
@@ -343,15 +317,13 @@ class EigenGS:
     def _colored(
         self, coefficients: NDArray[np.float64], size: tuple[int, int] | None
     ) -> Gaussians:
-        """The model's shapes with the colours and background given, scaled to a size."""
+        """Return the shapes of the model with colours and background, scaled to a size."""
         result = with_colors(self.gaussians, coefficients, self.gaussians.space)
         return result.scaled(*size) if size else result
 
-    # --- What is computed once a model -----------------------------------------------------------
-
     @cached_property
     def equations(self) -> NormalEquations:
-        """The normal equations of all splats, factorised."""
+        """Normal equations of all Gaussians, with their factors."""
         return NormalEquations(self.gaussians, self.low)
 
     @cached_property
@@ -362,12 +334,12 @@ class EigenGS:
 
     @cached_property
     def _mean_product(self) -> NDArray[np.float64]:
-        """What the rendered mean image correlates to, shape (N + 1, C)."""
+        """Correlations of the rendered mean image with all Gaussians, shape (N + 1, C)."""
         return self.equations.product(self._mean_coefficients)
 
     @cached_property
     def _projector(self) -> ComponentProjector:
-        """The rendered components, with the factors of their least squares."""
+        """Least squares on the rendered components."""
         return ComponentProjector(self.equations, self.weights)
 
     def _coefficients(
@@ -377,17 +349,17 @@ class EigenGS:
         centred: bool,
         target_psnr: float | None,
     ) -> tuple[Planes, ...]:
-        """Least squares on the rendered components; `centred` planes lack the mean image."""
-        seen = correlations if centred else correlations - self._mean_product
+        """Solve least squares on the rendered components; `centred` planes lack the mean image."""
+        products = correlations if centred else correlations - self._mean_product
         if target_psnr is None:
-            return self._projector.coefficients(seen)
+            return self._projector.coefficients(products)
         lengths = squared_norms(planes)
         if not centred:
             lengths = self.equations.error(self._mean_coefficients, correlations, lengths)
-        return self._projector.coefficients_for_psnr(seen, lengths, planes.size, target_psnr)
+        return self._projector.coefficients_for_psnr(products, lengths, planes.size, target_psnr)
 
     def _sum(self, coefficients: tuple[Any, ...]) -> NDArray[np.float64]:
-        """``sum_j a_j psi_nj`` for every channel, shape (N + 1, C)."""
+        """Return ``sum_j a_j psi_nj`` of each channel, shape (N + 1, C)."""
         columns = []
         for weights, values in zip(self.weights, coefficients, strict=True):
             values = np.asarray(values, np.float32)

@@ -1,4 +1,4 @@
-"""What a basis and a model are worth on image files that neither was made of."""
+"""The PSNR of a basis and a model on image files held out of the training."""
 
 from __future__ import annotations
 
@@ -19,25 +19,26 @@ from .eigengs import EigenGS
 from .truncation import TruncationCurve
 
 OnImage = Callable[[int], None]
-"""``watch(i)`` before image number i; what it raises ends the work."""
+"""``watch(i)`` runs before image number i; an error that it raises ends the work."""
 
 
 def truncation_curve_on(
     basis: Eigenbasis, files: Sequence[Path], watch: OnImage
 ) -> TruncationCurve | None:
-    """Measure how the error of images falls with the components; see `Eigenbasis.fall`.
+    """Measure the truncation curve of images; see `Eigenbasis.truncation_curve`.
 
     Parameters
     ----------
     basis : Eigenbasis
     files : sequence of Path
-        Images of any size. Those that cannot be read are left out.
+        Images of any size; unreadable files are skipped.
     watch : callable
+        See `OnImage`.
 
     Returns
     -------
-    Fall or None
-        None where no file can be read.
+    TruncationCurve or None
+        None if no file can be read.
     """
     readable = _readable(files, basis, watch, [])
     first = next(readable, None)
@@ -47,45 +48,47 @@ def truncation_curve_on(
 def evaluate(
     model: EigenGS, basis: Eigenbasis, files: Sequence[Path], watch: OnImage
 ) -> dict[str, float]:
-    """Measure what components, projected and exact colours are worth.
+    """Measure the PSNR of PCA, of projected colours and of exact colours.
 
     Parameters
     ----------
     model : EigenGS
     basis : Eigenbasis
-        Its components.
+        The basis that the model renders.
     files : sequence of Path
+        Images of any size.
     watch : callable
+        See `OnImage`.
 
     Returns
     -------
     dict of str to float
-        Means over the images, psnr_ycbcr in dB: "psnr_pca" of the components themselves,
-        "psnr_init" of projected and "psnr_solved" of exact colours. Empty where none can be read.
+        Mean psnr_ycbcr over the images, in dB: "psnr_pca" of the basis, "psnr_init" of projected
+        and "psnr_solved" of exact colours. Empty if no file can be read.
 
     Warns
     -----
     UserWarning
-        If some cannot.
+        If a file cannot be read.
     """
     rows, bad = [], list[str]()
     for image in _readable(files, basis, watch, bad):
-        shown = {
+        pictures = {
             "psnr_pca": basis.reconstruct(basis.project(image)),
             "psnr_init": render(model.encode(image, "projected")).numpy(),
             "psnr_solved": render(model.encode(image, "exact")).numpy(),
         }
-        rows.append({name: psnr(image, picture, "ycbcr") for name, picture in shown.items()})
+        rows.append({name: psnr(image, picture, "ycbcr") for name, picture in pictures.items()})
     if bad:
-        told = f"{len(bad)} of {len(files)} images held out were skipped, as {bad[0]}"
-        warnings.warn(told, stacklevel=2)
+        message = f"{len(bad)} of {len(files)} images held out were skipped, as {bad[0]}"
+        warnings.warn(message, stacklevel=2)
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]} if rows else {}
 
 
 def _readable(
     files: Sequence[Path], basis: Eigenbasis, watch: OnImage, bad: list[str]
 ) -> Iterator[NDArray[np.float32]]:
-    """Read images and crop them to the size of a basis; why some cannot be goes into `bad`."""
+    """Read images and crop them to the size of a basis; append errors to `bad`."""
     for i, path in enumerate(files):
         watch(i)
         try:

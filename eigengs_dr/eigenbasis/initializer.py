@@ -1,4 +1,4 @@
-"""The start of a fit that an eigenbasis gives: shapes and colours of a model."""
+"""The initialiser "eigen": a fit starts from the shapes and colours of a model."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def start_from_basis(target: FitTarget, options: FitOptions) -> FitProblem:
     Raises
     ------
     ValueError
-        If the model has another number of Gaussians, space or backend than the options ask for.
+        If the model and the options differ in the number of Gaussians, space or backend.
     """
     model = load_basis(options.basis or DEFAULT_BASIS, options.backend)
     _check_basis(model, target.pixels, options.gaussians, options.color)
@@ -49,15 +49,15 @@ def _encode(model: EigenGS, target: FitTarget, options: FitOptions) -> Gaussians
 
 
 def _picture(planes: NDArray[np.float32], color: str) -> NDArray[np.float32]:
-    """RGB that planes add to a rendering; that of zeros is in the rendering already."""
-    shown = np.stack(decode(color, list(np.moveaxis(planes, 2, 0))), axis=2)
-    return shown - np.array(decode(color, [0.0] * planes.shape[2]), np.float32)
+    """Return the RGB that planes add to a rendering, which already holds the RGB of zeros."""
+    rgb = np.stack(decode(color, list(np.moveaxis(planes, 2, 0))), axis=2)
+    return rgb - np.array(decode(color, [0.0] * planes.shape[2]), np.float32)
 
 
 def _check_basis(
     model: EigenGS, pixels: NDArray[np.float32], gaussians: int | None, color: str
 ) -> None:
-    """Raise ValueError where a basis is not what the other arguments ask for."""
+    """Raise ValueError unless a basis fits the image and the options."""
     count, space = len(model.gaussians), model.gaussians.space
     if gaussians not in (None, count):
         raise ValueError(
@@ -71,7 +71,7 @@ def _check_basis(
             "use init 'adaptive'"
         )
     if color != space:
-        trained = f"train a basis with --color {color}" if color in BASIS_SPACES else "another init"
+        advice = f"train a basis with --color {color}" if color in BASIS_SPACES else "another init"
         raise ValueError(
-            f"color is {color!r}, but the basis is in {space!r}; use color {space!r}, or {trained}"
+            f"color is {color!r}, but the basis is in {space!r}; use color {space!r}, or {advice}"
         )

@@ -1,4 +1,4 @@
-"""What the file of an EigenGS model holds, and the checks before it is believed."""
+"""The file of an EigenGS model: contents and checks."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from .basis_file import ENERGY_TOLERANCE, require_descending
 FORMAT, VERSION = "eigengs_dr.model", 2
 
 MAX_ENTRIES = 1 << 28
-"""Largest array: 300 components of a million splats."""
+"""Most elements of an array: 300 components of a million Gaussians have about as many."""
 
 MAX_WEIGHT = 1e6
-"""Largest colour or weight that is believed; 1 is white."""
+"""Largest valid colour or weight; 1 is white."""
 
 MAX_PSNR = 200.0
-"""Beyond all PSNR, of good and of bad."""
+"""Largest valid PSNR in dB, positive or negative; no real PSNR comes near."""
 
 LAYOUT_V1: dict[str, Field] = {
     "mean": Field("f4", 2),
@@ -36,7 +36,7 @@ LAYOUT_V1: dict[str, Field] = {
     **{f"scale{c}": Field("f4", 1) for c in range(3)},
     **{f"eigenvalues{c}": Field("f8", 1) for c in range(3)},
 }
-"""What a file of version 1 holds: the kind and the number of dimensions of each array."""
+"""Arrays of a file of version 1: kind and number of dimensions."""
 
 LAYOUT: dict[str, Field] = {
     **LAYOUT_V1,
@@ -44,19 +44,19 @@ LAYOUT: dict[str, Field] = {
     "held_out": Field("f8", 1),
     "split_reason": Field("U", 0),
 }
-"""What a file holds: since version 2 also how the error falls, and why splats are split."""
+"""Arrays of a file; version 2 added the last three, for the truncation curve and the split."""
 
 
 def layout_of(version: int) -> dict[str, Field]:
-    """Return what a file of a version that can be read holds."""
+    """Return the arrays of a file of a version, 1 or 2."""
     return LAYOUT_V1 if version < 2 else LAYOUT
 
 
 def to_members(model: Any) -> dict[str, NDArray[Any]]:
-    """Turn a model into the arrays of its file.
+    """Convert a model to the arrays of its file.
 
-    Weights are in half precision, each component scaled by its largest weight: what rounding adds
-    to an image is 60 dB and more below it.
+    Weights are stored in half precision; each component is scaled by its largest weight. The
+    rounding error is at least 60 dB below the image.
 
     Parameters
     ----------
@@ -82,12 +82,12 @@ def to_members(model: Any) -> dict[str, NDArray[Any]]:
 
 
 def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[str, Any]:
-    """Turn the arrays of a file into the fields of a model, once all of them fit together.
+    """Check the arrays of a file and convert them to the fields of a model.
 
     Parameters
     ----------
     arrays : dict of str to ndarray
-        Of the types and dimensions of `LAYOUT`, or of `LAYOUT_V1`.
+        Arrays with the types and dimensions of `LAYOUT` or `LAYOUT_V1`.
     backend : {"llvm", "cuda"}, optional
 
     Returns
@@ -98,7 +98,7 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
     Raises
     ------
     ValueError
-        One line that names the key and what was expected.
+        If an array is invalid; the message names the key and the expected value.
     """
     for key, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
@@ -131,10 +131,10 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
     most = max(len(arrays[f"weights{c}"]) for c in range(3))
     if not (0 <= low < count and 0 <= low_components <= most):
         raise ValueError(
-            f"split is {low}, {low_components}; expected up to {count - 1} splats and {most} "
+            f"split is {low}, {low_components}; expected up to {count - 1} Gaussians and {most} "
             "components"
         )
-    with np.errstate(over="ignore"):  # what overflows is refused
+    with np.errstate(over="ignore"):  # the check below refuses infinity
         weights = tuple(
             arrays[f"weights{c}"].astype(np.float32) * arrays[f"scale{c}"][:, None]
             for c in range(3)
@@ -156,23 +156,23 @@ def from_members(arrays: dict[str, NDArray[Any]], backend: str | None) -> dict[s
 
 
 def _optional_members(arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
-    """Check what files tell since version 2; nothing of an older one."""
+    """Check and return the fields of version 2; none for version 1."""
     if "variance" not in arrays:
         return {}
     variance, held_out = arrays["variance"], arrays["held_out"]
-    if len(variance):  # unknown in a model that came from an older file
+    if len(variance):  # empty in a model from a file of version 1
         _require("variance", variance, (3,))
     for c, total in enumerate(variance):
         if not 0 <= arrays[f"eigenvalues{c}"].sum() <= total * (1 + ENERGY_TOLERANCE):
             raise ValueError(f"eigenvalues{c} add up to more than variance {c}")
     if len(held_out):  # where images were held out
         _require("held_out", held_out, (1 + sum(len(arrays[f"scale{c}"]) for c in range(3)),))
-    falls = np.diff(held_out) < -1e-9  # that much is rounding of the logarithm
+    falls = np.diff(held_out) < -1e-9  # the logarithm rounds by less
     if falls.any() or (np.abs(held_out) > MAX_PSNR).any():
         raise ValueError(f"held_out must ascend, within {MAX_PSNR:g} dB")
     reason = str(arrays["split_reason"])
     if not (reason.isascii() and reason.isprintable()):
-        raise ValueError("split_reason holds characters that are not printed")
+        raise ValueError("split_reason holds characters that are not printed; expected ASCII")
     return {"variance": variance, "held_out": held_out, "split_reason": reason}
 
 

@@ -1,4 +1,4 @@
-"""Least squares on the rendered components of a model: all of them, or as few as are enough."""
+"""Least squares on the rendered components of a model: on all, or on the fewest for a PSNR."""
 
 from __future__ import annotations
 
@@ -16,16 +16,18 @@ Coefficients = tuple[NDArray[np.float32], ...]
 
 
 class ComponentProjector:
-    """All images that the rendered components Psi~ of each channel add up to.
+    """Projector of images onto the rendered components Psi~ of each channel.
 
     With the Cholesky factor L of ``Psi~^T Psi~``, the coefficients of an image x are
-    ``a = L^-T y`` with ``y = L^-1 Psi~^T x``. Here y are those on the components made orthonormal
-    one after the other (Gram and Schmidt), so that the first k components alone leave the error
-    ``|x|^2 - sum_(j <= k) y_j^2``, and have the coefficients of the leading blocks of L and y.
+    ``a = L^-T y`` with ``y = L^-1 Psi~^T x``. The entries of y are the coefficients on the
+    components after Gram-Schmidt orthonormalisation. Therefore the first k components leave the
+    error ``|x|^2 - sum_(j <= k) y_j^2``, and their coefficients follow from the leading blocks of
+    L and y.
 
     Parameters
     ----------
     equations : NormalEquations
+        Normal equations of the N Gaussians.
     weights : sequence of C ndarrays of float32, shape (k_c, N + 1)
         See `eigengs_dr.EigenGS`.
     """
@@ -34,29 +36,30 @@ class ComponentProjector:
         self.weights = weights
         self.factors: list[Any] = []
         for rows in weights:
-            # In double precision: components outnumber splats, or render alike, in some models.
+            # Double precision and a ridge: in some models components outnumber the Gaussians, or
+            # two components render alike.
             double = rows.astype(np.float64)
             gram = double @ equations.product(double.T)
             gram += np.eye(len(gram)) * (1e-9 * np.trace(gram) / max(1, len(gram)) + 1e-30)
             self.factors.append(cho_factor(gram, lower=True) if len(gram) else None)
 
     def coefficients(self, correlations: NDArray[np.float64]) -> Coefficients:
-        """Coefficients on all components.
+        """Return the coefficients on all components.
 
         Parameters
         ----------
         correlations : ndarray of float64, shape (N + 1, C)
-            ``[A 1]^T x`` of every channel of an image x without the mean image.
+            ``[A 1]^T x`` of each channel of an image x, less the mean image.
 
         Returns
         -------
         tuple of C ndarrays of float32, shape (k_c,)
         """
-        found = []
-        for seen, factor in zip(self._inner_products(correlations), self.factors, strict=True):
-            solved = cho_solve(factor, seen, check_finite=False) if len(seen) else seen
-            found.append(solved.astype(np.float32))
-        return tuple(found)
+        result = []
+        for rhs, factor in zip(self._inner_products(correlations), self.factors, strict=True):
+            solution = cho_solve(factor, rhs, check_finite=False) if len(rhs) else rhs
+            result.append(solution.astype(np.float32))
+        return tuple(result)
 
     def coefficients_for_psnr(
         self,
@@ -65,19 +68,19 @@ class ComponentProjector:
         entries: int,
         target_psnr: float,
     ) -> Coefficients:
-        """Coefficients on the fewest components that reach a PSNR.
+        """Return the coefficients on the fewest components that reach a PSNR.
 
         Parameters
         ----------
         correlations
             See `coefficients`.
         squares : ndarray of float64, shape (C,)
-            ``|x|^2`` of every channel.
+            ``|x|^2`` of each channel.
         entries : int
-            Pixels times channels.
+            Number of pixels times channels.
         target_psnr : float
-            See `eigengs_dr.eigenbasis.truncation.min_ranks_per_channel`. The ridge on the diagonal
-            of ``Psi~^T Psi~`` only lets the error be smaller than it is taken to be.
+            In dB; see `eigengs_dr.eigenbasis.truncation.min_ranks_per_channel`. The ridge on the
+            diagonal of ``Psi~^T Psi~`` makes the real error smaller than the estimate.
 
         Returns
         -------
@@ -85,24 +88,24 @@ class ComponentProjector:
             With ``m_c <= k_c``.
         """
         halves = [
-            solve_triangular(factor[0], seen, lower=True, check_finite=False) if len(seen) else seen
-            for seen, factor in zip(self._inner_products(correlations), self.factors, strict=True)
+            solve_triangular(factor[0], rhs, lower=True, check_finite=False) if len(rhs) else rhs
+            for rhs, factor in zip(self._inner_products(correlations), self.factors, strict=True)
         ]
         pairs = zip(squares, halves, strict=True)
-        left = [residual_energy(total, y.astype(np.float64) ** 2) for total, y in pairs]
-        counts = min_ranks_per_channel(left, entries, target_psnr)
-        found = []
+        residuals = [residual_energy(total, y.astype(np.float64) ** 2) for total, y in pairs]
+        counts = min_ranks_per_channel(residuals, entries, target_psnr)
+        result = []
         for y, factor, k in zip(halves, self.factors, counts, strict=True):
-            solved = y[:k]
+            solution = y[:k]
             if k:
                 lower = factor[0][:k, :k]
-                solved = solve_triangular(lower, solved, "T", lower=True, check_finite=False)
-            found.append(solved.astype(np.float32))
-        return tuple(found)
+                solution = solve_triangular(lower, solution, "T", lower=True, check_finite=False)
+            result.append(solution.astype(np.float32))
+        return tuple(result)
 
     def _inner_products(self, correlations: NDArray[np.float64]) -> list[NDArray[np.float32]]:
-        """``Psi~^T x`` of every channel."""
-        # Not a product by BLAS, whose threads and Dr.Jit's wait for each other: twice as slow.
+        """Return ``Psi~^T x`` of each channel."""
+        # Not BLAS: its threads and those of Dr.Jit wait for each other, which is twice as slow.
         return [
             np.einsum("jn,n->j", weights, correlations[:, c].astype(np.float32))
             for c, weights in enumerate(self.weights)

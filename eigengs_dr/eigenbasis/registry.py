@@ -1,4 +1,4 @@
-"""Models by name: those that ship with the package, and files."""
+"""Models by name, from the package or from files."""
 
 from __future__ import annotations
 
@@ -10,28 +10,29 @@ from ..backend.arrays import types_of
 from .eigengs import EigenGS
 
 SHIPPED = {"natural": Path(__file__).parents[1] / "data" / "natural.npz"}
-"""Files of the bases that are part of the package, by name; see ``tools/train_natural.py``."""
+"""Files of the package's models, by name; see ``tools/train_natural.py``."""
 
 
 def load_basis(basis: str | os.PathLike[str] | EigenGS, backend: str | None = None) -> EigenGS:
-    """Find a model by name or file.
+    """Load a model by name or file.
 
     Parameters
     ----------
     basis : str, path-like or EigenGS
-        A name of `SHIPPED`, which is read once; a file; a model, which is returned as it is.
+        A name of `SHIPPED`, whose file is read once; a file; or a model, which is returned.
     backend : {"llvm", "cuda"}, optional
 
     Raises
     ------
     ValueError
-        If there is no such name or file, the file is no model, or a model is on another backend.
+        If the name or file does not exist, the file is no model, or the model is on another
+        backend.
     """
     if isinstance(basis, EigenGS):
-        held = types_of(basis.gaussians.mean).backend
-        if backend not in (None, held):
+        current = types_of(basis.gaussians.mean).backend
+        if backend not in (None, current):
             raise ValueError(
-                f"the basis is a model on backend {held!r}, not on {backend!r}; load it with "
+                f"the basis is a model on backend {current!r}, not on {backend!r}; load it with "
                 f"backend={backend!r}, or leave the backend out"
             )
         return basis

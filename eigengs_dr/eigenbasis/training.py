@@ -1,4 +1,4 @@
-"""`train`: a folder of images to a model, with checkpoints and figures on images held out."""
+"""Training of a model on a folder of images, with checkpoints and figures of images held out."""
 
 from __future__ import annotations
 
@@ -29,40 +29,27 @@ from .incremental_pca import EigenState, block_length, empty_state, merge, rank_
 from .truncation import TruncationCurve, check_target
 
 HELD_OUT = 10
-"""One image in so many is not trained on, but measured."""
+"""Every tenth image is held out of the training and measured."""
 
 MAX_HELD_OUT = 100
-"""Images measured at most: more would not change the figures much."""
+"""Most images to measure; more would change the figures little."""
 
 SAVE_SECONDS = 10.0
-"""Time between two checkpoints of the shapes."""
+"""Seconds between two checkpoints of the shapes."""
 
 StageProgress = Callable[[str, int, int], None]
 
 
 class Interrupted(Exception):
-    """Ctrl-C was pressed; the message says what is saved."""
+    """An interrupt by Ctrl-C; the message says what is saved."""
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """What decides the result of a training, beside the images.
+    """Options of `eigengs_dr.Eigenbasis.from_images` and `eigengs_dr.EigenGS.fit`, and a target.
 
-    Attributes
-    ----------
-    size : (int, int)
-        Width and height in pixels.
-    components : int or tuple of 3 ints
-        The most kept of each channel.
-    energy : float or None
-        Keep as few components as hold this share of a channel's variance.
-    target_psnr : float or None
-        Keep as few components as the images held out need for this mean PSNR of their PCA, in dB;
-        see `eigengs_dr.eigenbasis.truncation.TruncationCurve`.
-    gaussians, frequency_aware, preset, steps, seed
-        See `eigengs_dr.EigenGS.fit`.
-    color : {"ycbcr", "rgb"}
-        Space of the components.
+    `target_psnr` keeps the fewest components whose PCA has this mean PSNR, in dB, on the images
+    held out; see `eigengs_dr.eigenbasis.truncation.TruncationCurve`.
     """
 
     size: tuple[int, int] = (256, 256)
@@ -78,20 +65,13 @@ class TrainOptions:
 
 
 class Training(NamedTuple):
-    """Result of `train`.
+    """Result of `train`: the model, the basis that it renders, and figures.
 
-    Attributes
-    ----------
-    model : EigenGS
-    basis : Eigenbasis
-        The components that the model renders.
-    figures : dict of str to object
-        ``seconds``, ``pca_seconds``, ``shape_seconds``, ``weight_seconds`` (of this run alone, if
-        it went on with another: ``resumed``), ``peak_rss_mb``, ``images``, ``components`` of each
-        channel, ``gaussians``, ``frequency_aware`` and ``split_reason``, why;
-        ``psnr_held_out``, the attribute ``held_out`` of the model; ``psnr_components`` and others
-        of `eigengs_dr.eigenbasis.components.solve.ComponentFit`; those of
-        `eigengs_dr.eigenbasis.evaluation.evaluate`.
+    The figures are ``seconds``, ``pca_seconds``, ``shape_seconds``, ``weight_seconds`` (of the last
+    run alone if ``resumed``), ``peak_rss_mb``, ``images``, ``steps``, ``components`` (of each
+    channel), ``gaussians``, ``frequency_aware``, ``split_reason``, ``psnr_held_out`` (`held_out` of
+    the model), and those of `eigengs_dr.eigenbasis.components.solve.ComponentFit` and
+    `eigengs_dr.eigenbasis.evaluation.evaluate`.
     """
 
     model: EigenGS
@@ -108,31 +88,26 @@ def train(
 ) -> Training:
     """Train a model on a folder of images and write it.
 
-    A folder ``OUTPUT.checkpoint`` keeps what is done; a run that was stopped, by Ctrl-C or harder,
-    goes on from there when it is started again, with the images it began with, to the same result.
+    The folder ``OUTPUT.checkpoint`` keeps the work of an unfinished run. After Ctrl-C or a crash,
+    the same call resumes from there, with the same images, and gives the same result.
 
     Parameters
     ----------
     folder : path-like
-        One image in `HELD_OUT` is held out and measured.
+        Folder of images; one in `HELD_OUT` is held out and measured.
     output : path-like
-        The model's file.
-    settings : Settings
+        File of the model.
+    settings : TrainOptions
     backend : {"llvm", "cuda"}, optional
     progress : callable, optional
         ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    Trained
 
     Raises
     ------
     Interrupted
         After Ctrl-C.
     ValueError
-        If no image of the folder can be read, or the settings are wrong or not those of the
-        checkpoint.
+        If no image can be read, or the settings are wrong or differ from the checkpoint.
     OSError
         If a file cannot be written.
     """
@@ -156,11 +131,11 @@ def train(
     )
     folder = Path(folder)
     names = [path.name for path in image_files(folder)]
-    decisive = {**asdict(settings), "steps": steps, "folder": str(folder)}
-    with Checkpoint(output, json.loads(json.dumps(decisive)), names) as checkpoint:
+    record = {**asdict(settings), "steps": steps, "folder": str(folder)}
+    with Checkpoint(output, json.loads(json.dumps(record)), names) as checkpoint:
         if names != checkpoint.files:
             warnings.warn(
-                f"{folder}: its images are others than when this training began; it goes on with "
+                f"{folder}: the images have changed since this training began; it goes on with "
                 f"the {len(checkpoint.files)} that were there",
                 stacklevel=2,
             )
@@ -176,7 +151,7 @@ def train(
                 model = _model(
                     basis, truncation_curve_on(basis, held_out, run.stop_if_pressed), run
                 )
-                worth = evaluate(model, basis, held_out, partial(run.measure, total=len(held_out)))
+                scores = evaluate(model, basis, held_out, partial(run.measure, total=len(held_out)))
             except ValueError as error:
                 if not checkpoint.holds_work:
                     raise
@@ -193,7 +168,7 @@ def train(
             "steps": steps,
             "pca_seconds": pca_seconds,
             **model.figures,
-            **worth,
+            **scores,
             "peak_rss_mb": _peak_rss(),
             "seconds": time.perf_counter() - started,
         }
@@ -202,7 +177,7 @@ def train(
 
 
 class Run(NamedTuple):
-    """What the stages of a training share."""
+    """State that all stages of a training share."""
 
     checkpoint: Checkpoint
     settings: TrainOptions
@@ -218,13 +193,13 @@ class Run(NamedTuple):
             raise Interrupted("the same command goes on from here" if kept else "nothing is saved")
 
     def measure(self, done: int, total: int) -> None:
-        """Tell that images are measured, before the next one."""
+        """Report progress before an image is measured."""
         self.progress("measure", done, total)
         self.stop_if_pressed()
 
 
 def _basis(files: list[Path], held_out: list[Path], run: Run) -> Eigenbasis:
-    """Find the components, block by block, or read them from the checkpoint."""
+    """Find the components block by block, or read them from the checkpoint."""
     settings, checkpoint = run.settings, run.checkpoint
     if (path := checkpoint.folder / "basis.npz").exists():
         return Eigenbasis.load(path)
@@ -247,17 +222,17 @@ def _basis(files: list[Path], held_out: list[Path], run: Run) -> Eigenbasis:
                 if (done := first + number * length) < len(files):
                     checkpoint.save("pca", state.arrays() | {"next": np.array(done)})
     except ImageError as error:
-        if not state.count:  # of an earlier run that went on here: only what was left is bad
+        if not state.count:  # else an earlier run has read some images, and only the rest is bad
             raise
-        warnings.warn(f"the rest was skipped: {error}", stacklevel=2)
+        warnings.warn(f"the remaining images were skipped: {error}", stacklevel=2)
     basis = Eigenbasis.from_state(
         state, settings.size, settings.components, settings.energy, settings.color
     )
     if settings.target_psnr is not None:
         if (fall := truncation_curve_on(basis, held_out, run.stop_if_pressed)) is None:
             raise ValueError(
-                f"target_psnr needs images that are held out, one in {HELD_OUT}, and there are "
-                "none that can be read; give more images, or use energy"
+                f"target_psnr needs images that are held out, one in {HELD_OUT}, and none can be "
+                "read; give more images, or use energy"
             )
         basis = basis.truncated(fall.rank_for_psnr(settings.target_psnr))
     basis.save(path)
@@ -266,11 +241,11 @@ def _basis(files: list[Path], held_out: list[Path], run: Run) -> Eigenbasis:
 
 
 def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS:
-    """Fit Gaussians to the components, saving what training has reached."""
+    """Fit Gaussians to the components, and save checkpoints."""
     settings, checkpoint = run.settings, run.checkpoint
     run.stop_if_pressed()
     run.progress("weights", 0, 1)
-    split, compared = wants_split(basis, settings.gaussians, settings.frequency_aware, run.backend)
+    split, figures = wants_split(basis, settings.gaussians, settings.frequency_aware, run.backend)
     saved = time.perf_counter()
 
     def save(states: list[State]) -> None:
@@ -284,7 +259,7 @@ def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS
                 checkpoint.save("shapes", flat)
         run.stop_if_pressed()
 
-    fitted = fit_components(
+    component_fit = fit_components(
         basis,
         settings.gaussians,
         split,
@@ -297,15 +272,15 @@ def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS
     )
     return EigenGS.from_fit(
         basis,
-        fitted,
-        compared,
-        split_reason=split_reason(basis, settings.gaussians, settings.frequency_aware, compared),
+        component_fit,
+        figures,
+        split_reason=split_reason(basis, settings.gaussians, settings.frequency_aware, figures),
         held_out=np.zeros(0) if fall is None else fall.psnr,
     )
 
 
 def _states(flat: dict[str, Any]) -> list[State]:
-    """Undo the flattening of the states of both sides: "1.step" is the step of the second."""
+    """Unflatten the states of all bands; the key "1.step" is the step of the second band."""
     states: dict[str, State] = {}
     for key, array in flat.items():
         side, name = key.split(".", 1)
@@ -314,7 +289,7 @@ def _states(flat: dict[str, Any]) -> list[State]:
 
 
 def _peak_rss() -> float | None:
-    """Most memory this process ever held, in MiB; None where the system does not say."""
+    """Return the peak memory of this process in MiB, or None on Windows."""
     if sys.platform == "win32":
         return None
     import resource

@@ -1,15 +1,15 @@
-"""How the error falls from component to component, and how few of them are enough.
+"""Truncation curves: the error over the number of components, and the rank for a PSNR.
 
-On orthonormal components a channel x of an image, less the mean image, with the coefficients w_j,
-has the error ::
+Let x be a channel of an image less the mean image, and w_j its coefficients on orthonormal
+components. The first k components leave the error ::
 
     left(k) = |x|^2 - sum_(j <= k) w_j^2
 
-after the first k, so one cumulative sum tells it for every k. On average over a family, w_j^2 is
-the eigenvalue lambda_j, and |x|^2 the sum of them all.
+so one cumulative sum gives the error for every k. On average over a family of images, w_j^2 is the
+eigenvalue lambda_j, and |x|^2 is the sum of all eigenvalues.
 
-For a family, components of all channels are taken in one order, that of falling eigenvalues; for
-one image, each channel has as many as makes the fewest in all.
+For a family, the curve adds the components of all channels in the order of falling eigenvalues.
+For one image, each channel has its own rank, and the sum of the ranks is minimal.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 MIN_MSE = 1e-12
-"""Mean squared error below which all is rounding in single precision: 120 dB."""
+"""Smallest mean squared error, 120 dB; smaller errors are rounding of single precision."""
 
 Values = NDArray[np.float64]
 
 
 class TruncationCurve(NamedTuple):
-    """How much better an image is shown by 0, 1, 2, ..., n components.
+    """The PSNR of PCA with 0, 1, 2, ..., n components.
 
     Attributes
     ----------
     counts : ndarray of int64, shape (n + 1, C)
-        How many these are of each channel.
+        Number of components of each channel.
     psnr : ndarray of float64, shape (n + 1,)
-        In dB, ascending, at most 120: of the channels as they are, neither clamped nor rounded,
-        with peak 1. That is psnr_ycbcr where they are Y, Cb and Cr.
+        PSNR in dB, ascending, at most 120, of all channels, neither clamped nor rounded, with peak
+        1. For the channels Y, Cb and Cr, it is psnr_ycbcr.
     """
 
     counts: NDArray[np.int64]
@@ -58,26 +58,27 @@ class TruncationCurve(NamedTuple):
         Raises
         ------
         ValueError
-            If the target is no positive number.
+            If the target is not a positive number.
 
         Warns
         -----
         UserWarning
-            If all components do not reach it; the result is all of them.
+            If all components miss the target; the result then has all of them.
         """
         check_target(target_psnr)
-        enough = self.psnr >= target_psnr
-        if not enough.any():
+        reaches = self.psnr >= target_psnr
+        if not reaches.any():
             _warn_out_of_reach(target_psnr, self.counts[-1], self.psnr[-1])
-        return tuple(self.counts[enough.argmax() if enough.any() else -1].tolist())
+        return tuple(self.counts[reaches.argmax() if reaches.any() else -1].tolist())
 
     def explained_variance_ratio(self) -> Values:
-        """Return the share of the error without components that each number of them takes away.
+        """Return the share of the initial error that the first 0, 1, ..., n components remove.
 
         Returns
         -------
         ndarray of float64, shape (n + 1,)
-            From 0 up to 1. Where the error is that of the training images, it is their variance.
+            Ascending from 0 to at most 1. For the training images, the initial error is their
+            variance.
         """
         return 1 - 10 ** ((self.psnr[0] - self.psnr) / 10)
 
@@ -85,28 +86,28 @@ class TruncationCurve(NamedTuple):
 def curve_from_residuals(
     eigenvalues: Sequence[Values], left: Sequence[Values], entries: int
 ) -> TruncationCurve:
-    """Put the channels together.
+    """Build the curve of all channels from the residuals of each.
 
     Parameters
     ----------
     eigenvalues : sequence of C ndarrays, shape (k_c,)
         Variances along the components, descending.
     left : sequence of C ndarrays of float64, shape (k_c + 1,) or (M, k_c + 1)
-        Squared error of a channel, summed over its pixels, after 0, 1, ..., k_c of its components;
-        of one image, or of each of M.
+        Squared error of a channel, summed over its pixels, after 0, 1, ..., k_c components, for
+        one image or for M images.
     entries : int
-        Pixels times channels, H W C.
+        Number of pixels times channels, H W C.
 
     Returns
     -------
-    Fall
-        With the mean PSNR of the M images.
+    TruncationCurve
+        The mean PSNR of the M images.
     """
     channels = range(len(eigenvalues))
     order = np.argsort(-np.concatenate(eigenvalues), kind="stable")
     channel = np.repeat(channels, [len(values) for values in eigenvalues])[order]
-    added = channel[:, None] == np.array(channels)
-    counts = np.vstack([np.zeros(len(channels), np.int64), np.cumsum(added, axis=0)])
+    one_hot = channel[:, None] == np.array(channels)
+    counts = np.vstack([np.zeros(len(channels), np.int64), np.cumsum(one_hot, axis=0)])
     error = sum(rows[..., n] for rows, n in zip(left, counts.T, strict=True)) / entries
     return TruncationCurve(counts, np.atleast_2d(_decibels(error)).mean(axis=0))
 
@@ -114,49 +115,49 @@ def curve_from_residuals(
 def curve_from_eigenvalues(
     eigenvalues: Sequence[Values], variance: Values, entries: int
 ) -> TruncationCurve:
-    """Tell how the error of the training images falls: that of their PCA, by eigenvalues alone.
+    """Build the curve of the training images from the eigenvalues alone.
 
     Parameters
     ----------
     eigenvalues, entries
         See `curve_from_residuals`.
     variance : ndarray of float64, shape (C,)
-        Sum of all eigenvalues of a channel, of kept components or not.
+        Sum of all eigenvalues of each channel, with those of dropped components.
 
     Returns
     -------
-    Fall
-        With the PSNR of the mean error. Images that were not trained on have a larger one.
+    TruncationCurve
+        The PSNR of the mean error. Other images have a larger error.
     """
-    left = [
+    residuals = [
         residual_energy(total, values) for total, values in zip(variance, eigenvalues, strict=True)
     ]
-    return curve_from_residuals(eigenvalues, left, entries)
+    return curve_from_residuals(eigenvalues, residuals, entries)
 
 
 def min_ranks_per_channel(
     left: Sequence[Values], entries: int, target_psnr: float
 ) -> tuple[int, ...]:
-    """Find the fewest components in all that reach a PSNR for one image, each channel's apart.
+    """Find the rank of each channel with the smallest sum that reaches a PSNR for one image.
 
     Parameters
     ----------
     left : sequence of 3 ndarrays, shape (k_c + 1,)
         See `curve_from_residuals`; descending.
     entries : int
-        Pixels times channels.
+        Number of pixels times channels.
     target_psnr : float
         In dB.
 
     Returns
     -------
     tuple of 3 ints
-        Raises and warns as `TruncationCurve.fewest` does.
+        Errors and warnings are those of `TruncationCurve.rank_for_psnr`.
     """
     check_target(target_psnr)
     first, second, third = left
     allowed = entries * 10 ** (-target_psnr / 10) - second[:, None] - third
-    needed = np.searchsorted(-first, -allowed)  # of the first channel, for all numbers of the rest
+    needed = np.searchsorted(-first, -allowed)  # of the first channel, for all ranks of the others
     total = needed + np.arange(len(second))[:, None] + np.arange(len(third))
     total[needed == len(first)] = sum(map(len, left))
     if total.min() == sum(map(len, left)):
@@ -169,12 +170,12 @@ def min_ranks_per_channel(
 
 
 def residual_energy(total: float, gains: Values) -> Values:
-    """``total - sum_(i <= n) gains_i`` for n = 0, 1, ..., k: shape (k + 1,) of gains (k,)."""
+    """Return ``total - sum_(i <= n) gains_i`` for n = 0, 1, ..., k, shape (k + 1,)."""
     return total - np.concatenate([[0.0], np.cumsum(gains, dtype=np.float64)])
 
 
 def check_target(target_psnr: float) -> None:
-    """Raise ValueError unless a PSNR is a positive number."""
+    """Raise ValueError unless a target PSNR is a positive number."""
     if not 0 < target_psnr < math.inf:
         raise ValueError(f"target_psnr is {target_psnr}; expected a number of dB above 0")
 

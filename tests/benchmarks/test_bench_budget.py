@@ -62,7 +62,7 @@ def test_placing_anew_makes_a_difference(backend, tmp_path):
     once, anew = (budget._fit(task, image, 60, again) for again in (False, True))
     start = initialize(image, FitOptions(gaussians=60, backend=backend))
     for row, rearrange in ((once, None), (anew, start.redistribute)):
-        *_, last = descend(start.gaussians, start.target, method.schedule, 200, rearrange=rearrange)
+        *_, last = descend(start._replace(redistribute=rearrange), method.schedule, 200)
         assert row["iteration"] == 200
         assert row["psnr_ycbcr"] == psnr(picture_of(last), image, "ycbcr")
     assert once["psnr_ycbcr"] != anew["psnr_ycbcr"]

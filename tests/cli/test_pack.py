@@ -18,7 +18,7 @@ def test_commands_pack_and_read(tmp_path):
     told = run("pack", source, "-o", target, "--image", tmp_path / "x.png", "--budget", 0.2)
     assert told.exit_code == 0, told.output
     size = (tmp_path / "x.egs").stat().st_size
-    assert f"{size:,} bytes, {8 * size / 1024:.3f} bits a pixel" in told.output
+    assert f"{size:,} bytes, {8 * size / 1024:.3f} bits per pixel" in told.output
     told = run("info", target).output
     for line in (rf"bytes +{size}", r"bpp +\d", r"mean_bits +\[\d+, \d+\]"):
         assert re.search(f"(?m)^{line}", told)

@@ -65,7 +65,7 @@ def scene(tmp_path):
 def test_says_what_it_did(scene, tmp_path):
     result = run(scene(), "-o", tmp_path / "x.png", "--variant", "llvm_ad_rgb")
     assert result.exit_code == 0, result.output
-    assert "8x6, samples a pixel: 2" in result.stdout
+    assert "8x6, samples per pixel: 2" in result.stdout
     assert f"wrote {tmp_path / 'x.png'}" in result.stdout
     assert np.allclose(mi.Bitmap(str(tmp_path / "x.png")), 187.5, atol=0.5)  # 0.5, dithered
 
@@ -80,7 +80,7 @@ def test_several_scenes_into_a_folder(scene, tmp_path):
 def test_passes_make_one_picture(scene, tmp_path, monkeypatch):
     monkeypatch.setattr("eigengs_dr.cli.scene.SAMPLES_PER_PASS", 8 * 6 * 2)
     result = run(scene(), "-o", tmp_path / "x.exr", "--spp", 5)
-    assert "samples a pixel: 5" in result.stdout
+    assert "samples per pixel: 5" in result.stdout
     assert np.allclose(mi.Bitmap(str(tmp_path / "x.exr")), 0.5)
 
 

@@ -1,10 +1,10 @@
-"""Training the shapes that all components share, on random combinations of the components.
+"""Training of the shapes for all components, on random combinations of the components.
 
-With ``r_j ~ N(0, 1)``, ``sum_j r_j sqrt(lambda_j) Psi_j`` is a sample of the PCA model, and because
-the r_j are independent, the expected squared error of its rendering is ``sum_j lambda_j |Psi~_j -
-Psi_j|^2``: one rendering is an unbiased estimate of the error of the whole basis. Colours are
-solved for in every step; at their optimum the derivative with respect to the shapes is the partial
-one (variable projection).
+With ``r_j ~ N(0, 1)``, ``sum_j r_j sqrt(lambda_j) Psi_j`` is a sample of the PCA model. The r_j are
+independent, so the expected squared error of the rendered sample is ``sum_j lambda_j |Psi~_j -
+Psi_j|^2``. One rendering is therefore an unbiased estimate of the error of the whole basis. Each
+step solves for the colours first; at their optimum, the total derivative by the shapes equals the
+partial derivative (variable projection).
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ Planes = NDArray[np.float32]
 State = dict[str, NDArray[Any]]
 
 ROUND = 25
-"""Steps after which the optimiser starts anew: then shapes are all that a checkpoint holds."""
+"""Steps between two restarts of the optimiser; a checkpoint after a round needs the shapes alone.
+"""
 
 SOLVE_STEPS = 30
-"""Steps of conjugate gradients for the colours of a sample: with 8, the derivative is off by a
-third."""
+"""Steps of conjugate gradients for the colours of a sample. With 8 steps, the derivative has an
+error of a third."""
 
 SCHEDULE = Schedule(
     optimizer="adam",
@@ -43,10 +44,11 @@ SCHEDULE = Schedule(
     rates={"mean": 0.02, "factor": 0.02},
     warm_up=0,
 )
-"""Every step sees another sample: rates are a sixth of those that refine one image."""
+"""Schedule of the descent. The learning rates are a sixth of those for one image, because each step
+has another sample."""
 
 WARM_UP = 5
-"""Steps over which the rates rise in every round."""
+"""Steps of rising learning rates at the start of each round."""
 
 
 def train_shapes(
@@ -58,28 +60,33 @@ def train_shapes(
     backend: str | None = None,
     state: State | None = None,
 ) -> Iterator[State]:
-    """Move and reshape splats, from a grid on, until they render all components better.
+    """Train the means and factors of Gaussians, from a grid, to render all components.
 
     Parameters
     ----------
-    components : tuple of ndarray of float32, shape (k, H, W)
-        Of every channel.
-    eigenvalues : tuple of ndarray, shape (k,)
-        Variance along each.
+    components : tuple of C ndarrays of float32, shape (k_c, H, W)
+        Components of each channel.
+    eigenvalues : tuple of C ndarrays, shape (k_c,)
+        Variance along each component.
     count : int
-        Number of splats.
+        Number of Gaussians.
     seed : int
-        Of the random combinations; the one of a step depends on nothing else.
+        Seed of the random combinations; seed and step determine a combination.
     steps : int
-        Steps in all; none leaves the grid.
+        Total number of steps; 0 keeps the grid.
     backend : {"llvm", "cuda"}, optional
     state : dict, optional
-        One that was yielded before: goes on as if it had not stopped.
+        Resume from this earlier result, as if the training had not stopped.
 
     Yields
     ------
     dict of str to ndarray
-        "step", "mean" and "factor": at the start, after every `ROUND` steps and at the end.
+        "step", "mean" and "factor", at the start, after every `ROUND` steps and at the end.
+
+    Raises
+    ------
+    ValueError
+        If `state` has another number of Gaussians, or more steps than `steps`.
     """
     height, width = components[0].shape[1:]
     if state is None:
@@ -90,7 +97,7 @@ def train_shapes(
         or len(state["mean"]) != count
         or not 0 <= state["step"] <= steps
     ):
-        raise ValueError("state: it is not of this number of splats and steps")
+        raise ValueError("state: it does not fit this number of Gaussians and steps; drop it")
     gaussians = shapes_of(state, (width, height), len(components), backend)
     if not any(len(values) for values in eigenvalues):
         return
@@ -102,7 +109,7 @@ def train_shapes(
 
 
 def on_grid(size: tuple[int, int], count: int) -> State:
-    """Return the state before training: `count` splats on a grid of a size (width, height)."""
+    """Return the state before training, `count` Gaussians on a grid of a size (width, height)."""
     mean, factor = place_grid(np.empty((size[1], size[0], 1)), count, np.random.default_rng(0))
     return {"step": np.array(0), "mean": mean, "factor": factor}
 
@@ -110,7 +117,7 @@ def on_grid(size: tuple[int, int], count: int) -> State:
 def shapes_of(
     state: State, size: tuple[int, int], channels: int, backend: str | None = None
 ) -> Gaussians:
-    """Make a set of the shapes of a state, without colours; its space is "data"."""
+    """Return the Gaussians of a state, with colours of 0 in the space "data"."""
     colors = np.zeros((len(state["mean"]), channels))
     return Gaussians.from_arrays(
         state["mean"], state["factor"], colors, size=size, space="data", backend=backend
@@ -124,7 +131,7 @@ def _round(
     seed: int,
     span: tuple[int, int, int],
 ) -> Gaussians:
-    """Take steps from the first to before the last, with an optimiser of their own."""
+    """Take the steps from `first` to before `last` of a span, with a new optimiser."""
     first, last, steps = span
     types, coordinates = types_of(gaussians.mean), SCHEDULE.variables()
     variables = coordinates.encode(gaussians)
@@ -156,12 +163,12 @@ def samples(
     first: int,
     last: int,
 ) -> Planes:
-    """Draw random combinations of the components, less the mean image.
+    """Draw random combinations of the components, without the mean image.
 
     Returns
     -------
     ndarray of float32, shape (last - first, H, W, C)
-        Number i depends on `seed` and ``first + i`` alone.
+        Combination i depends on `seed` and ``first + i`` alone.
     """
     channels = []
     for c, (planes, values) in enumerate(zip(components, eigenvalues, strict=True)):

@@ -1,4 +1,4 @@
-"""Shared Gaussians for an eigenbasis: their shapes, and a weight for each splat and component."""
+"""The fit of shared Gaussians to an eigenbasis: shapes, and a weight for each component."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from .shape_training import on_grid, shapes_of, train_shapes
 from .split import FrequencyBand, frequency_bands, low_component_count
 
 STEPS = {"default": 0, "eigengs": 15_000}
-"""Presets, and the steps of training that each takes when none are asked for."""
+"""Presets and their default number of training steps."""
 
 Planes = NDArray[np.float32]
 State = dict[str, NDArray[Any]]
 Part = tuple[NormalEquations, Gaussians, tuple[Planes, ...]]
-"""Equations of splats, their shapes, and their weights in the components of each channel."""
+"""Normal equations, Gaussians, and their weights in the components of each channel."""
 
 
 class ComponentFit(NamedTuple):
@@ -36,9 +36,9 @@ class ComponentFit(NamedTuple):
     gaussians, weights, low, low_components
         See `eigengs_dr.EigenGS`.
     figures : dict of str to float
-        ``psnr_components``: fit of the components, weighted by their variances, in dB;
-        ``psnr_untrained``: the same before the shapes were trained, if they were;
-        ``shape_seconds``, ``weight_seconds``: training, and the rest.
+        ``psnr_components``: PSNR of the components, weighted by their variances, in dB;
+        ``psnr_untrained``: the same PSNR before the training of the shapes, if there is one;
+        ``shape_seconds``, ``weight_seconds``: time of the training, and of the rest.
     """
 
     gaussians: Gaussians
@@ -59,26 +59,32 @@ def fit_components(
     states: list[State] | None = None,
     save: Callable[[list[State]], None] = lambda states: None,
 ) -> ComponentFit:
-    """Place, train and weight one set of splats for all components.
+    """Place and train one set of Gaussians for all components, and find their weights.
 
     Parameters
     ----------
     basis : Eigenbasis
     count : int
-        Splats, at most one a pixel; at least 2 for the split.
+        Number of Gaussians, at most one per pixel; at least 2 for the split.
     split : bool
-        Whether `LOW_SHARE` of the splats serve the first components alone, the rest the others.
+        Whether a share `LOW_SHARE` of the Gaussians serves the first components alone, and the
+        other Gaussians the other components.
     method : {"default", "eigengs"}
-        "default" solves for the weights, and trains the shapes on random combinations of
-        components; "eigengs" trains shapes and weights together, as the paper does.
+        "default" trains the shapes on random combinations of components and solves for the
+        weights; "eigengs" trains shapes and weights together, as the paper does.
     steps : int
-        Steps of training for each side.
+        Training steps for each band.
     seed : int
     backend : {"llvm", "cuda"}, optional
     states : list of dict, optional
-        What `save` was given last: training goes on from there.
+        Resume from the last argument of `save`.
     save : callable, optional
-        ``save(states)`` after every round of training; what it raises ends the work.
+        ``save(states)`` after every round of training; an error that it raises ends the work.
+
+    Raises
+    ------
+    ValueError
+        If the method is "eigengs" and the basis has no components.
     """
     if method == "eigengs" and not any(map(len, basis.components)):
         raise ValueError("the images give no components to train on; use preset 'default'")
@@ -86,8 +92,8 @@ def fit_components(
     sides, states = frequency_bands(basis, count, split), list(states or [])
     train, result = METHODS_BY_PRESET[method]
     for i, side in enumerate(sides):
-        known = states[i] if i < len(states) else None
-        for state in train(side, seed + i, steps, backend, known):
+        previous = states[i] if i < len(states) else None
+        for state in train(side, seed + i, steps, backend, previous):
             states[i:] = [state]
             save(states)
     trained = time.perf_counter()
@@ -115,7 +121,7 @@ def fit_components(
 def _assemble(
     states: list[State], sides: list[FrequencyBand], result: Any, backend: str | None
 ) -> Part:
-    """The equations of all splats, and shapes and weights of all sides."""
+    """Return the equations, shapes and weights of the Gaussians of all bands."""
     parts = [result(state, side, backend) for state, side in zip(states, sides, strict=True)]
     equations, gaussians, weights = parts[0]
     if len(parts) > 1:
@@ -133,9 +139,10 @@ def check_arguments(
     preset: str,
     steps: int | None,
 ) -> int:
-    """Raise ValueError for the first argument of `EigenGS.fit` out of range; return the steps.
+    """Check the arguments of `EigenGS.fit` and return the number of steps.
 
-    ``size`` is width and height of the basis in pixels; the others are those of `EigenGS.fit`.
+    ``size`` is the width and height of the basis in pixels. The function raises ValueError for the
+    first argument that is out of range.
     """
     if preset not in STEPS:
         raise ValueError(f"preset {preset!r} is unknown; use one of {', '.join(STEPS)}")
@@ -149,7 +156,7 @@ def check_arguments(
             f"gaussians is {gaussians}; a basis of {size[0]}x{size[1]} takes 1 to {most}"
         )
     if preset == "eigengs" and steps < 1:
-        raise ValueError("steps is 0; the preset 'eigengs' finds weights by training alone")
+        raise ValueError("steps is 0; preset 'eigengs' needs training, so give at least 1")
     if not isinstance(frequency_aware, bool) and frequency_aware != "auto":
         raise ValueError(f"frequency_aware is {frequency_aware!r}; use 'auto', True or False")
     return steps
@@ -158,7 +165,7 @@ def check_arguments(
 def psnr_components(
     equations: NormalEquations, basis: Eigenbasis, weights: tuple[Planes, ...]
 ) -> float:
-    """Fit of the components, ``sum_j lambda_j |Psi~_j - Psi_j|^2`` a pixel and channel, in dB."""
+    """Return the PSNR of ``sum_j lambda_j |Psi~_j - Psi_j|^2`` per pixel and channel, in dB."""
     total = 0.0
     for planes, values, rows in zip(basis.components, basis.eigenvalues, weights, strict=True):
         correlations = equations.correlate(planes)
@@ -176,60 +183,60 @@ def _train_shapes(
 
 
 def _solve_weights(state: State, side: FrequencyBand, backend: str | None) -> Part:
-    """The shapes of a state and the best weights on them."""
+    """Return the shapes of a state and their best weights."""
     height, width = side.components[0].shape[1:]
     shapes = shapes_of(state, (width, height), len(side.components), backend)
     equations = NormalEquations(shapes)
-    solved = [equations.solve(equations.correlate(planes)) for planes in side.components]
-    return equations, shapes, tuple(weights.T.astype(np.float32) for weights in solved)
+    solutions = [equations.solve(equations.correlate(planes)) for planes in side.components]
+    return equations, shapes, tuple(weights.T.astype(np.float32) for weights in solutions)
 
 
 def _train_jointly(
     side: FrequencyBand, seed: int, steps: int, backend: str | None, state: State | None
 ) -> Iterator[State]:
-    known = JointState.from_arrays(state) if state else None
-    for reached in train_jointly(
-        side.components, side.splats, seed, steps, backend=backend, state=known
+    start = JointState.from_arrays(state) if state else None
+    for current in train_jointly(
+        side.components, side.splats, seed, steps, backend=backend, state=start
     ):
-        yield reached.arrays()
+        yield current.arrays()
 
 
 def _weights_of(state: State, side: FrequencyBand, backend: str | None) -> Part:
-    """Shapes and weights of a state, with as many (unused) channels as the components have."""
-    reached = JointState.from_arrays(state)
+    """Return the shapes and weights of a state; colours are 0, with all channels."""
+    joint = JointState.from_arrays(state)
     blank = np.zeros((side.splats + 1, len(side.components)))
-    shapes = with_colors(reached.gaussians(backend), blank, "data")
-    return NormalEquations(shapes), shapes, reached.weights()
+    shapes = with_colors(joint.gaussians(backend), blank, "data")
+    return NormalEquations(shapes), shapes, joint.weights()
 
 
 METHODS_BY_PRESET = {
     "default": (_train_shapes, _solve_weights),
     "eigengs": (_train_jointly, _weights_of),
 }
-"""Presets: what trains one side step by step, and what makes shapes and weights of its state."""
+"""Functions of each preset: one trains a band step by step, one turns its state into a `Part`."""
 
 
 def _join_weights(first: tuple[Planes, ...], second: tuple[Planes, ...]) -> tuple[Planes, ...]:
-    """Weights of all splats and components from those of both sides; across, they are 0."""
-    joined = []
+    """Join the weights of both bands; weights between the bands are 0."""
+    result = []
     for low, high in zip(first, second, strict=True):
         right, left = high.shape[1] - 1, low.shape[1] - 1
         above = np.hstack([low[:, :-1], np.zeros((len(low), right), np.float32), low[:, -1:]])
         below = np.hstack([np.zeros((len(high), left), np.float32), high])
-        joined.append(np.vstack([above, below]))
-    return tuple(joined)
+        result.append(np.vstack([above, below]))
+    return tuple(result)
 
 
 def with_colors(gaussians: Gaussians, coefficients: NDArray[np.float64], space: str) -> Gaussians:
-    """Give shapes the colours of an image.
+    """Return Gaussians of the same shapes with other colours.
 
     Parameters
     ----------
     gaussians : Gaussians
     coefficients : ndarray, shape (N + 1, C)
-        Colours and, last, the background.
+        Colours of the Gaussians; the last row is the background.
     space : str
-        What the channels mean.
+        Colour space of the channels.
     """
     types = types_of(gaussians.mean)
     rows = coefficients.astype(np.float32).T

@@ -17,25 +17,25 @@ from .shape_training import on_grid, shapes_of
 Planes = NDArray[np.float32]
 
 LOW_SHARE = 0.1
-"""Share of the splats that serve the low frequencies, where components are split (the paper)."""
+"""Share of the Gaussians that serve the low frequencies in a split (the paper)."""
 
 
 LOW_COMPONENTS = 50
-"""Components of each channel that count as low frequencies (the authors' code); half of them where
-there are fewer than twice as many."""
+"""Number of components of each channel that are low frequencies (the authors' code); with fewer
+than 100 components, it is half of them."""
 
 
 SPLIT_FROM = 512
-"""Longer side in pixels from which "auto" considers the split: the paper found that it costs 0.4
-to 0.8 dB at 256 and gains 1 dB at 512."""
+"""Smallest longer side, in pixels, at which "auto" considers the split. In the paper, the split
+costs 0.4 to 0.8 dB at 256 pixels and gains 1 dB at 512."""
 
 
 SPLIT_COST = 0.2
-"""Decibels of exact colours that "auto" pays for the split."""
+"""Largest loss of PSNR, in dB of exact colours, at which "auto" still splits."""
 
 
 class FrequencyBand(NamedTuple):
-    """Splats and components that belong together: all of them, or one side of the split."""
+    """A number of Gaussians and the components that they serve: all, or one side of the split."""
 
     splats: int
     components: tuple[Planes, ...]
@@ -45,18 +45,18 @@ class FrequencyBand(NamedTuple):
 def wants_split(
     basis: Eigenbasis, count: int, frequency_aware: bool | str, backend: str | None = None
 ) -> tuple[bool, dict[str, float]]:
-    """Decide on the frequency-aware split; "auto" measures where the resolution calls for it.
+    """Decide on the frequency-aware split; "auto" measures it for large images.
 
-    From `SPLIT_FROM` pixels on, exact colours of the basis' training images on both placements are
-    compared: coarse splats are worth `SPLIT_COST`, because what they carry need not be made of
-    small ones (the paper's "penny-round tiles").
+    From `SPLIT_FROM` pixels on, "auto" fits exact colours to the example images, with and without
+    the split, and compares the PSNR. It accepts a loss of `SPLIT_COST`, because without coarse
+    Gaussians, small Gaussians must render the low frequencies (the paper's "penny-round tiles").
 
     Returns
     -------
     bool
         Whether to split.
     dict of str to float
-        ``psnr_whole`` and ``psnr_split`` in dB, if they were measured.
+        ``psnr_whole`` and ``psnr_split`` in dB; empty without a measurement.
     """
     if count < 2 or low_component_count(basis) < 1:
         return False, {}
@@ -81,11 +81,11 @@ def wants_split(
 def split_reason(
     basis: Eigenbasis, count: int, frequency_aware: bool | str, figures: dict[str, float]
 ) -> str:
-    """Tell in under 64 characters why `wants_split` decided as it did, from its figures."""
+    """Return the reason for the decision of `wants_split` in under 64 characters."""
     if count < 2 or low_component_count(basis) < 1:
         return "too few Gaussians or components to split"
     if isinstance(frequency_aware, bool):
-        return "as asked"
+        return "frequency_aware is set"
     if figures:
         whole, split = figures["psnr_whole"], figures["psnr_split"]
         return f"whole {whole:.2f} dB, split {split:.2f} dB, may cost {SPLIT_COST:g}"
@@ -95,19 +95,19 @@ def split_reason(
 
 
 def low_component_count(basis: Eigenbasis) -> int:
-    """Components of each channel on the side of the low frequencies."""
+    """Return the number of components of each channel that are low frequencies."""
     return min(LOW_COMPONENTS, max(map(len, basis.components)) // 2)
 
 
 def frequency_bands(basis: Eigenbasis, count: int, split: bool) -> list[FrequencyBand]:
-    """Divide splats and components, N_l before N_h."""
+    """Divide the Gaussians and components into bands, low frequencies first."""
     if not split:
         return [FrequencyBand(count, basis.components, basis.eigenvalues)]
-    few = max(1, round(LOW_SHARE * count))
+    low = max(1, round(LOW_SHARE * count))
 
     def part(number: int, rows: slice) -> FrequencyBand:
         planes = tuple(c[rows] for c in basis.components)
         return FrequencyBand(number, planes, tuple(e[rows] for e in basis.eigenvalues))
 
     first = low_component_count(basis)
-    return [part(few, slice(first)), part(count - few, slice(first, None))]
+    return [part(low, slice(first)), part(count - low, slice(first, None))]

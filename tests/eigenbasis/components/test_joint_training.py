@@ -253,5 +253,5 @@ def test_components_that_cannot_be_fitted(planes, words):
 def test_a_state_of_other_work(backend):
     state = train(backend, 1)[-1]
     for planes, count in ((components(), SPLATS + 1), (components((4, 3, 1)), SPLATS)):
-        with pytest.raises(ValueError, match="other components or another number"):
+        with pytest.raises(ValueError, match="other components or another number of Gaussians"):
             train_jointly(planes, count, 0, 2, backend=backend, state=state)

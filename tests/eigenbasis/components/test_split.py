@@ -63,8 +63,8 @@ def test_the_split_tells_why(backend, monkeypatch):
         assert len(text) < 64 and text.isascii()
         return decision, text
 
-    assert reason(100, True) == (True, "as asked")
-    assert reason(100, False) == (False, "as asked")
+    assert reason(100, True) == (True, "frequency_aware is set")
+    assert reason(100, False) == (False, "frequency_aware is set")
     assert reason(1, True) == (False, "too few Gaussians or components to split")
     assert reason(100, "auto") == (False, "32 pixels a side; auto measures from 512 on")
     monkeypatch.setattr("eigengs_dr.eigenbasis.components.split.SPLIT_FROM", 32)
