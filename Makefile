@@ -3,6 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
+DOCS_READY := .venv/docs-ready
 # A photo inside the scikit-image wheel, so that none has to be downloaded.
 PHOTO := .venv/lib/python3*/site-packages/skimage/data/coffee.png
 
@@ -23,13 +24,14 @@ APT_INSTALL := apt_install() { \
 	{ $$get install $$1 || { $$get update && $$get install $$1; }; } </dev/null >/dev/null 2>&1 \
 	|| { echo "make setup: $$2" >&2; exit 1; }; }
 
-.PHONY: help setup demo scenes test test-slow bench report basis clean
+.PHONY: help setup demo scenes test test-slow docs bench report basis clean
 
 help:
 	@echo "make demo       fit a photo, at once and well; shows PSNR, time and the pictures it wrote"
 	@echo "make scenes     render the Mitsuba scenes in scenes/, in 2 minutes"
 	@echo "make test       linters, type checker, tests"
 	@echo "make test-slow  the tests that take minutes"
+	@echo "make docs       build the manual, build/docs/html/index.html; every warning is an error"
 	@echo "make bench      time the renderer"
 	@echo "make report     measure a part of all and write docs/results, in half an hour; goes on after a break"
 	@echo "make basis      train the basis that ships, again"
@@ -63,10 +65,19 @@ test: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 	$(BIN)/python -m pytest -q
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -q -m slow
+
+$(DOCS_READY): $(READY)
+	$(BIN)/python -m pip install --editable '.[docs]'
+	@touch $@
+
+docs: $(DOCS_READY)
+	rm -rf docs/reference/generated
+	$(BIN)/sphinx-build -E -W --keep-going -n -d build/docs/doctrees docs build/docs/html
 
 bench: $(READY)
 	@mkdir -p build/bench

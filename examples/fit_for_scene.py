@@ -1,15 +1,18 @@
-"""No more Gaussians than a scene shows: the same poster, far away, at some distance, and close."""
+"""
+As many Gaussians as a camera resolves
+======================================
+
+The same poster hangs far away, at a middle distance, and close. ``eg.fit_for_scene`` finds the
+number of Gaussians that each camera needs. This page needs Mitsuba: ``pip install '.[plugins]'``.
+"""
 
 import sys
 from pathlib import Path
 
-import eigengs_dr as eg  # isort: skip  (before Mitsuba: it names a libLLVM that works)
+import eigengs_dr as eg  # isort: skip  (before Mitsuba: it finds libLLVM)
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.cli.pictures import overlay
-from eigengs_dr.image.color import to_coded
-from eigengs_dr.image.montage import join_pictures, text_line
 from eigengs_dr.plugins import texture_of
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "build/examples")
@@ -19,30 +22,27 @@ mi.set_variant("llvm_ad_rgb")
 eg.register_plugins()
 
 photo = eg.sample("coffee")[60:316, 180:436]
+photo = photo.reshape(128, 2, 128, 2, 3).mean(axis=(1, 3))  # half the size
 eg.save_image(folder / "budget_photo.png", photo)
+
+# %%
+# The scene is a poster under even light. Its texture is a bitmap at first.
+
 BITMAP = {"type": "bitmap", "filename": str(folder / "budget_photo.png"), "wrap_mode": "clamp"}
-SIDE = 128
+SIDE = 64
 
 
 def room(texture, distance):
-    """Make a scene: a poster under a lamp, from the front; the image is in the texture."""
+    """Make a scene: a poster, seen from the front."""
     # Rows of an image run down, v of a rectangle runs up.
     upright = mi.ScalarTransform4f().scale([1, -1, 1])
+    camera = mi.ScalarTransform4f().look_at([0, 0, distance], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}}
     return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "path", "max_depth": 2},
-            "sensor": {
-                "type": "perspective",
-                "fov": 36,
-                "to_world": mi.ScalarTransform4f().look_at([0, 0, distance], [0, 0, 0], [0, 1, 0]),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": SIDE,
-                    "height": SIDE,
-                    "rfilter": {"type": "box"},
-                },
-            },
+            "sensor": {"type": "perspective", "fov": 36, "to_world": camera, "film": film},
             "lamp": {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}},
             "poster": {
                 "type": "rectangle",
@@ -54,25 +54,18 @@ def room(texture, distance):
 
 
 def photograph(texture, distance):
-    """Render, with the same noise for every texture, and code the light as sRGB."""
-    light = np.array(mi.render(room(texture, distance), spp=64, seed=1))
-    return to_coded(light.clip(0, 1))
+    """Render with the same noise for every texture; return sRGB in [0, 1]."""
+    light = mi.Bitmap(mi.render(room(texture, distance), spp=64, seed=1))
+    coded = light.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=True)
+    return np.array(coded).clip(0, 1)
 
 
-def strip(name, full, reduced, found):
-    """Put a rendering with the bitmap, one with the Gaussians, and their outlines side by side."""
-    pictures = {
-        f"{name}: bitmap": full.repeat(2, axis=0).repeat(2, axis=1),
-        f"{len(found.gaussians)} Gaussians": reduced.repeat(2, axis=0).repeat(2, axis=1),
-        "outlines of them": overlay(found.gaussians, eg.picture_of(found.gaussians)),
-    }
-    cells = [join_pictures([text_line(text, 2 * SIDE), p], 0, 0) for text, p in pictures.items()]
-    return join_pictures(cells, 1)
+# %%
+# The search needs the scene, the place of the texture, and the image. The camera decides how many
+# Gaussians are enough for 40 dB. Left is the poster with the bitmap, right with the Gaussians.
 
-
-strips = []
-for name, distance in (("far", 24), ("middle", 8), ("near", 3.2)):
-    # Of a scene its cameras count, and where the texture is; here, that is a bitmap.
+rows = []
+for name, distance in (("far", 24), ("middle", 10), ("near", 3.2)):
     found = eg.fit_for_scene(room(BITMAP, distance), "poster.bsdf.brdf_0.reflectance", photo)
     poster = texture_of(found.gaussians, wrap_mode="clamp")
     full, reduced = photograph(BITMAP, distance), photograph(poster, distance)
@@ -81,5 +74,5 @@ for name, distance in (("far", 24), ("middle", 8), ("near", 3.2)):
         f"{name}: a pixel is {texels:.1f} texels, {len(found.gaussians)} Gaussians; "
         f"PSNR {found.psnr[0]:.1f} dB on the poster, {eg.psnr(full, reduced):.1f} dB rendered"
     )
-    strips.append(strip(name, full, reduced, found))
-eg.save_image(folder / "budget.png", join_pictures(strips, 0))
+    rows.append(np.concatenate([full, reduced], axis=1))
+eg.save_image(folder / "budget.png", np.concatenate(rows))

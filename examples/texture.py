@@ -1,9 +1,15 @@
-"""A texture: fit a photo, pave a floor with it in Mitsuba, and filter what lies far away."""
+"""
+A texture in a scene
+====================
+
+Fit a photo, cover a floor with it in Mitsuba, and filter the distant part in closed form. This page
+needs Mitsuba: ``pip install '.[plugins]'``.
+"""
 
 import sys
 from pathlib import Path
 
-import eigengs_dr as eg  # isort: skip  (before Mitsuba: it names a libLLVM that works)
+import eigengs_dr as eg  # isort: skip  (before Mitsuba: it finds libLLVM)
 import drjit as dr
 import mitsuba as mi
 
@@ -13,11 +19,18 @@ folder = Path(sys.argv[1] if len(sys.argv) > 1 else "build/examples")
 folder.mkdir(parents=True, exist_ok=True)
 
 mi.set_variant("llvm_ad_rgb")
-eg.register_plugins()  # Mitsuba now knows a texture named "gaussian_texture"
+eg.register_plugins()  # Mitsuba now knows the texture "gaussian_texture"
 
-# Light adds up, sRGB codes do not: what shall be a reflectance is best fitted in linear light.
+# %%
+# A reflectance adds up in linear light, not in sRGB codes. So fit it with ``color="linear"``.
+
 photo = eg.sample("coffee")[:, 100:500]
 cups = eg.fit(photo, gaussians=4000, iterations=100, color="linear").gaussians
+
+# %%
+# The floor repeats the picture 40 x 40 times. ``texture_of`` writes the set as a dictionary for
+# ``mi.load_dict``. A saved set is
+# ``{"type": "gaussian_texture", "filename": "cups.npz", "to_uv": ...}``.
 
 camera = mi.load_dict(
     {
@@ -32,7 +45,6 @@ camera = mi.load_dict(
 def floor(prefilter):
     """Make a scene: a floor of 40 x 40 pictures in the sun."""
     tiles = mi.ScalarTransform4f().scale([40, 40, 1])
-    # Of a saved set: {"type": "gaussian_texture", "filename": "cups.npz", "to_uv": tiles, ...}
     texture = texture_of(cups, to_uv=tiles, wrap_mode="repeat", prefilter=prefilter)
     return mi.load_dict(
         {
@@ -49,19 +61,31 @@ def floor(prefilter):
     )
 
 
-# Far away, a pixel covers many pictures. One sample sees one point of them, which is noise; with
-# the angle of a pixel, a lookup returns the mean over what the pixel covers: Gaussians smoothed by
-# a Gaussian are Gaussians again.
-points = mi.render(floor(prefilter=0.0), spp=1)
-filtered = mi.render(floor(prefilter=pixel_angle(camera)), spp=1)
-truth = mi.render(floor(prefilter=0.0), spp=128)
+def write(name, image):
+    """Write a rendering as a PNG file."""
+    mi.util.write_bitmap(str(folder / f"{name}.png"), image, write_async=False)
 
-for name, image in (("points", points), ("filtered", filtered), ("truth", truth)):
-    mi.util.write_bitmap(str(folder / f"floor_{name}.png"), image, write_async=False)
+
+# %%
+# A distant pixel covers many pictures. One sample sees one point of them, which is noise. With the
+# angle of a pixel, one sample sees their mean: a Gaussian blurred by a Gaussian is a Gaussian.
+#
+# The first picture has one sample a pixel at points. The second has one prefiltered sample a pixel.
+# The third has 128 samples a pixel at points.
+
+points = mi.render(floor(prefilter=0.0), spp=1)
+write("floor_points", points)
+filtered = mi.render(floor(prefilter=pixel_angle(camera)), spp=1)
+write("floor_filtered", filtered)
+truth = mi.render(floor(prefilter=0.0), spp=128)
+write("floor_truth", truth)
+
+# %%
+# The error is the root of the mean squared difference from the picture with 128 samples.
 
 
 def error_of(image):
-    """Root of the mean squared difference to what many samples give."""
+    """Compare a rendering with the one of many samples."""
     return dr.sqrt(dr.mean(dr.square(image - truth))).item()
 
 

@@ -21,6 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from eigengs_dr.backend.arrays import upload
+
 STEP = 5.0
 """Distance of the samples, in nm. That of Mitsuba's tables of D65 and the matching functions, so
 that products with them are cubic polynomials between the samples."""
@@ -102,7 +104,7 @@ def upload_table() -> Any:
     """
     red_green = basis()[1][:2]
     intervals = np.concatenate([red_green[:, :-1], np.diff(red_green, axis=1)])
-    return mi.Float(np.ascontiguousarray(intervals.T, dtype=np.float32).ravel())
+    return upload(mi.Float, intervals.T.astype(np.float32).ravel())
 
 
 def upsample(rgb: Any, wavelengths: Any, table: Any) -> Any:

@@ -103,6 +103,18 @@ def upload(kind: Any, values: NDArray[Any]) -> Any:
     return upload_rows(kind, [values])[0]
 
 
+def upload_tensor(kind: Any, values: NDArray[Any]) -> Any:
+    """Copy a NumPy array of any shape into a Dr.Jit tensor, as `upload` does.
+
+    Parameters
+    ----------
+    kind : type
+        Dr.Jit tensor type, e.g. ``drjit.llvm.ad.TensorXf``.
+    values : ndarray
+    """
+    return kind(upload(dr.array_t(kind), values.ravel()), values.shape)
+
+
 def upload_rows(kind: Any, rows: Iterable[NDArray[Any]]) -> list:
     """Copy flat NumPy arrays as `upload` does, and wait once for all of them."""
     targets = []

@@ -18,6 +18,9 @@ from .outputs import check_outputs, name_outputs
 SUFFIXES = (".png", ".exr")
 """What is written: PNG as sRGB, clamped; EXR as it is."""
 
+MADE = "build/scenes/"
+"""Folder of the sets that the scenes of the repository use."""
+
 SAMPLES_PER_PASS = 1 << 24
 """Most samples that are taken at once: their state is some 20 bytes each, and between two passes
 there is progress to show and Ctrl-C to listen to."""
@@ -170,4 +173,6 @@ def _refusal(path: Path, error: BaseException) -> Exception:
     where, _, trace = text.partition("Traceback (most recent call last):")
     if trace:
         text = where + re.sub(r"^\w+: (\[Errno \d+\] )?", "", trace.strip().splitlines()[-1])
+    if MADE in text:
+        text += "; run 'make scenes' first, which makes the sets of these scenes"
     return ValueError(f"{path}: {text or type(error).__name__}")

@@ -22,6 +22,7 @@ import mitsuba as mi
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 
+from ..backend.arrays import upload
 from ..raster.lookup.points import fold
 
 SPACING = 0.5
@@ -222,7 +223,7 @@ def _film_positions(sensor: Any, pixels: NDArray[np.uint32], side: int) -> tuple
     columns, rows = sensor.film().crop_size()
     ray = dr.arange(mi.UInt32, len(pixels) * side * side)
     across = dr.opaque(mi.UInt32, side)  # one program for every number of rays
-    pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), ray // (across * across))
+    pixel = dr.gather(mi.UInt32, upload(mi.UInt32, pixels), ray // (across * across))
     inside = ray % (across * across)
     x = pixel % columns + (mi.Float(inside % across) + 0.5) / across
     y = pixel // columns + (mi.Float(inside // across) + 0.5) / across

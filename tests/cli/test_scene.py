@@ -156,3 +156,11 @@ def test_mistaken_files(scene, tmp_path):
 def test_without_mitsuba(scene, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     assert_refused(run(scene(), "-o", tmp_path / "x.png"), "pip install 'mitsuba==3.9.*'")
+
+
+def test_sets_that_were_not_made_yet(scene, tmp_path):
+    """The scenes of the repository need `make scenes` once."""
+    line = """<shape type="rectangle"><bsdf type="diffuse"><texture type="gaussian_texture"
+        name="reflectance"><string name="filename" value="build/scenes/none.npz"/></texture>
+        </bsdf></shape>"""
+    assert_refused(run(scene(line), "-o", tmp_path / "x.png"), "none.npz", "make scenes")

@@ -1,0 +1,119 @@
+"""Settings of the manual: Sphinx, MyST, numpydoc, sphinx-click and sphinx-gallery."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from sphinx.util import logging
+
+import eigengs_dr as eg
+
+sys.path.insert(0, str(Path(__file__).parent))  # for check_names.py and gallery.py
+from check_names import missing
+
+LOGGER = logging.getLogger(__name__)
+
+project = "eigengs_dr"
+author = "the authors of eigengs_dr"
+copyright = f"2026, {author}"
+version = release = eg.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",
+    "numpydoc",
+    "sphinx_click",
+    "sphinx_copybutton",
+    "sphinx_design",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["results/**"]
+templates_path = ["_templates"]
+
+# --- Pages ---------------------------------------------------------------------------------------
+
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
+
+html_theme = "furo"
+html_title = f"eigengs_dr {release}"
+html_static_path = ["_static"]
+html_css_files = ["custom.css"]
+
+# --- Reference -----------------------------------------------------------------------------------
+
+autosummary_generate = True
+autodoc_typehints = "none"  # the docstrings name types, shapes and units
+autodoc_member_order = "bysource"
+numpydoc_show_class_members = False
+numpydoc_class_members_toctree = False
+
+# A name in single backticks is a link where it is public, else plain code.
+default_role = "py:obj"
+smartquotes = False  # options keep both of their hyphens
+_public = "|".join(name for name in eg.__all__)
+nitpick_ignore_regex = [("py:obj", rf"(?!(eigengs_dr\.)?({_public})$).*"), ("py:class", r".*")]
+
+
+def skip_tuple_fields(
+    app: Any, what: str, name: str, item: Any, skip: bool, options: Any
+) -> bool | None:
+    """Leave out the fields of named tuples, which the docstring of their class describes."""
+    is_field = (getattr(item, "__doc__", None) or "").startswith("Alias for field number")
+    return True if is_field else None
+
+
+def check_names(app: Any) -> None:
+    """Warn of public names that the reference leaves out, and of names that do not exist."""
+    listed = set((Path(__file__).parent / "reference" / "python.md").read_text().split())
+    for name in sorted(set(eg.__all__) - listed):
+        LOGGER.warning("reference/python.md: the public name %s is not listed", name)
+    for line in missing():
+        LOGGER.warning("%s does not exist", line)
+
+
+def show_examples_as_code(app: Any, context: Any, lines: list[str]) -> None:
+    """Turn the lines of a help text that keep their breaks into a block of code."""
+    result: list[str] = []
+    for line in lines:
+        text = line.removeprefix("| ")
+        if text == line or not text.startswith(" "):
+            result.append(text)
+            continue
+        if not result[-1].startswith("   "):
+            result += ["", ".. code-block:: text", ""]
+        result.append("   " + text.strip())
+    lines[:] = result
+
+
+def setup(app: Any) -> None:
+    """Connect the functions above."""
+    app.connect("builder-inited", check_names)
+    app.connect("autodoc-skip-member", skip_tuple_fields)
+    app.connect("sphinx-click-process-description", show_examples_as_code)
+
+
+# --- Tutorials -----------------------------------------------------------------------------------
+
+sphinx_gallery_conf = {
+    "examples_dirs": "../examples",
+    "gallery_dirs": "tutorials",
+    "filename_pattern": r"\.py$",
+    "within_subsection_order": "gallery.sort_key",
+    "image_scrapers": ("gallery.scrape_pictures",),
+    "reset_argv": "gallery.output_folder",
+    "reset_modules": (),
+    "capture_repr": (),
+    "remove_config_comments": True,
+    "download_all_examples": False,
+    "show_memory": False,
+    "write_computation_times": False,
+    "show_signature": False,
+    "min_reported_time": 30,
+    "abort_on_example_error": True,
+}
