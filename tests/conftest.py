@@ -46,6 +46,17 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.skip(reason=NO_GPU))
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_pyfunc_call():
+    """Fail a test that an interrupted fit ends; pytest would take it for Ctrl-C and end the run."""
+    try:
+        return (yield)
+    except KeyboardInterrupt as error:
+        if type(error) is KeyboardInterrupt:
+            raise
+        raise AssertionError(f"not expected: {error!r}") from error
+
+
 def pytest_terminal_summary(terminalreporter):
     """Say how much was not tested for want of a GPU."""
     skipped = terminalreporter.stats.get("skipped", [])

@@ -8,7 +8,7 @@ from _helpers.halves import SIDE, picture
 from _helpers.photos import coffee
 from eigengs_dr.fitting import search as budget
 from eigengs_dr.fitting.density_control import densify
-from eigengs_dr.fitting.fit import fit
+from eigengs_dr.fitting.fit import FitInterrupted, fit
 from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.options import FitOptions, max_gaussians_for
 from eigengs_dr.fitting.presets import PRESETS
@@ -74,7 +74,9 @@ def test_interrupted_while_it_settles_it_keeps_the_best():
         if row["psnr_ycbcr"] >= 28:  # the search has met its goal, and settles
             raise KeyboardInterrupt
 
-    found = fit(picture(), target_psnr=28, iterations=200, progress=press)
+    with pytest.raises(FitInterrupted) as interruption:
+        fit(picture(), target_psnr=28, iterations=200, progress=press)
+    found = interruption.value.result
     assert found.stopped == "interrupted"
     assert found.iterations < whole.iterations
     assert len(found.gaussians) == best[0]
@@ -139,9 +141,9 @@ def searched(monkeypatch, measure):
     start = initialize(picture(), FitOptions(gaussians=60, init="adaptive"))
     steps = []
 
-    def stand(gaussians, target, schedule, count, *rest):
+    def stand(problem, schedule, count):
         steps.append(count)
-        return iter([gaussians] * (count + 1))
+        return iter([problem.gaussians] * (count + 1))
 
     def judge(gaussians):
         return {"decibels": measure(gaussians, steps)}
@@ -212,10 +214,10 @@ def test_a_search_ends_where_no_place_is_left_to_grow(monkeypatch):
         ({"target_psnr": 0}, "above 0"),
         ({"target_psnr": np.nan}, "above 0"),
         ({"target_psnr": 101}, "at most 100"),
-        ({"target_space": "lab"}, "use ycbcr or rgb"),
+        ({"target_space": "lab"}, "use one of ycbcr, rgb"),
         ({"max_gaussians": 0}, "takes 1 to 1024"),
         ({"max_gaussians": 2000}, "takes 1 to 1024"),
-        ({"max_gaussians": 50.5}, "takes 1 to 1024"),
+        ({"max_gaussians": 50.5}, "max_gaussians is 50.5; it must be .* whole"),
         ({"target_psnr": None, "max_gaussians": 50}, "belong to target_psnr"),
         ({"target_psnr": None, "target_space": "rgb"}, "belong to target_psnr"),
     ],
