@@ -1,4 +1,4 @@
-"""The public names of eigengs_dr, once: `lazy_loader` reads them here, and so do type checkers."""
+"""The public names of eigengs_dr; `lazy_loader` and type checkers read this file."""
 
 from .backend.selection import BackendError
 from .codec.bit_allocation import PackResult, pack

@@ -1,1 +1,1 @@
-"""Dr.Jit on this machine: libLLVM, the choice of a backend, array types, recorded programs."""
+"""Dr.Jit on this machine: libLLVM, choice of a backend, array types, frozen programs."""

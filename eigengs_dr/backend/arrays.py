@@ -1,4 +1,4 @@
-"""The Dr.Jit array types that go together, found from one array."""
+"""Array types of one Dr.Jit backend and precision, and copies of NumPy arrays."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 
 class ArrayTypes(NamedTuple):
-    """The types of one backend and one float precision that the splat programs use."""
+    """The array types of one backend and one float precision."""
 
     Float: Any
     Int: Any
@@ -29,17 +29,16 @@ class ArrayTypes(NamedTuple):
 
 
 def types_of(array: Any) -> ArrayTypes:
-    """Find the types that belong to a Dr.Jit array.
+    """Return the array types with the backend and the precision of a Dr.Jit array.
 
     Parameters
     ----------
     array : Dr.Jit array
-        Any floating-point array of a JIT backend with derivatives, e.g. of ``drjit.llvm.ad``.
+        A floating-point array of any depth from ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
 
     Returns
     -------
     ArrayTypes
-        Types of the same backend and precision.
 
     Raises
     ------
@@ -87,18 +86,20 @@ def _types(module: str, bits: int) -> ArrayTypes:
 def upload(kind: Any, values: NDArray[Any]) -> Any:
     """Copy a flat NumPy array into memory that Dr.Jit owns.
 
-    ``kind(values)`` may keep NumPy's memory, which is aligned by luck: packet gathers from it are
-    replaced by single ones, 10 times slower, and a frozen function is traced again.
+    ``kind(values)`` may share NumPy's memory, which may be unaligned. Dr.Jit then replaces packet
+    gathers by single gathers, which are 10 times slower, and traces a frozen function again.
 
     Parameters
     ----------
     kind : type
         Dr.Jit array type, e.g. ``drjit.llvm.ad.Float``.
     values : ndarray, shape (n,)
+        Any dtype that converts to `kind`.
 
     Returns
     -------
-    Dr.Jit array of type `kind`, evaluated
+    Dr.Jit array of type `kind`, shape (n,)
+        Evaluated.
     """
     return upload_rows(kind, [values])[0]
 
@@ -116,7 +117,7 @@ def upload_tensor(kind: Any, values: NDArray[Any]) -> Any:
 
 
 def upload_rows(kind: Any, rows: Iterable[NDArray[Any]]) -> list:
-    """Copy flat NumPy arrays as `upload` does, and wait once for all of them."""
+    """Copy flat NumPy arrays as `upload` does, but wait only once for all copies."""
     targets = []
     for values in rows:
         target = dr.empty(kind, len(values))
@@ -124,5 +125,5 @@ def upload_rows(kind: Any, rows: Iterable[NDArray[Any]]) -> list:
         dr.scatter(target, kind(np.ascontiguousarray(values)), index)
         targets.append(target)
     dr.eval(targets)
-    dr.sync_thread()  # the copy may read the caller's memory until then
+    dr.sync_thread()  # the copies may read the caller's memory until here
     return targets

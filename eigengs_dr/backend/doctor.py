@@ -1,6 +1,6 @@
-"""Say what works on this machine and what to install.
+"""Diagnosis of this machine: which backends work, and what to install.
 
-Each backend is tried in a process of its own, so that one that crashes is reported like any other.
+Each backend is tried in its own process, so that a crash ends only this process.
 """
 
 import importlib.util
@@ -20,7 +20,7 @@ from eigengs_dr.backend.selection import describe, select
 try:
     types = select(sys.argv[1])
     import drjit as dr
-    # Versions 15 and 16 of LLVM get as far as here and end the process in dr.clip.
+    # LLVM 15 and 16 load, but end the process in dr.clip.
     if dr.clip(types.Float(1, 2, 3), 0, 2)[2] != 2:
         raise RuntimeError("wrong result")
     answer = {"works": True, "problem": None, **describe(sys.argv[1])}
@@ -28,23 +28,31 @@ except Exception as error:
     answer = {"works": False, "problem": str(error)}
 print(json.dumps(answer))
 """
+"""Python program that computes with the backend of its first argument and prints a JSON object."""
 
 VARIANTS = "import json, mitsuba; print(json.dumps(mitsuba.variants()))"
+"""Python program that prints the variants of Mitsuba as JSON."""
 
 
 def report() -> dict[str, Any]:
-    """Find out what works here.
+    """Try every backend and collect the versions of this machine.
 
-    Takes a second or two; starts Dr.Jit in other processes only.
+    This takes one or two seconds and starts Dr.Jit in other processes only.
 
     Returns
     -------
     dict
-        ``llvm`` and ``cuda``: for each ``works``, ``problem`` (one line that says what to do, or
-        None) and, where it works, what `backend.describe` returns. ``libllvm``: rows of ``path``,
-        ``version`` and ``usable`` of all that were found. ``libllvm_path``: the value of
-        ``DRJIT_LIBLLVM_PATH``, or None. ``mitsuba``: ``version`` and ``variants``, both None where
-        it is not installed. ``python``, ``platform``.
+        ``llvm``, ``cuda`` : dict
+            ``works`` and ``problem`` (None, or one line that says what to do). If the backend
+            works, also the entries of `eigengs_dr.backend.selection.describe`.
+        ``libllvm`` : list of dict
+            ``path``, ``version`` and ``usable`` of every library found.
+        ``libllvm_path`` : str or None
+            Value of ``DRJIT_LIBLLVM_PATH``.
+        ``mitsuba`` : dict
+            ``version``, None if Mitsuba is not installed; ``variants``, None if it cannot be
+            imported.
+        ``python``, ``platform`` : str
     """
     return {
         "llvm": _try("llvm"),
@@ -60,12 +68,12 @@ def report() -> dict[str, Any]:
 
 
 def describe(found: dict[str, Any]) -> str:
-    """Write a report as text.
+    """Format a report as text.
 
     Parameters
     ----------
     found : dict
-        What `report` returned.
+        The result of `report`.
 
     Returns
     -------
@@ -89,7 +97,7 @@ def describe(found: dict[str, Any]) -> str:
 
 
 def _details(name: str, trial: dict[str, Any]) -> str:
-    """What a backend that works works with."""
+    """Describe the software and hardware of a backend that works."""
     versions = trial["versions"]
     if name == "cuda":
         return f"Dr.Jit {versions['drjit']}"
@@ -98,14 +106,14 @@ def _details(name: str, trial: dict[str, Any]) -> str:
 
 
 def _mitsuba_line(version: str | None, variants: list[str] | None) -> str:
-    """What there is of Mitsuba."""
+    """Describe the installation of Mitsuba."""
     if version is None:
         return "not installed; only the plugins need it: pip install 'mitsuba==3.9.*'"
     return f"{version}: {', '.join(variants) if variants else 'cannot be imported'}"
 
 
 def _try(name: str) -> dict[str, Any]:
-    """Compute something small with a backend, in another process."""
+    """Run `TRIAL` with a backend, in another process."""
     process = _python(TRIAL, name)
     if process.returncode == 0:
         return dict(json.loads(process.stdout.splitlines()[-1]))
@@ -114,7 +122,7 @@ def _try(name: str) -> dict[str, Any]:
 
 
 def _mitsuba() -> dict[str, Any]:
-    """Version and variants of Mitsuba, if it is there."""
+    """Return the version and the variants of Mitsuba."""
     if importlib.util.find_spec("mitsuba") is None:
         return {"version": None, "variants": None}
     process = _python(VARIANTS)

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM between steps instead of inside one."""
+"""Interrupts that wait for the end of a step."""
 
 import signal
 import threading
@@ -7,21 +7,21 @@ from contextlib import contextmanager
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-"""Signals that ask a program to end: Ctrl-C, and the one that schedulers and ``kill`` send."""
+"""Signals that ask a program to end: Ctrl-C sends SIGINT, schedulers and ``kill`` send SIGTERM."""
 
 
 @contextmanager
 def defer_interrupts() -> Iterator[Callable[[], bool]]:
-    """Remember Ctrl-C and SIGTERM while a block runs, so that the block can end where it is whole.
+    """Record Ctrl-C and SIGTERM during a block, so that the block can stop between two steps.
 
-    Inside a frozen function or a loop that is being traced, Dr.Jit turns `KeyboardInterrupt` into a
-    `RuntimeError` and leaves the work half done. A second signal does what it did before the block.
-    Outside the main thread, which receives no signals, nothing changes.
+    Dr.Jit turns a `KeyboardInterrupt` inside a frozen function or a traced loop into a
+    `RuntimeError`. The first signal is only recorded; a second signal has its usual effect. Only
+    the main thread receives signals, so the block changes nothing in other threads.
 
     Yields
     ------
     callable
-        ``pressed() -> bool``: whether a signal came since the block began.
+        ``pressed() -> bool``: whether the block has received a signal.
 
     Examples
     --------
@@ -33,7 +33,7 @@ def defer_interrupts() -> Iterator[Callable[[], bool]]:
         yield lambda: False
         return
     handlers = {number: signal.getsignal(number) for number in SIGNALS}
-    # None is a handler that is not Python's; an ignored signal stays ignored.
+    # Python cannot restore a handler that is None; an ignored signal stays ignored.
     handlers = {n: old for n, old in handlers.items() if old not in (None, signal.SIG_IGN)}
     received = []
 

@@ -1,9 +1,9 @@
-"""The libLLVM that Dr.Jit loads: find one that works and name it before the import.
+"""Choice of the libLLVM that Dr.Jit loads.
 
-Dr.Jit looks for libLLVM while it is being imported: at ``DRJIT_LIBLLVM_PATH`` if that is set, else
-for the system's ``libLLVM.so`` and then in ``/usr/lib``. The one it finds may be too old: version
-14 is refused, 15 and 16 are accepted and then end the process at the first ``dr.clip``.
-`select_libllvm` therefore names a newer one before the import.
+Dr.Jit looks for libLLVM while it is imported: first at ``DRJIT_LIBLLVM_PATH``, then for the
+system's ``libLLVM.so``, then in ``/usr/lib``. The library may be too old: Dr.Jit refuses version
+14, and accepts versions 15 and 16, but these end the process at the first ``dr.clip``. Therefore
+`select_libllvm` sets the variable to a newer library before the import.
 """
 
 import glob
@@ -16,32 +16,29 @@ from pathlib import Path
 from typing import NamedTuple
 
 PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
-"""The environment variable by which Dr.Jit is told which libLLVM to load."""
-
+"""The environment variable from which Dr.Jit takes the path of libLLVM."""
 
 MIN_VERSION = 17
-"""The oldest major version of LLVM accepted."""
+"""The oldest major version of LLVM that is accepted."""
 
 TESTED_VERSIONS = (19, 22)
-"""Versions that the tests were run with; they are preferred to all others."""
-
+"""Major versions that the tests ran with; they are preferred to all others."""
 
 INSTALL_ADVICE = (
     f"install LLVM {MIN_VERSION} or newer: Debian, Ubuntu 'apt install libllvm19', Fedora "
     "'dnf install llvm-libs', macOS 'brew install llvm', Windows 'winget install LLVM.LLVM'"
 )
-"""What to do where no libLLVM works, by operating system."""
+"""What to do if no libLLVM works, for each operating system."""
 
 
 class Library(NamedTuple):
-    """A libLLVM on the disk.
+    """A file of libLLVM.
 
     Attributes
     ----------
     path : str
-        Where it was found.
     version : int or None
-        Major version, as far as file names tell: those on Windows do not.
+        Major version, read from the file name; None if the name has none, as on Windows.
     """
 
     path: str
@@ -49,38 +46,39 @@ class Library(NamedTuple):
 
     @property
     def usable(self) -> bool:
-        """Whether Dr.Jit works with it; an unknown version gets the benefit of the doubt."""
+        """Whether the version is at least `MIN_VERSION`, or unknown."""
         return self.version is None or self.version >= MIN_VERSION
 
 
 def candidates() -> list[Library]:
-    """Find the LLVM libraries of this machine by their file names, without loading any.
+    """Find the LLVM libraries of this machine by their file names, without loading them.
 
     Returns
     -------
     list of Library
-        One entry a file: tested versions first, then the newest first, unknown versions last.
+        One entry for each file: tested versions first, then the others, each from the newest to
+        the oldest. Unknown versions come last.
     """
     found: dict[str, Library] = {}
     for pattern in _patterns():
         for path in sorted(glob.glob(pattern)):
             real = os.path.realpath(path)
-            # A small file of that name is a linker script, not the library.
+            # A small file with this name is a linker script.
             if os.path.isfile(real) and os.path.getsize(real) > 1_000_000:
                 found.setdefault(real, Library(path, _version_in(path) or _version_in(real)))
     return sorted(found.values(), key=_preference)
 
 
 def _preference(library: Library) -> tuple[bool, int]:
-    """Sort key: tested versions first, the newest of each group first."""
+    """Return the sort key of `candidates`."""
     return library.version not in TESTED_VERSIONS, -(library.version or 0)
 
 
 def select_libllvm() -> None:
-    """Point Dr.Jit to a libLLVM that works, see `candidates`; called when the package is imported.
+    """Set `PATH_VARIABLE` to the first usable library of `candidates`, without loading it.
 
-    Sets `PATH_VARIABLE` where it is unset, Dr.Jit is not imported yet and a usable library is
-    found. Loads nothing.
+    The function does nothing if the variable is set, Dr.Jit is imported already, or no library is
+    usable. It runs when the package is imported.
     """
     if os.environ.get(PATH_VARIABLE) or "drjit" in sys.modules:
         return
@@ -90,7 +88,7 @@ def select_libllvm() -> None:
 
 
 def _patterns() -> list[str]:
-    """Where a libLLVM may lie, by operating system."""
+    """Return the file patterns of libLLVM on this operating system."""
     conda = os.environ.get("CONDA_PREFIX", "")
     if sys.platform == "win32":
         folders = [os.environ.get("PROGRAMFILES", r"C:\Program Files") + r"\LLVM\bin"]
@@ -118,12 +116,12 @@ def _version_in(path: str) -> int | None:
 
 
 def _usable() -> Iterator[Library]:
-    """The candidates that work, in the order of `candidates`."""
+    """Return the usable libraries in the order of `candidates`."""
     return (library for library in candidates() if library.usable)
 
 
 def load_failure() -> str:
-    """Say which libLLVM Dr.Jit refused, or that there is none."""
+    """Say in part of a line which libLLVM Dr.Jit refused, or that none was found."""
     asked = os.environ.get(PATH_VARIABLE)
     if not asked:
         names = ", ".join(library.path for library in candidates())
@@ -136,7 +134,7 @@ def load_failure() -> str:
 
 
 def advice() -> str:
-    """What to do about a libLLVM that does not work: take another that is here, or install one."""
+    """Say in part of a line what to do: use another library of this machine, or install one."""
     failed = os.path.realpath(os.environ.get(PATH_VARIABLE) or loaded_path() or "")
     others = (library.path for library in _usable() if os.path.realpath(library.path) != failed)
     other = next(others, None)
@@ -148,7 +146,14 @@ def advice() -> str:
 
 
 def loaded_path() -> str | None:
-    """Which libLLVM is loaded: what the system says, which only Linux does, else what was asked."""
+    """Return the path of the libLLVM in use.
+
+    Returns
+    -------
+    str or None
+        On Linux the file that the process has loaded, or None; on other systems the value of
+        `PATH_VARIABLE`, or None.
+    """
     asked = os.environ.get(PATH_VARIABLE)
     try:
         lines = Path("/proc/self/maps").read_text().splitlines()

@@ -1,4 +1,4 @@
-"""Programs of Dr.Jit traced once and replayed, with the garbage collector kept out."""
+"""Frozen programs of Dr.Jit: traced once, replayed, and safe from the garbage collector."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ import drjit as dr
 
 @contextmanager
 def freeze_program(function: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
-    """Freeze a function by `drjit.freeze` for a block, and free its program after it.
+    """Freeze a function with `drjit.freeze` during a block, and free its program after the block.
 
-    While Dr.Jit 1.5 records a program, the process ends if anything frees another program, or an
-    array that borrows NumPy's memory. Both happen wherever the garbage collector comes upon what
-    was left in a cycle, so it waits during calls; and the program is freed here, not by it.
+    While Dr.Jit 1.5 records a program, the process ends if Python frees another program or an array
+    that shares NumPy's memory. The garbage collector frees such objects at any time if a reference
+    cycle holds them. Therefore the collector is off during calls, and the block frees the program.
 
     Parameters
     ----------
     function : callable
-        See `drjit.freeze` for what it may do.
+        A function that `drjit.freeze` accepts.
 
     Yields
     ------
     callable
-        Takes and returns what the function does.
+        The frozen function, with the arguments and the result of `function`.
     """
     program = dr.freeze(function)
 

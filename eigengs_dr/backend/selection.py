@@ -1,4 +1,4 @@
-"""Pick the backend: llvm, where a libLLVM works, or cuda."""
+"""Choice of the Dr.Jit backend: llvm or cuda."""
 
 import importlib
 import importlib.metadata
@@ -16,16 +16,16 @@ from .libllvm import MIN_VERSION, advice, load_failure, loaded_path
 
 
 class BackendError(RuntimeError):
-    """A backend that is not there; the message is one line that says what to install."""
+    """A backend is not available; the message is one line that says what to install."""
 
 
 def select(backend: str | None = None) -> ModuleType:
-    """Return the module of a backend's differentiable array types.
+    """Return the module with a backend's differentiable array types.
 
     Parameters
     ----------
     backend : {"llvm", "cuda"}, optional
-        The backend. By default "cuda" where there is a GPU, else "llvm".
+        By default "cuda" if the machine has a CUDA GPU, else "llvm".
 
     Returns
     -------
@@ -35,10 +35,10 @@ def select(backend: str | None = None) -> ModuleType:
     Raises
     ------
     BackendError
-        If the backend is not there, its libLLVM would end the process, or Dr.Jit cannot be
-        imported. One line that says what to install.
+        If the backend is not available, its libLLVM is older than `MIN_VERSION`, or Dr.Jit cannot
+        be imported.
     ValueError
-        If `backend` is another name.
+        If `backend` has another value.
 
     Examples
     --------
@@ -62,7 +62,7 @@ def select(backend: str | None = None) -> ModuleType:
 
 
 def describe(backend: str | None = None) -> dict[str, Any]:
-    """Say what a figure was measured with.
+    """Return the hardware and the versions that a measurement depends on.
 
     Parameters
     ----------
@@ -72,14 +72,14 @@ def describe(backend: str | None = None) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``backend``; ``threads``, those of the llvm backend; ``cpu``, its model; ``platform``; and
-        ``versions`` of eigengs_dr, drjit, numpy and python, with ``libllvm`` and ``libllvm_path``,
-        both None where none is loaded.
+        ``backend``; ``threads`` of the llvm backend; ``cpu``, the model of the processor;
+        ``platform``; ``versions``, a dict of eigengs_dr, drjit, numpy, python, libllvm and
+        libllvm_path. The last two are None if the llvm backend does not work.
 
     Raises
     ------
-    BackendError
-        As `select` does.
+    BackendError, ValueError
+        As for `select`.
     """
     module = select(backend)
     import drjit as dr
@@ -102,17 +102,17 @@ def describe(backend: str | None = None) -> dict[str, Any]:
 
 
 def version_of(package: str) -> str | None:
-    """Version of an installed package.
+    """Return the version of a Python package.
 
     Parameters
     ----------
     package : str
-        Its name on the package index.
+        Name on the package index.
 
     Returns
     -------
     str or None
-        None where it is not installed.
+        None if the package is not installed.
     """
     try:
         return importlib.metadata.version(package)
@@ -121,20 +121,20 @@ def version_of(package: str) -> str | None:
 
 
 def _import_drjit() -> ModuleType:
-    """Import Dr.Jit; its wheel needs a library that bare systems lack, and says so badly."""
+    """Import Dr.Jit; if libatomic is missing, say so more clearly than Dr.Jit does."""
     try:
         with _silent_stderr():
             return importlib.import_module("drjit")
     except (ImportError, NameError) as error:
         reason = error.__context__ or error
         raise BackendError(
-            f"Dr.Jit cannot be imported ({reason}); where libatomic is missing, install it: "
+            f"Dr.Jit cannot be imported ({reason}); if libatomic is missing, install it: "
             "Debian, Ubuntu 'apt install libatomic1', Fedora 'dnf install libatomic'"
         ) from error
 
 
 def _cpu_model() -> str:
-    """Model of the processor, as Linux names it; elsewhere the architecture."""
+    """Return the model of the processor on Linux, or its architecture on other systems."""
     try:
         text = Path("/proc/cpuinfo").read_text()
     except OSError:
@@ -145,13 +145,13 @@ def _cpu_model() -> str:
 
 @contextmanager
 def _silent_stderr() -> Iterator[None]:
-    """Keep Dr.Jit's own lines on a libLLVM that fails off the terminal: ours says what to do."""
+    """Hide what Dr.Jit prints about a libLLVM that fails; `BackendError` says what to do."""
     if "drjit" in sys.modules:
         yield
         return
     try:
         saved = os.dup(2)
-    except OSError:  # standard error is closed, as in some daemons: nothing can be shown there
+    except OSError:  # some daemons close standard error
         yield
         return
     null = os.open(os.devnull, os.O_WRONLY)

@@ -1,1 +1,1 @@
-"""The representation: sets of 2D Gaussians, their covariances, their files."""
+"""Sets of 2D Gaussians, their covariances and their files."""

@@ -1,9 +1,8 @@
-"""Covariances of 2D Gaussians and what they are written as: factors, Cholesky factors, logarithms.
+"""Forms of the covariance of a 2D Gaussian: factor, Cholesky factor, matrix logarithm.
 
 A Gaussian has the covariance ``Sigma = (F^T F)^-1`` with the upper triangular *factor*
-``F = [[a, b], [0, c]]``, a and c positive. The functions here turn it into other forms and back.
-Those on NumPy arrays compute in double precision; the two of the Cholesky factor take Dr.Jit arrays
-and are differentiable.
+``F = [[a, b], [0, c]]``, a > 0 and c > 0. Functions on NumPy arrays compute in double precision.
+Functions of the Cholesky factor take Dr.Jit arrays and are differentiable.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ Array = NDArray[np.floating]
 
 
 def factor_from_covariance(xx: Array, xy: Array, yy: Array) -> NDArray[np.float64]:
-    """Factor the inverse of covariances: ``F^T F = Sigma^-1``.
+    """Return the factors of covariances: ``F^T F = Sigma^-1``.
 
     Parameters
     ----------
@@ -35,17 +34,17 @@ def factor_from_covariance(xx: Array, xy: Array, yy: Array) -> NDArray[np.float6
 
 
 def max_deviation(a: Array, b: Array, c: Array) -> NDArray[np.float64]:
-    """Return the largest standard deviation of Gaussians: the root of the larger eigenvalue.
+    """Return the largest standard deviation of each Gaussian: the root of the larger eigenvalue.
 
     Parameters
     ----------
     a, b, c : ndarray, shape (N,)
-        Factors.
+        Entries of the factors.
 
     Returns
     -------
     ndarray of float64, shape (N,)
-        In pixels, if the factors are in 1 / pixels.
+        In pixels if the factors are in 1 / pixels.
     """
     ia, t, ic = 1 / a, -b / (a * c), 1 / c  # F^-1 = [[ia, t], [0, ic]]
     middle = 0.5 * (ia * ia + t * t + ic * ic)
@@ -54,14 +53,15 @@ def max_deviation(a: Array, b: Array, c: Array) -> NDArray[np.float64]:
 
 
 def condition_number(factor: Array) -> NDArray[np.float64]:
-    """Return the condition numbers of covariances, the ratio of their eigenvalues.
+    """Return the condition numbers of covariances: the ratio of the eigenvalues.
 
-    With t the trace and ``d = (a c)^2`` the determinant of ``F^T F``, its larger eigenvalue is
-    ``l = (t + sqrt(t^2 - 4 d)) / 2``, and the ratio of both is ``l^2 / d``.
+    ``F^T F`` has the trace t, the determinant ``d = (a c)^2`` and the larger eigenvalue
+    ``l = (t + sqrt(t^2 - 4 d)) / 2``. The condition number is ``l^2 / d``.
 
     Parameters
     ----------
     factor : ndarray, shape (N, 3)
+        a, b, c.
 
     Returns
     -------
@@ -70,24 +70,25 @@ def condition_number(factor: Array) -> NDArray[np.float64]:
     """
     a, b, c = np.asarray(factor, np.float64).T
     trace = a * a + b * b + c * c
-    # t^2 - 4 d without cancellation: 1 for round Gaussians, not NaN.
+    # This product equals t^2 - 4 d, but does not cancel to a negative number for round Gaussians.
     root = np.sqrt(((a - c) ** 2 + b * b) * ((a + c) ** 2 + b * b))
     return np.asarray((0.5 * (trace + root) / (a * c)) ** 2, np.float64)
 
 
 def outline(factor: Array, points: int = 25) -> NDArray[np.float64]:
-    """Return points around Gaussians at one standard deviation, relative to the mean.
+    """Return points of the ellipses at one standard deviation, relative to the mean.
 
     Parameters
     ----------
     factor : ndarray, shape (N, 3)
+        a, b, c.
     points : int, optional
-        Points of each Gaussian; the last one repeats the first.
+        Number of points per Gaussian; the last point repeats the first.
 
     Returns
     -------
     ndarray of float64, shape (N, points, 2)
-        Solutions of ``|F x| = 1``. They are not finite where the factor is zero.
+        x, y with ``|F (x, y)| = 1``; not finite if a or c is zero.
     """
     turn = np.linspace(0, 2 * np.pi, points)
     a, b, c = np.asarray(factor, np.float64).T[:, :, None]
@@ -108,16 +109,17 @@ def log_shapes(factor: Array) -> NDArray[np.float64]:
     Parameters
     ----------
     factor : ndarray, shape (N, 3)
+        a, b, c.
 
     Returns
     -------
     ndarray of float64, shape (N, 3)
-        s, the logarithm of one over the size; u and v, how long and which way the Gaussian is
-        stretched, both 0 for a round one.
+        s, u, v. The size, the geometric mean of the two standard deviations, is ``exp(-s)``. The
+        vector (u, v) gives elongation and direction, and is 0 for a round Gaussian.
     """
     a, b, c = np.asarray(factor, np.float64).T
     half, across, size = 0.5 * (a * a - b * b - c * c), a * b, np.log(a * c)
-    # Eigenvalues of F^T F: their product is (a c)^2, and the larger one does not cancel.
+    # The larger eigenvalue of F^T F is a sum of positive numbers: no digits cancel.
     largest = 0.5 * (a * a + b * b + c * c) + np.hypot(half, across)
     length = 0.5 * (np.log(largest) - size)
     angle = np.arctan2(across, half)
@@ -125,18 +127,18 @@ def log_shapes(factor: Array) -> NDArray[np.float64]:
 
 
 def factors_from_log_shapes(shape: Array) -> NDArray[np.float64]:
-    """Return the factors a, b, c, shape (N, 3): the inverse of `log_shapes`."""
+    """Return the factors a, b, c, shape (N, 3), of s, u, v; inverse of `log_shapes`."""
     s, u, v = np.asarray(shape, np.float64).T
     length, angle = np.hypot(u, v), np.arctan2(v, u)
     # F^T F / exp(2 s) = cosh(2 length) + sinh(2 length) [[cos, sin], [sin, -cos]] of the angle.
-    # Written like this, no digits of a^2 cancel.
+    # The form of a below avoids the cancellation of digits in cosh + sinh cos.
     odd = np.sinh(2 * length)
     a = np.sqrt(np.exp(-2 * length) + 2 * odd * np.cos(0.5 * angle) ** 2)
     return np.stack([a, odd * np.sin(angle) / a, 1 / a], axis=1) * np.exp(s)[:, None]
 
 
 def sizes_from_log_shapes(shape: Array) -> NDArray[np.float64]:
-    """Return the geometric means of the two standard deviations, shape (N,): ``exp(-s)``."""
+    """Return the sizes ``exp(-s)``, shape (N,): geometric means of the standard deviations."""
     return np.exp(-np.asarray(shape, np.float64)[:, 0])
 
 
@@ -146,14 +148,33 @@ def sizes_from_log_shapes(shape: Array) -> NDArray[np.float64]:
 
 
 def cholesky_from_factor(a: Any, b: Any, c: Any) -> tuple[Any, Any, Any]:
-    """Return ``L = [[l1, 0], [l2, l3]]`` with ``Sigma = L L^T``; a, b, c are Float, shape (N,)."""
+    """Return l1, l2, l3 of ``L = [[l1, 0], [l2, l3]]`` with ``Sigma = L L^T``.
+
+    Parameters
+    ----------
+    a, b, c : Float, shape (N,)
+
+    Returns
+    -------
+    l1, l2, l3 : Float, shape (N,)
+        l1 and l3 are positive.
+    """
     # Sigma = F^-1 F^-T = [[1 / a^2 + b^2 / (a c)^2, -b / (a c^2)], [., 1 / c^2]]
     l1 = dr.sqrt(dr.square(1 / a) + dr.square(b / (a * c)))
     return l1, -b / (a * c * c * l1), 1 / (a * c * l1)
 
 
 def factor_from_cholesky(l1: Any, l2: Any, l3: Any) -> tuple[Any, Any, Any]:
-    """Return a, b, c with ``F^T F = (L L^T)^-1``; l1, l2, l3 are Float, shape (N,)."""
+    """Return a, b, c with ``F^T F = (L L^T)^-1``; inverse of `cholesky_from_factor`.
+
+    Parameters
+    ----------
+    l1, l2, l3 : Float, shape (N,)
+
+    Returns
+    -------
+    a, b, c : Float, shape (N,)
+    """
     yy = dr.square(l2) + dr.square(l3)
     a = dr.sqrt(yy) / dr.abs(l1 * l3)
     return a, -l1 * l2 / yy * a, dr.rsqrt(yy)

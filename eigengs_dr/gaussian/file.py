@@ -1,4 +1,4 @@
-"""The file of a set of Gaussians, and what makes a set."""
+"""The file format of a set of Gaussians, and the checks of a set."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from ..storage.npz import BadValue, Field
 
 FORMAT = "eigengs_dr.gaussians"
 VERSION = 2
-"""Version 2 added the cutoff."""
+"""Version of the format; version 2 added the cutoff."""
 
 CUTOFF = 3.0
-"""Default cutoff in standard deviations. Where a Gaussian is cut off, it has at most
-``exp(-cutoff^2 / 2)`` of its amplitude: 1.1 % at 3, 0.034 % at 4, 3.7e-6 at 5."""
+"""Default cutoff, in standard deviations. At the cutoff a Gaussian has ``exp(-cutoff^2 / 2)`` of
+its amplitude: 1.1 % at 3, 0.034 % at 4, 3.7e-6 at 5."""
 
 MAX_CUTOFF = 12.0
-"""``exp(-72)`` is below the precision of every format here; the fast exponential needs a bound."""
+"""Largest cutoff, in standard deviations. The fast exponential needs a bound, and ``exp(-72)`` is
+below single precision."""
 
 LAYOUT: dict[str, Field] = {
     "mean": Field("f4", 2),
@@ -33,20 +34,20 @@ LAYOUT: dict[str, Field] = {
     "size": Field("i8", 1),
     "space": Field("U", 0),
 }
-"""Arrays of a file of version 1: their kinds and numbers of dimensions."""
+"""Arrays of a file of version 1, with their types and numbers of dimensions."""
 
 CUTOFF_FIELD = Field("f8", 0)
-"""The cutoff, from version 2 on; sets of older files have `CUTOFF`."""
+"""The array that version 2 added; sets of version 1 have the cutoff `CUTOFF`."""
 
 READERS = {b"\x89EGS": "eigengs_dr.codec.egs:read_set"}
-"""Readers of other formats by the first bytes of a file: 'module:function', imported on use.
-``function(path, sections)`` returns a `SetData`."""
+"""Readers of other formats, by the first bytes of a file: 'module:function'. The function takes
+(path, sections) and returns a `SetData`; its module is imported when a file needs it."""
 
 Arrays = dict[str, NDArray[Any]]
 
 
 class SetData(NamedTuple):
-    """What a file of a set holds.
+    """Content of a file of a set.
 
     Attributes
     ----------
@@ -67,24 +68,24 @@ class SetData(NamedTuple):
 
 
 def write(path: str | os.PathLike[str], data: SetData) -> None:
-    """Write a set in single precision, all or nothing.
+    """Write a set as an ``.npz`` file in single precision, completely or not at all.
 
     Raises
     ------
     ValueError
-        If the suffix belongs to another format.
+        If the suffix is ``.egs``.
     OSError
-        If the file cannot be written; an existing one is then as before.
+        If the file cannot be written; an existing file does not change.
     """
     if Path(path).suffix.lower() == ".egs":
-        raise ValueError(f"{path}: .egs files are written by eigengs_dr.pack; save as .npz")
+        raise ValueError(f"{path}: only eigengs_dr.pack writes .egs files; save as .npz")
     members = {name: array.astype(np.float32) for name, array in data.arrays.items()}
     members |= {"size": np.array(data.size, np.int64), "space": np.array(data.space)}
     npz.write(path, FORMAT, VERSION, members | {"cutoff": np.array(data.cutoff, np.float64)})
 
 
 def read(path: Path, sections: int | None = None) -> SetData:
-    """Read and check a set; parameters and errors are those of `eigengs_dr.Gaussians.load`."""
+    """Read and check a set; parameters and errors as for `eigengs_dr.Gaussians.load`."""
     data = _read(path, sections)
     try:
         check(data)
@@ -102,7 +103,7 @@ def _read(path: Path, sections: int | None) -> SetData:
             data: SetData = getattr(import_module(module), function)(path, sections)
             return data
     if sections is not None:
-        raise ValueError(f"{path}: has no sections, which only packed files have; leave it out")
+        raise ValueError(f"{path}: has no sections; pass sections only for .egs files")
     version = npz.read_version(path, FORMAT, VERSION)
     layout = LAYOUT if version < 2 else LAYOUT | {"cutoff": CUTOFF_FIELD}
     arrays = npz.read(path, FORMAT, VERSION, layout)
@@ -112,10 +113,10 @@ def _read(path: Path, sections: int | None) -> SetData:
 
 
 def check(data: SetData) -> None:
-    """Raise `BadValue` where the parts of a set do not fit each other.
+    """Raise `BadValue` if a part of a set is invalid.
 
-    Sides go from 1 to 65536 pixels, the number of channels must fit the space, values are finite, a
-    and c are positive, and the cutoff is in (0, `MAX_CUTOFF`].
+    Shapes must fit each other and the space. Values must be finite, a and c positive, sides from 1
+    to 65536 pixels, and the cutoff in (0, `MAX_CUTOFF`].
     """
     arrays, size, space, cutoff = data
     mean, factor, color = arrays["mean"], arrays["factor"], arrays["color"]

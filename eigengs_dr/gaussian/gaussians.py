@@ -1,4 +1,4 @@
-"""A set of 2D Gaussians: its parameters and their bounds."""
+"""Sets of 2D Gaussians: parameters, bounds, and operations on whole sets."""
 
 from __future__ import annotations
 
@@ -19,19 +19,18 @@ from ..storage.npz import BadValue
 from .file import CUTOFF, SetData, check, read, write
 
 MIN_DEVIATION = 0.25
-"""Smallest standard deviation along an axis of the factor, in pixels: what is narrower falls
-between pixel centres, and its gradient with it."""
+"""Smallest standard deviation along an axis of the factor, in pixels. A narrower Gaussian can fall
+between pixel centres, where it has no gradient."""
 
 
 @dataclass
 class Gaussians:
     """N two-dimensional Gaussians and a constant background: an image of any size.
 
-    ``I(x) = background + sum_n color_n exp(-1/2 |F_n (x - mean_n)|^2)``, ``F = [[a, b], [0, c]]``:
-    the covariance of a splat is ``(F^T F)^-1``, positive definite for any a, c > 0. x points right
-    and y down, and pixel centres are at +0.5.
-
-    A PyTree: functions such as `drjit.eval`, `drjit.enable_grad` or `drjit.grad` traverse it.
+    ``I(x) = background + sum_n color_n exp(-1/2 |F_n (x - mean_n)|^2)`` with
+    ``F = [[a, b], [0, c]]``. The covariance ``(F^T F)^-1`` is positive definite for any a, c > 0. x
+    points right, y points down, and pixel centres are at +0.5. The class is a PyTree: `drjit.eval`,
+    `drjit.enable_grad`, `drjit.grad` and similar functions traverse it.
 
     Attributes
     ----------
@@ -40,16 +39,17 @@ class Gaussians:
     factor : Array3f, shape (3, N)
         a, b, c in 1 / pixels.
     color : ArrayXf, shape (C, N)
-        C = 1, 3 or 4 (or any other number) channels; 1 is white.
+        C channels; 1 is white.
     background : ArrayXf, shape (C, 1)
-        Value of every pixel before the splats are added.
+        Value of every pixel before the Gaussians are added.
     width, height : int
         Native size in pixels.
     space : str
-        What the channels mean, one of `eigengs_dr.image.color.SPACES`.
+        Colour space of the channels, one of `eigengs_dr.image.color.SPACES`.
     cutoff : float
-        Standard deviations after which a Gaussian ends, in (0, 12]. The error at a point is at most
-        ``exp(-cutoff^2 / 2)`` times the sum of the absolute colours that are left out there.
+        Standard deviations at which a Gaussian ends, in (0, 12]. The error at a point is at most
+        ``exp(-cutoff^2 / 2)`` times the sum of the absolute colours of the Gaussians that end
+        before it.
 
     Examples
     --------
@@ -81,7 +81,7 @@ class Gaussians:
         backend: str | None = None,
         cutoff: float = CUTOFF,
     ) -> Gaussians:
-        """Upload NumPy arrays.
+        """Create a set from NumPy arrays, in single precision.
 
         Parameters
         ----------
@@ -94,15 +94,15 @@ class Gaussians:
             Zero by default.
         size : (int, int)
             Native width and height in pixels.
-        space : str, optional
+        space, cutoff : optional
+            See `Gaussians`.
         backend : {"llvm", "cuda"}, optional
-        cutoff : float, optional
-            Standard deviations after which a Gaussian ends, in (0, 12].
+            By default "cuda" if the machine has a CUDA GPU, else "llvm".
 
         Raises
         ------
         ValueError
-            If shapes do not fit each other, a or c is not positive, or a value is not finite.
+            If shapes do not fit each other, or a value is not finite or out of range.
         """
         arrays = {"mean": mean, "factor": factor, "color": color}
         if background is not None:
@@ -122,11 +122,11 @@ class Gaussians:
             width=index(size[0]),
             height=index(size[1]),
             space=space,
-            cutoff=float(cutoff),  # a NumPy scalar would promote everything to float64
+            cutoff=float(cutoff),  # a NumPy scalar would promote Dr.Jit arrays to float64
         )
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """Download mean (N, 2), factor (N, 3), color (N, C) and background (C,) as NumPy arrays."""
+        """Return mean (N, 2), factor (N, 3), color (N, C) and background (C,) as NumPy arrays."""
         n = len(self)
         return {
             "mean": _rows(self.mean, n),
@@ -136,7 +136,7 @@ class Gaussians:
         }
 
     def __len__(self) -> int:
-        """Count the splats."""
+        """Return the number of Gaussians."""
         return max(dr.width(self.mean), dr.width(self.factor), dr.width(self.color))
 
     @property
@@ -145,21 +145,21 @@ class Gaussians:
         return len(self.color)
 
     def __getitem__(self, selection: Any) -> Gaussians:
-        """Select splats by a slice, an integer array or a boolean mask; the background stays.
+        """Select Gaussians by a slice, an integer array or a boolean mask; differentiable.
 
-        Differentiable with respect to the parameters of the splats that are kept.
+        The result has the same background.
 
         Raises
         ------
         IndexError
-            If the index is out of range or of another kind.
+            If the index is out of range or has another type.
         ValueError
-            If nothing is selected.
+            If the selection is empty.
         """
         types = types_of(self.mean)
         kept = np.atleast_1d(np.arange(len(self), dtype=np.uint32)[selection])
         if not kept.size:
-            raise ValueError("Gaussians: the selection is empty; a set has at least one splat")
+            raise ValueError("Gaussians: the selection is empty; select at least one Gaussian")
         chosen = upload(types.UInt, kept)
 
         def pick(rows: Any) -> Any:
@@ -169,7 +169,7 @@ class Gaussians:
         return replace(self, mean=pick(self.mean), factor=pick(self.factor), color=pick(self.color))
 
     def scaled(self, width: int, height: int) -> Gaussians:
-        """Return the same picture with another native size, in pixels.
+        """Scale the picture to another native size, in pixels; differentiable.
 
         Raises
         ------
@@ -192,12 +192,11 @@ class Gaussians:
         )
 
     def bounded(self) -> Gaussians:
-        """Return the set with every parameter inside its bounds, whatever a step did to it.
+        """Clip every parameter to its bounds.
 
-        Means stay in the image, a and c between 1 / (twice the longer side) and 1 /
-        `MIN_DEVIATION`, b within +-1 / `MIN_DEVIATION`: the inverse covariance then has ``det = (a
-        c)^2 > 0``. Values that are not finite are replaced: a mean by the middle, a factor by the
-        bound, a colour by 0.
+        A mean lies in the image. a and c lie between 1 / (twice the longer side) and
+        1 / `MIN_DEVIATION`, and b within +-1 / `MIN_DEVIATION`. A mean that is not finite becomes
+        the centre of the image, a and c become 1 / `MIN_DEVIATION`, b and colours become 0.
         """
         types = types_of(self.mean)
         low, high = 1 / (2 * max(self.width, self.height)), 1 / MIN_DEVIATION
@@ -220,14 +219,14 @@ class Gaussians:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the set as an ``.npz`` file in single precision, all or nothing.
+        """Write the set as an ``.npz`` file in single precision, completely or not at all.
 
         Raises
         ------
         ValueError
-            If the suffix is ``.egs``, which `eigengs_dr.pack` writes.
+            If the suffix is ``.egs``; use `eigengs_dr.pack` for such files.
         OSError
-            If the file cannot be written; an existing one is then as before.
+            If the file cannot be written; an existing file does not change.
         """
         size = (self.width, self.height)
         write(path, SetData(self.to_arrays(), size, self.space, self.cutoff))
@@ -245,38 +244,38 @@ class Gaussians:
         ----------
         path : path-like
         backend : {"llvm", "cuda"}, optional
+            As for `from_arrays`.
         sections : int, optional
-            Read so many sections of a packed file, from the first; what follows them may be
-            missing. By default all.
+            Number of sections to read from the start of an ``.egs`` file, which may end after
+            them. By default all sections.
 
         Raises
         ------
         ValueError
-            If the file is not one of these, is damaged, newer than this package, or holds values
-            that are not finite or do not fit together: one line that names file and key. If it
-            has not so many sections.
+            If the file has another format or a newer version, is damaged, has fewer sections, or
+            holds invalid values. One line names the file and the key.
         OSError
-            If it cannot be opened.
+            If the file cannot be opened.
         """
         arrays, size, space, cutoff = read(Path(path), sections)
         return cls.from_arrays(**arrays, size=size, space=space, backend=backend, cutoff=cutoff)
 
 
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
-    """Join sets of splats; backgrounds add, so that rendering the result is the sum of renderings.
+    """Join sets and add their backgrounds: the result renders as the sum of the sets.
 
     Parameters
     ----------
     sets : sequence of Gaussians
-        At least one; all of the same native size, space, cutoff, channels and backend.
+        At least one. All have the same native size, space, cutoff, channels and backend.
 
     Raises
     ------
     ValueError
-        If there is none, or they differ.
+        If there are no sets, or they differ in one of these properties.
     """
     if not sets:
-        raise ValueError("concatenate: no sets were given")
+        raise ValueError("concatenate: no sets were given; pass at least one")
     first = sets[0]
     kinds = {(g.width, g.height, g.space, g.cutoff, g.channels, type(g.mean)) for g in sets}
     if len(kinds) > 1:
@@ -305,7 +304,7 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
 
 
 def _broadcast(row: Any, count: int) -> Any:
-    """Give a row that may be a single number `count` entries."""
+    """Repeat a row with a single entry `count` times."""
     return row + dr.zeros(type(row), count)
 
 
@@ -314,6 +313,6 @@ def _columns(types: Any, array: NDArray[Any]) -> list:
 
 
 def _rows(rows: Any, count: int) -> NDArray[Any]:
-    """Stack Dr.Jit rows, some of which may be literals, to a (count, rows) array."""
+    """Stack Dr.Jit rows, which may have a single entry, to an array of shape (count, rows)."""
     columns = [np.broadcast_to(dr.detach(row).numpy(), count) for row in rows]
     return np.stack(columns, axis=1)

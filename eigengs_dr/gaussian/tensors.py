@@ -1,4 +1,4 @@
-"""A set of Gaussians as Dr.Jit tensors and back: what optimisers and other frameworks hold."""
+"""A set of Gaussians as Dr.Jit tensors, for optimisers and other frameworks."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from ..backend.arrays import types_of
 from .gaussians import Gaussians
 
 FIELDS = {"mean": 2, "factor": 3, "color": 0, "background": 0}
-"""Parameters of a set, with their columns; 0 stands for the number of channels."""
+"""Parameters of a set, with their numbers of columns; 0 means the number of channels."""
 
 
 def to_tensors(gaussians: Gaussians) -> dict[str, Any]:
-    """Write the parameters of a set as tensors, differentiably.
+    """Return the parameters of a set as tensors; differentiable.
 
     Parameters
     ----------
@@ -25,8 +25,8 @@ def to_tensors(gaussians: Gaussians) -> dict[str, Any]:
     Returns
     -------
     dict of str to TensorXf
-        mean (N, 2), factor (N, 3), color (N, C) and background (C,), as `Gaussians.from_arrays`
-        takes them.
+        mean (N, 2), factor (N, 3), color (N, C) and background (C,), as in
+        `Gaussians.from_arrays`.
 
     Examples
     --------
@@ -47,20 +47,20 @@ def to_tensors(gaussians: Gaussians) -> dict[str, Any]:
 
 
 def from_tensors(tensors: Mapping[str, Any], like: Gaussians) -> Gaussians:
-    """Make a set of tensors, differentiably: the inverse of `to_tensors`.
+    """Create a set from tensors; differentiable. The inverse of `to_tensors`.
 
     Parameters
     ----------
     tensors : mapping of str to TensorXf
-        Any of mean, factor, color and background, shaped as `to_tensors` returns them; other keys
-        are ignored.
+        Any of mean, factor, color and background, with the shapes that `to_tensors` returns. Other
+        keys are ignored.
     like : Gaussians
-        Gives the size, the space and the parameters that `tensors` lacks.
+        Set that gives the size, the space, the cutoff and the parameters that `tensors` lacks.
 
     Returns
     -------
     Gaussians
-        Values are not checked: see `Gaussians.bounded`.
+        Values are not checked; `Gaussians.bounded` clips them.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def from_tensors(tensors: Mapping[str, Any], like: Gaussians) -> Gaussians:
     """
     given = {name: tensors[name] for name in FIELDS if name in tensors}
     counts = [given[name].shape[0] for name in ("mean", "factor", "color") if name in given]
-    # Splats may be more or fewer than in `like` where nothing of it is left.
+    # The number of Gaussians may only differ from `like` if all of its Gaussians are replaced.
     count = max(counts) if len(counts) == 3 else len(like)
     for name, tensor in given.items():
         columns = FIELDS[name] or like.channels
@@ -86,7 +86,7 @@ def from_tensors(tensors: Mapping[str, Any], like: Gaussians) -> Gaussians:
 
 
 def _rows(like: Any, tensor: Any) -> Any:
-    """Columns of a tensor as an array of arrays of the type of `like`."""
+    """Return the columns of a tensor as a nested array with the type of `like`."""
     types = types_of(like)
     number = tensor.shape[-1]
     index = dr.arange(types.UInt, dr.width(tensor.array) // number) * number

@@ -1,1 +1,1 @@
-"""Pixels: files, colour spaces, sizes, metrics. No Gaussians."""
+"""Images as arrays of pixels: files, colour spaces, sizes, metrics."""

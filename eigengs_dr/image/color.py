@@ -1,4 +1,4 @@
-"""Colour spaces: RGB to the studio-range YCbCr of ITU-R BT.601 or to linear light, and back."""
+"""Colour spaces: gamma-encoded RGB, studio-range YCbCr of ITU-R BT.601, linear light."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 SPACES = ("ycbcr", "rgb", "linear", "data")
-"""What the channels of a set of Gaussians may mean.
+"""Names of the colour spaces that the channels of a set of Gaussians may have.
 
 ``"ycbcr"`` is studio-range YCbCr / 255, ``"rgb"`` is gamma-encoded RGB, ``"linear"`` is linear RGB
 and ``"data"`` is anything else (roughness, normals, ...), with any number of channels.
 """
 
 MAX_CHANNELS = 64
-"""A program holds the sums of all channels of a tile in registers: it must end somewhere."""
+"""Largest number of channels: a program holds the sums of all channels of a tile in registers."""
 
 RGB_TO_YCBCR: NDArray[np.float64] = (
     np.array(
@@ -26,7 +26,7 @@ RGB_TO_YCBCR: NDArray[np.float64] = (
     )
     / 255
 )
-"""Matrix M, shape (3, 3), of ``ycbcr = M rgb + YCBCR_OFFSET``, rows Y, Cb, Cr; ITU-R BT.601."""
+"""Matrix M, shape (3, 3), of ``ycbcr = M rgb + YCBCR_OFFSET``; rows Y, Cb, Cr (ITU-R BT.601)."""
 
 YCBCR_OFFSET: NDArray[np.float64] = np.array([16.0, 128.0, 128.0]) / 255
 """YCbCr of black, shape (3,)."""
@@ -38,8 +38,8 @@ YCBCR_TO_RGB: NDArray[np.floating[Any]] = np.linalg.inv(RGB_TO_YCBCR)
 def rgb_to_ycbcr(image: NDArray[Any]) -> NDArray[Any]:
     """Convert RGB to studio-range YCbCr / 255.
 
-    For RGB in [0, 1], Y lies in [16, 235] / 255 and Cb and Cr in [16, 240] / 255. Nothing is
-    clamped, so that the conversion is affine and invertible everywhere.
+    For RGB in [0, 1], Y lies in [16, 235] / 255, and Cb and Cr lie in [16, 240] / 255. Values are
+    not clamped, so the conversion is affine and invertible everywhere.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def rgb_to_ycbcr(image: NDArray[Any]) -> NDArray[Any]:
     Returns
     -------
     ndarray, same shape and dtype
-        Y, Cb, Cr; equals ``skimage.color.rgb2ycbcr(image) / 255``.
+        Y, Cb, Cr, equal to ``skimage.color.rgb2ycbcr(image) / 255``.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def ycbcr_to_rgb(image: NDArray[Any]) -> NDArray[Any]:
     Returns
     -------
     ndarray, same shape and dtype
-        RGB, 1 is white, not clamped: many YCbCr triples lie outside the RGB cube.
+        RGB, 1 is white. Values are not clamped: many YCbCr triples lie outside the RGB cube.
 
     Raises
     ------
@@ -90,14 +90,13 @@ def ycbcr_to_rgb(image: NDArray[Any]) -> NDArray[Any]:
 def to_linear(coded: Any) -> Any:
     """Decode sRGB to linear light: ``x / 12.92``, above 0.04045 ``((x + 0.055) / 1.055)^2.4``.
 
-    Elementwise on NumPy and Dr.Jit arrays (vectors, colours and tensors too), in their precision.
-    Both parts continue beyond [0, 1], so that values and derivatives are finite everywhere, also
-    where the other part applies.
+    The function works elementwise and keeps the precision. Values and derivatives are finite
+    everywhere, also outside [0, 1].
 
     Parameters
     ----------
-    coded : array of floats, any shape
-        sRGB, 1 is white.
+    coded : NumPy or Dr.Jit array of floats, any shape
+        sRGB, 1 is white. Dr.Jit vectors, colours and tensors are accepted too.
 
     Returns
     -------
@@ -119,27 +118,27 @@ def to_linear(coded: Any) -> Any:
     array([0.   , 0.214, 1.   ])
     """
     select, maximum, power = _functions(coded)
-    # The power sees no argument where its slope is infinite or its value is NaN: in reverse mode
-    # even zero times that would be NaN.
+    # Clamping keeps infinite slopes and NaN out of the power: reverse mode multiplies them by zero,
+    # which gives NaN.
     curved = power((maximum(coded, 0.04045) + 0.055) * (1 / 1.055), 2.4)
     return select(coded <= 0.04045, coded * (1 / 12.92), curved)
 
 
 def to_coded(linear: Any) -> Any:
-    """Code linear light as sRGB: ``12.92 x``, above 0.0031308 ``1.055 x^(1 / 2.4) - 0.055``.
+    """Encode linear light as sRGB: ``12.92 x``, above 0.0031308 ``1.055 x^(1 / 2.4) - 0.055``.
 
-    The inverse of `to_linear`, of which the rest holds here too; only where both parts meet do the
-    constants of the standard leave a step of 3e-8.
+    This is the inverse of `to_linear`. The constants of the standard leave a step of 3e-8 between
+    both parts.
 
     Parameters
     ----------
-    linear : array of floats, any shape
+    linear : NumPy or Dr.Jit array of floats, any shape
         Linear light, 1 is white.
 
     Returns
     -------
     array, same shape and type
-        sRGB, 1 is white, not clamped: light below 0 gives codes below 0.
+        sRGB, 1 is white. Values are not clamped: negative light gives negative codes.
 
     Raises
     ------
@@ -152,27 +151,24 @@ def to_coded(linear: Any) -> Any:
 
 
 def decode(space: str, channels: Sequence[Any]) -> list[Any]:
-    """Turn the channels of a render into what is shown: RGB, or data as it is.
-
-    Works on any array type that multiplies by a Python float (NumPy or Dr.Jit, attached to a
-    derivative or not), and keeps the precision of the arrays.
+    """Convert YCbCr channels to RGB, and return the channels of other spaces unchanged.
 
     Parameters
     ----------
     space : {"ycbcr", "rgb", "linear", "data"}
-        What the channels mean, one of `SPACES`.
-    channels : sequence of arrays
-        One array a channel, all of one shape; exactly three for ``"ycbcr"``.
+        Colour space of the channels.
+    channels : sequence of NumPy or Dr.Jit arrays
+        One array for each channel, all of one shape; exactly three for ``"ycbcr"``.
 
     Returns
     -------
     list of arrays
-        R, G, B for ``"ycbcr"``, not clamped; the channels unchanged for every other space.
+        R, G, B for ``"ycbcr"``, not clamped, in the precision of the arrays; otherwise `channels`.
 
     Raises
     ------
     ValueError
-        If the space is unknown, or is ``"ycbcr"`` without having three channels.
+        If the space is unknown, or if it is ``"ycbcr"`` and there are not three channels.
     """
     if space not in SPACES:
         raise ValueError(f"colour space {space!r} is unknown; use one of {', '.join(SPACES)}")
@@ -188,9 +184,9 @@ def decode(space: str, channels: Sequence[Any]) -> list[Any]:
 
 
 def _functions(array: Any) -> tuple[Any, Any, Any]:
-    """Select, maximum and power for a NumPy or a Dr.Jit array."""
+    """Return select, maximum and power for a NumPy or a Dr.Jit array."""
     if not isinstance(array, np.ndarray | np.generic | float):
-        import drjit as dr  # loads libLLVM, which must be found first
+        import drjit as dr  # loads libLLVM
 
         return dr.select, dr.maximum, dr.power
     if isinstance(array, np.ndarray | np.generic) and array.dtype not in (np.float32, np.float64):
@@ -199,7 +195,7 @@ def _functions(array: Any) -> tuple[Any, Any, Any]:
 
 
 def _check_rgb(image: NDArray[Any]) -> NDArray[Any]:
-    """Refuse what is not a float image of three channels: bytes would be taken for [0, 1]."""
+    """Refuse an image without three float channels: bytes would be read as values in [0, 1]."""
     image = np.asarray(image)
     if image.shape[-1:] != (3,):
         raise ValueError(f"image has shape {image.shape}; expected (..., 3)")

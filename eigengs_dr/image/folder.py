@@ -1,4 +1,4 @@
-"""Families of images, read in blocks of bounded memory: folders, files, arrays, iterators."""
+"""Families of images in folders, files, arrays or iterators, read in blocks of bounded memory."""
 
 from __future__ import annotations
 
@@ -21,35 +21,34 @@ from .io import SAVE_OPTIONS, ImageError, check_image, load_image
 from .resize import center_crop
 
 BASIS_SPACES = ("ycbcr", "rgb")
-"""Colour spaces that images can be read in."""
+"""Colour spaces to which `read_blocks` can convert images."""
 
 DECODE_THREADS = min(8, os.cpu_count() or 1)
-"""Files decoded at the same time: Pillow and NumPy release the interpreter while they work."""
+"""Number of threads that decode files; Pillow and NumPy release the interpreter lock."""
 
 MAX_WAITING = 4 * DECODE_THREADS
-"""Images that may wait in memory until they are their turn."""
+"""Largest number of prepared images that wait in memory."""
 
 MAX_NAMED = 3
-"""Skipped files that are named; the others are only counted."""
+"""Largest number of skipped files that a warning names."""
 
 Source = str | os.PathLike[str] | NDArray[Any] | Iterable[str | os.PathLike[str] | NDArray[Any]]
 """A folder, an array of images, or any iterable of files or such arrays."""
 
 ReadProgress = Callable[[int, int | None, dict[str, Any]], None]
-"""``progress(done, total, row)``; the total is None where it is not known."""
+"""``progress(done, total, row)``; the total is None if it is unknown."""
 
 
 class PreparedImage(NamedTuple):
-    """One image of a stream.
+    """One image of a block, or the reason why it cannot be read.
 
     Attributes
     ----------
     planes : ndarray of float32, shape (3, d), or None
-        None where the file could not be read.
     fitted : bool
-        Whether it was of another size.
+        Whether the image was cropped and resized.
     problem : str
-        The name of the file and why it could not be read.
+        Name of the file and the reason; empty if `planes` is not None.
     """
 
     planes: NDArray[np.float32] | None
@@ -58,18 +57,16 @@ class PreparedImage(NamedTuple):
 
 
 def image_files(folder: str | Path) -> list[Path]:
-    """List the images of a folder, without its subfolders.
+    """List the images of a folder, without hidden files and subfolders.
 
     Parameters
     ----------
     folder : str or Path
-        Where to look.
 
     Returns
     -------
     list of Path
-        Files with a suffix of `SAVE_OPTIONS` (in upper or lower case), sorted by name, hidden files
-        left out.
+        Files with a suffix of `SAVE_OPTIONS` in upper or lower case, sorted by name.
 
     Raises
     ------
@@ -103,43 +100,41 @@ def read_blocks(
 ) -> Generator[NDArray[np.float32], None, None]:
     """Read images in blocks, in the order of the source.
 
-    Every `length` consecutive images of the source make one block, from which those that cannot be
-    read are missing. Work that stopped after n blocks therefore goes on, with the same blocks as if
-    it had not, with the source from image ``n * length`` on.
+    Every `length` consecutive images of the source form one block, without the files that cannot be
+    read. A run that stopped after n blocks can continue with image ``n * length`` of the source.
 
     Parameters
     ----------
     source : path, array or iterable
-        A folder (its images are listed once), an array of images (n, H, W, 3) or (n, H, W), or an
-        iterable of files, of such arrays or of single RGB images (H, W, 3). Pixels as for
-        `check_image`. Arrays are used before the next is asked for, and may then be overwritten.
+        A folder, an array of images (n, H, W, 3) or (n, H, W), or an iterable of files, of arrays
+        of images or of RGB images (H, W, 3). Pixels as for `eigengs_dr.image.io.check_image`. An
+        iterator may overwrite an array after the next one is requested.
     size : (int, int)
-        Width and height. Images of another size are cropped around their centre and resampled.
+        Width and height in pixels. Images of another size are centre-cropped and resized.
     space : {"ycbcr", "rgb"}
-        What the three channels mean.
+        Colour space of the result.
     length : int
-        Most images in a block.
+        Largest number of images in a block.
     progress : callable, optional
         ``progress(done, total, {})`` after every image; `total` is None for an iterator.
 
     Yields
     ------
     ndarray of float32, shape (b, 3, height * width)
-        With b <= length, and b = 0 where no file of a block could be read. It may be overwritten.
-        While the caller keeps it, two blocks are in memory: let go of it before asking for more.
+        0 <= b <= length. The caller may overwrite the block, and should delete it before the next
+        request: otherwise two blocks are in memory.
 
     Raises
     ------
     ImageError
-        If the source holds no image, none of its files can be read, or an array is not images.
+        If the source has no images, none of its files can be read, or an array is not an image.
     ValueError
-        If an argument is none of the above.
+        If the size, the space or the length is invalid.
 
     Warns
     -----
     UserWarning
-        At the end, in a line each: how many images were skipped, the first of them by name; how
-        many were of another size.
+        At the end: how many images were skipped, with the first names, and how many were resized.
     """
     size = check_size(size)
     if space not in BASIS_SPACES:
@@ -157,17 +152,16 @@ def read_blocks(
 
 
 def check_size(size: Any) -> tuple[int, int]:
-    """Return a width and a height as integers.
+    """Return a size, (width, height) in pixels, as two integers.
 
     Parameters
     ----------
     size : (int, int)
-        Width and height.
 
     Raises
     ------
     ValueError
-        If it is something else, or a side is not positive.
+        If `size` is not a pair of integers, or a side is not positive.
     """
     try:
         width, height = map(index, size)
@@ -179,23 +173,22 @@ def check_size(size: Any) -> tuple[int, int]:
 
 
 def to_planes(image: NDArray[np.float32], space: str) -> NDArray[np.float32]:
-    """Separate the channels of an RGB image, converted to a colour space.
+    """Convert an RGB image to a colour space and separate its channels.
 
     Parameters
     ----------
     image : ndarray of float32, shape (H, W, 3)
-        RGB.
     space : {"ycbcr", "rgb"}
 
     Returns
     -------
     ndarray of float32, shape (3, H * W)
-        Each channel row by row; for ``"ycbcr"`` as `rgb_to_ycbcr` has it, but for rounding.
+        Each channel row by row; ``"ycbcr"`` is `eigengs_dr.image.color.rgb_to_ycbcr` in float32.
     """
     planes = np.ascontiguousarray(image.reshape(-1, 3).T)
     if space == "rgb":
         return planes
-    # Not a product of matrices: the threads of BLAS and those that decode would fight for cores.
+    # No matrix product: the threads of BLAS would compete with the decoding threads for cores.
     result = np.empty_like(planes)
     for row, weights, offset in zip(
         result, RGB_TO_YCBCR.astype(np.float32), YCBCR_OFFSET.astype(np.float32), strict=True
@@ -214,7 +207,7 @@ def _blocks(
     total: int | None,
     progress: ReadProgress | None,
 ) -> Generator[NDArray[np.float32], None, None]:
-    """Gather images into blocks, and say at the end what was wrong with some."""
+    """Collect images in blocks, and warn at the end of skipped and resized images."""
     pixels = size[0] * size[1]
     done = fitted = 0
     problems: list[str] = []
@@ -235,9 +228,9 @@ def _blocks(
             if done == before:
                 break
             yield block[:filled]
-            del block  # before the next is made
+            del block  # frees the memory before the next block
     if done == 0:
-        raise ImageError("the source holds no images; check where they should come from")
+        raise ImageError("the source holds no images; check the source")
     if len(problems) == done:
         raise ImageError(f"none of {done} images can be read, as {problems[0]}; check the files")
     if problems:
@@ -253,13 +246,13 @@ def _blocks(
 def _prepare_images(
     source: Iterable[Any], size: tuple[int, int], space: str
 ) -> Generator[PreparedImage, None, None]:
-    """Prepare images in parallel; they come in the order of the source."""
+    """Prepare images in parallel, and yield them in the order of the source."""
     pool = ThreadPoolExecutor(DECODE_THREADS, thread_name_prefix="decode")
     waiting: deque[Future[PreparedImage]] = deque()
     try:
         for place, item in enumerate(_singles(source)):
             waiting.append(pool.submit(_prepare, item, place, size, space))
-            # An array is done with at once: its owner may overwrite it.
+            # Finish an array at once: its owner may overwrite it.
             while len(waiting) > (MAX_WAITING if isinstance(item, Path) else 0):
                 yield waiting.popleft().result()
         while waiting:
@@ -269,7 +262,7 @@ def _prepare_images(
 
 
 def _singles(source: Iterable[Any]) -> Iterator[Any]:
-    """Take arrays of several images apart."""
+    """Yield files and single images."""
     for item in source:
         if _is_file(item):
             yield Path(item)
@@ -284,7 +277,7 @@ def _prepare(item: Any, place: int, size: tuple[int, int], space: str) -> Prepar
     except ImageError as error:
         if not isinstance(item, Path):
             raise ImageError(f"image {place} of the source{str(error)[len('image') :]}") from None
-        # "folder/a.jpg: the file is empty (0 bytes); copy it again" is more than a list can hold.
+        # A warning that lists several files has room for the name and the reason only.
         reason = str(error).removeprefix(f"{item}: ").split("; ")[0]
         return PreparedImage(None, False, f"{item.name} ({reason})")
     width, height = size
@@ -299,9 +292,9 @@ def _is_file(item: Any) -> bool:
 
 
 def _images(item: Any) -> Sequence[Any]:
-    """Look at an array as a sequence of images."""
+    """Return the images of an array as a sequence."""
     if not isinstance(item, np.ndarray) or item.ndim not in (3, 4):
         kind = f"shape {item.shape}" if isinstance(item, np.ndarray) else type(item).__name__
         raise ImageError(f"images: found {kind}, expected (n, H, W, 3) or (n, H, W); pass arrays")
-    # A short last axis holds channels: nobody has grey images that narrow.
+    # A last axis of 1 or 3 holds channels: no grey image is so narrow.
     return [item] if item.ndim == 3 and item.shape[2] in (1, 3) else list(item)

@@ -1,4 +1,4 @@
-"""Reading, checking and writing images."""
+"""Image files and arrays: load, check, save."""
 
 import warnings
 from pathlib import Path
@@ -22,46 +22,47 @@ SAVE_OPTIONS: dict[str, dict[str, Any]] = {
     ".bmp": {},
     ".ppm": {},
 }
-"""Suffixes that are written and looked for in folders, with what Pillow is told when writing."""
-
+"""Suffixes of image files, with the options that Pillow receives when it writes a file."""
 
 MIN_PIXEL, MAX_PIXEL = -0.5, 1.5
-"""Range of accepted float pixels: room for what resampling overshoots, none for 0..255."""
+"""Range of accepted float pixels: resampled images overshoot [0, 1], but pixels in 0..255 are an
+error."""
 
 
 class ImageError(ValueError):
-    """An image that cannot be used: one line that says which, why and what to do."""
+    """An image cannot be used; one line names the image, the reason and what to do."""
 
 
 def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]:
     """Read an image file as RGB.
 
-    Grey is replicated, palette, CMYK and YCbCr are converted, and the orientation of the EXIF
-    header is applied. 8-bit values v become v/255 exactly. 16-bit grey keeps its precision
-    (v/65535); of 16-bit RGB and RGBA, and of 16-bit grey with alpha, Pillow keeps the upper 8 bits.
+    The function replicates grey, converts palette, CMYK and YCbCr, and applies the orientation of
+    the EXIF header. It ignores colour profiles. An 8-bit value v becomes v/255 exactly. 16-bit grey
+    keeps its precision (v/65535). Pillow keeps only the upper 8 bits of 16-bit RGB, 16-bit RGBA and
+    16-bit grey with alpha.
 
     Parameters
     ----------
     path : str or Path
-        Anything that Pillow reads.
+        A file in any format that Pillow reads.
     keep_grey : bool, optional
-        Return one channel where the file is opaque grey.
+        Return one channel if the file is opaque grey.
 
     Returns
     -------
-    ndarray of float32, shape (H, W, 3), or (H, W, 1)
-        RGB in [0, 1] as stored in the file (colour profiles are ignored); float files as they are.
+    ndarray of float32, shape (H, W, 3) or (H, W, 1)
+        RGB in [0, 1]; values of float files are not scaled.
 
     Warns
     -----
     UserWarning
-        If the image is transparent somewhere: it is shown over white. If it holds several frames:
-        the first is used.
+        If the image has transparent pixels, which are shown over white. If the file holds several
+        frames, of which the first is used.
 
     Raises
     ------
     ImageError
-        If there is no such file, or it is empty, damaged, too large or not an image.
+        If the file is missing, empty, damaged, too large or not an image.
     """
     from PIL import Image, ImageOps, UnidentifiedImageError  # 0.05 s
 
@@ -99,25 +100,26 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
 
 
 def check_image(image: ArrayLike, keep_grey: bool = False) -> NDArray[np.float32]:
-    """Bring an array that should be an image into the form that everything else expects.
+    """Convert an array to a float32 image, and refuse an array that is not an image.
 
     Parameters
     ----------
     image : array_like, shape (H, W), (H, W, 1) or (H, W, 3)
-        Grey or RGB: uint8 or uint16 (scaled to [0, 1]), bool, or floats, where 1 is white. Floats
-        may overshoot [0, 1] by 0.5, as resampled images do, and are not clamped.
+        Grey or RGB: uint8 or uint16 (scaled to [0, 1]), bool, or floats with 1 as white. Floats may
+        overshoot [0, 1] by 0.5, as in resampled images; they are not clamped.
     keep_grey : bool, optional
-        Leave grey at one channel.
+        Return one channel if the image is grey.
 
     Returns
     -------
-    ndarray of float32, shape (H, W, 3), or (H, W, 1)
-        RGB, C-contiguous, never sharing memory with the argument.
+    ndarray of float32, shape (H, W, 3) or (H, W, 1)
+        RGB. The array is C-contiguous and shares no memory with `image`.
 
     Raises
     ------
     ImageError
-        If the shape, the type or the range is another, there are no pixels, or some are not finite.
+        If the shape, the dtype or the range is wrong, the image has no pixels, or a pixel is not
+        finite.
 
     Examples
     --------
@@ -129,22 +131,22 @@ def check_image(image: ArrayLike, keep_grey: bool = False) -> NDArray[np.float32
 
 
 def save_image(path: str | Path, image: ArrayLike) -> None:
-    """Write an image file, 8 bits a channel, in one step: whole or not at all.
+    """Write an image file with 8 bits per channel, completely or not at all.
 
     Parameters
     ----------
     path : str or Path
-        The suffix chooses the format and is one of `SAVE_OPTIONS`; a file that is there is
-        replaced. PNG, TIFF, BMP and PPM are lossless; JPEG and WebP are written with quality 95.
+        The suffix selects the format: .png, .tif, .tiff, .bmp and .ppm are lossless; .jpg, .jpeg
+        and .webp have quality 95. An existing file is replaced.
     image : array_like, shape (H, W), (H, W, 1) or (H, W, 3)
-        As for `check_image`, but floats of any finite value are clamped to [0, 1]. One channel is
-        written as grey.
+        RGB, or grey, which is written with one channel. Types as for `check_image`; finite floats
+        of any value are clamped to [0, 1].
 
     Raises
     ------
     ImageError
-        If the image is not one, the suffix is unknown or the file cannot be written. A file that
-        was there is then unchanged, and nothing else is left behind.
+        If the array is not an image, the suffix is unknown or the file cannot be written. An
+        existing file does not change.
     """
     from PIL import Image
 
@@ -160,19 +162,19 @@ def save_image(path: str | Path, image: ArrayLike) -> None:
             Image.fromarray(pixels).save(temporary, **SAVE_OPTIONS[suffix])
     except (OSError, ValueError) as error:
         message = str(error)
-        if not message.startswith(f"{path}: "):  # what replacing() refuses, it explains itself
+        if not message.startswith(f"{path}: "):  # errors of atomic_write are clear already
             reason = getattr(error, "strerror", None) or message
             message = f"{path}: cannot be written ({reason}); choose another path"
         raise ImageError(message) from error
 
 
 def to_8bit(image: NDArray[Any]) -> NDArray[Any]:
-    """Round to what an 8-bit file holds, in floats.
+    """Scale, clamp and round an image to 8 bits, and return the values as floats.
 
     Parameters
     ----------
     image : ndarray of float
-        On a [0, 1] scale; clamped to it.
+        0 is black, 1 is white.
 
     Returns
     -------
@@ -183,7 +185,7 @@ def to_8bit(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def _pixels(image: "Image") -> tuple[NDArray[Any], bool]:
-    """Pixels of a Pillow image, and whether some were transparent."""
+    """Return the pixels of a Pillow image, and whether some of them are transparent."""
     if image.mode == "I":  # 16-bit grey of PGM files comes as 32-bit integers
         return np.asarray(image) / 65535, False
     if image.mode == "F" or image.mode.startswith("I;16"):
@@ -196,7 +198,7 @@ def _pixels(image: "Image") -> tuple[NDArray[Any], bool]:
 
 
 def _rgb(image: ArrayLike, name: str, keep_grey: bool = False) -> NDArray[np.float32]:
-    """Scale to float32 and replicate grey to RGB; `name` is what errors call the image."""
+    """Scale to float32 and replicate grey to RGB; errors call the image `name`."""
     try:
         array = np.asarray(image)
     except ValueError:  # rows of unequal length
@@ -222,14 +224,14 @@ def _rgb(image: ArrayLike, name: str, keep_grey: bool = False) -> NDArray[np.flo
             f"the first at [{row}, {column}]; replace them, as with np.nan_to_num"
         )
     peak = np.iinfo(array.dtype).max if kind == "u" else 1
-    with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite: clamped or refused
+    with np.errstate(over="ignore"):  # callers clamp or refuse the infinities
         pixels = np.divide(array, peak, dtype=np.float32)
     channels = pixels.shape[2] if keep_grey else 3
     return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], channels)))
 
 
 def _check_range(pixels: NDArray[np.float32], name: str) -> NDArray[np.float32]:
-    """Refuse pixels that cannot be meant to lie in [0, 1]."""
+    """Refuse pixels far outside [0, 1]."""
     low, high = float(pixels.min()), float(pixels.max())
     if low < MIN_PIXEL or high > MAX_PIXEL:
         hint = "divide by 255" if 2 < high <= 255 and low >= 0 else "scale it"

@@ -1,4 +1,4 @@
-"""How close two images are: PSNR in RGB and YCbCr, SSIM and MS-SSIM."""
+"""Similarity of two images: PSNR in RGB and YCbCr, SSIM and MS-SSIM."""
 
 import math
 from typing import Any
@@ -16,37 +16,37 @@ SIGMA = 1.5
 """Standard deviation of that window, in pixels."""
 
 MAX_PSNR = 100.0
-"""Decibels above which only rounding is left."""
+"""Upper bound of reported PSNRs, in dB: above it, only rounding errors differ."""
 
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of MS-SSIM from the finest scale to the coarsest, Wang et al. 2003, section 3.2."""
 
 
 def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
-    """Peak signal-to-noise ratio of two RGB images, in decibels.
+    """Compute the peak signal-to-noise ratio of two images, in decibels.
 
-    ``"rgb"`` compares what is seen: both images clamped to [0, 1] and rounded to 8 bits, peak 255.
-    ``"ycbcr"`` compares studio-range YCbCr / 255, neither clamped nor rounded, with peak 1, as the
-    official EigenGS code does. That range spans 219/255 of the peak, so that for the same pictures
-    it reads higher than ``"rgb"``: 4.94 dB for white noise, 6.09 dB for an error in grey.
-    ``"data"`` compares the channels as they are, neither clamped nor rounded, with peak 1.
+    ``"rgb"`` compares 8-bit images: both are clamped to [0, 1] and rounded, and the peak is 255.
+    ``"ycbcr"`` compares studio-range YCbCr / 255 with peak 1 and neither clamps nor rounds, like
+    the official EigenGS code. The range of Y spans 219/255 of the peak. Therefore ``"ycbcr"`` gives
+    higher numbers than ``"rgb"``: 4.94 dB more for white noise, 6.09 dB more for an error in grey.
+    ``"data"`` compares the channels with peak 1 and neither clamps nor rounds.
 
     Parameters
     ----------
     a, b : array_like of float, shape (H, W, 3) or (H, W, 1)
-        RGB or grey, 1 is white. The result does not depend on their order.
+        RGB or grey, 1 is white. Their order does not matter.
     space : {"rgb", "ycbcr", "data"}
-        Where the mean squared error is taken, over all pixels and all channels.
+        Space in which the mean squared error over all pixels and channels is computed.
 
     Returns
     -------
     float
-        ``10 log10(peak^2 / mse)``; infinite for equal images, NaN where pixels are NaN.
+        ``10 log10(peak^2 / mse)``; infinite for equal images, NaN if a pixel is NaN.
 
     Raises
     ------
     ValueError
-        If the images are not both of one such shape, or the space is unknown.
+        If the shapes differ or are not as above, or the space is unknown.
 
     Examples
     --------
@@ -66,7 +66,10 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
 
 
 def float_space(color: str) -> str:
-    """Space of the PSNR that is called psnr_ycbcr: data has no YCbCr and is compared as it is."""
+    """Return the space in which psnr_ycbcr compares sets of the space `color`.
+
+    Sets in the space "data" have no YCbCr, so their channels are compared directly.
+    """
     return "data" if color == "data" else "ycbcr"
 
 
@@ -76,26 +79,26 @@ def psnr_from_mse(mse: float) -> float:
 
 
 def ssim(a: ArrayLike, b: ArrayLike) -> float:
-    """Structural similarity of two RGB images, with the settings of Wang et al. 2004.
+    """Compute the structural similarity of two images, with the settings of Wang et al. 2004.
 
-    Images are clamped to [0, 1]; the window is Gaussian, 11 pixels wide with sigma 1.5, and
-    the mean runs over channels and over the pixels whose whole window lies inside the image. Where
-    an image is smaller than that, its border pixels count too, with the image mirrored.
+    Images are clamped to [0, 1]. The window is Gaussian, 11 pixels wide with sigma 1.5. The mean is
+    taken over the channels and over the pixels whose window lies inside the image. If a side is
+    shorter than 11 pixels, the image is mirrored at its borders and border pixels count too.
 
     Parameters
     ----------
     a, b : array_like of float, shape (H, W, 3) or (H, W, 1)
-        RGB or grey, 1 is white. The result does not depend on their order.
+        RGB or grey, 1 is white. Their order does not matter.
 
     Returns
     -------
     float
-        At most 1, which equal images reach.
+        At most 1; 1 for equal images.
 
     Raises
     ------
     ValueError
-        If the images are not both of one such shape.
+        If the shapes differ or are not as above.
 
     References
     ----------
@@ -103,7 +106,7 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
     structural similarity. IEEE Transactions on Image Processing 13(4), 2004. Computed by
     `skimage.metrics.structural_similarity`.
     """
-    from skimage.metrics import structural_similarity  # 0.3 s that only this function needs
+    from skimage.metrics import structural_similarity  # the import takes 0.3 s
 
     a, b = _pair(a, b)
     similarity = structural_similarity(
@@ -120,28 +123,29 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
-    r"""Multi-scale structural similarity of two RGB images over YCbCr (Wang et al. 2003).
+    r"""Compute the multi-scale structural similarity of two images (Wang et al. 2003).
 
-    With :math:`c_j` the mean contrast-structure term of scale j and :math:`s_J` the mean SSIM of
-    the coarsest scale, negative means taken as 0,
+    The result is the mean over the channels of
 
     .. math:: \prod_{j<J} c_j^{w_j} \; s_J^{w_J}
 
-    is averaged over Y, Cb and Cr, unclamped, peak 1. The window is Gaussian, 11 pixels wide with
-    sigma 1.5, and stays inside the image; each scale halves the one before by 2x2 means. This is
-    what the official EigenGS code calls SSIM: `ms_ssim` of pytorch-msssim, ``data_range=1``. An odd
-    last row or column is dropped when halving, where that package pads with zeros.
+    with the mean contrast-structure term :math:`c_j` of scale j and the mean SSIM :math:`s_J` of
+    the coarsest scale; negative means count as 0. Channels are not clamped, and the peak is 1. The
+    window is Gaussian, 11 pixels wide with sigma 1.5, and stays inside the image. Each scale halves
+    the previous one by 2x2 means. The official EigenGS code calls this number SSIM: `ms_ssim` of
+    pytorch-msssim with ``data_range=1``. Halving drops an odd last row or column; pytorch-msssim
+    pads it with zeros.
 
-    An image has as many of the five scales as leave its smaller side 11 pixels or more, so five
-    from 176 pixels on. With fewer, the exponents of those left are scaled up to the same sum; a
-    smaller side below 11 pixels shrinks the window of its only scale to the next odd size.
+    The smaller side of the coarsest scale has at least 11 pixels, so an image needs 176 pixels for
+    all five scales. With fewer scales, their exponents are scaled up to the same sum. If the
+    smaller side is below 11 pixels, the window shrinks to the largest odd size that fits.
 
     Parameters
     ----------
     a, b : array_like of float, shape (H, W, 3) or (H, W, 1)
-        RGB or grey, 1 is white. The result does not depend on their order.
+        RGB or grey, 1 is white. Their order does not matter.
     space : {"ycbcr", "data"}
-        "data" averages over the channels as they are.
+        Channels to compare: Y, Cb and Cr, or the channels of the images.
 
     Returns
     -------
@@ -151,7 +155,7 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     Raises
     ------
     ValueError
-        If the images are not both of one such shape, or the space is unknown.
+        If the shapes differ or are not as above, or the space is unknown.
 
     References
     ----------
@@ -177,7 +181,7 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
 
 
 def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Both images as float64, of one shape (H, W, 3); grey is the RGB that looks like it."""
+    """Return both images as float64 RGB of one shape (H, W, 3); grey is replicated."""
     x, y = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     if x.shape != y.shape:
         raise ValueError(f"images have shapes {x.shape} and {y.shape}; crop or scale one of them")
@@ -190,14 +194,14 @@ def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.f
 
 
 def _window_size(sides: tuple[int, ...]) -> int:
-    """Side of the window: `WINDOW`, or the largest odd number that fits a smaller image."""
+    """Return the side of the window: `WINDOW`, or the largest odd number that fits the image."""
     return min(WINDOW, (min(sides) - 1) // 2 * 2 + 1)
 
 
 def _similarity(
     x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Mean SSIM and mean contrast-structure term per channel of two (3, H, W) images, peak 1."""
+    """Return mean SSIM and mean contrast-structure term per channel of two (3, H, W) images."""
     c1, c2 = 0.01**2, 0.03**2
     mean_x, mean_y, xx, yy, xy = _windowed_means(np.stack([x, y, x * x, y * y, x * y]))
     covariance = xy - mean_x * mean_y
@@ -208,8 +212,8 @@ def _similarity(
 
 
 def _windowed_means(maps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gaussian means over the last two axes, at the pixels whose window lies inside."""
-    from scipy.ndimage import correlate1d  # 0.2 s that only this function needs
+    """Return Gaussian means over the last two axes, for pixels whose window lies inside."""
+    from scipy.ndimage import correlate1d  # the import takes 0.2 s
 
     height, width = maps.shape[-2:]
     margin = _window_size((height, width)) // 2
@@ -221,7 +225,7 @@ def _windowed_means(maps: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _halved(image: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Means of the 2x2 blocks of a (3, H, W) image; an odd last row or column is dropped."""
+    """Return the means of the 2x2 blocks of a (3, H, W) image; drop an odd last row or column."""
     height, width = image.shape[1] // 2, image.shape[2] // 2
     blocks = image[:, : 2 * height, : 2 * width].reshape(3, height, 2, width, 2)
     return blocks.mean(axis=(2, 4))

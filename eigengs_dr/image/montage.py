@@ -1,4 +1,4 @@
-"""Pictures side by side and below each other, with lines of text."""
+"""Montages: pictures in rows and columns, with lines of text."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 GAP = 8
-"""White pixels behind every picture."""
+"""Width of the white border after every picture, in pixels."""
 
 SIZE = 10
-"""Height of letters in pixels."""
+"""Height of letters, in pixels."""
 
 Picture = NDArray[Any]
 
 
 def text_line(text: str, width: int, size: int = SIZE) -> Picture:
-    """Write a line of text, black on white.
+    """Draw a line of text, black on white.
 
     Parameters
     ----------
     text : str
-        What is too long is cut off.
+        Text that is wider than the picture is cut off.
     width : int
-        Pixels.
+        Width of the picture in pixels.
     size : int, optional
-        Height of letters in pixels; the line is a quarter higher.
+        Height of letters in pixels; the picture is a quarter higher.
 
     Returns
     -------
@@ -43,15 +43,15 @@ def text_line(text: str, width: int, size: int = SIZE) -> Picture:
 
 
 def join_pictures(pictures: Sequence[Picture], axis: int, gap: int = GAP) -> Picture:
-    """Put pictures below each other (axis 0) or side by side (axis 1), on white.
+    """Join pictures below each other (axis 0) or side by side (axis 1), on white.
 
     Parameters
     ----------
     pictures : sequence of ndarray of float, shape (H, W, 3)
-        At least one; RGB. They may differ in size and begin at one edge.
+        At least one RGB picture. Pictures of different sizes are aligned at the top or left.
     axis : {0, 1}
     gap : int, optional
-        White pixels behind every picture, also the last.
+        Width of the white border after every picture, also after the last, in pixels.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Images at other sizes."""
+"""Images resized by antialiased bicubic resampling."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from numpy.typing import NDArray
 
 
 def resample(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
-    """Bring an image to another size, whatever its aspect ratio; shrinking filters what aliases.
+    """Resize an image to any aspect ratio.
 
     Parameters
     ----------
     image : ndarray of float32, shape (H, W, C)
         Any number of channels and any finite values.
     width, height : int
-        Pixels of the result, at least 1.
+        Size of the result in pixels, at least 1.
 
     Returns
     -------
     ndarray of float32, shape (height, width, C)
-        Bicubic, antialiased; not clamped, so that it may overshoot at edges by some percent. A copy
-        where the size is the same already.
+        Values are not clamped and may overshoot at edges by some percent. A copy if the size does
+        not change.
 
     Raises
     ------
@@ -31,14 +31,14 @@ def resample(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.
 
 
 def center_crop(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
-    """Bring an image to another size without distortion: its largest centred part of that shape.
+    """Crop an image to its largest centred part with the aspect ratio of the result, and resize it.
 
-    Parameters and results as for `resample`. The part may begin inside a pixel, so that the centre
-    of the image stays the centre exactly, and filters see what lies around it.
+    Parameters, result and errors as for `resample`. The part may begin inside a pixel: the centre
+    of the image stays the centre exactly. Filters also use the pixels around the part.
     """
     rows, columns = image.shape[:2]
     scale = min(columns / max(width, 1), rows / max(height, 1))
-    # Rounding must not move the part out of the image.
+    # Rounding must not move the box out of the image.
     left, top = max(0, (columns - scale * width) / 2), max(0, (rows - scale * height) / 2)
     return _resized(image, width, height, (left, top, columns - left, rows - top))
 

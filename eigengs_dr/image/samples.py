@@ -1,4 +1,4 @@
-"""Photos that ship inside scikit-image."""
+"""Sample photos that are part of scikit-image."""
 
 import importlib.util
 from pathlib import Path
@@ -28,11 +28,11 @@ SAMPLES = {
     "retina": "retina.jpg",
     "rocket": "rocket.jpg",
 }
-"""Photos inside the scikit-image wheel, by name; the others of that library need a download."""
+"""Files inside the scikit-image wheel, by name; its other photos need a download."""
 
 
 def sample(name: str) -> NDArray[np.float32]:
-    """Load a photo that ships inside scikit-image: nothing is downloaded.
+    """Load a photo that is part of scikit-image, without a download.
 
     Parameters
     ----------
@@ -42,16 +42,16 @@ def sample(name: str) -> NDArray[np.float32]:
     Returns
     -------
     ndarray of float32, shape (H, W, 3)
-        RGB in [0, 1]; grey photos are replicated.
+        RGB in [0, 1]; grey photos have three equal channels.
 
     Raises
     ------
     ImageError
-        If there is no sample of that name, or scikit-image is not installed.
+        If the name is unknown, or scikit-image is not installed.
     """
     if name not in SAMPLES:
         raise ImageError(f"sample {name!r} is unknown; use one of {', '.join(SAMPLES)}")
-    # The folder is found without importing scikit-image.
+    # find_spec finds the folder without the slow import of scikit-image.
     package = importlib.util.find_spec("skimage")
     if package is None or package.origin is None:
         raise ImageError("scikit-image, which holds the samples, is missing; install scikit-image")

@@ -1,1 +1,1 @@
-"""What a Gaussian contributes to a pixel, and the sum of all Gaussians."""
+"""Rasterization: the weight of a Gaussian at a pixel, and the sum of all Gaussians."""

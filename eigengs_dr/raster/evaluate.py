@@ -1,7 +1,7 @@
-"""One splat: what it contributes at a point, and where its parameters lie in memory.
+"""The weight of one Gaussian at a point, its derivatives, and its convolution with a footprint.
 
-A splat with mean mu and the inverse factor ``F = [[a, b], [0, c]]``, so that ``Sigma^-1 = F^T F``,
-has the weight ``exp(-1/2 |F (x - mu)|^2)`` at x, and 0 where ``|F (x - mu)| > cutoff``.
+A Gaussian with the mean mu and the factor ``F = [[a, b], [0, c]]`` of ``Sigma^-1 = F^T F`` has the
+weight ``exp(-1/2 |F (x - mu)|^2)`` at x, and the weight 0 if ``|F (x - mu)| > cutoff``.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ LN2 = math.log(2)
 
 
 def exp2_neg(q: Any) -> Any:
-    """``2^-q`` for ``0 <= q <= 120``: relative error < 3e-7 at half the cost of `drjit.exp2`.
+    """Return ``2^-q`` for ``0 <= q <= 120``: relative error < 3e-7, half the cost of `drjit.exp2`.
 
-    ``q = n - f`` with integer n and ``|f| <= 1/2``: a polynomial gives ``2^f``, and n is subtracted
-    from its exponent bits. Outside the range the result is arbitrary and callers mask it. In double
-    precision this is `drjit.exp2`. Not differentiable: see `falloff`.
+    Split ``q = n - f`` into an integer n and ``|f| <= 1/2``: a polynomial gives ``2^f``, and n is
+    subtracted from its exponent bits. Outside the range the result is arbitrary, and callers mask
+    it. Double precision uses `drjit.exp2`. Not differentiable: see `falloff`.
     """
     types = types_of(q)
     if types.bits == 64:
@@ -44,7 +44,7 @@ def exp2_neg(q: Any) -> Any:
 
 
 def falloff(q: Any, limit: float) -> Any:
-    """``2^-q`` inside the cutoff ``q <= limit`` and 0 outside, with derivative ``-ln(2) 2^-q``."""
+    """Return ``2^-q`` for ``q <= limit``, else 0; the derivative is ``-ln(2)`` times the value."""
     exact = dr.detach(q)
     value = dr.select(exact <= limit, exp2_neg(exact), 0)
     if not dr.grad_enabled(q):
@@ -53,34 +53,33 @@ def falloff(q: Any, limit: float) -> Any:
 
 
 def weights(shape: list, x: Any, y: Any, tile: tuple[int, int], radius: float) -> list:
-    """Evaluate one splat at a block of pixels: ``2^-|F (x - mu)|^2``, F in kernel units.
+    """Evaluate one Gaussian at a block of pixels: ``2^-|F (x - mu)|^2`` in the units of kernels.
 
-    Everything that evaluates a Gaussian goes through here: the renderer, its derivatives both ways,
-    the colour solve and the textures (with a block of one point).
+    The renderer, its derivatives, the colour solve and the textures (with blocks of one point) all
+    evaluate Gaussians here. Cost per point: one `exp2_neg`, a comparison and 2 or 3 operations.
 
     Parameters
     ----------
     shape : list of 5 Float
-        Mean x, mean y, a, b, c in the units of the kernels, see `KernelParameters`.
+        Mean x, mean y, a, b, c; see `eigengs_dr.raster.parameters.KernelParameters`.
     x, y : Float
-        First point of the block.
+        First point of the block, in pixels.
     tile : (int, int)
-        Width and height of the block; points are 1 apart.
-    limit : float
-        ``(UNIT * cutoff)^2``.
+        Width and height of the block; points are 1 pixel apart.
+    radius : float
+        Cutoff, see `eigengs_dr.raster.parameters.kernel_radius`.
 
     Returns
     -------
     list of Float
-        Weights in [0, 1], row after row. Cost: one `exp2_neg`, a comparison and 2 or 3 more
-        operations a point.
+        Weights in [0, 1], row after row.
     """
     limit = radius * radius
     return [falloff(dr.fma(u, u, v * v), limit) for us, v in _rows(shape, x, y, tile) for u in us]
 
 
 def _rows(shape: list, x: Any, y: Any, tile: tuple[int, int]) -> list[tuple[list, Any]]:
-    """``F (x - mu) = (u, v)`` at a block of pixels: for every row its u's and its one v."""
+    """Return ``F (x - mu) = (u, v)`` at a block of pixels: a list of u and one v for each row."""
     mean_x, mean_y, a, b, c = shape
     dx, dy = x - mean_x, y - mean_y
     u0, v0 = dr.fma(a, dx, b * dy), c * dy
@@ -100,20 +99,20 @@ def weights_vjp(
     radius: float,
     cotangent: Callable[[int, Any], Any],
 ) -> list:
-    """Gradient of ``sum_k g_k w_k`` with respect to the shape, where ``g_k = cotangent(k, w_k)``.
+    """Return the gradient of ``sum_k g_k w_k`` for ``g_k = cotangent(k, w_k)``.
 
-    Derived by hand beside `weights`, which a test compares it with, because it halves the adjoint:
-    with ``e = -2 ln(2) g w``, ``du = e u`` and ``dv = e v``, and (i, j) the place in the block,
-    ``da = sum du (dx + i)``, ``db = sum du (dy + j)``, ``dc = sum dv (dy + j)`` and
-    ``d mu = -(a sum du, b sum du + c sum dv)``.
+    With ``e = -2 ln(2) g w``, ``du = e u``, ``dv = e v`` and the offset (i, j) in the block, the
+    gradient is ``da = sum du (dx + i)``, ``db = sum du (dy + j)``, ``dc = sum dv (dy + j)`` and
+    ``d mu = -(a sum du, b sum du + c sum dv)``. These formulas halve the cost of the adjoint
+    compared with Dr.Jit's own derivatives of `weights`.
 
     Parameters
     ----------
     shape, x, y, tile, radius
-        As in `weights`.
+        As for `weights`.
     cotangent : callable
-        ``cotangent(k, w)`` receives the weight of the k-th point and returns the derivative of the
-        loss with respect to it.
+        ``cotangent(k, w)`` receives the weight of point k and returns the derivative of the loss
+        with respect to this weight.
 
     Returns
     -------
@@ -150,22 +149,23 @@ def weights_vjp(
 
 
 def widen(shape: list, footprint: list) -> tuple[list, Any]:
-    """Convolve a splat with a Gaussian of unit integral: a filter, or what a pixel sees.
+    """Convolve a Gaussian with a Gaussian footprint whose integral is 1.
 
-    ``Sigma' = Sigma + Sigma_f``, with the amplitude ``sqrt(det Sigma / det Sigma')`` that keeps the
-    integral (Heckbert, "Fundamentals of Texture Mapping and Image Warping", 1989).
+    The result has the covariance ``Sigma' = Sigma + Sigma_f``, and the amplitude
+    ``sqrt(det Sigma / det Sigma')`` keeps the integral (Heckbert, "Fundamentals of Texture Mapping
+    and Image Warping", 1989).
 
     Parameters
     ----------
     shape : list of 5 Float
-        As in `weights`.
+        As for `weights`.
     footprint : list of 3 Float
-        xx, xy, yy of ``Sigma_f``, from `kernel_covariance`.
+        xx, xy, yy of ``Sigma_f``, from `eigengs_dr.raster.parameters.kernel_covariance`.
 
     Returns
     -------
     shape : list of 5 Float
-        The same mean and the factor of ``Sigma'``.
+        The mean and the factor of ``Sigma'``.
     amplitude : Float
         In (0, 1].
     """
@@ -175,8 +175,8 @@ def widen(shape: list, footprint: list) -> tuple[list, Any]:
     t = -b * ia * ic  # F^-1 = [[1/a, t], [0, 1/c]]
     xy = dr.fma(t, ic, fxy)
     yy = dr.fma(ic, ic, fyy)
-    # det(S + F) = det S + tr(adj(S) F) + det F, a sum of squares: the plain determinant loses all
-    # its digits for needles.
+    # det(S + F) = det S + tr(adj(S) F) + det F is a sum of squares. The plain formula xx yy - xy^2
+    # loses all digits for very elongated Gaussians.
     across = dr.fma(ic * ic, fxx, t * dr.fma(t, fyy, -2 * ic * fxy))
     whole = ia * ic
     added = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0) + dr.maximum(across, 0)

@@ -1,9 +1,9 @@
-"""The sum over all splats and its derivatives: a lane a tile forward, a lane a splat in reverse.
+"""The sum over all Gaussians with one lane per tile, and its adjoint with one lane per Gaussian.
 
 ``I(x) = background + sum_n c_n w_n(x)`` with the weights of `eigengs_dr.raster.evaluate`.
 
-Layout of images in this module: tile after tile, in a tile row after row, pixel after pixel,
-channel after channel, so that a lane reads or writes one contiguous piece with packet operations.
+Tile layout: images are stored tile after tile, within a tile row after row, pixel after pixel,
+channel after channel. A lane then reads or writes one contiguous run with packet operations.
 """
 
 from __future__ import annotations
@@ -19,32 +19,33 @@ from .parameters import NUM_SHAPE_PARAMS
 from .tiles import Grid, TileLists, for_each_tile
 
 # ---------------------------------------------------------------------------------------------
-#  Sum over splats, one lane a tile
+#  Sum over Gaussians, one lane per tile
 # ---------------------------------------------------------------------------------------------
 
 
 def forward(packed: Any, start: list, lists: TileLists, radius: float, tangent: Any = None) -> Any:
-    """Sum the splats of every tile: the image, or its derivative along `tangent`.
+    """Sum the Gaussians of every tile: the image, or its derivative along `tangent`.
 
-    ``I_pc = start_c + sum_n w_n(p) c_nc``. Cost: one gather of the splat's parameters and
-    ``pixels * (weight + channels)`` operations for each entry of the lists.
+    ``I_pc = start_c + sum_n w_n(p) c_nc``. Cost per entry of the lists: one gather of parameters
+    and ``pixels * (weight + channels)`` operations.
 
     Parameters
     ----------
     packed : Float
-        `NUM_SHAPE_PARAMS` + channels parameters of every splat, from `pack`.
+        `NUM_SHAPE_PARAMS` + channels parameters per Gaussian, from `pack_parameters`.
     start : list of Float
-        What each channel starts from: the background.
+        Initial value of each channel: the background.
     lists : TileLists
-    limit : float
-        ``(UNIT * cutoff)^2``.
+    radius : float
+        Cutoff, see `eigengs_dr.raster.parameters.kernel_radius`.
     tangent : Float, optional
-        Packed derivatives of the parameters; the result is then ``d I`` along them.
+        Packed derivatives of the parameters. The result is then the derivative of the image along
+        them, and `start` holds the derivative of the background.
 
     Returns
     -------
     Float, shape (tiles * pixels * channels,)
-        In the tile layout of this module.
+        In tile layout.
     """
     types = types_of(packed)
     grid, channels = lists.grid, len(start)
@@ -88,7 +89,7 @@ def forward(packed: Any, start: list, lists: TileLists, radius: float, tangent: 
 
 
 # ---------------------------------------------------------------------------------------------
-#  Its adjoint, one lane a splat
+#  Adjoint, one lane per Gaussian
 # ---------------------------------------------------------------------------------------------
 
 
@@ -100,24 +101,24 @@ def adjoint(
     radius: float,
     color_only: bool = False,
 ) -> list:
-    """Gradient of ``<delta, accumulate(packed)>`` with respect to the parameters of every splat.
+    """Return the gradient of ``<delta, forward(packed)>`` with respect to all parameters.
 
-    A lane owns a splat, walks the tiles inside its ellipse, gathers delta there and sums in
-    registers: no atomics, one result on every run. Derivatives of weights: `weights_vjp`.
+    A lane owns a Gaussian, visits the tiles inside its ellipse, gathers delta there and sums in
+    registers. Without atomic operations, every run gives the same result.
 
     Parameters
     ----------
     packed : Float
-        As in `forward`.
+        As for `forward`.
     delta : Float
         Derivative of a loss with respect to the image, in tile layout.
     channels : int
     lists : TileLists
-        Only its grid and order of splats are used.
+        Only `grid` and `splat_order` are used.
     radius : float
-        ``UNIT * cutoff``.
+        As for `forward`.
     color_only : bool, optional
-        Leave out the derivatives of the shapes.
+        Omit the derivatives with respect to the shapes.
 
     Returns
     -------
@@ -162,7 +163,7 @@ def adjoint(
 
 
 def _restore_order(types: ArrayTypes, sums: list, order: Any) -> list:
-    """Undo the permutation of lanes by packets."""
+    """Undo the permutation of lanes, with packet operations."""
     number, count = len(sums), dr.width(order)
     stride = -(-number // 4) * 4
     packed = dr.empty(types.Float, stride * count)
@@ -171,7 +172,7 @@ def _restore_order(types: ArrayTypes, sums: list, order: Any) -> list:
 
 
 def channel_sums(image: Any, channels: int, grid: Grid) -> list:
-    """Sum every channel of an image in tile layout: a list of `channels` arrays of one element."""
+    """Sum each channel of an image in tile layout; return a list of Float, shape (1,)."""
     types = types_of(image)
     tile = dr.arange(types.UInt, grid.tiles)
     values = gather_run(types, image, tile, grid.pixels * channels, True)

@@ -1,4 +1,4 @@
-"""Where the parameters of Gaussians lie in memory, and how a lane gathers them."""
+"""The layout of parameters in memory, and gathers from it."""
 
 from __future__ import annotations
 
@@ -10,10 +10,20 @@ from ..backend.arrays import ArrayTypes, types_of
 
 
 def pack_parameters(values: list) -> Any:
-    """Store the parameters of N splats one splat after another, padded to a multiple of 4 floats.
+    """Store the parameters of N Gaussians one Gaussian after another.
 
-    Gathers of 4 neighbours are 8 times as fast as 4 gathers on the CPU. Arrays that wrap NumPy's
-    memory may not be aligned and silently lose that, so this always copies.
+    On the CPU, one gather of 4 neighbours is 8 times as fast as 4 gathers. It needs aligned memory,
+    which arrays that share NumPy's memory may lack, so the parameters are always copied.
+
+    Parameters
+    ----------
+    values : list of Float, shape (N,)
+        One array for each parameter.
+
+    Returns
+    -------
+    Float, shape (N * stride,)
+        The stride is the number of parameters, padded to a multiple of 4.
     """
     types = types_of(values[0])
     stride = -(-len(values) // 4) * 4
@@ -25,17 +35,23 @@ def pack_parameters(values: list) -> Any:
 
 
 def gather_run(types: ArrayTypes, source: Any, index: Any, length: int, active: Any) -> list:
-    """Gather ``source[index * length : (index + 1) * length]`` by packets if the length is even."""
+    """Gather ``source[index * length : (index + 1) * length]``, in packets if the length is even.
+
+    Return a list of `length` Float.
+    """
     shape = (length, dr.width(index))
     return list(dr.gather(types.FloatX, source, index, active, shape=shape))
 
 
 def unpack_parameters(packed: Any, index: Any, number: int, active: Any = True) -> list:
-    """Gather the first `number` parameters of the splats `index`; undoes `pack_parameters`."""
+    """Gather the first `number` parameters of the Gaussians `index`; undo `pack_parameters`."""
     return gather_run(types_of(packed), packed, index, -(-number // 4) * 4, active)[:number]
 
 
 def gather_index(types: ArrayTypes, splat: Any, i: Any, active: Any) -> Any:
-    """``splat[i]`` through a gather of a pair, 8 times as fast as a single one on the CPU."""
+    """Return ``splat[i]`` by the gather of a pair, 8 times as fast on the CPU as a single gather.
+
+    `splat` must have an even length.
+    """
     pair = dr.gather(types.UInt2, splat, i >> 1, active)
     return dr.select((i & 1) == 0, pair[0], pair[1])

@@ -1,8 +1,8 @@
-"""Gaussians as the kernels take them: the one place that knows the units of the kernels.
+"""Conversion of Gaussians to the units of the kernels.
 
 Kernels evaluate ``exp(-1/2 |F (x - mu)|^2)`` as ``2^-|s F (x - mu)|^2`` with ``s = EXP2_SCALE``,
-which saves a product for every pixel. The factors, the cutoff and the covariances of footprints
-therefore reach the kernels in units that hold s.
+which saves a product for every pixel. Factors, cutoffs and covariances of footprints are therefore
+scaled by powers of s before they reach the kernels.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from ..backend.arrays import types_of
 from ..gaussian.gaussians import Gaussians
 
 EXP2_SCALE = math.sqrt(0.5 / math.log(2))
-"""The s of ``exp(-q / 2) = 2^-(s^2 q)``."""
+"""The scale s in ``exp(-q / 2) = 2^-(s^2 q)``."""
 
 NUM_SHAPE_PARAMS = 5
-"""Parameters of a Gaussian before its colour: mean x, mean y, a, b, c."""
+"""Number of parameters of a Gaussian without its colour: mean x, mean y, a, b, c."""
 
 
 @dataclass
@@ -29,7 +29,7 @@ class KernelParameters:
     Attributes
     ----------
     shape : list of 5 Float, shape (N,)
-        Mean x and mean y in pixels; a, b, c times `EXP2_SCALE`, in 1 / pixels.
+        Mean x and mean y in pixels; a, b, c in 1 / pixels, times `EXP2_SCALE`.
     color : list of C Float, shape (N,)
     background : list of C Float, shape (1,)
     """
@@ -40,7 +40,7 @@ class KernelParameters:
 
 
 def kernel_parameters(gaussians: Gaussians) -> KernelParameters:
-    """Return the parameters of a set, its channels as they are; differentiable."""
+    """Return the parameters of a set without decoding its colours; differentiable."""
     return KernelParameters(
         kernel_shape(gaussians), list(gaussians.color), list(gaussians.background)
     )
@@ -52,7 +52,7 @@ def kernel_shape(gaussians: Gaussians) -> list:
 
 
 def detached_shape(gaussians: Gaussians) -> list:
-    """Return `kernel_shape` without derivatives, every row of the full length N."""
+    """Return `kernel_shape` without derivatives; all rows have the length N."""
     zeros = dr.zeros(types_of(gaussians.mean).Float, len(gaussians))
     return [dr.detach(v) + zeros for v in kernel_shape(gaussians)]
 
@@ -74,6 +74,6 @@ def kernel_covariance(covariance: list) -> list:
     Parameters
     ----------
     covariance : list of Float
-        Entries in pixels squared, such as xx, xy, yy of a footprint.
+        Entries such as xx, xy, yy of a footprint, in pixels squared.
     """
     return [entry * (1 / EXP2_SCALE**2) for entry in covariance]

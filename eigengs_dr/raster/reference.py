@@ -1,4 +1,4 @@
-"""Slow renderers with the meaning of the fast one: what tests and benchmarks compare against."""
+"""Slow reference renderers for tests and benchmarks."""
 
 from __future__ import annotations
 
@@ -14,21 +14,24 @@ from .tiles import TileLists
 
 
 def render_plain(values: list, background: list, lists: TileLists, cutoff: float = 3.0) -> Any:
-    """Render as a first Dr.Jit program would: one lane a pixel, derivatives by Dr.Jit alone.
+    """Render with one lane per pixel and Dr.Jit's own derivatives.
+
+    Cost per pixel: the whole list of its tile, with one gather per parameter, and in reverse mode
+    one atomic addition per parameter.
 
     Parameters
     ----------
     values : list of Float, shape (N,)
-        Mean x, mean y, a, b, c (see `eigengs_dr.raster.evaluate`), then the channels.
+        Mean x, mean y, a, b, c in pixels and 1 / pixels, then the channels.
     background : list of Float
     lists : TileLists
     cutoff : float, optional
+        Standard deviations.
 
     Returns
     -------
     Float, shape (height * width * channels,)
-        Row after row. Cost: for every pixel the whole list of its tile, one gather a parameter; in
-        reverse one atomic addition a parameter.
+        Pixels row after row.
     """
     types = types_of(values[0])
     grid = lists.grid
@@ -61,7 +64,7 @@ def render_plain(values: list, background: list, lists: TileLists, cutoff: float
 
 
 def _slots(lists: TileLists, UInt: Any, tile: Any) -> Any:
-    """Positions of tiles in the lists."""
+    """Return the positions of tiles in `TileLists.order`."""
     slot = dr.empty(UInt, lists.grid.tiles)
     dr.scatter(slot, dr.arange(UInt, lists.grid.tiles), lists.order)
     return dr.gather(UInt, slot, tile)
@@ -76,23 +79,25 @@ def render_exact(
     height: int,
     cutoff: float = np.inf,
 ) -> np.ndarray:
-    """Sum all splats at all pixels in float64, without tiles and by default without a cutoff.
+    """Sum all Gaussians at all pixels in float64, without tiles and by default without a cutoff.
+
+    Cost: ``N * width * height`` exponentials.
 
     Parameters
     ----------
     mean : ndarray, shape (N, 2)
+        In pixels.
     factor : ndarray, shape (N, 3)
-        a, b, c of ``F = [[a, b], [0, c]]``.
+        a, b, c of ``F = [[a, b], [0, c]]``, in 1 / pixels.
     color : ndarray, shape (N, C)
     background : ndarray, shape (C,)
     width, height : int
     cutoff : float, optional
-        In standard deviations.
+        Standard deviations.
 
     Returns
     -------
-    ndarray, float64, shape (height, width, C)
-        Cost: N * width * height exponentials.
+    ndarray of float64, shape (height, width, C)
     """
     x = np.arange(width) + 0.5
     y = (np.arange(height) + 0.5)[:, None]

@@ -1,4 +1,4 @@
-"""`render`: Gaussians to an image, differentiable in both modes for every parameter."""
+"""Differentiable rendering of Gaussians, in forward and reverse mode."""
 
 from __future__ import annotations
 
@@ -28,36 +28,37 @@ def render(
 ) -> Any:
     """Render a set of Gaussians at any size.
 
-    Differentiable with respect to mean, factor, color and background, in forward and reverse mode.
-    Sets in YCbCr come out as RGB, sets in linear light in linear light (`picture_of` codes them as
-    sRGB), data as it is; nothing is clamped.
+    The result is differentiable with respect to mean, factor, color and background, in forward and
+    reverse mode. A set in YCbCr renders as RGB, a set in linear light renders in linear light
+    (`picture_of` encodes it as sRGB), and data stays as it is. Values are not clamped.
 
     Parameters
     ----------
     gaussians : Gaussians
     width, height : int, optional
-        Size of the image in pixels; the native size by default. One of the two gives the other by
-        the native aspect ratio.
+        Size of the image in pixels; by default the native size. If only one is given, the native
+        aspect ratio gives the other.
     cutoff : float, optional
-        Standard deviations after which a Gaussian ends, in (0, 12]; by default that of the set.
+        Standard deviations at which a Gaussian ends, in (0, 12]; by default the cutoff of the set.
 
     Returns
     -------
     TensorXf, shape (height, width, C)
-        Dr.Jit tensor of the backend and precision of the set; 1 is white.
+        Dr.Jit tensor with the backend and the precision of the set; 1 is white.
 
     Raises
     ------
     ValueError
-        If a side is not positive or the cutoff not in (0, 12].
+        If a side is not positive or the cutoff is not in (0, 12].
 
     Notes
     -----
-    The order of summation is a function of the input: renderings on one machine and backend are
-    bit-equal. A splat whose mean or factor is not finite is not drawn; a colour that is not finite
-    spoils the tiles that its splat touches. Building tile lists reads sizes back, which
-    `drjit.freeze` does not allow: freeze a function that takes `bin_gaussians`'s result and calls
-    `rasterize`, as `eigengs_dr.fitting.optimizers.descent` does.
+    The order of summation depends only on the input, so renderings on one machine and backend are
+    equal bit by bit. A Gaussian is not drawn if its mean or factor is not finite. If its colour is
+    not finite, pixels of the tiles that it touches may be wrong. `drjit.freeze` cannot record
+    `render`, because the construction of tile lists reads sizes back. Freeze a function that takes
+    the result of `bin_gaussians` and calls `rasterize`, as `eigengs_dr.fitting.optimizers.descent`
+    does.
 
     Examples
     --------
@@ -69,7 +70,8 @@ def render(
     width, height = _size(gaussians, width, height)
     scaled = gaussians.scaled(width, height)
     if cutoff is not None:
-        scaled = replace(scaled, cutoff=float(cutoff))  # float64 of NumPy would promote everything
+        # A NumPy scalar would promote Dr.Jit arrays to float64.
+        scaled = replace(scaled, cutoff=float(cutoff))
     parameters, lists = decode_parameters(scaled), bin_gaussians(scaled)
     image = rasterize(parameters, lists, scaled.cutoff)
     return to_tensor(image, lists.grid, len(parameters.background))
@@ -81,14 +83,14 @@ def picture_of(
     height: int | None = None,
     cutoff: float | None = None,
 ) -> NDArray[Any]:
-    """Render what is looked at and compared: `render`, but linear light coded as sRGB.
+    """Render a set for display and comparison: like `render`, but linear light becomes sRGB.
 
     Parameters and errors as for `render`.
 
     Returns
     -------
     ndarray, shape (height, width, C)
-        1 is white. Light below 0 is black; nothing else is clamped.
+        1 is white. Negative linear light becomes 0; other values are not clamped.
     """
     image = render(dr.detach(gaussians), width, height, cutoff).numpy()
     return to_coded(np.maximum(image, 0)) if gaussians.space == "linear" else image
@@ -111,7 +113,8 @@ def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[
 def decode_parameters(gaussians: Gaussians) -> KernelParameters:
     """Return the parameters of a set with its colours decoded to RGB; differentiable.
 
-    Decoding is linear: N colours are converted instead of H W pixels.
+    Decoding is affine, so the conversion of N colours and the background replaces the conversion of
+    all pixels.
     """
     black = decode(gaussians.space, [0.0] * gaussians.channels)
     color = [
@@ -122,7 +125,7 @@ def decode_parameters(gaussians: Gaussians) -> KernelParameters:
 
 
 def bin_gaussians(gaussians: Gaussians, pad: float = 0.0) -> TileLists:
-    """List the splats of every tile of the image at native size; see `eigengs_dr.raster.tiles`.
+    """List the Gaussians of every tile of the image at native size, enlarged by `pad` pixels.
 
     Raises
     ------
@@ -143,25 +146,22 @@ def rasterize(parameters: KernelParameters, lists: TileLists, cutoff: float) -> 
     ----------
     parameters : KernelParameters
     lists : TileLists
-        Of these Gaussians, or of where they were a few small steps ago.
+        Lists of these Gaussians. Padded lists stay valid while the ellipses move and grow by less
+        than the padding.
     cutoff : float
         Standard deviations.
 
     Returns
     -------
     Float, shape (tiles * pixels * channels,)
-        See `eigengs_dr.raster.kernels` for the layout, `to_tensor` for an image.
+        In the tile layout of `eigengs_dr.raster.kernels`; `to_tensor` makes an image of it.
     """
     values = [*parameters.shape, *parameters.color]
     return dr.custom(_Rasterize, values, parameters.background, lists, kernel_radius(cutoff))
 
 
 class _Rasterize(dr.CustomOp):
-    """``I = background + sum_n c_n w_n`` with the kernels' own derivatives.
-
-    With ``w_n = 2^-q_n``, reverse mode gives every splat the sum over its pixels of ``dL/dI`` times
-    the derivative of its contribution; forward mode sums the derivatives of the contributions.
-    """
+    """``I = background + sum_n c_n w_n`` with the derivatives of `eigengs_dr.raster.kernels`."""
 
     def eval(self, values: list, background: list, lists: TileLists, radius: float) -> Any:
         self.lists, self.radius, self.channels = lists, radius, len(background)
@@ -181,7 +181,7 @@ class _Rasterize(dr.CustomOp):
 
 
 def to_tensor(image: Any, grid: Grid, channels: int) -> Any:
-    """Bring an image from tile layout to a tensor (height, width, channels); differentiable."""
+    """Convert an image from tile layout to a tensor (height, width, channels); differentiable."""
     types = types_of(image)
     shape = (grid.ny * grid.tile[1], grid.nx * grid.tile[0], channels)
     whole = types.Tensor(dr.custom(_Rows, image, grid, channels), shape)
@@ -191,7 +191,7 @@ def to_tensor(image: Any, grid: Grid, channels: int) -> Any:
 
 
 class _Rows(dr.CustomOp):
-    """Permute tile layout to rows; its transpose permutes back. Copies runs of pixels."""
+    """Permutation from tile layout to rows of pixels; the transpose permutes back."""
 
     def eval(self, image: Any, grid: Grid, channels: int) -> Any:
         types = types_of(image)
@@ -217,12 +217,12 @@ class _Rows(dr.CustomOp):
 
 
 def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
-    """Upload an image (height, width, channels) in tile layout; overhanging pixels are 0."""
+    """Upload an image (height, width, channels) in tile layout; pixels outside it are 0."""
     height, width, channels = image.shape
     tile_width, tile_height = grid.tile
     over = (grid.ny * tile_height - height, grid.nx * tile_width - width)
     padded = np.pad(image, [(0, over[0]), (0, over[1]), (0, 0)]) if any(over) else image
-    # A row of a tile is copied as one run.
+    # Pixels and channels share an axis: a row of a tile is then copied as one run.
     tiled = padded.reshape(grid.ny, tile_height, grid.nx, tile_width * channels)
     flat = tiled.transpose(0, 2, 1, 3).reshape(-1)
     return upload(types.Float, flat)

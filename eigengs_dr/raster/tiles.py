@@ -1,8 +1,8 @@
-"""Which splats touch which tiles of the image.
+"""Lists of the Gaussians that touch each tile of the image.
 
-A tile is the block of pixels that one lane of the renderer owns. The cutoff ellipse of a splat is
-tested against the pixel centres of every row of tiles in closed form, so that a stretched splat
-visits the tiles along its axis and not those of its bounding box.
+A tile is the block of pixels that one lane of the renderer owns. A closed form gives the tiles of
+each row that the cutoff ellipse of a Gaussian touches. An elongated Gaussian therefore visits only
+the tiles along its axis, not all tiles of its bounding box.
 """
 
 from __future__ import annotations
@@ -17,17 +17,16 @@ import numpy as np
 from ..backend.arrays import ArrayTypes, types_of, upload
 
 TILE = (4, 4)
-"""Width and height of a tile in pixels. Measured on 2 cores with AVX-512: 4x4 holds the sums of 16
-pixels in registers and visits 1.7 pixels for one inside the ellipse (8x8: 3.3)."""
-
+"""Width and height of a tile in pixels. Measured on 2 cores with AVX-512: 4x4 keeps the sums of 16
+pixels in registers and visits 1.7 pixels for each pixel inside the ellipse (8x8: 3.3)."""
 
 MAX_LIST_ENTRIES = 1 << 28
-"""Longest lists, all tiles together: sorting them takes 4 GiB."""
+"""Largest number of entries in the lists of all tiles; sorting them takes 4 GiB."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A `width` x `height` image cut into `nx` x `ny` tiles of `tile` pixels; the last overhang."""
+    """Division of a `width` x `height` image into `nx` x `ny` tiles; the last may overhang."""
 
     width: int
     height: int
@@ -35,40 +34,40 @@ class Grid:
 
     @property
     def nx(self) -> int:
-        """Tiles in a row."""
+        """Number of columns of tiles."""
         return -(-self.width // self.tile[0])
 
     @property
     def ny(self) -> int:
-        """Rows of tiles."""
+        """Number of rows of tiles."""
         return -(-self.height // self.tile[1])
 
     @property
     def tiles(self) -> int:
-        """All tiles."""
+        """Number of tiles."""
         return self.nx * self.ny
 
     @property
     def pixels(self) -> int:
-        """Pixels of one tile."""
+        """Number of pixels of one tile."""
         return self.tile[0] * self.tile[1]
 
 
 @dataclass(frozen=True)
 class TileLists:
-    """For every tile the splats that may touch it, in ascending order.
+    """Indices of the Gaussians that may touch each tile, in ascending order.
 
     Attributes
     ----------
     grid : Grid
-    splat : UInt32, shape (entries,)
-        Indices of splats, tile after tile; what follows the last list is not used.
+    splat : UInt32, shape (capacity,)
+        Indices of Gaussians, tile after tile; entries after the last list are not used.
     begin, end : UInt32, shape (tiles,)
-        Where the list of the tile `order[i]` lies in `splat`.
+        Range in `splat` of the list of the tile ``order[i]``.
     order : UInt32, shape (tiles,)
-        Tiles by descending length of their lists: lanes of one SIMD packet then run equally long.
+        Tiles by descending length of their lists: lanes of one SIMD packet then take equally long.
     splat_order : UInt32, shape (N,)
-        Splats by descending number of their tiles, for the same reason.
+        Gaussians by descending number of their tiles, for the same reason.
     """
 
     grid: Grid
@@ -82,29 +81,29 @@ class TileLists:
 def tile_columns(
     shape: list, radius: Any, grid: Grid, row: Any, pad: float = 0.0
 ) -> tuple[Any, Any]:
-    """Columns of tiles `[first, last)` that the ellipse of a splat touches in one row of tiles.
+    """Return the columns `[first, last)` that the ellipse of a Gaussian touches in a row of tiles.
 
     The ellipse is ``(a dx + b dy)^2 + (c dy)^2 <= radius^2``. At height dy its right edge is
-    ``(-b dy + sqrt(radius^2 - c^2 dy^2)) / a``, concave in dy with its maximum at
-    ``dy* = -b radius / (c sqrt(b^2 + c^2))``; the left edge is its mirror image with the minimum at
-    ``-dy*``. Clamping both to the row gives the exact extent over the row.
+    ``(-b dy + sqrt(radius^2 - c^2 dy^2)) / a``, which is concave in dy with its maximum at
+    ``dy* = -b radius / (c sqrt(b^2 + c^2))``. The left edge is the mirror image with its minimum at
+    ``-dy*``. Both heights, clamped to the row, give the exact extent in the row.
 
     Parameters
     ----------
     shape : list of 5 Float
-        Mean x, mean y, a, b, c in pixels and 1 / pixels, a > 0 and c > 0.
+        Mean x, mean y in pixels; a, b, c in 1 / pixels, in the units of `radius`; a > 0, c > 0.
     radius : float
         Cutoff in the units of the factor.
     grid : Grid
     row : Int32
         Row of tiles.
     pad : float, optional
-        Pixels added on every side.
+        Pixels by which the ellipse is enlarged on every side.
 
     Returns
     -------
     first, last : Int32
-        Clamped to the grid; ``first >= last`` where the row is not touched.
+        Clamped to the grid; ``first >= last`` if the ellipse does not touch the row.
     """
     mx, my, a, b, c = shape
     width, height = grid.tile
@@ -132,7 +131,7 @@ def tile_columns(
 
 
 def tile_rows(shape: list, radius: Any, grid: Grid, pad: float = 0.0) -> tuple[Any, Any]:
-    """Rows of tiles `[first, last)` that the ellipse of a splat may touch; see `tile_columns`."""
+    """Return the rows of tiles `[first, last)` that the ellipse may touch; see `tile_columns`."""
     Int = types_of(shape[0]).Int
     my, c = shape[1], shape[4]
     height = grid.tile[1]
@@ -153,21 +152,21 @@ def for_each_tile(
     pad: float = 0.0,
     label: str,
 ) -> Any:
-    """Let every splat visit the tiles that its cutoff ellipse touches, row by row.
+    """Call `visit` for every Gaussian and every tile that its ellipse touches, row by row.
 
-    The two loops over rows and columns are run as one, so that lanes of a packet wait for the
-    longest walk in total and not for the longest row each time.
+    One loop covers rows and columns: lanes of a packet then wait once for the longest walk, and not
+    in every row for the longest row.
 
     Parameters
     ----------
     shape : list of 5 Float, shape (N,)
-        As in `tile_columns`.
+        As for `tile_columns`.
     radius, grid, pad
-        As in `tile_columns`.
+        As for `tile_columns`.
     visit : callable
-        ``visit(tile, column, row, active, state) -> state``, tile being ``row * nx + column``.
+        ``visit(tile, column, row, active, state) -> state`` with ``tile = row * nx + column``.
     state : PyTree
-        Whatever `visit` accumulates.
+        Initial state.
     label : str
         Name of the loop for profilers.
 
@@ -198,21 +197,22 @@ def for_each_tile(
 
 
 def build_lists(shape: list, radius: float, grid: Grid, pad: float = 0.0) -> TileLists:
-    """List for every tile the splats whose cutoff ellipse touches it.
+    """List for every tile the Gaussians whose cutoff ellipse touches it.
 
-    Every splat counts its tiles, then writes one key ``tile * N + splat`` for each; sorting the
-    keys gives the lists. The order is a function of the input alone, so renderings are bit-equal.
-    Cost: O(entries log entries); the splats are walked twice.
+    Every Gaussian counts its tiles, then writes a key ``tile * N + index`` for each tile. The
+    sorted keys give the lists. Their order depends only on the input, so renderings are equal bit
+    by bit. Cost: O(entries log entries) and two visits of all tiles.
 
     Parameters
     ----------
-    shape : list of 5 Float, shape (N,)
-        Mean x, mean y and the factor a, b, c, as in `tile_columns`.
-    radius : float
-        Cutoff in the units of the factor.
-    grid : Grid
+    shape, radius, grid
+        As for `tile_columns`; arrays of shape (N,).
     pad : float, optional
-        Pixels by which the ellipses are enlarged, so that lists stay valid while splats move.
+        Pixels by which the ellipses are enlarged, so that lists stay valid while Gaussians move.
+
+    Returns
+    -------
+    TileLists
 
     Raises
     ------
@@ -234,8 +234,8 @@ def build_lists(shape: list, radius: float, grid: Grid, pad: float = 0.0) -> Til
     entries = int(dr.sum(dr.uint64_array_t(types.UInt)(touched))[0])
     if entries >= MAX_LIST_ENTRIES:
         raise ValueError(
-            f"{count} splats touch {entries} tiles in all, {MAX_LIST_ENTRIES} can be listed: "
-            "use fewer or smaller splats, or a smaller image"
+            f"{count} Gaussians touch {entries} tiles, the limit is {MAX_LIST_ENTRIES}: "
+            "use fewer or smaller Gaussians, or a smaller image"
         )
     Key = types.UInt if grid.tiles * count < 2**32 else dr.uint64_array_t(types.UInt)
     keys = dr.empty(Key, max(entries, 1))
@@ -255,10 +255,10 @@ def build_lists(shape: list, radius: float, grid: Grid, pad: float = 0.0) -> Til
 def _lists(
     types: ArrayTypes, grid: Grid, count: int, keys: Any, entries: int, touched: Any
 ) -> TileLists:
-    """Turn sorted keys ``tile * N + splat`` into lists."""
+    """Convert sorted keys ``tile * N + index`` to lists."""
     Key = type(keys)
-    # A power of two: numbers in programs are constants, and few of them keep what is compiled and
-    # what is frozen in use. It is even as well, so that lists can be read in pairs.
+    # Programs contain the capacity as a constant: with powers of two, few programs are compiled and
+    # frozen ones can be replayed. The capacity is even, so that lists can be read in pairs.
     capacity = 2 << entries.bit_length()
     padded = dr.full(Key, (1 << 8 * dr.itemsize_v(Key)) - 1, capacity)
     if entries:
@@ -279,7 +279,7 @@ def _lists(
 
 
 def _order_descending(length: Any) -> Any:
-    """Indices that sort lengths in descending order, ties by index."""
+    """Return the indices that sort lengths in descending order, and equal lengths by index."""
     UInt = type(length)
     count = dr.width(length)
     Key = dr.uint64_array_t(UInt)

@@ -1,1 +1,1 @@
-"""Files of arrays, whole or not at all. NumPy only."""
+"""Files of NumPy arrays, each written completely or not at all."""

@@ -1,4 +1,4 @@
-"""Writing a file whole or not at all."""
+"""Files that are written completely or not at all."""
 
 import os
 import secrets
@@ -9,26 +9,27 @@ from pathlib import Path
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Replace a file in one step: write to the path that is given, beside the target.
+    """Replace a file in one step: write a temporary file, then rename it to the target.
 
-    Readers see the old file or the new one, never a part of it, also after a crash.
+    Readers see the old file or the new file, never a part of it, even after a crash.
 
     Parameters
     ----------
     path : str or os.PathLike
-        The target, which may exist; its folder must. A symbolic link is followed.
+        The target. It may exist, and its folder must exist. A symbolic link is followed.
 
     Yields
     ------
     Path
-        An empty temporary file with the target's suffix. When the block ends it is flushed to disk
-        and renamed; when the block raises it is removed and the target stays as it was.
+        An empty temporary file with the target's suffix, in the target's folder. At the end of the
+        block it is flushed to disk and renamed. If the block raises, the temporary file is deleted
+        and the target does not change.
 
     Raises
     ------
     OSError
-        If the folder is missing or may not be written, the target is a folder or a device, or the
-        disk is full; it names the target.
+        If the folder is missing or not writable, the target is a folder or a device, or the disk is
+        full. The message names the target.
 
     Examples
     --------
@@ -37,7 +38,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = _target(path)
     temporary = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
-    # touch() rather than tempfile, whose files only their owner may read.
+    # tempfile would make a file that only its owner may read.
     temporary.touch(exist_ok=False)
     try:
         yield temporary
@@ -47,37 +48,37 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     except BaseException as error:
         temporary.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):
-            # A full disk is reported without a name, or with that of the temporary file.
+            # The error of a full disk has no name, or the name of the temporary file.
             raise OSError(error.errno, error.strerror or str(error), str(path)) from error
         raise
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:
-    """Check that `atomic_write` will be able to write a file, before long work depends on it.
+    """Check that `atomic_write` can write a file, before long work depends on it.
 
     Parameters
     ----------
     path : str or os.PathLike
-        The file that is to be written.
+        The target.
 
     Raises
     ------
     OSError
-        One line that names the file and says why it cannot be written.
+        If the file cannot be written: one line that names the file and the reason.
     """
     target = _target(path)
     probe = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
     try:
-        # A look at the mode bits would miss read-only disks, quotas and access lists.
+        # Mode bits do not show read-only disks, quotas and access lists.
         probe.touch(exist_ok=False)
         probe.unlink()
     except OSError as error:
-        reason = f"no file can be made in {target.parent} ({error.strerror})"
+        reason = f"cannot create a file in {target.parent} ({error.strerror})"
         raise OSError(f"{path}: {reason}; choose another path") from error
 
 
 def _target(path: str | os.PathLike[str]) -> Path:
-    """Where a path leads; refuses what must not be renamed over, such as /dev/null."""
+    """Follow links, and refuse a target that must not be replaced, such as /dev/null."""
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
         kind = "a folder" if target.is_dir() else "a device"

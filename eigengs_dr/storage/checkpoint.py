@@ -1,4 +1,4 @@
-"""Checkpoints of a training: a folder beside the model, from which a killed run goes on."""
+"""Checkpoint of a training: a folder beside the model, from which a stopped run continues."""
 
 from __future__ import annotations
 
@@ -17,29 +17,38 @@ from .atomic import atomic_write
 FORMAT, VERSION = "eigengs_dr.checkpoint", 1
 
 MAX_ENTRIES = 1 << 31
-"""Largest array: the components of large images are."""
+"""Largest number of elements of one array; the components of large images need so large a limit."""
 
 
 class Checkpoint:
-    """Named sets of arrays in a folder, all of one run.
+    """A folder with the named sets of arrays of one run.
 
-    A context manager: the folder is deleted when its block ends, but kept when the block raises.
+    As a context manager it deletes the folder at the end of the block. If the block raises, the
+    folder stays, unless it holds no work.
 
     Parameters
     ----------
     output : path-like
-        The model that is trained; the folder is named like it, with ".checkpoint" added.
+        The file of the model; the folder has the same name with ".checkpoint" added.
     settings : dict
-        What decides the result, as JSON has it. A folder of other settings is refused.
+        Options on which the result depends, with values that JSON can hold.
     files : list of str
-        Images to train on. Those of a run that is gone on with replace them, see `files`.
+        Images to train on. If the folder exists, its list replaces this one.
+
+    Attributes
+    ----------
+    folder : Path
+    files : list of str
+        Images of the run, in the order of its first start.
+    resumed : bool
+        Whether the folder existed, so that the run continues an earlier run.
 
     Raises
     ------
     ValueError
-        If the folder is of a run with other settings, or damaged.
+        If the folder belongs to a run with other settings, or is damaged.
     OSError
-        If it cannot be made.
+        If the folder cannot be created.
     """
 
     def __init__(
@@ -47,9 +56,7 @@ class Checkpoint:
     ) -> None:
         self.folder = Path(f"{os.fspath(output)}.checkpoint")
         self.files = files
-        """Images of the run, in order: those that the folder held when it began."""
         self.resumed = self.folder.exists()
-        """Whether the run goes on with the work of another."""
         head = self.folder / "run.json"
         if not self.resumed:
             self.folder.mkdir()
@@ -61,38 +68,44 @@ class Checkpoint:
             known, self.files = found["settings"], [str(name) for name in found["files"]]
         except (OSError, ValueError, KeyError, TypeError):
             raise ValueError(
-                f"{self.folder}: is no readable checkpoint; delete the folder to start anew"
+                f"{self.folder}: not a readable checkpoint; delete the folder to start again"
             ) from None
         different = [key for key in settings if known.get(key) != settings[key]]
         if different:
             key = different[0]
             raise ValueError(
-                f"{self.folder}: holds a run that was interrupted, with {key} {known.get(key)} "
-                f"instead of {settings[key]}; go on with its settings, or delete the folder"
+                f"{self.folder}: holds an interrupted run with {key} {known.get(key)} "
+                f"instead of {settings[key]}; use its settings, or delete the folder"
             )
 
     def __enter__(self) -> Checkpoint:
         return self
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        """Delete the folder where the work is done, or nothing was saved in it."""
+        """Delete the folder if the block ended without an error or nothing was saved."""
         if error is None or not self.holds_work:
             shutil.rmtree(self.folder, ignore_errors=True)
 
     @property
     def holds_work(self) -> bool:
-        """Whether anything was saved."""
+        """Whether the folder holds arrays."""
         return any(self.folder.glob("[!.]*.npz"))
 
     def save(self, name: str, arrays: dict[str, NDArray[Any]]) -> None:
-        """Keep arrays under a name; those that were there are replaced in one step."""
+        """Write arrays under a name, and replace older arrays of this name in one step.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written; an existing file does not change.
+        """
         fields = {key: [array.dtype.str[1:], array.ndim] for key, array in arrays.items()}
         layout = np.frombuffer(json.dumps(fields).encode(), np.uint8)
         members = {"layout": layout, **arrays}
         archive.write(self.folder / f"{name}.npz", FORMAT, VERSION, members, compressed=False)
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
-        """Return what was saved under a name, or None.
+        """Return the arrays that were saved under a name, or None.
 
         Raises
         ------
@@ -113,5 +126,5 @@ class Checkpoint:
         return archive.read(path, FORMAT, VERSION, fields)
 
     def remove(self, name: str) -> None:
-        """Delete what was saved under a name."""
+        """Delete the arrays that were saved under a name."""
         (self.folder / f"{name}.npz").unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Files of arrays: ``.npz`` without pickle, checked before an array is read."""
+"""Files of arrays: ``.npz`` without pickle; headers are checked before arrays are read."""
 
 from __future__ import annotations
 
@@ -17,15 +17,25 @@ from numpy.typing import NDArray
 from .atomic import atomic_write
 
 MAX_ENTRIES = 1 << 26
-"""Largest number of elements read for one array: what a file claims is not believed beyond."""
+"""Largest number of elements of one array; a file that claims more is refused."""
 
 
 class BadValue(ValueError):
-    """Something in a file that does not fit; callers put the name of the file before it."""
+    """A value in a file is wrong; callers put the name of the file before the message."""
 
 
 class Field(NamedTuple):
-    """What an array in a file must be: NumPy kind ("f4", "i8", "U"), dimensions, most elements."""
+    """Properties that an array in a file must have.
+
+    Attributes
+    ----------
+    kind : str
+        NumPy type, such as "f4", "i8" or "U" for text.
+    ndim : int
+        Number of dimensions.
+    most : int
+        Largest number of elements.
+    """
 
     kind: str
     ndim: int
@@ -39,7 +49,7 @@ def write(
     arrays: dict[str, NDArray[Any]],
     compressed: bool = True,
 ) -> None:
-    """Write arrays with the name and version of their format, all or nothing.
+    """Write arrays with the name and the version of their format, in one step.
 
     Parameters
     ----------
@@ -49,12 +59,12 @@ def write(
     version : int
     arrays : dict of str to ndarray
     compressed : bool, optional
-        Not worth its time for many single-precision numbers.
+        Large arrays of single-precision numbers hardly shrink and take long to compress.
 
     Raises
     ------
     OSError
-        If the file cannot be written; an existing one is then as before.
+        If the file cannot be written; an existing file does not change.
     """
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         members: dict[str, Any] = {"format": np.array(name), "version": np.array(version), **arrays}
@@ -70,10 +80,11 @@ def read(
     ----------
     path : path-like
     name : str
-        Format expected.
+        Expected format.
     version : int
-        Newest version understood.
+        Newest version that the caller can read.
     layout : dict of str to Field
+        Arrays to read.
 
     Returns
     -------
@@ -82,10 +93,11 @@ def read(
     Raises
     ------
     ValueError
-        If the file is no such archive, truncated, of another format or newer, or an array is
-        missing, of another type or larger than it may be. One line: file, key, what was expected.
+        If the file is no such archive, is truncated, or has another format or a newer version; if
+        an array is missing, has another type or is too large. One line names the file, the key and
+        the expected value.
     OSError
-        If it cannot be opened.
+        If the file cannot be opened.
     """
     with _opened(Path(path), name) as archive:
         found = str(_member(archive, "format", Field("U", 0)))
@@ -105,29 +117,29 @@ def read_version(path: str | os.PathLike[str], name: str, version: int) -> int:
 
 
 def format_of(path: str | os.PathLike[str]) -> str:
-    """Return the name of the format of a file that `write` wrote; raises what `read` does."""
+    """Return the name of the format of a file that `write` wrote; errors as for `read`."""
     with _opened(Path(path), "eigengs_dr") as archive:
         return str(_member(archive, "format", Field("U", 0)))
 
 
 @contextmanager
 def _opened(path: Path, name: str) -> Iterator[zipfile.ZipFile]:
-    """Open a file; whatever goes wrong while it is read becomes one line."""
+    """Open a file, and turn every error inside the block into one line."""
     with path.open("rb") as file:
         try:
             with zipfile.ZipFile(file) as archive:
                 yield archive
         except BadValue as error:
             raise ValueError(f"{path}: {error}") from None
-        except Exception as error:  # zlib, lzma, zipfile and NumPy each raise what they like
+        except Exception as error:  # zlib, lzma, zipfile and NumPy raise many types
             raise ValueError(
                 f"{path}: not a readable {name} file ({' '.join(str(error).split())[:80]}); "
-                "it may be damaged or something else"
+                "it may be damaged or of another kind"
             ) from None
 
 
 def _member(archive: zipfile.ZipFile, key: str, field: Field) -> NDArray[Any]:
-    """Read one array after its header was checked."""
+    """Check the header of one array, then read the array."""
     try:
         entry = archive.getinfo(f"{key}.npy")
     except KeyError:

@@ -149,7 +149,7 @@ def test_mistaken_options(options, words, scene, tmp_path):
 
 def test_mistaken_files(scene, tmp_path):
     assert_refused(run(tmp_path / "no.xml", "-o", tmp_path / "x.png"), "no.xml")
-    assert_refused(run(scene(), "-o", tmp_path / "no" / "x.png"), "no file can be made")
+    assert_refused(run(scene(), "-o", tmp_path / "no" / "x.png"), "cannot create a file")
     assert_refused(run(scene(), "-o", tmp_path / "x.jpg"), ".png or .exr")
 
 

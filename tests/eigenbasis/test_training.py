@@ -252,7 +252,7 @@ def test_damaged_checkpoint(folder, output, in_pieces, stage, call, name):
 
 def test_a_file_in_place_of_the_checkpoint(folder, output):
     checkpoint_of(output).write_text("mine")
-    with pytest.raises(ValueError, match="no readable checkpoint"):
+    with pytest.raises(ValueError, match="not a readable checkpoint"):
         train(folder, output, settings())
     assert checkpoint_of(output).read_text() == "mine"
 

@@ -1,1 +1,1 @@
-"""The sum at scattered points and through footprints, as textures need it."""
+"""The sum of Gaussians at scattered points and through footprints, for textures."""

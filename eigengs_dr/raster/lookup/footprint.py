@@ -1,4 +1,4 @@
-"""A splat seen through a Gaussian footprint: how wide that is, and what borders leave of both."""
+"""Gaussian footprints: the bounds of their size, and the part of them that lies in the image."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import drjit as dr
 from ..parameters import EXP2_SCALE
 
 MAX_FOOTPRINT = 0.4
-"""Largest standard deviation of a footprint, in widths and heights of the texture. One that is as
-wide as this in all directions sees the mean: what it leaves of a repeating texture is below
-``exp(-(2 pi WIDEST)^2 / 2)`` = 4 % of its coarsest wave."""
+"""Largest standard deviation of a footprint, in widths and heights of the texture. A footprint that
+has it in all directions gets the mean of the texture: it would keep at most
+``exp(-(2 pi MAX_FOOTPRINT)^2 / 2)`` = 4 % of the coarsest wave of a repeating texture."""
 
 
 def bound_covariance(metric: list) -> tuple[list, Any]:
-    """Invert the metric of a footprint, with no axis longer than `MAX_FOOTPRINT`.
+    """Invert the metric of a footprint, and shorten its axes to at most `MAX_FOOTPRINT`.
 
-    Of a symmetric 2x2 matrix M with eigenvalues p > q is
-    ``f(M) = f(q) + (M - q) (f(p) - f(q)) / (p - q)``; here ``f(p) = 1 / max(p, WIDEST^-2)``.
+    A symmetric 2x2 matrix M with the eigenvalues p > q has
+    ``f(M) = f(q) + (M - q) (f(p) - f(q)) / (p - q)``. Here ``f(p) = 1 / max(p, MAX_FOOTPRINT^-2)``.
 
     Parameters
     ----------
@@ -29,9 +29,10 @@ def bound_covariance(metric: list) -> tuple[list, Any]:
     Returns
     -------
     covariance : list of 3 Float
-        xx, xy, yy.
+        xx, xy, yy, in squared widths and heights of the texture.
     blind : Bool
-        Where the footprint is so wide in all directions that only the mean is left, or not finite.
+        True if all axes are longer than `MAX_FOOTPRINT` or the metric is not finite: the caller
+        should use the mean of the texture.
     """
     xx, xy, yy = metric
     floor = 1 / MAX_FOOTPRINT**2
@@ -48,21 +49,27 @@ def bound_covariance(metric: list) -> tuple[list, Any]:
 
 
 def inside_share(shape: list, footprint: list, x: Any, y: Any, width: int, height: int) -> Any:
-    """What part of ``footprint x splat`` lies in the image.
+    """Return the part of the product of a footprint and a Gaussian that lies in the image.
 
-    The product of both Gaussians is one with the mean ``x - Sigma_f Sigma'^-1 (x - mu)`` and the
-    covariance ``Sigma_f - Sigma_f Sigma'^-1 Sigma_f``. Its mass in a rectangle is taken for the
-    product of the masses in the two strips: exact but near corners.
+    The product is a Gaussian with the mean ``x - Sigma_f Sigma'^-1 (x - mu)`` and the covariance
+    ``Sigma_f - Sigma_f Sigma'^-1 Sigma_f``. The masses in the vertical and the horizontal strip of
+    the image are multiplied. The result is exact except near corners.
 
     Parameters
     ----------
     shape : list of 5 Float
-        Of the widened splat, from `widen`.
+        The widened Gaussian, from `eigengs_dr.raster.evaluate.widen`.
     footprint : list of 3 Float
-        As in `widen`.
+        As for `eigengs_dr.raster.evaluate.widen`.
     x, y : Float
-        Centre of the footprint.
+        Centre of the footprint, in pixels.
     width, height : int
+        Size of the image, in pixels.
+
+    Returns
+    -------
+    Float
+        In [0, 1].
     """
     mean_x, mean_y, a, b, c = shape
     fxx, fxy, fyy = footprint
@@ -82,7 +89,10 @@ def inside_share(shape: list, footprint: list, x: Any, y: Any, width: int, heigh
 
 
 def quick_erf(x: Any) -> Any:
-    """Error function to 0.005, at a fifth of the cost: the best odd polynomial that ends flat."""
+    """Return the error function to 0.005 at a fifth of its cost.
+
+    The odd polynomial of degree 7 has the slope 0 at both ends of [-2, 2].
+    """
     x = dr.clip(x, -2, 2)
     q = x * x
     p = dr.fma(dr.fma(dr.fma(-0.00595457, q, 0.07127595), q, -0.34688831), q, 1.12823041)

@@ -1,9 +1,9 @@
-"""The value of a sum of Gaussians at scattered points: what a texture is asked for.
+"""The sum of Gaussians at scattered points, for the lookups of textures.
 
-The plane of the image is cut into cells, and each cell lists the splats whose cutoff ellipse
-touches it, so that a point costs as many splats as overlap near it, however many there are.
-Everything here may run inside a virtual function call, where Dr.Jit knows no custom derivatives:
-its own autodiff gives gradients with respect to the packed parameters.
+The image is divided into cells, and each cell lists the Gaussians whose cutoff ellipse touches it.
+The cost of a point depends on the Gaussians near it, not on the size of the set. Virtual function
+calls of Dr.Jit do not support custom derivatives, so Dr.Jit's own autodiff gives the gradients with
+respect to the packed parameters.
 """
 
 from __future__ import annotations
@@ -24,17 +24,18 @@ from ..tiles import Grid, build_lists
 
 @dataclass(frozen=True)
 class Cells:
-    """For every cell the splats that may touch it.
+    """Indices of the Gaussians that may touch each cell.
 
     Attributes
     ----------
     grid : Grid
-        Of the image and `margin` pixels more on every side.
+        Cells of the image, enlarged by `margin` on every side.
     margin : int
-    splat : UInt32, shape (entries,)
-        Indices of splats, cell after cell.
-    ends : UInt32, shape (2 cells,)
-        Begin and end of the list of each cell in `splat`, one after the other.
+        In pixels.
+    splat : UInt32, shape (capacity,)
+        Indices of Gaussians, cell after cell.
+    ends : UInt32, shape (2 * cells,)
+        Begin and end in `splat` of the list of each cell.
     """
 
     grid: Grid
@@ -44,10 +45,10 @@ class Cells:
 
 
 def cell_side(width: int, height: int, count: int) -> int:
-    """Side of cells in pixels: 0.8 of the spacing of the splats, as a power of two.
+    """Return the side of cells, in pixels: 0.8 times the spacing of Gaussians, as a power of two.
 
-    Half of it lists fewer splats that miss the point, saves 3 % of a rendering, and takes three
-    times as long to list.
+    Cells of half this side save 3 % of the time of a rendering, because their lists hold fewer
+    Gaussians that miss the point, but the lists take three times as long to build.
     """
     spacing = math.sqrt(width * height / count)
     return 1 << max(0, round(math.log2(0.8 * spacing)))
@@ -56,24 +57,28 @@ def cell_side(width: int, height: int, count: int) -> int:
 def list_cells(
     shape: list, width: int, height: int, radius: float, side: int, margin: int = 0
 ) -> Cells:
-    """List the splats of every cell of an image and its margin.
+    """List the Gaussians of every cell of an image and its margin.
 
     Parameters
     ----------
     shape : list of 5 Float, shape (N,)
-        Mean x, mean y and the factor a, b, c, as `eigengs_dr.raster.evaluate.weights` takes them.
+        Mean x, mean y, a, b, c, as for `eigengs_dr.raster.evaluate.weights`.
     width, height : int
-        Of the image, in pixels.
+        Size of the image, in pixels.
     radius : float
         Cutoff in the units of the factor.
     side : int
-        Of a cell, in pixels.
+        Side of a cell, in pixels.
     margin : int, optional
-        Pixels around the image that have cells too.
+        Width of the border around the image that has cells too, in pixels.
+
+    Returns
+    -------
+    Cells
     """
     grid = Grid(width + 2 * margin, height + 2 * margin, (side, side))
     moved = [shape[0] + margin, shape[1] + margin, *shape[2:]]
-    # Lists are built for pixel centres; half a pixel more makes them good for all points.
+    # Lists are built for pixel centres; half a pixel of padding makes them valid for all points.
     lists = build_lists(moved, radius, grid, pad=0.5)
     types = types_of(shape[0])
     ends = dr.empty(types.UInt, 2 * grid.tiles)
@@ -83,29 +88,31 @@ def list_cells(
 
 
 def fold(x: Any, side: int, wrap: str) -> tuple[Any, Any]:
-    """Bring a coordinate into the image, as `wrap` says what lies outside.
+    """Move a coordinate into the image.
 
     Parameters
     ----------
     x : Float
         In pixels.
     side : int
-        Of the image.
+        Width or height of the image, in pixels.
     wrap : {"repeat", "mirror", "clamp"}
+        Continuation of the image outside its borders.
 
     Returns
     -------
     x : Float
         In [0, side]; NaN and infinities become 0.
     slope : Float
-        Its derivative: 1, or -1 where the image is mirrored, or 0 where it is clamped.
+        The derivative: 1, or -1 in a mirrored copy, or 0 in a clamped part.
     """
     x = dr.select(dr.isfinite(x), x, 0)
     one = type(x)(1)
     if wrap == "clamp":
         return dr.clip(x, 0, side), dr.select((x >= 0) & (x <= side), one, 0)
     period = dr.floor(x * (1 / side))
-    local = dr.clip(dr.fma(period, -side, x), 0, side)  # far out, rounding leaves the image
+    # Far from the image, rounding errors exceed its size.
+    local = dr.clip(dr.fma(period, -side, x), 0, side)
     if wrap == "repeat":
         return local, one
     odd = dr.fma(-2, dr.floor(0.5 * period), period) == 1
@@ -113,12 +120,12 @@ def fold(x: Any, side: int, wrap: str) -> tuple[Any, Any]:
 
 
 def cell_range(cells: Cells, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
-    """Begin and end of the list of the cell at a point; both 0 outside the cells."""
+    """Return begin and end of the list of the cell at a point; both are 0 outside the cells."""
     types = types_of(x)
     grid = cells.grid
     column = types.Int(dr.floor((x + cells.margin) * (1 / grid.tile[0])))
     row = types.Int(dr.floor((y + cells.margin) * (1 / grid.tile[1])))
-    # The borders of the image belong to it.
+    # The last cells include the right and the lower border.
     column = dr.select(x == grid.width - cells.margin, grid.nx - 1, column)
     row = dr.select(y == grid.height - cells.margin, grid.ny - 1, row)
     inside = active & (column >= 0) & (column < grid.nx) & (row >= 0) & (row < grid.ny)
@@ -136,25 +143,25 @@ def sum_at_points(
     terms: Callable[[list, Any, Any], list],
     count: int,
 ) -> list:
-    """Sum what the splats near a point contribute there.
+    """Sum the contributions of the Gaussians near a point.
 
-    Cost: one gather of the parameters and one call of `terms` for each splat listed.
+    Cost: one gather of parameters and one call of `terms` for each Gaussian in the list of the
+    cell.
 
     Parameters
     ----------
     cells : Cells
     packed : Float
-        Parameters of every splat, from `eigengs_dr.raster.layout.pack_parameters`; may carry
-        gradients.
+        Parameters from `eigengs_dr.raster.layout.pack_parameters`; may carry gradients.
     number : int
-        Parameters of one splat.
+        Number of parameters of one Gaussian.
     x, y : Float
         In pixels, x to the right and y down.
     active : Bool
     terms : callable
-        ``terms(parameters, x, y)`` returns what a splat contributes.
+        ``terms(parameters, x, y)`` returns the contributions of a Gaussian as a list of Float.
     count : int
-        Number of these values.
+        Length of this list.
 
     Returns
     -------
@@ -168,7 +175,7 @@ def sum_at_points(
         splat = unpack_parameters(packed, gather_index(types, cells.splat, i, here), number, here)
         return i + 1, end, x, y, [s + t for s, t in zip(sums, terms(splat, x, y), strict=True)]
 
-    # A pure sum, which "-1" tells Dr.Jit: its gradient needs no storage.
+    # max_iterations=-1 tells Dr.Jit that the loop is a pure sum: its gradient needs no storage.
     return dr.while_loop(
         (begin, end, x, y, [types.Float(0) for _ in range(count)]),
         lambda i, end, *rest: i < end,
@@ -180,7 +187,7 @@ def sum_at_points(
 
 
 def value_terms(radius: float) -> Callable[[list, Any, Any], list]:
-    """Terms of the sum itself: ``c_n w_n(x)``; see `sum_at_points`."""
+    """Return the `terms` of `sum_at_points` for the values ``c_n w_n(x)``."""
 
     def terms(splat: list, x: Any, y: Any) -> list:
         (w,) = weights(splat[:NUM_SHAPE_PARAMS], x, y, (1, 1), radius)
@@ -190,10 +197,10 @@ def value_terms(radius: float) -> Callable[[list, Any, Any], list]:
 
 
 def gradient_terms(radius: float) -> Callable[[list, Any, Any], list]:
-    """Terms of the sum and of its derivatives along x and y, three for every channel.
+    """Return the `terms` of `sum_at_points` for values and derivatives along x and y.
 
-    ``grad w = -2 ln(2) w F^T F (x - mu)``, with F in units of
-    `eigengs_dr.raster.evaluate.EXP2_SCALE`.
+    Each channel has three terms. ``grad w = -2 ln(2) w F^T F (x - mu)`` with F in the units of the
+    kernels, see `eigengs_dr.raster.parameters.EXP2_SCALE`.
     """
 
     def terms(splat: list, x: Any, y: Any) -> list:

@@ -1,9 +1,9 @@
-"""The sum of Gaussians seen through a Gaussian footprint: a prefilter in closed form.
+"""The sum of Gaussians filtered by a Gaussian footprint, in closed form.
 
-A Gaussian convolved with a Gaussian is one again, so what a pixel sees of a texture is the sum of
-widened splats (`eigengs_dr.raster.evaluate.widen`): no mip map, no more samples. A texture ends at
-its borders, or repeats: a splat then counts with the share of ``footprint x splat`` that lies in
-the image, and copies of the image that the footprint reaches are summed as well.
+The convolution of two Gaussians is a Gaussian. Therefore a pixel sees the sum of widened Gaussians
+(`eigengs_dr.raster.evaluate.widen`) and needs neither a mip map nor more samples. At the borders of
+the image, a Gaussian is multiplied by the part of its product with the footprint that lies in the
+image, and the sum includes all copies of the image that the footprint reaches.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .points import sum_at_points
 from .size_classes import SizeClasses
 
 FOOTPRINT_REACH = 3.0
-"""Standard deviations after which a footprint ends, where copies of the image are looked for."""
+"""Half-width of a footprint, in standard deviations, in the search for copies of the image."""
 
 
 def sum_prefiltered(
@@ -35,27 +35,29 @@ def sum_prefiltered(
     active: Any,
     cutoff: float,
 ) -> list:
-    """Sum the splats that a footprint sees.
+    """Sum the Gaussians under a footprint.
+
+    Cost: one `widen` and one weight for each Gaussian near the footprint, in the image and in each
+    copy that the footprint reaches; four error functions more if it crosses a border.
 
     Parameters
     ----------
-    sizes : Sizes
+    sizes : SizeClasses
     packed, number
-        As in `eigengs_dr.raster.lookup.points.sum_at_points`.
+        As for `eigengs_dr.raster.lookup.points.sum_at_points`.
     x, y : Float
-        Centre of the footprint in the image, in pixels, see `eigengs_dr.raster.lookup.points.fold`.
+        Centre of the footprint in pixels, moved into the image by
+        `eigengs_dr.raster.lookup.points.fold`.
     footprint : list of 3 Float
-        xx, xy, yy of its covariance, in pixels squared; not differentiated.
+        xx, xy, yy of the covariance, in pixels squared; not differentiated.
     active : Bool
     cutoff : float
-        In standard deviations.
+        Standard deviations.
 
     Returns
     -------
     list of Float
-        Sums of the channels. Cost: for every splat listed near the footprint in the image, and in
-        each copy of the image that it reaches, a widening and a weight; where it reaches over a
-        border, four error functions more.
+        One sum for each channel.
     """
     types = types_of(packed)
     footprint = [dr.detach(f) for f in footprint]
@@ -80,7 +82,7 @@ def sum_prefiltered(
 
 
 def _widened_values(footprint: list, radius: float) -> Any:
-    """Terms of the sum seen through a footprint, inside the image; see `points.sum_near`."""
+    """Return the `terms` of `sum_at_points` for the filtered sum, without borders."""
     scaled = kernel_covariance(footprint)
 
     def terms(splat: list, x: Any, y: Any) -> list:
@@ -94,7 +96,7 @@ def _widened_values(footprint: list, radius: float) -> Any:
 
 @dataclass(frozen=True)
 class _Lookup:
-    """What both passes of one call share."""
+    """Arguments of `sum_prefiltered` that `_sum_copies` needs."""
 
     sizes: SizeClasses
     packed: Any
@@ -106,8 +108,8 @@ class _Lookup:
 def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> list:
     """Sum over the copies of the image from ``copies[:2]`` to ``copies[2:]``.
 
-    Four loops in one, so that the lanes of a packet wait for the longest sum in total: over rows
-    and columns of copies, sizes, rows of cells, and the run of splats in a row.
+    One loop covers the copies, the size classes, the rows of cells and the Gaussians of a row:
+    lanes of a packet then wait once for the longest sum.
     """
     sizes, footprint, packed = lookup.sizes, lookup.footprint, lookup.packed
     types = types_of(packed)
@@ -117,7 +119,7 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
     bottom = dr.select(active, bottom, top - 1)
 
     def local(i: Any, j: Any, x: Any, y: Any) -> tuple:
-        """Point in the copy (i, j), and the sign its mirroring gives to the footprint's xy."""
+        """Return the point in the copy (i, j), and the sign of the footprint's xy in this copy."""
         x, y = x - types.Float(i) * sizes.width, y - types.Float(j) * sizes.height
         if sizes.wrap == "repeat":
             return x, y, types.Float(1)
@@ -126,7 +128,7 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
         return x, y, dr.select(odd_x == odd_y, types.Float(1), -1)
 
     def rows(i: Any, j: Any, k: Any) -> tuple:
-        """Rows of cells [first, last] of the size k that the footprint sees."""
+        """Return the rows of cells [first, last] of the size class k under the footprint."""
         square, _, _, ny, inverse, origin = _row_of(types, sizes, k)
         _, y0, _ = local(i, j, dr.detach(x), dr.detach(y))
         reach = lookup.cutoff * dr.sqrt(footprint[2] + square)
@@ -135,7 +137,7 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
         return types.Int(first), types.Int(last)
 
     def run(i: Any, j: Any, k: Any, row: Any, valid: Any) -> tuple:
-        """Splats [begin, end) of one row of cells inside the ellipse of ``footprint + size^2``."""
+        """Return the range [begin, end) in `splat` of a row of cells in the widened ellipse."""
         square, first, nx, _, inverse, origin = _row_of(types, sizes, k)
         x0, y0, sign = local(i, j, dr.detach(x), dr.detach(y))
         xx, xy, yy = footprint[0] + square, footprint[1] * sign, footprint[2] + square
@@ -143,7 +145,7 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
         low = dr.fma(types.Float(row), side, origin) - y0
         reach = lookup.cutoff * dr.sqrt(yy)
         low, high = dr.maximum(low, -reach), dr.minimum(low + side, reach)
-        # At the height dy the ellipse reaches from m dy - h to m dy + h.
+        # At height dy the ellipse of footprint + size^2 spans lean * dy - half to lean * dy + half.
         lean, ratio = xy * dr.rcp(yy), dr.rcp(yy)
         free = dr.fma(-xy, lean, xx)
         peak = xy * dr.rsqrt(xx) * lookup.cutoff  # dy of the rightmost point
@@ -205,7 +207,7 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
 
 
 def _advance(go: Any, k: Any, i: Any, j: Any, sizes: int, left: Any, right: Any) -> tuple:
-    """Step to the next size, after the last to the next copy, after a row of copies to the next."""
+    """Step to the next size class; after the last class to the next copy or row of copies."""
     k = dr.select(go, k + 1, k)
     over = k >= sizes
     k, i = dr.select(over, 0, k), dr.select(over, i + 1, i)
@@ -214,6 +216,6 @@ def _advance(go: Any, k: Any, i: Any, j: Any, sizes: int, left: Any, right: Any)
 
 
 def _row_of(types: Any, sizes: SizeClasses, k: Any) -> list:
-    """Row k of the table of sizes."""
-    row = gather_run(types, sizes.table, types.UInt(k), 8, True)  # 8: packets of a power of two
+    """Gather row k of `SizeClasses.table`."""
+    row = gather_run(types, sizes.table, types.UInt(k), 8, True)  # packets need a power of two
     return row[:6]

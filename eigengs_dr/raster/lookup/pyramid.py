@@ -1,13 +1,14 @@
-"""Distant views of a sum of Gaussians: coarser sums of it, of few Gaussians on a regular lattice.
+"""A pyramid of coarser sums of Gaussians on regular grids, for wide footprints.
 
-A footprint that covers much of a texture covers many splats. What it sees is smooth, and needs
-few: with the spacing h, the sum blurred by ``2 (SIGMA h)^2`` is
+A footprint that covers much of a texture covers many Gaussians, but the filtered texture is smooth
+and needs few. On a grid of points p with the spacing h, with ``s = SAMPLE_DEVIATION * h``, the sum
+blurred by the variance ``2 s^2`` is
 
-    sum_p h^2 / (2 pi (SIGMA h)^2) B(p) exp(-|x - p|^2 / (2 (SIGMA h)^2)),
+    sum_p h^2 / (2 pi s^2) B(p) exp(-|x - p|^2 / (2 s^2)),
 
-B being the sum blurred by ``(SIGMA h)^2``, in closed form, at the points p of the lattice. A lookup
-widens these Gaussians by what its footprint has more. The ripple that the spacing leaves is below
-``2 exp(-2 (pi SIGMA)^2)`` = 5e-4.
+where B is the sum blurred by ``s^2`` in closed form. A lookup widens these Gaussians by the rest of
+the variance of its footprint. The ripple of the grid is below
+``2 exp(-2 (pi SAMPLE_DEVIATION)^2)`` = 5e-4.
 """
 
 from __future__ import annotations
@@ -26,18 +27,29 @@ from .prefilter import sum_prefiltered
 from .size_classes import SizeClasses
 
 SAMPLE_DEVIATION = 0.65
-"""Standard deviation of the lattice's Gaussians in units of its spacing."""
+"""Standard deviation of the Gaussians of a level, in spacings of its points."""
 
 FINEST, FEWEST = 1, 8
-"""Spacing of the finest lattice in pixels, and points along the shorter side of the coarsest."""
+"""Spacing of the points of the finest level, in pixels, and smallest number of points along the
+shorter side of the coarsest level."""
 
 SAMPLE_REACH = 3.0
-"""Standard deviations after which Gaussians of a lattice end."""
+"""Standard deviations at which the Gaussians of a level end."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """A lattice: its first value, numbers of points, and spacings in pixels."""
+    """A regular grid of points.
+
+    Attributes
+    ----------
+    first : int
+        Index of its first point in `GaussianPyramid.values`.
+    nx, ny : int
+        Number of columns and rows of points.
+    dx, dy : float
+        Spacings in pixels.
+    """
 
     first: int
     nx: int
@@ -48,19 +60,20 @@ class Level:
 
 @dataclass(frozen=True)
 class GaussianPyramid:
-    """Lattices of spacings of powers of two.
+    """Levels whose spacings are powers of two.
 
     Attributes
     ----------
     width, height : int
-        Of the image.
+        Size of the image, in pixels.
     wrap : {"repeat", "mirror", "clamp"}
+        Continuation of the image outside its borders.
     channels : int
         At most 4.
     levels : tuple of Level
         From fine to coarse.
-    values : Float
-        B at all points, level after level, row after row, 4 numbers a point; carries gradients.
+    values : Float, shape (4 * points,)
+        B at the points of all levels, row after row, 4 numbers per point; carries gradients.
     """
 
     width: int
@@ -72,40 +85,45 @@ class GaussianPyramid:
 
 
 def build_pyramid(sizes: SizeClasses, packed: Any, number: int, cutoff: float) -> GaussianPyramid:
-    """Look a sum of Gaussians up at the points of all lattices, differentiably.
+    """Evaluate a sum of Gaussians at the points of all levels; differentiable.
 
-    Cost: one exact lookup for each of ``width height / FINEST^2`` points; coarser lattices come
-    from finer ones.
+    Cost: one `eigengs_dr.raster.lookup.prefilter.sum_prefiltered` for each of the
+    ``width height / FINEST^2`` points of the finest level. Each other level samples the previous
+    level.
 
     Parameters
     ----------
     sizes, packed, number, cutoff
-        As in `eigengs_dr.raster.lookup.prefilter.sum_prefiltered`.
+        As for `eigengs_dr.raster.lookup.prefilter.sum_prefiltered`.
+
+    Returns
+    -------
+    GaussianPyramid
     """
     types = types_of(packed)
     width, height = sizes.width, sizes.height
-    lattice = GaussianPyramid(width, height, sizes.wrap, number - NUM_SHAPE_PARAMS, (), None)
+    pyramid = GaussianPyramid(width, height, sizes.wrap, number - NUM_SHAPE_PARAMS, (), None)
     parts: list = []
     spacing = FINEST
     while not parts or min(width, height) >= FEWEST * spacing:
         nx, ny = math.ceil(width / spacing), math.ceil(height / spacing)
-        level = Level(sum(map(_points, lattice.levels)), nx, ny, width / nx, height / ny)
+        level = Level(sum(map(_points, pyramid.levels)), nx, ny, width / nx, height / ny)
         index = dr.arange(types.UInt, nx * ny)
         x = (types.Float(index % nx) + 0.5) * level.dx
         y = (types.Float(index // nx) + 0.5) * level.dy
         blur = [types.Float((SAMPLE_DEVIATION * level.dx) ** 2), types.Float(0)]
         blur.append(types.Float((SAMPLE_DEVIATION * level.dy) ** 2))
         if parts:
-            finer = replace(lattice, levels=(replace(lattice.levels[-1], first=0),))
+            finer = replace(pyramid, levels=(replace(pyramid.levels[-1], first=0),))
             seen = sum_pyramid(replace(finer, values=parts[-1]), x, y, blur, types.Bool(True))
         else:
             seen = sum_prefiltered(sizes, packed, number, x, y, blur, types.Bool(True), cutoff)
         parts.append(_interleaved(types, seen, nx * ny))
-        lattice = replace(lattice, levels=(*lattice.levels, level))
+        pyramid = replace(pyramid, levels=(*pyramid.levels, level))
         spacing *= 2
     values = dr.concat(parts)
     dr.eval(values)
-    return replace(lattice, values=values)
+    return replace(pyramid, values=values)
 
 
 def _points(level: Level) -> int:
@@ -113,7 +131,7 @@ def _points(level: Level) -> int:
 
 
 def _interleaved(types: ArrayTypes, rows: list, count: int) -> Any:
-    """4 numbers a point, one point after another."""
+    """Store the values of all channels point after point, 4 numbers per point."""
     padded = [*rows, *[types.Float(0)] * (4 - len(rows))]
     flat = dr.ravel(types.FloatX([row + dr.zeros(types.Float, count) for row in padded]), order="F")
     dr.eval(flat)
@@ -121,7 +139,7 @@ def _interleaved(types: ArrayTypes, rows: list, count: int) -> Any:
 
 
 def pyramid_mean(lattice: GaussianPyramid) -> list:
-    """Mean of every channel over the image."""
+    """Return the mean of every channel over the image: a list of Float, shape (1,)."""
     types = types_of(lattice.values)
     level = lattice.levels[-1]
     rows = gather_run(
@@ -131,41 +149,53 @@ def pyramid_mean(lattice: GaussianPyramid) -> list:
 
 
 def is_minified(lattice: GaussianPyramid, footprint: list) -> Any:
-    """Where a footprint is wide enough in all directions for the finest lattice."""
+    """Return whether a footprint is wide enough in all directions for the finest level.
+
+    Parameters
+    ----------
+    footprint : list of 3 Float
+        xx, xy, yy of the covariance, in pixels squared.
+
+    Returns
+    -------
+    Bool
+    """
     xx, xy, yy = footprint
     smallest = 0.5 * (xx + yy) - dr.sqrt(dr.fma(0.25 * (xx - yy), xx - yy, xy * xy))
     return smallest >= _min_variance(lattice.levels[0])
 
 
 def _min_variance(level: Level) -> float:
-    """Smallest variance of a footprint that a lattice serves."""
+    """Return the smallest variance of a footprint that a level can filter, in pixels squared."""
     return 2 * (SAMPLE_DEVIATION * max(level.dx, level.dy)) ** 2
 
 
 def sum_pyramid(lattice: GaussianPyramid, x: Any, y: Any, footprint: list, active: Any) -> list:
-    """Look a footprint up in the coarsest lattice that serves it.
+    """Filter the sum by a footprint, on the coarsest level that is fine enough.
+
+    Cost: one weight and one gather for each point inside the ellipse of `SAMPLE_REACH` standard
+    deviations: 30 to 100 points times the ratio of its axes.
 
     Parameters
     ----------
-    lattice : Lattice
+    lattice : GaussianPyramid
     x, y : Float
         Centre of the footprint in the image, in pixels.
     footprint : list of 3 Float
-        xx, xy, yy of its covariance, in pixels squared, for which `is_minified` holds; not
+        xx, xy, yy of the covariance, in pixels squared; `is_minified` must hold; not
         differentiated.
     active : Bool
 
     Returns
     -------
     list of Float
-        Sums of the channels. Cost: a weight and a gather for each point of the lattice inside the
-        ellipse of `SAMPLE_REACH` standard deviations, some 30 to 100 times the ratio of its axes.
+        One sum for each channel.
     """
     types = types_of(lattice.values)
     xx, xy, yy = (dr.detach(f) for f in footprint)
     smallest = 0.5 * (xx + yy) - dr.sqrt(dr.fma(0.25 * (xx - yy), xx - yy, xy * xy))
     first, nx, ny, dx, dy = _pick(types, lattice.levels, smallest)
-    # In units of the lattice, without the blur that its values have already.
+    # In spacings of the level; the values are already blurred by SAMPLE_DEVIATION^2.
     u, v = x * dr.rcp(dx) - 0.5, y * dr.rcp(dy) - 0.5
     xx = dr.maximum(xx * dr.square(dr.rcp(dx)) - SAMPLE_DEVIATION**2, SAMPLE_DEVIATION**2)
     yy = dr.maximum(yy * dr.square(dr.rcp(dy)) - SAMPLE_DEVIATION**2, SAMPLE_DEVIATION**2)
@@ -177,7 +207,7 @@ def sum_pyramid(lattice: GaussianPyramid, x: Any, y: Any, footprint: list, activ
     scale = dr.rsqrt(determinant) * (1 / (2 * math.pi * -math.expm1(-0.5 * SAMPLE_REACH**2)))
 
     def row_of(j: Any) -> tuple:
-        """Columns [i, stop] of the ellipse in one row of the lattice."""
+        """Return the columns [i, stop] of the ellipse in one row of points."""
         down = types.Float(j) - dr.detach(v)
         half = dr.safe_sqrt(free * (SAMPLE_REACH**2 - down * down * dr.rcp(yy)))
         middle = dr.fma(lean, down, dr.detach(u))
@@ -204,14 +234,14 @@ def sum_pyramid(lattice: GaussianPyramid, x: Any, y: Any, footprint: list, activ
         (i, stop, j, u, v, [types.Float(0) for _ in range(lattice.channels)]),
         lambda i, stop, j, *rest: j <= last,
         add,
-        label="sum lattice",
+        label="sum pyramid",
         mode="symbolic",
         max_iterations=-1,
     )[-1]
 
 
 def _pick(types: ArrayTypes, levels: tuple[Level, ...], smallest: Any) -> list:
-    """Numbers of the coarsest lattice that serves footprints with this smallest variance."""
+    """Return first, nx, ny, dx, dy of the coarsest level for footprints with this variance."""
     kinds = (types.UInt, types.Float, types.Float, types.Float, types.Float)
     rows = [(t.first, t.nx, t.ny, t.dx, t.dy) for t in levels]
     picked = [kind(number) for kind, number in zip(kinds, rows[0], strict=True)]
@@ -225,7 +255,7 @@ def _pick(types: ArrayTypes, levels: tuple[Level, ...], smallest: Any) -> list:
 
 
 def _fold(types: ArrayTypes, index: Any, count: Any, wrap: str) -> Any:
-    """Bring the index of a point into the lattice, whose points lie half a spacing inside."""
+    """Move the index of a point into the level; points lie half a spacing inside the borders."""
     k = types.Float(index)
     if wrap == "repeat":
         return types.UInt(k - count * dr.floor((k + 0.5) * dr.rcp(count)))

@@ -1,4 +1,4 @@
-"""Splats sorted by size and place, so that a footprint finds those it may see."""
+"""Gaussians sorted by size and position, so that a footprint finds the Gaussians near it."""
 
 from __future__ import annotations
 
@@ -16,39 +16,43 @@ from ..parameters import EXP2_SCALE, kernel_radius
 from .points import Cells, cell_side, list_cells
 
 MIN_CLASS_SIZE = 1.0
-"""Largest standard deviation, in pixels, of the smallest size that splats are sorted by."""
+"""Largest standard deviation in the smallest size class, in pixels."""
 
 CLASS_RATIO = 3.0
-"""Of one size to the next. More sizes are more rows to visit, fewer more splats in vain."""
+"""Ratio of the sizes of two classes. With a smaller ratio a lookup visits more rows of cells; with
+a larger ratio it visits more Gaussians that miss the footprint."""
 
 LISTED_FOOTPRINTS = (1.0, 4.0)
-"""Footprints, in pixels, for which cells list their splats: where most lookups fall."""
+"""Standard deviations of the footprints for which cells list their Gaussians, in pixels; most
+lookups have such footprints."""
 
 
 @dataclass(frozen=True)
 class SizeClasses:
-    """Splats sorted by size, and those of one size by the cell that holds their mean.
+    """Gaussians sorted by size, and Gaussians of one size sorted by the cell of their mean.
 
-    A splat of the size s, its largest standard deviation being at most s, can only be seen by a
-    footprint if its mean lies in the ellipse of ``footprint + s^2``: rows of cells of which each is
-    one run of `splat`.
+    A class of the size s holds Gaussians whose largest standard deviation is at most s. A footprint
+    can only see such a Gaussian if the mean lies in the ellipse of ``footprint + s^2``. This
+    ellipse covers some rows of cells, and in each row the Gaussians are one range of `splat`.
 
     Attributes
     ----------
     width, height : int
-        Of the image.
+        Size of the image, in pixels.
     wrap : {"repeat", "mirror", "clamp"}
+        Continuation of the image outside its borders.
     count : int
-        Number of sizes.
-    splat : UInt32, shape (N,)
-        Indices of splats: size after size, row after row, cell after cell.
+        Number of classes.
+    splat : UInt32, shape (entries,)
+        Indices of Gaussians: class after class, row after row, cell after cell.
     starts : UInt32, shape (cells + 1,)
-        Where the splats of every cell begin in `splat`.
-    table : Float, shape (8 count,)
-        Of each size its square, first cell, columns, rows, 1 / side and origin of the cells.
+        Index in `splat` of the first Gaussian of each cell.
+    table : Float, shape (8 * count,)
+        For each class: s^2, first cell, columns, rows, 1 / side of a cell, origin of the cells, and
+        two zeros.
     listed : list of (float, Cells)
-        Lists for points inside of the image and footprints of up to this standard deviation: those
-        of splats widened by it, whose ellipses contain those of smaller footprints.
+        Lists for footprints inside the image, of up to this standard deviation. They hold the
+        Gaussians widened by it, whose ellipses contain the ellipses for smaller footprints.
     """
 
     width: int
@@ -62,17 +66,23 @@ class SizeClasses:
 
 
 def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: str) -> SizeClasses:
-    """Sort splats for `sum_filtered`.
+    """Sort Gaussians for `eigengs_dr.raster.lookup.prefilter.sum_prefiltered`.
 
     Parameters
     ----------
     shape : list of 5 Float, shape (N,)
-        Mean x, mean y and the factor a, b, c, as `eigengs_dr.raster.evaluate.weights` takes them.
+        Mean x, mean y, a, b, c, as for `eigengs_dr.raster.evaluate.weights`.
     width, height : int
-        Of the image, in pixels.
+        Size of the image, in pixels.
     cutoff : float
-        In standard deviations.
+        Standard deviations.
     wrap : {"repeat", "mirror", "clamp"}
+
+    Returns
+    -------
+    SizeClasses
+        Gaussians that are not finite, or so far from the image that they end before it, are left
+        out.
     """
     types = types_of(shape[0])
     x, y, a, b, c = (np.asarray(s.numpy(), np.float64) for s in shape)
@@ -84,8 +94,8 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
     order, counts, table, first = [], [], [], 0
     for k in np.unique(rank[drawn]):
         own = np.flatnonzero(drawn & (rank == k))
-        largest = min(float(size[own].max()), 1e12)  # its square has to be a number
-        # What is farther from the image leaves nothing in it.
+        largest = min(float(size[own].max()), 1e12)  # its square must be finite in float32
+        # Means beyond this margin are farther from the image than the cutoff.
         side = max(largest, max(width, height) / 1024)
         origin = -cutoff * largest
         columns, rows = (math.ceil((s - 2 * origin) / side) for s in (width, height))
@@ -97,7 +107,8 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
         table.append([largest**2, first, columns, rows, 1 / side, origin, 0, 0])
         first += columns * rows
     starts = np.cumsum(np.concatenate([[0], *counts] if counts else [[0, 0]]))
-    found = np.concatenate([*order, [0]])  # never empty, and even: it is read in pairs
+    # gather_index reads pairs: the array must have an even length and must not be empty.
+    found = np.concatenate([*order, [0]])
     splat = np.pad(found, (0, len(found) % 2))
     return SizeClasses(
         width,
