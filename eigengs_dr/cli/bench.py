@@ -18,7 +18,15 @@ class Benchmarks(click.Group):
         return _load().get_command(context, name)
 
 
-bench = Benchmarks("bench", help="Measure speed and accuracy.")
+HELP = """Measure speed and accuracy, and draw tables and charts.
+
+\b
+Examples:
+  eigengs-dr bench kernels
+  eigengs-dr bench tables data/ -o results/ --set natural256 --images 3
+"""
+
+bench = Benchmarks("bench", help=HELP)
 
 
 def _load() -> Any:

@@ -118,7 +118,7 @@ def _mitsuba(variant: str | None, quiet: bool) -> Any:
     try:
         import mitsuba as mi
     except ImportError as error:
-        advice = "install it: pip install 'eigengs-dr[plugins]'"
+        advice = "install it: pip install 'mitsuba==3.9.*'"
         raise ValueError(f"scenes need Mitsuba ({error}); {advice}") from error
     from ..plugins import register_plugins
 

@@ -2,16 +2,11 @@
 
 import importlib.util
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .io import ImageError, load_image
-
-if TYPE_CHECKING:
-    pass
-
 
 SAMPLES = {
     "astronaut": "astronaut.png",

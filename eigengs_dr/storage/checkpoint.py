@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import npz as archive
+from . import npz
 from .atomic import atomic_write
 
 FORMAT, VERSION = "eigengs_dr.checkpoint", 1
@@ -102,7 +102,7 @@ class Checkpoint:
         fields = {key: [array.dtype.str[1:], array.ndim] for key, array in arrays.items()}
         layout = np.frombuffer(json.dumps(fields).encode(), np.uint8)
         members = {"layout": layout, **arrays}
-        archive.write(self.folder / f"{name}.npz", FORMAT, VERSION, members, compressed=False)
+        npz.write(self.folder / f"{name}.npz", FORMAT, VERSION, members, compressed=False)
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
         """Return the arrays that were saved under a name, or None.
@@ -115,15 +115,15 @@ class Checkpoint:
         path = self.folder / f"{name}.npz"
         if not path.exists():
             return None
-        layout = archive.read(path, FORMAT, VERSION, {"layout": archive.Field("u1", 1)})["layout"]
+        layout = npz.read(path, FORMAT, VERSION, {"layout": npz.Field("u1", 1)})["layout"]
         try:
             fields = {
-                key: archive.Field(kind, ndim, MAX_ENTRIES)
+                key: npz.Field(kind, ndim, MAX_ENTRIES)
                 for key, (kind, ndim) in json.loads(layout.tobytes()).items()
             }
         except (ValueError, AttributeError, TypeError):
             raise ValueError(f"{path}: layout is damaged") from None
-        return archive.read(path, FORMAT, VERSION, fields)
+        return npz.read(path, FORMAT, VERSION, fields)
 
     def remove(self, name: str) -> None:
         """Delete the arrays that were saved under a name."""

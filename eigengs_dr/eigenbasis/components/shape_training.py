@@ -137,9 +137,9 @@ def _round(
     variables = coordinates.encode(gaussians)
     optimizer = SCHEDULE.make_optimizer()
     optimizer.update({name: variables[name] for name in SCHEDULE.rates})
-    place_grid = Grid(gaussians.width, gaussians.height)
+    tiles = Grid(gaussians.width, gaussians.height)
     whole = np.ones((gaussians.height, gaussians.width, len(components)), np.float32)
-    inside = to_tiles(types, whole, place_grid)
+    inside = to_tiles(types, whole, tiles)
     current = gaussians
     with freeze_program(step_program(coordinates)) as take_step:
         for step, image in enumerate(samples(components, eigenvalues, seed, first, last), first):
@@ -149,7 +149,7 @@ def _round(
             optimizer.set_learning_rate(
                 {name: dr.opaque(types.Float, rate * left) for name, rate in SCHEDULE.rates.items()}
             )
-            target = to_tiles(types, image, place_grid)
+            target = to_tiles(types, image, tiles)
             take_step(optimizer, fixed, target, inside, [bin_gaussians(current)])
             current = coordinates.decode(fixed, dict(optimizer))
             dr.eval(current)
