@@ -133,6 +133,6 @@ def make_target(pixels: NDArray[np.float32], color: str) -> FitTarget:
 def dark_weight(light: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the factors of errors in linear light, an array of any shape with 1 for white.
 
-    The factors are ``max(light, BLACK)^-DARKNESS``, see `DARKNESS`.
+    The factors are ``max(light, BLACK)^-DARKNESS``.
     """
     return np.asarray(np.maximum(light, BLACK) ** -DARKNESS, np.float32)
