@@ -1,6 +1,6 @@
-"""Mitsuba plugins; `register_plugins` makes them known to the variant in use and to later ones."""
+"""Mitsuba plugins. `register_plugins` registers them with the current variant and later ones."""
 
-import eigengs_dr  # noqa: F401  finds a libLLVM that works before Mitsuba imports Dr.Jit
+import eigengs_dr  # noqa: F401  finds a working libLLVM before Mitsuba imports Dr.Jit
 
 try:
     import mitsuba  # noqa: F401

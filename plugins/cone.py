@@ -1,4 +1,4 @@
-"""What a pixel sees of a texture: the camera's cone, cut by the surface."""
+"""The footprint of a pixel on a texture: the cone of the pixel, cut by the surface."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ import drjit as dr
 import mitsuba as mi
 
 PIXEL = 0.4
-"""Standard deviation of a footprint in pixels. Samples fall anywhere in a pixel, which blurs by
-0.29 (a box) already; at 0.4 one sample of a receding plane came closest to the mean of 1,024."""
+"""Standard deviation of a footprint in pixels. The random positions of samples in a pixel already
+blur by 0.29 (a box); at 0.4, one sample of a receding plane came closest to the mean of 1,024."""
 
 
 def pixel_angle(sensor: Any) -> float:
-    """Angle that a pixel in the middle of a perspective sensor's image subtends.
+    """Return the angle of a pixel in the centre of a perspective image, for ``prefilter``.
 
-    It is what the property ``prefilter`` of a texture takes: ``2 tan(x_fov / 2) / width``. Rays
-    start at the near clip plane, so keep ``near_clip`` small against the distance of the texture.
+    The angle is ``2 tan(x_fov / 2) / width``. Rays start at the near clip plane, so keep
+    ``near_clip`` small against the distance of the texture.
 
     Parameters
     ----------
     sensor : mitsuba.Sensor
-        A ``perspective`` or ``thinlens`` one.
+        A ``perspective`` or ``thinlens`` sensor.
 
     Returns
     -------
     float
-        In radians.
+        The angle in radians.
 
     Raises
     ------
@@ -37,20 +37,21 @@ def pixel_angle(sensor: Any) -> float:
     parameters = mi.traverse(sensor)
     if "x_fov" not in parameters:
         raise ValueError(
-            f"pixel_angle: {type(sensor).__name__} has no x_fov; give it a perspective or thinlens "
-            "sensor, or write the angle of a pixel, in radians, into 'prefilter' yourself"
+            f"pixel_angle: {type(sensor).__name__} has no x_fov; use a perspective or thinlens "
+            "sensor, or set 'prefilter' to the angle of a pixel in radians"
         )
     fov = math.radians(float(dr.slice(parameters["x_fov"])))
     return 2 * math.tan(fov / 2) / sensor.film().size()[0]
 
 
 def metric(si: Any, inverse: tuple, angle: float) -> tuple[list, Any]:
-    """Metric of the texture plane in which the footprint of a pixel is the unit circle.
+    """Return the metric of the texture plane in which the footprint of a pixel is the unit circle.
 
-    Around a ray along d a pixel's cone has the radius ``r = PIXEL angle t``. A step ``J (du, dv)``,
-    ``J = [dp_du dp_dv]``, is seen as ``P J (du, dv)`` with ``P = 1 - d d^T``, so the inverse
-    covariance is ``J^T P J / r^2``. t counts from where the ray starts: the near clip plane, or the
-    last bounce, behind which a texture is seen sharper than it has to be.
+    At the distance t along the ray direction d, the cone of a pixel has the radius
+    ``r = PIXEL angle t``. With ``J = [dp_du dp_dv]`` and ``P = 1 - d d^T``, the camera sees a step
+    ``J (du, dv)`` as ``P J (du, dv)``, so the inverse covariance is ``J^T P J / r^2``. t counts
+    from the start of the ray: the near clip plane, or the last bounce. After a bounce the cone is
+    narrower than it should be, and the texture sharper.
 
     Parameters
     ----------
@@ -58,14 +59,15 @@ def metric(si: Any, inverse: tuple, angle: float) -> tuple[list, Any]:
     inverse : tuple of 4 float
         Rows of the inverse of the linear part of ``to_uv``.
     angle : float
-        Of a pixel, in radians.
+        Angle of a pixel in radians.
 
     Returns
     -------
     metric : list of 3 Float
-        xx, xy, yy; detached from derivatives.
+        Entries xx, xy, yy, without gradients.
     valid : Bool
-        False where the surface has no uv Jacobian or the ray no length: there is no footprint.
+        False if the footprint is undefined: the surface has no uv Jacobian, or t is not positive
+        and finite.
     """
     d = dr.detach(si.to_world(si.wi))
     u, v = dr.detach(si.dp_du), dr.detach(si.dp_dv)

@@ -1,7 +1,7 @@
 """The Mitsuba texture ``gaussian_texture``: a sum of 2D Gaussians, differentiable and prefiltered.
 
-Dr.Jit takes `self` for loop state, which silently loses gradients, and knows no custom derivatives
-inside a virtual call: the class below only hands arrays to the functions of
+Dr.Jit treats `self` as loop state, which silently loses gradients, and supports no custom
+derivatives inside a virtual call. So the class below only passes arrays to the functions of
 `eigengs_dr.raster.lookup.points` and `eigengs_dr.raster.lookup.prefilter`.
 """
 
@@ -38,44 +38,47 @@ from .properties import affine, angle, cutoff, raw, source_of, wrap_mode
 from .spectrum import upload_table, upsample
 
 SURVEY = 128
-"""Points along a side at which brightness is looked up: for sampling of emission, and its mean."""
+"""Points along a side of the grid of brightness, for sampling of emission and for the mean."""
 
 DARKEST = 0.02
-"""Least density with which a point is sampled, relative to the mean."""
+"""Smallest density of sampled positions, relative to the mean."""
 
 INSIDE = 0.01
-"""Pixels by which clamped points stay away from the border."""
+"""Distance in pixels of clamped points from the border."""
 
 
 def gaussian_texture() -> type:
-    """Make the class for the variant in use, whose `mitsuba.Texture` it extends."""
+    """Return the class of the texture, a `mitsuba.Texture` of the current variant."""
     if mi.variant().startswith("scalar"):
         return _Refusal
 
     class GaussianTexture(mi.Texture):
         """A sum of Gaussians over uv, ``(u, v) = (x / width, y / height)``, row 0 at v = 0.
 
+        The Gaussians come from `filename`, from `model`, or from the arrays of a set, as
+        `eigengs_dr.plugins.texture_of` writes them.
+
         Properties
         ----------
         filename : str
-            A set that ``eigengs-dr fit`` or `Gaussians.save` wrote. Or a set's arrays, as
-            `eigengs_dr.plugins.texture_of` writes them; or
+            Path of a set from ``eigengs-dr fit`` or `Gaussians.save`.
         first : int
-            With `filename`: use so many Gaussians, from the first. Sets that were fitted in levels
-            make a texture of any number.
+            With `filename`: number of Gaussians to use, from the first. Any number works for
+            level-of-detail sets. By default all.
         model, coefficients
-            A saved `EigenGS` model and, optionally, coefficients (C, k).
+            Path of an `EigenGS` model and, optionally, coefficients (C, k).
         to_uv : transform
-            Of uv before the lookup.
+            Transform of uv before the lookup.
         wrap_mode : {"repeat", "mirror", "clamp"}
+            Continuation of the texture outside of its borders; by default "repeat".
         raw : bool
-            Values as they are: neither decoded nor clamped.
+            Return values without decoding and clamping; by default false.
         prefilter : float
-            Angle of a pixel in radians (see `eigengs_dr.plugins.pixel_angle`): lookups then see
-            the texture through the pixel's footprint. 0, the default, looks at points. Slopes
-            of bump maps (`eval_1_grad`) are those at points.
+            Angle of a pixel in radians, at least 0 and below 1, see
+            `eigengs_dr.plugins.pixel_angle`. Lookups average over the footprint of the pixel; 0,
+            the default, looks at points. Slopes of bump maps (`eval_1_grad`) ignore the footprint.
         cutoff : float
-            Standard deviations after which a splat ends; by default that of the set.
+            Radius of a Gaussian in standard deviations; by default the cutoff of the set.
         """
 
         def __init__(self, props: Any) -> None:
@@ -98,7 +101,7 @@ def gaussian_texture() -> type:
             gaussians = self.source.gaussians()
             parameters = decode_parameters(gaussians)
             shape, color = parameters.shape, [_finite(c) for c in parameters.color]
-            # First what may refuse: old lists of new splats would read beyond their end.
+            # The lists come first, since they may raise: old lists would read beyond new Gaussians.
             if not keys or any(key in self.source.shaping for key in keys):
                 self._list([dr.detach(s) for s in shape])
             self.background = [_finite(b) for b in parameters.background]
@@ -112,7 +115,7 @@ def gaussian_texture() -> type:
             self._survey()
 
         def _list(self, shape: list) -> None:
-            """List the splats near every cell."""
+            """List the Gaussians near every cell."""
             size = (self.width, self.height)
             radius = kernel_radius(self.cutoff)
             side = cell_side(*size, dr.width(shape))
@@ -132,8 +135,8 @@ def gaussian_texture() -> type:
                 return mi.Color3f(*color)
             if self.raw or self.space == "data":
                 raise ValueError(
-                    f"{_name(self)}: a reflectance or radiance is asked of a texture that "
-                    "holds raw data; use a set in a colour space, and raw = false"
+                    f"{_name(self)}: a spectral variant needs colours for a reflectance or "
+                    "radiance, not raw data; use a set in a colour space, and raw = false"
                 )
             return upsample(mi.Color3f(*color), si.wavelengths, self.spectra)
 
@@ -145,8 +148,8 @@ def gaussian_texture() -> type:
         def eval_3(self, si: Any, active: Any = True) -> Any:
             if self.channels != 3:
                 raise ValueError(
-                    f"{_name(self)}: three channels are asked of a texture that has one; "
-                    "normal maps need a set of a colour picture"
+                    f"{_name(self)}: a lookup of three channels, such as a normal map, needs a set "
+                    "of three channels; this set has one"
                 )
             return mi.Color3f(*self._color(si, active))
 
@@ -167,7 +170,7 @@ def gaussian_texture() -> type:
             return mi.Vector2f(a * du + c * dv, b * du + d * dv)
 
         def _color(self, si: Any, active: Any) -> list:
-            """Look the channels up, decoded and clamped unless `raw`."""
+            """Look up the channels, decoded and clamped unless `raw`."""
             (x, sx), (y, sy), active = self._point(si, active)
             if self.angle:
                 sums = self._filtered(si, (x, sx), (y, sy), active)
@@ -181,12 +184,12 @@ def gaussian_texture() -> type:
             return [dr.select(active, _shown(self, s), 0) for s in sums]
 
         def _filtered(self, si: Any, column: tuple, row: tuple, active: Any) -> list:
-            """Sum what the footprint of the pixel sees around a point, given as by `fold`."""
-            # With the slopes of folding, a footprint turns where the image is mirrored, and has no
-            # width along the axis on which what lies outside is all like the border.
+            """Average the texture over the footprint around a point, given as by `fold`."""
+            # The slopes of `fold` turn a footprint in mirrored images. They also take away its
+            # width along an axis on which the point lies outside of a clamped image.
             (x, sx), (y, sy) = column, row
             sx, sy = sx * self.width, sy * self.height
-            if self.wrap == "clamp":  # one without width would count half on a border
+            if self.wrap == "clamp":  # a footprint without width would count half on a border
                 x, y = (
                     dr.clip(x, INSIDE, self.width - INSIDE),
                     dr.clip(y, INSIDE, self.height - INSIDE),
@@ -212,7 +215,7 @@ def gaussian_texture() -> type:
             return [dr.select(blind, m, s) for m, s in zip(self.average, seen, strict=True)]
 
         def _point(self, si: Any, active: Any) -> tuple:
-            """Fold uv into the image: x, y in pixels with their derivatives; where uv is finite."""
+            """Fold uv into the image: x, y in pixels with their slopes, active if uv is finite."""
             (a, b, tu), (c, d, tv) = self.to_uv
             u = a * si.uv.x + b * si.uv.y + tu
             v = c * si.uv.x + d * si.uv.y + tv
@@ -251,7 +254,7 @@ def gaussian_texture() -> type:
             return float(self.brightness.numpy().max())
 
         def _survey(self) -> None:
-            """Look brightness up on a grid over uv: here, as no lookup of a scene can wait."""
+            """Evaluate brightness on a grid over uv now, since lookups during a render cannot."""
             with dr.suspend_grad():
                 i = dr.arange(mi.UInt32, SURVEY**2)
                 si = dr.zeros(mi.SurfaceInteraction3f, SURVEY**2)
@@ -261,7 +264,7 @@ def gaussian_texture() -> type:
             self.distribution = None
 
         def _sampled(self) -> Any:
-            """Distribution of emission over uv, made when it is first asked for."""
+            """Return the distribution of emission over uv; the first call makes it."""
             if self.distribution is None:
                 density = self.brightness.numpy().reshape(SURVEY, SURVEY)
                 density = np.maximum(density, 0)
@@ -269,7 +272,7 @@ def gaussian_texture() -> type:
                 self.distribution = mi.DiscreteDistribution2D(np.maximum(density, floor))
             return self.distribution
 
-        # --- What it is --------------------------------------------------------------------------
+        # --- Description -------------------------------------------------------------------------
 
         def resolution(self) -> Any:
             return mi.ScalarVector2i(self.width, self.height)
@@ -279,7 +282,7 @@ def gaussian_texture() -> type:
 
         def to_string(self) -> str:
             return (
-                f"GaussianTexture[\n  splats = {len(self.source.start)},\n  resolution = "
+                f"GaussianTexture[\n  gaussians = {len(self.source.start)},\n  resolution = "
                 f"[{self.width}, {self.height}],\n  space = {self.space},\n  raw = {self.raw},\n"
                 f"  wrap_mode = {self.wrap},\n  prefilter = {self.angle:g},\n"
                 f"  cutoff = {self.cutoff:g}\n]"
@@ -289,10 +292,11 @@ def gaussian_texture() -> type:
 
 
 def uncollected(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Keep Python's garbage collector out of a lookup.
+    """Decorate a lookup to run without Python's garbage collector.
 
-    Mitsuba calls lookups while it records a program. Another scene that is freed in the midst of
-    that takes its textures out of the program, which then ends the process or reads freed memory.
+    Mitsuba calls lookups while it records a program. If the collector frees another scene during
+    the recording, the program loses the textures of that scene; it then ends the process or reads
+    freed memory.
     """
 
     @wraps(method)
@@ -314,8 +318,8 @@ def uncollected(method: Callable[..., Any]) -> Callable[..., Any]:
 def _shown(texture: Any, value: Any) -> Any:
     """Clamp and decode a channel, unless raw.
 
-    The clamp conserves energy and lets gradients pass as if it were not there: else a colour that
-    a step took beyond the range would never come back.
+    The clamp conserves energy. Gradients ignore it: else a colour that a step moved out of the
+    range would never come back.
     """
     if texture.raw:
         return value
@@ -324,7 +328,7 @@ def _shown(texture: Any, value: Any) -> Any:
 
 
 def _slope(texture: Any, value: Any) -> Any:
-    """Derivative of what `_shown` does to a channel inside of [0, 1]."""
+    """Return the derivative of `_shown` for a channel in [0, 1]."""
     if texture.raw or texture.space not in ("ycbcr", "rgb"):
         return type(value)(1)
     curved = 2.4 / 1.055 * dr.power((dr.maximum(value, 0.04045) + 0.055) * (1 / 1.055), 1.4)
@@ -340,15 +344,15 @@ def _luminance(color: list) -> Any:
 
 
 def _finite(x: Any) -> Any:
-    """Without what is not finite, which an optimiser's step may leave behind."""
+    """Replace values that are not finite, which an optimiser may leave, by 0."""
     return dr.select(dr.isfinite(x), x, 0)
 
 
 class _Refusal:
-    """What scalar variants get: one line."""
+    """The class for scalar variants, which raises an error."""
 
     def __init__(self, props: Any) -> None:
         raise RuntimeError(
-            f"gaussian_texture does not work in the variant {mi.variant()}; "
+            f"gaussian_texture does not support the variant {mi.variant()}; "
             "use mi.set_variant('llvm_ad_rgb') or another llvm or cuda variant"
         )

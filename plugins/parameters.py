@@ -1,4 +1,4 @@
-"""Where a texture's Gaussians come from: a set, or the coefficients of an eigenbasis."""
+"""The parameters of a texture: the Gaussians of a set, or the coefficients of an eigenbasis."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from eigengs_dr.gaussian.tensors import FIELDS, from_tensors, to_tensors
 
 
 def texture_of(gaussians: Gaussians, **properties: Any) -> dict[str, Any]:
-    """Write a set as a ``gaussian_texture``, for `mitsuba.load_dict`.
+    """Return a set as the dictionary of a ``gaussian_texture``, for `mitsuba.load_dict`.
 
     Parameters
     ----------
     gaussians : Gaussians
     **properties
-        Others of the texture: ``wrap_mode``, ``to_uv``, ``raw``, ``prefilter``, ``cutoff``.
+        Other properties of the texture: ``wrap_mode``, ``to_uv``, ``raw``, ``prefilter``,
+        ``cutoff``.
 
     Returns
     -------
     dict
-        The set's tensors, size and space, and what was given.
+        The tensors, size, space and cutoff of the set, and the other properties.
 
     Examples
     --------
@@ -37,7 +38,7 @@ def texture_of(gaussians: Gaussians, **properties: Any) -> dict[str, Any]:
     >>> bsdf = mi.load_dict({"type": "diffuse", "reflectance": texture_of(g, wrap_mode="clamp")})
     """
     tensors = to_tensors(gaussians)
-    # A flat tensor of three would make Mitsuba try, and complain, to read it as a colour.
+    # Mitsuba would try to read a flat tensor of three numbers as a colour, and fail.
     tensors["background"] = tensors["background"][None]
     return {
         "type": "gaussian_texture",
@@ -58,28 +59,33 @@ def gaussians_of(parameters: Any, texture: str, like: Gaussians) -> Gaussians:
     parameters : dict-like
         A `mitsuba.SceneParameters`, or an optimiser.
     texture : str
-        Name of the texture in it, such as ``"poster.bsdf.reflectance"``.
+        Name of the texture in `parameters`, such as ``"poster.bsdf.reflectance"``.
     like : Gaussians
-        What the texture was made of: gives the size, the space and what `parameters` lacks.
+        The set that the texture was made from. It gives the size, the space and the tensors that
+        `parameters` lacks.
+
+    Returns
+    -------
+    Gaussians
 
     Raises
     ------
     ValueError
-        If tensors do not fit each other.
+        If the shapes of the tensors do not match.
     """
     return from_tensors(_found(parameters, texture), like)
 
 
 def keep_in_bounds(parameters: Any, texture: str, like: Gaussians) -> None:
-    """Bring the parameters of a texture back inside their bounds, after a step of an optimiser.
+    """Project the parameters of a texture into their bounds, after a step of an optimiser.
 
-    What `eigengs_dr.Gaussians.bounded` does: means stay in the image, factors where a splat is
-    neither a spike nor a sheet, and what is not finite is replaced.
+    The function applies `eigengs_dr.Gaussians.bounded`: means stay in the image, standard
+    deviations in their range, and values that are not finite are replaced.
 
     Parameters
     ----------
     parameters, texture, like
-        As for `gaussians_of`; entries that `parameters` lacks are left alone.
+        See `gaussians_of`. The function changes only entries of `parameters` that exist.
     """
     found = _found(parameters, texture)
     bounded = to_tensors(dr.detach(from_tensors(found, like)).bounded())
@@ -93,13 +99,13 @@ def _found(parameters: Any, texture: str) -> dict[str, Any]:
 
 
 class FromSet:
-    """mean (N, 2), factor (N, 3), color (N, C) and background (C,) are the parameters.
+    """The parameters mean (N, 2), factor (N, 3), color (N, C) and background (C,) of a set.
 
-    In native pixels, and in the space of the set, as in `eigengs_dr.Gaussians`.
+    Units are native pixels and the space of the set, as in `eigengs_dr.Gaussians`.
     """
 
     shaping = ("mean", "factor")
-    """Parameters after whose change splats must be listed anew."""
+    """Parameters whose change requires new lists of the Gaussians."""
 
     def __init__(self, gaussians: Gaussians) -> None:
         self.start = gaussians
@@ -111,12 +117,12 @@ class FromSet:
             callback.put(name, tensor, mi.ParamFlags.Differentiable)
 
     def gaussians(self) -> Gaussians:
-        """Put the parameters together; gradients flow back to them.
+        """Return the set of the parameters; gradients flow back to them.
 
         Raises
         ------
         ValueError
-            If they do not fit each other.
+            If the shapes of the parameters do not match.
         """
         try:
             return from_tensors(self.tensors, self.start)
@@ -125,10 +131,10 @@ class FromSet:
 
 
 class FromModel:
-    """Coefficients (C, k) of an `eigengs_dr.EigenGS` model are the one parameter.
+    """The parameter coefficients (C, k) of an `eigengs_dr.EigenGS` model.
 
-    ``colors = mean colors + coefficients x weights`` for every channel; shapes stay. Channels with
-    fewer components than others ignore the rest of their row.
+    ``colors = mean colors + coefficients x weights`` for every channel; shapes do not change. A
+    channel with fewer components than others ignores the rest of its row.
     """
 
     shaping = ()
@@ -149,12 +155,12 @@ class FromModel:
         callback.put("coefficients", self.coefficients, mi.ParamFlags.Differentiable)
 
     def gaussians(self) -> Gaussians:
-        """Multiply weights and coefficients; gradients flow back to these.
+        """Return the set of the coefficients; gradients flow back to them.
 
         Raises
         ------
         ValueError
-            If their shape is wrong.
+            If the coefficients have the wrong shape.
         """
         start, expected = self.start, (len(self.weights), self.weights[0].shape[1])
         found = tuple(self.coefficients.shape)
@@ -168,7 +174,7 @@ class FromModel:
         splat, last = dr.arange(types.UInt, count), types.UInt(count)
         for c, weights in enumerate(self.weights):
             row = dr.gather(types.Float, self.coefficients.array, _run(c, expected[1]))
-            # As a step may leave what is not finite, which would also come through zero weights.
+            # An optimiser may leave values that are not finite; times zero weights, they give NaN.
             row = mi.TensorXf(dr.select(dr.isfinite(row), row, 0), (expected[1], 1))
             change = (weights @ row).array
             colors.append(start.color[c] + dr.gather(types.Float, change, splat))

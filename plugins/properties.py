@@ -1,4 +1,4 @@
-"""Properties of ``gaussian_texture``: read, checked, refused in one line."""
+"""The properties of ``gaussian_texture``, and their checks."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from eigengs_dr.image.color import SPACES
 from .parameters import FromModel, FromSet
 
 WRAPS = ("repeat", "mirror", "clamp")
-"""What lies outside of the image."""
+"""Names of the ways to continue an image outside of its borders."""
 
 
 def source_of(props: Any) -> FromSet | FromModel:
-    """Read the properties that say where the Gaussians come from.
+    """Read the Gaussians from the properties ``filename``, ``model`` or ``mean``, ...
 
     Raises
     ------
     ValueError
-        If there is none or more than one such property, a file is not what is asked for, or its
-        channels are no texture's.
+        If none or several of these properties are given, a file has other content, or a set does
+        not have one or three channels.
     """
     given = [key for key in ("filename", "model", "mean") if key in props]
     if len(given) != 1:
@@ -44,13 +44,13 @@ def source_of(props: Any) -> FromSet | FromModel:
         gaussians = _from_arrays(props, backend)
     if gaussians.channels not in (1, 3):
         raise ValueError(
-            f"gaussian_texture: the set has {gaussians.channels} channels; a texture has 1 or 3"
+            f"gaussian_texture: the set has {gaussians.channels} channels; use a set of 1 or 3"
         )
     return FromSet(gaussians)
 
 
 def _first(props: Any) -> int | None:
-    """Read ``first``: how many Gaussians of a file are used; None for all."""
+    """Read ``first``, the number of Gaussians to use from a file; None for all."""
     value = props.get("first", 0)
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise ValueError(f"gaussian_texture: first is {value!r}; it must be a number of Gaussians")
@@ -58,17 +58,17 @@ def _first(props: Any) -> int | None:
 
 
 def _coefficients(props: Any) -> Any:
-    """Read ``coefficients``; None, for those of the mean image, where there are none."""
+    """Read ``coefficients``; None, without this property, stands for the mean image."""
     if "coefficients" not in props:
         return None
     found = np.array(props["coefficients"])
     if found.dtype.kind not in "fiu" or not np.isfinite(found).all():
-        raise ValueError("gaussian_texture: coefficients has values that are not finite")
+        raise ValueError("gaussian_texture: coefficients must be finite numbers")
     return found.astype(np.float32)
 
 
 def _from_arrays(props: Any, backend: str) -> Gaussians:
-    """Read a set from the properties that `texture_of` wrote."""
+    """Read a set from the properties of `texture_of`."""
     missing = [key for key in (*FIELDS, "width", "height", "space") if key not in props]
     if missing:
         raise ValueError(f"gaussian_texture: {missing[0]} is missing; see texture_of")
@@ -90,12 +90,12 @@ def _from_arrays(props: Any, backend: str) -> Gaussians:
 
 
 def _path(props: Any, key: str) -> str:
-    """Where a file lies: beside the scene, or where Mitsuba's resolver finds it."""
+    """Return the path of a file by Mitsuba's resolver, which also looks beside the scene."""
     return str(mi.file_resolver().resolve(props[key]))
 
 
 def raw(props: Any) -> bool:
-    """Read ``raw``: whether values are given as they are."""
+    """Read ``raw``: whether lookups skip decoding and clamping."""
     value = props.get("raw", False)
     if not isinstance(value, bool):
         raise ValueError(f"gaussian_texture: raw is {value!r}; it must be a boolean")
@@ -110,7 +110,7 @@ def _number(props: Any, key: str, default: float) -> float:
 
 
 def cutoff(props: Any, default: float) -> float:
-    """Read ``cutoff`` in standard deviations; `default` is that of the set."""
+    """Read ``cutoff`` in standard deviations; by default the cutoff of the set."""
     value = _number(props, "cutoff", default)
     if not 0 < value <= MAX_CUTOFF:
         raise ValueError(
@@ -120,7 +120,7 @@ def cutoff(props: Any, default: float) -> float:
 
 
 def angle(props: Any) -> float:
-    """Read ``prefilter``: the angle of a pixel in radians, 0 for none."""
+    """Read ``prefilter``: the angle of a pixel in radians, or 0 for lookups at points."""
     value = _number(props, "prefilter", 0.0)
     if not 0 <= value < 1:
         raise ValueError(
@@ -141,7 +141,7 @@ def wrap_mode(props: Any) -> str:
 
 
 def affine(props: Any) -> tuple[tuple, tuple]:
-    """Read ``to_uv``: its rows (m00, m01, translation), and the inverse of its linear part."""
+    """Read ``to_uv``: return its rows (m00, m01, translation) and its linear part's inverse."""
     transform = props["to_uv"] if "to_uv" in props else mi.ScalarTransform4f()
     if not hasattr(transform, "matrix"):
         raise ValueError(f"gaussian_texture: to_uv is {transform!r}; it must be a transform")

@@ -1,4 +1,4 @@
-"""Make the plugins known to Mitsuba, for the variant in use and for those set later."""
+"""Registration of the plugins with Mitsuba."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from .gaussian_texture import gaussian_texture
 
 
 def register_plugins() -> None:
-    """Make ``gaussian_texture`` known to Mitsuba.
+    """Register ``gaussian_texture`` with the current variant of Mitsuba and with later ones.
 
-    For the variant in use, if one is set, and for every variant set later; calling it again
-    changes nothing. Scalar variants learn the name as well, and refuse it when a scene uses it.
+    Further calls change nothing. In scalar variants, a scene that uses the texture raises an error.
 
     Raises
     ------

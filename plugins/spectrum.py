@@ -1,15 +1,15 @@
 """Reflectance spectra from linear sRGB: linear in the colour, hence exactly differentiable.
 
 Mitsuba's own upsampling (Jakob and Hanika, 2019) looks up its coefficients in a table on the host,
-once a texel, so that no derivative leads back to the colours. Here instead a spectrum is a weighted
-sum of three fixed basis spectra,
+once per texel, so gradients do not reach the colours. Here a spectrum is a weighted sum of three
+fixed basis spectra,
 
-    s(l) = r R(l) + g G(l) + b B(l),    R, G, B >= 0,    R + G + B = 1,
+    s(l) = r R(l) + g G(l) + b B(l),    R, G, B >= 0,    R + G + B = 1.
 
-so that colours in [0, 1] give reflectances in [0, 1], and greys give constant spectra. The idea is
-that of I. Mallett and C. Yuksel, "Spectral Primary Decomposition for Rendering with sRGB
-Reflectance", EGSR 2019; the basis is computed from Mitsuba's own curves, so that it is Mitsuba
-that gets back the colours.
+Colours in [0, 1] give reflectances in [0, 1], and greys give constant spectra. The idea is from
+I. Mallett and C. Yuksel, "Spectral Primary Decomposition for Rendering with sRGB Reflectance",
+EGSR 2019. The basis is computed from Mitsuba's own curves, so Mitsuba's integration of a spectrum
+returns the colour.
 """
 
 from functools import cache
@@ -24,33 +24,33 @@ from scipy.optimize import nnls
 from eigengs_dr.backend.arrays import upload
 
 STEP = 5.0
-"""Distance of the samples, in nm. That of Mitsuba's tables of D65 and the matching functions, so
-that products with them are cubic polynomials between the samples."""
+"""Distance of the samples in nm, as in Mitsuba's tables of D65 and the matching functions. Products
+with these tables are then cubic polynomials between the samples."""
 
 PENALTY = 1e3
-"""Weight of the equality constraints, against differences of neighbouring samples of at most 1."""
+"""Weight of the equality constraints; the differences of neighbouring samples are at most 1."""
 
 
 @cache
 def basis() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute the basis spectra: the smoothest that give back the three primaries.
+    """Compute the smoothest basis spectra that reproduce the three primaries.
 
-    With the samples x_i of R, G and B side by side, and M the colours of hat functions,
+    With the samples x_i of R, G and B in one vector, and the colours M of hat functions,
 
         minimise    sum (x_{i+1} - x_i)^2
         subject to  M [R G B] = diag(M 1),    R + G + B = 1,    R, G, B >= 0.
 
-    M 1 is the colour of a white surface, which misses (1, 1, 1) by 2e-4 at most, as Mitsuba rounds
-    its constants. First differences, unlike second ones, leave the spectra constant where the eye
-    sees nothing. The equations enter as rows of large weight, so that Lawson and Hanson's
-    non-negative least squares solves the problem, in some 10 ms.
+    M 1 is the colour of a white surface. It differs from (1, 1, 1) by 2e-4 at most, because Mitsuba
+    rounds its constants. First differences, unlike second ones, keep the spectra constant at
+    wavelengths that the eye does not see. The equations are rows of large weight in Lawson and
+    Hanson's non-negative least squares, which takes some 10 ms.
 
     Returns
     -------
     wavelengths : ndarray of float64, shape (n,)
-        Where the spectra are sampled, in nm: 360, 365, ... 830. In between they are linear.
+        Wavelengths of the samples in nm: 360, 365, ... 830. Between samples, spectra are linear.
     spectra : ndarray of float64, shape (3, n)
-        R, G and B. Callers share both arrays, so that neither can be written to.
+        R, G and B. Both arrays are read-only, because callers share them.
     """
     wavelengths, colors = _hat_colors()
     count = len(wavelengths)
@@ -75,12 +75,12 @@ def basis() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _hat_colors() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Integrate hat functions under D65: samples, shape (n,), and linear sRGB, shape (3, n).
+    """Return the wavelengths (n,), and the linear sRGB (3, n) of hat functions under D65.
 
-    A hat, D65 and a matching function are each linear between samples: Simpson's rule is exact.
+    Simpson's rule is exact: a hat, D65 and a matching function are linear between samples.
     """
-    # Any variant has these functions; this one is quickest for single values, needs no device and
-    # need not be the one that is set.
+    # The scalar variant is the fastest for single values and needs no device. It works whatever
+    # the current variant is.
     scalar: Any = mi.scalar_rgb
     half = np.arange(scalar.MI_CIE_MIN, scalar.MI_CIE_MAX + 1e-3, STEP / 2)
     light = np.array([np.array(scalar.cie1931_xyz(x)) * scalar.cie_d65(x) for x in half]).T
@@ -94,13 +94,13 @@ def _hat_colors() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def upload_table() -> Any:
-    """Upload the basis for `upsample`, in the variant that is set (LLVM or CUDA).
+    """Upload the basis for `upsample`, in the current variant (LLVM or CUDA).
 
     Returns
     -------
     mitsuba.Float
         Four numbers for each interval between samples: R and G at its start, and their increments.
-        One packet gather then reads all that a wavelength needs; B is what is missing to 1.
+        One packet gather then reads all numbers for a wavelength, since B = 1 - R - G.
     """
     red_green = basis()[1][:2]
     intervals = np.concatenate([red_green[:, :-1], np.diff(red_green, axis=1)])
@@ -108,29 +108,29 @@ def upload_table() -> Any:
 
 
 def upsample(rgb: Any, wavelengths: Any, table: Any) -> Any:
-    """Evaluate the reflectance spectrum of a colour, s = b + (r - b) R + (g - b) G.
+    """Return the reflectance spectrum of a colour, s = b + (r - b) R + (g - b) G.
 
-    So written, greys are exactly grey in floating point too. Nothing is evaluated: the function
-    may be called inside symbolic loops and calls. Derivatives lead to the colour, in both modes.
+    This form keeps greys exactly grey in floating point. The function evaluates nothing, so
+    symbolic loops and calls may contain it. Gradients flow to the colour, in both AD modes.
 
     Parameters
     ----------
     rgb : mitsuba.Color3f
-        Linear sRGB. In [0, 1] for a reflectance, but any value will do.
+        Linear sRGB: in [0, 1] for a reflectance, but any value works.
     wavelengths : mitsuba.Spectrum
         Wavelengths in nm, such as ``si.wavelengths``.
     table : mitsuba.Float
-        What `upload_table` returned.
+        Result of `upload_table`.
 
     Returns
     -------
     mitsuba.Spectrum, of the type of `wavelengths`
-        The reflectance; zero outside of 360 to 830 nm, and where a wavelength is not a number.
+        The reflectance; 0 for wavelengths that are NaN or outside of 360 to 830 nm.
     """
     result = []
     for wavelength in wavelengths:
         inside = (wavelength >= mi.MI_CIE_MIN) & (wavelength <= mi.MI_CIE_MAX)
-        # NaN must not become an index: no mask would then keep the gather inside of the table.
+        # NaN must not become an index: no mask would keep the gather inside the table.
         position = (dr.select(inside, wavelength, mi.MI_CIE_MIN) - mi.MI_CIE_MIN) / STEP
         start = dr.minimum(mi.UInt32(position), dr.width(table) // 4 - 1)
         value = dr.gather(mi.Vector4f, table, start)

@@ -1,1 +1,1 @@
-"""Sets of Gaussians in few bytes."""
+"""Compression of sets of Gaussians to ``.egs`` files."""

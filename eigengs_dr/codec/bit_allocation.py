@@ -1,10 +1,10 @@
-"""`pack`: the smallest file of a set of Gaussians that a stated loss of quality allows.
+"""The function `pack`, which writes a set to the smallest file within a given loss of PSNR.
 
-The error of rounding is ``D = sum_g k_g Delta_g^2`` with a step ``Delta_g`` for each kind of
-parameter, and a bit less for each of its ``n_g`` numbers doubles the step. Where no bit can be
-moved to another kind for less error, all ``k_g Delta_g^2 / n_g`` are equal (reverse
-water-filling; Cover and Thomas, Elements of Information Theory, section 10.3.3). The ``k_g`` are
-measured, and one common factor of the steps is then searched for.
+The error of rounding is ``D = sum_g k_g Delta_g^2`` with a step ``Delta_g`` for each kind g of
+parameter. One bit less for each of the ``n_g`` numbers of a kind doubles its step. The allocation
+is optimal if all ``k_g Delta_g^2 / n_g`` are equal (reverse water-filling; Cover and Thomas,
+Elements of Information Theory, section 10.3.3). `pack` measures the ``k_g`` and then searches one
+common factor of the steps.
 """
 
 from __future__ import annotations
@@ -33,27 +33,28 @@ from .quantization import Steps
 Array = NDArray[np.floating]
 
 BUDGET = 0.5
-"""Decibels that a file may lose by default: beyond, more bits are saved by fewer splats."""
+"""Loss of PSNR by default, in dB. For a larger loss, fewer Gaussians save more bits."""
 
 MSE_WITHOUT_IMAGE = 1e-4
-"""Mean squared error, 40 dB, that a set is taken to have where its image is not given."""
+"""Mean squared error that `pack` assumes for a set if it has no image: 40 dB."""
 
 MIN_MSE = 1e-9
-"""Mean squared error, 90 dB, below which nothing is gained by less."""
+"""Smallest mean squared error that counts: 90 dB."""
 
 PROBE_STEPS = Steps(mean=0.1, scale=0.08, stretch=0.06, color=0.125)
-"""Steps at which the errors of one kind are measured; that of colours times their root mean
-square in units of one over the size."""
+"""Steps for the measurement of ``k_g``. The step of colours is relative to their root mean square,
+each colour times the size of its Gaussian."""
 
 MAX_STEPS = Steps(mean=4.0, scale=1.0, stretch=1.0, color=1.0)
-"""Largest steps, in the same units: what does not show at any step would have none."""
+"""Upper bounds of the steps, in the units of `PROBE_STEPS`. Without a bound, a parameter with no
+visible effect would get an infinite step."""
 
 NEGLIGIBLE = 1 / 32
-"""Share of a step at which errors are a thousandth."""
+"""Fraction of a step at which the error is a thousandth."""
 
 HALVINGS = 4
-"""Halvings of the interval of the common factor, of which the ends differ by a root of 2: the last
-one is worth 0.04 bits a number."""
+"""Halvings of the interval of the common factor, whose ends differ by a factor of sqrt(2). The last
+halving saves 0.04 bits per number."""
 
 TOO_FINE = "pack: no rounding is fine enough for the budget; allow more dB"
 
@@ -66,16 +67,18 @@ class PackResult(NamedTuple):
     Attributes
     ----------
     gaussians : Gaussians
-        What the file holds: the rounded set, its splats in the order of the file.
+        The rounded set in the order of the file.
     bytes : int
+        Size of the file.
     bits_per_pixel : float
-        Of the native size.
+        Bits of the file per pixel of the native size.
     psnr : float
-        Decibels, in the space of the budget, of its rendering against the image; where none was
-        given, against the rendering of the set before.
+        PSNR of the rendering of the rounded set in dB, in the space of the budget, against the
+        image; without an image, against the rendering of the set before rounding.
     psnr_drop : float
-        Decibels below what the set had before; for want of an image, below 40 dB.
+        Loss of PSNR in dB; without an image, from 40 dB.
     steps : Steps
+        Steps of the rounding.
     """
 
     gaussians: Gaussians
@@ -94,45 +97,44 @@ def pack(
     sections: Sequence[int] | None = None,
     cutoff: float | None = None,
 ) -> PackResult:
-    """Write the smallest ``.egs`` file of a set that keeps its quality but for a budget.
+    """Write a set to the smallest ``.egs`` file whose loss of PSNR stays within a budget.
 
     Parameters
     ----------
     gaussians : Gaussians
     path : path-like
-        Replaced, all or nothing. `Gaussians.load` reads it.
+        File to write; `pack` replaces an existing file atomically. `Gaussians.load` reads it.
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W), optional
-        The image that the set was fitted to, as `fit` takes it. By default the rendering of the
-        set.
+        The image of the fit, as `fit` takes it. By default the rendering of the set.
     budget : float, optional
-        Decibels of PSNR that may be lost, above 0 and at most 100: against the image, in
-        the space of the set (psnr_ycbcr where that is YCbCr; light is coded as sRGB), at its native
-        size. Without the image, what a set of 40 dB loses where the errors add.
+        Largest loss of PSNR in dB, above 0 and at most 100: against the image, at the native size
+        and in the space of the set (psnr_ycbcr for YCbCr; `pack` compares linear light as sRGB).
+        Without an image, the loss of a set of 40 dB if the errors add.
     sections : sequence of int, optional
-        Numbers of splats in each part of the file, in the order of the set; readers may stop after
-        any of them, and the budget holds for what they have then. By default all in one. Inside a
-        section splats lie in the order of the curve.
+        Number of Gaussians in each section of the file, in the order of the set. A reader may stop
+        after any section; the budget holds for each of these prefixes. By default one section.
+        Inside a section, Gaussians are stored in Hilbert-curve order.
     cutoff : float, optional
-        Standard deviations after which a Gaussian ends; by default that of the set.
+        Radius of a Gaussian in standard deviations; by default the cutoff of the set.
 
     Returns
     -------
-    Receipt
+    PackResult
 
     Raises
     ------
     ValueError
-        If the image or an argument does not fit the set, the file has another suffix than ``.egs``,
-        or no file holds the budget.
+        If the image or an argument does not fit the set, the suffix is not ``.egs``, or no file
+        meets the budget.
     OSError
-        If the file cannot be written; an existing one is then as before.
+        If the file cannot be written; an existing file then stays unchanged.
 
     Notes
     -----
-    The result is a function of the arguments, bit for bit, on one machine and backend.
+    On one machine and backend, the same arguments give the same file bit for bit.
     """
     if Path(path).suffix.lower() != SUFFIX:
-        raise ValueError(f"{path}: packed sets end in {SUFFIX}; choose such a name, or use save()")
+        raise ValueError(f"{path}: pack writes {SUFFIX} files; use this suffix, or save()")
     rows = _rows(len(gaussians), sections)
     if not 0 < budget <= MAX_PSNR:
         raise ValueError(
@@ -142,7 +144,8 @@ def pack(
     if cutoff is not None:
         gaussians = replace(gaussians, cutoff=float(cutoff))
     shown = _shown(gaussians) if image is None else _compared(gaussians, image)
-    # The best light for an image is not the best picture: a set that has found it is kept.
+    # The best linear light is not the best sRGB picture. So compensation keeps a set in linear
+    # light near its own rendering, not near the image.
     keeps = image is None or gaussians.space == "linear"
     target = _planes_of(gaussians) if keeps else shown
     unseen = MSE_WITHOUT_IMAGE if image is None else 0
@@ -159,7 +162,7 @@ def pack(
     def attempt(steps: Steps) -> _Candidate:
         packed = quantize_with_feedback(gaussians, target, steps, rows)
         after = zip(errors(to_gaussians(packed, gaussians)), limits, strict=True)
-        # Of all that a reader may stop at the worst counts, on the scale of the whole.
+        # The worst prefix counts, with its error on the scale of the whole set.
         return packed, max(error * (limits[-1] / limit) for error, limit in after)
 
     start = _water_fill(attempt, gaussians, limits[-1])
@@ -180,7 +183,7 @@ def pack(
 def _water_fill(
     attempt: Callable[[Steps], _Candidate], gaussians: Gaussians, limit: float
 ) -> Steps:
-    """Steps of equal marginal cost whose errors, were they squares, would reach the limit."""
+    """Return steps of equal marginal cost that reach the limit if errors grow as their squares."""
     arrays = gaussians.to_arrays()
     size = sizes_from_log_shapes(log_shapes(arrays["factor"]))
     spread = float(np.sqrt(np.mean(np.square(arrays["color"] * size[:, None]))))
@@ -196,7 +199,7 @@ def _water_fill(
 
 
 def _search(attempt: Callable[[Steps], _Candidate], steps: Steps, limit: float) -> _Candidate:
-    """Find the largest common factor of the steps whose error is within the limit."""
+    """Find the largest common factor of the steps with an error within the limit."""
 
     def scaled(power: float) -> _Candidate:
         return attempt(_steps(np.array(steps) * 2**power))
@@ -219,16 +222,16 @@ def _search(attempt: Callable[[Steps], _Candidate], steps: Steps, limit: float) 
 
 
 def _steps(values: Array) -> Steps:
-    """Steps as a file holds them."""
+    """Return steps in single precision, as in the file."""
     return Steps(*np.asarray(values, np.float32).tolist())
 
 
 def _rows(count: int, sections: Sequence[int] | None) -> list[slice]:
-    """The splats of each section."""
+    """Return the range of the Gaussians of each section."""
     counts = [count] if sections is None else [int(k) for k in sections]
     if not counts or min(counts) < 1 or sum(counts) != count or len(counts) > MAX_SECTIONS:
         raise ValueError(
-            f"pack: sections are {counts[:8]}, expected 1 to {MAX_SECTIONS} numbers of splats "
+            f"pack: sections are {counts[:8]}, expected 1 to {MAX_SECTIONS} numbers of Gaussians "
             f"above 0 whose sum is {count}"
         )
     ends = np.cumsum(counts).tolist()
@@ -236,7 +239,7 @@ def _rows(count: int, sections: Sequence[int] | None) -> list[slice]:
 
 
 def _compared(gaussians: Gaussians, image: ArrayLike) -> Array:
-    """The image in the space in which it is compared: that of the set, light coded as sRGB."""
+    """Return the image in the space of the comparison: the set's space, or sRGB for light."""
     pixels = check_image(image, keep_grey=gaussians.channels == 1)
     expected = (gaussians.height, gaussians.width, gaussians.channels)
     if pixels.shape != expected:
@@ -245,13 +248,13 @@ def _compared(gaussians: Gaussians, image: ArrayLike) -> Array:
 
 
 def _shown(gaussians: Gaussians) -> Array:
-    """Render a set in the space in which it is compared."""
+    """Render a set in the space of the comparison, see `_compared`."""
     planes = _planes_of(gaussians)
     return to_coded(np.maximum(planes, 0)) if gaussians.space == "linear" else planes
 
 
 def _planes_of(gaussians: Gaussians) -> Array:
-    """Render the channels of a set as they are."""
+    """Render a set in its own space."""
     return render(replace(gaussians, space="data")).numpy()
 
 

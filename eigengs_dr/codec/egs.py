@@ -1,9 +1,10 @@
-"""The file of a packed set, ``.egs``: splats as whole numbers, in sections read one by one.
+"""The ``.egs`` file format: Gaussians as integers, in sections that are read one by one.
 
-All numbers are little endian. A header (`_HEADER`) with what all splats share, the background, and
-a checksum; then the sections, each with the number of its splats, its length and its checksum
-(`_SECTION`), and the planes of its numbers (`eigengs_dr.codec.entropy`): steps along a Hilbert
-curve through the means, s, u, v, and one plane a channel.
+All numbers are little endian. The file starts with a header (`_HEADER`), the cutoff from version 2
+on, the background and a checksum. The sections follow. A section starts with its number of
+Gaussians, its length and its checksum (`_SECTION`). Its planes of integers follow, see
+`eigengs_dr.codec.entropy`: steps along a Hilbert curve through the means, s, u, v, and one plane
+per channel.
 """
 
 from __future__ import annotations
@@ -28,19 +29,20 @@ from .quantization import Steps, Symbols, dequantize
 SUFFIX = ".egs"
 
 MAGIC = b"\x89EGS"
-"""First bytes of a file: the first is no letter, so that no text begins so."""
+"""First bytes of a file. The first byte is no ASCII character, so no text file starts with it."""
 
 VERSION = 2
-"""Version 2 adds a cutoff after the header; sets with the default one are written as version 1."""
+"""Newest version of the format. Version 2 adds a cutoff after the header; sets with the default
+cutoff are written as version 1."""
 
 MAX_SECTIONS = 1 << 12
 
 _HEADER = struct.Struct("<4sBBBBHIIii4f")
 """Magic, version, space, channels, levels of the curve, sections, width, height, corner x and y
-(steps from the first pixel's middle), and the steps."""
+(in steps from the centre of the first pixel), and the steps."""
 
 _SECTION = struct.Struct("<III")
-"""Splats, bytes that follow, and their CRC-32."""
+"""Number of Gaussians, number of bytes that follow, and their CRC-32."""
 
 _CUTOFF = struct.Struct("<d")
 
@@ -48,12 +50,12 @@ _CHECK = struct.Struct("<I")
 
 
 class EgsContent(NamedTuple):
-    """What a file holds.
+    """The content of a file.
 
     Attributes
     ----------
     sections : list of Symbols
-        Splats, section by section.
+        Gaussians, section by section.
     steps : Steps
     background : ndarray of float32, shape (C,)
     size : (int, int)
@@ -61,7 +63,7 @@ class EgsContent(NamedTuple):
     space : str
         One of `eigengs_dr.image.color.SPACES`.
     cutoff : float
-        Standard deviations.
+        Radius of a Gaussian in standard deviations.
     """
 
     sections: list[Symbols]
@@ -72,15 +74,15 @@ class EgsContent(NamedTuple):
     cutoff: float = CUTOFF
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Mean (N, 2), factor (N, 3), color (N, C) and background (C,), all of float32."""
+        """Return mean (N, 2), factor (N, 3), color (N, C) and background (C,), all of float32."""
         values = {**dequantize(self.whole(), self.steps), "background": self.background}
         with np.errstate(over="ignore"):
             return {name: value.astype(np.float32) for name, value in values.items()}
 
     def widths(self) -> dict[str, list[int]]:
-        """Bits that tell the values of each parameter apart: of x and y; s, u and v; the colours.
+        """Return the bits for the range of each parameter: x and y; s, u and v; the colours.
 
-        The codes of a file are shorter, as near values are frequent.
+        The codes of a file are shorter, because the values are not uniform.
         """
         return {
             name: [int(span).bit_length() for span in np.ptp(part, axis=0)]
@@ -88,7 +90,7 @@ class EgsContent(NamedTuple):
         }
 
     def whole(self) -> Symbols:
-        """Return the splats of all sections."""
+        """Return the Gaussians of all sections."""
         return Symbols(
             np.concatenate([section.mean for section in self.sections]),
             np.concatenate([section.shape for section in self.sections]),
@@ -97,13 +99,13 @@ class EgsContent(NamedTuple):
 
 
 def is_egs(path: str | os.PathLike[str]) -> bool:
-    """Tell whether a file begins as a packed set; `OSError` if it cannot be opened."""
+    """Return whether a file starts with `MAGIC`; raise `OSError` if it cannot be opened."""
     with open(path, "rb") as file:
         return file.read(len(MAGIC)) == MAGIC
 
 
 def to_bytes(packed: EgsContent) -> bytes:
-    """Lay a set out as a file; the splats of each section are put in the order of the curve."""
+    """Return the bytes of a file; sort the Gaussians of each section in Hilbert-curve order."""
     mean = packed.whole().mean
     corner = mean.min(axis=0)
     levels = int((mean - corner).max()).bit_length()
@@ -129,12 +131,12 @@ def to_bytes(packed: EgsContent) -> bytes:
 
 
 def write(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write what `to_bytes` laid out, all or nothing.
+    """Write the result of `to_bytes` to a file atomically.
 
     Raises
     ------
     OSError
-        If the file cannot be written; an existing one is then as before.
+        If the file cannot be written; an existing file then stays unchanged.
     """
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
@@ -147,15 +149,19 @@ def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsConten
     ----------
     path : path-like
     sections : int, optional
-        Read so many sections, from the first; what follows may be missing. By default all.
+        Number of sections to read; the rest of the file may be missing. By default all.
+
+    Returns
+    -------
+    EgsContent
 
     Raises
     ------
     ValueError
-        If the file is no packed set, is damaged, cut off, or newer than this package, or has fewer
-        sections: one line that names the file.
+        If the file is no packed set, is damaged, cut off or newer than this package, or has fewer
+        sections.
     OSError
-        If it cannot be opened.
+        If the file cannot be opened.
     """
     path = Path(path)
     with path.open("rb") as file:
@@ -166,15 +172,15 @@ def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsConten
 
 
 def read_set(path: Path, sections: int | None = None) -> SetData:
-    """Read a packed set for `eigengs_dr.Gaussians.load`; parameters and errors as for `read`."""
+    """Read a packed set for `eigengs_dr.Gaussians.load`; for parameters and errors see `read`."""
     content = read(path, sections)
     return SetData(content.arrays(), content.size, content.space, content.cutoff)
 
 
 def _body(section: Symbols, corner: NDArray[np.int64], levels: int) -> bytes:
-    """The planes of a section."""
+    """Return the bytes of the planes of a section."""
     places = hilbert_encode(section.mean - corner, levels)
-    # Splats in one place are sorted too: equal sets give equal files, in whatever order they are.
+    # Gaussians at one position are sorted too, so that equal sets in any order give equal files.
     columns = [*section.color.T[::-1], *section.shape.T[::-1], places]
     order = np.lexsort(columns)
     ways = np.diff(places[order], prepend=0)
@@ -189,7 +195,7 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
         raise BadValue("not a packed set of Gaussians; it may be damaged or something else")
     if not 1 <= version <= VERSION:
         raise BadValue(
-            f"version is {version}, this package reads up to {VERSION}; upgrade eigengs-dr"
+            f"version is {version}, but this package reads up to {VERSION}; upgrade eigengs-dr"
         )
     more = _exactly(file, _CUTOFF.size) if version > 1 else b""
     background = _exactly(file, 4 * channels)
@@ -199,19 +205,21 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
     corner, steps = np.array(rest[:2], np.int64), Steps(*rest[2:])
     _check_header(space, channels, levels, count, steps)
     if wanted is not None and not 1 <= wanted <= count:
-        raise BadValue(f"{wanted} sections are asked for, the file has {count}; ask for 1 or more")
+        raise BadValue(f"the file has {count} sections, not {wanted}; ask for 1 to {count}")
     found: list[Symbols] = []
     for number in range(1, (wanted or count) + 1):
         body, splats = _section(file, size, number, 4 + channels)
         room = MAX_ENTRIES // max(3, channels) - sum(len(section.mean) for section in found)
         if splats > room:
-            raise BadValue(f"section {number} claims {splats} splats, more than may be read")
+            raise BadValue(
+                f"section {number} claims {splats} Gaussians, but at most {room} more can be read"
+            )
         try:
             found.append(_symbols(body, splats, channels, corner, levels))
         except BadValue as error:
             raise BadValue(f"section {number}: {error}; copy the file again") from None
     if wanted is None and file.read(1):
-        raise BadValue("something follows the last section; copy the file again")
+        raise BadValue("data follow the last section; copy the file again")
     return EgsContent(
         sections=found,
         steps=steps,
@@ -223,11 +231,11 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
 
 
 def _check_header(space: int, channels: int, levels: int, count: int, steps: Steps) -> None:
-    """Refuse what `to_bytes` does not write; size and values are checked with all sets."""
+    """Raise BadValue for headers that `to_bytes` never writes; `Gaussians.load` checks the rest."""
     if not 1 <= channels <= MAX_CHANNELS:
         raise BadValue(f"the header claims {channels} channels, expected 1 to {MAX_CHANNELS}")
     if space >= len(SPACES) or levels > MAX_LEVELS:
-        raise BadValue("the header holds values that are not known; upgrade eigengs-dr")
+        raise BadValue("the header holds unknown values; upgrade eigengs-dr")
     if not 1 <= count <= MAX_SECTIONS:
         raise BadValue(f"the header claims {count} sections, expected 1 to {MAX_SECTIONS}")
     if not all(0 < step < np.inf for step in steps):
@@ -235,13 +243,15 @@ def _check_header(space: int, channels: int, levels: int, count: int, steps: Ste
 
 
 def _section(file: BinaryIO, size: int, number: int, planes: int) -> tuple[bytes, int]:
-    """The planes of the section that comes next, unchanged by accident, and its splats."""
+    """Read the next section, check its checksum, and return its planes and number of Gaussians."""
     splats, length, check = _SECTION.unpack(_exactly(file, _SECTION.size))
     if length > size - file.tell():
         raise BadValue(f"section {number} is cut off; copy the file again")
-    # Every number takes a bit at least: memory is bounded by what the file is long.
+    # Every integer takes at least one bit, so the length of the file bounds the memory.
     if not 1 <= splats <= 8 * length // planes:
-        raise BadValue(f"section {number} claims {splats} splats in {length} bytes")
+        raise BadValue(
+            f"section {number} claims {splats} Gaussians in {length} bytes; copy the file again"
+        )
     body = _exactly(file, length)
     if zlib.crc32(body) != check:
         raise BadValue(f"section {number} is damaged; copy the file again")
@@ -251,13 +261,13 @@ def _section(file: BinaryIO, size: int, number: int, planes: int) -> tuple[bytes
 def _symbols(
     body: bytes, splats: int, channels: int, corner: NDArray[np.int64], levels: int
 ) -> Symbols:
-    """Decode the planes of a section, whose checksum does not say who wrote them."""
+    """Decode the planes of a section; they may be hostile although the checksum is right."""
     planes, rest = list[NDArray[np.int64]](), memoryview(body)
     for _ in range(4 + channels):
         plane, rest = decode(rest, splats)
         planes.append(plane)
     if len(rest):
-        raise BadValue("something follows the last plane")
+        raise BadValue("data follow the last plane")
     ways, places = planes[0], np.cumsum(planes[0])
     if (ways < 0).any() or (places < 0).any() or places[-1] >> 2 * levels:
         raise BadValue("the curve leaves its square")
@@ -269,7 +279,7 @@ def _symbols(
 
 
 def _exactly(file: BinaryIO, count: int) -> bytes:
-    """Read bytes that must be there."""
+    """Read `count` bytes, or raise BadValue."""
     data = file.read(count)
     if len(data) < count:
         raise BadValue("the file is cut off; copy it again")

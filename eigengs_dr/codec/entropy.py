@@ -1,9 +1,9 @@
-"""Whole numbers to few bytes: Huffman's code by zlib, checked when it is read.
+"""Entropy coding of integers by zlib's Huffman codes.
 
-A number is split as floating-point numbers are, into the part that is worth a code and the low bits
-of large numbers, which are as good as random and stored as they are. An adaptive model with a range
-coder, which would need another dependency, would take between 3 % less and 5 % more: the tables
-that it would learn are short here, and some numbers lie far out.
+A number is split, as in floating point, into a Huffman code for its leading bits and its low bits,
+which are almost random and stored as they are. An adaptive model with a range coder would need
+another dependency and take between 3 % less and 5 % more bytes: the planes are short, and have
+outliers.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from ..storage.npz import BadValue
 IntArray = NDArray[np.int64]
 
 MAX_BITS = 50
-"""Bits of the largest number, sign included."""
+"""Bits of the largest number, with the sign."""
 
 LEADING = (1, 2, 3, 4)
-"""Bits after the first that may belong to a code; the best is stored with each plane."""
+"""Candidates for the number of bits after the first in a code; each plane stores the best one."""
 
 SIGNED = 8
-"""Flag beside that number: values are on both sides of a centre."""
+"""Flag, stored with the number of bits, for values on both sides of a centre."""
 
 CENTRE = np.dtype("<i2")
 
 
 def encode(values: IntArray) -> bytes:
-    """Code whole numbers below ``2^48`` in absolute value, shape (N,)."""
+    """Encode a plane of integers, shape (N,), below ``2^48`` in absolute value."""
     signed = bool((values < 0).any())
     centre = int(np.clip(np.median(values), -(1 << 15), (1 << 15) - 1)) if signed else 0
     away = values - centre
@@ -41,22 +41,27 @@ def encode(values: IntArray) -> bytes:
 
 
 def decode(data: memoryview, count: int) -> tuple[IntArray, memoryview]:
-    """Read a plane of `count` numbers that `encode` wrote; the data may be hostile.
+    """Decode a plane of `count` numbers from the start of the data, which may be hostile.
+
+    Parameters
+    ----------
+    data : memoryview
+    count : int
 
     Returns
     -------
     values : ndarray of int64, shape (count,)
     rest : memoryview
-        What follows the plane.
+        The data after the plane.
 
     Raises
     ------
     BadValue
-        If the data are no such plane.
+        If the data do not start with a plane of `count` numbers.
     """
     head = bytes(data[: 1 + CENTRE.itemsize])
     if len(head) < 1 + CENTRE.itemsize or head[0] & ~SIGNED not in LEADING:
-        raise BadValue("a plane of numbers does not begin as one")
+        raise BadValue("a plane of numbers has an invalid first byte")
     leading, signed = head[0] & ~SIGNED, bool(head[0] & SIGNED)
     stream = zlib.decompressobj(-zlib.MAX_WBITS)
     try:
@@ -73,13 +78,13 @@ def decode(data: memoryview, count: int) -> tuple[IntArray, memoryview]:
 
 
 def _encode_leading(folded: IntArray, leading: int, signed: bool) -> list[bytes]:
-    """Head, codes and low bits; nothing where a code would not fit a byte."""
+    """Return head, codes and low bits; or an empty list if a code would not fit a byte."""
     shifted = folded + (1 << leading)
     width = np.frexp(shifted.astype(np.float64))[1].astype(np.int64) - 1 - leading
     codes = (width << leading) + (shifted >> width) - (1 << leading)
     if codes.max() > 255:
         return []
-    # Codes repeat in no order that the other methods of zlib would find.
+    # The codes hold no repeated sequences, which other strategies of zlib look for.
     stream = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS, 9, zlib.Z_HUFFMAN_ONLY)
     packed = stream.compress(codes.astype(np.uint8).tobytes()) + stream.flush()
     owner, shift = _bits(width)
@@ -88,14 +93,14 @@ def _encode_leading(folded: IntArray, leading: int, signed: bool) -> list[bytes]
 
 
 def _bits(width: IntArray) -> tuple[IntArray, IntArray]:
-    """For every low bit, the number that it belongs to and its power of two, highest first."""
+    """Return the index of the number and the power of two of every low bit, highest bit first."""
     owner = np.repeat(np.arange(len(width)), width)
     start = np.cumsum(width) - width
     return owner, width[owner] - 1 - (np.arange(len(owner)) - start[owner])
 
 
 def _join_bits(codes: IntArray, low: memoryview, leading: int) -> tuple[IntArray, int]:
-    """The numbers, and how many bytes their low bits took."""
+    """Return the numbers, and the number of bytes of their low bits."""
     width = codes >> leading
     size = -(-int(width.sum()) // 8)
     if size > len(low) or width.max() > MAX_BITS - leading:
@@ -105,11 +110,11 @@ def _join_bits(codes: IntArray, low: memoryview, leading: int) -> tuple[IntArray
 
 
 def _read_mantissas(low: bytes, width: IntArray) -> IntArray:
-    """The low bits of every number; memory does not depend on how many they are."""
+    """Return the low bits of every number, with memory independent of their number."""
     start, data = np.cumsum(width) - width, np.frombuffer(low + bytes(8), np.uint8)
     word = np.zeros(len(width), np.uint64)
-    for k in range(8):  # the eight bytes in which the bits begin, of which they take up to 57
+    for k in range(8):  # the up to 57 bits lie in the eight bytes from their first bit on
         word = word << np.uint64(8) | data[(start >> 3) + k].astype(np.uint64)
     word <<= (start & 7).astype(np.uint64)
-    # In two parts: a shift by 64, for a number without low bits, would not be defined.
+    # Two shifts, because a shift by 64, for a number without low bits, would be undefined.
     return (word >> (63 - width).astype(np.uint64) >> np.uint64(1)).astype(np.int64)

@@ -1,9 +1,10 @@
-"""Round a set of Gaussians so that what is rounded later makes up for what was lost before.
+"""Rounding with error feedback: later parameters compensate for the rounding of earlier ones.
 
-Shapes are rounded first, and means and colours descend; then means, and colours are solved for;
-then half of the colours, and the others are solved for again. At equal error files are 4 % smaller
-for the descent, and 1 to 2 % for the halves, than with colours solved for once. In several sections
-all is rounded as it is: a reader may stop after each of them.
+Rounding takes three stages. Round the shapes, then descend on means and colours. Round the means,
+then solve for the colours. Round every other colour, then solve for the rest. At equal error, the
+descent makes files 4 % smaller, and the alternate rounding 1 to 2 %, than one solve for the
+colours. A set in several sections gets no compensation, because a reader may stop after any
+section.
 """
 
 from __future__ import annotations
@@ -27,35 +28,39 @@ from .quantization import Steps, dequantize, quantize
 Array = NDArray[np.floating]
 
 COMPENSATION_STEPS = 20
-"""Steps that means and colours take after the shapes are rounded."""
+"""Steps of the descent on means and colours after the rounding of the shapes."""
 
 COMPENSATION_RATE = 0.4
-"""Their rates, as a share of those of `fit`: they are not far from where they should be."""
+"""Learning rates of this descent, as a fraction of those of `fit`: the optimum is near."""
 
 
 def quantize_with_feedback(
     gaussians: Gaussians, target: Array, steps: Steps, rows: list[slice]
 ) -> EgsContent:
-    """Round shapes, then means, then colours, each time with the best of what is still free.
+    """Round shapes, then means, then colours; let the parameters not yet rounded compensate.
 
     Parameters
     ----------
     gaussians : Gaussians
-        Detached.
+        Set without gradients.
     target : ndarray, shape (H, W, C)
-        What its channels, as they are, shall render to.
+        Target of the rendering, in the space of the set.
     steps : Steps
     rows : list of slice
-        The splats of each section.
+        Range of the Gaussians of each section.
+
+    Returns
+    -------
+    EgsContent
 
     Raises
     ------
     ValueError
-        If a number would be too large to be stored.
+        If a number would be too large to store.
     """
     arrays = gaussians.to_arrays()
     shape = log_shapes(arrays["factor"])
-    if len(rows) == 1:  # what makes up for the whole does not for the first splats alone
+    if len(rows) == 1:  # compensation for the whole set would harm its prefixes
         arrays |= _compensate(gaussians, target, shape, steps)
     symbols = quantize(arrays["mean"], shape, arrays["color"], steps)
     background, size = arrays["background"], (gaussians.width, gaussians.height)
@@ -72,11 +77,11 @@ def quantize_with_feedback(
 def _compensate(
     gaussians: Gaussians, target: Array, shape: Array, steps: Steps
 ) -> dict[str, Array]:
-    """Means, colours and background that make up for what the rounding of others loses."""
+    """Return means, colours and background that compensate for the rounding."""
     arrays, none = gaussians.to_arrays(), np.zeros((len(gaussians), gaussians.channels))
     fixed = dequantize(quantize(arrays["mean"], shape, none, steps), steps)
     current = _with(gaussians, factor=fixed["factor"])
-    if _all_inside(gaussians):  # descent would move splats that lie outside into the image
+    if _all_inside(gaussians):  # descent would move means outside the image into it
         current = solve(current, target, 5, warm_start=True).gaussians
         schedule = PRESETS["default"].schedule
         rates = {name: COMPENSATION_RATE * schedule.rates[name] for name in ("mean", "color")}
@@ -94,7 +99,7 @@ def _compensate(
 def _round_alternately(
     solved: Gaussians, target: Array, mean: Array, shape: Array, steps: Steps
 ) -> Gaussians:
-    """Round every other colour: those between, neighbours in space, make up for what is lost."""
+    """Round every other colour; solve for the colours between, which are near in space."""
     if len(solved) == 1:
         return solved
     arrays, late = solved.to_arrays(), np.arange(len(solved)) % 2 == 1
@@ -108,7 +113,7 @@ def _round_alternately(
 
 
 def to_gaussians(packed: EgsContent, like: Gaussians) -> Gaussians:
-    """Return the splats of a file before it is written, on the backend of another set."""
+    """Return the Gaussians of a content, on the backend of another set."""
     backend = types_of(like.mean).backend
     return Gaussians.from_arrays(
         **packed.arrays(),
@@ -120,7 +125,7 @@ def to_gaussians(packed: EgsContent, like: Gaussians) -> Gaussians:
 
 
 def _with(gaussians: Gaussians, **changed: Array) -> Gaussians:
-    """The set with other arrays."""
+    """Return the set with some arrays replaced."""
     return Gaussians.from_arrays(
         **{**gaussians.to_arrays(), **changed},
         size=(gaussians.width, gaussians.height),
@@ -131,6 +136,6 @@ def _with(gaussians: Gaussians, **changed: Array) -> Gaussians:
 
 
 def _all_inside(gaussians: Gaussians) -> bool:
-    """Whether all means lie in the image."""
+    """Return whether all means lie in the image."""
     mean = gaussians.to_arrays()["mean"]
     return bool(((mean >= 0) & (mean <= (gaussians.width, gaussians.height))).all())

@@ -1,7 +1,7 @@
-"""A Hilbert curve through points with whole coordinates: neighbours on it are neighbours in space.
+"""The Hilbert index of points with integer coordinates: neighbours on the curve are near in space.
 
-N points in the order of the curve need no order of their own: of all the ways to list them one is
-left, which saves ``log2(N!)`` bits where the steps along the curve are stored.
+A file that stores points in Hilbert-curve order stores only the steps along the curve. It need not
+store the order of the N points, which saves ``log2(N!)`` bits.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ from numpy.typing import NDArray
 IntArray = NDArray[np.int64]
 
 MAX_LEVELS = 24
-"""Of squares within squares: places along the curve then fit 48 bits."""
+"""Largest number of levels of the curve; an index then fits 48 bits."""
 
 
 def hilbert_encode(points: IntArray, levels: int) -> IntArray:
-    """Find where on the curve points lie.
+    """Return the Hilbert indices of points.
 
     Parameters
     ----------
     points : ndarray of int64, shape (N, 2)
         x, y from 0 to ``2^levels - 1``.
     levels : int
-        At most `MAX_LEVELS`.
+        Levels of the curve, at most `MAX_LEVELS`.
 
     Returns
     -------
     ndarray of int64, shape (N,)
-        From 0 to ``4^levels - 1``, one for every point of the square.
+        Indices from 0 to ``4^levels - 1``, one for every point of the square.
 
     Examples
     --------
@@ -45,7 +45,7 @@ def hilbert_encode(points: IntArray, levels: int) -> IntArray:
 
 
 def hilbert_decode(places: IntArray, levels: int) -> IntArray:
-    """Find the points, shape (N, 2), at places along the curve: the inverse of `hilbert_encode`."""
+    """Return the points (N, 2) of Hilbert indices (N,): the inverse of `hilbert_encode`."""
     x = y = np.zeros_like(places)
     for level in range(levels):
         quarter = places >> 2 * level & 3
@@ -59,7 +59,7 @@ def hilbert_decode(places: IntArray, levels: int) -> IntArray:
 def _rotate(
     x: IntArray, y: IntArray, right: IntArray, low: IntArray, last: int
 ) -> tuple[IntArray, IntArray]:
-    """Coordinates inside a quarter, as the curve runs there; turning back is the same."""
+    """Return coordinates in the frame of the curve in a quarter; the map is its own inverse."""
     x, y = x & last, y & last
     mirrored = (low == 0) & (right == 1)
     x, y = np.where(mirrored, last - x, x), np.where(mirrored, last - y, y)

@@ -1,4 +1,4 @@
-"""Fewer splats where they are worth least, more where an image is missed most."""
+"""Density control: drop the Gaussians of least use, and add Gaussians where the error is large."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = NDArray[np.floating]
 
 
 SOLVE_STEPS = 5
-"""Steps of the colour solve after splats were dropped: their neighbours take over."""
+"""Steps of the colour solve after dropping Gaussians, so that their neighbours replace them."""
 
 
 def removal_cost(
@@ -25,7 +25,7 @@ def removal_cost(
     target: NDArray[np.float32],
     weight: Array | None = None,
 ) -> NDArray[np.float64]:
-    """Rise of the squared error if a splat were gone and all others stayed as they are.
+    """Return how much the squared error grows if one Gaussian is removed, for each Gaussian.
 
     With the residual r of the set, ``|r + c_n w_n|^2 - |r|^2 = c_n^2 <w_n, w_n> + 2 c_n <w_n, r>``,
     summed over channels. Cost: two adjoints with respect to colours.
@@ -36,12 +36,12 @@ def removal_cost(
     target : ndarray of float32, shape (H, W, C)
         The image in the space of the set.
     weight : ndarray, shape (H, W, C), optional
-        What errors are multiplied by before they are squared.
+        Factor of the errors before squaring.
 
     Returns
     -------
-    ndarray, shape (N,)
-        Negative where the set would be better without the splat.
+    ndarray of float64, shape (N,)
+        Negative if the set would be better without the Gaussian.
     """
     counts = np.ones_like(target) if weight is None else np.square(weight).astype(np.float32)
     missed = residual(gaussians, target) * counts
@@ -57,10 +57,10 @@ def prune(
     count: int,
     weight: Array | None = None,
 ) -> Gaussians:
-    """Keep the `count` splats that are worth the most, in their order, and solve for the colours.
+    """Keep the `count` Gaussians of largest removal cost, in order, and solve for the colours.
 
-    Parameters are those of `removal_cost`. With a weight colours stay: those that are solved for
-    minimise the error without it.
+    For the other parameters see `removal_cost`. With a weight the colours stay, because the solve
+    minimises the error without weights.
     """
     value = removal_cost(gaussians, target, weight)
     kept = np.sort(np.argsort(-value, kind="stable")[:count])
@@ -75,10 +75,10 @@ def densify(
     count: int,
     weight: Array | None = None,
 ) -> Gaussians:
-    """Add round splats where one takes most from the error, until there are `count`.
+    """Add round Gaussians where they reduce the error most, until the set has `count`.
 
-    Parameters are those of `removal_cost`. Fewer are added where the image has no more places, see
-    `residual_peaks`; none to a set that has as many.
+    For the other parameters see `removal_cost`. The result may have fewer Gaussians, if
+    `residual_peaks` finds too few places. A set with `count` or more Gaussians stays as it is.
     """
     if count <= len(gaussians):
         return gaussians

@@ -1,4 +1,4 @@
-"""`fit`: one image to Gaussians, from their placement to the refined set."""
+"""The function `fit`, which fits Gaussians to one image."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ..eigenbasis.eigengs import EigenGS
 
 PIXELS_PER_FIRST_GAUSSIAN = 64
-"""Pixels for each Gaussian of the first try, if the number of Gaussians is searched for."""
+"""Pixels per Gaussian in the first try of a search for the number of Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -36,25 +36,26 @@ class Fit:
     Attributes
     ----------
     gaussians : Gaussians
+        The fitted set.
     trace : list of dict
-        Rows with iteration, seconds, psnr_ycbcr, psnr_rgb; and gaussians, if their number was
-        searched for. Row 0 is before refinement. Seconds count from the call of `fit`: they hold
-        placement, upload, the colour solve, and the time that the rows take. With color "data"
-        psnr_rgb is the PSNR of the data, clamped and rounded to 8 bits, and psnr_ycbcr the PSNR of
-        the data as they are.
+        Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb. A search for the number of
+        Gaussians adds the key gaussians. Row 0 shows the set before refinement. Seconds count from
+        the call of `fit`; they include placement, upload, the colour solve and the measurements.
+        With color "data", psnr_rgb is the PSNR of the data after clamping and rounding to 8 bits,
+        and psnr_ycbcr the PSNR of the unchanged data.
     image : ndarray of float32, shape (H, W, 3), or (H, W, 1) for data of one channel
-        The picture of the set: RGB, not clamped; linear light coded as sRGB, clamped at 0; or the
+        The rendering of the set: RGB without clamping; for linear light, sRGB clamped at 0; or the
         data.
     seconds, seconds_init : float
-        The whole time, and the part before refinement.
+        The whole time, and the time before refinement.
     iterations : int
-        Steps of refinement taken.
+        Number of refinement steps.
     stopped : str
-        Why the fit ended: "iterations", "plateau", "interrupted"; with a target PSNR "met" or "out
-        of reach".
+        Why the fit ended: "iterations", "plateau" or "interrupted"; a search for the number of
+        Gaussians ends with "met", "out of reach" or "interrupted".
     mean_image : ndarray of float32, shape (H, W, 3), or None
-        RGB that renderings of the set are added to: the preset "eigengs" keeps the mean image of
-        its basis as pixels. The attribute `image` has it already.
+        RGB image to add to renderings of the set. The preset "eigengs" keeps the mean image of its
+        basis as pixels. The attribute `image` includes the mean image.
     """
 
     gaussians: Gaussians
@@ -78,7 +79,7 @@ class Fit:
 
 
 class FitInterrupted(KeyboardInterrupt):
-    """Ctrl-C or SIGTERM during a fit.
+    """The error of a fit that Ctrl-C or SIGTERM interrupted.
 
     Attributes
     ----------
@@ -108,48 +109,50 @@ def fit(
     max_gaussians: int | None = None,
     cutoff: float = CUTOFF,
 ) -> Fit:
-    """Fit an image by a sum of Gaussians: a given number of them, or as few as a PSNR needs.
+    """Fit an image by a given number of Gaussians, or by as few as a target PSNR needs.
 
     Parameters
     ----------
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
         See `eigengs_dr.image.io.check_image`.
     gaussians : int, optional
-        Number of Gaussians, at most one a pixel. By default 5000, or one a pixel for smaller
-        images; with an eigenbasis the number that the basis has.
+        Number of Gaussians, at most one per pixel. By default 5000, or one per pixel for smaller
+        images; with an eigenbasis, the number of Gaussians of the basis.
     iterations : int, optional
         Largest number of refinement steps; 0 keeps the colours of the solve.
     init : {"auto", "adaptive", "grid", "random", "eigen"}, optional
-        Where Gaussians start. "auto" is "eigen" if a basis is given, else the initialiser of the
-        preset: "adaptive" for "default".
+        Initialiser. "auto" is "eigen" if a basis is given, else the initialiser of the preset:
+        "adaptive" for "default".
     basis : str, path-like or EigenGS, optional
-        The start of "eigen": the name of a basis of this package, the file of another, or a model.
-        By default "natural", which ships with the package.
+        Basis for "eigen": the name of a basis in this package, the path of a basis file, or a
+        model. By default "natural", which ships with the package.
     preset : {"default", "gaussianimage", "eigengs"}, optional
         The method, see `eigengs_dr.fitting.presets`.
     solve_steps : int, optional
-        Steps of conjugate gradients in the colour solve; "eigen" needs none at its own size.
+        Steps of conjugate gradients in the colour solve. "eigen" uses them only if the image and
+        the basis differ in size.
     color : {"ycbcr", "rgb", "linear", "data"}, optional
-        Space of the colours and of the squared error. "linear" decodes sRGB, so that the Gaussians
-        sum to linear light, as textures need it; errors weigh more in the dark. "data" takes the
-        channels as they are, one or three (roughness, normals, heights).
+        Space of the colours and of the squared error. "linear" decodes sRGB: the Gaussians sum to
+        linear light, as textures need it, and errors weigh more in the dark. "data" uses one or
+        three channels unchanged (roughness, normals, heights).
     seed : int, optional
-        Seed of random numbers. Only "random" and the colours of presets without a solve draw any:
-        the preset "default" gives one result for all seeds.
+        Seed of the random numbers. Only the initialiser "random" and presets without a colour
+        solve use random numbers; the preset "default" gives one result for all seeds.
     backend : {"llvm", "cuda"}, optional
         By default "cuda" if there is a GPU.
     progress : callable, optional
-        ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
+        Called every 10 steps as ``progress(iteration, iterations, row)`` with the last row of the
+        trace.
     target_psnr : float, optional
-        Instead of `gaussians`: decibels to reach with as few Gaussians as possible, see
-        `eigengs_dr.fitting.search`. The search takes up to about twice `iterations` steps.
+        PSNR in dB to reach with as few Gaussians as possible; excludes `gaussians`. The search
+        takes up to about twice `iterations` steps, see `eigengs_dr.fitting.search`.
     target_space : {"ycbcr", "rgb"}, optional
         Whether `target_psnr` is a psnr_ycbcr or a psnr_rgb.
     max_gaussians : int, optional
-        Largest number of Gaussians for `target_psnr`. By default the number that has as many
-        parameters as the image has numbers: 3 for 8 pixels in colour.
+        Largest number of Gaussians for `target_psnr`. By default the Gaussians have at most as
+        many parameters as the image has numbers: 3 Gaussians for 8 pixels in colour.
     cutoff : float, optional
-        Standard deviations after which a Gaussian ends, in (0, 12]; the set keeps it.
+        Radius of a Gaussian in standard deviations, in (0, 12]; the set keeps it.
 
     Returns
     -------
@@ -158,15 +161,15 @@ def fit(
     Raises
     ------
     ValueError
-        If the image is unusable or an argument out of range; one line.
+        If the image is unusable or an argument is out of range.
     BackendError
-        If the backend is not there.
+        If the backend is not available.
     FitInterrupted
         After Ctrl-C or SIGTERM: a `KeyboardInterrupt` that holds the best set so far.
 
     Notes
     -----
-    One seed gives one result, bit for bit, on one machine and backend.
+    On one machine and backend, one seed gives the same result bit for bit.
 
     Examples
     --------
@@ -194,7 +197,7 @@ def fit(
 
 
 def fit_image(image: ArrayLike, options: FitOptions, progress: FitProgress | None = None) -> Fit:
-    """Fit an image with options that were checked; see `fit` for results and errors."""
+    """Fit an image with the options of one record; see `fit` for results and errors."""
     started = time.perf_counter()
     pixels = check_image(image, keep_grey=options.color == "data")
     options.check_image(pixels)
@@ -217,7 +220,7 @@ def fit_image(image: ArrayLike, options: FitOptions, progress: FitProgress | Non
 
 
 def _first_try(pixels: NDArray[np.float32], options: FitOptions) -> FitOptions:
-    """Return the options of the start: a search starts with few Gaussians."""
+    """Return the options of the initialiser; a search starts with few Gaussians."""
     if options.target_psnr is None:
         return options
     most = options.max_gaussians or max_gaussians_for(pixels)
@@ -258,7 +261,7 @@ def finish(
     started: float,
     seconds_init: float,
 ) -> Fit:
-    """Render the result of a refinement.
+    """Render the result of a refinement and return it as a `Fit`.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""What refinement starts from: Gaussians placed by the image or by a basis, with their colours.
+"""The start of a fit: Gaussians with colours, placed by the image or by a basis.
 
-The registries of placements and initialisers are here. To add one, write one file and one entry
-below: ``module:function``, which is imported when it is first used.
+This module holds the registries of placements and initialisers. To add one, write one file and add
+one entry ``module:function`` below; its first use imports it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PLACEMENTS = {
     "grid": "eigengs_dr.fitting.placement.grid:place_grid",
     "adaptive": "eigengs_dr.fitting.placement.adaptive:place_adaptive",
 }
-"""Where Gaussians start by the image alone; each entry is a `Placement`."""
+"""Placements by name; each entry is a `Placement`, which uses the image alone."""
 
 INITIALIZERS = {
     **dict.fromkeys(PLACEMENTS, "eigengs_dr.fitting.redistribute:start_from_placement"),
@@ -33,13 +33,14 @@ INITIALIZERS = {
 """Initialisers by the name that ``init`` takes; each entry is an `Initializer`."""
 
 DARKNESS, BLACK = 0.3, 0.003
-"""Errors of light I weigh ``max(I, BLACK)^-DARKNESS``: by the root of the slope of the sRGB curve,
-between errors of light, which spare the dark, and errors of codes. At 5000 splats and 300 steps
-that gains 0.7 dB of psnr_rgb over no weights, on 12 training images of ImageNet classes."""
+"""Exponent and smallest light I, with 1 for white, of the weight ``max(I, BLACK)^-DARKNESS`` of
+errors in linear light. The weight is about the square root of the slope of the sRGB curve, between
+errors of light, which neglect the dark, and errors of sRGB codes. With 5,000 Gaussians and 300
+steps it gains 0.7 dB of psnr_rgb over no weight, on 12 training images of ImageNet classes."""
 
 
 class Placement(Protocol):
-    """Places and shapes Gaussians by the image alone."""
+    """The type of functions that place and shape Gaussians by the image alone."""
 
     def __call__(
         self, image: NDArray[np.floating], count: int, generator: np.random.Generator
@@ -48,16 +49,16 @@ class Placement(Protocol):
 
 
 class FitTarget(NamedTuple):
-    """What a fit aims at.
+    """The image that a fit approximates.
 
     Attributes
     ----------
     pixels : ndarray of float32, shape (H, W, C)
-        The image as it was given: RGB, or data.
+        The image of the user: RGB, or data.
     values : ndarray of float32, shape (H, W, C)
         The image in the space of the colours.
     weight : ndarray of float32, shape (H, W, C), or None
-        Errors are multiplied by the weight before they are squared.
+        Factor of the errors before squaring.
     """
 
     pixels: NDArray[np.float32]
@@ -66,20 +67,21 @@ class FitTarget(NamedTuple):
 
 
 class FitProblem(NamedTuple):
-    """What descent starts from, and what it aims at.
+    """The start and the target of a descent.
 
     Attributes
     ----------
     gaussians : Gaussians
+        The set before the first step.
     target : ndarray of float32, shape (H, W, C)
-        The image in the space of the set; without the mean image if that one stays pixels.
+        The image in the space of the set, minus the mean image if the mean image stays pixels.
     weight : ndarray of float32, shape (H, W, C), or None
-        Errors are multiplied by the weight before they are squared.
+        Factor of the errors before squaring.
     base_image : ndarray of float32, shape (H, W, 3), or None
-        RGB that renderings of the set are added to: the mean image, if it stays pixels.
+        RGB image to add to renderings of the set: the mean image, if it stays pixels.
     redistribute : callable, or None
-        ``redistribute(gaussians, count)`` places Gaussians anew where a fitted set left much error;
-        None unless the image alone places them.
+        ``redistribute(gaussians, count)`` returns a new set with more Gaussians where the old set
+        left more error. None for initialisers other than "adaptive".
     """
 
     gaussians: Gaussians
@@ -90,32 +92,36 @@ class FitProblem(NamedTuple):
 
 
 class Initializer(Protocol):
-    """Places Gaussians and finds their colours."""
+    """The type of functions that place Gaussians and find their colours."""
 
     def __call__(self, target: FitTarget, options: FitOptions) -> FitProblem:
         """Return the start of a fit."""
 
 
 def initialize(pixels: NDArray[np.float32], options: FitOptions) -> FitProblem:
-    """Place Gaussians and find their colours: everything of a fit that comes before refinement.
+    """Place Gaussians and find their colours before refinement.
 
     Parameters
     ----------
     pixels : ndarray of float32, shape (H, W, C)
-        As `eigengs_dr.image.io.check_image` returns them.
+        Pixels from `eigengs_dr.image.io.check_image`.
     options : FitOptions
+
+    Returns
+    -------
+    FitProblem
 
     Raises
     ------
     ValueError
-        If the basis does not fit the other options; one line.
+        If the basis contradicts another option.
     """
     start: Initializer = resolve_name(INITIALIZERS[options.initializer])
     return start(make_target(pixels, options.color), options)
 
 
 def make_target(pixels: NDArray[np.float32], color: str) -> FitTarget:
-    """Bring pixels (H, W, C) to the space of the colours, and weigh errors there."""
+    """Convert pixels (H, W, C) to the space of the colours, and weigh the errors there."""
     if color == "ycbcr":
         return FitTarget(pixels, rgb_to_ycbcr(pixels))
     if color == "linear":
@@ -125,8 +131,8 @@ def make_target(pixels: NDArray[np.float32], color: str) -> FitTarget:
 
 
 def dark_weight(light: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What errors of linear light, of any shape, are multiplied by before they are squared.
+    """Return the factors of errors in linear light, an array of any shape with 1 for white.
 
-    ``max(light, BLACK)^-DARKNESS``, where 1 is white; see there.
+    The factors are ``max(light, BLACK)^-DARKNESS``.
     """
     return np.asarray(np.maximum(light, BLACK) ** -DARKNESS, np.float32)

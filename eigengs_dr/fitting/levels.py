@@ -1,8 +1,9 @@
-"""Levels of detail: one set whose first splats, for some numbers of them, make the image too.
+"""Levels of detail: one set whose first N Gaussians already form the image, for several N.
 
-Splats are placed level by level, those of each where the ones before leave most to bend, and all
-are refined together on the sum of the decibels of all levels. Sorting a plain fit by what its
-splats are worth does not do: they lean on each other, and the first quarter makes no image.
+Placement adds one level after the other, with more Gaussians where the residual of the earlier
+levels has larger second derivatives. Refinement then moves all levels together and minimises the
+sum of the logarithms of their squared errors. Sorting the Gaussians of a plain fit by their removal
+cost does not work: they depend on each other, and the first quarter does not form an image.
 """
 
 from __future__ import annotations
@@ -28,19 +29,20 @@ from .redistribute import place_like, residual
 from .refine import FitProgress, refine
 
 LEVEL_RATIO = 4
-"""Splats of a level over those of the one before: half the distance between them."""
+"""Ratio of the numbers of Gaussians up to a level and up to the level before it; 4 halves their
+spacing."""
 
 STEPS_PER_LEVEL = 50
-"""Steps of refinement after a level is added, before the next one is placed."""
+"""Refinement steps between the placements of two levels."""
 
 
 def level_counts(count: int, levels: int) -> list[int]:
-    """Numbers of splats up to each level, the last being `count`.
+    """Return the number of Gaussians up to each level; the last number is `count`.
 
     Raises
     ------
     ValueError
-        If the first level would have no splat, or levels is not positive.
+        If the first level would have no Gaussian, or levels is not positive.
 
     Examples
     --------
@@ -65,29 +67,32 @@ def fit_levels(
     backend: str | None = None,
     progress: FitProgress | None = None,
 ) -> Fit:
-    """Fit Gaussians of which the first quarter makes the image too, and the first quarter of that.
+    """Fit Gaussians of which the first quarter, sixteenth, ... form the image too.
 
     Parameters
     ----------
     gaussians : int, optional
-        Number of splats; by default 5000, or one a pixel if these are fewer.
+        Number of Gaussians; by default 5000, or one per pixel for smaller images.
     levels : int, optional
-        How often the set is quartered, and the whole: `level_counts` tells the numbers. Splats of
-        one level that are worth more come first, so that all numbers between make an image.
+        Number of levels, with the whole set; `level_counts` returns their sizes. Inside a level,
+        Gaussians with a larger removal cost come first, so that every prefix forms an image.
     image, iterations, color, seed, backend, progress
         See `eigengs_dr.fit`.
 
     Returns
     -------
     Fit
-        ``result.gaussians[:n]`` for the levels n. The trace tells of the whole set.
+        ``result.gaussians[:n]`` is a level, for each n of `level_counts`. The trace measures the
+        whole set.
 
     Raises
     ------
     ValueError
-        If the image is unusable or an argument out of range; one line.
+        If the image is unusable or an argument is out of range.
     BackendError
-        If the backend is not there.
+        If the backend is not available.
+    FitInterrupted
+        After Ctrl-C or SIGTERM, see `eigengs_dr.fit`.
     """
     started = time.perf_counter()
     options = FitOptions(
@@ -123,7 +128,7 @@ def _place_levels(
     steps: int,
     interrupted: Callable[[], bool],
 ) -> Gaussians:
-    """Add levels to the first one, each placed on what those before it leave after some steps."""
+    """Add levels to the first one; place each by the residual after some steps without it."""
     gaussians = start.gaussians
     for level, count in enumerate(counts[1:], 1):
         below = counts[: level - 1]
@@ -136,13 +141,13 @@ def _place_levels(
         gaussians = dr.detach(gaussians)
         left = residual(gaussians, start.target)
         added = place_like(gaussians, left, left, count - len(gaussians))
-        # A background of their own would be part of the levels before.
+        # The background is one for all levels: a new one would change the earlier levels.
         gaussians = concatenate([gaussians, replace(added, background=0 * added.background)])
     return gaussians
 
 
 def _sort_levels(gaussians: Gaussians, start: FitProblem, counts: list[int]) -> Gaussians:
-    """Sort the splats of each level, those that are worth most to it first."""
+    """Sort the Gaussians inside each level by their removal cost, the largest first."""
     order, before = [], 0
     for count in counts:
         value = removal_cost(gaussians[:count], start.target, start.weight)

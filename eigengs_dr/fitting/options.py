@@ -1,4 +1,4 @@
-"""Everything that decides a fit beside the image: one record, checked once."""
+"""The options of a fit in one record, which checks them once."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from ..eigenbasis.eigengs import EigenGS
 
 DEFAULT_COUNT = 5000
-"""Gaussians if no number is asked for."""
+"""Number of Gaussians by default."""
 
 DEFAULT_BASIS = "natural"
-"""The basis if none is named: the one that ships with the package."""
+"""Name of the basis by default: the basis that ships with the package."""
 
 COLOR_PARAMETERS = 5
-"""Parameters of a Gaussian beside its colour: two of the mean and three of the factor."""
+"""Parameters of a Gaussian without its colour: two of the mean and three of the factor."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ class FitOptions:
     Raises
     ------
     ValueError
-        If an option is out of range or two of them exclude each other; one line that names it.
+        If an option is out of range, or two options exclude each other.
     """
 
     gaussians: int | None = None
@@ -79,13 +79,18 @@ class FitOptions:
 
     @property
     def initializer(self) -> str:
-        """The name of the initialiser: a basis implies "eigen", "auto" is that of the preset."""
+        """The name of the initialiser: with "auto", "eigen" for a basis, else the preset's."""
         if self.init != "auto":
             return self.init
         return "eigen" if self.basis is not None else self.method.init
 
     def check_image(self, pixels: NDArray[np.float32]) -> None:
-        """Raise ValueError if an image (H, W, C) has fewer pixels than Gaussians are asked for."""
+        """Raise ValueError if the options ask for more Gaussians than an image has pixels.
+
+        Parameters
+        ----------
+        pixels : ndarray of float32, shape (H, W, C)
+        """
         height, width = pixels.shape[:2]
         for name in ("gaussians", "max_gaussians"):
             count = getattr(self, name)
@@ -95,7 +100,7 @@ class FitOptions:
                 )
 
     def count_for(self, pixels: NDArray[np.float32]) -> int:
-        """Return the number of Gaussians for an image (H, W, C) that is not searched for."""
+        """Return the number of Gaussians for an image (H, W, C), if the fit does not search it."""
         return self.gaussians or default_count(pixels.shape[0] * pixels.shape[1])
 
     def _check_numbers(self) -> None:
@@ -112,11 +117,11 @@ class FitOptions:
             )
 
     def _check_search(self) -> None:
-        """Refuse what a search for the smallest number of Gaussians cannot do."""
+        """Raise ValueError for options that contradict a search for the number of Gaussians."""
         if self.target_psnr is None:
             if self.max_gaussians is not None or self.target_space != "ycbcr":
                 raise ValueError(
-                    "max_gaussians and target_space belong to target_psnr; give it, too"
+                    "max_gaussians and target_space belong to target_psnr; give target_psnr too"
                 )
             return
         if self.gaussians is not None:
@@ -133,11 +138,11 @@ class FitOptions:
 
 
 def default_count(pixels: int) -> int:
-    """Return the number of Gaussians if none is asked for: `DEFAULT_COUNT`, at most one a pixel."""
+    """Return the default number of Gaussians: `DEFAULT_COUNT`, at most one per pixel."""
     return min(DEFAULT_COUNT, pixels)
 
 
 def max_gaussians_for(pixels: NDArray[np.float32]) -> int:
-    """Return how many Gaussians have as many parameters as an image (H, W, C) has numbers."""
+    """Return the number of Gaussians with as many parameters as an image (H, W, C) has numbers."""
     channels = pixels.shape[2]
     return max(1, pixels.size // (COLOR_PARAMETERS + channels))

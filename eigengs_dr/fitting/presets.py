@@ -1,4 +1,4 @@
-"""The named methods that `fit` and the benchmarks compare."""
+"""The named methods of `fit`."""
 
 from __future__ import annotations
 
@@ -9,18 +9,21 @@ from .optimizers.schedule import Schedule
 
 @dataclass(frozen=True)
 class Preset:
-    """A method: where splats start, whether colours are solved for, how all is refined.
+    """A method: the initialiser, the start of the colours and the schedule of the refinement.
 
     Attributes
     ----------
     init : str
-        What ``init="auto"`` stands for.
+        Initialiser for ``init="auto"``.
     solves : bool
-        Whether colours are the best ones for the shapes before refinement starts. Else those of the
-        eigenbasis are projected, and all others drawn from [0, 1] with a black background.
+        Whether a solve finds the best colours for the shapes before refinement. Without a solve,
+        an eigenbasis gives the colours by projection; other initialisers draw them from [0, 1] on
+        a black background.
     schedule : Schedule
+        Schedule of the refinement.
     mean : {"gaussians", "dense"}
-        With an eigenbasis, whether Gaussians make the mean image too or it is kept as pixels.
+        With an eigenbasis: "gaussians" if the Gaussians include the mean image, "dense" if the
+        mean image stays pixels.
     """
 
     init: str
@@ -29,8 +32,8 @@ class Preset:
     mean: str = "gaussians"
 
 
-# GaussianImage's recipe: one rate for all; it is halved only after 20,000 steps, which no run here
-# reaches.
+# GaussianImage has one learning rate for all variables. It halves the rate after 20,000 steps,
+# which no fit here reaches.
 _ONE_RATE = Schedule(
     optimizer="adan",
     rates={"mean": 1e-3, "cholesky": 1e-3, "color": 1e-3},
@@ -51,7 +54,7 @@ PRESETS = {
         ),
     ),
     "gaussianimage": Preset(init="random", solves=False, schedule=_ONE_RATE),
-    # The paper's: the same descent, from the projection on the eigenbasis.
+    # EigenGS's paper descends as GaussianImage does, from the projection on the eigenbasis.
     "eigengs": Preset(init="eigen", solves=False, schedule=_ONE_RATE, mean="dense"),
 }
 """Presets by name."""

@@ -1,15 +1,16 @@
-"""Splats placed anew where a fit is worst: density by error.
+"""Redistribution: a new placement of the Gaussians, denser where a fit left more error.
 
-Where the density of splats is rho, an image is missed by a squared error of about
-``e = k rho^-FALL`` a pixel. For a given number of splats, the sum over all pixels is least where
-each has the same share of it, ``s = e / rho``; so, from a set that was tried and what it missed,
+At a density of rho Gaussians per pixel, a fit leaves a squared error of about ``e = k rho^-q`` per
+pixel, with q = `eigengs_dr.fitting.placement.density.ERROR_EXPONENT`. For a given number of
+Gaussians, the sum of the errors is smallest if all Gaussians have the same error ``s = e / rho``.
+So the density and the error of one fit give the best density:
 
-    rho' ~ k^(1 / (FALL + 1)) = rho s^(1 / (FALL + 1)).
+    rho' ~ k^(1 / (q + 1)) = rho s^(1 / (q + 1)).
 
-What is hard to fit and what only bends much is told apart by trying. That is known for some splats
-together; among them, density follows the bending (`eigengs_dr.fitting.placement.adaptive`). The
-constants were chosen on training images of ImageNet classes and of cats, by the error after 1,000
-steps.
+Only a fit can tell parts that are hard to fit from parts that just have large second derivatives.
+The errors of several neighbouring Gaussians are averaged; between these Gaussians, the density
+follows the second derivatives (`eigengs_dr.fitting.placement.adaptive`). The constants were chosen
+on training images of ImageNet classes and of cats, by the error after 1,000 steps.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ Array = NDArray[np.floating]
 
 
 def start_from_placement(target: FitTarget, options: FitOptions) -> FitProblem:
-    """Place Gaussians by the image alone; an `eigengs_dr.fitting.initializers.Initializer`."""
+    """Place Gaussians by the image alone; see `eigengs_dr.fitting.initializers.Initializer`."""
     name, method = options.initializer, options.method
     place: Placement = resolve_name(PLACEMENTS[name])
-    # Linear light would draw too few Gaussians to the dark.
+    # Linear light would put too few Gaussians into dark parts.
     shown = target.pixels if options.color == "linear" else target.values
     count = options.count_for(target.pixels)
     generator = np.random.default_rng(options.seed)
@@ -76,34 +77,34 @@ def redistribute(
     weight: Array | None = None,
     solve_steps: int = 10,
 ) -> Gaussians:
-    """Place splats anew, dense where a set left much error, and solve for their colours.
+    """Place a new set, denser where the old set left more error, and solve for its colours.
 
     Parameters
     ----------
     gaussians : Gaussians
-        A set that was fitted, if only for some steps.
+        The old set, after some steps of a fit.
     count : int
-        Number of splats of the result, from 1 to H W.
+        Number of Gaussians of the new set, from 1 to H W.
     image : ndarray, shape (H, W, C)
-        What shapes splats, see `eigengs_dr.fitting.placement.adaptive`.
+        The image that shapes the Gaussians, see `eigengs_dr.fitting.placement.adaptive`.
     target : ndarray of float32, shape (H, W, C)
         The image in the space of the set.
     weight : ndarray, shape (H, W, C), optional
-        What errors are multiplied by before they are squared.
+        Factor of the errors before squaring.
     solve_steps : int, optional
-        See `eigengs_dr.fitting.solvers.conjugate_gradient`.
+        Steps of the colour solve, see `eigengs_dr.fitting.solvers.conjugate_gradient`.
 
     Returns
     -------
     Gaussians
-        Of the old set it has the density and the errors, no splat.
+        The new set. It keeps no Gaussian of the old set.
     """
     missed = residual(gaussians, target)
     error = np.square(missed if weight is None else missed * weight).sum(axis=2)
     old = gaussians.to_arrays()["mean"]
 
     def density(bend: Array, spacing: float) -> Array:
-        height, width = bend.shape[1:]  # of the image, or of a smaller one
+        height, width = bend.shape[1:]  # the placement may shrink the image
         there = old * np.array([width / gaussians.width, height / gaussians.height])
         here = np.maximum(resample(error[..., None], width, height)[..., 0], 0)
         return target_density(there, here, density_from_hessian(bend, spacing))
@@ -119,10 +120,10 @@ def place_like(
     density: Density | None = None,
     solve_steps: int = 10,
 ) -> Gaussians:
-    """Place splats by an image and solve for their colours, in the space and size of another set.
+    """Place Gaussians by an image in the space and size of another set; solve for their colours.
 
-    Parameters are those of `redistribute`; see `eigengs_dr.fitting.placement.adaptive` for the
-    density.
+    For the parameters see `redistribute`, and for the density
+    `eigengs_dr.fitting.placement.adaptive.place_adaptive`.
     """
     mean, factor = place_adaptive(image, count, density=density)
     placed = Gaussians.from_arrays(
@@ -138,6 +139,6 @@ def place_like(
 
 
 def residual(gaussians: Gaussians, target: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return what a set misses of an image in its own space, shape (H, W, C)."""
+    """Return the target minus the rendering of a set, both in its space: shape (H, W, C)."""
     shown = render(replace(dr.detach(gaussians), space="data"))
     return np.asarray(target - shown.numpy(), np.float32)

@@ -1,4 +1,4 @@
-"""Refinement: a descent with a trace, that keeps the best set and ends where nothing is gained."""
+"""Refinement: a descent that records a trace, keeps the best set and stops at a plateau."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class Refinement(NamedTuple):
     Attributes
     ----------
     gaussians : Gaussians
-        The best set that a row of the trace saw, by psnr_ycbcr.
+        The set with the highest psnr_ycbcr in the trace.
     trace : list of dict
-        Rows with iteration, seconds, psnr_ycbcr, psnr_rgb.
+        Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb.
     iterations : int
-        Steps taken.
+        Number of steps.
     stopped : str
         "iterations", "plateau" or "interrupted"; see also `eigengs_dr.fitting.search.search_count`.
     """
@@ -59,27 +59,28 @@ def refine(
     Parameters
     ----------
     problem : FitProblem
-        The start and the aim.
+        The start and the target.
     image : ndarray of float32, shape (H, W, 3) or (H, W, 1)
         The image in RGB, or the data, for the trace.
     schedule : Schedule
     iterations : int
         Largest number of steps.
     started : float, optional
-        `time.perf_counter()` from which the seconds of the trace count; now by default.
+        Value of `time.perf_counter()` at which the seconds of the trace start; by default now.
     levels : sequence of int, optional
-        Numbers of Gaussians, from the first, that shall make the image too; see `descend`.
+        Sizes of the prefixes of the set that shall form the image too; see `descend`.
     progress : callable, optional
-        ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
+        Called every 10 steps as ``progress(iteration, iterations, row)`` with the last row of the
+        trace. It may raise `KeyboardInterrupt` to end the refinement.
     interrupted : callable, optional
-        Asked before every step whether to stop; see
+        Called before every step; True ends the refinement. See
         `eigengs_dr.backend.interrupt.defer_interrupts`.
 
     Returns
     -------
     Refinement
-        Never worse than the start. If it was interrupted, the last row of the trace is of the last
-        step. `KeyboardInterrupt` from `progress` ends it too.
+        A set never worse than the start. After an interrupt, the last row of the trace measures
+        the last step.
     """
     started = time.perf_counter() if started is None else started
     marks, trace = trace_steps(iterations), list[dict[str, Any]]()
@@ -100,7 +101,7 @@ def refine(
                 if step in marks:
                     judge()
                 if progress and (step in marks or step % 10 == 0):
-                    dr.sync_thread()  # steps run asynchronously; the bar shows finished ones
+                    dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
                     progress(step, iterations, trace[-1])
                 if interrupted():
                     break
@@ -122,7 +123,7 @@ def measure(
     started: float,
     base_image: NDArray[np.float32] | None = None,
 ) -> dict[str, Any]:
-    """Measure a set for a row of a trace: seconds, psnr_ycbcr, psnr_rgb; see `refine`."""
+    """Return the seconds, psnr_ycbcr and psnr_rgb of a set for a row of the trace of `refine`."""
     rendered = picture_of(gaussians)
     if base_image is not None:
         rendered = rendered + base_image
@@ -134,7 +135,7 @@ def measure(
 
 
 def _is_plateau(trace: list[dict[str, Any]], schedule: Schedule) -> bool:
-    """Tell whether the last `patience` steps gained less than `least_gain` decibels."""
+    """Return whether the last `patience` steps gained less than `least_gain` decibels."""
     last = trace[-1]
     if last["psnr_ycbcr"] > MAX_PSNR:
         return True
@@ -143,6 +144,6 @@ def _is_plateau(trace: list[dict[str, Any]], schedule: Schedule) -> bool:
 
 
 def trace_steps(iterations: int) -> set[int]:
-    """Steps after which the trace has a row: 0, 10, 20, 50, 100, then every 100, and the last."""
+    """Return the steps with a row in the trace: 0, 10, 20, 50, every 100, and the last step."""
     marks = {0, 10, 20, 50, iterations} | set(range(100, iterations, 100))
     return {m for m in marks if m <= iterations}

@@ -1,10 +1,10 @@
-"""The fewest splats for a quality.
+"""The search for the smallest number of Gaussians that reaches a PSNR.
 
-Three stages. *Estimate*: some steps with few splats tell what more would reach, two tries what
-twice as many gain, and each where the splats of the next one belong
-(`eigengs_dr.fitting.redistribute`). *Fit* that number. *Polish*: drop what is worth least while the
-goal is met, add where the error is while it is not (`eigengs_dr.fitting.density_control`), each
-time with a short descent.
+The search has three stages. *Estimate*: short descents with few Gaussians ("tries") estimate the
+number. Two tries measure the gain per doubling; each try shows where to place the Gaussians of the
+next one (`eigengs_dr.fitting.redistribute`). *Fit*: a longer descent with the estimated number.
+*Polish*: density control (`eigengs_dr.fitting.density_control`) drops Gaussians while the set meets
+the goal and adds Gaussians while it does not; each change ends with a short descent.
 """
 
 from __future__ import annotations
@@ -26,45 +26,44 @@ from .refine import FitProgress, Refinement
 
 @dataclass(frozen=True)
 class SearchPolicy:
-    """The numbers of a search; chosen on training photos of ImageNet classes.
+    """The constants of a search, chosen on training photos of ImageNet classes.
 
     Attributes
     ----------
     try_share, fit_share, polish_share : float
-        Shares of the iterations that a try, the fit, and each polishing descent take.
+        Steps of a try, of the fit and of a polish, as fractions of the iterations.
     max_length : float
-        The search takes at most this multiple of the iterations, unless these are few (some ten).
+        Steps of the search, at most, as a multiple of the iterations, if these exceed some ten.
     max_tries : int
         Largest number of tries.
     max_polishes : int
-        Polishing descents after which a search ends once the goal is met.
+        Number of polishes after which a search ends if a set meets the goal.
     db_per_doubling : float
         Gain of twice as many Gaussians, in dB, until two tries of the image measure it; see
         `eigengs_dr.fitting.placement.density.ERROR_EXPONENT`.
     doubling_range : (float, float)
-        Range of the measured gain that is believed, in dB; training images gained 1.6 to 8.
+        Allowed range of the measured gain, in dB; training images gained 1.6 to 8.
     min_octaves : float
         Smallest distance of two tries that measures the gain, in doublings.
     late_share : float
-        Gain of a fit after the steps of a try, as a share of the gain in these steps. Measured with
-        150 to 2,500 Gaussians, to half a decibel.
+        Gain of a fit after the steps of a try, as a fraction of the gain in these steps; measured
+        with 150 to 2,500 Gaussians, to half a decibel.
     margin : float
-        The fit has this multiple of the estimated number: dropping some settles it better than
-        adding.
+        Gaussians of the fit over the estimated number; dropping some works better than adding some.
     max_leap : float
-        Largest ratio from one try to the next.
+        Largest ratio of the numbers of Gaussians of two consecutive tries.
     try_tolerance, fit_tolerance : float
-        Shares by which the last try, and the fit, may miss the estimated number.
+        Largest relative difference from the estimated number for the last try and for the fit.
     max_drop : float
-        Largest share of the Gaussians that are dropped at once.
+        Largest fraction of the Gaussians that one polish drops.
     polish_rate : float
-        Share of the learning rates in a polishing descent.
+        Learning rates of a polish, as a fraction of those of the schedule.
     polish_gain : float
-        Expected gain of the first polishing descent, in dB; training images gained 0.2.
+        Expected gain of the first polish, in dB; training images gained 0.2.
     gain_decay : float
-        Expected gain of the next polishing descent, as a share of the gain of the last.
+        Expected gain of the next polish, as a fraction of the gain of the last.
     surplus : float
-        Decibels above the goal that are not worth another descent.
+        Decibels above the goal that do not justify another polish.
     """
 
     try_share: float = 0.1
@@ -105,36 +104,34 @@ def search_count(
     interrupted: Callable[[], bool] = lambda: False,
     policy: SearchPolicy = DEFAULT_POLICY,
 ) -> Refinement:
-    """Find the fewest splats that meet a goal.
+    """Find the smallest number of Gaussians that meets a goal.
 
     Parameters
     ----------
-    start : Start
-        A first guess, placed by the image alone, so that it can be rearranged.
+    start : FitProblem
+        A first guess by the initialiser "adaptive", which can redistribute.
     measure : callable
-        ``measure(gaussians)`` returns figures in decibels, by name.
+        ``measure(gaussians)`` returns a dict with a value in dB under the key `figure`.
     figure : str
-        The one that counts.
+        Key of the value that shall reach the goal.
     goal : float
-        What it has to reach.
+        The goal in dB.
     most : int
-        Splats, at most.
+        Largest number of Gaussians.
     schedule : Schedule
     iterations : int, optional
-        Steps that a fit of a known number would take; the search takes up to about twice as many.
-    progress : callable, optional
-        ``progress(iteration, iterations, row)`` every 10 steps, with the last row of the trace.
-    interrupted : callable, optional
-        Asked before every step whether to stop.
+        Steps of a fit with a known number; the search takes up to about twice as many.
+    progress, interrupted : callable, optional
+        See `eigengs_dr.fitting.refine.refine`.
     policy : SearchPolicy, optional
-        The numbers of the search.
+        The constants of the search.
 
     Returns
     -------
-    Refined
-        The smallest set that meets the goal, or else the best one. The trace has a row for every
-        set that was judged, with iteration, gaussians and the figures; it stopped because the goal
-        was "met", is "out of reach", or it was "interrupted".
+    Refinement
+        The smallest set that meets the goal, or else the best set. The trace has a row for every
+        measured set, with iteration, gaussians and the values of `measure`. `stopped` is "met",
+        "out of reach" or "interrupted".
     """
     run = _Run(start, measure, figure, goal, schedule, progress, interrupted, policy)
     shares = (policy.try_share, policy.fit_share, policy.polish_share)
@@ -144,7 +141,7 @@ def search_count(
         placed = _estimate(run, most, tries)
         if run.best.missing > 0 or len(run.best.gaussians) > 1:
             trial = _fit_estimate(run, placed, most, fit)
-            # Of few iterations the tries have taken all.
+            # If the iterations are few, the tries have used them up; polish all the same.
             longest = round(policy.max_length * iterations)
             most_steps = max(longest, run.step + policy.max_polishes * polish)
             _polish(run, trial, most, polish, most_steps)
@@ -156,7 +153,7 @@ def search_count(
 
 
 class _Trial(NamedTuple):
-    """What a descent led to, and how many decibels are missing there."""
+    """A set, and by how many decibels it misses the goal."""
 
     gaussians: Gaussians
     missing: float
@@ -164,7 +161,7 @@ class _Trial(NamedTuple):
 
 @dataclass
 class _Run:
-    """What all descents of one search share, and what came of them."""
+    """The state of one search."""
 
     start: FitProblem
     measure: Callable[[Gaussians], Row]
@@ -185,7 +182,7 @@ class _Run:
         self.best = self.score(self.start.gaussians)
 
     def descend(self, gaussians: Gaussians, steps: int, share: float = 1.0) -> _Trial:
-        """Take some steps at a share of the rates, unless interrupted, and judge the set."""
+        """Take some steps at a fraction of the learning rates, and score the set."""
         rates = {name: share * rate for name, rate in self.schedule.rates.items()}
         schedule = replace(self.schedule, rates=rates)
         self.planned = max(self.planned, self.step + steps)
@@ -199,7 +196,7 @@ class _Run:
             current = following
             self.step += 1
             if self.progress and self.step % 10 == 0:
-                dr.sync_thread()  # steps run asynchronously; the bar tells what is done
+                dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
                 self.progress(self.step, self.planned, self.trace[-1])
         return self.score(dr.detach(current))
 
@@ -214,14 +211,14 @@ class _Run:
 
 
 def _better(a: _Trial, b: _Trial) -> bool:
-    """Whether a meets the goal with fewer splats than b; or comes nearer, where b does not."""
+    """Return whether a meets the goal with fewer Gaussians than b, or comes nearer to it."""
     if a.missing <= 0 and b.missing <= 0:
         return len(a.gaussians) < len(b.gaussians)
     return a.missing < b.missing
 
 
 def _estimate(run: _Run, most: int, steps: int) -> Gaussians:
-    """Place about as many splats as the goal takes, where some steps told that they belong."""
+    """Estimate the number of Gaussians by tries, and place them where the last try left error."""
     assert run.start.redistribute is not None
     placed, before, last = run.start.gaussians, run.best, None
     for _ in range(run.policy.max_tries):
@@ -234,7 +231,7 @@ def _estimate(run: _Run, most: int, steps: int) -> Gaussians:
                 run.policy.margin * _count_for_gain(run, len(placed), trial.missing - gain, most)
             ),
         )
-        # The first try stands where the image bends, not yet where error was left.
+        # The first try was placed by the image, without errors: it does not count as close.
         close = last is not None and abs(count - len(placed)) <= run.policy.try_tolerance * len(
             placed
         )
@@ -246,7 +243,7 @@ def _estimate(run: _Run, most: int, steps: int) -> Gaussians:
 
 
 def _fit_estimate(run: _Run, placed: Gaussians, most: int, steps: int) -> _Trial:
-    """Fit, and once more where the estimate was far off: to place is better than to mend."""
+    """Fit the estimated number; if it was far off, redistribute and fit once more."""
     trial = run.descend(placed, steps)
     count = _count_for_gain(run, len(placed), trial.missing, most)
     if run.interrupted() or abs(count - len(placed)) <= run.policy.fit_tolerance * len(placed):
@@ -266,7 +263,7 @@ def _update_slope(run: _Run, last: _Trial | None, trial: _Trial) -> None:
 
 
 def _count_for_gain(run: _Run, count: int, missing: float, most: int) -> int:
-    """Splats that would gain so many decibels more."""
+    """Return the number of Gaussians that would gain the missing decibels."""
     octaves = min(
         max(missing / run.db_per_doubling, -math.log2(run.policy.max_leap)),
         math.log2(run.policy.max_leap),
@@ -275,9 +272,9 @@ def _count_for_gain(run: _Run, count: int, missing: float, most: int) -> int:
 
 
 def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) -> None:
-    """Drop splats while the goal is met, add some while it is not; `run` keeps the best set.
+    """Drop Gaussians while the set meets the goal, else add some; `run` keeps the best set.
 
-    Where few splats find a place, there would be no end: the steps of the search are limited.
+    `most_steps` limits the steps of the search: if `densify` finds few places, it would not end.
     """
     target, weight = run.start.target, run.start.weight
     least_growth, rounds, gain = 1.02, 0, run.policy.polish_gain
@@ -295,7 +292,7 @@ def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
                 return
             changed = prune(trial.gaussians, target, wanted, weight)
         elif found.missing <= 0:
-            # Between what failed and what was found lies the answer; steps alone may lead there.
+            # The best number lies between this one and that of the best set; or a polish suffices.
             wanted = max(
                 count, _count_for_gain(run, count, missing, (count + len(found.gaussians)) // 2)
             )
@@ -305,7 +302,7 @@ def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
                 _count_for_gain(run, count, missing, most), math.ceil(least_growth * count)
             )
             changed = densify(trial.gaussians, target, min(wanted, most), weight)
-            if len(changed) == count:  # no more are allowed, or no place takes from the error
+            if len(changed) == count:  # `most` is reached, or no Gaussian would reduce the error
                 return
             least_growth = 2 * least_growth - 1
         rounds += 1

@@ -1,1 +1,1 @@
-"""What cameras see of a texture in a Mitsuba scene."""
+"""Textures in Mitsuba scenes: their visibility, and Gaussians for what the cameras resolve."""

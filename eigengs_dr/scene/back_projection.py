@@ -1,14 +1,14 @@
-"""The smoothest texture that cameras take for an image.
+"""Back-projection: a smooth texture that looks like an image to all cameras.
 
 Cameras see means over pixels (`eigengs_dr.scene.visibility`): ``R x`` of a texture x. Many textures
-look like the image to all of them, and the smoothest takes the fewest Gaussians. It is approached
-from the image blurred by a part of each texel's footprint, B x, by steps of
+look like the image to all cameras; a smooth one needs few Gaussians. The iteration starts from B x,
+the image blurred by a fraction of the footprint of each texel, and repeats
 
-    t <- t + B R+ (R x - R t),
+    t <- t + B R+ (R x - R t).
 
-with R+ the mean, over the pixels that see a texel, of what they miss: Landweber's iteration,
-smoothed; in super-resolution it is called back-projection (Irani and Peleg, 1991). What blurring
-took from the pixels comes back; what they do not see stays away.
+For each texel, R+ averages the residuals of the pixels that see it. This is a smoothed Landweber
+iteration; in super-resolution it is called back-projection (Irani and Peleg, 1991). The iteration
+restores the details that pixels see, and leaves out the details that no pixel sees.
 """
 
 from __future__ import annotations
@@ -22,30 +22,31 @@ from scipy.ndimage import gaussian_filter
 from .visibility import Visibility
 
 ITERATIONS = 20
-"""Steps in which a texture gets back what the pixels miss."""
+"""Steps of the back-projection."""
 
 KNOWN = 0.3
-"""Share of seen texels under a Gaussian from which their mean replaces that of a wider one."""
+"""Fraction of seen texels under a kernel at which their mean fully replaces that of the next wider
+kernel."""
 
 Image = NDArray[np.float32]
 
 
 def extrapolate(values: Image, seen: NDArray[np.bool_]) -> Image:
-    """Continue an image smoothly to where it is not seen: there, nothing shall bend it.
+    """Replace unseen texels of an image by a smooth continuation of the seen ones.
 
-    By means of the texels that are seen under Gaussians, narrow ones near to these, and far away
-    wider ones.
+    The value of an unseen texel is the mean of the seen texels under a Gaussian kernel, which is
+    narrow near seen texels and wide far from them.
 
     Parameters
     ----------
     values : ndarray of float32, shape (H, W, C)
     seen : ndarray of bool, shape (H, W)
-        True somewhere.
+        True for at least one texel.
 
     Returns
     -------
     ndarray of float32, shape (H, W, C)
-        `values` where they are seen.
+        Equal to `values` at seen texels.
     """
     known = seen[..., None].astype(np.float32)
     result = np.broadcast_to(values[seen].mean(axis=0, dtype=np.float32), values.shape)
@@ -58,20 +59,20 @@ def extrapolate(values: Image, seen: NDArray[np.bool_]) -> Image:
 
 
 def back_project(whole: Image, found: Visibility, share: float) -> Image:
-    """Blur an image by a share of its footprints, then bring back what pixels see of it.
+    """Blur an image by a fraction of its footprints, then restore the details that pixels see.
 
     Parameters
     ----------
     whole : ndarray of float32, shape (H, W, C)
-        In [0, 1], also where it is not seen; see `extrapolate`.
-    found : Resolution
+        Image in [0, 1], with the unseen texels from `extrapolate`.
+    found : Visibility
     share : float
-        Standard deviation of B over that of the footprint.
+        Standard deviation of the blur B, as a fraction of that of the footprint.
 
     Returns
     -------
     ndarray of float32, shape (H, W, C)
-        In [0, 1]: each step is brought back to it, as what a texture sums is.
+        Texture in [0, 1]. Every step clamps it to this range, as the plugin clamps its sums.
     """
     blur = _blur_by(np.where(found.seen, found.footprint, np.inf) * share)
     flat = whole.reshape(-1, whole.shape[2])
@@ -87,10 +88,10 @@ def back_project(whole: Image, found: Visibility, share: float) -> Image:
 
 
 def _blur_by(deviation: NDArray[np.floating]) -> Callable[[Image], Image]:
-    """Make a blur whose standard deviation, in texels, differs from place to place.
+    """Return a blur with a different standard deviation, in texels, at every texel.
 
-    Between images that are blurred evenly, each by sqrt(2) more than the last; where the deviation
-    is infinite, as where it is largest.
+    The blur interpolates between uniform blurs whose standard deviations differ by sqrt(2). Texels
+    with an infinite deviation get the largest finite one.
     """
     finite = np.isfinite(deviation)
     low, high = float(deviation[finite].min()), float(deviation[finite].max())

@@ -1,8 +1,8 @@
-"""No more Gaussians than the cameras of a scene can tell from the full image.
+"""The function `fit_for_scene`, which finds the fewest Gaussians for the cameras of a scene.
 
-The image is replaced by the smoothest texture that the cameras take for it
-(`eigengs_dr.scene.back_projection`). Then the smallest number of Gaussians is sought whose picture,
-as the cameras see it, is as close to that of the image as was asked for.
+The target of the fit is not the image but a smoother texture that looks the same to the cameras
+(`eigengs_dr.scene.back_projection`). A search then finds the smallest number of Gaussians with
+which every camera sees the texture at a given PSNR.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ from .back_projection import back_project, extrapolate
 from .visibility import Visibility, visibility
 
 COLORS = ("linear", "data")
-"""What textures hold."""
+"""Names of the spaces of textures: linear light, or data."""
 
 BLURS = (0.4, 0.25, 0.15, 0.1)
-"""Standard deviations, in pixels, by which the target is blurred before it gets back what pixels
-miss: the first that leaves `MARGIN` is taken."""
+"""Standard deviations in pixels of the blur of the back-projection. `fit_for_scene` takes the first
+one that leaves `MARGIN`."""
 
 MARGIN = 6.0
-"""Decibels by which the target is closer to the image than its Gaussians have to be."""
+"""Decibels between the PSNR of the target and the PSNR that its Gaussians must reach."""
 
 PIXELS = 4
-"""Pixels a Gaussian, where the search begins."""
+"""Pixels per Gaussian at the start of the search."""
 
 CLOSE = 1.1
-"""Ratio of two numbers of Gaussians, one too few and one enough, at which the search ends."""
+"""Ratio of a sufficient and an insufficient number of Gaussians at which the search ends."""
 
 ENOUGH = 2.0
-"""Texels a pixel below which the image is enlarged, as a bitmap is between its texels: else what
-Gaussians do there is not seen."""
+"""Smallest number of texels per pixel without an enlargement. With fewer texels the image is
+interpolated bilinearly, as bitmaps are; else no sample would show the Gaussians between texels."""
 
 FINER = 3
-"""Times that it is enlarged; odd, so that texels stay samples."""
+"""Factor of the enlargement; odd, so that the centres of texels stay samples."""
 
 EVEN = 2.0
-"""Texels over which weights are averaged: rays meet texels unevenly."""
+"""Standard deviation in texels of the blur of the weights, because rays hit texels unevenly."""
 
 Image = NDArray[np.float32]
 
@@ -68,14 +68,14 @@ class SceneFit(NamedTuple):
     Attributes
     ----------
     gaussians : Gaussians
-        Of the size of the image; none that touches only what no camera sees.
+        Set of the size of the image, without Gaussians that touch only unseen texels.
     psnr : tuple of float
-        For each camera that sees the texture, in the order of the scene, the PSNR of what it sees
-        of the Gaussians, against what it sees of the image.
-    resolution : Resolution
+        PSNR in dB for each camera that sees the texture, in the order of the scene: the view of the
+        Gaussians against the view of the image.
+    visibility : Visibility
         What the cameras see of the texels of the image.
     tried : list of (int, float)
-        Numbers of Gaussians, and the lowest PSNR of a camera with them, as they were tried.
+        Number of Gaussians and lowest PSNR of a camera, for each attempt of the search.
     """
 
     gaussians: Gaussians
@@ -94,27 +94,28 @@ def fit_for_scene(
     iterations: int = 100,
     wrap_mode: str = "repeat",
 ) -> SceneFit:
-    """Find the fewest Gaussians that the cameras of a scene see as they would see an image.
+    """Find the fewest Gaussians with which all cameras of a scene see an image at a given PSNR.
 
     Parameters
     ----------
     scene : mitsuba.Scene
-        With all its cameras, and any bitmap or ``gaussian_texture`` in the place of the texture.
+        Scene with all its cameras, and any bitmap or ``gaussian_texture`` in the place of the
+        texture; only its position is used.
     texture : str
         Name of the texture among the parameters of the scene, such as
         ``"poster.bsdf.reflectance"``.
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
-        What the texture shall show, float in [0, 1] or unsigned integers; row 0 at v = 0.
+        Image for the texture, float in [0, 1] or unsigned integers; row 0 at v = 0.
     psnr : float, optional
-        Decibels that every camera has to see at least. Compared are the means over pixels of the
-        texture itself, clamped as the texture clamps it, in even light and without noise: as 8-bit
-        sRGB for light, as they are for data.
+        Smallest PSNR of any camera in dB, above 0 and below 60. It compares means of the clamped
+        texture over pixels, in even light and without noise: as 8-bit sRGB for colours, unchanged
+        for data.
     color : {"linear", "data"}, optional
-        Whether the image is a colour, which is decoded to light, or data.
+        "linear" if the image is a colour, which is decoded to light; or "data".
     most : int, optional
-        Most Gaussians; by default as many as there are texels that are seen.
+        Largest number of Gaussians; by default the number of seen texels.
     iterations : int, optional
-        Steps of refinement for each number of Gaussians that is tried.
+        Steps of refinement for each number of Gaussians.
     wrap_mode : {"repeat", "mirror", "clamp"}, optional
         See `eigengs_dr.scene.visibility.visibility`.
 
@@ -126,11 +127,11 @@ def fit_for_scene(
     ------
     ValueError
         If the image or an argument is unusable, the scene has no such texture, no pixel sees it, or
-        not even the most Gaussians are enough; one line.
+        the largest number of Gaussians does not suffice.
 
     Examples
     --------
-    With a scene whose poster holds any texture (`examples/fit_for_scene.py` is a whole one)::
+    A scene whose poster has any texture; `examples/fit_for_scene.py` is a complete example::
 
         room = mi.load_file("room.xml")
         found = eg.fit_for_scene(room, "poster.bsdf.reflectance", eg.load_image("poster.jpg"))
@@ -138,10 +139,12 @@ def fit_for_scene(
     """
     if color not in COLORS:
         raise ValueError(f"color {color!r} is unknown; textures hold {' or '.join(COLORS)}")
-    if not 0 < psnr < 60:  # 8 bits are read without an error from 59 dB on
-        raise ValueError(f"psnr is {psnr:g}; it must be above 0 and below 60 decibels")
+    if not 0 < psnr < 60:  # from 59 dB on, 8-bit values have no error
+        raise ValueError(f"psnr is {psnr:g}; it must be above 0 and below 60 dB")
     if iterations < 0 or (most is not None and most < 1):
-        raise ValueError("iterations must be at least 0, and most at least 1")
+        raise ValueError(
+            f"iterations is {iterations} and most is {most}; they must be at least 0 and at least 1"
+        )
     pixels = check_image(image, keep_grey=color == "data").clip(0, 1)
     height, width = pixels.shape[:2]
     values = to_linear(pixels) if color == "linear" else pixels
@@ -167,7 +170,7 @@ def fit_for_scene(
         return gaussians, seen(render(gaussians).numpy())
 
     most = min(most or int(found.seen.sum()), fine.seen.size)
-    looks = np.minimum(PIXEL / found.footprint[found.seen], 1) ** 2  # pixels a texel, at most one
+    looks = np.minimum(PIXEL / found.footprint[found.seen], 1) ** 2  # pixels per texel, at most 1
     start = max(1, int(looks.sum()) // PIXELS)
     gaussians, reached, tried = _search_count(attempt, psnr, start, most)
     placed = _move(gaussians, corner, times * width, times * height).scaled(width, height)
@@ -175,7 +178,7 @@ def fit_for_scene(
 
 
 def _crop_to_seen(values: Image, found: Visibility) -> tuple[Image, Visibility, tuple[int, int]]:
-    """Keep the rectangle of what is seen, and return its corner, column and row."""
+    """Crop to the bounding box of the seen texels; also return its corner (column, row)."""
     kept = [np.flatnonzero(found.seen.any(axis=axis)) for axis in (1, 0)]
     part = tuple(slice(k[0], k[-1] + 1) for k in kept)
     texels = np.arange(found.seen.size).reshape(found.seen.shape)[part].ravel()
@@ -185,22 +188,22 @@ def _crop_to_seen(values: Image, found: Visibility) -> tuple[Image, Visibility, 
 
 
 def _move(gaussians: Gaussians, corner: tuple[int, int], width: int, height: int) -> Gaussians:
-    """Put a set in its place in a larger image."""
+    """Shift a set to a corner (column, row) of a larger image."""
     mean = gaussians.mean + type(gaussians.mean)(*corner)
     return replace(gaussians, mean=mean, width=width, height=height)
 
 
-# --- What is fitted -------------------------------------------------------------------------------
+# --- The target ----------------------------------------------------------------------------------
 
 
 def _seen_by(texels: Image, rows: Any, color: str) -> NDArray[Any]:
-    """What the pixels of a camera see of a texture, as a column of pixels, shape (n, 1, C)."""
+    """Return what the pixels of a camera see of a texture, shape (n, 1, C)."""
     looks = rows @ texels.clip(0, 1).reshape(-1, texels.shape[2])
     return (to_coded(looks) if color == "linear" else looks)[:, None]
 
 
 def _target(values: Image, found: Visibility, is_close: Callable[[Image], bool]) -> Image:
-    """Find what to fit: the smoothest texture that is close enough, or else the image."""
+    """Find the target of the fit: the smoothest texture that is close enough, or else the image."""
     whole = extrapolate(values, found.seen)
     for share in BLURS:
         target = back_project(whole, found, share / PIXEL)
@@ -210,7 +213,7 @@ def _target(values: Image, found: Visibility, is_close: Callable[[Image], bool])
 
 
 def _weights(found: Visibility, target: Image, color: str) -> Image:
-    """What errors are multiplied by: the root of how much of the pixels a texel is, 0 unseen."""
+    """Return factors of the errors: the square root of each texel's share of the pixels."""
     share = gaussian_filter(found.pixels, EVEN) * found.seen
     weight = np.sqrt(share / share.max())[..., None]
     light = dark_weight(target) if color == "linear" else np.ones_like(target)
@@ -228,7 +231,7 @@ def _fit(
     iterations: int,
     color: str,
 ) -> Gaussians:
-    """Fit so many Gaussians, less those that touch nothing that is seen."""
+    """Place `count` Gaussians, drop those that reach no seen texel, and fit the rest."""
     height, width, channels = target.shape
     picture = to_coded(target) if color == "linear" else target
     mean, factor = place_adaptive(picture, count, np.random.default_rng(0))
@@ -251,7 +254,7 @@ def _fit(
 def _reaches_seen(
     mean: NDArray[Any], factor: NDArray[Any], seen: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Tell which splats may reach a texel that is seen, by their longer axes; at least one."""
+    """Return which Gaussians may reach a seen texel, by their longer axes; at least one."""
     column = mean[:, 0].astype(int).clip(0, seen.shape[1] - 1)
     row = mean[:, 1].astype(int).clip(0, seen.shape[0] - 1)
     away = distance_transform_edt(~seen)[row, column]
@@ -264,12 +267,12 @@ def _search_count(
     start: int,
     most: int,
 ) -> tuple[Gaussians, tuple[float, ...], list[tuple[int, float]]]:
-    """Search the smallest number that is enough: doubled or halved, then between the last two.
+    """Search for the smallest sufficient number: double or halve it, then bisect.
 
     Raises
     ------
     ValueError
-        If the most are not enough.
+        If the number `most` does not suffice.
     """
     tried: list[tuple[int, float]] = []
     low, high, best = 0, most, None
@@ -282,8 +285,8 @@ def _search_count(
             high, best = count, (gaussians, reached)
         elif count == most:
             raise ValueError(
-                f"{most} Gaussians reach {lowest:.1f} dB where the cameras are to see {bound:g}; "
-                "ask for less, or allow more Gaussians or iterations"
+                f"{most} Gaussians reach {lowest:.1f} dB, but the cameras shall see {bound:g} dB; "
+                "lower the PSNR, or allow more Gaussians or iterations"
             )
         else:
             low = count

@@ -1,9 +1,9 @@
-"""What the cameras of a Mitsuba scene resolve of a texture: footprints, lookups, what is unseen.
+"""Visibility: the texels of a texture that the cameras of a Mitsuba scene see, and how sharply.
 
-Rays go through every pixel of every camera to what they hit first. Where that is the texture, the
-pixel's differentials give the parallelogram ``J`` that it covers there, in texels, and with it the
-footprint ``PIXEL^2 J J^T`` of the texture's own prefilter (`eigengs_dr.plugins.cone`). Of a texel
-the sharpest look counts. What mirrors or glass show is not followed, and the lens is a pinhole.
+Rays go through every pixel of every camera to their first hit. If they hit the texture, the ray
+differentials give the parallelogram ``J`` that the pixel covers there, in texels, and from it the
+footprint ``PIXEL^2 J J^T`` of the texture's prefilter (`eigengs_dr.plugins.cone`). The smallest
+footprint of a texel counts. Rays do not follow mirrors or glass, and the lens is a pinhole.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..plugins.cone import PIXEL  # first, for it says what to install where Mitsuba is missing
+from ..plugins.cone import PIXEL  # first: its error says what to install if Mitsuba is missing
 
 # isort: split
 import drjit as dr
@@ -26,25 +26,26 @@ from ..backend.arrays import upload
 from ..raster.lookup.points import fold
 
 SPACING = 0.5
-"""Texels between two rays that are close enough: each texel is then met by some."""
+"""Largest distance of neighbouring rays in texels, so that rays hit each texel."""
 
 MIN_RAYS = 2
-"""Rays along a side of a pixel, at least: borders of the texture cross pixels."""
+"""Smallest number of rays along a side of a pixel, because borders of the texture cross pixels."""
 
 MAX_RAYS = 1 << 22
-"""Rays of a camera; where these are too few, texels between hits take after the nearest one."""
+"""Largest number of rays of a camera. If they miss a texel, the nearest hit counts for it."""
 
 BATCH = 1 << 20
-"""Rays that are traced at once."""
+"""Number of rays that are traced at once."""
 
 PIXEL_REACH = 0.75
-"""Distances of neighbouring rays over which a hit speaks for texels: half a diagonal, and some."""
+"""Radius around a hit in which texels count as seen, in distances of neighbouring rays: a bit more
+than half a diagonal."""
 
 NEIGHBOURS = 1.5
-"""Texels that are added to that: bilinear lookups read the next ones, also across a corner."""
+"""Texels added to this radius, because bilinear lookups read neighbours, also diagonal ones."""
 
 WRAPS = ("repeat", "mirror", "clamp")
-"""What lies outside of the image."""
+"""Names of the ways to continue an image outside of its borders."""
 
 Floats = NDArray[np.floating]
 
@@ -55,14 +56,12 @@ class Visibility(NamedTuple):
     Attributes
     ----------
     footprint : ndarray of float32, shape (H, W)
-        Standard deviation of the footprint of a pixel, in texels, by the camera and pixel that see
-        a texel most sharply; infinite where none does. A footprint that is longer than wide counts
-        as if it were round and as small as it is narrow: no detail is taken for lost that is seen
-        along some direction.
+        Smallest standard deviation, in texels, of a pixel's footprint at each texel; infinite at
+        unseen texels. The shorter axis counts, so that no detail visible along one axis is lost.
     pixel_to_texel : list of scipy.sparse.csr_array of float32, shape (pixels, H * W)
-        For each camera that sees the texture, of each pixel that does, the share of every texel in
-        what it sees of the texture: rows add up to 1. ``lookups[k] @ texels`` is the texture in
-        even light.
+        One matrix for each camera that sees the texture, with one row for each pixel that sees it:
+        the shares of the texels in the pixel, with the sum 1. ``pixel_to_texel[k] @ texels`` is the
+        view of camera k in even light.
     """
 
     footprint: NDArray[np.float32]
@@ -70,12 +69,12 @@ class Visibility(NamedTuple):
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """Whether some pixel sees a texel, shape (H, W)."""
+        """Whether a pixel sees each texel: ndarray of bool, shape (H, W)."""
         return np.isfinite(self.footprint)
 
     @property
     def pixels(self) -> NDArray[np.float32]:
-        """Share of each texel in what a camera sees, shape (H, W); mean of cameras, sum 1."""
+        """Mean share of each texel in the views of the cameras, shape (H, W), with the sum 1."""
         shares = [np.asarray(rows.sum(axis=0)) / rows.shape[0] for rows in self.pixel_to_texel]
         return np.mean(shares, axis=0, dtype=np.float32).reshape(self.footprint.shape)
 
@@ -88,23 +87,24 @@ def visibility(
     Parameters
     ----------
     scene : mitsuba.Scene
-        All its sensors count, each with the size and crop of its film.
+        All its sensors count, with the size and crop of their films.
     texture : str
         Name of the texture among the parameters of the scene (`mitsuba.traverse`), such as
         ``"poster.bsdf.reflectance"``: a bitmap or a ``gaussian_texture`` of any content.
     width, height : int
-        Texels to measure on: the size of the image that the texture shall show.
+        Size in texels: that of the image for the texture.
     wrap_mode : {"repeat", "mirror", "clamp"}, optional
-        That of a bitmap, which does not tell it; a ``gaussian_texture`` does.
+        Wrap mode of a bitmap, which Mitsuba does not tell; a ``gaussian_texture`` uses its own.
 
     Returns
     -------
-    Resolution
+    Visibility
 
     Raises
     ------
     ValueError
-        If there is no such texture, the wrap mode is unknown, or no pixel sees the texture.
+        If the scene has no such texture, no shape uses it, no pixel sees it, or the wrap mode is
+        unknown.
     """
     if wrap_mode not in WRAPS:
         raise ValueError(f"wrap_mode {wrap_mode!r} is unknown; use one of {', '.join(WRAPS)}")
@@ -121,7 +121,7 @@ def visibility(
     if not lookups:
         raise ValueError(
             f"no pixel of the scene's {len(scene.sensors())} cameras sees {texture!r}; check where "
-            "they look, and what stands in front"
+            "the cameras look, and what hides the texture"
         )
     return Visibility(footprint.reshape(height, width), lookups)
 
@@ -135,7 +135,7 @@ def _find(scene: Any, texture: str) -> tuple[Any, list]:
     Raises
     ------
     ValueError
-        If there is none of that name, or no shape uses it.
+        If the scene has no texture of this name, or no shape uses it.
     """
     entries = mi.traverse(scene).properties
     textures = {
@@ -149,12 +149,12 @@ def _find(scene: Any, texture: str) -> tuple[Any, list]:
     node = textures[texture]
     shapes = [shape for shape in scene.shapes() if node in mi.traverse(shape).hierarchy]
     if not shapes:
-        raise ValueError(f"texture {texture!r} belongs to no shape; cameras see shapes alone")
+        raise ValueError(f"texture {texture!r} belongs to no shape; name the texture of a shape")
     return node, shapes
 
 
 def _mapping(node: Any, wrap_mode: str) -> tuple[NDArray[np.float64], str]:
-    """Rows of ``to_uv``, shape (2, 3), and the wrap mode of a texture."""
+    """Return the rows of ``to_uv``, shape (2, 3), and the wrap mode of a texture."""
     if hasattr(node, "wrap"):
         return np.array(node.to_uv), node.wrap
     parameters = mi.traverse(node)
@@ -167,7 +167,7 @@ def _mapping(node: Any, wrap_mode: str) -> tuple[NDArray[np.float64], str]:
 
 
 class _View(NamedTuple):
-    """A camera, and what it looks for: shapes, and how their uv become texels."""
+    """A camera, the shapes with the texture, and the map from their uv to texels."""
 
     scene: Any
     sensor: Any
@@ -179,9 +179,9 @@ class _View(NamedTuple):
 
 
 class _Hits(NamedTuple):
-    """Rays that meet the texture: pixel, place and half axes of the pixel there, in texels.
+    """Rays that hit the texture: pixel, position and half axes of the pixel there, in texels.
 
-    The half axes are the singular values of J; `side` is the rays along a side of a pixel.
+    The half axes are the singular values of J; `side` counts the rays along a side of a pixel.
     """
 
     pixel: NDArray[Any]
@@ -193,7 +193,7 @@ class _Hits(NamedTuple):
 
 
 def _samples_of(view: _View) -> _Hits | None:
-    """Send rays close enough to each other; None where a camera does not see the texture."""
+    """Trace rays at a distance of `SPACING` texels; None if the camera does not see the texture."""
     columns, rows = view.sensor.film().crop_size()
     every = np.arange(columns * rows, dtype=np.uint32)
     hits = _trace(view, every, MIN_RAYS)
@@ -206,7 +206,7 @@ def _samples_of(view: _View) -> _Hits | None:
 
 
 def _trace(view: _View, pixels: NDArray[np.uint32], side: int) -> _Hits:
-    """Send ``side * side`` rays through each of the pixels, and keep those that hit the texture."""
+    """Trace ``side * side`` rays through each pixel, and keep the rays that hit the texture."""
     step = max(1, BATCH // side**2)
     parts = []
     for first in range(0, len(pixels), step):
@@ -219,7 +219,7 @@ def _trace(view: _View, pixels: NDArray[np.uint32], side: int) -> _Hits:
 
 
 def _film_positions(sensor: Any, pixels: NDArray[np.uint32], side: int) -> tuple[Any, Any]:
-    """Pixel of every ray, and its place on the film, in [0, 1]."""
+    """Return the pixel of every ray, and its position on the film, in [0, 1]."""
     columns, rows = sensor.film().crop_size()
     ray = dr.arange(mi.UInt32, len(pixels) * side * side)
     across = dr.opaque(mi.UInt32, side)  # one program for every number of rays
@@ -231,10 +231,10 @@ def _film_positions(sensor: Any, pixels: NDArray[np.uint32], side: int) -> tuple
 
 
 def _trace_to(view: _View, where: Any) -> tuple:
-    """Trace rays from places on the film: which hit, where, and the half axes of their pixels."""
+    """Trace rays from positions on the film: return their hits, positions and half axes."""
     with dr.suspend_grad():
         ray, _ = view.sensor.sample_ray_differential(0.0, 0.5, where, mi.Point2f(0.5))
-        ray.has_differentials = True  # a batch of sensors computes them, and does not say so
+        ray.has_differentials = True  # a batch of sensors computes them but leaves this False
         si = view.scene.ray_intersect(ray, mi.RayFlags.All, True)
         si.compute_uv_partials(ray)
         hit = mi.Bool(False)
@@ -247,7 +247,7 @@ def _trace_to(view: _View, where: Any) -> tuple:
 
 
 def _on_texture(si: Any, view: _View) -> tuple:
-    """Place of a hit, x and y, and the singular values of the pixel's J, all in texels."""
+    """Return the position (x, y) of a hit and the singular values of J, all in texels."""
     to_x, to_y = (view.to_uv * [[view.width], [view.height]]).tolist()
 
     def along(row: list[float], uv: Any) -> Any:
@@ -257,7 +257,7 @@ def _on_texture(si: Any, view: _View) -> tuple:
     y, _ = fold(along(to_y, si.uv) + to_y[2], view.height, view.wrap)
     ux, uy = along(to_x, si.duv_dx), along(to_x, si.duv_dy)
     vx, vy = along(to_y, si.duv_dx), along(to_y, si.duv_dy)
-    # Eigenvalues of J J^T, the smaller one by the determinant: a difference would cancel.
+    # Eigenvalues of J J^T; the determinant gives the smaller one, as a difference would cancel.
     xx, xy, yy = ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy
     half = 0.5 * (xx - yy)
     long = dr.sqrt(0.5 * (xx + yy) + dr.sqrt(half * half + xy * xy))
@@ -268,7 +268,7 @@ def _on_texture(si: Any, view: _View) -> tuple:
 
 
 def _min_footprint(hits: _Hits, width: int, height: int) -> NDArray[np.float32]:
-    """Smallest footprint at every texel, shape (H * W,); infinite where no hit is near."""
+    """Return the smallest footprint at every texel, shape (H * W,); infinite far from hits."""
     column = hits.x.astype(int).clip(0, width - 1)
     texel = hits.y.astype(int).clip(0, height - 1) * width + column
     footprint = np.full(height * width, np.inf, np.float32)
@@ -285,7 +285,7 @@ def _min_footprint(hits: _Hits, width: int, height: int) -> NDArray[np.float32]:
 
 
 def _rows(hits: _Hits, width: int, height: int) -> Any:
-    """Shares of texels in pixels, bilinear at every hit; see `Visibility.pixel_to_texel`."""
+    """Return the bilinear shares of texels in pixels; see `Visibility.pixel_to_texel`."""
     pixels, row, count = np.unique(hits.pixel, return_inverse=True, return_counts=True)
     left, top = np.floor(hits.x - 0.5), np.floor(hits.y - 0.5)
     across, down = hits.x - 0.5 - left, hits.y - 0.5 - top

@@ -271,7 +271,7 @@ class TestModel:
         given = {"type": "gaussian_texture", "model": path}
         broken = np.zeros((3, max(model.components)), np.float32)
         broken[:, -1] = value
-        with pytest.raises(RuntimeError, match="coefficients has values that are not finite"):
+        with pytest.raises(RuntimeError, match="coefficients must be finite"):
             mi.load_dict({**given, "coefficients": mi.TensorXf(broken)})
         tex = mi.load_dict(given)
         expected = np.array(tex.eval(texel_centres()))

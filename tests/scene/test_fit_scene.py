@@ -76,7 +76,7 @@ class TestSearch:
         assert len(set(counts)) == len(counts) < 30
 
     def test_the_most_may_be_too_few(self):
-        with pytest.raises(ValueError, match=r"^70 Gaussians reach 20\.0 dB where .* see 31;"):
+        with pytest.raises(ValueError, match=r"^70 Gaussians reach 20\.0 dB, .* see 31 dB;"):
             scenefit._search_count(lambda count: (range(count), (20.0, 40.0)), 31.0, 3, 70)
 
 

@@ -1,1 +1,1 @@
-"""Variables, optimisers and schedules of gradient descent."""
+"""Gradient descent: variables, optimisers and schedules."""

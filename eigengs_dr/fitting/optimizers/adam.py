@@ -1,4 +1,4 @@
-"""Adam that survives long runs."""
+"""Adam without the NaN of long runs."""
 
 from __future__ import annotations
 
@@ -10,15 +10,20 @@ from drjit.opt import Adam as DrjitAdam
 
 
 class Adam(DrjitAdam):
-    """Dr.Jit's Adam, whose count of steps stops where its averages need no debiasing any more.
+    """Dr.Jit's Adam with a limit on its count of steps.
 
-    Debiasing divides by ``1 - beta^t``. Dr.Jit 1.5 computes that power in double precision, and
-    its result is minus infinity for powers just below the least normal number: with a beta of 0.9
-    the steps 6,734 to 6,736 would turn all variables into NaN. Powers below 2^-54 round to the
-    same quotient, so the count may stop there.
+    Debiasing divides by ``1 - beta^t``. Dr.Jit 1.5 computes ``beta^t`` in double precision and
+    returns minus infinity for powers just below the smallest normal number: with a beta of 0.9,
+    the steps 6,734 to 6,736 would turn all variables into NaN. If ``beta^t`` is below 2^-54, the
+    division changes nothing, so the count stops there.
 
-    Parameters are those of `drjit.opt.Adam`; both betas must be above 0, and so close that the
-    power of the smaller is a normal number where that of the larger is 2^-54.
+    The parameters are those of `drjit.opt.Adam`. Both betas must be above 0, and close to each
+    other: when the power of the larger is 2^-54, the power of the smaller must be a normal number.
+
+    Raises
+    ------
+    ValueError
+        If the betas differ too much.
     """
 
     def __init__(self, *args: Any, **settings: Any) -> None:

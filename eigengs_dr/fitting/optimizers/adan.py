@@ -1,4 +1,4 @@
-"""Adan, an adaptive optimiser with Nesterov momentum, in the manner of `drjit.opt`."""
+"""Adan, an adaptive optimiser with Nesterov momentum, as a `drjit.opt.Optimizer`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from drjit.opt import Optimizer
 class Adan(Optimizer):
     """Adan of Xie et al., "Adan: Adaptive Nesterov Momentum Algorithm" (2022), no weight decay.
 
-    With the gradient g, its change ``d_t = g_t - g_{t-1}`` (0 in the first step) and the factors
-    beta of three moving averages::
+    With the gradient g, its change ``d_t = g_t - g_{t-1}`` (0 in the first step) and the decay
+    factors beta of three moving averages::
 
         m_t = beta_1 m_{t-1} + (1 - beta_1) g_t
         v_t = beta_2 v_{t-1} + (1 - beta_2) d_t
@@ -20,7 +20,7 @@ class Adan(Optimizer):
         p_t = p_{t-1} - lr (m_t / (1 - beta_1^t) + beta_2 v_t / (1 - beta_2^t))
                           / (sqrt(n_t / (1 - beta_3^t)) + epsilon)
 
-    The betas are those of the authors' implementation, one minus those of the paper's text.
+    The betas are those of the authors' implementation: one minus the betas of the paper.
 
     Parameters
     ----------
@@ -29,9 +29,14 @@ class Adan(Optimizer):
     params : mapping of str to arrays, optional
         Initial parameters.
     betas : (float, float, float), optional
-        Each in [0, 1).
+        Decay factors of the moving averages, each in [0, 1).
     epsilon : float, optional
-        Bounds the step where gradients vanish.
+        Number that bounds the step if gradients vanish.
+
+    Raises
+    ------
+    ValueError
+        If a beta is outside [0, 1).
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Gradient descent on all parameters of one image's Gaussians, step by step."""
+"""Gradient descent on all parameters of the Gaussians of one image."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .parameterization import Parameterization
 from .schedule import MIN_PHASE_RATIO, Schedule, lr_factor
 
 MSE_EPSILON = 1e-10
-"""Mean squared error that is not told from none."""
+"""Mean squared error added before the logarithm, which would diverge at an error of 0."""
 
 
 def descend(
@@ -31,19 +31,19 @@ def descend(
     Parameters
     ----------
     problem : FitProblem
-        The start and the aim. If it can redistribute, and the run is long enough, a first phase of
-        `Schedule.redistribute_after` steps shows where error is left; Gaussians are then placed
-        anew, and a descent of its own follows.
+        The start and the target. If the problem can redistribute and the run is long enough, a
+        first phase of `Schedule.redistribute_after` steps shows where error is left. The rest of
+        the steps then starts from redistributed Gaussians.
     schedule : Schedule
     iterations : int
-        Steps in all.
+        Number of steps, with the first phase.
     levels : sequence of int, optional
-        Numbers of Gaussians, from the first, that shall make the image too, as well as they can.
+        Numbers n. The first n Gaussians shall form the image too, as well as they can.
 
     Yields
     ------
     Gaussians
-        Steps run asynchronously: the arrays of a set may not be computed yet.
+        The current set. Steps run asynchronously: its arrays may not be computed yet.
     """
     yield problem.gaussians
     first = schedule.redistribute_after
@@ -58,9 +58,9 @@ def descend(
 def _run_phase(
     problem: FitProblem, schedule: Schedule, iterations: int, levels: Sequence[int] = ()
 ) -> Generator[Gaussians, None, None]:
-    """Yield the set after every step of one descent.
+    """Yield the set after every step of one phase.
 
-    Between two builds the tile lists are of where the Gaussians were, enlarged by `schedule.pad`.
+    Tile lists last `schedule.rebuild` steps: they list Gaussians enlarged by `schedule.pad`.
     """
     gaussians, target, weight = problem.gaussians, problem.target, problem.weight
     types = types_of(gaussians.mean)
@@ -86,35 +86,35 @@ def _run_phase(
             )
             take_step(optimizer, gaussians, tiles, weights, lists)
             current = coordinates.decode(gaussians, dict(optimizer))
-            # Later steps write into the optimiser's arrays: what is yielded must be a copy.
+            # Later steps write into the optimiser's arrays, so the yielded set must be a copy.
             current = replace(current, color=current.color + zero)
             dr.eval(current)
             yield current
 
 
 def step_program(coordinates: Parameterization, levels: Sequence[int] = ()) -> Any:
-    """Make the function of a step, to be frozen: traced once, replayed without Python.
+    """Make the function of one step for `eigengs_dr.backend.recording.freeze_program`.
 
-    A program belongs to one run: a replay does not notice that, say, the betas of another optimiser
-    differ.
+    Dr.Jit traces the function once and replays it without Python. The program belongs to one run: a
+    replay does not notice other settings, such as the betas of another optimiser.
     """
 
     def step(
         optimizer: Any, fixed: Gaussians, target: Any, weights: Any, lists: list[TileLists]
     ) -> None:
-        """Descend on the mean squared error, then bring the variables back inside their bounds.
+        """Descend on the mean squared error, then project the variables into their bounds.
 
-        The weights are 0 where tiles overhang the image.
+        The weights are 0 outside the image, where tiles overhang it.
         """
         current = coordinates.decode(fixed, dict(optimizer))
         errors = [
             _error(prefix(current, count), target, weights, listed)
             for count, listed in zip((*levels, len(fixed)), lists, strict=True)
         ]
-        # Of several, the sum of their decibels: none is sacrificed for another.
+        # With levels, sum the logarithms of the errors, so that no level suffers for another.
         loss = sum(dr.log(e + MSE_EPSILON) for e in errors) if levels else errors[0]
         dr.backward(loss)
-        # Kept apart from the optimiser's arithmetic, the large kernels serve every preset.
+        # Evaluated apart from the optimiser's arithmetic, the large kernels serve every preset.
         dr.eval([dr.grad(v) for v in optimizer.values()])
         optimizer.step(eval=False)
         optimizer.update(coordinates.project(fixed, dict(optimizer)))
@@ -128,18 +128,18 @@ def _error(gaussians: Gaussians, target: Any, weights: Any, lists: TileLists) ->
 
 
 def prefix(gaussians: Gaussians, count: int) -> Gaussians:
-    """The first splats of a set; differentiable, also in a frozen program."""
+    """Return the first `count` Gaussians of a set, differentiably, also in a frozen program."""
     if count == len(gaussians):
         return gaussians
     types = types_of(gaussians.mean)
     index = dr.arange(types.UInt, count)
 
-    def taken(rows: Any) -> Any:
+    def take(rows: Any) -> Any:
         return type(rows)([dr.gather(types.Float, row, index) for row in rows])
 
     return replace(
         gaussians,
-        mean=taken(gaussians.mean),
-        factor=taken(gaussians.factor),
-        color=taken(gaussians.color),
+        mean=take(gaussians.mean),
+        factor=take(gaussians.factor),
+        color=take(gaussians.color),
     )

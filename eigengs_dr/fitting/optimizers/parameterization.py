@@ -1,4 +1,4 @@
-"""The variables that an optimiser moves, and the Gaussians they stand for."""
+"""Parameterizations: the variables that an optimiser moves, and their Gaussians."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class Parameterization(NamedTuple):
     encode : callable
         ``encode(gaussians) -> dict`` of named arrays.
     decode : callable
-        ``decode(fixed, variables) -> Gaussians``; what is not among the variables is that of
-        `fixed`, the set that was given to `encode`.
+        ``decode(fixed, variables) -> Gaussians``, with `fixed` the argument of `encode`. Fields
+        without a variable keep the values of `fixed`.
     project : callable
-        ``project(fixed, variables) -> dict``: the variables, moved where a step left their bounds.
+        ``project(fixed, variables) -> dict``: the variables, moved back into their bounds.
     """
 
     encode: Callable[[Gaussians], dict[str, Any]]
@@ -33,12 +33,12 @@ class Parameterization(NamedTuple):
 
 
 # ---------------------------------------------------------------------------------------------
-#  The parameters themselves, in units of each splat's size
+#  The parameters themselves, in units of the size of each Gaussian
 # ---------------------------------------------------------------------------------------------
 
 
 def _size(g: Gaussians) -> Any:
-    """Geometric mean of a splat's standard deviations, in pixels: ``det F = a c``."""
+    """Geometric mean of the standard deviations of a Gaussian, in pixels: ``det F = a c``."""
     return dr.rsqrt(g.factor[0] * g.factor[2])
 
 
@@ -62,16 +62,16 @@ def _project_relative(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, 
 
 
 SCALE_RELATIVE = Parameterization(_encode_relative, _decode_relative, _project_relative)
-"""Mean over the size that the splat started with, factor times that size, colour: one rate serves
-small and large splats, and pictures of any size."""
+"""Mean divided by the size of the Gaussian at the start, factor times this size, and colour. One
+learning rate then serves small and large Gaussians, and images of any size."""
 
 
 # ---------------------------------------------------------------------------------------------
-#  Those of GaussianImage (Zhang et al., ECCV 2024)
+#  The parameters of GaussianImage (Zhang et al., ECCV 2024)
 # ---------------------------------------------------------------------------------------------
 
 CHOLESKY_BOUND = 0.5
-"""Added to the diagonal of the Cholesky factor, in pixels: no splat is narrower."""
+"""Pixels added to the diagonal of the Cholesky factor, as GaussianImage does."""
 
 
 def _encode_cholesky(g: Gaussians) -> dict[str, Any]:
@@ -108,4 +108,4 @@ def _project_cholesky(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, 
 
 
 CHOLESKY = Parameterization(_encode_cholesky, _decode_cholesky, _project_cholesky)
-"""atanh of the mean in [-1, 1], Cholesky factor of the covariance in pixels, colour."""
+"""atanh of the mean in [-1, 1], Cholesky factor of the covariance in pixels, and colour."""

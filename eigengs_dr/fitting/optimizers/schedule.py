@@ -1,7 +1,7 @@
-"""How long and how fast an image is refined: rates, their decay, and when tile lists are built.
+"""The schedule of a refinement: learning rates, their decay, and the builds of tile lists.
 
-The registries of optimisers and parameterizations are here too. To add one, write one file in this
-folder and one entry below: ``module:name``, which is imported when it is first used.
+This module also holds the registries of optimisers and parameterizations. To add one, write one
+file in this folder and add one entry ``module:name`` below; its first use imports it.
 """
 
 from __future__ import annotations
@@ -25,45 +25,46 @@ PARAMETERIZATIONS = {
     "scale_relative": "eigengs_dr.fitting.optimizers.parameterization:SCALE_RELATIVE",
     "cholesky": "eigengs_dr.fitting.optimizers.parameterization:CHOLESKY",
 }
-"""The variables that an optimiser moves, by name: each is a `Parameterization`."""
+"""Parameterizations by name: the variables that an optimiser moves."""
 
 MIN_PHASE_RATIO = 10
-"""Gaussians are redistributed only if the whole run has at least this many times the steps of its
-first phase. Of 1,000 steps redistribution gains 0.8 dB, of 200 0.5, and of 100 nothing (5,000
-Gaussians, ImageNet classes)."""
+"""Smallest ratio of the steps of the whole run to the steps of its first phase at which Gaussians
+are redistributed. In 1,000 steps redistribution gains 0.8 dB, in 200 steps 0.5 dB, and in 100 steps
+nothing (5,000 Gaussians, ImageNet classes)."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How an image is refined; the numbers of a preset.
+    """The settings of a refinement.
 
     Attributes
     ----------
     optimizer : str
         A name in `OPTIMIZERS`.
     rates : dict of str to float
-        Learning rate of every variable at the start. With "scale_relative" variables the rates of
-        mean and factor are in sizes of the Gaussian, and the rate of color in units of white.
+        Learning rate of every variable at the start. With "scale_relative" variables, the rates of
+        mean and factor are relative to the size of the Gaussian; the unit of color is white.
     settings : dict, optional
-        More arguments of the optimiser.
+        Other arguments of the optimiser.
     parameterization : str
         A name in `PARAMETERIZATIONS`.
     warm_up : int
-        Steps over which the rates rise. Until its averages have settled, Adam takes steps of full
-        length, which would leave the solved start by some decibels.
+        Steps over which the rates rise. The first steps of Adam have full length whatever the
+        gradient; without a warm-up they would lose some decibels of the colour solve.
     decay : float
-        Share of the rates that is left at the end of half a cosine.
+        Fraction of the rates at the end, after half a cosine.
     rebuild : int
         Steps between two builds of the tile lists.
     pad : float
-        Pixels by which Gaussians are enlarged when lists are built, so that the lists last
+        Pixels by which a build of the lists enlarges the Gaussians, so that the lists last
         `rebuild` steps.
     redistribute_after : int
-        Steps of the first phase, after which Gaussians may be redistributed; see `descend`.
+        Steps of the first phase, before redistribution; see
+        `eigengs_dr.fitting.optimizers.descent.descend`.
     patience : int
-        Stop when this many steps gained less than `least_gain`.
+        Number of steps. A refinement stops if this many steps gain less than `least_gain`.
     least_gain : float
-        Decibels.
+        Gain in dB, see `patience`.
     """
 
     optimizer: str
@@ -79,17 +80,17 @@ class Schedule:
     least_gain: float = 0.01
 
     def make_optimizer(self) -> Any:
-        """Return a new optimiser with a rate of 1 and no variables."""
+        """Return a new optimiser with a learning rate of 1 and no variables."""
         return resolve_name(OPTIMIZERS[self.optimizer])(1.0, **self.settings)
 
     def variables(self) -> Parameterization:
-        """Return the variables that the optimiser moves."""
+        """Return the parameterization."""
         found: Parameterization = resolve_name(PARAMETERIZATIONS[self.parameterization])
         return found
 
 
 def lr_factor(schedule: Schedule, step: int, iterations: int) -> float:
-    """Factor of the rates: a linear rise, then half a cosine."""
+    """Return the factor of the learning rates at a step: a linear rise times half a cosine."""
     along = 0.5 * (1 + math.cos(math.pi * step / iterations))
     left = schedule.decay + (1 - schedule.decay) * along
     return left * min(1.0, (step + 1) / max(1, schedule.warm_up))

@@ -1,1 +1,1 @@
-"""Where Gaussians start and where they are added. NumPy only."""
+"""Placement: where Gaussians start, and where density control adds them. NumPy only."""

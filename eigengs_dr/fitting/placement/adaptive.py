@@ -1,10 +1,10 @@
-"""Splats placed and shaped by the image: many, small and stretched where it bends the most.
+"""Adaptive placement: more and smaller Gaussians where the image has large second derivatives.
 
-A Gaussian follows an image where that is nearly linear; what it misses is the second derivative. So
-the density of splats follows the squared Hessian (`hessian_energy`), their centres cut a
-space-filling curve into pieces of equal mass and take one Lloyd step, and each is stretched along
-the direction that bends the least. The constants were chosen on training images of faces and of
-ImageNet classes by the error after 10 steps of the colour solve.
+Gaussians approximate an image well where it is nearly linear; the error comes from the second
+derivatives. So the density of Gaussians follows the squared Hessian (`hessian_energy`). The means
+are the centroids of pieces of equal mass of a Hilbert curve, after one Lloyd step. Each Gaussian is
+stretched along the direction of the smallest second derivative. The constants were chosen on
+training images of faces and of ImageNet classes by the error after 10 steps of the colour solve.
 """
 
 from __future__ import annotations
@@ -22,29 +22,30 @@ Array = NDArray[np.floating]
 Density = Callable[[Array, float], Array]
 
 IMAGE_BLUR = 0.18
-"""Standard deviation, in splat spacings, of what no splat can follow."""
+"""Standard deviation of the blur of the image, in spacings: it removes details that no Gaussian can
+follow."""
 
 DENSITY_BLUR = 0.14
-"""Over how many spacings the bending is averaged for the density."""
+"""Standard deviation of the blur of the squared Hessian for the density, in spacings."""
 
 DIRECTION_BLUR = 0.4
-"""Over how many spacings it is averaged for the direction."""
+"""Standard deviation of the blur of the squared Hessian for the direction, in spacings."""
 
 NOISE_SLOPE = 0.2
-"""Change of slope across a spacing that counts as noise, without direction; the pixels' unit."""
+"""Isotropic noise: a change of the slope across one spacing, in units of the image."""
 
 DENSITY_EXPONENT = 2 / 3
-"""Density is the squared Hessian to this power."""
+"""Exponent of the squared Hessian in the density."""
 
 RELATIVE_SIZE = 0.7
-"""Geometric mean of both standard deviations over ``1 / sqrt(density)``."""
+"""Geometric mean of both standard deviations, relative to ``1 / sqrt(density)``."""
 
 MAX_STRETCH = 3.0
 """Ratio of the standard deviations along and across a straight edge."""
 
 WORKING_SPACING = 8.0
-"""Pixels between splats that are enough to place them: larger images are shrunk first, for the
-constants above were chosen at such a spacing, and filters of large images take long."""
+"""Pixels between Gaussians for placement. Images with at least twice this spacing are shrunk first:
+the constants above were chosen near this spacing, and filters of large images take long."""
 
 
 def place_adaptive(
@@ -53,24 +54,24 @@ def place_adaptive(
     generator: np.random.Generator | None = None,
     density: Density | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Place and shape splats by the second derivatives of an image.
+    """Place and shape Gaussians by the second derivatives of an image.
 
     Parameters
     ----------
     image : ndarray, shape (H, W, C)
-        In the space whose squared error counts.
+        Image in the space of the squared error.
     count : int
-        Number of splats, from 1 to H W.
+        Number of Gaussians, from 1 to H W.
     generator : numpy.random.Generator, optional
         Not used: the result is a function of the image.
     density : callable, optional
-        ``density(bend, spacing)`` returns splats a pixel, up to a factor, of the shape of the image
-        or of a smaller one; by default `density_from_hessian`.
+        ``density(bend, spacing)`` returns the Gaussians per pixel, up to a factor, for the result
+        of `hessian_energy` on the image or on a smaller one; by default `density_from_hessian`.
 
     Returns
     -------
     mean : ndarray, shape (count, 2)
-        In pixels, centres at +0.5.
+        In pixels; pixel centres lie at +0.5.
     factor : ndarray, shape (count, 3)
         a, b, c in 1 / pixels; see `eigengs_dr.Gaussians`.
     """
@@ -84,18 +85,24 @@ def place_adaptive(
         x, y = width / small.shape[1], height / small.shape[0]
         return mean * (x, y), factor / (x, y, y)
     bend = hessian_energy(image, spacing)
-    splats = normalize_density((density or density_from_hessian)(bend, spacing), count)
-    mean = lloyd_step(stratify_along_hilbert(splats, count), splats)
-    return mean, shapes_from_hessian(mean, splats, bend, spacing)
+    per_pixel = normalize_density((density or density_from_hessian)(bend, spacing), count)
+    mean = lloyd_step(stratify_along_hilbert(per_pixel, count), per_pixel)
+    return mean, shapes_from_hessian(mean, per_pixel, bend, spacing)
 
 
 def hessian_energy(image: Array, spacing: float) -> NDArray[np.float32]:
-    """Squared Hessian ``sum_c H_c H_c`` of a blurred image plus isotropic noise.
+    """Return the squared Hessian ``sum_c H_c H_c`` of a blurred image plus isotropic noise.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W, C)
+    spacing : float
+        Distance between Gaussians in pixels.
 
     Returns
     -------
     ndarray of float32, shape (3, H, W)
-        Its entries xx, yy and xy.
+        The entries xx, yy and xy.
     """
     from scipy.ndimage import correlate1d, gaussian_filter
 
@@ -111,7 +118,7 @@ def hessian_energy(image: Array, spacing: float) -> NDArray[np.float32]:
 
 
 def density_from_hessian(bend: Array, spacing: float) -> Array:
-    """Density that the bending asks for, shape (H, W), up to a factor."""
+    """Return the density (H, W) for a squared Hessian, up to a factor; see `hessian_energy`."""
     from scipy.ndimage import gaussian_filter
 
     mean = gaussian_filter(bend[0] + bend[1], DENSITY_BLUR * spacing)
@@ -119,20 +126,20 @@ def density_from_hessian(bend: Array, spacing: float) -> Array:
 
 
 def normalize_density(density: Array, count: int) -> NDArray[np.float64]:
-    """Scale a density to `count` splats in all, or a little less where most pixels have one."""
-    splats: NDArray[np.float64] = density.astype(np.float64)
-    for _ in range(5):  # what is cut off above goes to the rest
-        splats = np.minimum(splats * (count / splats.sum()), 1.0)
-    return splats
+    """Scale a density to a sum of about `count` Gaussians, with at most one per pixel."""
+    per_pixel: NDArray[np.float64] = density.astype(np.float64)
+    for _ in range(5):  # each round moves the excess of full pixels to the others
+        per_pixel = np.minimum(per_pixel * (count / per_pixel.sum()), 1.0)
+    return per_pixel
 
 
 def stratify_along_hilbert(density: Array, count: int) -> NDArray[np.float64]:
-    """Cut a Hilbert curve through the pixels into pieces of equal mass.
+    """Cut a Hilbert curve through the pixels into pieces of equal mass, and return their centroids.
 
     Returns
     -------
-    ndarray, shape (count, 2)
-        Their centroids, in the order of the curve: neighbours in memory are neighbours in space.
+    ndarray of float64, shape (count, 2)
+        Centroids in pixels, in the order of the curve: neighbours in memory are close in space.
     """
     height, width = density.shape
     order = hilbert_order(height, width)
@@ -148,7 +155,7 @@ def stratify_along_hilbert(density: Array, count: int) -> NDArray[np.float64]:
 
 
 def lloyd_step(mean: Array, density: Array) -> NDArray[np.float64]:
-    """One Lloyd step: each centre moves to the centroid of the pixels nearest to it."""
+    """Take one Lloyd step: move each centre to the centroid of the pixels nearest to it."""
     count = len(mean)
     owner = nearest_center(mean, density.shape)
     rows, columns = np.indices(density.shape).reshape(2, -1)
@@ -161,7 +168,10 @@ def lloyd_step(mean: Array, density: Array) -> NDArray[np.float64]:
 
 
 def nearest_center(mean: Array, shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """Index of the centre nearest to each pixel, shape (H W,); of several in one pixel the last."""
+    """Return the index of the centre nearest to each pixel, shape (H W,).
+
+    If several centres lie in one pixel, only the last counts.
+    """
     from scipy.ndimage import distance_transform_edt
 
     column, row = _pixels(mean, shape)
@@ -174,7 +184,7 @@ def nearest_center(mean: Array, shape: tuple[int, ...]) -> NDArray[np.int64]:
 def shapes_from_hessian(
     mean: Array, density: Array, bend: Array, spacing: float
 ) -> NDArray[np.float64]:
-    """Shape the splats: size by the density, ratio and angle of the axes by the bending."""
+    """Return factors (N, 3): size by the density, ratio and angle of the axes by the Hessian."""
     from scipy.ndimage import gaussian_filter
 
     column, row = _pixels(mean, density.shape)
@@ -185,7 +195,7 @@ def shapes_from_hessian(
     ratio = 1 + (MAX_STRETCH - 1) * split / (xx + yy)
     variance = RELATIVE_SIZE**2 / density[row, column]
     along, across = variance * ratio, variance / ratio
-    angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the direction that bends the most
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # the direction of the largest second derivative
     cos, sin = np.cos(angle), np.sin(angle)
     return factor_from_covariance(
         across * cos**2 + along * sin**2,
@@ -195,6 +205,6 @@ def shapes_from_hessian(
 
 
 def _pixels(mean: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
-    """Columns and rows of the pixels that centres lie in."""
+    """Return the columns and rows of the pixels of the centres."""
     column = np.clip(mean[:, 0].astype(int), 0, shape[1] - 1)
     return column, np.clip(mean[:, 1].astype(int), 0, shape[0] - 1)

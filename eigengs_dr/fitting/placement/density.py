@@ -1,4 +1,4 @@
-"""Where Gaussians belong: the density that an error asks for, and the peaks of a residual."""
+"""The density of Gaussians for the error of a fit, and the peaks of a residual."""
 
 from __future__ import annotations
 
@@ -12,34 +12,36 @@ from .adaptive import nearest_center
 Array = NDArray[np.floating]
 
 ERROR_EXPONENT = 4 / 3
-"""Twice as many splats leave ``2^-FALL`` of the squared error: 4 dB, as measured from 1,250 to
-20,000 splats on 256x256 pixels."""
+"""Exponent q of the decay of the squared error: twice as many Gaussians leave ``2^-q`` of it, which
+is 4 dB less, as measured from 1,250 to 20,000 Gaussians on 256x256 pixels."""
 
 
 NEIGHBORS = 6
-"""Neighbours over which errors and densities are averaged: those of one splat are chance."""
+"""Number of neighbours over which errors and densities are averaged; those of one Gaussian vary by
+chance."""
 
 
 MIN_ERROR_SHARE = 1e-3
-"""Share of the average error that every splat counts with: no part of an image is stripped bare."""
+"""Smallest error of a Gaussian, relative to the average, so that no part of an image gets empty."""
 
 
 def target_density(mean: Array, error: Array, bending: Array) -> NDArray[np.float64]:
-    """Density that leaves every splat the same error, up to a factor.
+    """Return the density at which all Gaussians would have the same error, up to a factor.
 
     Parameters
     ----------
     mean : ndarray, shape (N, 2)
-        Where splats were, in pixels.
+        Means of the old set, in pixels.
     error : ndarray, shape (H, W)
-        Squared error that they left.
+        Squared error of the old set.
     bending : ndarray, shape (H, W)
-        Density that the bending of the image asks for, up to a factor.
+        Density for the second derivatives of the image, up to a factor.
 
     Returns
     -------
-    ndarray, shape (H, W)
-        A splat's pixels, those that are nearest to it, get ``s^(1 / (FALL + 1))`` splats.
+    ndarray of float64, shape (H, W)
+        The pixels nearest to an old Gaussian with the error s together get ``s^(1 / (q + 1))``
+        Gaussians, with q = `ERROR_EXPONENT`.
     """
     from scipy.spatial import cKDTree
 
@@ -53,54 +55,56 @@ def target_density(mean: Array, error: Array, bending: Array) -> NDArray[np.floa
 
     share, mass = around(error), around(bending)
     share = np.maximum(share, MIN_ERROR_SHARE * share.mean()) ** (1 / (ERROR_EXPONENT + 1))
-    if not share.any():  # nothing was missed
+    if not share.any():  # the old set has no error
         share = np.ones(count)
     ratio = share / np.maximum(mass, 1e-9 * mass.mean())
     return bending.astype(np.float64) * ratio[owner].reshape(error.shape)
 
 
 CANDIDATE_SIZES = (0.2, 0.35, 0.6, 1.0, 1.6)
-"""Standard deviations of splats that are tried where one is added, in distances of splats."""
+"""Candidate sizes of an added Gaussian, as multiples of the mean spacing."""
 
 
 BLUR_TRUNCATION = 3.0
-"""Standard deviations within which residuals are blurred."""
+"""Radius of the blur of residuals, in standard deviations."""
 
 
 SUPPRESSION_RADIUS = 1.5
-"""How far, in its standard deviations, a splat that is added keeps others away."""
+"""Distance from an added Gaussian to the next one, in standard deviations of the added one."""
 
 
 def residual_peaks(
     missed: Array, count: int, spacing: float, weight: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """Find where round splats would take most from a squared error.
+    """Find where added round Gaussians would reduce the squared error most.
 
-    A splat ``w`` with the best colour ``<w, r> / <w, w>`` takes ``<w, r>^2 / <w, w>``. With b, the
-    residual r blurred by its standard deviation s, ``<w, r> = S^2 b`` and ``<w, w> = T^2``, where
-    ``S = sum_k exp(-k^2 / (2 s^2))`` and ``T = sum_k exp(-k^2 / s^2)`` over the pixels k away along
-    an axis; for large s that is a colour of 2 b and a gain of ``4 pi s^2 b^2``. Maxima of the gain
-    over places and `CANDIDATE_SIZES` are taken in turn, the largest first, none nearer to one
-    already taken than `SUPPRESSION_RADIUS`.
+    A Gaussian with the weights w and the best colour ``<w, r> / <w, w>`` reduces the squared error
+    by the gain ``<w, r>^2 / <w, w>``. With b, the residual r blurred by the standard deviation s of
+    the Gaussian, ``<w, r> = S^2 b`` and ``<w, w> = T^2``, where ``S = sum_k exp(-k^2 / (2 s^2))``
+    and ``T = sum_k exp(-k^2 / s^2)`` over the offsets k along an axis. For large s the colour is
+    2 b and the gain ``4 pi s^2 b^2``. The function picks the maxima of the gain over positions and
+    `CANDIDATE_SIZES`, the largest first, and skips positions inside the `SUPPRESSION_RADIUS` of
+    earlier picks.
 
     Parameters
     ----------
     missed : ndarray, shape (H, W, C)
         Residual r.
     count : int
-        How many, at most.
+        Largest number of picks.
     spacing : float
-        Distance of splats in pixels.
+        Mean distance between Gaussians in pixels.
     weight : ndarray, shape (H, W, C), optional
-        What errors are multiplied by before they are squared.
+        Factor of the errors before squaring.
 
     Returns
     -------
     mean : ndarray, shape (n, 2)
-        n <= count.
+        In pixels; n <= count.
     size : ndarray, shape (n,)
         Standard deviations in pixels.
     color : ndarray, shape (n, C)
+        Best colours.
     """
     from scipy.ndimage import maximum_filter
 
@@ -121,7 +125,7 @@ def residual_peaks(
 
 
 def _best_sizes(missed: Array, spacing: float, weight: Array | None) -> tuple[Array, Array, Array]:
-    """Gain, size and colour of the best of `CANDIDATE_SIZES` at every pixel."""
+    """Return gain, size and colour of the best of `CANDIDATE_SIZES` at every pixel."""
     from scipy.ndimage import gaussian_filter
 
     counts = 1.0 if weight is None else np.square(weight)
@@ -131,7 +135,7 @@ def _best_sizes(missed: Array, spacing: float, weight: Array | None) -> tuple[Ar
         blur = gaussian_filter(
             missed, (deviation, deviation, 0), mode="constant", truncate=BLUR_TRUNCATION
         )
-        radius = int(BLUR_TRUNCATION * deviation + 0.5)  # that of the filter
+        radius = int(BLUR_TRUNCATION * deviation + 0.5)  # as SciPy computes it
         away = np.arange(-radius, radius + 1)
         taps = np.exp(-0.5 * np.square(away / deviation))
         projected, own_square = taps.sum() ** 2, np.square(taps).sum() ** 2

@@ -8,21 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 DEVIATION = 0.65
-"""Standard deviation of a splat on the grid over the root of the area it has for itself. Smaller
-leaves gaps; larger gains nothing, and colours take longer to solve for and grow."""
+"""Standard deviation of a Gaussian, relative to the square root of the area per Gaussian. A smaller
+one leaves gaps; a larger one gains nothing, slows the colour solve and makes the colours grow."""
 
 
 def place_grid(
     image: NDArray[np.floating], count: int, generator: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Place round splats in rows, each shifted against the last by half a distance: hexagons.
+    """Place round Gaussians in rows; shift every second row by half a distance.
 
-    Parameters and results as for `random`; only the size of the image is used. Any count: rows
-    differ by one splat at most.
+    For parameters and results see `eigengs_dr.fitting.placement.random.place_random`; the generator
+    is not used. The count may be any number: rows differ by at most one Gaussian.
     """
     height, width = image.shape[:2]
     spacing = math.sqrt(width * height / count)
-    # In a hexagonal lattice with one point an area s^2, rows are sqrt(3) / 2 of a distance apart.
+    # In a hexagonal grid with one point per area s^2, rows are sqrt(3) / 2 of a distance apart.
     rows = min(count, max(1, round(height / spacing * math.sqrt(2 / math.sqrt(3)))))
     starts = np.arange(rows + 1) * count // rows
     row = np.repeat(np.arange(rows), np.diff(starts))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-# A Hilbert curve through a square visits its quarters in this order, the plain way (state 0) or
-# with columns and rows swapped (1), with both counted from the other side (2), or both (3).
+# The order in which a Hilbert curve visits the quarters of a square, by state: as it is (0), with
+# columns and rows swapped (1), with both counted from the other side (2), or both changes (3).
 _RIGHT = np.array([[0, 0, 1, 1], [0, 1, 1, 0], [1, 1, 0, 0], [1, 0, 0, 1]], np.int32)
 
 
@@ -17,10 +17,18 @@ _STATE = np.arange(4, dtype=np.int8)[:, None] ^ np.array([1, 0, 0, 3], np.int8)
 
 
 def hilbert_order(height: int, width: int) -> NDArray[np.int64]:
-    """Pixel indices ``row * width + column`` in the order of a Hilbert curve over the image.
+    """Return the pixel indices ``row * width + column`` in the order of a Hilbert curve.
 
-    The curve over the next power of two is followed, and what lies outside the image left out.
-    Each square is replaced by its quarters, level by level: O(height * width), nothing is sorted.
+    The curve covers the next power of two; the function drops squares outside the image. It
+    replaces each square by its quarters, level by level, in O(height * width) without sorting.
+
+    Parameters
+    ----------
+    height, width : int
+
+    Returns
+    -------
+    ndarray of int64, shape (height * width,)
     """
     side = 1 << max(height - 1, width - 1).bit_length()
     column = row = np.zeros(1, np.int32)

@@ -1,4 +1,4 @@
-"""Where splats start: `place_random`, on a `grid`, or `adaptive` to the image."""
+"""Random placement, as in GaussianImage."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from ...gaussian.covariance import factor_from_covariance
 def place_random(
     image: NDArray[np.floating], count: int, generator: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Place splats uniformly, shaped as GaussianImage does: Cholesky factors uniform in [0, 1].
+    """Draw means uniformly in the image, and shapes as GaussianImage does.
 
-    The covariance is ``L L^T`` with ``L = [[l1 + 0.5, 0], [l2, l3 + 0.5]]`` pixels.
+    The covariance is ``L L^T`` with ``L = [[l1 + 0.5, 0], [l2, l3 + 0.5]]`` pixels and l1, l2, l3
+    uniform in [0, 1].
 
     Parameters
     ----------
     image : ndarray, shape (H, W, C)
-        Only its size is used.
+        The function uses only its size.
     count : int
-        Number of splats.
+        Number of Gaussians.
     generator : numpy.random.Generator
 
     Returns

@@ -1,1 +1,1 @@
-"""Linear least squares for colours on fixed shapes."""
+"""Linear least squares for the colours of fixed shapes."""

@@ -1,8 +1,9 @@
 """The best colours for fixed shapes: linear least squares by preconditioned conjugate gradients.
 
-An image is linear in colours and background: with the matrix ``A`` whose column n holds the weights
-of splat n at all pixels, and a last column of ones, the best colours minimise ``|A c - D|^2``. One
-rendering is a product with A, one adjoint a product with its transpose; A is never stored.
+A rendering is linear in colours and background. Column n of the matrix ``A`` holds the weights of
+Gaussian n at all pixels; the last column is 1. The best colours c minimise ``|A c - D|^2`` for the
+image D. A rendering computes a product with A, an adjoint a product with its transpose; A is never
+stored.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from ...raster.render import bin_gaussians, to_tiles
 from ...raster.tiles import TileLists
 
 RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}
-"""Share of the first ``r^T z`` below which only rounding is left, by bits of a number."""
+"""Tolerance by the bits of a float: a channel stops if ``r^T z``, relative to its first value, is
+smaller. A smaller ``r^T z`` is only rounding."""
 
 
 class Solution(NamedTuple):
@@ -37,8 +39,8 @@ class Solution(NamedTuple):
     gaussians : Gaussians
         The set with the new colours and background.
     residuals : list of float
-        Root mean square of ``D - A c`` over pixels and channels, before the first and after every
-        step; it never grows but for rounding.
+        Root mean square of ``D - A c`` over pixels and channels, before the first step and after
+        every step. It never grows, except by rounding.
     """
 
     gaussians: Gaussians
@@ -53,19 +55,19 @@ def solve(
 ) -> Solution:
     """Find the colours and the background that fit an image best on fixed shapes.
 
-    Conjugate gradients on the normal equations, preconditioned by their diagonal
-    ``sum_x w_n(x)^2``, each channel on its own. A step costs one rendering and one adjoint with
-    respect to colours.
+    The method is conjugate gradients on the normal equations, for each channel separately, with
+    their diagonal ``sum_x w_n(x)^2`` as preconditioner. A step costs one rendering and one adjoint
+    with respect to colours.
 
     Parameters
     ----------
     gaussians : Gaussians
     image : ndarray, shape (H, W, C)
-        At the native size, in the space of the set.
+        Image of the native size, in the space of the set.
     steps : int, optional
-        Steps of the method; stopping early regularises where splats overlap much.
+        Number of steps. Few steps regularise the colours of Gaussians that overlap much.
     warm_start : bool, optional
-        Start from the colours and background of the set instead of zero and the image's mean.
+        Start from the colours and background of the set instead of zero and the mean of the image.
 
     Returns
     -------
@@ -74,7 +76,7 @@ def solve(
     Raises
     ------
     ValueError
-        If the image has another shape than the set, or steps is negative.
+        If image and set differ in shape, or steps is negative.
     """
     expected = (gaussians.height, gaussians.width, gaussians.channels)
     if image.shape != expected:
@@ -88,16 +90,16 @@ def solve(
 def inner_products(
     gaussians: Gaussians, image: NDArray[Any], squared: bool = False
 ) -> NDArray[Any]:
-    """Inner products of every splat's weights with an image.
+    """Return the inner products of the weights of every Gaussian with an image.
 
     Parameters
     ----------
     gaussians : Gaussians
-        Its colours do not count.
+        The function ignores the colours.
     image : ndarray, shape (H, W, C)
-        At the native size.
+        Image of the native size.
     squared : bool, optional
-        Of the squares of the weights.
+        Square the weights first.
 
     Returns
     -------
@@ -144,7 +146,7 @@ def _solve(gaussians: Gaussians, image: NDArray[Any], steps: int, warm_start: bo
     dr.eval(p, rz, enough)
     with freeze_program(
         _step
-    ) as take_step:  # for this solve alone: a program does not notice another N
+    ) as take_step:  # for this solve only: a program does not notice another number of Gaussians
         for _ in range(steps):
             unknowns, residual, p, rz, square = take_step(
                 shape, unknowns, residual, p, rz, enough, inverse, inside, lists, gaussians.cutoff
@@ -172,13 +174,13 @@ def _step(
     lists: TileLists,
     cutoff: float,
 ) -> tuple:
-    """One step of conjugate gradients for all channels; ``alpha = rz / |A p|^2``."""
+    """Take one step of conjugate gradients for all channels; ``alpha = rz / |A p|^2``."""
     Float = type(residual)
     channels = len(x)
     q = _apply(shape, p, lists, inside, cutoff)
     dr.eval(q)
     curvature = channel_sums(dr.square(q), channels, lists.grid)
-    # What is solved but for rounding stays as it is: its directions would grow without bound.
+    # A channel that is solved except for rounding stops: its directions would grow without bound.
     alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, curvature, strict=True)]
     x = [dr.fma(a, d, v) for a, d, v in zip(alpha, p, x, strict=True)]
     spread = dr.tile(dr.concat(alpha), lists.grid.tiles * lists.grid.pixels)
@@ -196,7 +198,7 @@ def _step(
 
 
 def _apply(shape: list, unknowns: list, lists: TileLists, inside: Any, cutoff: float) -> Any:
-    """``A c``: render the colours, the last unknown of a channel being its background."""
+    """Return ``A c``: render the colours; the last unknown of a channel is its background."""
     types = types_of(shape[0])
     n = dr.width(shape[0])
     color = [dr.gather(types.Float, u, dr.arange(types.UInt, n)) for u in unknowns]
@@ -208,7 +210,7 @@ def _apply(shape: list, unknowns: list, lists: TileLists, inside: Any, cutoff: f
 def _apply_transposed(
     shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float
 ) -> list:
-    """``A^T d``: correlate with every splat, and the sum of every channel."""
+    """Return ``A^T d``: correlations with every Gaussian and, last, the sum of every channel."""
     types = types_of(delta)
     packed = pack_parameters([*shape, *[types.Float(0)] * channels])
     color = adjoint(packed, delta, channels, lists, kernel_radius(cutoff), color_only=True)
@@ -219,14 +221,14 @@ def _apply_transposed(
 def _inverse_diagonal(
     shape: list, inside: Any, channels: int, lists: TileLists, cutoff: float
 ) -> list:
-    """One over the diagonal of ``A^T A``."""
+    """Return one over the diagonal of ``A^T A``."""
     diagonal = _apply_squared(shape, inside, channels, lists, cutoff)
     return [dr.select(d > 1e-8, dr.rcp(d), 0) for d in diagonal]
 
 
 def _apply_squared(shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float) -> list:
-    """`_apply_transposed` for ``w^2``, the weight of a splat narrower by sqrt 2."""
+    """Apply `_apply_transposed` with ``w^2``, the weight of a Gaussian narrower by sqrt 2."""
     root = math.sqrt(2)
     narrow = [*shape[:2], *[f * root for f in shape[2:NUM_SHAPE_PARAMS]]]
-    reach = min(cutoff * root, MAX_CUTOFF)  # beyond, squares are 0 in any precision
+    reach = min(cutoff * root, MAX_CUTOFF)  # beyond, the squares are 0 in any precision
     return _apply_transposed(narrow, delta, channels, lists, reach)

@@ -1,9 +1,8 @@
-"""The best colours on shapes that many images share: one sparse factorisation serves them all.
+"""The best colours of many images on the same shapes, by one sparse factorisation.
 
-With A, whose column n holds the weights of splat n at all pixels, the best colours c and background
-b of an image D minimise ``|A c + b 1 - D|^2``. Shapes that do not change from image to image leave
-``A^T A`` as it is: it is factorised once, and each image costs one product and one
-back-substitution. For the shapes of one image alone,
+Column n of A holds the weights of Gaussian n at all pixels. The best colours c and background b of
+an image D minimise ``|A c + b 1 - D|^2``. ``A^T A`` depends on the shapes only: it is factorised
+once, and each image costs one product and one back-substitution. For one image,
 `eigengs_dr.fitting.solvers.conjugate_gradient` is cheaper.
 """
 
@@ -27,27 +26,29 @@ from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ...raster.render import bin_gaussians, to_tiles
 
 GROUP = 3
-"""Images that are correlated at once: an image's channels, so that one program serves all."""
+"""Planes that one adjoint correlates: as many as an image has channels, so that all calls share one
+program."""
 
 MAX_WEIGHTS = 1 << 28
-"""Largest number of weights that a matrix may have: they and their places take 6 GiB."""
+"""Largest number of weights of a matrix; the weights and their indices then take 6 GiB."""
 
 RIDGE = 1e-4
-"""Added to the diagonal of ``A^T A``, as a share of its mean: bounds the colours of splats that
-overlap much, at no visible cost."""
+"""Number added to the diagonal of ``A^T A``, relative to the mean of the diagonal. It bounds the
+colours of Gaussians that overlap much, at no visible cost."""
 
 
 class Block(NamedTuple):
-    """Consecutive splats whose colours are solved for together.
+    """Consecutive Gaussians with a common solve for their colours.
 
     Attributes
     ----------
     rows : slice
+        Range of the Gaussians.
     factor : SuperLU
-        Of ``A^T A + ridge``, in single precision: half the memory to read for every image, and
-        what that loses is below the ridge.
+        Factorisation of ``A^T A + ridge`` in single precision, which halves the memory to read for
+        every image; its rounding is below the ridge.
     spread : ndarray of float64, shape (n,)
-        ``h = (A^T A + ridge)^-1 A^T 1``, by which a background moves the colours.
+        ``h = (A^T A + ridge)^-1 A^T 1``: a background b changes the colours by ``-b h``.
     """
 
     rows: slice
@@ -55,32 +56,33 @@ class Block(NamedTuple):
     spread: NDArray[np.float64]
 
     def divide(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
-        """``(A^T A + ridge)^-1`` times columns."""
+        """Return ``(A^T A + ridge)^-1`` times columns."""
         return self.factor.solve(np.asarray(sums, np.float32, order="F")).astype(np.float64)
 
 
 class NormalEquations:
-    """``(A^T A + ridge) c = A^T (D - b)`` for any number of images D on fixed shapes, factorised.
+    """Factorised equations ``(A^T A + ridge) c = A^T (D - b)`` for any number of images D.
 
-    Solved exactly, or, with `low`, for two blocks of splats one after the other.
+    The solution is exact or, with `low`, for two blocks of Gaussians one after the other.
 
-    The background, a dense column of ones beside A, stays out of the sparse factor: block
-    elimination gives it from two sums. A column of coefficients is N colours and, last, the
+    The background is a dense column of ones beside A and stays out of the sparse factor: block
+    elimination computes it from two sums. A column of coefficients holds N colours and, last, the
     background.
 
     Parameters
     ----------
     gaussians : Gaussians
-        Shapes and native size; colours are not used.
+        Shapes and native size; the colours are ignored.
     low : int, optional
-        So many splats, the first ones, fit an image with the background, and the others what is
-        left. With large splats below small ones that starts some 0.1 dB below the solution for all
-        at once, in which both cancel each other in large numbers: it ends 1 dB lower when refined.
+        If positive, the first `low` Gaussians and the background fit the image, and the other
+        Gaussians fit the residual. If large Gaussians precede small ones, this solution starts some
+        0.1 dB below the exact one. The exact one, in which large numbers cancel each other, ends
+        1 dB lower after refinement.
 
     Raises
     ------
     ValueError
-        If the shapes are so alike that the equations are singular to working precision.
+        If the equations are singular to working precision because shapes are too similar.
     """
 
     def __init__(self, gaussians: Gaussians, low: int = 0) -> None:
@@ -98,7 +100,7 @@ class NormalEquations:
             self.lists = bin_gaussians(gaussians)
 
     def _block(self, rows: slice) -> Block:
-        """Factorise the equations of some splats."""
+        """Factorise the equations of some Gaussians."""
         gram = self.gram[rows, rows]
         ridge = max(RIDGE * gram.diagonal().mean(), 1e-12)
         system = (gram + diags_array(np.full(gram.shape[0], ridge))).tocsc()
@@ -110,19 +112,22 @@ class NormalEquations:
                 options={"SymmetricMode": True},
             )
         except RuntimeError as error:
-            raise ValueError(f"the splats' equations have no solution ({error})") from None
+            raise ValueError(
+                f"the equations of the Gaussians' colours are singular ({error}); use shapes that "
+                "differ more"
+            ) from None
         coverage = self.coverage[rows]
         block = Block(rows, factor, 0 * coverage)
         spread = block.divide(coverage)
         return block._replace(spread=spread + block.divide(coverage - system @ spread))
 
     def correlate(self, images: NDArray[np.float32]) -> NDArray[np.float64]:
-        """``A^T D`` and, last, ``1^T D``.
+        """Return ``A^T D`` and, in the last row, ``1^T D``.
 
         Parameters
         ----------
         images : ndarray of float32, shape (M, H, W)
-            M planes at the native size.
+            M planes of the native size.
 
         Returns
         -------
@@ -145,15 +150,22 @@ class NormalEquations:
         return result
 
     def solve(self, correlations: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Coefficients of least squares from what `correlate` gave; both of shape (N + 1, M).
+        """Return the least-squares coefficients for the result of `correlate`.
 
-        With two blocks those of the first, and then those of the second for what is left.
+        Parameters
+        ----------
+        correlations : ndarray of float64, shape (N + 1, M)
+
+        Returns
+        -------
+        ndarray of float64, shape (N + 1, M)
+            The second of two blocks fits the residual of the first.
         """
         first, *others = self.blocks
         sums, total = correlations[first.rows], correlations[-1]
         pixels = self.width * self.height
         free = pixels - first.spread @ self.coverage[first.rows]
-        # Splats that make a constant by themselves leave nothing for the background.
+        # If the Gaussians alone can form a constant, the background is not determined: use 0.
         background = (total - first.spread @ sums) / free if free > 1e-6 * pixels else 0 * total
         solved = np.zeros(correlations.shape)
         solved[-1] = background
@@ -164,7 +176,7 @@ class NormalEquations:
         return solved
 
     def product(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-        """``[A 1]^T [A 1] x`` for coefficients x of shape (N + 1, M)."""
+        """Return ``[A 1]^T [A 1] x`` for coefficients x of shape (N + 1, M)."""
         colors, background = coefficients[:-1], coefficients[-1:]
         pixels = self.width * self.height
         return np.vstack(
@@ -180,13 +192,13 @@ class NormalEquations:
         correlations: NDArray[np.float64],
         squared_norms: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """``|A c + b 1 - D|^2`` of M images by inner products, without rendering one.
+        """Return ``|A c + b 1 - D|^2`` of M images by inner products, without a rendering.
 
         Parameters
         ----------
         coefficients, correlations : ndarray of float64, shape (N + 1, M)
-        squares : ndarray of float64, shape (M,)
-            ``|D|^2``; the result is exact to about 1e-6 of it.
+        squared_norms : ndarray of float64, shape (M,)
+            ``|D|^2``; the result is exact to about 1e-6 of this number.
 
         Returns
         -------
@@ -198,23 +210,23 @@ class NormalEquations:
 
 
 def weight_matrix(gaussians: Gaussians) -> csr_array:
-    """Weights of every splat at every pixel of the native size: the transpose of A.
+    """Return the weights of every Gaussian at every pixel of the native size: the transpose of A.
 
     Parameters
     ----------
     gaussians : Gaussians
-        N splats; colours are not used.
+        N Gaussians; the colours are ignored.
 
     Returns
     -------
     csr_array of float32, shape (N, H * W)
-        Row n holds the weights of splat n, by `eigengs_dr.raster.evaluate.weights`. Cost and size:
-        the number of pixels inside all ellipses; 8 bytes each, and 30 while it is made.
+        Row n holds the weights of Gaussian n, by `eigengs_dr.raster.evaluate.weights`. Each pixel
+        inside an ellipse takes 8 bytes in the result, and 30 bytes during the computation.
 
     Raises
     ------
     ValueError
-        If these are more than `MAX_WEIGHTS`.
+        If the ellipses have more than `MAX_WEIGHTS` pixels in all.
     """
     arrays = gaussians.to_arrays()
     splat, x, y = _pixels_inside(
@@ -245,7 +257,7 @@ def _pixels_inside(
     height: int,
     cutoff: float,
 ) -> tuple[NDArray[np.uint32], NDArray[np.int32], NDArray[np.int32]]:
-    """List (splat, x, y) of the pixels inside each ellipse, row by row.
+    """List (Gaussian, x, y) of the pixels inside each ellipse, row by row.
 
     On the row at distance dy, ``|F (x - mu)| <= cutoff`` is
     ``|a dx + b dy| <= sqrt(cutoff^2 - (c dy)^2)``.
@@ -267,16 +279,19 @@ def _pixels_inside(
 def _expand(
     low: NDArray[np.int32], high: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """All integers of the ranges [low, high), each with the index of its range."""
+    """Return the integers of the ranges [low, high), each with the index of its range."""
     count = high - low
     total = int(count.sum(dtype=np.int64))
     if total > MAX_WEIGHTS:
-        raise ValueError(f"the splats cover {total:,} pixels in all, over {MAX_WEIGHTS:,}")
+        raise ValueError(
+            f"the Gaussians cover {total:,} pixels in all, over {MAX_WEIGHTS:,}; use fewer, or a "
+            "smaller size"
+        )
     which = np.repeat(np.arange(len(low)), count)
     before = np.repeat(np.cumsum(count) - count, count)
     return which, (np.arange(len(which)) - before + low[which]).astype(np.int32)
 
 
 def squared_norms(planes: NDArray[np.float32]) -> NDArray[np.float64]:
-    """``|D|^2`` of every plane."""
+    """Return ``|D|^2`` of every plane D: planes (M, H, W) give shape (M,)."""
     return np.einsum("nij,nij->n", planes, planes, dtype=np.float64)

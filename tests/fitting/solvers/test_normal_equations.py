@@ -163,5 +163,5 @@ def test_blocks_fit_what_is_left(backend):
 
 def test_a_matrix_too_large_is_refused(backend, monkeypatch):
     monkeypatch.setattr("eigengs_dr.fitting.solvers.normal_equations.MAX_WEIGHTS", 100)
-    with pytest.raises(ValueError, match=r"the splats cover [\d,]+ pixels in all, over 100"):
+    with pytest.raises(ValueError, match=r"the Gaussians cover [\d,]+ pixels in all, over 100"):
         NormalEquations(random_scene().on(backend))
