@@ -2,11 +2,12 @@
 
 from .backend.selection import BackendError
 from .codec.bit_allocation import PackResult, pack
-from .eigenbasis.basis import Eigenbasis
 from .eigenbasis.eigengs import EigenGS
+from .eigenbasis.pca.basis import Eigenbasis
 from .fitting.fit import Fit, FitInterrupted, fit
 from .fitting.levels import fit_levels, level_counts
-from .gaussian.gaussians import Gaussians, concatenate
+from .gaussian.concatenate import concatenate
+from .gaussian.gaussians import Gaussians
 from .gaussian.tensors import from_tensors, to_tensors
 from .image.io import ImageError, load_image, save_image
 from .image.metrics import ms_ssim, psnr, ssim

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..eigenbasis.basis import CHANNELS, Eigenbasis
 from ..eigenbasis.components.solve import with_colors
 from ..eigenbasis.eigengs import EigenGS
+from ..eigenbasis.pca.basis import CHANNELS, Eigenbasis
 from ..gaussian.covariance import outline
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode

@@ -134,7 +134,7 @@ def train(
 
 def _settings(gaussians: int | None, frequency_aware: str, **options: Any) -> Any:
     """Turn the options of the command into `TrainOptions`."""
-    from ..eigenbasis.training import TrainOptions
+    from ..eigenbasis.options import TrainOptions
     from ..fitting.options import default_count
 
     width, height = options["size"]

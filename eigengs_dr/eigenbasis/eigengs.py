@@ -23,12 +23,13 @@ from ..image.folder import to_planes
 from ..image.io import check_image
 from ..image.resize import resample
 from ..storage import npz
-from .basis import Eigenbasis
-from .components.solve import ComponentFit, State, check_arguments, fit_components, with_colors
+from .components.solve import ComponentFit, State, fit_components, with_colors
 from .components.split import split_reason, wants_split
 from .model_file import FORMAT, VERSION, from_members, layout_of, to_members
+from .options import TrainOptions
+from .pca.basis import Eigenbasis
+from .pca.truncation import TruncationCurve, curve_from_eigenvalues
 from .projection import ComponentProjector
-from .truncation import TruncationCurve, curve_from_eigenvalues
 
 Planes = NDArray[np.float32]
 TrainProgress = Callable[[int, int, dict[str, Any]], None]
@@ -58,7 +59,7 @@ class EigenGS:
         See `eigengs_dr.Eigenbasis`; empty in a file of version 1.
     held_out : ndarray of float64, shape (n + 1,) or (0,)
         Mean PSNR in dB of PCA with 0, 1, ..., n components, for images held out of the training;
-        see `eigengs_dr.eigenbasis.truncation.TruncationCurve`. Empty if no image was held out.
+        see `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`. Empty if no image was held out.
     figures : dict of str to float
         See `eigengs_dr.eigenbasis.components.solve.ComponentFit`; not saved.
     """
@@ -114,9 +115,15 @@ class EigenGS:
         BackendError
             If the backend does not work.
         """
-        steps = check_arguments(
-            (basis.width, basis.height), gaussians, frequency_aware, seed, preset, steps
+        options = TrainOptions(
+            size=(basis.width, basis.height),
+            gaussians=gaussians,
+            frequency_aware=frequency_aware,
+            preset=preset,
+            steps=steps,
+            seed=seed,
         )
+        steps = options.training_steps
         split, figures = wants_split(basis, gaussians, frequency_aware, backend)
         total = steps * (2 if split else 1)
 
@@ -153,9 +160,9 @@ class EigenGS:
         return tuple(len(w) for w in self.weights)
 
     def truncation_curve(self) -> TruncationCurve | None:
-        """Return `eigengs_dr.eigenbasis.truncation.curve_from_eigenvalues` of the training images.
+        """Return the truncation curve of the PCA of the training images.
 
-        The result is None for a file of version 1, which lacks the variance.
+        It is None for a file of version 1, which lacks the variance.
         """
         if not len(self.variance):
             return None
@@ -174,7 +181,7 @@ class EigenGS:
             An image of any size; it is resampled to the size of the model.
         target_psnr : float, optional
             Use the fewest components that reach this PSNR, in dB, for the image at the size of the
-            model; see `eigengs_dr.eigenbasis.truncation.TruncationCurve`. All by default.
+            model; see `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`. All by default.
 
         Returns
         -------

@@ -14,9 +14,9 @@ from ..image.io import ImageError, load_image
 from ..image.metrics import psnr
 from ..image.resize import center_crop
 from ..raster.render import render
-from .basis import Eigenbasis
 from .eigengs import EigenGS
-from .truncation import TruncationCurve
+from .pca.basis import Eigenbasis
+from .pca.truncation import TruncationCurve
 
 OnImage = Callable[[int], None]
 """``watch(i)`` runs before image number i; an error that it raises ends the work."""

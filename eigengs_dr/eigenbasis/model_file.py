@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import BASIS_SPACES
 from ..storage.npz import Field
-from .basis_file import ENERGY_TOLERANCE, require_descending
+from .pca.basis_file import ENERGY_TOLERANCE, require_descending
 
 FORMAT, VERSION = "eigengs_dr.model", 2
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from ..fitting.solvers.normal_equations import NormalEquations
-from .truncation import min_ranks_per_channel, residual_energy
+from .pca.truncation import min_ranks_per_channel, residual_energy
 
 Coefficients = tuple[NDArray[np.float32], ...]
 
@@ -79,7 +79,7 @@ class ComponentProjector:
         entries : int
             Number of pixels times channels.
         target_psnr : float
-            In dB; see `eigengs_dr.eigenbasis.truncation.min_ranks_per_channel`. The ridge on the
+            In dB; see `eigengs_dr.eigenbasis.pca.truncation`. The ridge on the
             diagonal of ``Psi~^T Psi~`` makes the real error smaller than the estimate.
 
         Returns

@@ -9,7 +9,7 @@ import time
 import warnings
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,16 +17,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..backend.interrupt import defer_interrupts
-from ..image.folder import BASIS_SPACES, check_size, image_files, read_blocks
+from ..image.folder import image_files, read_blocks
 from ..image.io import ImageError
 from ..storage.checkpoint import Checkpoint
-from .basis import Eigenbasis, check_components
-from .components.solve import State, check_arguments, fit_components
+from .components.solve import State, fit_components
 from .components.split import split_reason, wants_split
 from .eigengs import EigenGS
 from .evaluation import evaluate, truncation_curve_on
-from .incremental_pca import EigenState, block_length, empty_state, merge, rank_for
-from .truncation import TruncationCurve, check_target
+from .options import TrainOptions
+from .pca.basis import Eigenbasis, check_components
+from .pca.incremental_pca import EigenState, block_length, empty_state, merge, rank_for
+from .pca.truncation import TruncationCurve
 
 HELD_OUT = 10
 """Every tenth image is held out of the training and measured."""
@@ -42,26 +43,6 @@ StageProgress = Callable[[str, int, int], None]
 
 class Interrupted(Exception):
     """An interrupt by Ctrl-C; the message says what is saved."""
-
-
-@dataclass(frozen=True)
-class TrainOptions:
-    """Options of `eigengs_dr.Eigenbasis.from_images` and `eigengs_dr.EigenGS.fit`, and a target.
-
-    `target_psnr` keeps the fewest components whose PCA has this mean PSNR, in dB, on the images
-    held out; see `eigengs_dr.eigenbasis.truncation.TruncationCurve`.
-    """
-
-    size: tuple[int, int] = (256, 256)
-    components: int | tuple[int, int, int] = 300
-    energy: float | None = None
-    target_psnr: float | None = None
-    gaussians: int = 5000
-    frequency_aware: bool | str = "auto"
-    preset: str = "default"
-    steps: int | None = None
-    color: str = "ycbcr"
-    seed: int = 0
 
 
 class Training(NamedTuple):
@@ -112,25 +93,9 @@ def train(
         If a file cannot be written.
     """
     started = time.perf_counter()
-    check_components(settings.components, settings.energy)
-    if settings.target_psnr is not None:
-        check_target(settings.target_psnr)
-        if settings.energy is not None:
-            raise ValueError("energy and target_psnr both choose the components; give one of them")
-    if settings.color not in BASIS_SPACES:
-        raise ValueError(
-            f"color {settings.color!r} is unknown; use one of {', '.join(BASIS_SPACES)}"
-        )
-    steps = check_arguments(
-        check_size(settings.size),
-        settings.gaussians,
-        settings.frequency_aware,
-        settings.seed,
-        settings.preset,
-        settings.steps,
-    )
     folder = Path(folder)
     names = [path.name for path in image_files(folder)]
+    steps = settings.training_steps
     record = {**asdict(settings), "steps": steps, "folder": str(folder)}
     with Checkpoint(output, json.loads(json.dumps(record)), names) as checkpoint:
         if names != checkpoint.files:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
-from ..gaussian.gaussians import Gaussians, concatenate
+from ..gaussian.concatenate import concatenate
+from ..gaussian.gaussians import Gaussians
 from .placement.density import residual_peaks
 from .redistribute import residual
 from .solvers.conjugate_gradient import inner_products, solve

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 
 import drjit as dr
@@ -17,7 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..backend.interrupt import defer_interrupts
-from ..gaussian.gaussians import Gaussians, concatenate
+from ..gaussian.concatenate import concatenate
+from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image
 from .density_control import removal_cost
 from .fit import Fit, finish
@@ -133,11 +135,11 @@ def _place_levels(
     for level, count in enumerate(counts[1:], 1):
         below = counts[: level - 1]
         problem = start._replace(gaussians=gaussians, redistribute=None)
-        sets = descend(problem, schedule, steps, levels=below)
-        for current in sets:
-            gaussians = current
-            if interrupted():
-                break
+        with closing(descend(problem, schedule, steps, levels=below)) as sets:
+            for current in sets:
+                gaussians = current
+                if interrupted():
+                    break
         gaussians = dr.detach(gaussians)
         left = residual(gaussians, start.target)
         added = place_like(gaussians, left, left, count - len(gaussians))

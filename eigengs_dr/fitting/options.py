@@ -137,6 +137,69 @@ class FitOptions:
             )
 
 
+@dataclass(frozen=True)
+class SearchPolicy:
+    """The constants of a search, chosen on training photos of ImageNet classes.
+
+    Attributes
+    ----------
+    try_share, fit_share, polish_share : float
+        Steps of a try, of the fit and of a polish, as fractions of the iterations.
+    max_length : float
+        Steps of the search, at most, as a multiple of the iterations, if these exceed some ten.
+    max_tries : int
+        Largest number of tries.
+    max_polishes : int
+        Number of polishes after which a search ends if a set meets the goal.
+    db_per_doubling : float
+        Gain of twice as many Gaussians, in dB, until two tries of the image measure it; see
+        `eigengs_dr.fitting.placement.density.ERROR_EXPONENT`.
+    doubling_range : (float, float)
+        Allowed range of the measured gain, in dB; training images gained 1.6 to 8.
+    min_octaves : float
+        Smallest distance of two tries that measures the gain, in doublings.
+    late_share : float
+        Gain of a fit after the steps of a try, as a fraction of the gain in these steps; measured
+        with 150 to 2,500 Gaussians, to half a decibel.
+    margin : float
+        Gaussians of the fit over the estimated number; dropping some works better than adding some.
+    max_leap : float
+        Largest ratio of the numbers of Gaussians of two consecutive tries.
+    try_tolerance, fit_tolerance : float
+        Largest relative difference from the estimated number for the last try and for the fit.
+    max_drop : float
+        Largest fraction of the Gaussians that one polish drops.
+    polish_rate : float
+        Learning rates of a polish, as a fraction of those of the schedule.
+    polish_gain : float
+        Expected gain of the first polish, in dB; training images gained 0.2.
+    gain_decay : float
+        Expected gain of the next polish, as a fraction of the gain of the last.
+    surplus : float
+        Decibels above the goal that do not justify another polish.
+    """
+
+    try_share: float = 0.1
+    fit_share: float = 0.4
+    polish_share: float = 0.12
+    max_length: float = 2
+    max_tries: int = 4
+    max_polishes: int = 5
+    db_per_doubling: float = 4.0
+    doubling_range: tuple[float, float] = (2.0, 12.0)
+    min_octaves: float = 0.25
+    late_share: float = 0.25
+    margin: float = 1.09
+    max_leap: float = 16
+    try_tolerance: float = 0.1
+    fit_tolerance: float = 0.35
+    max_drop: float = 0.15
+    polish_rate: float = 0.3
+    polish_gain: float = 0.1
+    gain_decay: float = 0.5
+    surplus: float = 0.02
+
+
 def default_count(pixels: int) -> int:
     """Return the default number of Gaussians: `DEFAULT_COUNT`, at most one per pixel."""
     return min(DEFAULT_COUNT, pixels)

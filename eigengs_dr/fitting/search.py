@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -21,71 +22,8 @@ from .density_control import densify, prune
 from .initializers import FitProblem
 from .optimizers.descent import descend
 from .optimizers.schedule import Schedule
+from .options import SearchPolicy
 from .refine import FitProgress, Refinement
-
-
-@dataclass(frozen=True)
-class SearchPolicy:
-    """The constants of a search, chosen on training photos of ImageNet classes.
-
-    Attributes
-    ----------
-    try_share, fit_share, polish_share : float
-        Steps of a try, of the fit and of a polish, as fractions of the iterations.
-    max_length : float
-        Steps of the search, at most, as a multiple of the iterations, if these exceed some ten.
-    max_tries : int
-        Largest number of tries.
-    max_polishes : int
-        Number of polishes after which a search ends if a set meets the goal.
-    db_per_doubling : float
-        Gain of twice as many Gaussians, in dB, until two tries of the image measure it; see
-        `eigengs_dr.fitting.placement.density.ERROR_EXPONENT`.
-    doubling_range : (float, float)
-        Allowed range of the measured gain, in dB; training images gained 1.6 to 8.
-    min_octaves : float
-        Smallest distance of two tries that measures the gain, in doublings.
-    late_share : float
-        Gain of a fit after the steps of a try, as a fraction of the gain in these steps; measured
-        with 150 to 2,500 Gaussians, to half a decibel.
-    margin : float
-        Gaussians of the fit over the estimated number; dropping some works better than adding some.
-    max_leap : float
-        Largest ratio of the numbers of Gaussians of two consecutive tries.
-    try_tolerance, fit_tolerance : float
-        Largest relative difference from the estimated number for the last try and for the fit.
-    max_drop : float
-        Largest fraction of the Gaussians that one polish drops.
-    polish_rate : float
-        Learning rates of a polish, as a fraction of those of the schedule.
-    polish_gain : float
-        Expected gain of the first polish, in dB; training images gained 0.2.
-    gain_decay : float
-        Expected gain of the next polish, as a fraction of the gain of the last.
-    surplus : float
-        Decibels above the goal that do not justify another polish.
-    """
-
-    try_share: float = 0.1
-    fit_share: float = 0.4
-    polish_share: float = 0.12
-    max_length: float = 2
-    max_tries: int = 4
-    max_polishes: int = 5
-    db_per_doubling: float = 4.0
-    doubling_range: tuple[float, float] = (2.0, 12.0)
-    min_octaves: float = 0.25
-    late_share: float = 0.25
-    margin: float = 1.09
-    max_leap: float = 16
-    try_tolerance: float = 0.1
-    fit_tolerance: float = 0.35
-    max_drop: float = 0.15
-    polish_rate: float = 0.3
-    polish_gain: float = 0.1
-    gain_decay: float = 0.5
-    surplus: float = 0.02
-
 
 DEFAULT_POLICY = SearchPolicy()
 
@@ -187,17 +125,17 @@ class _Run:
         schedule = replace(self.schedule, rates=rates)
         self.planned = max(self.planned, self.step + steps)
         problem = self.start._replace(gaussians=gaussians, redistribute=None)
-        sets = descend(problem, schedule, steps)
-        current = next(sets)
-        while not self.interrupted():
-            following = next(sets, None)
-            if following is None:
-                break
-            current = following
-            self.step += 1
-            if self.progress and self.step % 10 == 0:
-                dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
-                self.progress(self.step, self.planned, self.trace[-1])
+        with closing(descend(problem, schedule, steps)) as sets:
+            current = next(sets)
+            while not self.interrupted():
+                following = next(sets, None)
+                if following is None:
+                    break
+                current = following
+                self.step += 1
+                if self.progress and self.step % 10 == 0:
+                    dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
+                    self.progress(self.step, self.planned, self.trace[-1])
         return self.score(dr.detach(current))
 
     def score(self, gaussians: Gaussians) -> _Trial:

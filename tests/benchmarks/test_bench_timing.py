@@ -9,7 +9,7 @@ from _helpers.benchmarks import family, make_sets, one_image, small_model, task_
 from eigengs_bench.harness import datasets, timing
 from eigengs_bench.names import PRESETS as NAMES
 from eigengs_bench.names import SETS, ImageSet
-from eigengs_dr.eigenbasis.basis import Eigenbasis
+from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.options import FitOptions

@@ -6,7 +6,8 @@ import pytest
 from _helpers.photos import SMALL, random_fields
 from eigengs_dr.cli import pictures
 from eigengs_dr.cli.pictures import CELL, LIGHTER, comparison, component_sheet, ellipses, overlay
-from eigengs_dr.eigenbasis.training import TrainOptions, train
+from eigengs_dr.eigenbasis.options import TrainOptions
+from eigengs_dr.eigenbasis.training import train
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.montage import GAP
 from eigengs_dr.image.resize import resample

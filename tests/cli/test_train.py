@@ -11,7 +11,8 @@ from _helpers.command import SMALL, assert_refused, run, said, succeeded
 from _helpers.photos import SMALL as SETTINGS
 from _helpers.photos import random_fields
 from eigengs_dr.cli import train as cli_train
-from eigengs_dr.eigenbasis.training import TrainOptions, train
+from eigengs_dr.eigenbasis.options import TrainOptions
+from eigengs_dr.eigenbasis.training import train
 
 
 def test_target_psnr(tmp_path):

@@ -3,7 +3,8 @@
 import pytest
 
 from _helpers.photos import SMALL, random_fields
-from eigengs_dr.eigenbasis.training import TrainOptions, train
+from eigengs_dr.eigenbasis.options import TrainOptions
+from eigengs_dr.eigenbasis.training import train
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,8 @@ from _helpers.families import family, fidelity, rendered, small_basis, small_mod
 from _helpers.photos import SMALL, random_fields
 from eigengs_dr.eigenbasis import model_file as modelfile
 from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.eigenbasis.training import TrainOptions, train
+from eigengs_dr.eigenbasis.options import TrainOptions
+from eigengs_dr.eigenbasis.training import train
 from eigengs_dr.storage import npz as archive
 
 NUMBERS = [key for key, field in modelfile.LAYOUT.items() if field.kind != "U"]

@@ -13,7 +13,8 @@ import pytest
 from _helpers.photos import SMALL, random_fields
 from eigengs_dr.eigenbasis import training
 from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.eigenbasis.training import Interrupted, TrainOptions, train
+from eigengs_dr.eigenbasis.options import TrainOptions
+from eigengs_dr.eigenbasis.training import Interrupted, train
 from eigengs_dr.image.io import ImageError, load_image
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import render

@@ -143,7 +143,7 @@ def searched(monkeypatch, measure):
 
     def stand(problem, schedule, count):
         steps.append(count)
-        return iter([problem.gaussians] * (count + 1))
+        return (problem.gaussians for _ in range(count + 1))
 
     def judge(gaussians):
         return {"decibels": measure(gaussians, steps)}

@@ -11,7 +11,8 @@ from hypothesis.extra import numpy as hnp
 
 from _helpers.sets import COUNT, NAMES, SIZE, arrays_of, check_equal, few, random_scene
 from eigengs_dr.backend.selection import select
-from eigengs_dr.gaussian.gaussians import MIN_DEVIATION, Gaussians, concatenate
+from eigengs_dr.gaussian.concatenate import concatenate
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION, Gaussians
 
 LOW, HIGH = 1 / (2 * max(SIZE)), 1 / MIN_DEVIATION
 """Bounds of the diagonal of a factor."""

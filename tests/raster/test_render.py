@@ -22,8 +22,8 @@ from _helpers.sets import (
     scenes,
 )
 from _helpers.waves import SIDE, SPLATS
+from eigengs_dr.gaussian.concatenate import concatenate
 from eigengs_dr.gaussian.file import CUTOFF, MAX_CUTOFF
-from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.color import rgb_to_ycbcr, ycbcr_to_rgb
 from eigengs_dr.raster.reference import render_plain
 from eigengs_dr.raster.render import (

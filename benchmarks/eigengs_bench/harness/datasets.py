@@ -9,8 +9,8 @@ from pathlib import Path
 from eigengs_bench.harness.store import Task
 from eigengs_bench.harness.timing import Image
 from eigengs_bench.names import SAMPLES, SETS
-from eigengs_dr.eigenbasis.basis import Eigenbasis
 from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 from eigengs_dr.fitting.options import DEFAULT_COUNT
 from eigengs_dr.image.folder import image_files
 from eigengs_dr.image.io import load_image

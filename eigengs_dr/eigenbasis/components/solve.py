@@ -12,15 +12,13 @@ from numpy.typing import NDArray
 
 from ...backend.arrays import types_of, upload_rows
 from ...fitting.solvers.normal_equations import NormalEquations, squared_norms
-from ...gaussian.gaussians import Gaussians, concatenate
+from ...gaussian.concatenate import concatenate
+from ...gaussian.gaussians import Gaussians
 from ...image.metrics import psnr_from_mse
-from ..basis import Eigenbasis
+from ..pca.basis import Eigenbasis
 from .joint_training import JointState, train_jointly
 from .shape_training import on_grid, shapes_of, train_shapes
 from .split import FrequencyBand, frequency_bands, low_component_count
-
-STEPS = {"default": 0, "eigengs": 15_000}
-"""Presets and their default number of training steps."""
 
 Planes = NDArray[np.float32]
 State = dict[str, NDArray[Any]]
@@ -129,37 +127,6 @@ def _assemble(
         equations = NormalEquations(gaussians, sides[0].splats)
         weights = _join_weights(weights, parts[1][2])
     return equations, gaussians, weights
-
-
-def check_arguments(
-    size: tuple[int, int],
-    gaussians: int,
-    frequency_aware: bool | str,
-    seed: int,
-    preset: str,
-    steps: int | None,
-) -> int:
-    """Check the arguments of `EigenGS.fit` and return the number of steps.
-
-    ``size`` is the width and height of the basis in pixels. The function raises ValueError for the
-    first argument that is out of range.
-    """
-    if preset not in STEPS:
-        raise ValueError(f"preset {preset!r} is unknown; use one of {', '.join(STEPS)}")
-    steps = STEPS[preset] if steps is None else steps
-    for name, number in (("gaussians", gaussians), ("seed", seed), ("steps", steps)):
-        if not isinstance(number, (int, np.integer)) or number < 0:
-            raise ValueError(f"{name} is {number!r}; it must be at least 0, and whole")
-    most = size[0] * size[1]
-    if not 1 <= gaussians <= most:
-        raise ValueError(
-            f"gaussians is {gaussians}; a basis of {size[0]}x{size[1]} takes 1 to {most}"
-        )
-    if preset == "eigengs" and steps < 1:
-        raise ValueError("steps is 0; preset 'eigengs' needs training, so give at least 1")
-    if not isinstance(frequency_aware, bool) and frequency_aware != "auto":
-        raise ValueError(f"frequency_aware is {frequency_aware!r}; use 'auto', True or False")
-    return steps
 
 
 def psnr_components(

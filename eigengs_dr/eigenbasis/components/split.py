@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...fitting.solvers.normal_equations import NormalEquations, squared_norms
-from ...gaussian.gaussians import concatenate
+from ...gaussian.concatenate import concatenate
 from ...image.folder import to_planes
 from ...image.metrics import psnr_from_mse
-from ..basis import Eigenbasis
+from ..pca.basis import Eigenbasis
 from .shape_training import on_grid, shapes_of
 
 Planes = NDArray[np.float32]

@@ -12,10 +12,10 @@ from operator import index
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..image.color import ycbcr_to_rgb
-from ..image.folder import ReadProgress, Source, check_size, read_blocks, to_planes
-from ..image.io import check_image
-from ..image.resize import resample
+from ...image.color import ycbcr_to_rgb
+from ...image.folder import ReadProgress, Source, check_size, read_blocks, to_planes
+from ...image.io import check_image
+from ...image.resize import resample
 from .basis_file import ENERGY_TOLERANCE, read_basis, write_basis
 from .incremental_pca import EigenState, block_length, empty_state, merge, rank_for
 from .truncation import (

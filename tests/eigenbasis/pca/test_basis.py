@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.decomposition import PCA
 
-import eigengs_dr.eigenbasis.basis as pca
+import eigengs_dr.eigenbasis.pca.basis as pca
 from _helpers.errors import one_line
 from _helpers.low_rank import HEIGHT, SIZE, WIDTH, assert_same, basis_of, family, planes
-from eigengs_dr.eigenbasis import incremental_pca as incremental
-from eigengs_dr.eigenbasis.basis import Eigenbasis
+from eigengs_dr.eigenbasis.pca import incremental_pca as incremental
+from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 from eigengs_dr.image.folder import image_files
 from eigengs_dr.image.io import ImageError, save_image
 from eigengs_dr.image.resize import resample

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from _helpers.low_rank import PIXELS, SIZE, assert_same, family, planes
-from eigengs_dr.eigenbasis import incremental_pca as incremental
-from eigengs_dr.eigenbasis.basis import Eigenbasis
-from eigengs_dr.eigenbasis.incremental_pca import EigenState, empty_state, merge
+from eigengs_dr.eigenbasis.pca import incremental_pca as incremental
+from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
+from eigengs_dr.eigenbasis.pca.incremental_pca import EigenState, empty_state, merge
 from eigengs_dr.image.folder import read_blocks
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from _helpers.low_rank import HEIGHT, WIDTH, assert_same, basis_of
-from eigengs_dr.eigenbasis import basis_file as basisfile
-from eigengs_dr.eigenbasis.basis import Eigenbasis
+from eigengs_dr.eigenbasis.pca import basis_file as basisfile
+from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 from eigengs_dr.storage import npz as archive
 
 

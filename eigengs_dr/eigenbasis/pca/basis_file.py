@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..image.folder import BASIS_SPACES
-from ..storage import npz as archive
+from ...image.folder import BASIS_SPACES
+from ...storage import npz as archive
 from .incremental_pca import EXAMPLES
 
 FORMAT, VERSION = "eigengs_dr.eigenbasis", 1

@@ -1,0 +1,92 @@
+"""Everything that decides a training beside the images: one record, checked once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..image.folder import BASIS_SPACES, check_size
+from .pca.basis import check_components
+from .pca.truncation import check_target
+
+STEPS = {"default": 0, "eigengs": 15_000}
+"""Presets, and the steps of training that each takes if none are given."""
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Options of a training; `eigengs_dr.EigenGS.fit` takes a part of them.
+
+    Attributes
+    ----------
+    size : (int, int)
+        Width and height in pixels.
+    components : int or tuple of 3 ints
+        Largest number of components of each channel.
+    energy : float or None
+        Keep the fewest components that hold this share of a channel's variance.
+    target_psnr : float or None
+        Keep the fewest components whose PCA has this mean PSNR, in dB, on the images held out; see
+        `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`.
+    gaussians, frequency_aware, preset, steps, seed
+        See `eigengs_dr.EigenGS.fit`.
+    color : {"ycbcr", "rgb"}
+        Space of the components.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range, or two of them exclude each other; one line that names it.
+    """
+
+    size: tuple[int, int] = (256, 256)
+    components: int | tuple[int, int, int] = 300
+    energy: float | None = None
+    target_psnr: float | None = None
+    gaussians: int = 5000
+    frequency_aware: bool | str = "auto"
+    preset: str = "default"
+    steps: int | None = None
+    color: str = "ycbcr"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_components(self.components, self.energy)
+        if self.target_psnr is not None:
+            check_target(self.target_psnr)
+            if self.energy is not None:
+                raise ValueError(
+                    "energy and target_psnr both choose the components; give one of them"
+                )
+        if self.color not in BASIS_SPACES:
+            raise ValueError(
+                f"color {self.color!r} is unknown; use one of {', '.join(BASIS_SPACES)}"
+            )
+        if self.preset not in STEPS:
+            raise ValueError(f"preset {self.preset!r} is unknown; use one of {', '.join(STEPS)}")
+        counts = {
+            "gaussians": self.gaussians,
+            "seed": self.seed,
+            "steps": self.training_steps,
+        }
+        for name, number in counts.items():
+            if not isinstance(number, (int, np.integer)) or number < 0:
+                raise ValueError(f"{name} is {number!r}; it must be at least 0, and whole")
+        width, height = check_size(self.size)
+        if not 1 <= self.gaussians <= width * height:
+            raise ValueError(
+                f"gaussians is {self.gaussians}; a basis of {width}x{height} takes 1 to "
+                f"{width * height}"
+            )
+        if self.preset == "eigengs" and self.training_steps < 1:
+            raise ValueError("steps is 0; preset 'eigengs' needs training, so give at least 1")
+        if not isinstance(self.frequency_aware, bool) and self.frequency_aware != "auto":
+            raise ValueError(
+                f"frequency_aware is {self.frequency_aware!r}; use 'auto', True or False"
+            )
+
+    @property
+    def training_steps(self) -> int:
+        """The number of steps: as given, or that of the preset."""
+        return STEPS[self.preset] if self.steps is None else self.steps

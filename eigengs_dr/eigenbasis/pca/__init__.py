@@ -1,0 +1,1 @@
+"""The principal components of a family of images."""
