@@ -7,16 +7,13 @@ derivatives inside a virtual call. So the class below only passes arrays to the 
 
 from __future__ import annotations
 
-import gc
-from collections.abc import Callable
-from functools import wraps
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.image.color import to_linear
+from eigengs_dr.backend.recording import without_collector
 from eigengs_dr.raster.layout import pack_parameters
 from eigengs_dr.raster.lookup.footprint import bound_covariance
 from eigengs_dr.raster.lookup.points import (
@@ -36,6 +33,7 @@ from eigengs_dr.raster.render import decode_parameters
 from .cone import metric
 from .properties import affine, angle, cutoff, raw, source_of, wrap_mode
 from .spectrum import upload_table, upsample
+from .values import keep_finite, luminance, show, slope_of
 
 SURVEY = 128
 """Points along a side of the grid of brightness, for sampling of emission and for the mean."""
@@ -100,17 +98,17 @@ def gaussian_texture() -> type:
         def parameters_changed(self, keys: list[str]) -> None:
             gaussians = self.source.gaussians()
             parameters = decode_parameters(gaussians)
-            shape, color = parameters.shape, [_finite(c) for c in parameters.color]
+            shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
             if not keys or any(key in self.source.shaping for key in keys):
                 self._list([dr.detach(s) for s in shape])
-            self.background = [_finite(b) for b in parameters.background]
+            self.background = [keep_finite(b) for b in parameters.background]
             self.packed = pack_parameters([*shape, *color])
             dr.eval(self.packed, self.background)
             if self.angle:
                 number = NUM_SHAPE_PARAMS + self.channels
-                self.lattice = build_pyramid(self.sizes, self.packed, number, self.cutoff)
-                self.average = pyramid_mean(self.lattice)
+                self.pyramid = build_pyramid(self.sizes, self.packed, number, self.cutoff)
+                self.average = pyramid_mean(self.pyramid)
                 dr.eval(self.average)
             self._survey()
 
@@ -126,11 +124,11 @@ def gaussian_texture() -> type:
 
         # --- Lookups -----------------------------------------------------------------------------
 
-        @uncollected
+        @without_collector
         def eval(self, si: Any, active: Any = True) -> Any:
             color = self._color(si, active)
             if len(color) == 1 or mi.is_monochromatic:
-                return mi.UnpolarizedSpectrum(_luminance(color))
+                return mi.UnpolarizedSpectrum(luminance(color))
             if not mi.is_spectral:
                 return mi.Color3f(*color)
             if self.raw or self.space == "data":
@@ -140,11 +138,11 @@ def gaussian_texture() -> type:
                 )
             return upsample(mi.Color3f(*color), si.wavelengths, self.spectra)
 
-        @uncollected
+        @without_collector
         def eval_1(self, si: Any, active: Any = True) -> Any:
-            return _luminance(self._color(si, active))
+            return luminance(self._color(si, active))
 
-        @uncollected
+        @without_collector
         def eval_3(self, si: Any, active: Any = True) -> Any:
             if self.channels != 3:
                 raise ValueError(
@@ -153,18 +151,17 @@ def gaussian_texture() -> type:
                 )
             return mi.Color3f(*self._color(si, active))
 
-        @uncollected
+        @without_collector
         def eval_1_grad(self, si: Any, active: Any = True) -> Any:
             (x, sx), (y, sy), active = self._point(si, active)
             terms = gradient_terms(kernel_radius(self.cutoff))
             number = NUM_SHAPE_PARAMS + self.channels
-            sums = sum_at_points(
-                self.cells, self.packed, number, x, y, active, terms, 3 * self.channels
-            )
+            count = 3 * self.channels
+            sums = sum_at_points(self.cells, self.packed, number, x, y, active, terms, count)
             coded = [s + b for s, b in zip(sums[::3], self.background, strict=True)]
-            slope = [dr.select((c >= 0) & (c <= 1) | self.raw, _slope(self, c), 0) for c in coded]
-            du = _luminance([s * k for s, k in zip(slope, sums[1::3], strict=True)])
-            dv = _luminance([s * k for s, k in zip(slope, sums[2::3], strict=True)])
+            slope = [dr.select((c >= 0) & (c <= 1) | self.raw, slope_of(self, c), 0) for c in coded]
+            du = luminance([s * k for s, k in zip(slope, sums[1::3], strict=True)])
+            dv = luminance([s * k for s, k in zip(slope, sums[2::3], strict=True)])
             du, dv = du * sx * self.width, dv * sy * self.height
             (a, b, _), (c, d, _) = self.to_uv
             return mi.Vector2f(a * du + c * dv, b * du + d * dv)
@@ -181,7 +178,7 @@ def gaussian_texture() -> type:
                     self.cells, self.packed, number, x, y, active, terms, self.channels
                 )
             sums = [s + b for s, b in zip(sums, self.background, strict=True)]
-            return [dr.select(active, _shown(self, s), 0) for s in sums]
+            return [dr.select(active, show(self, s), 0) for s in sums]
 
         def _filtered(self, si: Any, column: tuple, row: tuple, active: Any) -> list:
             """Average the texture over the footprint around a point, given as by `fold`."""
@@ -190,16 +187,14 @@ def gaussian_texture() -> type:
             (x, sx), (y, sy) = column, row
             sx, sy = sx * self.width, sy * self.height
             if self.wrap == "clamp":  # a footprint without width would count half on a border
-                x, y = (
-                    dr.clip(x, INSIDE, self.width - INSIDE),
-                    dr.clip(y, INSIDE, self.height - INSIDE),
-                )
+                x = dr.clip(x, INSIDE, self.width - INSIDE)
+                y = dr.clip(y, INSIDE, self.height - INSIDE)
             inverse, valid = metric(si, self.from_uv, self.angle)
             unit, blind = bound_covariance(inverse)
             sizes = (sx * sx, sx * sy, sy * sy)
             footprint = [dr.select(valid, f * s, 0) for f, s in zip(unit, sizes, strict=True)]
             blind &= valid & (sx * sy != 0)
-            distant = is_minified(self.lattice, footprint)
+            distant = is_minified(self.pyramid, footprint)
             near = sum_prefiltered(
                 self.sizes,
                 self.packed,
@@ -210,7 +205,7 @@ def gaussian_texture() -> type:
                 active & ~distant,
                 self.cutoff,
             )
-            far = sum_pyramid(self.lattice, x, y, footprint, active & distant & ~blind)
+            far = sum_pyramid(self.pyramid, x, y, footprint, active & distant & ~blind)
             seen = [dr.select(distant, f, n) for f, n in zip(far, near, strict=True)]
             return [dr.select(blind, m, s) for m, s in zip(self.average, seen, strict=True)]
 
@@ -226,19 +221,19 @@ def gaussian_texture() -> type:
 
         # --- Sampling ----------------------------------------------------------------------------
 
-        @uncollected
+        @without_collector
         def sample_position(self, sample: Any, active: Any = True) -> tuple:
             cell, density, rest = self._sampled().sample(sample, active)
             return mi.Point2f((mi.Point2f(cell) + rest) / SURVEY), density * SURVEY**2
 
-        @uncollected
+        @without_collector
         def pdf_position(self, p: Any, active: Any = True) -> Any:
             inside = (p.x >= 0) & (p.x <= 1) & (p.y >= 0) & (p.y <= 1)
             cell = dr.minimum(mi.Point2u(dr.select(inside, p, 0) * SURVEY), SURVEY - 1)
             density = self._sampled().pdf(cell, active) * SURVEY**2
             return dr.select(inside, density, 0)
 
-        @uncollected
+        @without_collector
         def sample_spectrum(self, si: Any, sample: Any, active: Any = True) -> tuple:
             if not mi.is_spectral:
                 return mi.Color0f(), self.eval(si, active)
@@ -259,7 +254,7 @@ def gaussian_texture() -> type:
                 i = dr.arange(mi.UInt32, SURVEY**2)
                 si = dr.zeros(mi.SurfaceInteraction3f, SURVEY**2)
                 si.uv = (mi.Point2f(i % SURVEY, i // SURVEY) + 0.5) / SURVEY
-                self.brightness = _luminance(self._color(si, mi.Bool(True)))
+                self.brightness = luminance(self._color(si, mi.Bool(True)))
                 dr.eval(self.brightness)
             self.distribution = None
 
@@ -291,61 +286,8 @@ def gaussian_texture() -> type:
     return GaussianTexture
 
 
-def uncollected(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a lookup to run without Python's garbage collector.
-
-    Mitsuba calls lookups while it records a program. If the collector frees another scene during
-    the recording, the program loses the textures of that scene; it then ends the process or reads
-    freed memory.
-    """
-
-    @wraps(method)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        collects = gc.isenabled()
-        gc.disable()
-        try:
-            return method(*args, **kwargs)
-        finally:
-            if collects:
-                gc.enable()
-
-    return call
-
-
-# --- Values --------------------------------------------------------------------------------------
-
-
-def _shown(texture: Any, value: Any) -> Any:
-    """Clamp and decode a channel, unless raw.
-
-    The clamp conserves energy. Gradients ignore it: else a colour that a step moved out of the
-    range would never come back.
-    """
-    if texture.raw:
-        return value
-    value = dr.replace_grad(dr.clip(value, 0, 1), value)
-    return to_linear(value) if texture.space in ("ycbcr", "rgb") else value
-
-
-def _slope(texture: Any, value: Any) -> Any:
-    """Return the derivative of `_shown` for a channel in [0, 1]."""
-    if texture.raw or texture.space not in ("ycbcr", "rgb"):
-        return type(value)(1)
-    curved = 2.4 / 1.055 * dr.power((dr.maximum(value, 0.04045) + 0.055) * (1 / 1.055), 1.4)
-    return dr.select(value <= 0.04045, 1 / 12.92, curved)
-
-
 def _name(texture: Any) -> str:
     return f"gaussian_texture {texture.id()!r}" if texture.id() else "gaussian_texture"
-
-
-def _luminance(color: list) -> Any:
-    return color[0] if len(color) == 1 else mi.luminance(mi.Color3f(*color))
-
-
-def _finite(x: Any) -> Any:
-    """Replace values that are not finite, which an optimiser may leave, by 0."""
-    return dr.select(dr.isfinite(x), x, 0)
 
 
 class _Refusal:

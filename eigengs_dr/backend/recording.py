@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from typing import Any
 
 import drjit as dr
@@ -29,17 +30,37 @@ def freeze_program(function: Callable[..., Any]) -> Iterator[Callable[..., Any]]
         The frozen function, with the arguments and the result of `function`.
     """
     program = dr.freeze(function)
-
-    def call(*arguments: Any) -> Any:
-        running = gc.isenabled()
-        gc.disable()
-        try:
-            return program(*arguments)
-        finally:
-            if running:
-                gc.enable()
-
     try:
-        yield call
+        yield without_collector(program)
     finally:
         program.clear()
+
+
+def without_collector(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that runs without Python's garbage collector.
+
+    Lookups of a texture need it too: Mitsuba calls them while it records a program. If the
+    collector frees another scene during the recording, the program loses the textures of that
+    scene; it then ends the process or reads freed memory.
+
+    Parameters
+    ----------
+    function : callable
+
+    Returns
+    -------
+    callable
+        With the arguments and the result of `function`.
+    """
+
+    @wraps(function)
+    def call(*arguments: Any, **settings: Any) -> Any:
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return function(*arguments, **settings)
+        finally:
+            if collects:
+                gc.enable()
+
+    return call
