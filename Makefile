@@ -27,13 +27,13 @@ APT_INSTALL := apt_install() { \
 .PHONY: help setup demo scenes test test-slow docs bench report basis clean
 
 help:
-	@echo "make demo       fit a photo, at once and well; shows PSNR, time and the pictures it wrote"
+	@echo "make demo       fit a photo; shows PSNR, time and the pictures it wrote"
 	@echo "make scenes     render the Mitsuba scenes in scenes/, in 2 minutes"
-	@echo "make test       linters, type checker, tests"
+	@echo "make test       linters, type checker, layers, tests"
 	@echo "make test-slow  the tests that take minutes"
 	@echo "make docs       build the manual, build/docs/html/index.html; every warning is an error"
 	@echo "make bench      time the renderer"
-	@echo "make report     measure a part of all and write build/results, in half an hour; goes on after a break"
+	@echo "make report     measure a part of everything and write build/results, in half an hour; resumes after a break"
 	@echo "make basis      train the basis that ships, again"
 	@echo "make setup      only set up .venv, and libLLVM where none works"
 	@echo "make clean      remove what these made"
@@ -99,5 +99,5 @@ basis: $(READY)
 	$(BIN)/python tools/train_natural.py eigengs_dr/data/natural.npz
 
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist *.egg-info benchmarks/*.egg-info docs/tutorials/*.* docs/tutorials/images docs/reference/generated .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

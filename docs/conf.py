@@ -30,7 +30,6 @@ extensions = [
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["results/**"]
 templates_path = ["_templates"]
 
 # --- Pages ---------------------------------------------------------------------------------------
