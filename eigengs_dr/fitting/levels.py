@@ -39,7 +39,20 @@ STEPS_PER_LEVEL = 50
 
 
 def level_counts(count: int, levels: int) -> list[int]:
-    """Return the number of Gaussians up to each level; the last number is `count`.
+    """Return the number of Gaussians up to each level.
+
+    Parameters
+    ----------
+    count : int
+        Number of Gaussians of the whole set.
+    levels : int
+        Number of levels, with the whole set.
+
+    Returns
+    -------
+    list of int
+        In ascending order; each level has `LEVEL_RATIO` times as many as the one before, and the
+        last has `count`.
 
     Raises
     ------
@@ -73,13 +86,22 @@ def fit_levels(
 
     Parameters
     ----------
+    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
+        See `eigengs_dr.fit`.
     gaussians : int, optional
         Number of Gaussians; by default 5000, or one per pixel for smaller images.
     levels : int, optional
         Number of levels, with the whole set; `level_counts` returns their sizes. Inside a level,
         Gaussians with a larger removal cost come first, so that every prefix forms an image.
-    image, iterations, color, seed, backend, progress
+    iterations : int, optional
+        Largest number of refinement steps of the whole set.
+    color : {"ycbcr", "rgb", "linear", "data"}, optional
         See `eigengs_dr.fit`.
+    seed : int, optional
+        Not used: the placement draws no random numbers.
+    backend : {"llvm", "cuda"}, optional
+    progress : callable, optional
+        ``progress(iteration, iterations, row)``, see `eigengs_dr.fit`.
 
     Returns
     -------

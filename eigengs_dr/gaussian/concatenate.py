@@ -19,6 +19,12 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     sets : sequence of Gaussians
         At least one. All have the same native size, space, cutoff, channels and backend.
 
+    Returns
+    -------
+    Gaussians
+        The Gaussians of the first set, then those of the second, and so on. A single set is
+        returned as it is.
+
     Raises
     ------
     ValueError

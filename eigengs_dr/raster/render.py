@@ -85,7 +85,13 @@ def picture_of(
 ) -> NDArray[Any]:
     """Render a set for display and comparison: like `render`, but linear light becomes sRGB.
 
-    Parameters and errors as for `render`.
+    Parameters
+    ----------
+    gaussians : Gaussians
+    width, height : int, optional
+        Size of the image in pixels, as for `render`.
+    cutoff : float, optional
+        Standard deviations after which a Gaussian ends; by default that of the set.
 
     Returns
     -------
