@@ -96,7 +96,7 @@ report: $(READY)
 	$(BIN)/eigengs-dr bench report $(RESULTS) -o build/results
 
 basis: $(READY)
-	$(BIN)/python tools/train_natural.py eigengs_dr/data/natural.npz
+	$(BIN)/python tools/train_natural.py eigengs_dr/eigenbasis/data/natural.npz
 
 clean:
 	rm -rf .venv build dist *.egg-info benchmarks/*.egg-info docs/tutorials/*.* docs/tutorials/images docs/reference/generated .pytest_cache .mypy_cache .ruff_cache .hypothesis

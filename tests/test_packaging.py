@@ -51,7 +51,7 @@ def test_wheel(tmp_path):
         "eigengs_dr/" + path.relative_to(ROOT).as_posix() for path in ROOT.glob("plugins/*.py")
     }
     assert modules | plugins <= set(names)
-    for name in ("data/natural.npz", "__init__.pyi", "py.typed"):
+    for name in ("eigenbasis/data/natural.npz", "__init__.pyi", "py.typed"):
         assert f"eigengs_dr/{name}" in names
     installed = tmp_path / "installed"
     where = str(installed / "eigengs_dr/plugins/__init__.py")

@@ -9,7 +9,7 @@ from pathlib import Path
 from ..backend.arrays import types_of
 from .eigengs import EigenGS
 
-SHIPPED = {"natural": Path(__file__).parents[1] / "data" / "natural.npz"}
+SHIPPED = {"natural": Path(__file__).parent / "data" / "natural.npz"}
 """Files of the package's models, by name; see ``tools/train_natural.py``."""
 
 
