@@ -82,7 +82,7 @@ def fit_levels(
     backend: str | None = None,
     progress: FitProgress | None = None,
 ) -> Fit:
-    """Fit Gaussians of which the first quarter, sixteenth, ... form the image too.
+    """Fit nested sets: the first quarter of the Gaussians forms the image too, and so on.
 
     Parameters
     ----------
