@@ -1,1 +1,9 @@
-"""Dr.Jit on this machine: libLLVM, choice of a backend, array types, frozen programs."""
+"""Dr.Jit on this machine.
+
+- ``libllvm``: finds a libLLVM that works, before Dr.Jit loads one
+- ``selection``: picks llvm or cuda
+- ``arrays``: array types that go together; copies of NumPy arrays
+- ``recording``: frozen programs
+- ``interrupt``: Ctrl-C and SIGTERM between steps
+- ``doctor``: what works here and what to install
+"""

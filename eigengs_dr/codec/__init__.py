@@ -1,1 +1,9 @@
-"""Compression of sets of Gaussians to ``.egs`` files."""
+"""Sets of Gaussians in few bytes.
+
+- ``quantization``: parameters as whole numbers
+- ``hilbert_index``: places along a Hilbert curve
+- ``entropy``: whole numbers as bytes
+- ``egs``: the .egs file
+- ``bit_allocation``: `pack`: steps for a loss of PSNR
+- ``error_feedback``: rounding that later parameters compensate
+"""

@@ -1,1 +1,13 @@
-"""Families of images: PCA, shared Gaussians for all components, models."""
+"""A family of images: one set of Gaussians for all of its principal components.
+
+- ``pca``: the principal components
+- ``components``: shared Gaussians for all components: shapes and weights
+- ``eigengs``: the model `EigenGS`
+- ``projection``: coefficients of an image
+- ``options``: the options of a training, checked once
+- ``training``: a folder of images to a model
+- ``evaluation``: a model on images held out
+- ``initializer``: a model as the start of a fit
+- ``registry``: models by name
+- ``model_file``: the file of a model
+"""

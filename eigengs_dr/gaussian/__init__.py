@@ -1,1 +1,8 @@
-"""Sets of 2D Gaussians, their covariances and their files."""
+"""The representation: sets of 2D Gaussians.
+
+- ``gaussians``: the set
+- ``concatenate``: joining sets
+- ``covariance``: factors, Cholesky factors, logarithms, eigenvalues
+- ``tensors``: sets as tensors
+- ``file``: the .npz file, and what makes a set valid
+"""

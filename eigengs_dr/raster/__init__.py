@@ -1,1 +1,11 @@
-"""Rasterization: the weight of a Gaussian at a pixel, and the sum of all Gaussians."""
+"""What a Gaussian contributes to a pixel, and the sum of all Gaussians.
+
+- ``evaluate``: the weight of one Gaussian at a block of pixels, and its derivatives
+- ``parameters``: Gaussians in the units of the kernels
+- ``layout``: where parameters lie in memory
+- ``tiles``: which Gaussians touch which tile
+- ``kernels``: the sum over all Gaussians (forward) and its gradient (adjoint)
+- ``render``: the differentiable operation and `render`
+- ``reference``: slow renderers to compare with
+- ``lookup``: the sum at scattered points, for textures
+"""

@@ -1,1 +1,6 @@
-"""Textures in Mitsuba scenes: their visibility, and Gaussians for what the cameras resolve."""
+"""What the cameras of a Mitsuba scene see of a texture.
+
+- ``visibility``: pixels to texels
+- ``back_projection``: the smoothest texture that looks alike
+- ``fit_scene``: the fewest Gaussians for a scene
+"""

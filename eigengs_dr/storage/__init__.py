@@ -1,1 +1,6 @@
-"""Files of NumPy arrays, each written completely or not at all."""
+"""Files of arrays, whole or not at all. NumPy only.
+
+- ``atomic``: replaces a file in one step
+- ``npz``: arrays with a format, a version and checks
+- ``checkpoint``: the work of an unfinished training
+"""

@@ -1,1 +1,8 @@
-"""Placement: where Gaussians start, and where density control adds them. NumPy only."""
+"""Where Gaussians start, and where they are added.
+
+- ``random``: uniform, as GaussianImage does
+- ``grid``: a hexagonal grid
+- ``adaptive``: by the second derivatives of the image
+- ``density``: the density that an error asks for; peaks of a residual
+- ``hilbert_scan``: pixels in the order of a Hilbert curve
+"""

@@ -1,1 +1,5 @@
-"""Linear least squares for the colours of fixed shapes."""
+"""Linear least squares for the colours on fixed shapes.
+
+- ``conjugate_gradient``: for one image
+- ``normal_equations``: for many images on the same shapes: factorised once
+"""

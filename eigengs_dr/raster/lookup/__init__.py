@@ -1,1 +1,8 @@
-"""The sum of Gaussians at scattered points and through footprints, for textures."""
+"""The sum at scattered points and through footprints, as textures need it.
+
+- ``points``: values and slopes at points
+- ``footprint``: the footprint of a pixel
+- ``prefilter``: the sum seen through a footprint, in closed form
+- ``size_classes``: the Gaussians that a footprint may see
+- ``pyramid``: wide footprints: coarse samples of the sum
+"""
