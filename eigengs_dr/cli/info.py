@@ -80,6 +80,7 @@ def _describe_image(gaussians: Any) -> dict[str, Any]:
         "height": gaussians.height,
         "channels": gaussians.channels,
         "space": gaussians.space,
+        "cutoff": gaussians.cutoff,
     }
 
 
