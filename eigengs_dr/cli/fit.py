@@ -108,9 +108,10 @@ def fit(
     options = FitOptions(**settings)
     _check_levels(options, levels)
     paths = _expand(images)
-    outputs = name_outputs(paths, output, [".npz"])
-    previews = name_outputs(paths, preview, list(SAVE_OPTIONS)) if preview else []
-    check_outputs([*outputs, *previews, report], paths)
+    several = len(paths) > 1 or any(path.is_dir() for path in images)
+    outputs = name_outputs(paths, output, [".npz"], several)
+    previews = name_outputs(paths, preview, list(SAVE_OPTIONS), several) if preview else []
+    check_outputs([*outputs, *previews, report], [*paths, *_basis_file(options)])
     select(options.backend)
     run = _fitter(options, levels)
     records: list[dict[str, Any]] = []
@@ -119,7 +120,7 @@ def fit(
         if records[-1]["stopped"] == "interrupted":
             break
     if report:
-        figures = records[0] if len(paths) == 1 else {"images": records}
+        figures = {"images": records} if several else records[0]
         run_figures = describe_run(context, options.backend) | _decisive(options, levels)
         write_report(report, run_figures | figures)
     _exit(context, records, options)
@@ -139,6 +140,12 @@ def _expand(images: tuple[Path, ...]) -> list[Path]:
     from ..image.folder import image_files
 
     return [file for path in images for file in (image_files(path) if path.is_dir() else [path])]
+
+
+def _basis_file(options: FitOptions) -> list[Path]:
+    """Return the file of the basis, if there is one; no output may overwrite it."""
+    files = [Path(str(options.basis))] if options.basis else []
+    return [path for path in files if path.is_file()]
 
 
 def _check_levels(options: FitOptions, levels: int | None) -> None:

@@ -313,6 +313,17 @@ def test_a_folder_is_fitted(photo, tmp_path):
     assert sorted(p.name for p in (tmp_path / "fits").iterdir()) == ["a.npz", "b.npz"]
 
 
+def test_a_folder_of_one_image_is_fitted(photo, tmp_path):
+    folder, report = tmp_path / "photos", tmp_path / "r.json"
+    folder.mkdir()
+    shutil.copy(photo, folder / "a.png")
+    outputs = ["-o", tmp_path / "fits", "--preview", tmp_path / "previews", "--report", report]
+    succeeded(run("fit", folder, *outputs, *QUICK))
+    assert [p.name for p in (tmp_path / "fits").iterdir()] == ["a.npz"]
+    assert [p.name for p in (tmp_path / "previews").iterdir()] == ["a.png"]
+    assert len(json.loads(report.read_text())["images"]) == 1
+
+
 def test_several_images_are_not_written_to_a_file(photo, tmp_path):
     other = tmp_path / "other.png"
     shutil.copy(photo, other)
