@@ -81,3 +81,18 @@ def test_import_takes_less_than_half_a_second():
     code = "import time; start = time.perf_counter(); import eigengs_dr; "
     code += "print(time.perf_counter() - start)"
     assert min(float(run_python(code).stdout) for _ in range(3)) < 0.5
+
+
+@pytest.mark.parametrize("name", ["fit_for_scene", "register_plugins"])
+def test_without_mitsuba_its_users_say_what_to_install(name):
+    code = f"""
+import sys
+sys.modules["mitsuba"] = None
+import eigengs_dr as eg
+try:
+    eg.{name}
+except ImportError as error:
+    print(error)
+"""
+    process = run_python(code)
+    assert "pip install 'mitsuba" in process.stdout, process.stderr
