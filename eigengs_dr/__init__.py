@@ -8,8 +8,10 @@ import lazy_loader
 
 from .backend.libllvm import select_libllvm
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
 __version__ = "0.1.0"
 
-select_libllvm()  # Dr.Jit looks for libLLVM once, while it is imported
+# Dr.Jit looks for libLLVM once, while it is imported; lazy_loader imports it here if EAGER_IMPORT
+# is set.
+select_libllvm()
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

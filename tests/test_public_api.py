@@ -10,6 +10,7 @@ import pytest
 
 import eigengs_dr
 from _helpers.process import run_python
+from eigengs_dr.backend.libllvm import candidates
 
 MODULES = [
     module.name
@@ -71,8 +72,44 @@ if sys.platform == "linux":
     assert set(process.stdout.splitlines()) == {"[]"}
 
 
+def test_libllvm_is_chosen_before_names_are_imported_at_once():
+    """With EAGER_IMPORT, `lazy_loader` imports all names, and so Dr.Jit, with the package."""
+    code = """
+import os
+chosen = []
+class Watch:
+    def find_spec(self, name, path=None, target=None):
+        if name == "drjit":
+            chosen.append(os.environ.get("DRJIT_LIBLLVM_PATH"))
+import sys
+sys.meta_path.insert(0, Watch())
+import eigengs_dr
+print(chosen[0] == os.environ.get("DRJIT_LIBLLVM_PATH"), bool(chosen[0]))
+"""
+    pytest.importorskip("mitsuba", reason="all names need mitsuba")
+    if not candidates():
+        pytest.skip("needs a libLLVM")
+    process = run_python(code, EAGER_IMPORT="1", DRJIT_LIBLLVM_PATH=None)
+    assert process.stdout.split() == ["True", "True"], process.stderr
+
+
 def test_import_takes_less_than_half_a_second():
     """The quickest of several, because others may use the machine."""
     code = "import time; start = time.perf_counter(); import eigengs_dr; "
     code += "print(time.perf_counter() - start)"
     assert min(float(run_python(code).stdout) for _ in range(3)) < 0.5
+
+
+@pytest.mark.parametrize("name", ["fit_for_scene", "register_plugins"])
+def test_without_mitsuba_its_users_say_what_to_install(name):
+    code = f"""
+import sys
+sys.modules["mitsuba"] = None
+import eigengs_dr as eg
+try:
+    eg.{name}
+except ImportError as error:
+    print(error)
+"""
+    process = run_python(code)
+    assert "pip install 'mitsuba" in process.stdout, process.stderr

@@ -80,7 +80,8 @@ def progress_bar(quiet: bool) -> Iterator[Callable[..., None]]:
     """
     from tqdm import tqdm
 
-    with tqdm(unit="it", leave=False, disable=True if quiet else None) as bar:
+    silent = quiet or sys.stderr is None  # Python's value if standard error is closed
+    with tqdm(unit="it", leave=False, disable=True if silent else None) as bar:
         current = ""
 
         def show(label: str, done: int, total: int, row: dict[str, Any] | None = None) -> None:

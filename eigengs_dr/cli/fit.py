@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 MISSED = 1
 """Exit code if the target PSNR cannot be reached."""
 
+FAILED = 2
+"""Exit code if one of several images cannot be fitted."""
+
 INPUT = click.Path(exists=True, path_type=Path)
 
 
@@ -89,7 +92,8 @@ def fit(
     """Fit images by sums of Gaussians.
 
     An IMAGE may be a folder of images. For several images, -o and --preview name folders, and the
-    files in them have the names of the images.
+    files in them have the names of the images. An image that cannot be fitted is left out; the exit
+    code is then 2.
 
     Ctrl-C writes the best fit so far and exits with code 130. If --target-psnr cannot be reached,
     the command says so, writes the best fit and exits with code 1.
@@ -108,18 +112,27 @@ def fit(
     options = FitOptions(**settings)
     _check_levels(options, levels)
     paths = _expand(images)
-    outputs = name_outputs(paths, output, [".npz"])
-    previews = name_outputs(paths, preview, list(SAVE_OPTIONS)) if preview else []
-    check_outputs([*outputs, *previews, report], paths)
+    several = len(paths) > 1 or any(path.is_dir() for path in images)
+    outputs = name_outputs(paths, output, [".npz"], several)
+    previews = name_outputs(paths, preview, list(SAVE_OPTIONS), several) if preview else []
+    check_outputs([*outputs, *previews, report], [*paths, *_basis_file(options)])
+    if output is None:
+        _check_replaced(outputs)
     select(options.backend)
     run = _fitter(options, levels)
     records: list[dict[str, Any]] = []
     for path, target, picture in zip_longest(paths, outputs, previews):
-        records.append(_fit_one(path, target, picture, quiet, options, run))
+        try:
+            records.append(_fit_one(path, target, picture, quiet, options, run))
+        except (ValueError, OSError) as error:
+            if not several:
+                raise
+            say(f"error: {error}")
+            records.append({"input": str(path), "error": str(error), "stopped": "failed"})
         if records[-1]["stopped"] == "interrupted":
             break
     if report:
-        figures = records[0] if len(paths) == 1 else {"images": records}
+        figures = {"images": records} if several else records[0]
         run_figures = describe_run(context, options.backend) | _decisive(options, levels)
         write_report(report, run_figures | figures)
     _exit(context, records, options)
@@ -139,6 +152,22 @@ def _expand(images: tuple[Path, ...]) -> list[Path]:
     from ..image.folder import image_files
 
     return [file for path in images for file in (image_files(path) if path.is_dir() else [path])]
+
+
+def _basis_file(options: FitOptions) -> list[Path]:
+    """Return the file of the basis, if there is one; no output may overwrite it."""
+    files = [Path(str(options.basis))] if options.basis else []
+    return [path for path in files if path.is_file()]
+
+
+def _check_replaced(outputs: list[Path]) -> None:
+    """Raise ValueError if a name that was not asked for is taken by something else than a set."""
+    from ..gaussian.file import FORMAT
+    from ..storage import npz
+
+    for path in outputs:
+        if path.exists() and npz.format_of(path) != FORMAT:
+            raise ValueError(f"{path}: exists and is no set of Gaussians; choose a name with -o")
 
 
 def _check_levels(options: FitOptions, levels: int | None) -> None:
@@ -239,6 +268,8 @@ def _exit(context: click.Context, records: list[dict[str, Any]], options: FitOpt
     if records[-1]["stopped"] == "interrupted":
         say(f"interrupted; the best fit so far is in {records[-1]['output']}")
         context.exit(INTERRUPTED)
+    if any(record["stopped"] == "failed" for record in records):
+        context.exit(FAILED)
     failures = [record for record in records if record["stopped"] == "out of reach"]
     for record in failures:
         psnr = record["psnr_" + options.target_space]

@@ -47,7 +47,7 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     from ..eigenbasis.registry import SHIPPED
     from ..gaussian import file as setfile
     from ..gaussian.gaussians import Gaussians
-    from ..storage import npz as archive
+    from ..storage import npz
     from .pictures import component_sheet
 
     kinds: dict[str, tuple[str, Any, Any, Any]] = {
@@ -55,7 +55,7 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
         modelfile.FORMAT: ("model", EigenGS.load, _describe_model, component_sheet),
     }
     file = SHIPPED.get(str(file), file)
-    file_format = setfile.FORMAT if packed.is_egs(file) else archive.format_of(file)
+    file_format = setfile.FORMAT if packed.is_egs(file) else npz.format_of(file)
     if file_format not in kinds:
         raise ValueError(
             f"{file}: format is {file_format[:40]!r}, expected one of {', '.join(kinds)}"

@@ -8,7 +8,7 @@ from ..storage.atomic import require_writable
 
 
 def name_outputs(
-    inputs: Sequence[Path], output: Path | None, suffixes: Sequence[str]
+    inputs: Sequence[Path], output: Path | None, suffixes: Sequence[str], folder: bool = False
 ) -> list[Path]:
     """Name one output file for each input.
 
@@ -21,6 +21,8 @@ def name_outputs(
         Files in a folder have the names of the inputs. None is the current folder.
     suffixes : sequence of str
         Valid suffixes of the file; files in a folder get the first.
+    folder : bool, optional
+        Whether one input needs a folder too, as several inputs do.
 
     Returns
     -------
@@ -30,18 +32,22 @@ def name_outputs(
     Raises
     ------
     ValueError
-        If the file has another suffix, the output of several inputs is a file, or two inputs have
-        one output.
+        If the file has another suffix, the output of several inputs is a file, an input occurs
+        twice, or two inputs have one output.
     OSError
         If the folder cannot be created.
     """
     output = Path() if output is None else output
-    if len(inputs) == 1 and not output.is_dir():
+    if len(inputs) == 1 and not folder and not output.is_dir():
         if output.suffix.lower() not in suffixes:
             raise ValueError(f"{output}: the name must end in {' or '.join(suffixes)}")
         return [output]
     if not output.is_dir() and (output.exists() or output.suffix.lower() in suffixes):
-        raise ValueError(f"{output}: is a file; several images need a folder")
+        raise ValueError(f"{output}: is a file; several images, or a folder of them, need a folder")
+    real = [os.path.realpath(path) for path in inputs]
+    twice = next((path for k, path in enumerate(inputs) if real[k] in real[:k]), None)
+    if twice:
+        raise ValueError(f"{twice}: is given twice; give it once")
     names = [path.stem + suffixes[0] for path in inputs]
     duplicate = next((name for name in names if names.count(name) > 1), None)
     if duplicate:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import BASIS_SPACES
 from ..storage.npz import Field
@@ -61,7 +62,14 @@ def to_members(model: Any) -> dict[str, NDArray[Any]]:
     Parameters
     ----------
     model : EigenGS
+
+    Raises
+    ------
+    ValueError
+        If the Gaussians have another cutoff than the default: the file does not hold it.
     """
+    if model.gaussians.cutoff != CUTOFF:
+        raise ValueError(f"the cutoff is {model.gaussians.cutoff}; a model is saved with {CUTOFF}")
     arrays = {key: v.astype(np.float32) for key, v in model.gaussians.to_arrays().items()}
     members: dict[str, NDArray[Any]] = {
         **arrays,

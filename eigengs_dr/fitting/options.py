@@ -110,7 +110,8 @@ class FitOptions:
                 counts[name] = getattr(self, name)
         for name, count in counts.items():
             if not isinstance(count, (int, np.integer)) or count < 0:
-                raise ValueError(f"{name} is {count!r}; it must be at least 0, and whole")
+                least = 1 if name.endswith("gaussians") else 0
+                raise ValueError(f"{name} is {count!r}; it must be at least {least}, and whole")
         if not 0 < self.cutoff <= MAX_CUTOFF:
             raise ValueError(
                 f"cutoff is {self.cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}"

@@ -4,3 +4,5 @@
 - ``back_projection``: the smoothest texture that looks alike
 - ``fit_scene``: the fewest Gaussians for a scene
 """
+
+from .. import plugins  # noqa: F401  without Mitsuba, its error says what to install

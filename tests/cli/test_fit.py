@@ -313,6 +313,17 @@ def test_a_folder_is_fitted(photo, tmp_path):
     assert sorted(p.name for p in (tmp_path / "fits").iterdir()) == ["a.npz", "b.npz"]
 
 
+def test_a_folder_of_one_image_is_fitted(photo, tmp_path):
+    folder, report = tmp_path / "photos", tmp_path / "r.json"
+    folder.mkdir()
+    shutil.copy(photo, folder / "a.png")
+    outputs = ["-o", tmp_path / "fits", "--preview", tmp_path / "previews", "--report", report]
+    succeeded(run("fit", folder, *outputs, *QUICK))
+    assert [p.name for p in (tmp_path / "fits").iterdir()] == ["a.npz"]
+    assert [p.name for p in (tmp_path / "previews").iterdir()] == ["a.png"]
+    assert len(json.loads(report.read_text())["images"]) == 1
+
+
 def test_several_images_are_not_written_to_a_file(photo, tmp_path):
     other = tmp_path / "other.png"
     shutil.copy(photo, other)
@@ -335,3 +346,27 @@ def test_the_report_has_all_of_the_time(fitted):
     report = json.loads((fitted[0] / "fit.json").read_text())
     assert report["seconds_init"] <= report["seconds"] <= report["seconds_total"]
     assert report["seconds_load"] + report["seconds"] <= report["seconds_total"]
+
+
+def test_a_bad_image_does_not_end_a_folder(photo, tmp_path):
+    """It is named at once, and in the report; the others are fitted."""
+    folder, report = tmp_path / "photos", tmp_path / "r.json"
+    folder.mkdir()
+    for name in ("a.png", "c.png"):
+        shutil.copy(photo, folder / name)
+    (folder / "b.png").write_text("no image")
+    result = run("fit", folder, "-o", tmp_path / "fits", "--report", report, *QUICK)
+    assert result.exit_code == 2
+    assert "b.png" in result.stderr and result.stderr.count("\n") == 1
+    assert sorted(p.name for p in (tmp_path / "fits").iterdir()) == ["a.npz", "c.npz"]
+    images = json.loads(report.read_text())["images"]
+    assert [image["stopped"] for image in images] == ["iterations", "failed", "iterations"]
+    assert "b.png" in images[1]["error"]
+
+
+def test_the_default_name_replaces_no_model(trained, photo, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(trained[0] / "m.npz", tmp_path / "photo.npz")
+    assert_refused(run("fit", photo, *QUICK), "photo.npz", "-o")
+    succeeded(run("fit", photo, "-o", "photo.npz", *QUICK))
+    succeeded(run("fit", photo, *QUICK))

@@ -6,6 +6,7 @@ import sys
 import pytest
 
 from _helpers.command import run, succeeded
+from eigengs_dr.cli.main import main
 
 
 @pytest.mark.parametrize(
@@ -38,3 +39,12 @@ def test_python_m():
     command = [sys.executable, "-m", "eigengs_dr", "--help"]
     found = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "eigengs-dr fit" in found.stdout
+
+
+def test_closed_standard_error(photo, tmp_path, monkeypatch):
+    """As in a service, or after ``2>&-``: no bar is shown."""
+    monkeypatch.setattr(sys, "stderr", None)
+    with pytest.raises(SystemExit) as ended:
+        main(["fit", str(photo), "-o", str(tmp_path / "x.npz"), "--iterations", "0"])
+    assert not ended.value.code
+    assert (tmp_path / "x.npz").exists()

@@ -4,12 +4,12 @@ import shutil
 
 import pytest
 
-import eigengs_dr as eg
 from _helpers.command import assert_refused, run
+from eigengs_dr.fitting import fit as fit_module
 
 
 def test_unwritable_outputs(photo, existing, tmp_path, monkeypatch):
-    monkeypatch.setattr(eg, "fit", lambda *_, **__: pytest.fail("the work was started"))
+    monkeypatch.setattr(fit_module, "fit_image", lambda *_: pytest.fail("the work was started"))
     gone = tmp_path / "gone"
     assert_refused(run("fit", photo, "-o", gone / "x.npz"), gone)
     assert_refused(run("fit", photo, "-o", photo / "x.npz"), photo)
@@ -37,3 +37,18 @@ def test_outputs_that_would_overwrite_each_other(photo, existing, tmp_path):
 
 def test_several_images_into_a_file(photo, existing):
     assert_refused(run("fit", photo, photo, "-o", existing), existing, "folder")
+
+
+def test_a_basis_is_not_overwritten(trained, photo):
+    """By default the output has the name of the photo, in the current folder."""
+    model = shutil.copy(trained[0] / "m.npz", photo.with_suffix(".npz"))
+    before = model.read_bytes()
+    basis = ["--basis", model, "--iterations", 0]
+    assert_refused(run("fit", photo, "-o", photo.parent, *basis), model, "is read")
+    assert model.read_bytes() == before
+
+
+def test_an_image_given_twice(photo, tmp_path):
+    assert_refused(run("fit", photo, photo, "-o", tmp_path / "out"), photo, "twice")
+    assert_refused(run("fit", photo.parent, photo, "-o", tmp_path / "out"), photo, "twice")
+    assert not (tmp_path / "out").exists()

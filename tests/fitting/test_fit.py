@@ -370,7 +370,7 @@ def test_rates_far_too_high(backend, preset, factor):
     ("name", "value", "words"),
     [
         ("gaussians", 0, "gaussians is 0; an image of 32x32 takes 1 to 1024"),
-        ("gaussians", -3, "gaussians is -3"),
+        ("gaussians", -3, "gaussians is -3; it must be at least 1"),
         ("gaussians", SIDE * SIDE + 1, "gaussians is 1025; an image of 32x32 takes 1 to 1024"),
         ("iterations", -1, "iterations is -1; it must be at least 0"),
         ("solve_steps", -1, "solve_steps is -1"),

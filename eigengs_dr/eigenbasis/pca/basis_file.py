@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...image.folder import BASIS_SPACES
-from ...storage import npz as archive
+from ...storage import npz
 from .incremental_pca import EXAMPLES
 
 FORMAT, VERSION = "eigengs_dr.eigenbasis", 1
@@ -23,13 +23,13 @@ ENERGY_TOLERANCE = 1e-5
 MAX_ENTRIES = 1 << 28
 """Most elements of an array: 16 examples of 2,000x2,000 pixels have fewer."""
 
-LAYOUT: dict[str, archive.Field] = {
-    "mean": archive.Field("f4", 3, MAX_ENTRIES),
-    "variance": archive.Field("f8", 1),
-    "count": archive.Field("i8", 0),
-    "space": archive.Field("U", 0),
-    "examples": archive.Field("f4", 4, MAX_ENTRIES),
-    **{f"eigenvalues{c}": archive.Field("f8", 1) for c in range(3)},
+LAYOUT: dict[str, npz.Field] = {
+    "mean": npz.Field("f4", 3, MAX_ENTRIES),
+    "variance": npz.Field("f8", 1),
+    "count": npz.Field("i8", 0),
+    "space": npz.Field("U", 0),
+    "examples": npz.Field("f4", 4, MAX_ENTRIES),
+    **{f"eigenvalues{c}": npz.Field("f8", 1) for c in range(3)},
 }
 """Arrays of a file, except the components, whose shapes follow from these."""
 
@@ -45,18 +45,18 @@ def write_basis(path: str | os.PathLike[str], basis: Any) -> None:
     }
     for c, pair in enumerate(zip(basis.components, basis.eigenvalues, strict=True)):
         arrays[f"components{c}"], arrays[f"eigenvalues{c}"] = pair
-    archive.write(path, FORMAT, VERSION, arrays, compressed=False)
+    npz.write(path, FORMAT, VERSION, arrays, compressed=False)
 
 
 def read_basis(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read the fields of an `eigengs_dr.Eigenbasis`; see its `load`."""
     path = Path(path)
-    head = archive.read(path, FORMAT, VERSION, LAYOUT)
+    head = npz.read(path, FORMAT, VERSION, LAYOUT)
     try:
         _check(head)
         values = tuple(head.pop(f"eigenvalues{c}") for c in range(3))
         components = _components(path, values, head["mean"].shape)
-    except archive.BadValue as error:
+    except npz.BadValue as error:
         raise ValueError(f"{path}: {error}") from None
     return {
         **head,
@@ -68,37 +68,35 @@ def read_basis(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def _check(head: dict[str, NDArray[Any]]) -> None:
-    """Raise `archive.BadValue` unless the arrays of a file make a basis."""
+    """Raise `npz.BadValue` unless the arrays of a file make a basis."""
     mean, variance, examples = head["mean"], head["variance"], head["examples"]
     if len(mean) != 3 or 0 in mean.shape:
-        raise archive.BadValue(f"mean has shape {mean.shape}, expected (3, H, W)")
+        raise npz.BadValue(f"mean has shape {mean.shape}, expected (3, H, W)")
     if variance.shape != (3,):
-        raise archive.BadValue(f"variance has shape {variance.shape}, expected (3,)")
+        raise npz.BadValue(f"variance has shape {variance.shape}, expected (3,)")
     if examples.shape[1:] != (*mean.shape[1:], 3) or len(examples) > EXAMPLES:
         expected = f"(n, {mean.shape[1]}, {mean.shape[2]}, 3) with n <= {EXAMPLES}"
-        raise archive.BadValue(f"examples has shape {examples.shape}, expected {expected}")
+        raise npz.BadValue(f"examples has shape {examples.shape}, expected {expected}")
     for name, array in head.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise archive.BadValue(f"{name} holds values that are not finite")
+            raise npz.BadValue(f"{name} holds values that are not finite")
     for c in range(3):
         values = head[f"eigenvalues{c}"]
         require_descending(f"eigenvalues{c}", values)
         if len(values) > mean[0].size:
-            raise archive.BadValue(f"eigenvalues{c} has {len(values)} values, more than pixels")
+            raise npz.BadValue(f"eigenvalues{c} has {len(values)} values, more than pixels")
         if values.sum() > variance[c] * (1 + ENERGY_TOLERANCE):
-            raise archive.BadValue(f"eigenvalues{c} add up to more than variance {c}")
+            raise npz.BadValue(f"eigenvalues{c} add up to more than variance {c}")
     if head["count"] < 1:
-        raise archive.BadValue(f"count is {head['count']}, expected at least 1")
+        raise npz.BadValue(f"count is {head['count']}, expected at least 1")
     if head["space"] not in BASIS_SPACES:
-        raise archive.BadValue(
-            f"space is '{head['space']}', expected one of {', '.join(BASIS_SPACES)}"
-        )
+        raise npz.BadValue(f"space is '{head['space']}', expected one of {', '.join(BASIS_SPACES)}")
 
 
 def require_descending(name: str, values: NDArray[np.float64]) -> None:
-    """Raise `archive.BadValue` unless eigenvalues descend and are not negative."""
+    """Raise `npz.BadValue` unless eigenvalues descend and are not negative."""
     if (values < 0).any() or (np.diff(values) > 0).any():
-        raise archive.BadValue(f"{name} must descend and not be negative")
+        raise npz.BadValue(f"{name} must descend and not be negative")
 
 
 def _components(
@@ -106,11 +104,11 @@ def _components(
 ) -> tuple[NDArray[np.float32], ...]:
     """Read one component for each eigenvalue of each channel."""
     shapes = {f"components{c}": (len(e), *shape[1:]) for c, e in enumerate(eigenvalues)}
-    layout = {key: archive.Field("f4", 3, math.prod(s)) for key, s in shapes.items()}
-    arrays = archive.read(path, FORMAT, VERSION, layout)
+    layout = {key: npz.Field("f4", 3, math.prod(s)) for key, s in shapes.items()}
+    arrays = npz.read(path, FORMAT, VERSION, layout)
     for key, expected in shapes.items():
         if arrays[key].shape != expected:
-            raise archive.BadValue(f"{key} has shape {arrays[key].shape}, expected {expected}")
+            raise npz.BadValue(f"{key} has shape {arrays[key].shape}, expected {expected}")
         if not np.isfinite(arrays[key]).all():
-            raise archive.BadValue(f"{key} holds values that are not finite")
+            raise npz.BadValue(f"{key} holds values that are not finite")
     return tuple(arrays.values())
