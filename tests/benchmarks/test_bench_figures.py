@@ -13,7 +13,7 @@ from eigengs_bench.harness import datasets
 from eigengs_bench.harness.datasets import images_of
 from eigengs_bench.harness.store import read
 from eigengs_bench.names import FIGURES, SETS
-from eigengs_bench.report import strips
+from eigengs_bench.report import charts as strips
 from eigengs_dr.cli.pictures import overlay
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting.fit import fit
@@ -71,14 +71,8 @@ def test_all_figures_are_drawn_listed_and_credited(drawn):
         assert 0 < (drawn.folder / figure.path).stat().st_size < 300_000
         cats = figure.path.startswith("cats-")
         assert figure.credit == (CREDIT if cats else "")
-    assert [arguments[1:2] == (CREDIT,) for arguments in drawn.seen["strip"]] == [
-        False,
-        False,
-        True,
-        False,
-        True,
-        True,
-    ]
+    credits = [credit for _, credit, _ in drawn.seen["strip"]]
+    assert credits == ["", "", CREDIT, "", CREDIT, CREDIT]
     assert not drawn.notes
 
 
@@ -90,7 +84,7 @@ def first_fit(drawn, image, preset):
 
 def test_iterations_are_those_of_the_presets(drawn):
     """The start of each row is that of `fit`."""
-    rows, _ = drawn.seen["strip"][2]
+    rows, *_ = drawn.seen["strip"][2]
     [(_, image)] = images_of(drawn.task, "cats256", 1)
     assert [heading.split(":")[0] for heading, _ in rows] == ["gaussianimage", "eigengs", "default"]
     for heading, (first, last, photo) in rows:
@@ -103,7 +97,7 @@ def test_iterations_are_those_of_the_presets(drawn):
 
 
 def test_colors_have_both_psnrs_and_the_error(drawn):
-    (rows,) = drawn.seen["strip"][3]
+    rows, *_ = drawn.seen["strip"][3]
     assert ["YCbCr;" in rows[0][0], "RGB;" in rows[1][0]] == [True, True]
     for _, (photo, fitted, error) in rows:
         shown = (error[1] - 0.5) / figure_strips.MAGNIFIED
@@ -138,7 +132,7 @@ def test_a_second_run_measures_nothing_again(drawn, monkeypatch):
         raise AssertionError("measured again")
 
     before = (drawn.folder / "curves.jsonl").read_bytes()
-    monkeypatch.setattr(figures, "descent", fail)
+    monkeypatch.setattr(figures, "preset_descent", fail)
     figures.run(drawn.task, ["curves"])
     again = figures.read_list(drawn.folder / "figures.json")
     assert [figure["path"] for figure in again] == [figure.path for figure in drawn.made]
@@ -175,7 +169,7 @@ def test_both_parts_of_a_split_make_the_whole(drawn):
 
 
 def test_cats_are_projected_on_every_basis(drawn):
-    rows, _ = drawn.seen["strip"][5]
+    rows, *_ = drawn.seen["strip"][5]
     bases = [model(drawn, "auto"), model(drawn, "auto", "natural256"), small_model("llvm")]
     for (_, cells), (_, image) in zip(rows, images_of(drawn.task, "cats256", 3), strict=True):
         np.testing.assert_array_equal(cells[0][1], image)

@@ -75,7 +75,7 @@ def rate_rows():
 
 
 def test_rates_tell_ratios_and_where_they_are_missing():
-    (table,) = rates.tell(list(rate_rows())).tables
+    (table,) = rates.summarize(list(rate_rows())).tables
     cells = {row[0]: row[1:] for row in lines_of(table)}
     # 32 dB is half way: sqrt(1 * 4) and 3 times that; 2 * 4^(6 / 8) for WebP on the second.
     assert cells[rate.OURS][1] == "4.00" and cells[rate.OURS][3].startswith("3.00")
@@ -86,7 +86,7 @@ def test_rates_tell_ratios_and_where_they_are_missing():
 
 
 def test_rate_charts_show_the_means_of_the_images():
-    _, figure = rates.tell(list(rate_rows())).charts["rate-made"]
+    _, figure = rates.summarize(list(rate_rows())).charts["rate-made"]
     left, right = figure.axes
     lines = {line.get_label(): line.get_xydata() for line in left.lines}
     np.testing.assert_allclose(lines[rate.OURS], [[2.0, 26.0], [8.0, 38.0]])

@@ -71,7 +71,7 @@ def test_every_method_is_measured_and_figures_are_those_of_fit(data, tmp_path, b
     before = (tmp_path / tables.FILE).read_bytes()
     assert tables.run(task, ["faces256"]) == found
     assert (tmp_path / tables.FILE).read_bytes() == before
-    captions = [table.caption for table in methods.tell(found).tables]
+    captions = [table.caption for table in methods.summarize(found).tables]
     for start in (
         "PSNR YCbCr",
         "Methods: faces256, 1 image of 32x32",
@@ -110,9 +110,9 @@ def four_images(run=RUN):
 
 
 def test_cells_are_means_over_images():
-    glance, shown, printed = methods.tell(four_images()).tables
+    glance, shown, printed = methods.summarize(four_images()).tables
     assert lines_of(glance) == [
-        ("faces256", preset, "4", "33.0", "-", "-", "-", "37.3 (1 failed)", "1.00 (1.00-1.00)")
+        ("faces256", preset, "4", "33.0", "37.3 (1 failed)", "1.00 (1.00-1.00)")
         for preset in ("gaussianimage", "default")
     ]
     assert list(shown.frame.columns) == ["method", "figure", "0", "1,000"]
@@ -131,9 +131,9 @@ def test_cells_are_means_over_images():
 
 def test_captions_tell_different_code():
     rows = four_images()
-    assert not any("code" in t.caption for t in methods.tell(rows).tables)
+    assert not any("code" in t.caption for t in methods.summarize(rows).tables)
     rows[-1] = {**rows[-1], "run": {**RUN, "commit": "b" * 40}}
-    glance, shown, printed = methods.tell(rows).tables
+    glance, shown, printed = methods.summarize(rows).tables
     for table in (glance, shown):
         assert "[rows of different code: commit aaaaaaaaa; commit bbbbbbbbb]" in table.caption
     assert "code" not in printed.caption
@@ -143,7 +143,7 @@ def test_the_ablation_shows_both_spaces():
     kinds = [(color, split) for color in ("ycbcr", "rgb") for split in ("split", "whole")]
     method = {"preset": "eigengs", "source": "faces256", "components": 300}
     rows = [fit_row("a", [moment(1000, 40.0)], **method, color=c, split=s) for c, s in kinds]
-    ablation, printed = methods.tell(rows).tables
+    ablation, printed = methods.summarize(rows).tables
     assert ablation.caption.startswith("Colour space and split: faces256")
     assert lines_of(ablation)[0] == ("eigengs, ycbcr, split", "PSNR YCbCr / dB", "40.0")
     assert lines_of(ablation)[-2] == ("eigengs, rgb, whole", "PSNR RGB / dB", "34.0")
@@ -163,7 +163,7 @@ def test_what_is_never_reached_is_said():
         {"job": job, "share": share, "seconds": 0.04, "run": RUN}
         for share in (0.02, 0.01, 0.04, None)
     ]
-    [table] = methods.tell(rows).tables
+    [table] = methods.summarize(rows).tables
     assert lines_of(table) == [
         ("faces256", "1,000", "3 of 4", "0.040 (0.040-0.040)", "0.0200 (0.0150-0.0300)", "0.0400")
     ]

@@ -16,18 +16,18 @@ from eigengs_dr.image.samples import sample
 
 Shapes = tuple[NDArray[np.float64], NDArray[np.float64]]
 
-# Pixels of a side, splats (the paper's number, and that of the basis that ships), and steps.
+# Pixels of a side, Gaussians (as in the paper, and in the basis that ships), and steps.
 SIDE, GAUSSIANS, ITERATIONS = 256, 5000, 1000
-SMOOTH_SIDE = 512  # splats lie 7 pixels apart, which shows; the paper's 20,000 lie under 4 apart
+SMOOTH_SIDE = 512  # distances of 7 pixels show; those of the paper's 20,000 are below 4
 STRIPE = 3  # rows of a stripe of the image that is foreign to a basis
 
 
 class Case(NamedTuple):
     """One thing that may go wrong.
 
-    ``image()`` makes the image. `place` returns means and factors to start from, called as the
-    `Placement` is; None for the start of the preset. `rates` multiplies the
-    rates of the preset. A case `alone` is measured in a process of its own, for its memory.
+    ``image()`` makes the image. `place`, a `Placement`, returns means and factors to start from;
+    None for the start of the preset. `rates` multiplies the rates of the preset. A case `alone`
+    runs in a process of its own, for its memory.
     """
 
     name: str
@@ -108,29 +108,28 @@ def _grey(plane: NDArray[np.number]) -> Image:
 
 
 def needles(image: Image, count: int, generator: np.random.Generator) -> Shapes:
-    """Stretch splats a hundredfold, in all directions: condition 10,000."""
+    """Stretch Gaussians a hundredfold, in all directions: condition 10,000."""
     angle = generator.uniform(0, np.pi, count)
     cos, sin = np.cos(angle), np.sin(angle)
     long, thin = 30.0**2, 0.3**2
     xx, yy = long * cos**2 + thin * sin**2, long * sin**2 + thin * cos**2
-    return _anywhere(image, count, generator), factor_from_covariance(
-        xx, (long - thin) * cos * sin, yy
-    )
+    factor = factor_from_covariance(xx, (long - thin) * cos * sin, yy)
+    return _anywhere(image, count, generator), factor
 
 
 def subpixel(image: Image, count: int, generator: np.random.Generator) -> Shapes:
-    """Make splats so narrow that pixel centres miss most; bounds widen them to a quarter pixel."""
+    """Make most Gaussians too narrow for pixel centres; bounds widen them to a quarter pixel."""
     return _anywhere(image, count, generator), _round(count, 0.05)
 
 
 def heap(image: Image, count: int, generator: np.random.Generator) -> Shapes:
-    """Put equal splats on one point: there is no telling them apart."""
+    """Put equal Gaussians on one point."""
     height, width = image.shape[:2]
     return np.tile([width // 2 + 0.5, height // 2 + 0.5], (count, 1)), _round(count, 1.0)
 
 
 def outside(image: Image, count: int, generator: np.random.Generator) -> Shapes:
-    """Put splats around the image, where no pixel sees them; bounds bring them to its edges."""
+    """Put Gaussians around the image, where no pixel sees them; bounds bring them to its edges."""
     height, width = image.shape[:2]
     angle, radius = generator.uniform(0, 2 * np.pi, count), generator.uniform(1, 2, count)
     mean = 0.5 + np.stack([np.cos(angle), np.sin(angle)], axis=1) * radius[:, None]
@@ -145,8 +144,6 @@ def _round(count: int, sigma: float) -> NDArray[np.float64]:
     return np.tile([1 / sigma, 0.0, 1 / sigma], (count, 1))
 
 
-_PLACES = (needles, subpixel, heap, outside)
-
 _ALL = (
     Case("photo", photo),  # what the others are compared with
     Case("constant", partial(flat, 0.2, 0.4, 0.6)),  # whole 8-bit levels
@@ -157,17 +154,16 @@ _ALL = (
     Case("1x512", partial(photo, 512, 1), 128),
     Case("large", partial(photo, 4096, 4096), 20000, 20, alone=True),
     Case("foreign", foreign),
-    *(Case(place.__name__, photo, place=place) for place in _PLACES),
+    *(Case(place.__name__, photo, place=place) for place in (needles, subpixel, heap, outside)),
     Case("fast", photo, rates=10.0),
     Case("long", photo, iterations=10_000),
 )
 
-# Cases by name. What half precision costs is measured in each.
 CASES = {case.name: case for case in _ALL}
 
 
 def chosen_cases(names: Sequence[str], iterations: int) -> list[Case]:
-    """Return cases by name, by default all, with at most so many steps."""
+    """Return cases by name, by default all, with at most this many steps."""
     if unknown := [name for name in names if name not in CASES]:
         raise ValueError(f"case {unknown[0]!r} is unknown; use one of {', '.join(CASES)}")
     chosen = [CASES[name] for name in dict.fromkeys(names or CASES)]

@@ -18,9 +18,7 @@ from eigengs_dr.image.resize import center_crop
 from eigengs_dr.image.samples import sample
 
 SAMPLE_NAMES, SAMPLE_SIDE = ("chelsea", "coffee", "astronaut"), 256
-
-# Components that are computed of every set: models of fewer take the first of them.
-MAX_COMPONENTS = 500
+MAX_COMPONENTS = 500  # of the basis of a set: models of fewer take the first of them
 
 
 def images_of(task: Task, name: str, count: int | None = None) -> list[tuple[str, Image]]:
@@ -35,9 +33,8 @@ def images_of(task: Task, name: str, count: int | None = None) -> list[tuple[str
     if task.data is None:
         raise ValueError(f"set {name!r} needs DATA, the folder that holds it")
     folder, sides = task.data / SETS[name].folder, SETS[name][1:3]
-    files = image_files(folder / "test" if (folder / "test").is_dir() else folder)[:count]
     found = []
-    for file in files:
+    for file in image_files(folder / "test" if (folder / "test").is_dir() else folder)[:count]:
         picture = load_image(file)
         upright = picture.shape[0] > picture.shape[1]
         size = (min(sides), max(sides)) if upright else sides
@@ -46,7 +43,7 @@ def images_of(task: Task, name: str, count: int | None = None) -> list[tuple[str
 
 
 def usual_count(name: str) -> int:
-    """Return the number of splats of fits on a set."""
+    """Return the number of Gaussians of fits on a set."""
     return SETS[name].gaussians if name in SETS else DEFAULT_COUNT
 
 
