@@ -78,10 +78,7 @@ def measures_rows(file: str, iterations: int = 1000, least: int = 1) -> Any:
         @click.pass_context
         @wraps(command)
         def wrapped(context: click.Context, output: Path, quiet: bool, **settings: Any) -> None:
-            shared = {name: settings.pop(name, None) for name in ("data", "seed", "backend")}
-            shared |= {
-                name: settings.pop(name) for name in ("images", "iterations") if name in settings
-            }
+            shared = {name: settings.pop(name) for name in Task._fields if name in settings}
             if not shared.get("data") and set(settings.get("names", ())) - {SAMPLES}:
                 raise ValueError("--set needs DATA, the folder of the set, for all but samples")
             output.mkdir(parents=True, exist_ok=True)
@@ -91,7 +88,7 @@ def measures_rows(file: str, iterations: int = 1000, least: int = 1) -> Any:
             if note := other_code(output / file, run):
                 say(f"note: {note}")
             with progress_bar(quiet) as show:
-                task = Task(folder=output, run=run, progress=show, **shared)
+                task = Task(output, run, progress=show, **shared)
                 section = command(task, **settings)
             save(section, output, quiet)
 

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from _helpers.benchmarks import RUN, broken_off, lines_of, one_image, run, task_in
-from eigengs_bench.experiments import levels, rate
+from eigengs_bench.experiments import rate
 from eigengs_bench.harness import datasets
 from eigengs_bench.report.sections import rate as rates
 from eigengs_dr.fitting.fit import fit
@@ -124,11 +124,3 @@ def test_levels_tell_what_prefixes_are_worth(tmp_path, backend):
     assert float(lines[-1]["alone"]) == pytest.approx(float(lines[-1]["sorted"]), abs=1e-4)
     assert float(lines[0]["levels"]) > float(lines[0]["sorted"])
     assert "4 *" in done.stdout and (out / "levels.svg").stat().st_size > 1000
-
-
-def test_levels_end_with_a_fit_that_was_broken_off(tmp_path, monkeypatch):
-    monkeypatch.setattr(levels, "fit_levels", broken_off)
-    save_image(tmp_path / "a.png", one_image())
-    arguments = ("-o", tmp_path / "out", "--gaussians", 16, "--levels", 2)
-    assert run("bench", "levels", tmp_path / "a.png", *arguments).exit_code == 130
-    assert not list((tmp_path / "out").iterdir())

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from _helpers.benchmarks import RUN, fit_row, moment, run, task_in
+from _helpers.benchmarks import RUN, fit_row, moment, run
 from eigengs_bench.harness import store
 from eigengs_bench.report.frames import (
     as_text,
@@ -210,8 +210,3 @@ def test_sets_need_data(tmp_path):
     for wrong in ("0", "101", "nan"):
         assert run("bench", "budget", "-o", tmp_path / "x", "--target", wrong).exit_code == 2
     assert not (tmp_path / "out").exists()
-
-
-def test_a_task_measures_into_its_folder(tmp_path):
-    (row,) = task_in(tmp_path).measure("x.jsonl", jobs([], "a"), "label")
-    assert store.read(tmp_path / "x.jsonl") == [row]

@@ -30,8 +30,8 @@ class Task(NamedTuple):
     """What experiments share: `folder` of rows and models, `data` of image sets, `run` of rows."""
 
     folder: Path
-    data: Path | None
     run: Row
+    data: Path | None = None
     images: int = 20
     iterations: int = 1000
     seed: int = 0

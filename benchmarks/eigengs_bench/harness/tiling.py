@@ -30,8 +30,6 @@ def tiling(picture: Image, image: Image) -> float:
     >>> round(tiling(image + 0.01 * (np.indices((32, 32)).sum(0) % 2)[..., None], image), 1)
     1.3
     """
-    if picture.shape != image.shape:
-        raise ValueError(f"tiling: the shapes {picture.shape} and {image.shape} differ")
     region = smooth_regions(image)
     if not region.any():
         return float("nan")

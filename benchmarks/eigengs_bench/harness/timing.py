@@ -75,14 +75,10 @@ def decibels(picture: Image, image: Image, space: str) -> float:
 
 def score(moment: Moment, image: Image) -> dict[str, Any]:
     """Turn a moment into a row: iteration, seconds, psnr_ycbcr, psnr_rgb, ssim, ms_ssim."""
-    return {
-        "iteration": moment.iteration,
-        "seconds": moment.seconds,
-        "psnr_ycbcr": decibels(moment.picture, image, "ycbcr"),
-        "psnr_rgb": decibels(moment.picture, image, "rgb"),
-        "ssim": ssim(moment.picture, image),
-        "ms_ssim": ms_ssim(moment.picture, image),
-    }
+    row: dict[str, Any] = {"iteration": moment.iteration, "seconds": moment.seconds}
+    row |= {f"psnr_{k}": decibels(moment.picture, image, k) for k in ("ycbcr", "rgb")}
+    similar = {"ssim": ssim(moment.picture, image), "ms_ssim": ms_ssim(moment.picture, image)}
+    return row | similar
 
 
 def interleaved(
