@@ -42,8 +42,8 @@ def drawn(tmp_path_factory):
             patch.setitem(SETS, name, chosen._replace(width=32, height=32, gaussians=60))
         patch.setattr(datasets, "MAX_COMPONENTS", 10)
         patch.setattr(figures, "EVERY", 2)
+        patch.setattr(figure_strips, "COMPONENTS", 8)
         for module in (figures, figure_strips):
-            patch.setattr(module, "COMPONENTS", 8)
             patch.setattr(module, "load_basis", lambda name, backend: small_model("llvm"))
 
         def spy(module, name):
@@ -126,7 +126,7 @@ def test_a_second_run_measures_nothing_again(drawn, monkeypatch):
         raise AssertionError("measured again")
 
     before = (drawn.folder / "curves.jsonl").read_bytes()
-    monkeypatch.setattr(figures, "preset_descent", fail)
+    monkeypatch.setattr(figure_strips, "preset_descent", fail)
     figures.run(drawn.task, ["curves"])
     again = figures.read_list(drawn.folder / "figures.json")
     assert [figure["path"] for figure in again] == [figure.path for figure in drawn.made]

@@ -8,18 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from eigengs_bench.experiments.figure_strips import (
-    COMPONENTS,
-    METHODS,
-    Figure,
-    colors,
-    cross,
-    is_present,
-    iterations,
-    preset_descent,
-    split,
-    to_size,
-)
+from eigengs_bench.experiments import figure_strips as strips
+from eigengs_bench.experiments.figure_strips import METHODS, Figure, is_present, to_size
 from eigengs_bench.harness.datasets import images_of, model_for
 from eigengs_bench.harness.store import Job, Row, Task, code_name, today
 from eigengs_bench.harness.timing import Image
@@ -54,7 +44,8 @@ def run(
     `ValueError` if nothing can be drawn.
     """
     listed = read_list(task.folder / LIST)  # a damaged list is an error now, not after minutes
-    studies = dict(zip(FIGURES, (iterations, colors, curves, radii, split, cross), strict=True))
+    makers = strips.iterations, strips.colors, curves, radii, strips.split, strips.cross
+    studies = dict(zip(FIGURES, makers, strict=True))
     wanted = [name for name in FIGURES if not names or name in names]
     drawn = [name for name in wanted if _has_sets(task, name)]
     if left := [name for name in wanted if name not in drawn]:
@@ -114,7 +105,7 @@ def _curve_jobs(task: Task, name: str, marks: Sequence[int]) -> Iterator[Job]:
     if name == "kodak":
         model = load_basis("natural", task.backend)
     else:
-        model = model_for(task, name, name, COMPONENTS)
+        model = model_for(task, name, name, strips.COMPONENTS)
     for file, image in images_of(task, name):
         for preset in METHODS:
             label = {"set": name, "image": file, "preset": preset, **settings}
@@ -122,7 +113,7 @@ def _curve_jobs(task: Task, name: str, marks: Sequence[int]) -> Iterator[Job]:
 
 
 def _curve(task: Task, image: Image, model: EigenGS, preset: str, marks: Sequence[int]) -> Row:
-    moments = preset_descent(task, image, model, preset, marks)
+    moments = strips.preset_descent(task, image, model, preset, marks)
     return {"psnr_ycbcr": [psnr(moment.picture, image, "ycbcr") for moment in moments]}
 
 
@@ -135,11 +126,11 @@ def radii(task: Task) -> Iterator[Figure]:
     """Draw how large Gaussians are, with and without the split by frequency, as in the paper."""
     images, panels = images_of(task, CATS), {}
     for whole, title in ((False, "no split"), (True, "frequency-aware split")):
-        model = model_for(task, CATS, CATS, COMPONENTS, split=whole)
+        model = model_for(task, CATS, CATS, strips.COMPONENTS, split=whole)
         found = []
         for done, (_, image) in enumerate(images):
             task.progress(f"radii, {title}", done, len(images))
-            *_, last = preset_descent(task, image, model, "eigengs", [task.iterations])
+            *_, last = strips.preset_descent(task, image, model, "eigengs", [task.iterations])
             found.append(radii_of(last.gaussians))
         panels[title] = np.split(np.stack(found), [model.low], axis=1)
     save_figure(task.folder / "radii.svg", radii_chart(panels))

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eigengs_bench.experiments.kernels import COUNT, ROUNDS, SIDE, WARM_UP, programs, random_scene
+from eigengs_bench.experiments import kernels
 from eigengs_bench.harness.datasets import images_of, is_trained, model_for, usual_count
 from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.timing import Image, decibels, follow, interleaved, score, warm_up
@@ -65,7 +65,8 @@ class Variant(NamedTuple):
 def run(task: Task, names: Sequence[str]) -> list[Row]:
     """Measure all variants on sets of images, and the renderer."""
     jobs = [job for name in names for job in _jobs(task, name, variants(task, name))]
-    jobs.append(({"set": "kernels", "side": SIDE, "gaussians": COUNT}, partial(_kernels, task)))
+    scene = {"set": "kernels", "side": kernels.SIDE, "gaussians": kernels.COUNT}
+    jobs.append((scene, partial(_kernels, task)))
     return task.measure(FILE, jobs, "pareto")
 
 
@@ -171,18 +172,18 @@ def _kernels(task: Task) -> Row:
     are of all pixels, against a rendering in float64 at the cutoff `WIDEST`.
     """
     module = select(task.backend)
-    scene = random_scene(types_in(module))
+    scene = kernels.random_scene(types_in(module))
     colors = {key: module.ArrayXf64(getattr(scene, key)) for key in ("color", "background")}
     shapes = {"mean": module.Array2f64(scene.mean), "factor": module.Array3f64(scene.factor)}
     exact = render(replace(scene, **shapes, **colors), cutoff=WIDEST).numpy()
     rows, timed = list[Row](), dict[str, Any]()
     for cutoff, renderer in product(CUTOFFS, ("fast", "plain")):
-        forward, step, shown = programs(scene, cutoff, renderer == "plain")
+        forward, step, shown = kernels.programs(scene, cutoff, renderer == "plain")
         timed |= {f"forward {len(rows)}": forward, f"step {len(rows)}": step}
         error = shown() - exact
         errors = {"largest_error": np.abs(error).max(), "rms_error": np.sqrt(np.mean(error**2))}
         rows.append({"renderer": renderer, "cutoff": cutoff, **errors})
-    ms = interleaved(timed, WARM_UP, ROUNDS)
+    ms = interleaved(timed, kernels.WARM_UP, kernels.ROUNDS)
     for program in timed.values():
         program.func.clear()  # left to the garbage collector, they may go while another is traced
     for k, row in enumerate(rows):

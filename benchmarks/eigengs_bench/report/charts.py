@@ -109,10 +109,11 @@ def tiles_chart(image: Image, pictures: Mapping[str, Image], side: int = 128) ->
     axes = figure.subplots(2, len(pictures), squeeze=False)
     for column, (name, picture) in zip(axes.T, pictures.items(), strict=True):
         error = 0.5 + MAGNIFIED * (picture - image)
-        titles = f"{name}:\n{tiling(picture, image):.2f} levels", f"its errors times {MAGNIFIED}"
-        for axis, shown, title in zip(column, (picture, error), titles, strict=True):
+        title = f"{name}:\n{tiling(picture, image):.2f} levels of tiling"
+        titles = title, f"its errors times {MAGNIFIED}"
+        for axis, shown, above in zip(column, (picture, error), titles, strict=True):
             axis.imshow(np.clip(shown[part], 0, 1), interpolation="nearest")
-            axis.set_title(title)
+            axis.set_title(above)
             axis.set_axis_off()
     return figure
 
