@@ -97,7 +97,7 @@ def rate(task: Task, names: Names) -> Any:
     type=click.FloatRange(0, 100, min_open=True),
     default=(32.0, 36.0, 40.0),
     show_default=True,
-    help="PSNR to reach; may be repeated.",
+    help="PSNR in YCbCr to reach; may be repeated.",
 )
 @measures_rows("budget.jsonl")
 @set_options(20, NATURAL)
