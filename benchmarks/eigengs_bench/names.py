@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 
 class ImageSet(NamedTuple):
-    """A folder of images, the size in pixels they are brought to, and the paper's splats for it."""
+    """A folder of images, their size in pixels, and the paper's number of Gaussians."""
 
     folder: str
     width: int

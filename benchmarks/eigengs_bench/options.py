@@ -1,4 +1,4 @@
-"""What makes a command of an experiment: its options, its folder, and how it tells its rows."""
+"""What makes a command of an experiment: its options, its folder, and its output."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -10,15 +10,8 @@ import click
 from eigengs_bench.harness.store import Row, Task, code_state, other_code
 from eigengs_bench.names import SAMPLES, SETS
 from eigengs_dr.backend.selection import select
+from eigengs_dr.cli import options
 from eigengs_dr.cli.console import progress_bar, say
-from eigengs_dr.cli.options import (
-    FOLDER,
-    backend_option,
-    describe_run,
-    quiet_option,
-    report_option,
-    seed_option,
-)
 from eigengs_dr.cli.outputs import check_outputs
 from eigengs_dr.cli.report import write_report
 
@@ -30,7 +23,7 @@ output_option = click.option(
     metavar="FOLDER",
     help="For results, which are continued; made where it is missing.",
 )
-data_argument = click.argument("data", type=FOLDER, required=False, metavar="[DATA]")
+data_argument = click.argument("data", type=options.FOLDER, required=False, metavar="[DATA]")
 
 
 def count_option(name: str, default: int, text: str = "", least: int = 1) -> Any:
@@ -41,110 +34,100 @@ def count_option(name: str, default: int, text: str = "", least: int = 1) -> Any
 
 def many_option(name: str, to: str, values: Any, text: str) -> Any:
     """Make an option that takes some of several words and may be repeated."""
-    text = f"{text}; may be repeated."
-    return click.option(name, to, multiple=True, type=click.Choice(list(values)), help=text)
+    text, kind = f"{text}; may be repeated.", click.Choice(list(values))
+    return click.option(name, to, multiple=True, type=kind, callback=_each_once, help=text)
 
 
-def set_options(images: int, usual: str = f"{SAMPLES}, photos of scikit-image") -> Any:
-    """Make what the commands that fit sets of images take: where they are, which, how many."""
-    names = many_option("--set", "names", [SAMPLES, *SETS], f"Images to fit, by default {usual}")
-    return _chain(data_argument, names, count_option("--images", images, "Of each set."))
+def _each_once(context: Any, option: Any, values: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(values))
 
 
-def chosen_sets(names: tuple[str, ...], data: Path | None, usual: str = SAMPLES) -> tuple[str, ...]:
-    """Sets to measure on, each once; without data `SAMPLES` alone, `ValueError` for others."""
-    wanted = tuple(dict.fromkeys(names)) or (SAMPLES if data is None else usual,)
-    if data is None and set(wanted) - {SAMPLES}:
-        raise ValueError("--set needs DATA, the folder that holds the set, for all but samples")
-    return wanted
+def set_options(images: int, usual: str = SAMPLES) -> Any:
+    """Make the options of commands that fit sets; without DATA or --set they fit `SAMPLES`."""
+    text = f"Images to fit, by default {usual} with DATA, and samples without"
+
+    def decorate(command: Callable[..., Any]) -> Any:
+        @wraps(command)
+        def wrapped(task: Task, names: tuple[str, ...], **settings: Any) -> Any:
+            return command(task, names or (usual if task.data else SAMPLES,), **settings)
+
+        chosen = many_option("--set", "names", [SAMPLES, *SETS], text)
+        return data_argument(chosen(count_option("--images", images, "Of each set.")(wrapped)))
+
+    return decorate
 
 
 def about(context: click.Context, backend: str | None) -> Row:
     """Describe a run for rows and reports: command, machine, versions, commit of the code."""
-    return {**describe_run(context, backend), **code_state()}
+    return {**options.describe_run(context, backend), **code_state()}
 
 
 def measures_rows(file: str, iterations: int = 1000, least: int = 1) -> Any:
     """Make a function of a task into a command that keeps rows in a file of a folder.
 
-    The function returns a `Told`: its tables are printed, and its charts and points are written to
-    the folder. A note is printed if the file holds rows of other code.
+    The command prints the tables of the `Section` that the function returns, and writes its charts
+    to the folder. It prints a note if the file holds rows of other code.
     """
 
     def decorate(command: Callable[..., Any]) -> Any:
+        @output_option
+        @count_option("--iterations", iterations, "Steps of every fit, or the most.", least)
+        @options.seed_option
+        @options.backend_option
+        @options.quiet_option
+        @click.pass_context
         @wraps(command)
-        def wrapped(
-            context: click.Context,
-            output: Path,
-            iterations: int,
-            seed: int,
-            backend: str | None,
-            quiet: bool,
-            data: Path | None = None,
-            images: int = 0,
-            names: tuple[str, ...] = (),
-            **settings: Any,
-        ) -> None:
-            chosen_sets(names if data is None else (), data)
+        def wrapped(context: click.Context, output: Path, quiet: bool, **settings: Any) -> None:
+            shared = {name: settings.pop(name) for name in Task._fields if name in settings}
+            if not shared.get("data") and set(settings.get("names", ())) - {SAMPLES}:
+                raise ValueError("--set needs DATA, the folder of the set, for all but samples")
             output.mkdir(parents=True, exist_ok=True)
             check_outputs([output / file], [])
-            select(backend)
-            run = about(context, backend)
+            select(shared["backend"])
+            run = about(context, shared["backend"])
             if note := other_code(output / file, run):
                 say(f"note: {note}")
             with progress_bar(quiet) as show:
-                task = Task(output, data, run, images, iterations, seed, backend, show)
-                told = command(task, names=names, **settings)
-            save(told, output, quiet)
+                task = Task(output, run, progress=show, **shared)
+                section = command(task, **settings)
+            save(section, output, quiet)
 
-        steps = count_option("--iterations", iterations, "Steps of every fit, or the most.", least)
-        options = (output_option, steps, seed_option, backend_option, quiet_option)
-        return _chain(*options, click.pass_context)(wrapped)
+        return wrapped
 
     return decorate
 
 
-def save(told: Any, output: Path, quiet: bool) -> None:
-    """Write charts as SVG and their points as CSV into a folder; print the tables."""
+def save(section: Any, output: Path, quiet: bool) -> None:
+    """Write the charts of a section as SVG into a folder; print its tables."""
     from eigengs_bench.report.charts import save_figure
     from eigengs_bench.report.frames import as_text
-    from eigengs_dr.storage.atomic import atomic_write
 
-    for name, (_, figure) in told.charts.items():
+    for name, (_, figure) in section.charts.items():
         save_figure(output / f"{name}.svg", figure)
-    for name, points in told.points.items():
-        with atomic_write(output / f"{name}.csv") as temporary:
-            points.to_csv(temporary, index=False)
     if not quiet:
-        click.echo("\n\n".join(map(as_text, told.tables)))
-        click.echo("".join(f"\nchart: {output / name}.svg" for name in told.charts))
+        click.echo("\n\n".join(map(as_text, section.tables)))
+        click.echo("".join(f"\nchart: {output / name}.svg" for name in section.charts))
 
 
 def prints_figures(command: Callable[..., Any]) -> Any:
     """Make a function into a command that prints the figures that it returns, and reports them.
 
-    It is called with ``show``, see `progress_bar`, and returns the backend, settings and figures.
+    The command calls it with ``show``, see `progress_bar`. A text beside the figures replaces them.
     """
 
+    @options.report_option
+    @options.quiet_option
+    @click.pass_context
     @wraps(command)
     def wrapped(context: click.Context, report: Path | None, quiet: bool, **settings: Any) -> None:
         check_outputs([report], [])
+        backend = settings.get("backend", settings.get("variant", "").split("_")[0] or None)
+        select(backend)
         with progress_bar(quiet) as show:
-            backend, told, figures = command(show=show, **settings)
+            figures, text = command(show=show, **settings)
         if report:
-            write_report(report, {**about(context, backend), **told, **figures})
+            write_report(report, {**about(context, backend), **figures})
         if not quiet:
-            click.echo("\n".join(f"{key:24} {value:.4g}" for key, value in figures.items()))
+            click.echo(text or "\n".join(f"{k:24} {value:.4g}" for k, value in figures.items()))
 
-    return _chain(report_option, quiet_option, click.pass_context)(wrapped)
-
-
-def _chain(*decorators: Any) -> Callable[[Any], Any]:
-    """Join decorators of click, the first outermost."""
-
-    def decorate(command: Any) -> Any:
-        for decorator in reversed(decorators):
-            command = decorator(command)
-        return command
-
-    return decorate
+    return wrapped

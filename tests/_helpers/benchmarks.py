@@ -35,7 +35,7 @@ def run(*arguments):
 
 def task_in(folder, backend=None, data=None, **settings):
     """A task whose rows are of `RUN`."""
-    return Task(Path(folder), data, RUN, backend=backend, **settings)
+    return Task(Path(folder), RUN, data, backend=backend, **settings)
 
 
 def make_sets(folder, monkeypatch, names=("faces256", "natural256"), gaussians=60):

@@ -10,9 +10,9 @@ from _helpers.benchmarks import family, run, small_model
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 dr = pytest.importorskip("drjit")
 
-from eigengs_bench.experiments import inverse, inverse_representations  # noqa: E402
+from eigengs_bench.experiments import inverse  # noqa: E402
 from eigengs_bench.experiments import inverse_scene as scenery  # noqa: E402
-from eigengs_bench.experiments.inverse_representations import COEFFICIENTS, METHODS, coefficients  # noqa: E402
+from eigengs_bench.experiments.inverse_scene import COEFFICIENTS, METHODS, coefficients  # noqa: E402
 from eigengs_bench.names import CONDITIONS  # noqa: E402
 from eigengs_dr.eigenbasis.eigengs import EigenGS  # noqa: E402
 from eigengs_dr.image.color import to_linear  # noqa: E402
@@ -95,7 +95,7 @@ def test_coefficients_find_a_member_of_the_family(basis):
 
 
 def test_gaussians_go_on_from_the_coefficients(basis, monkeypatch):
-    monkeypatch.setattr(inverse_representations, "FIRST_STAGE", 0.2)  # 4 of 20 steps
+    monkeypatch.setattr(scenery, "FIRST_STAGE", 0.2)  # 4 of 20 steps
     trace = recovered(basis, "both", 20)
     first = trace.psnr_ycbcr[trace.steps.index(4)]
     assert trace.steps[-1] == 20

@@ -1,6 +1,5 @@
 """Speed against accuracy: the front, what is measured, and how it is shown."""
 
-import csv
 import json
 
 import numpy as np
@@ -8,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from _helpers.benchmarks import RUN, lines_of, make_sets, one_image, run, small_model, task_in
+from _helpers.benchmarks import RUN, lines_of, one_image, run, small_model, task_in
 from eigengs_bench.experiments import kernels, pareto
 from eigengs_bench.experiments.pareto import Variant
 from eigengs_bench.harness.timing import follow
 from eigengs_bench.report.frames import frame_of
-from eigengs_bench.report.sections.pareto import front, points_of, tell
+from eigengs_bench.report.sections.pareto import front, points_of, summarize
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.fit import fit
@@ -49,11 +48,8 @@ def test_variants_turn_one_setting_each(tmp_path, monkeypatch):
                 assert sum(a != b for a, b in zip(v[2:], base[2:], strict=True)) == 1
         else:
             assert v.preset == ("eigengs" if v.knob == "components" else v.value)
-    assert {v.basis for v in others if v.knob == "components"} == {
-        "model 50",
-        "model 100",
-        "model 500",
-    }
+    models = {v.basis for v in others if v.knob == "components"}
+    assert models == {"model 50", "model 100", "model 500"}
     assert others[1].basis == "model 300" and {v.preset for v in others} == set(PRESETS)
 
 
@@ -65,9 +61,8 @@ def shorter(monkeypatch):
 
 def test_every_horizon_of_falling_rates_is_a_run_of_its_own(shorter, backend, tmp_path):
     image = one_image()
-    row = pareto.trace(
-        task_in(tmp_path, backend, iterations=12), Variant("preset", "default", 100), image
-    )
+    task = task_in(tmp_path, backend, iterations=12)
+    row = pareto.trace(task, Variant("preset", "default", 100), image)
     assert [figures["iteration"] for figures in row["trace"]] == [0, 4, 12]
     assert row["gaussians"] == 100
     for figures in row["trace"]:
@@ -133,12 +128,8 @@ def test_the_error_of_a_cutoff_is_what_it_leaves_out(small_kernels, monkeypatch,
     arrays = kernels.random_scene(types_in(select(backend))).to_arrays()
     order = ("mean", "factor", "color", "background")
     whole, cut = (render_exact(*map(arrays.get, order), 64, 64, cut) for cut in (np.inf, 3.5))
-    assert [(row["renderer"], row["cutoff"]) for row in rows] == [
-        ("fast", 2.5),
-        ("plain", 2.5),
-        ("fast", 3.5),
-        ("plain", 3.5),
-    ]
+    order = [(row["renderer"], row["cutoff"]) for row in rows]
+    assert order == list(zip(2 * ["fast", "plain"], [2.5, 2.5, 3.5, 3.5], strict=True))
     for row in rows[2:]:
         assert row["largest_error"] == pytest.approx(np.abs(whole - cut).max(), rel=1e-3)
         rms = np.sqrt(np.mean((whole - cut) ** 2))
@@ -181,18 +172,11 @@ def test_points_are_medians_of_seconds_and_means_of_decibels():
 
 
 def test_tables_tell_what_is_on_the_front():
-    told = tell(made_rows())
+    told = summarize(made_rows())
     (table,) = told.tables
-    assert lines_of(table)[0] == (
-        "preset default",
-        "2.000 (1.500-2.500)",
-        "31.0 ± 1.4",
-        "5.00 (3.50-6.50)",
-        "42.0 ± 2.8",
-        "36.0 ± 2.8",
-        "41.0 ± 2.8",
-        "9",
-        "0, 9",
+    assert " | ".join(lines_of(table)[0]) == (
+        "preset default | 2.000 (1.500-2.500) | 31.0 ± 1.4 | 5.00 (3.50-6.50) | 42.0 ± 2.8 | "
+        "36.0 ± 2.8 | 41.0 ± 2.8 | 9 | 0, 9"
     )
     assert lines_of(table)[1][0] == "cutoff 2.5" and lines_of(table)[1][-2:] == ("-", "-")
     assert list(told.charts) == ["pareto-cats"]
@@ -216,25 +200,12 @@ def test_the_command_measures_draws_and_goes_on(small, backend, tmp_path):
     assert told.exit_code == 0, told.output
     for text in ("preset eigengs", "cutoff 2.5", "samples float16", "plain 3.5", "samples.svg"):
         assert text in told.stdout
-    files = ["pareto.jsonl", "pareto-samples.csv"]
+    files = ["pareto.jsonl"]
     files += [f"pareto-{name}.svg" for name in ("samples", "storage", "kernels")]
     kept = {name: (out / name).read_bytes() for name in files}
     rows = [json.loads(line) for line in kept["pareto.jsonl"].splitlines()]
     assert len(rows) == 3 + 2
     assert {(row["job"]["seed"], row["job"]["iterations"]) for row in rows[:-1]} == {(0, 3)}
-    points = list(csv.DictReader(kept["pareto-samples.csv"].decode().splitlines()))
-    assert {"1"} <= {point["front"] for point in points} <= {"0", "1"}
-    assert points[0]["iteration"] == "0"
     assert b"front: none is better" in kept["pareto-samples.svg"]
     assert run("bench", "pareto", *arguments).stdout == told.stdout
     assert kept == {name: (out / name).read_bytes() for name in files}
-
-
-def test_sets_bring_their_models(monkeypatch, backend, tmp_path):
-    data = make_sets(tmp_path / "data", monkeypatch, ["faces256"], 100)
-    monkeypatch.setattr(pareto, "DEFAULT_COMPONENTS", 4)
-    monkeypatch.setattr(pareto, "COMPONENTS", (2, 6))
-    fits = {v[:2]: v for v in pareto.variants(task_in(tmp_path, backend, data), "faces256")}
-    assert fits["preset", "eigengs"].basis.components == (4, 4, 4)
-    assert fits["components", 6].basis.components == (6, 6, 6)
-    assert fits["preset", "default"].gaussians == 100

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from _helpers.benchmarks import RUN, broken_off, lines_of, one_image, run, task_in
-from eigengs_bench.experiments import levels, rate
+from eigengs_bench.experiments import rate
 from eigengs_bench.harness import datasets
 from eigengs_bench.report.sections import rate as rates
 from eigengs_dr.fitting.fit import fit
@@ -75,7 +75,7 @@ def rate_rows():
 
 
 def test_rates_tell_ratios_and_where_they_are_missing():
-    (table,) = rates.tell(list(rate_rows())).tables
+    (table,) = rates.summarize(list(rate_rows())).tables
     cells = {row[0]: row[1:] for row in lines_of(table)}
     # 32 dB is half way: sqrt(1 * 4) and 3 times that; 2 * 4^(6 / 8) for WebP on the second.
     assert cells[rate.OURS][1] == "4.00" and cells[rate.OURS][3].startswith("3.00")
@@ -86,7 +86,7 @@ def test_rates_tell_ratios_and_where_they_are_missing():
 
 
 def test_rate_charts_show_the_means_of_the_images():
-    _, figure = rates.tell(list(rate_rows())).charts["rate-made"]
+    _, figure = rates.summarize(list(rate_rows())).charts["rate-made"]
     left, right = figure.axes
     lines = {line.get_label(): line.get_xydata() for line in left.lines}
     np.testing.assert_allclose(lines[rate.OURS], [[2.0, 26.0], [8.0, 38.0]])
@@ -124,11 +124,3 @@ def test_levels_tell_what_prefixes_are_worth(tmp_path, backend):
     assert float(lines[-1]["alone"]) == pytest.approx(float(lines[-1]["sorted"]), abs=1e-4)
     assert float(lines[0]["levels"]) > float(lines[0]["sorted"])
     assert "4 *" in done.stdout and (out / "levels.svg").stat().st_size > 1000
-
-
-def test_levels_end_with_a_fit_that_was_broken_off(tmp_path, monkeypatch):
-    monkeypatch.setattr(levels, "fit_levels", broken_off)
-    save_image(tmp_path / "a.png", one_image())
-    arguments = ("-o", tmp_path / "out", "--gaussians", 16, "--levels", 2)
-    assert run("bench", "levels", tmp_path / "a.png", *arguments).exit_code == 130
-    assert not list((tmp_path / "out").iterdir())

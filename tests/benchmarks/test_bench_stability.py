@@ -5,14 +5,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from _helpers.benchmarks import RUN, cell_row, lines_of, run
+from _helpers.benchmarks import RUN, cell_row, lines_of, run, task_in
 from eigengs_bench.experiments import stability
 from eigengs_bench.experiments import stability_cases as cases
 from eigengs_bench.experiments.stability_cases import CASES, Case, flat, heap, outside, photo
 from eigengs_bench.harness.store import read
 from eigengs_bench.harness.tiling import smooth_regions, tiling
 from eigengs_bench.names import PRESETS as NAMES
-from eigengs_bench.report.sections.stability import defects, tell
+from eigengs_bench.report.sections.stability import defects, summarize
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.gaussian.covariance import condition_number
 from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
@@ -113,7 +113,7 @@ def test_given_shapes_are_started_from(backend, preset):
 def test_what_a_preset_cannot_do_is_said():
     case = Case("thin", partial(photo, 70, 71))
     found = stability.measure_cell(case, "eigengs", 0, None)
-    assert found == {"needs": "a basis with at most 4970 splats"}
+    assert found == {"needs": "a basis with at most 4970 Gaussians"}
 
 
 def test_a_set_that_is_not_finite_is_seen(backend):
@@ -128,9 +128,11 @@ def test_a_set_that_is_not_finite_is_seen(backend):
     assert not stability._score(moments, image)["finite"]
 
 
-def test_a_case_alone_tells_its_memory(backend, monkeypatch):
+def test_a_case_alone_tells_its_memory(backend, monkeypatch, tmp_path):
     monkeypatch.setattr(stability, "_peak", lambda: -1.0)  # of this process
-    [(name, work)] = stability.jobs([small(alone=True)], ["default"], 3, backend)
+    [(name, work)] = stability.jobs(
+        task_in(tmp_path, backend, seed=3), [small(alone=True)], ["default"]
+    )
     assert name == {"case": "small", "preset": "default", "seed": 3, "iterations": 3}
     assert 0.02 < work()["peak_gib"] < 50
 
@@ -148,8 +150,7 @@ def test_defects_are_named():
         cell_row("thin", needs="more"),
     ]
     assert defects(rows) == ["worse: ends 0.50 dB below its start", "lost: not finite"]
-    assert defects(rows, "eigengs") == ["other: ends 20.00 dB below its start"]
-    assert lines_of(tell(rows).tables[-1]) == [(line,) for line in defects(rows)]
+    assert lines_of(summarize(rows).tables[-1]) == [(line,) for line in defects(rows)]
 
 
 def test_tables_show_presets_side_by_side():
@@ -163,7 +164,7 @@ def test_tables_show_presets_side_by_side():
         cell_row("thin", needs="a basis"),
     ]
     rows[-1]["job"]["iterations"] = 2000
-    ends, rgb, drop, half, condition, _, cost, wrong = tell(rows).tables
+    ends, rgb, drop, half, condition, _, cost, wrong = summarize(rows).tables
     assert ends.caption.endswith(
         "; 100 or 2,000 steps [rows of different code: commit aaaaaaaaa; commit bbbbbbbbb]"
     )
@@ -216,8 +217,6 @@ def test_errors_at_edges_do_not_count():
 def test_where_nothing_is_smooth_there_is_no_figure():
     image = np.indices((32, 32)).sum(axis=0)[..., None] % 2 * np.ones(3)
     assert np.isnan(tiling(image, image))
-    with pytest.raises(ValueError, match="differ"):
-        tiling(image[:8], image)
 
 
 # --- The command ---
@@ -230,7 +229,7 @@ def test_the_command_writes_rows_tables_and_tiles(monkeypatch, tmp_path):
     arguments = ("-o", folder, "--case", "smooth", "--case", "photo", "--iterations", 2)
     told = run("bench", "stability", *arguments)
     assert told.exit_code == 0, told.output
-    for word in ("smooth", "photo", *NAMES, "needs a basis with at most 384 splats", "2 steps"):
+    for word in ("smooth", "photo", *NAMES, "needs a basis with at most 384 Gaussians", "2 steps"):
         assert word in told.stdout
     assert (folder / "stability-tiles.png").stat().st_size > 10_000
     rows = read(folder / "stability.jsonl")

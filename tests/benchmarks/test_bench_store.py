@@ -7,16 +7,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from _helpers.benchmarks import RUN, fit_row, moment, run, task_in
+from _helpers.benchmarks import RUN, fit_row, moment, run
 from eigengs_bench.harness import store
 from eigengs_bench.report.frames import (
     as_text,
-    code_remark,
     counted,
+    extent,
     frame_of,
     number,
     quartiles,
-    span,
+    remark,
     spread,
     table,
 )
@@ -99,12 +99,11 @@ def test_a_table_says_when_its_rows_are_of_different_code():
         " [rows of different code: commit aaaaaaaaa; commit bbbbbbbbb]": [RUN, OTHER, RUN],
         " [rows of code that is in no commit: commit aaaaaaaaa with uncommitted changes]": [DIRTY],
     }
-    for remark, runs in said.items():
-        assert code_remark([{"run": run} for run in runs]) == remark
+    for text, runs in said.items():
         codes = frame_of([{"job": {}, "run": run} for run in runs]).code
-        assert table("It", ("a",), [("1",)], codes).caption == "It" + remark
-    assert "version 0.1.0, commit unknown" in code_remark(
-        [{"run": {**RUN, "commit": None}}, {"run": RUN}]
+        assert table("It", ("a",), [("1",)], codes).caption == "It" + text
+    assert "version 0.1.0, commit unknown" in remark(
+        [store.code_name({**RUN, "commit": None}), store.code_name(RUN)]
     )
 
 
@@ -143,9 +142,9 @@ def test_cells():
     assert spread(pd.Series([1.0])) == "1.0"
     assert quartiles(pd.Series([1.0, 2.0, 3.0, 4.0, 5.0])) == "3.00 (2.00-4.00)"
     assert quartiles(pd.Series([1.0]), 3) == "1.000"
-    assert span(pd.Series([12.0, 37.0, 55.0]), 0) == ("37", "12 to 55")
-    assert span(pd.Series([], dtype=float), 0) == ("-", "-")
-    assert (counted(1), counted(3)) == ("1 image", "3 images")
+    assert extent(pd.Series([12.0, 37.0, 55.0]), 0) == "12 to 55"
+    assert extent(pd.Series([], dtype=float), 0) == "-"
+    assert (counted(pd.Series([1, 1])), counted(pd.Series([1, 2]))) == ("1 image", "2 images")
     shown = table("It", ("name", "dB"), [("one", "1.00"), ("eleven", "11.50")])
     assert as_text(shown).split("\n")[2:] == [
         "name       dB",
@@ -211,8 +210,3 @@ def test_sets_need_data(tmp_path):
     for wrong in ("0", "101", "nan"):
         assert run("bench", "budget", "-o", tmp_path / "x", "--target", wrong).exit_code == 2
     assert not (tmp_path / "out").exists()
-
-
-def test_a_task_measures_into_its_folder(tmp_path):
-    (row,) = task_in(tmp_path).measure("x.jsonl", jobs([], "a"), "label")
-    assert store.read(tmp_path / "x.jsonl") == [row]

@@ -1,4 +1,4 @@
-"""No more splats than needed: fits of fixed numbers, and what the search for the fewest finds.
+"""The fewest Gaussians for a PSNR: of fits of fixed numbers, and of the search.
 
 The job of a fit has "gaussians" and "rearranged", and its row the figures of `score`. The job of a
 search has "target", and its row gaussians, stopped, iterations, seconds, psnr_ycbcr and psnr_rgb.
@@ -20,21 +20,19 @@ from eigengs_dr.fitting.options import FitOptions, max_gaussians_for
 
 FILE = "budget.jsonl"
 
-SPARSEST = 1024  # pixels a splat of the smallest fixed number
+SPARSEST = 1024  # pixels a Gaussian of the smallest fixed number
 STEPS_AN_OCTAVE = 2  # fixed numbers from one to twice as many, at least
 
 
 def run(task: Task, names: Sequence[str], targets: Sequence[float]) -> list[Row]:
-    """Measure sets, image by image; a fit that two of the `parts` need is in the rows twice."""
+    """Measure sets, image by image; a fit that two parts need is in the rows twice."""
     found: list[Row] = []
     for name in names:
         pictures = images_of(task, name)
         total, done = len(pictures) * (3 * len(targets) + 2), 0
         for file, image in pictures:
-            about = {"set": name, "image": file, "iterations": task.iterations, "seed": task.seed}
             count = min(usual_count(name), image.shape[0] * image.shape[1])
-            measured = _measured(task, about, image)
-            for part in parts(grid(image), targets, count, *measured):
+            for part in _parts(task, {"set": name, "image": file}, image, targets, count):
                 found += part
                 done += 1
                 task.progress(name, done, total)
@@ -42,40 +40,17 @@ def run(task: Task, names: Sequence[str], targets: Sequence[float]) -> list[Row]
 
 
 def grid(image: Image) -> list[int]:
-    """Fixed numbers of splats: from one for `SPARSEST` pixels to the most that a search uses."""
+    """Fixed numbers of Gaussians: from one for `SPARSEST` pixels to the most of a search."""
     most = max_gaussians_for(image)
     least = min(most, math.ceil(image.shape[0] * image.shape[1] / SPARSEST))
     steps = math.ceil(STEPS_AN_OCTAVE * math.log2(most / least))
     return sorted({round(count) for count in np.geomspace(least, most, steps + 1)})
 
 
-def parts(
-    counts: Sequence[int],
-    targets: Sequence[float],
-    usual: int,
-    fitted: Callable[[int, bool], Row],
-    searched: Callable[[float], Row],
-) -> Iterator[list[Row]]:
-    """Compare on one image, and yield the rows of each of ``3 len(targets) + 2`` parts.
-
-    For every target the fits of fixed numbers around it, without placing anew; then for every
-    target the search, and a fit of the number that it found; then fits of the usual number without
-    and with placing anew.
-    """
-    for target in targets:
-        yield bisect(counts, target, lambda count: fitted(count, False))
-    for target in targets:
-        search = searched(target)
-        yield [search]
-        yield [fitted(search["gaussians"], True)]
-    yield [fitted(usual, False)]
-    yield [fitted(usual, True)]
-
-
 def bisect(counts: Sequence[int], target: float, fitted: Callable[[int], Row]) -> list[Row]:
     """Fit until two neighbours are known, of which the first misses a target and the second not.
 
-    Or the smallest number, if that reaches it; or the largest, if that does not. Searches for
+    Or the smallest number, if it reaches the target; or the largest, if it does not. Searches for
     several targets begin with the same numbers.
     """
     looked: list[Row] = []
@@ -88,33 +63,42 @@ def bisect(counts: Sequence[int], target: float, fitted: Callable[[int], Row]) -
     return looked
 
 
-def _measured(
-    task: Task, about: Row, image: Image
-) -> tuple[Callable[[int, bool], Row], Callable[[float], Row]]:
-    """Functions that measure on one image what the file does not hold yet."""
-    quiet = task._replace(progress=lambda *_: None)
+def _parts(
+    task: Task, about: Row, image: Image, targets: Sequence[float], usual: int
+) -> Iterator[list[Row]]:
+    """Yield the rows of one image, ``3 len(targets) + 2`` parts: what the file lacks is measured.
 
-    def fitted(count: int, rearranged: bool) -> Row:
+    For every target the fits of fixed numbers around it, without placing anew; then for every
+    target the search, and a fit of the number that it found; then fits of the usual number without
+    and with placing anew.
+    """
+    quiet = task._replace(progress=lambda *_: None)
+    about = {**about, "iterations": task.iterations, "seed": task.seed}
+
+    def fitted(count: int, rearranged: bool = False) -> Row:
         job = {**about, "gaussians": count, "rearranged": rearranged}
         return quiet.measure(FILE, [(job, partial(_fit, task, image, count, rearranged))], "")[0]
 
-    def searched(target: float) -> Row:
+    for target in targets:
+        yield bisect(grid(image), target, fitted)
+    for target in targets:
         job = {**about, "target": float(target)}
-        return quiet.measure(FILE, [(job, partial(_search, task, image, target))], "")[0]
-
-    return fitted, searched
+        found = quiet.measure(FILE, [(job, partial(_search, task, image, target))], "")
+        yield found
+        yield [fitted(found[0]["gaussians"], True)]
+    yield [fitted(usual)]
+    yield [fitted(usual, True)]
 
 
 def _fit(task: Task, image: Image, count: int, rearranged: bool) -> Row:
     options = FitOptions(gaussians=count, seed=task.seed, backend=task.backend)
-    schedule = options.method.schedule
 
     def start() -> FitProblem:
         begun = initialize(image, options)
         return begun if rearranged else begun._replace(redistribute=None)
 
-    warm_up(start, schedule, task.iterations)
-    (moment,) = follow(start, schedule, task.iterations, (task.iterations,))
+    warm_up(start, options.method.schedule, task.iterations)
+    (moment,) = follow(start, options.method.schedule, task.iterations, (task.iterations,))
     return score(moment, image)
 
 
@@ -124,9 +108,6 @@ def _search(task: Task, image: Image, target: float) -> Row:
     found = search(iterations=task.iterations)
     return {
         "gaussians": len(found.gaussians),
-        "stopped": found.stopped,
-        "iterations": found.iterations,
-        "seconds": found.seconds,
-        "psnr_ycbcr": decibels(found.image, image, "ycbcr"),
-        "psnr_rgb": decibels(found.image, image, "rgb"),
+        **{key: getattr(found, key) for key in ("stopped", "iterations", "seconds")},
+        **{f"psnr_{space}": decibels(found.image, image, space) for space in ("ycbcr", "rgb")},
     }

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import render
 
-SOLVE_STEPS = 10  # steps of conjugate gradients, those of `eigengs_dr.fit`
+SOLVE_STEPS = 10  # steps of conjugate gradients, as in `eigengs_dr.fit`
 PLACED = ("grid", "adaptive")  # starts that look at the image alone
 
 
@@ -29,7 +30,7 @@ def run(
     iterations: int = 100,
     progress: Progress = lambda *_: None,
 ) -> dict[str, float]:
-    """Compare starts of a fit: those of a model, and as many splats placed by the image alone.
+    """Compare starts of a fit: by a model, and by the image alone, with as many Gaussians.
 
     For every start S, ``S_psnr_ycbcr`` and ``S_psnr_rgb`` in dB are means over the images, and
     ``S_seconds`` medians, the start included. S is "projected" or "exact" (`EigenGS.encode`),
@@ -50,7 +51,6 @@ def run(
 
 
 def _measure(model: EigenGS, image: Image, iterations: int) -> Any:
-    """Names and figures of one image."""
     space = model.gaussians.space
     target = rgb_to_ycbcr(image) if space == "ycbcr" else image
     for colors in ("exact", "projected"):
@@ -58,13 +58,11 @@ def _measure(model: EigenGS, image: Image, iterations: int) -> Any:
         model.encode(image, colors)
         yield f"encode_{colors}_ms", 1e3 * (time.perf_counter() - started)
 
-    def solved() -> Gaussians:
-        return solve(model.encode(image, "projected"), target, SOLVE_STEPS, warm_start=True)[0]
-
+    projected = partial(model.encode, image, "projected")
     starts: dict[str, Callable[[], Gaussians]] = {
-        "projected": lambda: model.encode(image, "projected"),
-        "exact": lambda: model.encode(image),
-        "solved": solved,
+        "projected": projected,
+        "exact": partial(model.encode, image),
+        "solved": lambda: solve(projected(), target, SOLVE_STEPS, warm_start=True)[0],
     }
     schedule = PRESETS["default"].schedule
     for name, start in starts.items():

@@ -1,4 +1,4 @@
-"""The pictures of the paper: which there are, what they need, and the list of them."""
+"""The pictures of the paper: what they need, and the list of them."""
 
 import json
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -8,24 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from eigengs_bench.experiments.figure_strips import (
-    COMPONENTS,
-    METHODS,
-    Figure,
-    colors,
-    cross,
-    descent,
-    is_present,
-    iterations,
-    split,
-    to_size,
-)
+from eigengs_bench.experiments import figure_strips as strips
+from eigengs_bench.experiments.figure_strips import METHODS, Figure, is_present, to_size
 from eigengs_bench.harness.datasets import images_of, model_for
-from eigengs_bench.harness.store import Job, Row, Task, today
+from eigengs_bench.harness.store import Job, Row, Task, code_name, today
 from eigengs_bench.harness.timing import Image
 from eigengs_bench.names import CATS, FIGURES, NATURAL
 from eigengs_bench.report.charts import curves_chart, radii_chart, save_figure
-from eigengs_bench.report.frames import code_remark
+from eigengs_bench.report.frames import remark
 from eigengs_dr.cli.report import write_report
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.eigenbasis.registry import load_basis
@@ -50,13 +40,14 @@ def run(
 ) -> list[Figure]:
     """Draw figures into a folder, by default all, and list them in its ``figures.json``.
 
-    `note` is told in one line which ones are left out because they show image sets that are not
-    there. `ValueError` if nothing can be drawn.
+    `note` takes one line on figures that are left out because their image sets are not there.
+    `ValueError` if nothing can be drawn.
     """
-    listed = read_list(task.folder / LIST)  # a damaged list is told now, not after minutes
-    studies = dict(zip(FIGURES, (iterations, colors, curves, radii, split, cross), strict=True))
+    listed = read_list(task.folder / LIST)  # a damaged list is an error now, not after minutes
+    makers = strips.iterations, strips.colors, curves, radii, strips.split, strips.cross
+    studies = dict(zip(FIGURES, makers, strict=True))
     wanted = [name for name in FIGURES if not names or name in names]
-    drawn = [name for name in wanted if name in ("iterations", "colors") or _has_sets(task, name)]
+    drawn = [name for name in wanted if _has_sets(task, name)]
     if left := [name for name in wanted if name not in drawn]:
         where = f"no such sets in {task.data}" if task.data else "no folder DATA was named"
         note(f"left out: {', '.join(left)}: {where}")
@@ -64,17 +55,17 @@ def run(
         raise ValueError("no figure can be drawn without image sets; --figure colors needs none")
     made = [figure for name in drawn for figure in studies[name](task)]
     fresh = [{**figure._asdict(), "run": {"date": today(), **task.run}} for figure in made]
-    kept = [entry for entry in listed if entry["name"] not in drawn]
-    entries = sorted(kept + fresh, key=lambda entry: FIGURES.index(entry["name"]))
+    entries = [entry for entry in listed if entry["name"] not in drawn] + fresh
+    entries.sort(key=lambda entry: FIGURES.index(entry["name"]))
     write_report(task.folder / LIST, {"figures": entries})
     return made
 
 
 def _has_sets(task: Task, name: str) -> bool:
-    """Whether the sets that a figure shows are there; of curves, any."""
     if name == "curves":
         return any(is_present(task, panel) for panel in PANELS)
-    return all(is_present(task, used) for used in ((CATS, NATURAL) if name == "cross" else (CATS,)))
+    needed = {"radii": [CATS], "split": [CATS], "cross": [CATS, NATURAL]}.get(name, [])
+    return all(is_present(task, used) for used in needed)
 
 
 def read_list(path: Path) -> list[Row]:
@@ -93,8 +84,7 @@ def curves(task: Task) -> Iterator[Figure]:
     marks = sorted({*range(0, task.iterations + 1, EVERY), task.iterations})
     panels, rows = dict[str, dict[str, list[float]]](), list[Row]()
     for name in (name for name in PANELS if is_present(task, name)):
-        jobs = _curve_jobs(task, name, marks)
-        measured = task.measure(FILE, jobs, f"curves of {name}")
+        measured = task.measure(FILE, _curve_jobs(task, name, marks), f"curves of {name}")
         rows += measured
         panels[PANELS[name]] = {
             preset: _mean([row for row in measured if row["job"]["preset"] == preset])
@@ -105,16 +95,17 @@ def curves(task: Task) -> Iterator[Figure]:
     caption = (
         f"PSNR in YCbCr every {EVERY} iterations, mean of up to {task.images} test images a set. "
         "eigengs starts from a basis of each set's own training images, for Kodak from the one "
-        f"that ships.{code_remark(rows)}"
+        f"that ships.{remark(code_name(row['run']) for row in rows)}"
     )
     yield Figure("curves", "curves.svg", caption)
 
 
 def _curve_jobs(task: Task, name: str, marks: Sequence[int]) -> Iterator[Job]:
     settings = {"iterations": task.iterations, "every": EVERY, "seed": task.seed}
-    model = load_basis("natural", task.backend)
-    if name != "kodak":
-        model = model_for(task, name, name, COMPONENTS)
+    if name == "kodak":
+        model = load_basis("natural", task.backend)
+    else:
+        model = model_for(task, name, name, strips.COMPONENTS)
     for file, image in images_of(task, name):
         for preset in METHODS:
             label = {"set": name, "image": file, "preset": preset, **settings}
@@ -122,7 +113,7 @@ def _curve_jobs(task: Task, name: str, marks: Sequence[int]) -> Iterator[Job]:
 
 
 def _curve(task: Task, image: Image, model: EigenGS, preset: str, marks: Sequence[int]) -> Row:
-    moments = descent(task, image, model, preset, marks)
+    moments = strips.preset_descent(task, image, model, preset, marks)
     return {"psnr_ycbcr": [psnr(moment.picture, image, "ycbcr") for moment in moments]}
 
 
@@ -132,14 +123,14 @@ def _mean(measured: list[Row]) -> list[float]:
 
 
 def radii(task: Task) -> Iterator[Figure]:
-    """Draw how large splats are, with and without the split by frequency: the paper's figure."""
+    """Draw how large Gaussians are, with and without the split by frequency, as in the paper."""
     images, panels = images_of(task, CATS), {}
     for whole, title in ((False, "no split"), (True, "frequency-aware split")):
-        model = model_for(task, CATS, CATS, COMPONENTS, split=whole)
+        model = model_for(task, CATS, CATS, strips.COMPONENTS, split=whole)
         found = []
         for done, (_, image) in enumerate(images):
             task.progress(f"radii, {title}", done, len(images))
-            *_, last = descent(task, image, model, "eigengs", [task.iterations])
+            *_, last = strips.preset_descent(task, image, model, "eigengs", [task.iterations])
             found.append(radii_of(last.gaussians))
         panels[title] = np.split(np.stack(found), [model.low], axis=1)
     save_figure(task.folder / "radii.svg", radii_chart(panels))
@@ -152,6 +143,6 @@ def radii(task: Task) -> Iterator[Figure]:
 
 
 def radii_of(gaussians: Gaussians) -> NDArray[np.float64]:
-    """Geometric mean of the standard deviations of every splat, in pixels, shape (N,)."""
+    """Geometric mean of the standard deviations of every Gaussian, in pixels, shape (N,)."""
     factor = gaussians.to_arrays()["factor"].astype(np.float64)
     return 1 / np.sqrt(factor[:, 0] * factor[:, 2])  # det F = a c

@@ -4,15 +4,16 @@ import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from eigengs_bench.experiments.inverse_representations import METHODS
 from eigengs_bench.experiments.inverse_scene import (
     CONDITIONS,
+    METHODS,
     Condition,
     head_on,
     photograph,
@@ -73,19 +74,15 @@ def run(
     square = center_crop(image, *2 * [min(image.shape[:2])])
     results = {}
     for name in conditions:
-        condition = CONDITIONS[name]
-        photos, texture = photograph(condition, square)
+        photos, texture = photograph(CONDITIONS[name], square)
         truth = head_on(texture, *size)
         traces = {}
         for method, stages in METHODS.items():
-
-            def told(step: int, trace: Trace, label: str = f"{name}, {method}") -> None:
-                progress(label, step, steps, {"psnr_rgb": trace.psnr_rgb[-1]})
-
+            tell = partial(progress, f"{name}, {method}")
             # Once for the kernels, which are compiled and kept, and once for the figures.
-            recover(condition, photos, stages(model, file, 2), truth, 2)
+            recover(CONDITIONS[name], photos, stages(model, file, 2), truth, 2)
             found = stages(model, file, steps)
-            traces[method] = recover(condition, photos, found, truth, steps, told)
+            traces[method] = recover(CONDITIONS[name], photos, found, truth, steps, tell)
         results[name] = Result(photos.numpy(), truth, traces)
     return results
 
@@ -96,12 +93,11 @@ def recover(
     stages: Iterable[tuple[Any, int]],
     truth: Image,
     steps: int,
-    told: Callable[[int, Trace], None] = lambda step, trace: None,
+    progress: Callable[..., None] = lambda *_: None,
 ) -> Trace:
     """Run the stages of a method: descent by Adam on squared errors of the rendering.
 
-    A stage is a representation and the step at which it ends. The next one is asked for then, so
-    that it can go on from there. ``told(step, trace)`` is called after every step.
+    A stage is a representation and the step at which it ends; the next one starts from it.
     """
     trace, step, measuring, started = Trace(), 0, 0.0, time.perf_counter()
 
@@ -112,8 +108,8 @@ def recover(
         picture = head_on(texture, truth.shape[1], truth.shape[0])
         trace.steps.append(step)
         trace.seconds.append(now - started - measuring)
-        trace.psnr_ycbcr.append(psnr(picture, truth, "ycbcr"))
-        trace.psnr_rgb.append(psnr(picture, truth, "rgb"))
+        for space, values in (("ycbcr", trace.psnr_ycbcr), ("rgb", trace.psnr_rgb)):
+            values.append(psnr(picture, truth, space))
         if step in (*STRIP, steps):
             trace.pictures[step] = picture
         measuring += time.perf_counter() - now
@@ -141,7 +137,7 @@ def recover(
             step += 1
             if step in marks(steps):
                 measure(unknown.texture)
-            told(step, trace)
+            progress(step, steps, {"psnr_rgb": trace.psnr_rgb[-1]})
     return trace
 
 
@@ -155,7 +151,7 @@ def marks(steps: int) -> set[int]:
 
 
 def figures_of(results: dict[str, Result]) -> list[Row]:
-    """Boil results down to a row a condition and method.
+    """Summarize results: a row a condition and method.
 
     "goal_steps" and "goal_seconds" count up to `GOAL`, None for never; "visible" and "hidden" are
     the PSNR in YCbCr of the halves of a poster of which one is hidden, else None.
@@ -166,8 +162,8 @@ def figures_of(results: dict[str, Result]) -> list[Row]:
         for method, trace in traces.items():
             last = {key: getattr(trace, key)[-1] for key in ("psnr_ycbcr", "psnr_rgb", "seconds")}
             at = next((k for k, db in enumerate(trace.psnr_ycbcr) if db >= GOAL), None)
-            last["goal_steps"] = None if at is None else trace.steps[at]
-            last["goal_seconds"] = None if at is None else trace.seconds[at]
+            for key in ("steps", "seconds"):
+                last[f"goal_{key}"] = None if at is None else getattr(trace, key)[at]
             for half, columns in {"visible": np.s_[:middle], "hidden": np.s_[middle:]}.items():
                 seen = trace.pictures[trace.steps[-1]][:, columns], truth[:, columns]
                 last[half] = psnr(*seen, "ycbcr") if CONDITIONS[name].hidden else None
@@ -177,8 +173,11 @@ def figures_of(results: dict[str, Result]) -> list[Row]:
 
 def traces_of(results: dict[str, Result]) -> Row:
     """Lists of steps, seconds and PSNRs, by condition and method."""
-    names = ("steps", "seconds", "psnr_ycbcr", "psnr_rgb")
+
+    def lists(trace: Trace) -> Row:
+        return {name: values for name, values in vars(trace).items() if name != "pictures"}
+
     return {
-        condition: {m: {n: getattr(trace, n) for n in names} for m, trace in result.traces.items()}
-        for condition, result in results.items()
+        name: {method: lists(trace) for method, trace in result.traces.items()}
+        for name, result in results.items()
     }

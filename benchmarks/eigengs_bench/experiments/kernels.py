@@ -1,4 +1,4 @@
-"""How fast the renderer is: against plain Dr.Jit, against the machine, and as splats stretch."""
+"""How fast the renderer is: against plain Dr.Jit, against the machine, and as Gaussians stretch."""
 
 import math
 import time
@@ -28,7 +28,7 @@ from eigengs_dr.raster.reference import render_plain
 from eigengs_dr.raster.render import bin_gaussians, decode_parameters, rasterize, to_tensor
 from eigengs_dr.raster.tiles import Grid, TileLists, build_lists
 
-# The scene: splats of equal size, spread evenly at random over a square picture.
+# The scene: Gaussians of equal size, spread evenly at random over a square picture.
 SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
 # Tiles of the plain renderer, the best of 4x4, 8x8 and 16x16 in forward and reverse together.
 PLAIN_TILE = (8, 8)
@@ -64,17 +64,6 @@ def random_scene(types: ArrayTypes) -> Gaussians:
     )
 
 
-def time_programs(
-    timed: dict[str, Callable[[], Any]], progress: Progress = lambda *_: None
-) -> dict[str, float]:
-    """Median milliseconds of programs that take turns."""
-
-    def show(done: int) -> None:
-        progress("kernels", done, WARM_UP + ROUNDS)
-
-    return interleaved(timed, WARM_UP, ROUNDS, show)
-
-
 def kernel_figures(
     types: ArrayTypes, scene: Gaussians, progress: Progress = lambda *_: None
 ) -> dict[str, float]:
@@ -91,7 +80,8 @@ def kernel_figures(
         "lists_ms": lambda: bin_gaussians(scene, CUTOFF),
         "peak_ms": lambda: _peak(seeds),
     }
-    ms = time_programs(timed, progress)
+    total = WARM_UP + ROUNDS
+    ms = interleaved(timed, WARM_UP, ROUNDS, lambda done: progress("kernels", done, total))
     for program in (plain_forward, plain_step, fast_forward, fast_step):
         program.func.clear()  # left to the garbage collector, it may go while another is traced
     useful = pixels_inside(scene)
@@ -153,7 +143,6 @@ def _rasterize(values: list, background: list, lists: TileLists, cutoff: float) 
 
 
 def _peak(q: Any) -> Any:
-    """`exp`, `select` and 3 `fma` from and to registers, in independent chains."""
     types = types_of(q)
 
     def body(i: Any, q: Any, sums: list) -> tuple:
@@ -169,7 +158,7 @@ def _peak(q: Any) -> Any:
 
 
 def pixels_inside(scene: Gaussians) -> int:
-    """Count pairs of a splat and a pixel of the picture inside its cutoff ellipse."""
+    """Count pairs of a Gaussian and a pixel of the picture inside its cutoff ellipse."""
     mean = scene.to_arrays()["mean"].astype(np.float64)
     reach = int(CUTOFF * SIGMA) + 1
     near = np.arange(-reach, reach + 1)
@@ -181,7 +170,7 @@ def pixels_inside(scene: Gaussians) -> int:
 
 
 def _growth_figures(types: ArrayTypes, progress: Progress) -> dict[str, float]:
-    """Time every step of a refinement: splats stretch, and a poor renderer slows down."""
+    """Time every step of a refinement: Gaussians stretch, and a poor renderer slows down."""
     photo = sample("astronaut")
     top, left = ((side - SIDE) // 2 for side in photo.shape[:2])
     target = rgb_to_ycbcr(photo[top : top + SIDE, left : left + SIDE])
@@ -190,10 +179,8 @@ def _growth_figures(types: ArrayTypes, progress: Progress) -> dict[str, float]:
         mean, factor, np.zeros((COUNT, 3)), size=(SIDE, SIDE), backend=types.backend
     ).bounded()
     start = solve(start, target).gaussians
-    ends = []
-    for step, _ in enumerate(
-        descend(FitProblem(start, target), PRESETS["default"].schedule, STEPS)
-    ):
+    ends, sets = [], descend(FitProblem(start, target), PRESETS["default"].schedule, STEPS)
+    for step, _ in enumerate(sets):
         dr.sync_thread()
         ends.append(time.perf_counter())
         if step % 10 == 0:

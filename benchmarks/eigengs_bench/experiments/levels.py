@@ -1,15 +1,15 @@
-"""What levels of detail are worth: PSNR over how many splats of a set are drawn."""
+"""What levels of detail are worth: PSNR over how many Gaussians of a set are drawn."""
 
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from eigengs_bench.harness.store import Progress, Row
+from eigengs_bench.harness.store import Progress
 from eigengs_bench.harness.timing import Image
 from eigengs_dr.fitting.density_control import removal_cost
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.levels import fit_levels, level_counts
-from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import picture_of
@@ -20,12 +20,12 @@ SAMPLE, SIDE = "coffee", 256
 
 def run(
     image: Image, gaussians: int, levels: int, progress: Progress = lambda *_: None, **settings: Any
-) -> list[Row]:
-    """Fit an image in levels, and by as many splats as are looked at; see `fit` for the settings.
+) -> pd.DataFrame:
+    """Fit an image in levels, and by fits of single numbers; see `fit` for the settings.
 
-    A row a number of "splats": "level", whether a level ends there; and PSNRs in YCbCr of as many:
-    "levels", the first of the set in levels; "alone", a fit; "sorted", the most valuable ones of a
-    fit without levels.
+    A line a number of "splats": "level", whether a level ends there; and PSNRs in YCbCr of as many
+    Gaussians: "levels", the first of the set in levels; "alone", a fit; "sorted", the most valuable
+    ones of a fit without levels.
     """
     ends = level_counts(gaussians, levels)
     counts = sorted({*ends, *(2 * end for end in ends[:-1])})
@@ -35,12 +35,10 @@ def run(
     for done, count in enumerate(counts, 1):
         progress("fits", done, len(counts) + 1)
         alone[count] = fit(image, count, **settings).gaussians
-    plain = alone[gaussians]
+    plain, rows = alone[gaussians], []
     best = plain[np.argsort(-removal_cost(plain, rgb_to_ycbcr(image)), kind="stable")]
-
-    def row(n: int) -> Row:
-        drawn: dict[str, Gaussians] = {"levels": nested[:n], "alone": alone[n], "sorted": best[:n]}
+    for n in counts:
+        drawn = {"levels": nested[:n], "alone": alone[n], "sorted": best[:n]}
         reached = {key: psnr(picture_of(g), image, "ycbcr") for key, g in drawn.items()}
-        return {"splats": n, "level": n in ends, **reached}
-
-    return [row(n) for n in counts]
+        rows.append({"splats": n, "level": n in ends, **reached})
+    return pd.DataFrame(rows)

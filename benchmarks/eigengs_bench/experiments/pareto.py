@@ -1,7 +1,7 @@
 """Speed against accuracy: fits that differ from the default one in one setting at a time.
 
 The row of a variant has "gaussians", their number, and "trace", a list of `score` at each number of
-steps, with "psnr_wide", the PSNR in YCbCr of the same splats at the cutoff `WIDE`. The row of the
+steps, with "psnr_wide", the PSNR in YCbCr of the same set at the cutoff `WIDE`. The row of the
 knob "precision" has "stored", see `stored`; the last row has "kernels", see `_kernels`.
 """
 
@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eigengs_bench.experiments.kernels import COUNT, SIDE, programs, random_scene, time_programs
+from eigengs_bench.experiments import kernels
 from eigengs_bench.harness.datasets import images_of, is_trained, model_for, usual_count
 from eigengs_bench.harness.store import Job, Row, Task
-from eigengs_bench.harness.timing import Image, Moment, decibels, follow, score, warm_up
+from eigengs_bench.harness.timing import Image, decibels, follow, interleaved, score, warm_up
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.eigenbasis.eigengs import EigenGS
@@ -47,7 +47,7 @@ CUTOFFS = (2.5, 3.0, 3.5, 4.0, 5.0)  # of the renderer
 
 
 class Variant(NamedTuple):
-    """A fit with one setting, the knob, at another value; the other fields are those of `fit`.
+    """A fit with one setting, the knob, at another value; the other fields are arguments of `fit`.
 
     The default fit is the value "default" of the knob "preset".
     """
@@ -65,7 +65,8 @@ class Variant(NamedTuple):
 def run(task: Task, names: Sequence[str]) -> list[Row]:
     """Measure all variants on sets of images, and the renderer."""
     jobs = [job for name in names for job in _jobs(task, name, variants(task, name))]
-    jobs.append(({"set": "kernels", "side": SIDE, "gaussians": COUNT}, partial(_kernels, task)))
+    scene = {"set": "kernels", "side": kernels.SIDE, "gaussians": kernels.COUNT}
+    jobs.append((scene, partial(_kernels, task)))
     return task.measure(FILE, jobs, "pareto")
 
 
@@ -94,7 +95,6 @@ def variants(task: Task, name: str) -> list[Variant]:
 
 
 def _jobs(task: Task, name: str, fits: Sequence[Variant]) -> Iterator[Job]:
-    """For each image all variants, then how its default fit is stored."""
     for file, image in images_of(task, name):
         about = {"set": name, "image": file, "iterations": task.iterations, "seed": task.seed}
         for fit in fits:
@@ -112,48 +112,31 @@ def trace(task: Task, fit: Variant, image: Image) -> Row:
     runs = [(n, (n,)) for n in marks] if falls else [(iterations, tuple(marks))]
     found, count = [], 0
     for steps, shown in runs:
-        for moment in _moments(task, fit, image, steps, shown):
+        for moment in follow(_start(task, fit, image), schedule, steps, shown):
             count = len(moment.gaussians)
-            # The mean image may be in the picture, and not among the splats.
-            tails = picture_of(moment.gaussians, cutoff=WIDE) - picture_of(
-                moment.gaussians, cutoff=fit.cutoff
-            )
-            wide = decibels(moment.picture + tails, image, "ycbcr")
-            found.append({**score(moment, image), "psnr_wide": wide})
+            # The mean image may be in the picture, and not among the Gaussians.
+            wide, cut = (picture_of(moment.gaussians, cutoff=k) for k in (WIDE, fit.cutoff))
+            reached = decibels(moment.picture + (wide - cut), image, "ycbcr")
+            found.append({**score(moment, image), "psnr_wide": reached})
     return {"gaussians": count, "trace": found}
 
 
-def _moments(
-    task: Task, fit: Variant, image: Image, steps: int, marks: Sequence[int]
-) -> Iterator[Moment]:
-    schedule = PRESETS[fit.preset].schedule
-    return follow(_start(task, fit, image), schedule, steps, marks)
-
-
 def _start(task: Task, fit: Variant, image: Image) -> Callable[[], FitProblem]:
-    options = FitOptions(
-        gaussians=fit.gaussians,
-        init=fit.init,
-        basis=fit.basis,
-        preset=fit.preset,
-        solve_steps=fit.solve_steps,
-        cutoff=fit.cutoff,
-        seed=task.seed,
-        backend=task.backend,
-    )
-    return partial(initialize, image, options)
+    settings = {key: value for key, value in fit._asdict().items() if key not in ("knob", "value")}
+    return partial(initialize, image, FitOptions(seed=task.seed, backend=task.backend, **settings))
 
 
 def _stored(task: Task, fit: Variant, image: Image) -> Row:
-    (last,) = _moments(task, fit, image, task.iterations, (task.iterations,))
+    schedule, steps = PRESETS[fit.preset].schedule, task.iterations
+    (last,) = follow(_start(task, fit, image), schedule, steps, (steps,))
     return {"stored": stored(last.gaussians, image, task.backend)}
 
 
 def stored(gaussians: Gaussians, image: Image, backend: str | None = None) -> list[Row]:
     """Store a set in fewer bits and judge the set that is read back.
 
-    "bytes" are those of the parameters, and of the two ends of the range of each where it is cut
-    into steps; the background stays float32.
+    "bytes" counts the parameters, and the two ends of each range that is cut into steps; the
+    background stays float32.
     """
     arrays, rows = gaussians.to_arrays(), []
     background, size = arrays.pop("background"), (gaussians.width, gaussians.height)
@@ -163,8 +146,7 @@ def stored(gaussians: Gaussians, image: Image, backend: str | None = None) -> li
     forms: dict[str, tuple[float, Callable[[Any], Any]]] = {
         f"{b} bits": (numbers * b / 8 + 8 * parameters, partial(quantized, bits=b)) for b in BITS
     }
-    for kind in FLOATS:
-        forms[kind] = (numbers * np.dtype(kind).itemsize, partial(np.asarray, dtype=kind))
+    forms |= {k: (numbers * np.dtype(k).itemsize, partial(np.asarray, dtype=k)) for k in FLOATS}
     for name, (weight, form) in forms.items():
         kept = {key: form(values) for key, values in splats.items()}
         again = Gaussians.from_arrays(
@@ -190,23 +172,18 @@ def _kernels(task: Task) -> Row:
     are of all pixels, against a rendering in float64 at the cutoff `WIDEST`.
     """
     module = select(task.backend)
-    scene = random_scene(types_in(module))
-    double = replace(
-        scene,
-        mean=module.Array2f64(scene.mean),
-        factor=module.Array3f64(scene.factor),
-        color=module.ArrayXf64(scene.color),
-        background=module.ArrayXf64(scene.background),
-    )
-    exact = render(double, cutoff=WIDEST).numpy()
+    scene = kernels.random_scene(types_in(module))
+    colors = {key: module.ArrayXf64(getattr(scene, key)) for key in ("color", "background")}
+    shapes = {"mean": module.Array2f64(scene.mean), "factor": module.Array3f64(scene.factor)}
+    exact = render(replace(scene, **shapes, **colors), cutoff=WIDEST).numpy()
     rows, timed = list[Row](), dict[str, Any]()
     for cutoff, renderer in product(CUTOFFS, ("fast", "plain")):
-        forward, step, shown = programs(scene, cutoff, renderer == "plain")
+        forward, step, shown = kernels.programs(scene, cutoff, renderer == "plain")
         timed |= {f"forward {len(rows)}": forward, f"step {len(rows)}": step}
         error = shown() - exact
         errors = {"largest_error": np.abs(error).max(), "rms_error": np.sqrt(np.mean(error**2))}
         rows.append({"renderer": renderer, "cutoff": cutoff, **errors})
-    ms = time_programs(timed)
+    ms = interleaved(timed, kernels.WARM_UP, kernels.ROUNDS)
     for program in timed.values():
         program.func.clear()  # left to the garbage collector, they may go while another is traced
     for k, row in enumerate(rows):

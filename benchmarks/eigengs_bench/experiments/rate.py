@@ -1,7 +1,7 @@
 """Rate against distortion: packed fits beside JPEG and WebP of as many bytes.
 
 A row has "points": setting (the number of Gaussians, or the quality), bytes, bits_per_pixel,
-psnr_rgb, psnr_ycbcr, ssim and seconds, those of encoding; that of a packed fit also fit_seconds,
+psnr_rgb, psnr_ycbcr, ssim and seconds of encoding; the point of a packed fit also fit_seconds,
 which are among them, and unpacked_rgb, the PSNR before.
 """
 
@@ -28,8 +28,8 @@ from eigengs_dr.raster.render import picture_of
 
 FILE, OURS = "rate.jsonl", "packed Gaussians"
 
-PIXELS = (256, 128, 64, 32, 16, 8)  # pixels a splat of the fits that are packed
-# Decibels that packing may lose: of fits of all numbers of splats, some below and some above,
+PIXELS = (256, 128, 64, 32, 16, 8)  # pixels a Gaussian of the fits that are packed
+# Decibels that packing may lose: of some numbers below it and some above,
 # these had the best PSNR at equal size on training photos, by little.
 BUDGET = 0.8
 WARM_UP = 6  # untimed steps before a fit, that compile its programs
@@ -62,7 +62,6 @@ def _jobs(task: Task, name: str, images: list[tuple[str, Image]]) -> Iterator[Jo
 
 
 def _packed(task: Task, image: Image, count: int) -> Row:
-    """Fit, pack, and judge the picture that the file holds."""
     made = partial(fit, image, count, seed=task.seed, backend=task.backend)
     made(iterations=min(WARM_UP, task.iterations))
     started = time.perf_counter()
@@ -77,7 +76,6 @@ def _packed(task: Task, image: Image, count: int) -> Row:
 
 
 def _coded(image: Image, kind: str, options: dict[str, Any]) -> Row:
-    """Write an image in all qualities, and judge what is read back."""
     source, points = pillow.fromarray(to_8bit(image).astype(np.uint8)), []
     for quality in QUALITIES:
         file = io.BytesIO()

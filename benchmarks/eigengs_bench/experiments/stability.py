@@ -1,11 +1,12 @@
 """Hard cases times presets: which stay finite, and which end no worse than they started."""
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from multiprocessing import get_context
 from typing import Any
 
@@ -19,7 +20,7 @@ from eigengs_bench.harness.timing import Image, Moment, decibels, follow
 from eigengs_dr.eigenbasis.registry import load_basis
 from eigengs_dr.fitting.initializers import FitProblem, initialize
 from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.presets import PRESETS, Preset
+from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.fitting.refine import trace_steps
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.gaussian.covariance import condition_number
@@ -37,21 +38,15 @@ TILES = (("gaussianimage", 1), ("gaussianimage", 3), ("default", 1))
 
 def run(task: Task, cases: Iterable[Case], presets: Sequence[str]) -> list[Row]:
     """Measure every cell of the matrix, case by case."""
-    return task.measure(FILE, jobs(cases, presets, task.seed, task.backend), "stability")
+    return task.measure(FILE, jobs(task, cases, presets), "stability")
 
 
-def jobs(
-    cases: Iterable[Case], presets: Sequence[str], seed: int = 0, backend: str | None = None
-) -> list[Job]:
+def jobs(task: Task, cases: Iterable[Case], presets: Sequence[str]) -> Iterator[Job]:
     """Name the cells of the matrix."""
-    return [
-        (
-            {"case": case.name, "preset": name, "seed": seed, "iterations": case.iterations},
-            partial(_measure_alone if case.alone else measure_cell, case, name, seed, backend),
-        )
-        for case in cases
-        for name in presets
-    ]
+    for case, name in product(cases, presets):
+        measured = _measure_alone if case.alone else measure_cell
+        job = {"case": case.name, "preset": name, "seed": task.seed, "iterations": case.iterations}
+        yield job, partial(measured, case, name, task.seed, task.backend)
 
 
 def tiles_of(task: Task, smooth: Case) -> dict[str, Image]:
@@ -68,15 +63,16 @@ def tiles_of(task: Task, smooth: Case) -> dict[str, Image]:
 def measure_cell(case: Case, preset: str, seed: int, backend: str | None) -> Row:
     """Run a case by a preset and score it: one cell.
 
-    "needs", alone, says what a preset lacks. Else "finite" tells whether all parameters and pixels
-    were at all marks of `trace_steps`; start, end and half are PSNRs of the first and of the last
-    moment and of the last set in half precision, drop those from the best moment to the last;
+    "needs", alone, says what a preset lacks. Else "finite" is true if all parameters and pixels are
+    finite at all marks of `trace_steps`; start, end and half are PSNRs of the first and of the last
+    moment and of the last set in half precision, drop is the loss from the best moment to the last;
     "condition" is the highest of a covariance, "peak_gib" the memory of a case in its own process.
     """
     image = case.image()
     most = image.shape[0] * image.shape[1]
-    if _encodes(case, PRESETS[preset]) and len(load_basis(BASIS, backend).gaussians) > most:
-        return {"needs": f"a basis with at most {most} splats"}
+    encodes = PRESETS[preset].init == "eigen" and case.place is None
+    if encodes and len(load_basis(BASIS, backend).gaussians) > most:
+        return {"needs": f"a basis with at most {most} Gaussians"}
     followed = moments(case, image, preset, seed, backend)
     memory = {"peak_gib": _peak()} if case.alone else {}  # before the judgement takes its own
     return {**_score(followed, image), **memory}
@@ -93,15 +89,11 @@ def moments(
     return list(follow(start, schedule, case.iterations, trace_steps(case.iterations)))
 
 
-def _encodes(case: Case, method: Preset) -> bool:
-    return method.init == "eigen" and case.place is None
-
-
 def _start(case: Case, image: Image, preset: str, seed: int, backend: str | None) -> FitProblem:
     """Start as the preset does, or in its way from the shapes of the case."""
     method = PRESETS[preset]
     if case.place is None:
-        count = None if _encodes(case, method) else case.gaussians
+        count = None if method.init == "eigen" else case.gaussians
         options = FitOptions(gaussians=count, preset=preset, seed=seed, backend=backend)
         return initialize(image, options)
     target, generator = rgb_to_ycbcr(image), np.random.default_rng(seed)
@@ -137,7 +129,6 @@ def _score(followed: list[Moment], image: Image) -> Row:
 
 
 def _round_to_half(gaussians: Gaussians) -> Gaussians:
-    """Round all parameters to half precision."""
 
     def half(name: str) -> Any:
         values = getattr(gaussians, name)
@@ -148,7 +139,7 @@ def _round_to_half(gaussians: Gaussians) -> Gaussians:
 
 
 def _measure_alone(case: Case, preset: str, seed: int, backend: str | None) -> Row:
-    """Measure a cell in a new process, whose peak of memory is then that of the cell."""
+    """Measure a cell in a new process, which has the peak of memory of the cell alone."""
     try:
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
             return pool.submit(measure_cell, case, preset, seed, backend).result()
@@ -160,10 +151,10 @@ def _measure_alone(case: Case, preset: str, seed: int, backend: str | None) -> R
 
 
 def _peak() -> float | None:
-    """Most memory that this process has had, in GiB; None on Windows, which does not tell."""
+    """Most memory of this process so far, in GiB; None on Windows."""
     if sys.platform == "win32":
         return None
     import resource
 
-    unit = 1 if sys.platform == "darwin" else 1 << 10
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / (1 << 30)
+    unit = 30 if sys.platform == "darwin" else 20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << unit)

@@ -16,18 +16,18 @@ from eigengs_dr.image.samples import sample
 
 Shapes = tuple[NDArray[np.float64], NDArray[np.float64]]
 
-# Pixels of a side, splats (the paper's number, and that of the basis that ships), and steps.
+# Pixels of a side, Gaussians (as in the paper, and in the basis that ships), and steps.
 SIDE, GAUSSIANS, ITERATIONS = 256, 5000, 1000
-SMOOTH_SIDE = 512  # splats lie 7 pixels apart, which shows; the paper's 20,000 lie under 4 apart
+SMOOTH_SIDE = 512  # distances of 7 pixels show; those of the paper's 20,000 are below 4
 STRIPE = 3  # rows of a stripe of the image that is foreign to a basis
 
 
 class Case(NamedTuple):
     """One thing that may go wrong.
 
-    ``image()`` makes the image. `place` returns means and factors to start from, called as the
-    `Placement` is; None for the start of the preset. `rates` multiplies the
-    rates of the preset. A case `alone` is measured in a process of its own, for its memory.
+    ``image()`` makes the image. `place`, a `Placement`, returns means and factors to start from;
+    None for the start of the preset. `rates` multiplies the rates of the preset. A case `alone`
+    runs in a process of its own, for its memory.
     """
 
     name: str
@@ -49,20 +49,17 @@ def flat(red: float, green: float, blue: float) -> Image:
     return np.broadcast_to(np.array([red, green, blue], np.float32), (SIDE, SIDE, 3)).copy()
 
 
-def impulse() -> Image:
-    """Set one pixel to white on black."""
+def _impulse() -> Image:
     image = flat(0, 0, 0)
     image[SIDE // 2, SIDE // 2] = 1
     return image
 
 
-def checkerboard() -> Image:
-    """Alternate black and white pixels: nothing is finer."""
+def _checkerboard() -> Image:
     return _grey(np.indices((SIDE, SIDE)).sum(axis=0) % 2)
 
 
-def lines() -> Image:
-    """Draw a fan of white lines, one pixel wide and not smoothed, on black."""
+def _lines() -> Image:
     canvas = pillow.new("L", (SIDE, SIDE))
     for end in range(0, SIDE, 12):
         for corner in ((SIDE - 1, end), (end, SIDE - 1)):
@@ -70,35 +67,30 @@ def lines() -> Image:
     return _grey(np.asarray(canvas) / 255)
 
 
-def text() -> Image:
-    """Write small black letters on white."""
+def _text() -> Image:
     canvas = pillow.new("L", (SIDE, SIDE), 255)
     words = "\n".join(["Sphinx of black quartz, judge my vow. 0123456789"] * 23)
     ImageDraw.Draw(canvas).multiline_text((2, 2), words, fill=0, spacing=1)
     return _grey(np.asarray(canvas) / 255)
 
 
-def smooth() -> Image:
-    """Let colours run linearly from side to side."""
+def _smooth() -> Image:
     y, x = np.indices((SMOOTH_SIDE, SMOOTH_SIDE), np.float32) / (SMOOTH_SIDE - 1)
     return np.stack([0.15 + 0.7 * x, 0.2 + 0.5 * y, 0.75 - 0.3 * x - 0.2 * y], axis=2)
 
 
-def saturated() -> Image:
-    """Put squares of the eight corners of the RGB cube side by side."""
+def _saturated() -> Image:
     row, column = np.indices((SIDE, SIDE)) // 16
     corner = (row + 3 * column) % 8
     return np.stack([corner >> bit & 1 for bit in range(3)], axis=2).astype(np.float32)
 
 
-def noise() -> Image:
-    """Add noise of standard deviation 0.3 to a photo."""
+def _noise() -> Image:
     drawn = np.random.default_rng(0).normal(0, 0.3, (SIDE, SIDE, 3))
     return np.clip(photo() + drawn, 0, 1).astype(np.float32)
 
 
-def foreign() -> Image:
-    """Invert every other stripe of a photo: a basis of smooth components cannot follow."""
+def _foreign() -> Image:
     inverted = np.indices((SIDE, SIDE))[0] // STRIPE % 2 == 1
     return np.where(inverted[..., None], 1 - photo(), photo())
 
@@ -108,29 +100,28 @@ def _grey(plane: NDArray[np.number]) -> Image:
 
 
 def needles(image: Image, count: int, generator: np.random.Generator) -> Shapes:
-    """Stretch splats a hundredfold, in all directions: condition 10,000."""
+    """Stretch Gaussians a hundredfold, in all directions: condition 10,000."""
     angle = generator.uniform(0, np.pi, count)
     cos, sin = np.cos(angle), np.sin(angle)
     long, thin = 30.0**2, 0.3**2
     xx, yy = long * cos**2 + thin * sin**2, long * sin**2 + thin * cos**2
-    return _anywhere(image, count, generator), factor_from_covariance(
-        xx, (long - thin) * cos * sin, yy
-    )
+    factor = factor_from_covariance(xx, (long - thin) * cos * sin, yy)
+    return _anywhere(image, count, generator), factor
 
 
 def subpixel(image: Image, count: int, generator: np.random.Generator) -> Shapes:
-    """Make splats so narrow that pixel centres miss most; bounds widen them to a quarter pixel."""
+    """Make most Gaussians too narrow for pixel centres; bounds widen them to a quarter pixel."""
     return _anywhere(image, count, generator), _round(count, 0.05)
 
 
 def heap(image: Image, count: int, generator: np.random.Generator) -> Shapes:
-    """Put equal splats on one point: there is no telling them apart."""
+    """Put equal Gaussians on one point."""
     height, width = image.shape[:2]
     return np.tile([width // 2 + 0.5, height // 2 + 0.5], (count, 1)), _round(count, 1.0)
 
 
 def outside(image: Image, count: int, generator: np.random.Generator) -> Shapes:
-    """Put splats around the image, where no pixel sees them; bounds bring them to its edges."""
+    """Put Gaussians around the image, where no pixel sees them; bounds bring them to its edges."""
     height, width = image.shape[:2]
     angle, radius = generator.uniform(0, 2 * np.pi, count), generator.uniform(1, 2, count)
     mean = 0.5 + np.stack([np.cos(angle), np.sin(angle)], axis=1) * radius[:, None]
@@ -145,29 +136,31 @@ def _round(count: int, sigma: float) -> NDArray[np.float64]:
     return np.tile([1 / sigma, 0.0, 1 / sigma], (count, 1))
 
 
-_PLACES = (needles, subpixel, heap, outside)
-
 _ALL = (
     Case("photo", photo),  # what the others are compared with
     Case("constant", partial(flat, 0.2, 0.4, 0.6)),  # whole 8-bit levels
     Case("black", partial(flat, 0.0, 0.0, 0.0)),
     Case("white", partial(flat, 1.0, 1.0, 1.0)),
-    *(Case(make.__name__, make) for make in (impulse, checkerboard, lines, text, smooth)),
-    *(Case(make.__name__, make) for make in (saturated, noise)),
+    Case("impulse", _impulse),
+    Case("checkerboard", _checkerboard),
+    Case("lines", _lines),  # a fan, not smoothed
+    Case("text", _text),
+    Case("smooth", _smooth),
+    Case("saturated", _saturated),  # the eight corners of the RGB cube
+    Case("noise", _noise),
     Case("1x512", partial(photo, 512, 1), 128),
     Case("large", partial(photo, 4096, 4096), 20000, 20, alone=True),
-    Case("foreign", foreign),
-    *(Case(place.__name__, photo, place=place) for place in _PLACES),
+    Case("foreign", _foreign),
+    *(Case(place.__name__, photo, place=place) for place in (needles, subpixel, heap, outside)),
     Case("fast", photo, rates=10.0),
     Case("long", photo, iterations=10_000),
 )
 
-# Cases by name. What half precision costs is measured in each.
 CASES = {case.name: case for case in _ALL}
 
 
 def chosen_cases(names: Sequence[str], iterations: int) -> list[Case]:
-    """Return cases by name, by default all, with at most so many steps."""
+    """Return cases by name, by default all, with at most this many steps."""
     if unknown := [name for name in names if name not in CASES]:
         raise ValueError(f"case {unknown[0]!r} is unknown; use one of {', '.join(CASES)}")
     chosen = [CASES[name] for name in dict.fromkeys(names or CASES)]

@@ -7,7 +7,7 @@ A row has "job" with set, image, seed, iterations, gaussians and the fields of `
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from eigengs_bench.harness.datasets import images_of, is_trained, model_for
 from eigengs_bench.harness.store import Job, Row, Task
@@ -41,6 +41,7 @@ class Method(NamedTuple):
 
 
 Ready = Callable[[Method], Callable[..., FitProblem]]
+Pictures = Sequence[tuple[str, Image]]
 
 
 def methods(name: str, table: str, sources: Sequence[str]) -> list[Method]:
@@ -61,8 +62,7 @@ def methods(name: str, table: str, sources: Sequence[str]) -> list[Method]:
 
 def run(task: Task, names: Sequence[str], tables: Sequence[str] = TABLES) -> list[Row]:
     """Measure what tables need on sets, image by image, the methods in turn."""
-    found = []
-    sources = [name for name in SETS if is_trained(task.data, name)]
+    found, sources = list[Row](), [name for name in SETS if is_trained(task.data, name)]
     for name in names:
         compared = list(dict.fromkeys(m for table in tables for m in methods(name, table, sources)))
         pictures = images_of(task, name)
@@ -70,17 +70,14 @@ def run(task: Task, names: Sequence[str], tables: Sequence[str] = TABLES) -> lis
         measured = task.measure(FILE, _jobs(task, name, pictures, compared, ready), name)
         found += measured
         if "reach" in tables:
-            goals = {
-                row["job"]["image"]: row["moments"][-1]
-                for row in measured
-                if row["job"]["preset"] == "gaussianimage"
-            }
+            plain = [row for row in measured if row["job"]["preset"] == "gaussianimage"]
+            goals = {row["job"]["image"]: row["moments"][-1] for row in plain}
             found += task.measure(FILE, _reach_jobs(task, name, pictures, goals, ready), name)
     return found
 
 
 def _preparation(task: Task, name: str, picture: Image) -> Ready:
-    """Function that returns how a method starts; asked first, it trains and compiles untimed."""
+    """Function that returns how a method starts; its first call trains and compiles, untimed."""
 
     @cache
     def ready(method: Method) -> Callable[..., FitProblem]:
@@ -88,13 +85,9 @@ def _preparation(task: Task, name: str, picture: Image) -> Ready:
         if method.source:
             split = {"split": True, "whole": False}.get(method.split, "auto")
             model = model_for(task, name, method.source, method.components, method.color, split)
-        options = FitOptions(
-            gaussians=None if method.source else SETS[name].gaussians,
-            basis=model,
-            preset=method.preset,
-            color=method.color,
-            backend=task.backend,
-        )
+        count = None if method.source else SETS[name].gaussians
+        chosen: Any = {"preset": method.preset, "color": method.color, "backend": task.backend}
+        options = FitOptions(gaussians=count, basis=model, **chosen)
 
         def start(image: Image, seed: int, depth: int = 10) -> FitProblem:
             return initialize(image, replace(options, seed=seed, solve_steps=depth))
@@ -111,11 +104,7 @@ def _name(task: Task, name: str, image: str) -> Row:
 
 
 def _jobs(
-    task: Task,
-    name: str,
-    pictures: Sequence[tuple[str, Image]],
-    compared: Sequence[Method],
-    ready: Ready,
+    task: Task, name: str, pictures: Pictures, compared: Sequence[Method], ready: Ready
 ) -> Iterator[Job]:
     marks = {mark for mark in ITERATIONS if mark < task.iterations} | {task.iterations}
 
@@ -130,15 +119,10 @@ def _jobs(
 
 
 def _reach_jobs(
-    task: Task,
-    name: str,
-    pictures: Sequence[tuple[str, Image]],
-    goals: dict[str, Row],
-    ready: Ready,
+    task: Task, name: str, pictures: Pictures, goals: dict[str, Row], ready: Ready
 ) -> Iterator[Job]:
     def work(image: Image, goal: Row) -> Row:
-        start = ready(Method("default"))
-        return _reach(lambda depth: start(image, task.seed, depth), image, goal)
+        return _reach(partial(ready(Method("default")), image, task.seed), image, goal)
 
     for file, image in pictures:
         label = {**_name(task, name, file), "reach": "gaussianimage"}

@@ -15,8 +15,8 @@ from eigengs_dr.image.samples import sample
 from eigengs_dr.raster.render import picture_of, render
 
 SIDE, TEXELS, SPP = 512, 1024, 16  # of the picture, of the bitmap, and samples a pixel
-COUNTS = (500, 5_000, 20_000)  # splats of the textures
-SETTLED = 5_000  # splats of the texture that is also prefiltered, differentiated and changed
+COUNTS = (500, 5_000, 20_000)  # Gaussians of the textures
+SETTLED = 5_000  # Gaussians of the texture that is also prefiltered, differentiated and changed
 STEPS, WARM_UP, ROUNDS = 100, 2, 9  # of the fits; rounds that compile, and that are measured
 
 
@@ -74,21 +74,19 @@ def ball(mi: Any, texture: dict[str, Any]) -> Any:
     coat = {"type": "principled", "base_color": texture, "roughness": 0.3}
     floor = at.translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(6)
     light = {"type": "area", "radiance": {"type": "rgb", "value": 20.0}}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "path", "max_depth": 5},
-            "sensor": {**sensor, "sampler": sampler},
-            "ball": {"type": "sphere", "bsdf": coat},
-            "floor": {"type": "rectangle", "to_world": floor},
-            "lamp": {"type": "sphere", "center": [3, 4, 3], "emitter": light},
-            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.4}},
-        }
-    )
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 5},
+        "sensor": {**sensor, "sampler": sampler},
+        "ball": {"type": "sphere", "bsdf": coat},
+        "floor": {"type": "rectangle", "to_world": floor},
+        "lamp": {"type": "sphere", "center": [3, 4, 3], "emitter": light},
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.4}},
+    }
+    return mi.load_dict(scene)
 
 
 def _step(mi: Any, scene: Any) -> Callable[[], Any]:
-    """Render and differentiate with respect to the texture, as a step of a descent does."""
     integrator = mi.load_dict({"type": "prb", "max_depth": 5})
     parameters = mi.traverse(scene)
     parameters.keep(r".*base_color\.(data|mean|factor|color|background)")
@@ -105,7 +103,6 @@ def _step(mi: Any, scene: Any) -> Callable[[], Any]:
 
 
 def _change(mi: Any, scene: Any) -> Any:
-    """Tell the texture that its shapes have changed."""
     parameters = mi.traverse(scene)
     parameters.keep(r".*base_color\.factor")
     ((key, factor),) = parameters
@@ -115,7 +112,6 @@ def _change(mi: Any, scene: Any) -> Any:
 
 
 def _difference(mi: Any, gaussians: Any, texture: dict[str, Any]) -> float:
-    """Largest difference between texture and rendering at the centres of texels."""
     width, height = gaussians.width, gaussians.height
     index = dr.arange(mi.UInt32, width * height)
     si = dr.zeros(mi.SurfaceInteraction3f, width * height)

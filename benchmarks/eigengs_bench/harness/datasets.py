@@ -18,26 +18,21 @@ from eigengs_dr.image.resize import center_crop
 from eigengs_dr.image.samples import sample
 
 SAMPLE_NAMES, SAMPLE_SIDE = ("chelsea", "coffee", "astronaut"), 256
-
-# Components that are computed of every set: models of fewer take the first of them.
-MAX_COMPONENTS = 500
+MAX_COMPONENTS = 500  # of the basis of a set: models of fewer take the first of them
 
 
 def images_of(task: Task, name: str, count: int | None = None) -> list[tuple[str, Image]]:
     """Load names and pixels of the first images of a set, by default `task.images` of them.
 
-    Portraits have the size of the set turned by a quarter. `ValueError` if the set is not there.
+    Portraits have the size of the set turned by a quarter. `ImageError` if the set is not there.
     """
     count = task.images if count is None else count
     if name == SAMPLES:
         names = SAMPLE_NAMES[:count]
         return [(photo, center_crop(sample(photo), SAMPLE_SIDE, SAMPLE_SIDE)) for photo in names]
-    if task.data is None:
-        raise ValueError(f"set {name!r} needs DATA, the folder that holds it")
-    folder, sides = task.data / SETS[name].folder, SETS[name][1:3]
-    files = image_files(folder / "test" if (folder / "test").is_dir() else folder)[:count]
+    folder, sides = Path(task.data or "") / SETS[name].folder, SETS[name][1:3]
     found = []
-    for file in files:
+    for file in image_files(folder / "test" if (folder / "test").is_dir() else folder)[:count]:
         picture = load_image(file)
         upright = picture.shape[0] > picture.shape[1]
         size = (min(sides), max(sides)) if upright else sides
@@ -46,7 +41,7 @@ def images_of(task: Task, name: str, count: int | None = None) -> list[tuple[str
 
 
 def usual_count(name: str) -> int:
-    """Return the number of splats of fits on a set."""
+    """Return the number of Gaussians of fits on a set."""
     return SETS[name].gaussians if name in SETS else DEFAULT_COUNT
 
 

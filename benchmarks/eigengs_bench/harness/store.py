@@ -1,11 +1,9 @@
-"""Measurements as lines of JSON, added one by one: a run that was broken off goes on later.
+"""Measurements as lines of JSON, one by one: a run continues after a break.
 
 A row has "job", its name; its figures; and "run": the date, the command, the machine, the versions,
-and the "commit" of the code with "clean", whether no tracked file differed from it.
-
-Rows of another machine or of other versions are refused, as their seconds mean something else. Rows
-of other code are used, as nobody wants to measure an hour again after a change of a comment; this
-is always said: in one line when a file is continued, and in the caption of every table.
+and the "commit" of the code with "clean", whether no tracked file differed from it. The seconds of
+other machines or versions differ: their rows are an error. Rows of other code are used, with a note
+when a file is continued, and in the caption of every table.
 """
 
 import json
@@ -20,7 +18,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from eigengs_dr.cli.report import plain
-from eigengs_dr.storage.atomic import atomic_write
 
 Row = dict[str, Any]
 Job = tuple[Row, Callable[[], Row]]  # what names a measurement, its seed too, and what makes it
@@ -33,8 +30,8 @@ class Task(NamedTuple):
     """What experiments share: `folder` of rows and models, `data` of image sets, `run` of rows."""
 
     folder: Path
-    data: Path | None
     run: Row
+    data: Path | None = None
     images: int = 20
     iterations: int = 1000
     seed: int = 0
@@ -51,10 +48,7 @@ def measure(
 ) -> list[Row]:
     """Do the jobs that a file does not hold yet, and add a line after each; return their rows.
 
-    Raises
-    ------
-    ValueError
-        If the file is damaged, or was written on another machine or with other versions.
+    `ValueError` if the file is damaged, or of another machine or other versions.
     """
     known = {_key(row["job"]): row for row in read(path)}
     for row in known.values():
@@ -78,26 +72,23 @@ def measure(
 def read(path: Path) -> list[Row]:
     """Read the rows of a file, none where there is none; `ValueError` names a damaged line.
 
-    A last line that was cut short is dropped.
+    An incomplete last line does not count.
     """
-    if not path.exists():
-        return []
     found = []
-    for number, line in enumerate(path.read_text("utf-8", "replace").split("\n")[:-1], 1):
+    lines = path.read_text("utf-8", "replace").split("\n")[:-1] if path.exists() else []
+    for number, line in enumerate(lines, 1):
         try:
-            row = json.loads(line)
-            if not isinstance(row["job"], dict) or not isinstance(row["run"], dict):
+            found.append(json.loads(line))
+            if not isinstance(found[-1]["job"], dict) or not isinstance(found[-1]["run"], dict):
                 raise TypeError
         except (ValueError, KeyError, TypeError):
-            raise ValueError(
-                f"{path}: line {number} is not a measurement; delete that line"
-            ) from None
-        found.append(row)
+            message = f"{path}: line {number} is not a measurement; delete that line"
+            raise ValueError(message) from None
     return found
 
 
 def today() -> str:
-    """Return the date and time as rows tell them."""
+    """Return the date and time for a row."""
     return datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
 
 
@@ -111,7 +102,7 @@ def code_state() -> Row:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
-        git("ls-files", "--error-unmatch", "__init__.py")  # not a package below somebody's tree
+        git("ls-files", "--error-unmatch", "__init__.py")  # not a package below another tree
         clean = not git("status", "--porcelain", "--untracked-files=no")
         return {"commit": git("rev-parse", "HEAD"), "clean": clean}
     except (OSError, subprocess.CalledProcessError):
@@ -133,19 +124,16 @@ def count_codes(runs: Iterable[Row]) -> str:
 def other_code(path: Path, run: Row) -> str:
     """Say in one line which rows of a file are of other code than a run; "" for none."""
     others = [row["run"] for row in read(path) if code_name(row["run"]) != code_name(run)]
-    if not others:
-        return ""
-    return (
+    text = (
         f"{path}: rows of other code are used as they are: {count_codes(others)}; now it is "
         f"{code_name(run)}. To measure all of them again, write to another folder"
     )
+    return text if others else ""
 
 
 def _append(path: Path, row: Row) -> None:
     """Add a line behind the last whole one."""
-    if not path.exists():
-        with atomic_write(path):
-            pass
+    path.touch()
     with path.open("rb+") as file:
         whole = file.read().rfind(b"\n") + 1
         file.seek(whole)

@@ -1,4 +1,4 @@
-"""Penny-round tiles: splats that show where an image is smooth."""
+"""Penny-round tiles: Gaussians that show where an image is smooth."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from eigengs_dr.image.color import RGB_TO_YCBCR
 # Weights of R, G and B in the luma of ITU-R BT.601, where 1 is white.
 LUMA = RGB_TO_YCBCR[0] / RGB_TO_YCBCR[0].sum()
 # Standard deviation in pixels of the blur that takes tiles away: it leaves 0.2 % of a wave of 7
-# pixels, the distance of 5,000 splats on 512x512, and 93 % of one of 64.
+# pixels, the distance of 5,000 Gaussians on 512x512, and 93 % of one of 64.
 SIGMA = 4.0
 # Where an image differs by more from its own blur, in 8-bit levels, it has content that hides
 # tiles, and errors beside edges are none. Rounding to 8 bits stays below.
@@ -30,8 +30,6 @@ def tiling(picture: Image, image: Image) -> float:
     >>> round(tiling(image + 0.01 * (np.indices((32, 32)).sum(0) % 2)[..., None], image), 1)
     1.3
     """
-    if picture.shape != image.shape:
-        raise ValueError(f"tiling: the shapes {picture.shape} and {image.shape} differ")
     region = smooth_regions(image)
     if not region.any():
         return float("nan")
@@ -46,6 +44,5 @@ def smooth_regions(image: Image) -> NDArray[np.bool_]:
 
 
 def _fine(plane: NDArray[np.floating]) -> NDArray[np.float64]:
-    """What a blur does not keep."""
     plane = plane.astype(np.float64)
     return plane - gaussian_filter(plane, SIGMA)

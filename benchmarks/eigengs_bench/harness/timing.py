@@ -3,15 +3,17 @@
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from eigengs_dr.fitting.initializers import FitProblem
+from eigengs_dr.fitting.initializers import FitProblem, initialize
 from eigengs_dr.fitting.optimizers.descent import descend
 from eigengs_dr.fitting.optimizers.schedule import MIN_PHASE_RATIO, Schedule
+from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.metrics import MAX_PSNR, ms_ssim, psnr, ssim
 from eigengs_dr.raster.render import picture_of
@@ -33,8 +35,8 @@ def follow(
 ) -> Iterator[Moment]:
     """Run a descent to its last step and yield its state after the steps in `marks`.
 
-    Unlike `eigengs_dr.fit` it takes all steps, also where nothing is gained any more, and shows the
-    set as it is, not the best so far. The time of `begin` counts; the clock stops between moments.
+    It takes all steps, and shows the set as it is, where `eigengs_dr.fit` stops and keeps the best.
+    The time of `begin` counts; the clock stops between moments.
     """
     spent, resumed = 0.0, time.perf_counter()
     start = begin()
@@ -52,8 +54,16 @@ def follow(
         resumed = time.perf_counter()
 
 
+def descent(
+    image: Image, iterations: int, marks: Collection[int], **options: Any
+) -> Iterator[Moment]:
+    """Follow the descent of a fit; `options` are those of `FitOptions`."""
+    chosen = FitOptions(**options)
+    return follow(partial(initialize, image, chosen), chosen.method.schedule, iterations, marks)
+
+
 def warm_up(begin: Callable[[], FitProblem], schedule: Schedule, iterations: int) -> None:
-    """Compile the programs of a descent of so many steps, also those that place splats anew."""
+    """Compile the programs of a descent, also programs that place Gaussians anew."""
     steps = min(MIN_PHASE_RATIO, iterations)
     list(follow(begin, replace(schedule, redistribute_after=1), steps, (0, steps)))
 
@@ -65,14 +75,10 @@ def decibels(picture: Image, image: Image, space: str) -> float:
 
 def score(moment: Moment, image: Image) -> dict[str, Any]:
     """Turn a moment into a row: iteration, seconds, psnr_ycbcr, psnr_rgb, ssim, ms_ssim."""
-    return {
-        "iteration": moment.iteration,
-        "seconds": moment.seconds,
-        "psnr_ycbcr": decibels(moment.picture, image, "ycbcr"),
-        "psnr_rgb": decibels(moment.picture, image, "rgb"),
-        "ssim": ssim(moment.picture, image),
-        "ms_ssim": ms_ssim(moment.picture, image),
-    }
+    row: dict[str, Any] = {"iteration": moment.iteration, "seconds": moment.seconds}
+    row |= {f"psnr_{k}": decibels(moment.picture, image, k) for k in ("ycbcr", "rgb")}
+    similar = {"ssim": ssim(moment.picture, image), "ms_ssim": ms_ssim(moment.picture, image)}
+    return row | similar
 
 
 def interleaved(

@@ -1,1 +1,1 @@
-"""How rows are told: tables, charts, and the page of both."""
+"""Reports of rows: tables, charts, and the page of both."""

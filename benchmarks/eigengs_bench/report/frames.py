@@ -1,4 +1,4 @@
-"""Rows as data frames, figures as cells, and tables that say where their rows come from."""
+"""Rows as data frames, figures as cells, and tables that name the code of their rows."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,12 +20,11 @@ class Table(NamedTuple):
     frame: pd.DataFrame
 
 
-class Told(NamedTuple):
-    """Tables of rows, charts with their captions, and points of charts, by the stem of a file."""
+class Section(NamedTuple):
+    """Tables of rows, and charts with their captions, by the stem of a file."""
 
     tables: Sequence[Table] = ()
     charts: Mapping[str, tuple[str, Figure]] = {}
-    points: Mapping[str, pd.DataFrame] = {}
 
 
 def frame_of(rows: Iterable[Row], key: str = "") -> pd.DataFrame:
@@ -49,6 +48,14 @@ def table(
     return Table(caption + remark(codes), pd.DataFrame(list(lines), columns=list(columns)))
 
 
+def grouped(caption: str, frame: pd.DataFrame, by: list[str], columns: Mapping[str, Any]) -> Table:
+    """Make a table with a line a group: a cell is (column, function that writes its values)."""
+    if frame.empty:
+        return Table(caption, frame)
+    cells = frame.groupby(by, sort=False).agg(**columns).reset_index()
+    return Table(caption + remark(frame.code), cells)
+
+
 def remark(codes: Iterable[str]) -> str:
     """Say that rows are of several commits, or of a tree that was not clean; else ""."""
     known = list(dict.fromkeys(codes))
@@ -58,20 +65,13 @@ def remark(codes: Iterable[str]) -> str:
     return ""
 
 
-def code_remark(rows: Iterable[Row]) -> str:
-    """Return `remark` of the code of some rows."""
-    return remark(code_name(row["run"]) for row in rows)
-
-
 def as_text(table: Table, style: str = "simple") -> str:
     """Lay a table out for a terminal, or for Markdown with the style "pipe"."""
     if table.frame.empty:
         return f"{table.caption}: none"
-    sides = ["left"] + ["right"] * (len(table.frame.columns) - 1)
-    laid = table.frame.to_markdown(
-        index=False, tablefmt=style, colalign=sides, disable_numparse=True
-    )
-    return f"{table.caption}\n\n{laid}"
+    sides = ["left", *["right"] * (len(table.frame.columns) - 1)]
+    options: Any = {"tablefmt": style, "colalign": sides, "disable_numparse": True}
+    return f"{table.caption}\n\n{table.frame.to_markdown(index=False, **options)}"
 
 
 def number(value: float | None, decimals: int = 1) -> str:
@@ -95,25 +95,25 @@ def spread(values: pd.Series, decimals: int = 1) -> str:
 def quartiles(values: pd.Series, decimals: int = 2) -> str:
     """Write the median of times and the range of the middle half: "2.80 (2.71-2.95)"."""
     low, middle, high = (number(values.quantile(q), decimals) for q in (0.25, 0.5, 0.75))
-    return middle if len(values) < 2 else f"{middle} ({low}-{high})"
+    return middle if values.count() < 2 else f"{middle} ({low}-{high})"
 
 
-def span(values: pd.Series, decimals: int) -> tuple[str, str]:
-    """Write the median of values, and the least and the greatest: "37" and "12 to 55"."""
+def extent(values: pd.Series, decimals: int = 2) -> str:
+    """Write the least and the greatest of some values: "12 to 55"."""
     ends = f"{number(values.min(), decimals)} to {number(values.max(), decimals)}"
-    return number(values.median(), decimals), MISSING if values.empty else ends
+    return ends if values.count() else MISSING
 
 
-def counted(count: int, noun: str = "image") -> str:
-    """Write a number of things: "1 image", "3 images"."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+def counted(images: pd.Series) -> str:
+    """Write how many different images there are: "1 image", "3 images"."""
+    return f"{images.nunique()} image" + "s" * (images.nunique() != 1)
 
 
 def smallest(curve: Mapping[Any, float], target: float) -> float:
     """Interpolate the size at a PSNR, which is taken as linear in the logarithm of the size.
 
-    Between the first two neighbours, by their sizes (splats, or bits), that have the PSNR between
-    them; NaN where there are none.
+    Between the first two neighbours, by their sizes (Gaussians, or bits), that have the PSNR
+    between them; NaN where there are none.
     """
     for (few, low), (many, high) in pairwise(sorted(curve.items())):
         if low <= target <= high:

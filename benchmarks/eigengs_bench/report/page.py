@@ -1,6 +1,8 @@
-"""The page of all that benchmarks left in a folder: one HTML file, and Markdown with pictures."""
+"""The page of all results in a folder: one HTML file, and Markdown with pictures."""
 
 import json
+import mimetypes
+from base64 import b64encode
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -9,9 +11,9 @@ from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 
 from eigengs_bench.experiments.figures import LIST, read_list
-from eigengs_bench.harness.store import Row, count_codes, read
-from eigengs_bench.report.charts import data_uri, draw
-from eigengs_bench.report.frames import Told, as_text, code_remark
+from eigengs_bench.harness.store import Row, code_name, count_codes, read
+from eigengs_bench.report.charts import draw
+from eigengs_bench.report.frames import Section, as_text, remark
 from eigengs_bench.report.sections import budget, methods, pareto, rate, stability
 from eigengs_bench.report.sections.losses import where_default_loses
 from eigengs_dr.storage.atomic import atomic_write
@@ -19,18 +21,18 @@ from eigengs_dr.storage.atomic import atomic_write
 TILES = "stability-tiles.png"
 
 # Titles, the files of their rows, and what makes tables and charts of the rows.
-SECTIONS: tuple[tuple[str, tuple[str, ...], Callable[..., Told]], ...] = (
-    ("The methods", ("tables.jsonl",), methods.tell),
-    ("Speed against accuracy", ("pareto.jsonl",), pareto.tell),
-    ("Where methods fail", ("stability.jsonl",), stability.tell),
+SECTIONS: tuple[tuple[str, tuple[str, ...], Callable[..., Section]], ...] = (
+    ("The methods", ("tables.jsonl",), methods.summarize),
+    ("Speed against accuracy", ("pareto.jsonl",), pareto.summarize),
+    ("Where methods fail", ("stability.jsonl",), stability.summarize),
     ("Where default loses", ("tables.jsonl", "stability.jsonl"), where_default_loses),
-    ("Gaussians that a PSNR takes", ("budget.jsonl",), budget.tell),
-    ("Bytes that a PSNR takes", ("rate.jsonl",), rate.tell),
+    ("Gaussians that a PSNR takes", ("budget.jsonl",), budget.summarize),
+    ("Bytes that a PSNR takes", ("rate.jsonl",), rate.summarize),
 )
 
 
 class Picture(NamedTuple):
-    """A chart or a photo: the name and the content of its file, and what is said of it."""
+    """A chart or a photo: the name and the content of its file, and its caption."""
 
     name: str
     content: bytes
@@ -39,7 +41,8 @@ class Picture(NamedTuple):
     @property
     def uri(self) -> str:
         """A link that holds the picture."""
-        return data_uri(self.content, Path(self.name).suffix)
+        kind = mimetypes.guess_type(self.name)[0]
+        return f"data:{kind};base64,{b64encode(self.content).decode()}"
 
 
 def write_page(folder: Path, output: Path) -> None:
@@ -48,17 +51,15 @@ def write_page(folder: Path, output: Path) -> None:
     `ValueError` if the folder holds no results, or damaged ones.
     """
     sections = []
-    for title, files, tell in SECTIONS:
-        rows = [rows_of(folder / file) for file in files]
-        if any(rows):
-            told = tell(*rows)
-            charts = told.charts.items()
-            shown = [Picture(f"{name}.svg", draw(figure), text) for name, (text, figure) in charts]
+    for title, files, summarize in SECTIONS:
+        runs = [row["run"] for file in files for row in rows_of(folder / file)]
+        if runs:
+            tables, charts = summarize(*(rows_of(folder / file) for file in files))
+            shown = [Picture(f"{name}.svg", draw(f), text) for name, (text, f) in charts.items()]
             if files == ("stability.jsonl",) and (folder / TILES).exists():
-                caption = f'Tiles in the case "smooth", and errors.{code_remark(rows[0])}'
+                caption = f'Tiles in the case "smooth", and errors.{remark(map(code_name, runs))}'
                 shown.append(Picture(TILES, (folder / TILES).read_bytes(), caption))
-            runs = [row["run"] for some in rows for row in some]
-            sections.append((title, told.tables, shown, source_of(runs)))
+            sections.append((title, tables, shown, source_of(runs)))
     if listed := read_list(folder / LIST):
         shown = [
             Picture(f["path"], (folder / f["path"]).read_bytes(), f"{f['caption']} {f['credit']}")
@@ -103,6 +104,6 @@ def source_of(runs: Sequence[Row]) -> list[str]:
         lines.append(f"{command} ({' to '.join(dict.fromkeys((min(days), max(days))))})")
     for run in runs:
         versions = {k: v for k, v in run["versions"].items() if v and not k.endswith("_path")}
-        told = ", ".join(f"{name} {version}" for name, version in versions.items())
-        lines.append(f"{run['cpu']}, {run['threads']} threads, backend {run['backend']}; {told}")
+        named = ", ".join(f"{name} {version}" for name, version in versions.items())
+        lines.append(f"{run['cpu']}, {run['threads']} threads, backend {run['backend']}; {named}")
     return [*dict.fromkeys(lines), f"rows of {count_codes(runs)}"]

@@ -4,9 +4,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from eigengs_bench.experiments.inverse import GOAL, Result, figures_of
-from eigengs_bench.report.charts import label_axes, new_figure
-from eigengs_bench.report.frames import Table, number, table
-from eigengs_bench.report.strips import Picture, strip
+from eigengs_bench.report.charts import Picture, label_axes, new_figure, strip
+from eigengs_bench.report.frames import Table, number
 from eigengs_dr.image.color import to_coded
 from eigengs_dr.image.resize import resample
 
@@ -23,13 +22,12 @@ SIDE, GAP = 96, 4  # side of a picture in a strip, and white pixels between two,
 
 def results_table(results: dict[str, Result]) -> Table:
     """Lay out the figures of all conditions and methods."""
-    figures = pd.DataFrame(figures_of(results)).astype({"goal_steps": float})
-    lines = [
-        (f"{condition}, {TITLES[method]}", *(number(cell, 1) for cell in cells))
-        for condition, method, *cells in figures.itertuples(index=False)
-    ]
+    figures = pd.DataFrame(figures_of(results))
+    posters = figures.pop("condition") + ", " + figures.pop("method").map(TITLES)
+    figures = figures.astype(float).map(number)
+    figures.insert(0, "poster", posters)
     caption = f"PSNR / dB of recovered posters, also of halves; steps and seconds to {GOAL:g} dB"
-    return table(caption, ("poster", *figures.columns[2:]), lines)
+    return Table(caption, figures)
 
 
 def results_chart(results: dict[str, Result]) -> Figure:
@@ -41,11 +39,9 @@ def results_chart(results: dict[str, Result]) -> Figure:
             steps.plot(trace.steps, trace.psnr_ycbcr, label=TITLES[method])
             # The start, at 0 seconds, has no place on a logarithmic scale.
             seconds.plot(trace.seconds[1:], trace.psnr_ycbcr[1:])
-        label_axes(steps, "steps", "PSNR (YCbCr) / dB", "", title=name)
+        label_axes(steps, "steps", "PSNR (YCbCr) / dB", "", steps is axes[0, 0], title=name)
         steps.set_xscale("symlog", linthresh=1)
-        label_axes(seconds, "seconds", "PSNR (YCbCr) / dB")
-    lines = axes[0, 0].get_lines()
-    figure.legend(handles=lines, loc="outside lower center", ncols=len(lines), fontsize=9)
+        label_axes(seconds, "seconds", "PSNR (YCbCr) / dB", legend=False)
     return figure
 
 

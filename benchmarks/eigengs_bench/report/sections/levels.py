@@ -1,12 +1,9 @@
-"""PSNR over how many splats of a set are drawn, from the rows that `levels` measured."""
-
-from collections.abc import Sequence
+"""PSNR over how many Gaussians of a set are drawn, from the rows that `levels` measured."""
 
 import pandas as pd
 
-from eigengs_bench.harness.store import Row
 from eigengs_bench.report.charts import label_axes, new_figure
-from eigengs_bench.report.frames import Told, number, table
+from eigengs_bench.report.frames import Section, number, table
 
 LINES = {
     "levels": ("the first of one set, fitted in levels", "o-"),
@@ -15,22 +12,19 @@ LINES = {
 }
 
 
-def tell(rows: Sequence[Row], name: str) -> Told:
-    """Lay out PSNR over splats that are drawn of an image."""
-    points = pd.DataFrame(rows)
+def summarize(points: pd.DataFrame, name: str) -> Section:
+    """Lay out PSNR over the number of Gaussians that are drawn."""
     lines = [
-        (f"{row['splats']:,}{' *' * row['level']}", *(number(row[key], 2) for key in LINES))
-        for row in rows
+        (f"{row.splats:,}{' *' * row.level}", *(number(row[key], 2) for key in LINES))
+        for _, row in points.iterrows()
     ]
     words = ", ".join(words for words, _ in LINES.values())
-    caption = f"{name}: PSNR in YCbCr by splats drawn (* a level ends): {words}"
+    caption = f"{name}: PSNR in YCbCr by Gaussians drawn (* a level ends): {words}"
     figure = new_figure(6.4, 4.6, f"Levels of detail: {name}; lines mark where levels end")
     axis = figure.subplots()
     for key, (label, style) in LINES.items():
         axis.plot(points.splats, points[key], style, ms=4, label=label)
     for end in points.splats[points.level]:
         axis.axvline(end, color="#888888", lw=0.6)
-    label_axes(axis, "Gaussians drawn", "PSNR in YCbCr / dB", subs=(2, 5))
-    axis.legend(fontsize=9)
-    told = table(caption, ("splats", *LINES), lines)
-    return Told([told], {"levels": (caption, figure)}, {"levels": points})
+    label_axes(axis, "Gaussians drawn", "PSNR in YCbCr / dB")
+    return Section([table(caption, ("Gaussians", *LINES), lines)], {"levels": (caption, figure)})

@@ -1,4 +1,4 @@
-"""Where another preset is ahead of "default": said plainly, from what was measured."""
+"""Where another preset is ahead of "default"."""
 
 from collections.abc import Iterator, Sequence
 
@@ -6,13 +6,13 @@ import numpy as np
 import pandas as pd
 
 from eigengs_bench.harness.store import Row
-from eigengs_bench.report.frames import MISSING, Told, frame_of, number, table
+from eigengs_bench.report.frames import MISSING, Section, frame_of, number, table
 from eigengs_bench.report.sections.methods import groups_of, methods_of
 
 Line = tuple[str, ...]
 
 
-def where_default_loses(fits: Sequence[Row], cells: Sequence[Row]) -> Told:
+def where_default_loses(fits: Sequence[Row], cells: Sequence[Row]) -> Section:
     """List what "default" loses, by psnr_ycbcr, in rows of `tables` and of `stability`.
 
     Means over images are compared, of the methods of the main table with the same images: after as
@@ -20,19 +20,23 @@ def where_default_loses(fits: Sequence[Row], cells: Sequence[Row]) -> Told:
     has taken by then. Before its first set is there, it has none. Of hard cases ends are compared.
     """
     measured, cases = frame_of(fits, "moments"), frame_of(cells)
-    lines = [line for key, some in groups_of(measured).items() for line in _of_set(*key, some)]
+    lines = [
+        line
+        for (name, steps), some in groups_of(measured).items()
+        for line in _of_set(name, steps, some)
+    ]
     lines += _of_cases(cases) if len(cases) else []
     columns = ("images or case", "when", "who is ahead", "its dB", "dB of default")
     caption = "Where another preset is ahead of default: PSNR YCbCr / dB"
     codes = [code for frame in (measured, cases) if len(frame) for code in frame.code]
-    return Told([table(caption, columns, lines, codes)])
+    return Section([table(caption, columns, lines, codes)])
 
 
 def _of_set(name: str, iterations: int, fits: pd.DataFrame) -> Iterator[Line]:
     fits, where = methods_of(fits, name, "main"), f"{name}, {iterations:,} steps"
     default = fits[fits.method == "default"]
     ours = _course(default)
-    for method, part in fits[fits.method != "default"].groupby("method", observed=True):
+    for method, part in fits[fits.method != "default"].groupby("method", sort=False):
         if set(part.image) != set(default.image):
             continue
         course, first = _course(part), ours.seconds.min()
@@ -40,11 +44,10 @@ def _of_set(name: str, iterations: int, fits: pd.DataFrame) -> Iterator[Line]:
         if len(early):
             yield where, f"until {number(first, 3)} s", method, number(early.max()), MISSING
         for step, seconds, theirs in course.itertuples():
-            if theirs > ours.psnr[step]:
-                yield where, f"{step:,} steps", method, number(theirs), _told(ours.psnr[step])
             best = ours.psnr[ours.seconds <= seconds].max()  # NaN before the first
-            if theirs > best:
-                yield where, f"{number(seconds, 3)} s", method, number(theirs), _told(best)
+            for when, mine in ((f"{step:,} steps", ours.psnr[step]), (f"{seconds:.3f} s", best)):
+                if theirs > mine:
+                    yield where, when, method, number(theirs), _decibels(mine)
 
 
 def _course(fits: pd.DataFrame) -> pd.DataFrame:
@@ -53,8 +56,8 @@ def _course(fits: pd.DataFrame) -> pd.DataFrame:
     return known.groupby("iteration").agg({"seconds": "median", "psnr": "mean"})
 
 
-def _told(decibels: float) -> str:
-    return number(decibels) if decibels > -np.inf else "failed"
+def _decibels(value: float) -> str:
+    return number(value) if value > -np.inf else "failed"
 
 
 def _of_cases(cells: pd.DataFrame) -> Iterator[Line]:
@@ -63,5 +66,5 @@ def _of_cases(cells: pd.DataFrame) -> Iterator[Line]:
     default = cells[cells.preset == "default"].assign(ours=lambda f: f.end_ycbcr.fillna(-np.inf))
     both = cells.merge(default[[*same, "ours"]], on=same)
     for cell in both[both.end_ycbcr > both.ours].itertuples():
-        decibels = number(cell.end_ycbcr), _told(cell.ours)
-        yield f"case {cell.case}", f"{cell.iterations:,} steps", cell.preset, *decibels
+        ends = number(cell.end_ycbcr), _decibels(cell.ours)
+        yield f"case {cell.case}", f"{cell.iterations:,} steps", cell.preset, *ends

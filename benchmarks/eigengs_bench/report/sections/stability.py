@@ -5,51 +5,50 @@ from collections.abc import Callable, Iterable, Sequence
 import pandas as pd
 
 from eigengs_bench.harness.store import Row, code_name
-from eigengs_bench.report.frames import MISSING, Table, Told, number, table
+from eigengs_bench.report.frames import MISSING, Section, Table, number, table
 from eigengs_dr.image.metrics import MAX_PSNR
 
 TOLERANCE = 0.01  # decibels that an end may lie below its start
-NOT_FINITE = "not finite"
 
 
-def tell(rows: Sequence[Row]) -> Told:
+def summarize(rows: Sequence[Row]) -> Section:
     """Lay the matrix out, and list what is wrong with default."""
-    counts = sorted({row["job"]["iterations"] for row in rows})
-    steps = " or ".join(f"{count:,}" for count in counts)
+    steps = " or ".join(f"{n:,}" for n in sorted({row["job"]["iterations"] for row in rows}))
     matrix = [_matrix(f"{caption}; {steps} steps", cell, rows) for caption, cell in FIGURES]
     found = [(line,) for line in defects(rows)]
     caption = "Cells of default that are not finite, or end below their start"
-    codes = (code_name(row["run"]) for row in rows)
-    return Told([*matrix, table(caption, ("cell",), found, codes)])
+    return Section([*matrix, table(caption, ("cell",), found, _codes(rows))])
 
 
-def defects(rows: Iterable[Row], preset: str = "default") -> list[str]:
-    """Name the cells of a preset that are not finite, or end below their start: one line each."""
+def defects(rows: Iterable[Row]) -> list[str]:
+    """Name the cells of default that are not finite, or end below their start: one line each."""
     found = []
-    for row in (row for row in rows if row["job"]["preset"] == preset and "needs" not in row):
+    for row in (row for row in rows if row["job"]["preset"] == "default" and "needs" not in row):
         if not row["finite"]:
-            found.append(f"{row['job']['case']}: {NOT_FINITE}")
+            found.append(f"{row['job']['case']}: not finite")
         elif (lost := row["start_ycbcr"] - row["end_ycbcr"]) > TOLERANCE:
             found.append(f"{row['job']['case']}: ends {lost:.2f} dB below its start")
     return found
 
 
+def _codes(rows: Sequence[Row]) -> list[str]:
+    return [code_name(row["run"]) for row in rows]
+
+
 def _matrix(caption: str, cell: Callable[[Row], str], rows: Sequence[Row]) -> Table:
     """Put a figure of every case and preset into a matrix; of equal ones the last is shown."""
-    written = pd.DataFrame([{**row["job"], "cell": cell(row)} for row in rows])
-    written = written.drop_duplicates(["case", "preset"], keep="last")
-    matrix = written.pivot(index="case", columns="preset", values="cell")
-    matrix = matrix.reindex(index=written.case.unique(), columns=written.preset.unique())
-    matrix = matrix.fillna(MISSING).reset_index()
-    return table(caption, matrix, matrix.to_numpy(), (code_name(row["run"]) for row in rows))
+    cells = pd.DataFrame([{**row["job"], "cell": cell(row)} for row in rows])
+    cells = cells.drop_duplicates(["case", "preset"], keep="last")
+    matrix = cells.pivot(index="case", columns="preset", values="cell").fillna(MISSING)
+    matrix = matrix.loc[cells.case.unique(), cells.preset.unique()].reset_index()
+    return table(caption, matrix, matrix.to_numpy(), _codes(rows))
 
 
 def _ends(row: Row) -> str:
     if "needs" in row:
         return f"needs {row['needs']}"
-    if not row["finite"]:
-        return NOT_FINITE
-    return f"{_decibels(row['end_ycbcr'])} from {_decibels(row['start_ycbcr'])}"
+    ends = f"{_decibels(row['end_ycbcr'])} from {_decibels(row['start_ycbcr'])}"
+    return ends if row["finite"] else "not finite"
 
 
 def _decibels(value: float | None) -> str:
@@ -62,7 +61,6 @@ def _ratio(row: Row) -> str:
 
 
 def _half(row: Row) -> str:
-    """Decibels that half precision takes from the end."""
     if row.get("half_rgb") is None:
         return MISSING
     return number(round(row["end_rgb"] - row["half_rgb"], 2) + 0.0, 2)  # no "-0.00"
