@@ -126,7 +126,8 @@ def prints_figures(command: Callable[..., Any]) -> Any:
         with progress_bar(quiet) as show:
             figures, text = command(show=show, **settings)
         if report:
-            write_report(report, {**about(context, backend), **figures})
+            choices = {k: str(v) if isinstance(v, Path) else v for k, v in settings.items()}
+            write_report(report, {**about(context, backend), **choices, **figures})
         if not quiet:
             click.echo(text or "\n".join(f"{k:24} {value:.4g}" for k, value in figures.items()))
 
