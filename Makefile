@@ -44,8 +44,7 @@ $(READY): pyproject.toml benchmarks/pyproject.toml
 	@$(APT_INSTALL); $(PYTHON) -c 'import ensurepip' 2>/dev/null \
 		|| apt_install python3-venv "$(VENV_ADVICE)"
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --editable '.[dev]'
-	$(BIN)/python -m pip install --editable ./benchmarks
+	$(BIN)/python -m pip install --editable '.[dev]' --editable ./benchmarks
 	@$(APT_INSTALL); $(BIN)/eigengs-dr doctor >/dev/null \
 		|| apt_install "libllvm19 libatomic1" "$(LLVM_ADVICE)"
 	$(BIN)/eigengs-dr doctor

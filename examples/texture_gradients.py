@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from eigengs_dr.eigenbasis.registry import SHIPPED
 from eigengs_dr.plugins import gaussians_of, keep_in_bounds, texture_of
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "build/examples")
@@ -96,7 +97,7 @@ def render_loss(scene, parameters):
 # coefficients. Here they are in units of about the standard deviation of each component. They start
 # at 0, which is the mean image.
 
-file = Path(eg.__file__).parent / "data" / "natural.npz"
+file = SHIPPED["natural"]
 model = eg.EigenGS.load(file)
 scene = room({"type": "gaussian_texture", "model": str(file)})
 parameters = mi.traverse(scene)
