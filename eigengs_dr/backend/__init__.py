@@ -2,6 +2,7 @@
 
 - ``libllvm``: finds a libLLVM that works, before Dr.Jit loads one
 - ``selection``: picks llvm or cuda
+- ``arithmetic``: functions that cuda approximates too coarsely
 - ``arrays``: array types that go together; copies of NumPy arrays
 - ``recording``: frozen programs
 - ``interrupt``: Ctrl-C and SIGTERM between steps
