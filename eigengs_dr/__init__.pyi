@@ -1,5 +1,6 @@
 """The public names of eigengs_dr; `lazy_loader` and type checkers read this file."""
 
+from .backend.recording import exclusive
 from .backend.selection import BackendError
 from .codec.bit_allocation import PackResult, pack
 from .eigenbasis.eigengs import EigenGS
@@ -28,6 +29,7 @@ __all__ = [
     "ImageError",
     "PackResult",
     "concatenate",
+    "exclusive",
     "fit",
     "fit_for_scene",
     "fit_levels",

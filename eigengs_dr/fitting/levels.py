@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..backend.interrupt import defer_interrupts
+from ..backend.recording import exclusive
 from ..gaussian.concatenate import concatenate
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image
@@ -72,6 +73,7 @@ def level_counts(count: int, levels: int) -> list[int]:
     return [count // LEVEL_RATIO**k for k in reversed(range(levels))]
 
 
+@exclusive()
 def fit_levels(
     image: ArrayLike,
     gaussians: int | None = None,
