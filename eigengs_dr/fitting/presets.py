@@ -40,6 +40,7 @@ _ONE_RATE = Schedule(
     parameterization="cholesky",
     decay=1.0,
     warm_up=0,
+    drift=4e-3,
     patience=10_000,
 )
 

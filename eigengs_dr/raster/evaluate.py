@@ -12,20 +12,22 @@ from typing import Any
 
 import drjit as dr
 
+from ..backend.arithmetic import rcp, rsqrt
 from ..backend.arrays import types_of
 
 LN2 = math.log(2)
 
 
 def exp2_neg(q: Any) -> Any:
-    """Return ``2^-q`` for ``0 <= q <= 120``: relative error < 3e-7, half the cost of `drjit.exp2`.
+    """Return ``2^-q`` for ``-126 <= q <= 126``: relative error < 3e-7.
 
-    Split ``q = n - f`` into an integer n and ``|f| <= 1/2``: a polynomial gives ``2^f``, and n is
-    subtracted from its exponent bits. Outside the range the result is arbitrary, and callers mask
-    it. Double precision uses `drjit.exp2`. Not differentiable: see `falloff`.
+    On llvm, single precision costs half of `drjit.exp2`: split ``q = n - f`` into an integer n and
+    ``|f| <= 1/2``; a polynomial gives ``2^f``, and n is subtracted from its exponent bits. Outside
+    the range the result is arbitrary, and callers mask it. Double precision and cuda, where it is
+    one instruction, use `drjit.exp2`. Not differentiable: see `falloff`.
     """
     types = types_of(q)
-    if types.bits == 64:
+    if types.bits == 64 or types.backend == "cuda":
         return dr.exp2(-q)
     shifter = 12582912.0  # 1.5 * 2^23: adding it rounds to an integer in the low mantissa bits
     shifted = shifter - q
@@ -52,11 +54,13 @@ def falloff(q: Any, limit: float) -> Any:
     return dr.replace_grad(value, (-LN2 * value) * q)
 
 
-def weights(shape: list, x: Any, y: Any, tile: tuple[int, int], radius: float) -> list:
+def weights(
+    shape: list, x: Any, y: Any, tile: tuple[int, int], radius: float, steep: bool = True
+) -> list:
     """Evaluate one Gaussian at a block of pixels: ``2^-|F (x - mu)|^2`` in the units of kernels.
 
     The renderer, its derivatives, the colour solve and the textures (with blocks of one point) all
-    evaluate Gaussians here. Cost per point: one `exp2_neg`, a comparison and 2 or 3 operations.
+    evaluate Gaussians here.
 
     Parameters
     ----------
@@ -68,27 +72,110 @@ def weights(shape: list, x: Any, y: Any, tile: tuple[int, int], radius: float) -
         Width and height of the block; points are 1 pixel apart.
     radius : float
         Cutoff, see `eigengs_dr.raster.parameters.kernel_radius`.
+    steep : bool, optional
+        Whether to evaluate an exponential at every point. False is faster: products continue one
+        exponential of each row, with a relative error of about 2e-6. It needs a width of 4 and a
+        Gaussian for which `is_steep` is false, and Dr.Jit cannot differentiate it.
 
     Returns
     -------
     list of Float
         Weights in [0, 1], row after row.
     """
-    limit = radius * radius
-    return [falloff(dr.fma(u, u, v * v), limit) for us, v in _rows(shape, x, y, tile) for u in us]
+    return [w for row in _rows(shape, x, y, tile, radius, steep) for w in row[0]]
 
 
-def _rows(shape: list, x: Any, y: Any, tile: tuple[int, int]) -> list[tuple[list, Any]]:
-    """Return ``F (x - mu) = (u, v)`` at a block of pixels: a list of u and one v for each row."""
+def _rows(
+    shape: list, x: Any, y: Any, tile: tuple[int, int], radius: float, steep: bool
+) -> list[tuple[list, Any, Any]]:
+    """Return for each row of a block its weights, and (u, v) = F (x - mu) at its column `_column`.
+
+    One step to the right changes u by a, and one step down changes (u, v) by (b, c).
+    """
     mean_x, mean_y, a, b, c = shape
-    dx, dy = x - mean_x, y - mean_y
+    dx, dy = x + float(_column(tile)) - mean_x, y - mean_y
     u0, v0 = dr.fma(a, dx, b * dy), c * dy
+    points = [(dr.fma(b, float(j), u0), dr.fma(c, float(j), v0)) for j in range(tile[1])]
+    points[0] = (u0, v0)
+    if not steep:
+        return _chained(a, b, points, radius)
+    limit, steps = radius * radius, [float(i - _column(tile)) for i in range(tile[0])]
     rows = []
-    for j in range(tile[1]):
-        u = dr.fma(b, float(j), u0) if j else u0
-        v = dr.fma(c, float(j), v0) if j else v0
-        rows.append(([dr.fma(a, float(i), u) if i else u for i in range(tile[0])], v))
+    for u, v in points:
+        us = [dr.fma(a, i, u) if i else u for i in steps]
+        rows.append(([falloff(dr.fma(t, t, v * v), limit) for t in us], u, v))
     return rows
+
+
+def _column(tile: tuple[int, int]) -> int:
+    """Return the column in which a row of a block starts: the second of 4 bounds the products."""
+    return min(1, tile[0] - 1)
+
+
+def _chained(a: Any, b: Any, points: list, radius: float) -> list[tuple[list, Any, Any]]:
+    """Return the rows of `_rows` of 4 pixels by products, from the weights w_1 of the second pixel.
+
+    With (u, v) there, ``w_2 = w_1 M`` and ``w_3 = w_2 M K`` and ``w_0 = w_1 K / M``, where
+    ``M = 2^-(2 a u + a^2)`` and ``K = 2^-2a^2``. A row further down has ``M 2^-2ab``. `is_steep`
+    tells where all factors stay in the range of floats.
+    """
+    largest, least = 126.0, 2.0 ** (-radius * radius)
+    start = (len(points) - 1) // 2  # the ratios start here, where their exponents are smallest
+    exponent = dr.fma(2 * a, points[start][0], a * a)
+    ratio = exp2_neg(dr.clip(exponent, -largest, largest))
+    bend = exp2_neg(dr.minimum(2 * a * a, largest))
+    down = exp2_neg(dr.clip(2 * a * b, -largest, largest))
+    up = rcp(down)
+    rows = []
+    for (u, v), right, left in zip(
+        points,
+        _powers(ratio, up, down, start, len(points)),
+        _powers(rcp(ratio), down, up, start, len(points)),
+        strict=True,
+    ):
+        q = dr.fma(u, u, v * v)
+        w1 = dr.select(q <= largest, exp2_neg(q), 0)
+        w2 = w1 * right
+        ws = (w1 * (left * bend), w1, w2, w2 * (right * bend))
+        # A factor that left the range gives NaN here, and a comparison with NaN is false.
+        rows.append(([dr.select(w >= least, w, 0) for w in ws], u, v))
+    return rows
+
+
+def _powers(value: Any, up: Any, down: Any, start: int, count: int) -> list:
+    """Return `count` values, `value` at `start`, times `up` before it and times `down` after it."""
+    values = [value]
+    for _ in range(start):
+        values.insert(0, values[0] * up)
+    while len(values) < count:
+        values.append(values[-1] * down)
+    return values
+
+
+def is_steep(shape: list, radius: float) -> Any:
+    """Return for each Gaussian whether products could leave the range of floats in `weights`.
+
+    Beside a pixel inside the ellipse, ``|u| <= radius + 2 a`` at the second pixel of the row, and
+    ``|u| <= radius + 2 a + 2 |b|`` in the row where the ratios start. The exponents of the weight
+    there, ``u^2 + v^2``, and of the ratio, ``2 a u + a^2``, must stay below 126; 120 leaves room
+    for Gaussians that shrink until the next test.
+
+    Parameters
+    ----------
+    shape : list of 5 Float, shape (N,)
+        As for `weights`.
+    radius : float
+        As for `weights`.
+
+    Returns
+    -------
+    Bool, shape (N,)
+        True for standard deviations below about 0.2 pixels at a cutoff of 3.
+    """
+    _, _, a, b, _ = shape
+    reach = dr.fma(2.0, a, radius)
+    ratio = dr.fma(2 * a, reach + 2 * dr.abs(b), a * a)
+    return ~((reach * reach <= 120) & (ratio <= 120))
 
 
 def weights_vjp(
@@ -98,17 +185,18 @@ def weights_vjp(
     tile: tuple[int, int],
     radius: float,
     cotangent: Callable[[int, Any], Any],
+    steep: bool = True,
 ) -> list:
     """Return the gradient of ``sum_k g_k w_k`` for ``g_k = cotangent(k, w_k)``.
 
     With ``e = -2 ln(2) g w``, ``du = e u``, ``dv = e v`` and the offset (i, j) in the block, the
     gradient is ``da = sum du (dx + i)``, ``db = sum du (dy + j)``, ``dc = sum dv (dy + j)`` and
-    ``d mu = -(a sum du, b sum du + c sum dv)``. These formulas halve the cost of the adjoint
-    compared with Dr.Jit's own derivatives of `weights`.
+    ``d mu = -(a sum du, b sum du + c sum dv)``. A row needs only the moments ``sum e``,
+    ``sum e i`` and ``sum e i^2``, because u is linear in i.
 
     Parameters
     ----------
-    shape, x, y, tile, radius
+    shape, x, y, tile, radius, steep
         As for `weights`.
     cotangent : callable
         ``cotangent(k, w)`` receives the weight of point k and returns the derivative of the loss
@@ -120,22 +208,21 @@ def weights_vjp(
         Derivatives with respect to mean x, mean y, a, b, c.
     """
     mean_x, mean_y, a, b, c = shape
-    limit = radius * radius
+    steps = [float(i - _column(tile)) for i in range(tile[0])]
     du = dui = duj = dv = dvj = type(mean_x)(0)
-    for j, (us, v) in enumerate(_rows(shape, x, y, tile)):
-        e_row = u_row = type(mean_x)(0)
-        for i, u in enumerate(us):
-            w = falloff(dr.fma(u, u, v * v), limit)
-            e = w * cotangent(j * tile[0] + i, w)
-            e_row = e_row + e
-            u_row = dr.fma(e, u, u_row)
-            if i:
-                dui = dr.fma(e * u, float(i), dui)
-        dv_row = e_row * v
-        du, dv = du + u_row, dv + dv_row
+    for j, (ws, u, v) in enumerate(_rows(shape, x, y, tile, radius, steep)):
+        e = [w * cotangent(j * tile[0] + i, w) for i, w in enumerate(ws)]
+        e0, e1, e2 = (
+            _moment(e, [1.0] * len(e)),
+            _moment(e, steps),
+            _moment(e, [i * i for i in steps]),
+        )
+        u_row, v_row = dr.fma(u, e0, a * e1), v * e0
+        du, dv = du + u_row, dv + v_row
+        dui = dui + dr.fma(u, e1, a * e2)
         if j:
-            duj, dvj = dr.fma(u_row, float(j), duj), dr.fma(dv_row, float(j), dvj)
-    dx, dy = x - mean_x, y - mean_y
+            duj, dvj = dr.fma(u_row, float(j), duj), dr.fma(v_row, float(j), dvj)
+    dx, dy = x + float(_column(tile)) - mean_x, y - mean_y
     return [
         k * (-2 * LN2)
         for k in (
@@ -146,6 +233,17 @@ def weights_vjp(
             dr.fma(dy, dv, dvj),
         )
     ]
+
+
+def _moment(values: list, factors: list[float]) -> Any:
+    """Return the sum of values times literal factors; factors of 0 and 1 cost no product."""
+    total = type(values[0])(0)
+    for value, factor in zip(values, factors, strict=True):
+        if factor == 1:
+            total = total + value
+        elif factor:
+            total = dr.fma(value, factor, total)
+    return total
 
 
 def widen(shape: list, footprint: list) -> tuple[list, Any]:
@@ -171,7 +269,7 @@ def widen(shape: list, footprint: list) -> tuple[list, Any]:
     """
     mean_x, mean_y, a, b, c = shape
     fxx, fxy, fyy = footprint
-    ia, ic = dr.rcp(a), dr.rcp(c)
+    ia, ic = rcp(a), rcp(c)
     t = -b * ia * ic  # F^-1 = [[1/a, t], [0, 1/c]]
     xy = dr.fma(t, ic, fxy)
     yy = dr.fma(ic, ic, fyy)
@@ -180,7 +278,7 @@ def widen(shape: list, footprint: list) -> tuple[list, Any]:
     across = dr.fma(ic * ic, fxx, t * dr.fma(t, fyy, -2 * ic * fxy))
     whole = ia * ic
     added = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0) + dr.maximum(across, 0)
-    scale = dr.rsqrt(dr.fma(whole, whole, dr.fma(ia * ia, fyy, added)))
-    new_c = dr.rsqrt(yy)
+    scale = rsqrt(dr.fma(whole, whole, dr.fma(ia * ia, fyy, added)))
+    new_c = rsqrt(yy)
     scaled = new_c * scale
     return [mean_x, mean_y, yy * scaled, -xy * scaled, new_c], whole * scale

@@ -1,4 +1,4 @@
-"""The sum over all Gaussians with one lane per tile, and its adjoint with one lane per Gaussian.
+"""The sum over all Gaussians, its error, and its adjoint.
 
 ``I(x) = background + sum_n c_n w_n(x)`` with the weights of `eigengs_dr.raster.evaluate`.
 
@@ -8,26 +8,115 @@ channel after channel. A lane then reads or writes one contiguous run with packe
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 
 from ..backend.arrays import ArrayTypes, types_of
 from .evaluate import weights, weights_vjp
+from .granularity import granularity_of
 from .layout import gather_index, gather_run, unpack_parameters
+from .lists import Pieces, TileLists
 from .parameters import NUM_SHAPE_PARAMS
-from .tiles import Grid, TileLists, for_each_tile
+from .tiles import Grid
 
 # ---------------------------------------------------------------------------------------------
-#  Sum over Gaussians, one lane per tile
+#  Sum over Gaussians, one lane per block of rows of a tile
 # ---------------------------------------------------------------------------------------------
+
+
+class _Blocks(NamedTuple):
+    """The rows of tiles that each lane owns.
+
+    Attributes
+    ----------
+    run : UInt32
+        Index of the block in tile layout: the block holds the run of pixels ``[run, run + 1)``
+        times `pixels`.
+    x, y : Float
+        First pixel centre.
+    begin, end : UInt32
+        Range of the list of the tile.
+    size : (int, int)
+        Width and height of a block.
+    """
+
+    run: Any
+    x: Any
+    y: Any
+    begin: Any
+    end: Any
+    size: tuple[int, int]
+
+    @property
+    def pixels(self) -> int:
+        return self.size[0] * self.size[1]
+
+
+def _blocks(types: ArrayTypes, lists: TileLists) -> _Blocks:
+    """Divide every tile into blocks of `Granularity.rows` rows, one for each lane."""
+    width, height = lists.grid.tile
+    rows = min(granularity_of(types).rows, height)
+    parts = height // rows
+    tile, begin, end, part = lists.order, lists.begin, lists.end, types.UInt(0)
+    if parts > 1:  # neighbouring lanes share a tile, and write one contiguous run together
+        lane = dr.arange(types.UInt, lists.grid.tiles * parts)
+        part = lane % parts
+        tile, begin, end = (dr.gather(types.UInt, v, lane // parts) for v in (tile, begin, end))
+    x = types.Float(tile % lists.grid.nx * width) + 0.5
+    y = types.Float(tile // lists.grid.nx * height + part * rows) + 0.5
+    return _Blocks(tile * parts + part, x, y, begin, end, (width, rows))
+
+
+def _sum_blocks(
+    packed: Any, start: list, lists: TileLists, blocks: _Blocks, radius: float, tangent: Any = None
+) -> list:
+    """Sum the Gaussians of every block; return a list of Float, pixels times channels.
+
+    Cost per entry of the lists: one gather of parameters, and for a block of 4x4 pixels 6
+    exponentials, 60 operations for the weights and the cutoff, and an fma per pixel and channel.
+    """
+    types = types_of(packed)
+    number = NUM_SHAPE_PARAMS + len(start)
+
+    def contributions(p: list, steep: bool) -> list:
+        shape, color = p[:NUM_SHAPE_PARAMS], p[NUM_SHAPE_PARAMS:]
+        spread = weights(shape, blocks.x, blocks.y, blocks.size, radius, steep)
+        return [(w, c) for w in spread for c in color]
+
+    def add(i: Any, sums: list) -> tuple:
+        active = i < blocks.end
+        n = gather_index(types, lists.splat, i, active)
+        p = unpack_parameters(packed, n, number, active)
+        terms = contributions(p, lists.steep)
+        return i + 1, [dr.fma(w, c, s) for (w, c), s in zip(terms, sums, strict=True)]
+
+    def add_tangent(i: Any, sums: list) -> tuple:
+        active = i < blocks.end
+        n = gather_index(types, lists.splat, i, active)
+        p = unpack_parameters(packed, n, number, active)
+        with dr.resume_grad():
+            dr.enable_grad(p)
+            dr.set_grad(p, unpack_parameters(tangent, n, number, active))
+            out = [w * c for w, c in contributions(p, True)]
+            dr.forward_to(out)
+            change = dr.grad(out)
+        return i + 1, [s + d for s, d in zip(sums, change, strict=True)]
+
+    sums: list = dr.while_loop(
+        (types.UInt(blocks.begin), [types.Float(b) for _ in range(blocks.pixels) for b in start]),
+        lambda i, sums: i < blocks.end,
+        add if tangent is None else add_tangent,
+        label="sum splats",
+        max_iterations=-1,
+    )[-1]
+    return sums
 
 
 def forward(packed: Any, start: list, lists: TileLists, radius: float, tangent: Any = None) -> Any:
     """Sum the Gaussians of every tile: the image, or its derivative along `tangent`.
 
-    ``I_pc = start_c + sum_n w_n(p) c_nc``. Cost per entry of the lists: one gather of parameters
-    and ``pixels * (weight + channels)`` operations.
+    ``I_pc = start_c + sum_n w_n(p) c_nc``.
 
     Parameters
     ----------
@@ -48,48 +137,81 @@ def forward(packed: Any, start: list, lists: TileLists, radius: float, tangent: 
         In tile layout.
     """
     types = types_of(packed)
-    grid, channels = lists.grid, len(start)
-    number = NUM_SHAPE_PARAMS + channels
-    x = types.Float(lists.order % grid.nx * grid.tile[0]) + 0.5
-    y = types.Float(lists.order // grid.nx * grid.tile[1]) + 0.5
-
-    def contributions(p: list) -> list:
-        spread = weights(p[:NUM_SHAPE_PARAMS], x, y, grid.tile, radius)
-        return [(w, c) for w in spread for c in p[NUM_SHAPE_PARAMS:]]
-
-    def add(i: Any, sums: list) -> tuple:
-        active = i < lists.end
-        n = gather_index(types, lists.splat, i, active)
-        p = unpack_parameters(packed, n, number, active)
-        sums = [dr.fma(w, c, s) for (w, c), s in zip(contributions(p), sums, strict=True)]
-        return i + 1, sums
-
-    def add_tangent(i: Any, sums: list) -> tuple:
-        active = i < lists.end
-        n = gather_index(types, lists.splat, i, active)
-        p = unpack_parameters(packed, n, number, active)
-        with dr.resume_grad():
-            dr.enable_grad(p)
-            dr.set_grad(p, unpack_parameters(tangent, n, number, active))
-            out = [w * c for w, c in contributions(p)]
-            dr.forward_to(out)
-            change = dr.grad(out)
-        return i + 1, [s + d for s, d in zip(sums, change, strict=True)]
-
-    _, sums = dr.while_loop(
-        (types.UInt(lists.begin), [types.Float(b) for _ in range(grid.pixels) for b in start]),
-        lambda i, sums: i < lists.end,
-        add if tangent is None else add_tangent,
-        label="sum splats",
-        max_iterations=-1,
-    )
-    image = dr.empty(types.Float, grid.tiles * grid.pixels * channels)
-    dr.scatter(image, types.FloatX(sums), lists.order)
+    blocks = _blocks(types, lists)
+    sums = _sum_blocks(packed, start, lists, blocks, radius, tangent)
+    image = dr.empty(types.Float, lists.grid.tiles * lists.grid.pixels * len(start))
+    dr.scatter(image, types.FloatX(sums), blocks.run)
     return image
 
 
+def residual(
+    packed: Any,
+    start: list,
+    lists: TileLists,
+    radius: float,
+    target: Any,
+    weight: Any = None,
+) -> tuple[Any, list]:
+    """Sum the Gaussians of every tile, and compare them with an image, in one pass over memory.
+
+    With the error ``e = m (I - T)`` of a pixel, the results are ``m e``, which is half of the
+    derivative of ``sum e^2`` with respect to I, and the sums of ``e^2``. The factor m is the
+    weight inside the image, and 0 in parts of tiles outside it.
+
+    Parameters
+    ----------
+    packed, start, lists, radius
+        As for `forward`.
+    target : Float or None
+        Image T in tile layout; None for 0.
+    weight : Float, optional
+        Factor of the errors in tile layout; by default 1.
+
+    Returns
+    -------
+    delta : Float, shape (tiles * pixels * channels,)
+        ``m e`` in tile layout.
+    squares : list of Float, shape (lanes,)
+        For each channel, the sums of ``e^2`` over the pixels of each lane.
+    """
+    types = types_of(packed)
+    grid, channels = lists.grid, len(start)
+    blocks = _blocks(types, lists)
+    sums = _sum_blocks(packed, start, lists, blocks, radius)
+    length = blocks.pixels * channels
+
+    def load(image: Any) -> list:
+        return gather_run(types, image, blocks.run, length, True)
+
+    errors = sums if target is None else [s - t for s, t in zip(sums, load(target), strict=True)]
+    if weight is not None:
+        factors = load(weight)
+        errors = [e * m for e, m in zip(errors, factors, strict=True)]
+    inside = _inside(blocks, grid)
+    if inside is not None:
+        errors = [dr.select(inside[k // channels], e, 0) for k, e in enumerate(errors)]
+    squares = sum_channels([dr.square(e) for e in errors], channels)
+    if weight is not None:
+        errors = [e * m for e, m in zip(errors, factors, strict=True)]
+    delta = dr.empty(types.Float, grid.tiles * grid.pixels * channels)
+    dr.scatter(delta, types.FloatX(errors), blocks.run)
+    return delta, squares
+
+
+def _inside(blocks: _Blocks, grid: Grid) -> list | None:
+    """Return whether each pixel of a block lies in the image; None if tiles do not overhang."""
+    width, height = grid.tile
+    if grid.nx * width == grid.width and grid.ny * height == grid.height:
+        return None
+    return [
+        (blocks.x + i < grid.width) & (blocks.y + j < grid.height)
+        for j in range(blocks.size[1])
+        for i in range(blocks.size[0])
+    ]
+
+
 # ---------------------------------------------------------------------------------------------
-#  Adjoint, one lane per Gaussian
+#  Adjoint, one lane per piece of a Gaussian
 # ---------------------------------------------------------------------------------------------
 
 
@@ -103,8 +225,8 @@ def adjoint(
 ) -> list:
     """Return the gradient of ``<delta, forward(packed)>`` with respect to all parameters.
 
-    A lane owns a Gaussian, visits the tiles inside its ellipse, gathers delta there and sums in
-    registers. Without atomic operations, every run gives the same result.
+    A lane owns a piece of a Gaussian, visits its tiles, gathers delta there and sums in registers;
+    `sum_pieces` adds the pieces. Without atomic operations, every run gives the same result.
 
     Parameters
     ----------
@@ -114,7 +236,7 @@ def adjoint(
         Derivative of a loss with respect to the image, in tile layout.
     channels : int
     lists : TileLists
-        Only `grid` and `splat_order` are used.
+        With pieces.
     radius : float
         As for `forward`.
     color_only : bool, optional
@@ -125,15 +247,37 @@ def adjoint(
     list of Float, shape (N,)
         Derivatives with respect to mean x, mean y, a, b, c (unless `color_only`) and the channels.
     """
-    types = types_of(packed)
-    grid = lists.grid
-    splat = unpack_parameters(packed, lists.splat_order, NUM_SHAPE_PARAMS + channels)
-    length = grid.pixels * channels
+    assert lists.pieces is not None, "the lists were built without adjoint=True"
+    number = channels if color_only else NUM_SHAPE_PARAMS + channels
+    parts = adjoint_pieces(packed, delta, channels, lists, radius, color_only)
+    return sum_pieces(parts, lists.pieces, number)
 
-    def add_tile(tile: Any, column: Any, row: Any, active: Any, sums: list) -> list:
-        d = gather_run(types, delta, types.UInt(tile), length, active)
-        x = types.Float(column * grid.tile[0]) + 0.5
-        y = types.Float(row * grid.tile[1]) + 0.5
+
+def adjoint_pieces(
+    packed: Any,
+    delta: Any,
+    channels: int,
+    lists: TileLists,
+    radius: float,
+    color_only: bool = False,
+) -> Any:
+    """Return the packed sums of every piece, for `sum_pieces`; parameters as for `adjoint`.
+
+    Cost per visit of a tile: a gather of delta, 6 exponentials, and per pixel 2 operations for the
+    weight, 2 for the cutoff, 2 per channel and 5 for the shape.
+    """
+    types = types_of(packed)
+    grid, pieces, tile_size = lists.grid, lists.pieces, lists.grid.tile
+    assert pieces is not None
+    splat = unpack_parameters(packed, pieces.splat, NUM_SHAPE_PARAMS + channels)
+    shape, length = splat[:NUM_SHAPE_PARAMS], grid.pixels * channels
+
+    def add_tile(i: Any, sums: list) -> tuple:
+        active = i < pieces.end
+        tile = gather_index(types, pieces.tile, i, active)
+        d = gather_run(types, delta, tile, length, active)
+        x = types.Float(tile % grid.nx * tile_size[0]) + 0.5
+        y = types.Float(tile // grid.nx * tile_size[1]) + 0.5
         color = sums[-channels:]
 
         def cotangent(k: int, w: Any) -> Any:
@@ -144,31 +288,64 @@ def adjoint(
             return g
 
         if color_only:
-            for k, w in enumerate(weights(splat[:NUM_SHAPE_PARAMS], x, y, grid.tile, radius)):
+            for k, w in enumerate(weights(shape, x, y, tile_size, radius, lists.steep)):
                 cotangent(k, w)
-            return color
-        gradient = weights_vjp(splat[:NUM_SHAPE_PARAMS], x, y, grid.tile, radius, cotangent)
-        return [s + g for s, g in zip(sums, gradient, strict=False)] + color
+            return i + 1, color
+        gradient = weights_vjp(shape, x, y, tile_size, radius, cotangent, lists.steep)
+        return i + 1, [s + g for s, g in zip(sums, gradient, strict=False)] + color
 
     number = channels if color_only else NUM_SHAPE_PARAMS + channels
-    sums = for_each_tile(
-        splat[:NUM_SHAPE_PARAMS],
-        radius,
-        grid,
+    sums = dr.while_loop(
+        (types.UInt(pieces.begin), [types.Float(0) for _ in range(number)]),
+        lambda i, sums: i < pieces.end,
         add_tile,
-        [types.Float(0) for _ in range(number)],
         label="pull back",
-    )
-    return _restore_order(types, sums, lists.splat_order)
-
-
-def _restore_order(types: ArrayTypes, sums: list, order: Any) -> list:
-    """Undo the permutation of lanes, with packet operations."""
-    number, count = len(sums), dr.width(order)
+        max_iterations=-1,
+    )[-1]
     stride = -(-number // 4) * 4
-    packed = dr.empty(types.Float, stride * count)
-    dr.scatter(packed, types.FloatX([*sums, *[types.Float(0)] * (stride - number)]), order)
-    return unpack_parameters(packed, dr.arange(types.UInt, count), number)
+    parts = dr.empty(types.Float, stride * dr.width(pieces.slot))
+    values = [*sums, *[types.Float(0)] * (stride - number)]
+    dr.scatter(parts, types.FloatX(values), pieces.slot)
+    return parts
+
+
+def sum_pieces(parts: Any, pieces: Pieces, number: int, splat: Any = None) -> list:
+    """Add the results of the pieces of every Gaussian, in the order of the pieces.
+
+    Parameters
+    ----------
+    parts : Float
+        From `adjoint_pieces`.
+    pieces : Pieces
+    number : int
+        Number of derivatives of a Gaussian.
+    splat : UInt32, optional
+        Gaussians, by default all. Those that the lists do not hold have the sum 0.
+
+    Returns
+    -------
+    list of `number` Float
+    """
+    types = types_of(parts)
+    count = dr.width(pieces.first) - 1
+    if splat is None:
+        splat = dr.arange(types.UInt, count)
+    known = splat < count
+    begin = dr.gather(types.UInt, pieces.first, splat, known)
+    end = dr.gather(types.UInt, pieces.first, splat + 1, known)
+
+    def add(i: Any, sums: list) -> tuple:
+        values = unpack_parameters(parts, i, number, i < end)
+        return i + 1, [s + v for s, v in zip(sums, values, strict=True)]
+
+    sums: list = dr.while_loop(
+        (begin, [types.Float(0) for _ in range(number)]),
+        lambda i, sums: i < end,
+        add,
+        label="sum pieces",
+        max_iterations=-1,
+    )[-1]
+    return sums
 
 
 def channel_sums(image: Any, channels: int, grid: Grid) -> list:
@@ -176,4 +353,11 @@ def channel_sums(image: Any, channels: int, grid: Grid) -> list:
     types = types_of(image)
     tile = dr.arange(types.UInt, grid.tiles)
     values = gather_run(types, image, tile, grid.pixels * channels, True)
-    return [dr.sum(sum(values[c::channels], types.Float(0))) for c in range(channels)]
+    sums = sum_channels(values, channels)
+    dr.eval(sums)  # one kernel for all channels
+    return [dr.sum(s) for s in sums]
+
+
+def sum_channels(values: list, channels: int) -> list:
+    """Add the values of the pixels of a block, pixel after pixel, for each channel."""
+    return [sum(values[c::channels], type(values[0])(0)) for c in range(channels)]

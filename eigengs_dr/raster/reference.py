@@ -9,8 +9,8 @@ import numpy as np
 
 from ..backend.arrays import types_of
 from .evaluate import weights
+from .lists import TileLists
 from .parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_radius
-from .tiles import TileLists
 
 
 def render_plain(values: list, background: list, lists: TileLists, cutoff: float = 3.0) -> Any:

@@ -11,15 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, types_of, upload
+from ..backend.recording import exclusive
 from ..gaussian.file import MAX_CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode, to_coded
 from .kernels import adjoint, channel_sums, forward
 from .layout import gather_run, pack_parameters
+from .lists import TileLists, build_lists
 from .parameters import KernelParameters, detached_shape, kernel_radius, kernel_shape
-from .tiles import Grid, TileLists, build_lists
+from .tiles import Grid
 
 
+@exclusive()
 def render(
     gaussians: Gaussians,
     width: int | None = None,
@@ -72,11 +75,13 @@ def render(
     if cutoff is not None:
         # A NumPy scalar would promote Dr.Jit arrays to float64.
         scaled = replace(scaled, cutoff=float(cutoff))
-    parameters, lists = decode_parameters(scaled), bin_gaussians(scaled)
+    parameters = decode_parameters(scaled)
+    lists = bin_gaussians(scaled, adjoint=dr.grad_enabled(parameters))
     image = rasterize(parameters, lists, scaled.cutoff)
     return to_tensor(image, lists.grid, len(parameters.background))
 
 
+@exclusive()
 def picture_of(
     gaussians: Gaussians,
     width: int | None = None,
@@ -130,8 +135,24 @@ def decode_parameters(gaussians: Gaussians) -> KernelParameters:
     return KernelParameters(kernel_shape(gaussians), color, background)
 
 
-def bin_gaussians(gaussians: Gaussians, pad: float = 0.0) -> TileLists:
-    """List the Gaussians of every tile of the image at native size, enlarged by `pad` pixels.
+def bin_gaussians(
+    gaussians: Gaussians, pad: Any = 0.0, growth: float = 1.0, adjoint: bool = True
+) -> TileLists:
+    """List the Gaussians of every tile of the image at native size.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    pad : float or Float, shape (N,), optional
+        Pixels by which ellipses are enlarged, so that the lists stay valid while Gaussians move.
+    growth : float, optional
+        Factor by which ellipses are enlarged, for the same reason.
+    adjoint : bool, optional
+        Whether the lists serve reverse-mode differentiation too.
+
+    Returns
+    -------
+    TileLists
 
     Raises
     ------
@@ -142,7 +163,8 @@ def bin_gaussians(gaussians: Gaussians, pad: float = 0.0) -> TileLists:
     if not 0 < cutoff <= MAX_CUTOFF:
         raise ValueError(f"cutoff is {cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}")
     grid = Grid(gaussians.width, gaussians.height)
-    return build_lists(detached_shape(gaussians), kernel_radius(cutoff), grid, pad)
+    shape = detached_shape(gaussians)
+    return build_lists(shape, kernel_radius(cutoff), grid, pad, growth, adjoint)
 
 
 def rasterize(parameters: KernelParameters, lists: TileLists, cutoff: float) -> Any:

@@ -12,7 +12,14 @@ from _helpers.footprints import matrices
 from _helpers.sets import covariances, few, random_scene, upload
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.evaluate import exp2_neg, falloff, weights, weights_vjp, widen
+from eigengs_dr.raster.evaluate import (
+    exp2_neg,
+    falloff,
+    is_steep,
+    weights,
+    weights_vjp,
+    widen,
+)
 from eigengs_dr.raster.parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_radius
 from eigengs_dr.raster.render import decode_parameters
 
@@ -96,9 +103,13 @@ def test_derivative_of_falloff(types, mode):
     np.testing.assert_allclose(slope, exact, rtol=precision(types, 1e-6, 1e-13), atol=0)
 
 
-def test_weights(types):
+both_ways = pytest.mark.parametrize("steep", [True, False], ids=["exponentials", "products"])
+
+
+@both_ways
+def test_weights(types, steep):
     shape, x, y = draw()
-    found = weights(scaled(types, shape), *upload(types, x, y), TILE, RADIUS)
+    found = weights(scaled(types, shape), *upload(types, x, y), TILE, RADIUS, steep)
     assert len(found) == TILE[0] * TILE[1]
     q = squared_distance(shape, x, y)
     exact = np.where(q <= CUTOFF**2, np.exp(-0.5 * q), 0)
@@ -119,12 +130,41 @@ def test_one_point_is_a_block_of_one(types):
     assert error.max() < precision(types, 3e-6, 1e-13)
 
 
+@pytest.mark.parametrize("rows", [1, 2, 4])
+@pytest.mark.parametrize("cutoff", [2.0, 3.0, 3.5])
+def test_products_are_exact_for_all_but_steep_gaussians(types, rows, cutoff):
+    """Sizes from 0.1 to 100 pixels, all directions, near and far: as close as exponentials."""
+    rng = np.random.default_rng(rows)
+    count = 4000
+    x = y = np.full(count, 20.5)
+    mean = 22 + rng.uniform(-1, 1, (2, count)) * np.exp(rng.uniform(0, 4, count))
+    a, c = np.exp(rng.uniform(math.log(0.01), math.log(10), (2, count)))
+    b = rng.choice([-1, 1], count) * np.exp(rng.uniform(math.log(0.01), math.log(10), count))
+    shape = np.stack([*mean, a, b, c]).astype(np.float32).astype(float)
+    radius = kernel_radius(cutoff)
+    kernel, corner = scaled(types, shape), upload(types, x, y)
+    found, expected = (
+        np.stack([w.numpy() for w in weights(kernel, *corner, (4, rows), radius, steep)])
+        for steep in (False, True)
+    )
+    smooth = ~is_steep(kernel, radius).numpy()
+    assert 0.3 < smooth.mean() < 0.95
+    # At the edge of the ellipse, rounding decides whether a pixel is inside.
+    edge = math.exp(-0.5 * cutoff**2) * (1 + 1e-4)
+    clear = (found > edge) | (expected > edge) | (found + expected == 0)
+    error = np.abs(found - expected)[:, smooth][clear[:, smooth]]
+    assert ((expected[:, smooth] > edge).mean(axis=1) > 0.05).all()
+    assert np.isfinite(found[:, smooth]).all()
+    assert error.max() < precision(types, 2e-5, 1e-13)
+
+
+@both_ways
 @pytest.mark.parametrize("position", range(5))
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_weights_are_never_nan(types, position, value):
+def test_weights_are_never_nan(types, position, value, steep):
     shape = scaled(types, [[8.0], [8.0], [0.5], [0.1], [0.5]])
     shape[position] = types.Float(value)
-    found = weights(shape, types.Float(6.5), types.Float(6.5), TILE, RADIUS)
+    found = weights(shape, types.Float(6.5), types.Float(6.5), TILE, RADIUS, steep)
     assert not any(w.numpy().any() for w in found)
 
 
@@ -132,12 +172,13 @@ def pull_with(upstream):
     return lambda k, w: upstream[k]
 
 
-def test_pullback_is_the_derivative_of_weights(types):
+@both_ways
+def test_pullback_is_the_derivative_of_weights(types, steep):
     shape, x, y = draw()
     rng = np.random.default_rng(1)
     upstream = upload(types, *rng.normal(size=(TILE[0] * TILE[1], COUNT)))
     parameters, x, y = scaled(types, shape), *upload(types, x, y)
-    by_hand = weights_vjp(parameters, x, y, TILE, RADIUS, pull_with(upstream))
+    by_hand = weights_vjp(parameters, x, y, TILE, RADIUS, pull_with(upstream), steep)
     dr.enable_grad(parameters)
     total = sum(
         g * w for g, w in zip(upstream, weights(parameters, x, y, TILE, RADIUS), strict=True)
@@ -179,7 +220,8 @@ def test_pullback_against_finite_differences(types):
         )
 
 
-def test_pullback_asks_with_the_weights(types):
+@both_ways
+def test_pullback_asks_with_the_weights(types, steep):
     shape, x, y = draw()
     parameters, x, y = scaled(types, shape), *upload(types, x, y)
     asked = {}
@@ -188,9 +230,9 @@ def test_pullback_asks_with_the_weights(types):
         asked[k] = w
         return types.Float(0)
 
-    gradient = weights_vjp(parameters, x, y, TILE, RADIUS, pull)
+    gradient = weights_vjp(parameters, x, y, TILE, RADIUS, pull, steep)
     assert not any(g.numpy().any() for g in gradient)
-    expected = weights(parameters, x, y, TILE, RADIUS)
+    expected = weights(parameters, x, y, TILE, RADIUS, steep)
     assert sorted(asked) == list(range(len(expected)))
     for k, w in enumerate(expected):
         np.testing.assert_allclose(asked[k].numpy(), w.numpy(), rtol=0, atol=1e-6)

@@ -8,11 +8,14 @@ import drjit as dr
 import numpy as np
 import pytest
 from hypothesis import given
+from hypothesis import strategies as st
 
 from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.tiles import TILE, Grid, build_lists, for_each_tile
+from eigengs_dr.raster.granularity import GRANULARITY
+from eigengs_dr.raster.lists import _descending, build_lists
+from eigengs_dr.raster.tiles import TILE, Grid, for_each_tile
 
 RADIUS = 3.0
 GRID = Grid(*SIZE)
@@ -184,21 +187,70 @@ def test_other_tiles(backend, tile):
     check_lists(backend, scene.mean, scene.factor, Grid(*SIZE, tile))
 
 
-def test_sorting_by_length(backend):
+def test_lanes_are_all_tiles_by_length_within_windows(backend):
     scene = random_scene(4)
     lists = lists_of(backend, scene.mean, scene.factor)
+    assert sorted(lists.order.numpy()) == list(range(lists.grid.tiles))
     length = (lists.end - lists.begin).numpy().astype(int)
-    assert (np.diff(length) <= 0).all()
-    tiles = membership(lists).sum(axis=(1, 2))
-    order = lists.splat_order.numpy()
-    assert sorted(order) == list(range(COUNT))
-    assert (np.diff(tiles[order]) <= 0).all()
+    if GRANULARITY[backend].ordered:  # this image is one window
+        assert (np.diff(length) <= 0).all()
+    else:
+        np.testing.assert_array_equal(lists.order.numpy(), np.arange(lists.grid.tiles))
+
+
+def test_windows_keep_neighbours_together():
+    window = np.repeat([0, 1, 2], 50)
+    length = np.random.default_rng(0).integers(0, 9, 150)
+    order = _descending(length, window)
+    np.testing.assert_array_equal(window[order], window)
+    for part in np.split(length[order], 3):
+        assert (np.diff(part) <= 0).all()
+    again = np.lexsort((np.arange(150), -length, window))
+    np.testing.assert_array_equal(order, again)
+
+
+def pairs_by_splat(lists):
+    """The pairs of the pieces as a matrix (tiles, N), and the number of visits of every piece."""
+    pieces = lists.pieces
+    tile, splat, begin, end = (
+        getattr(pieces, k).numpy().astype(int) for k in ("tile", "splat", "begin", "end")
+    )
+    found = np.zeros((lists.grid.tiles, dr.width(pieces.first) - 1), int)
+    for n, i, j in zip(splat, begin, end, strict=True):
+        np.add.at(found[:, n], tile[i:j], 1)
+    return found, end - begin
+
+
+def pairs_by_tile(lists, count):
+    found = np.zeros((lists.grid.tiles, count), int)
+    splat, order = lists.splat.numpy(), lists.order.numpy()
+    for t, i, j in zip(order, lists.begin.numpy(), lists.end.numpy(), strict=True):
+        np.add.at(found[t], splat[i:j], 1)
+    return found
+
+
+@few
+@given(scene=scenes(), pad=st.sampled_from([0.0, 1.5]), growth=st.sampled_from([1.0, 1.3]))
+def test_pieces_are_the_transpose(backend, scene, pad, growth):
+    """Every pair once in both lists, and no piece longer than the granularity."""
+    shape = upload(backend, scene.mean, scene.factor)
+    lists = build_lists(shape, RADIUS, GRID, pad, growth)
+    found, visits = pairs_by_splat(lists)
+    assert found.max(initial=0) <= 1
+    np.testing.assert_array_equal(found, pairs_by_tile(lists, len(scene.mean)))
+    assert visits.max(initial=0) <= GRANULARITY[backend].visits
+    slot, first = lists.pieces.slot.numpy(), lists.pieces.first.numpy().astype(int)
+    assert sorted(slot) == list(range(len(slot)))
+    owner = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    splat = np.empty(len(slot), int)
+    splat[slot] = lists.pieces.splat.numpy()
+    np.testing.assert_array_equal(splat[: len(owner)], owner)
 
 
 def test_lists_are_deterministic(backend):
     scene = random_scene(5)
     first, second = (lists_of(backend, scene.mean, scene.factor) for _ in range(2))
-    for name in ("splat", "begin", "end", "order", "splat_order"):
+    for name in ("splat", "begin", "end", "order"):
         np.testing.assert_array_equal(getattr(first, name).numpy(), getattr(second, name).numpy())
 
 

@@ -24,8 +24,9 @@ from ...fitting.optimizers.parameterization import CHOLESKY
 from ...fitting.placement.random import place_random
 from ...gaussian.file import CUTOFF
 from ...gaussian.gaussians import Gaussians
-from ...raster.kernels import adjoint, forward
+from ...raster.kernels import adjoint, residual
 from ...raster.layout import pack_parameters
+from ...raster.lists import TileLists
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ...raster.render import bin_gaussians, to_tiles
 from ...raster.tiles import Grid
@@ -43,6 +44,8 @@ Gaussians."""
 GROUP = 8
 """Number of components in one rendering. More do not fit into the registers; fewer evaluate the
 Gaussians more often."""
+
+OPTIMIZER = Adan()
 
 Planes = NDArray[np.float32]
 
@@ -200,75 +203,91 @@ def _train(
 ) -> Iterator[JointState]:
     """Take the remaining steps."""
     types = types_in(select(backend))
-    shape = _optimizer(types, state.rows[:, :NUM_SHAPE_PARAMS], state.step)
+    shape = _upload(types, state.rows[:, :NUM_SHAPE_PARAMS])
     groups = list(_groups(types, state))
     targets = list(_targets(types, components, state))
     number = sum(state.counts) * math.prod(state.size)
-    # The derivative of the loss is the error times this share; it is 0 outside the image.
-    share = np.full((*state.size[::-1], GROUP), 2 / number, np.float32)
-    share = to_tiles(types, share, Grid(*state.size))
-    with freeze_program(_move_group) as move:
+    radius = kernel_radius(CUTOFF)
+    with freeze_program(_move_group) as move, freeze_program(_move_shape) as move_shape:
         for step in range(state.step, steps):
             rate = dr.opaque(types.Float, RATE * 0.5 ** (step // HALVED))
-            for optimizer in (shape, *groups):
-                optimizer.set_learning_rate(rate)
-            current = _placed(shape["rows"], state.size)
+            time = dr.opaque(types.Float, step + 1)
+            current = _placed(shape[0], state.size)
             values = kernel_shape(current)
+            dr.eval(values)
             # New lists in every step are cheaper than larger lists that last several steps.
-            common = dr.detach(values), share, bin_gaussians(current)
+            lists = bin_gaussians(current)
             sums = [dr.opaque(types.Float, 0, dr.width(v)) for v in (*values, 0.0)]
             yields = (step + 1) % ROUND == 0 or step + 1 == steps
-            for optimizer, target in zip(groups, targets, strict=True):
-                sums = move(optimizer, target, common, sums, yields)
-            # The sums are the gradient of the values; this continues it to the variables.
-            dr.backward(sum(v * g for v, g in zip(values, sums, strict=False)))
-            shape.step()
+            scale = dr.opaque(types.Float, 2 / number)
+            for k, target in enumerate(targets):
+                groups[k], sums = move(
+                    groups[k], target, values, lists, radius, scale, sums, yields, rate, time
+                )
+            shape = move_shape(shape, sums[:NUM_SHAPE_PARAMS], state.size, rate, time)
             if yields:
-                loss = float(sums[-1][0]) * number / 4
-                rows = np.concatenate([_rows(o) for o in (shape, *groups)], axis=1)
+                loss = float(sums[-1][0]) / number
+                rows = np.concatenate([_download(o) for o in (shape, *groups)], axis=1)
                 rows = rows[:, : state.rows.shape[1]]  # without the padding of the last group
                 yield state._replace(step=step + 1, loss=loss, rows=rows)
 
 
-def _move_group(optimizer: Adan, target: Any, common: tuple, sums: list, told: bool) -> list:
+def _move_group(
+    group: list,
+    target: Any,
+    shape: list,
+    lists: TileLists,
+    radius: float,
+    scale: Any,
+    sums: list,
+    told: bool,
+    rate: Any,
+    time: Any,
+) -> tuple[list, list]:
     """Move the weights of a group; add gradients of shapes, and errors if `told`, to `sums`."""
-    shape, share, lists = common
-    Float, radius = type(target), kernel_radius(CUTOFF)
-    packed = pack_parameters([*shape, *optimizer["rows"]])
-    rendered = forward(packed, [Float(0)] * GROUP, lists, radius)
-    delta = (rendered - target) * share
-    # By hand, because backward mode would also sum delta over all pixels, for the backgrounds.
-    gradient = adjoint(packed, delta, GROUP, lists, radius)
-    squares = dr.squared_norm(delta) if told else Float(0)
-    added = [s + g for s, g in zip(sums, [*gradient[:NUM_SHAPE_PARAMS], squares], strict=True)]
-    dr.set_grad(optimizer["rows"], gradient[NUM_SHAPE_PARAMS:])
-    dr.eval(added, dr.grad(optimizer["rows"]))
-    optimizer.step()
-    return added
+    rows, *moments = group
+    packed = pack_parameters([*shape, *rows])
+    delta, squares = residual(packed, [type(target)(0)] * GROUP, lists, radius, target)
+    gradient = [g * scale for g in adjoint(packed, delta, GROUP, lists, radius)]
+    error = type(target)(0)
+    if told:
+        dr.eval(squares)
+        error = sum(dr.sum(s) for s in squares)
+    added = [s + g for s, g in zip(sums, [*gradient[:NUM_SHAPE_PARAMS], error], strict=True)]
+    slopes = type(rows)(gradient[NUM_SHAPE_PARAMS:])
+    rows, moments = OPTIMIZER.step(rows, slopes, tuple(moments), rate, time)
+    return [rows, *moments], added
 
 
-def _optimizer(types: ArrayTypes, rows: Planes, step: int) -> Adan:
-    """Restore Adan after `step` steps from values, moments and gradients, shape (5, R, N)."""
-    values, *moments = (types.FloatX([upload(types.Float, row) for row in part]) for part in rows)
-    optimizer = Adan(RATE, {"rows": values})
-    time = dr.opaque(types.UInt, step)
-    optimizer.state["rows"] = (*optimizer.state["rows"][:3], (time, *moments))
-    return optimizer
+def _move_shape(shape: list, gradient: list, size: tuple[int, int], rate: Any, time: Any) -> list:
+    """Move the means and factors of all Gaussians along the gradient of the kernels' parameters."""
+    rows, *moments = shape
+    with dr.resume_grad():
+        traced = type(rows)(rows)
+        dr.enable_grad(traced)
+        values = kernel_shape(_placed(traced, size))
+        dr.backward(sum(v * g for v, g in zip(values, gradient, strict=True)))
+        slopes = dr.grad(traced)
+    rows, moments = OPTIMIZER.step(rows, slopes, tuple(moments), rate, time)
+    return [rows, *moments]
 
 
-def _rows(optimizer: Adan) -> Planes:
-    """Copy the state of an optimiser to NumPy, as `_optimizer` takes it."""
-    values, _, _, (_, *moments) = optimizer.state["rows"]
-    return np.stack([dr.detach(part).numpy() for part in (values, *moments)])
+def _upload(types: ArrayTypes, rows: Planes) -> list:
+    """Copy values, moments and gradients of `Adan`, shape (5, R, N), to the device."""
+    return [types.FloatX([upload(types.Float, row) for row in part]) for part in rows]
 
 
-def _groups(types: ArrayTypes, state: JointState) -> Iterator[Adan]:
-    """Make the optimiser of each group of weights."""
+def _download(parts: list) -> Planes:
+    """Copy the state of an optimiser to NumPy, as `_upload` takes it."""
+    return np.stack([dr.detach(part).numpy() for part in parts])
+
+
+def _groups(types: ArrayTypes, state: JointState) -> Iterator[list]:
+    """Upload the state of each group of weights."""
     for first in range(NUM_SHAPE_PARAMS, state.rows.shape[1], GROUP):
         rows = state.rows[:, first : first + GROUP]
         # The padding of the last group stays 0: a zero component with zero weights has no gradient.
-        rows = np.pad(rows, [(0, 0), (0, GROUP - rows.shape[1]), (0, 0)])
-        yield _optimizer(types, rows, state.step)
+        yield _upload(types, np.pad(rows, [(0, 0), (0, GROUP - rows.shape[1]), (0, 0)]))
 
 
 def _targets(types: ArrayTypes, components: tuple[Planes, ...], state: JointState) -> Iterator[Any]:

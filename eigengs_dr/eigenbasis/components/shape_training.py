@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...backend.arrays import types_of
 from ...backend.recording import freeze_program
-from ...fitting.optimizers.descent import step_program
+from ...fitting.optimizers.descent import pack, rate_table, start_descent, step_program
 from ...fitting.optimizers.schedule import Schedule, lr_factor
 from ...fitting.placement.grid import place_grid
 from ...fitting.solvers.conjugate_gradient import solve
@@ -133,27 +133,27 @@ def _round(
 ) -> Gaussians:
     """Take the steps from `first` to before `last` of a span, with a new optimiser."""
     first, last, steps = span
-    types, coordinates = types_of(gaussians.mean), SCHEDULE.variables()
-    variables = coordinates.encode(gaussians)
-    optimizer = SCHEDULE.make_optimizer()
-    optimizer.update({name: variables[name] for name in SCHEDULE.rates})
-    tiles = Grid(gaussians.width, gaussians.height)
-    whole = np.ones((gaussians.height, gaussians.width, len(components)), np.float32)
-    inside = to_tiles(types, whole, tiles)
-    current = gaussians
-    with freeze_program(step_program(coordinates)) as take_step:
-        for step, image in enumerate(samples(components, eigenvalues, seed, first, last), first):
-            solved = solve(current, image, SOLVE_STEPS).gaussians
+    types, grid = types_of(gaussians.mean), Grid(gaussians.width, gaussians.height)
+    state = start_descent(gaussians, SCHEDULE)
+    factors = [
+        lr_factor(SCHEDULE, step, steps) * min(1.0, (step - first + 1) / WARM_UP)
+        for step in range(first, last)
+    ]
+    rates = rate_table(types, SCHEDULE, factors)
+    with freeze_program(step_program(SCHEDULE, gaussians)) as take_step:
+        for index, image in enumerate(samples(components, eigenvalues, seed, first, last)):
+            solved = solve(state.gaussians, image, SOLVE_STEPS).gaussians
             fixed = replace(gaussians, color=solved.color, background=solved.background)
-            left = lr_factor(SCHEDULE, step, steps) * min(1.0, (step - first + 1) / WARM_UP)
-            optimizer.set_learning_rate(
-                {name: dr.opaque(types.Float, rate * left) for name, rate in SCHEDULE.rates.items()}
+            state = take_step(
+                replace(state, packed=pack(solved)),
+                fixed,
+                to_tiles(types, image, grid),
+                None,
+                [bin_gaussians(solved)],
+                rates,
+                dr.opaque(types.UInt, index),
             )
-            target = to_tiles(types, image, tiles)
-            take_step(optimizer, fixed, target, inside, [bin_gaussians(current)])
-            current = coordinates.decode(fixed, dict(optimizer))
-            dr.eval(current)
-    return dr.detach(current)
+    return dr.detach(state.gaussians)
 
 
 def samples(

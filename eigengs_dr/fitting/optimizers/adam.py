@@ -1,38 +1,57 @@
-"""Adam without the NaN of long runs."""
+"""Adam, an adaptive optimiser with momentum."""
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-from drjit.opt import Adam as DrjitAdam
+
+from .moments import debias, zeros_like
 
 
-class Adam(DrjitAdam):
-    """Dr.Jit's Adam with a limit on its count of steps.
+@dataclass(frozen=True)
+class Adam:
+    """Adam of Kingma and Ba, "Adam: A Method for Stochastic Optimization" (2015).
 
-    Debiasing divides by ``1 - beta^t``. Dr.Jit 1.5 computes ``beta^t`` in double precision and
-    returns minus infinity for powers just below the smallest normal number: with a beta of 0.9,
-    the steps 6,734 to 6,736 would turn all variables into NaN. If ``beta^t`` is below 2^-54, the
-    division changes nothing, so the count stops there.
+    With the gradient g, and moving averages with the decay factors beta::
 
-    The parameters are those of `drjit.opt.Adam`. Both betas must be above 0, and close to each
-    other: when the power of the larger is 2^-54, the power of the smaller must be a normal number.
+        m_t = beta_1 m_{t-1} + (1 - beta_1) g_t
+        v_t = beta_2 v_{t-1} + (1 - beta_2) g_t^2
+        p_t = p_{t-1} - lr sqrt(1 - beta_2^t) / (1 - beta_1^t) m_t / (sqrt(v_t) + epsilon)
+
+    With equal betas, no step is longer than the learning rate.
+
+    Parameters
+    ----------
+    beta_1, beta_2 : float, optional
+        Decay factors of the moving averages, each in [0, 1).
+    epsilon : float, optional
+        Number that bounds the step if gradients vanish.
 
     Raises
     ------
     ValueError
-        If the betas differ too much.
+        If a beta is outside [0, 1).
     """
 
-    def __init__(self, *args: Any, **settings: Any) -> None:
-        super().__init__(*args, **settings)
-        betas = (self.beta_1, self.beta_2)
-        self.last = math.ceil(54 / -math.log2(max(betas)))
-        if -math.log2(min(betas)) * self.last > 1000:
-            raise ValueError(f"Adam: betas are {betas}; they must be closer to each other")
+    beta_1: float = 0.9
+    beta_2: float = 0.999
+    epsilon: float = 1e-8
 
-    def _step(self, cache: Any, value: Any, grad: Any, lr: Any, extra: Any, /) -> tuple[Any, Any]:
-        t, *averages = extra
-        return super()._step(cache, value, grad, lr, (dr.minimum(t, self.last), *averages))
+    def __post_init__(self) -> None:
+        betas = (self.beta_1, self.beta_2)
+        if not all(0 <= beta < 1 for beta in betas):
+            raise ValueError(f"Adam: betas are {betas}; each must be in [0, 1)")
+
+    def start(self, value: Any) -> tuple:
+        """Return the moments before the first step; see `Optimizer`."""
+        return zeros_like(value), zeros_like(value)
+
+    def step(self, value: Any, gradient: Any, moments: tuple, rate: Any, time: Any) -> tuple:
+        """Return the value and the moments after a step; see `Optimizer`."""
+        m, v = moments
+        m = dr.lerp(gradient, m, self.beta_1)
+        v = dr.lerp(dr.square(gradient), v, self.beta_2)
+        scale = rate * dr.sqrt(debias(self.beta_2, time)) / debias(self.beta_1, time)
+        return value - scale * (m / (dr.sqrt(v) + self.epsilon)), (m, v)

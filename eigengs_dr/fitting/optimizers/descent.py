@@ -1,23 +1,30 @@
-"""Gradient descent on all parameters of the Gaussians of one image."""
+"""Gradient descent on all parameters of the Gaussians of one image.
+
+A step takes three kernels: the sum over Gaussians, which writes the derivative of the error instead
+of an image; the adjoint; and the optimiser, with one lane per Gaussian.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from ...backend.arrays import types_of
+from ...backend.arrays import ArrayTypes, types_of, upload
 from ...backend.recording import freeze_program
 from ...gaussian.gaussians import Gaussians
-from ...raster.parameters import kernel_parameters
-from ...raster.render import bin_gaussians, rasterize, to_tiles
-from ...raster.tiles import Grid, TileLists
+from ...raster.kernels import adjoint_pieces, residual, sum_pieces
+from ...raster.layout import pack_parameters
+from ...raster.lists import TileLists
+from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
+from ...raster.render import bin_gaussians, to_tiles
+from ...raster.tiles import Grid
 from ..initializers import FitProblem
 from .parameterization import Parameterization
-from .schedule import MIN_PHASE_RATIO, Schedule, lr_factor
+from .schedule import MIN_PHASE_RATIO, Schedule, lr_factor, next_build
 
 MSE_EPSILON = 1e-10
 """Mean squared error added before the logarithm, which would diverge at an error of 0."""
@@ -55,76 +62,173 @@ def descend(
     yield from _run_phase(problem, schedule, iterations, levels)
 
 
+@dataclass(frozen=True)
+class Descent:
+    """The state of a descent.
+
+    Attributes
+    ----------
+    variables : dict of str to arrays
+        The variables that the optimiser moves.
+    moments : dict of str to tuple
+        The state of the optimiser for each variable.
+    gaussians : Gaussians
+        The set of these variables.
+    packed : Float
+        The parameters of this set for the kernels.
+    """
+
+    variables: dict[str, Any]
+    moments: dict[str, tuple]
+    gaussians: Gaussians
+    packed: Any
+
+
+def start_descent(gaussians: Gaussians, schedule: Schedule) -> Descent:
+    """Return the state before the first step."""
+    encoded, optimizer = schedule.variables().encode(gaussians), schedule.make_optimizer()
+    variables = {name: dr.detach(encoded[name]) for name in schedule.rates}
+    dr.eval(variables)
+    moments = {name: optimizer.start(value) for name, value in variables.items()}
+    return Descent(variables, moments, gaussians, pack(gaussians))
+
+
+def pack(gaussians: Gaussians) -> Any:
+    """Return the parameters of a set for the kernels, in their layout in memory."""
+    return pack_parameters([*kernel_shape(gaussians), *gaussians.color])
+
+
 def _run_phase(
     problem: FitProblem, schedule: Schedule, iterations: int, levels: Sequence[int] = ()
 ) -> Generator[Gaussians, None, None]:
-    """Yield the set after every step of one phase.
-
-    Tile lists last `schedule.rebuild` steps: they list Gaussians enlarged by `schedule.pad`.
-    """
-    gaussians, target, weight = problem.gaussians, problem.target, problem.weight
-    types = types_of(gaussians.mean)
-    coordinates = schedule.variables()
-    start = coordinates.encode(gaussians)
-    optimizer = schedule.make_optimizer()
-    optimizer.update({name: start[name] for name in schedule.rates})
-    current = gaussians
-    grid = Grid(gaussians.width, gaussians.height)
-    tiles = to_tiles(types, target, grid)
-    weights = to_tiles(types, np.ones_like(target) if weight is None else weight, grid)
-    zero = dr.opaque(types.Float, 0)
-    with freeze_program(step_program(coordinates, levels)) as take_step:
+    """Yield the set after every step of one phase."""
+    fixed = problem.gaussians
+    types, grid = types_of(fixed.mean), Grid(fixed.width, fixed.height)
+    state, variables = start_descent(fixed, schedule), schedule.variables()
+    target = to_tiles(types, problem.target, grid)
+    weight = None if problem.weight is None else to_tiles(types, problem.weight, grid)
+    factors = [lr_factor(schedule, step, iterations) for step in range(iterations)]
+    rates = rate_table(types, schedule, factors)
+    stop = 0
+    with freeze_program(step_program(schedule, fixed, levels)) as take_step:
         for step in range(iterations):
-            if step % schedule.rebuild == 0:
+            if step == stop:
+                stop, moves = next_build(schedule, step, iterations)
+                pad, growth = variables.reach(state.gaussians, moves)
+                counts = (*levels, len(fixed))
                 lists = [
-                    bin_gaussians(prefix(current, count), schedule.pad)
-                    for count in (*levels, len(current))
+                    bin_gaussians(prefix(state.gaussians, n), _prefix(pad, n), growth)
+                    for n in counts
                 ]
-            left = lr_factor(schedule, step, iterations)
-            optimizer.set_learning_rate(
-                {name: dr.opaque(types.Float, rate * left) for name, rate in schedule.rates.items()}
-            )
-            take_step(optimizer, gaussians, tiles, weights, lists)
-            current = coordinates.decode(gaussians, dict(optimizer))
-            # Later steps write into the optimiser's arrays, so the yielded set must be a copy.
-            current = replace(current, color=current.color + zero)
-            dr.eval(current)
-            yield current
+            index = dr.opaque(types.UInt, step)
+            state = take_step(state, fixed, target, weight, lists, rates, index)
+            yield state.gaussians
 
 
-def step_program(coordinates: Parameterization, levels: Sequence[int] = ()) -> Any:
+def rate_table(types: ArrayTypes, schedule: Schedule, factors: Sequence[float]) -> Any:
+    """Return the learning rates of all steps, step after step, as Float."""
+    table = np.outer(factors, list(schedule.rates.values()))
+    return upload(types.Float, table.ravel().astype(np.float32 if types.bits == 32 else np.float64))
+
+
+def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()) -> Any:
     """Make the function of one step for `eigengs_dr.backend.recording.freeze_program`.
 
     Dr.Jit traces the function once and replays it without Python. The program belongs to one run: a
     replay does not notice other settings, such as the betas of another optimiser.
+
+    Parameters
+    ----------
+    schedule : Schedule
+    like : Gaussians
+        A set with the size of the image.
+    levels : sequence of int, optional
+        As for `descend`.
+
+    Returns
+    -------
+    callable
+        ``step(state, fixed, target, weight, lists, rates, index) -> state`` for a `Descent`; it
+        descends on the mean squared error, then projects the variables into their bounds.
     """
+    coordinates, optimizer = schedule.variables(), schedule.make_optimizer()
+    grid, channels = Grid(like.width, like.height), like.channels
+    number = grid.tiles * grid.pixels * channels
 
     def step(
-        optimizer: Any, fixed: Gaussians, target: Any, weights: Any, lists: list[TileLists]
-    ) -> None:
-        """Descend on the mean squared error, then project the variables into their bounds.
+        state: Descent,
+        fixed: Gaussians,
+        target: Any,
+        weight: Any,
+        lists: list[TileLists],
+        rates: Any,
+        index: Any,
+    ) -> Descent:
+        radius = kernel_radius(fixed.cutoff)
+        gradient: list = []
+        for listed in lists:
+            delta, squares = residual(
+                state.packed, list(fixed.background), listed, radius, target, weight
+            )
+            parts = adjoint_pieces(state.packed, delta, channels, listed, radius)
+            dr.eval(parts)
+            factor: Any = 2 / number
+            if levels:
+                # The sum of the logarithms of the errors, so that no level suffers for another.
+                dr.eval(squares)
+                mean = sum(dr.sum(s) for s in squares) * (1 / number)
+                factor = factor / (mean + MSE_EPSILON)
+            sums = _sum_level(parts, listed, channels, len(fixed))
+            before = gradient or [0.0] * len(sums)
+            gradient = [g + s * factor for g, s in zip(before, sums, strict=True)]
+        return _move(state, fixed, gradient, rates, index)
 
-        The weights are 0 outside the image, where tiles overhang it.
-        """
-        current = coordinates.decode(fixed, dict(optimizer))
-        errors = [
-            _error(prefix(current, count), target, weights, listed)
-            for count, listed in zip((*levels, len(fixed)), lists, strict=True)
-        ]
-        # With levels, sum the logarithms of the errors, so that no level suffers for another.
-        loss = sum(dr.log(e + MSE_EPSILON) for e in errors) if levels else errors[0]
-        dr.backward(loss)
-        # Evaluated apart from the optimiser's arithmetic, the large kernels serve every preset.
-        dr.eval([dr.grad(v) for v in optimizer.values()])
-        optimizer.step(eval=False)
-        optimizer.update(coordinates.project(fixed, dict(optimizer)))
+    def _move(state: Descent, fixed: Gaussians, gradient: Any, rates: Any, index: Any) -> Descent:
+        """Take the step of the optimiser; all of it is one kernel with a lane per Gaussian."""
+        Float = type(state.packed)
+        slopes = _pull_back(coordinates, fixed, state.variables, gradient)
+        variables, moments = {}, {}
+        for k, name in enumerate(schedule.rates):
+            rate = dr.gather(Float, rates, index * len(schedule.rates) + k)
+            variables[name], moments[name] = optimizer.step(
+                state.variables[name], slopes[name], state.moments[name], rate, Float(index) + 1
+            )
+        variables = coordinates.project(fixed, variables)
+        moved = coordinates.decode(fixed, variables)
+        return Descent(variables, moments, moved, pack(moved))
 
     return step
 
 
-def _error(gaussians: Gaussians, target: Any, weights: Any, lists: TileLists) -> Any:
-    rendered = rasterize(kernel_parameters(gaussians), lists, gaussians.cutoff)
-    return dr.mean(dr.square((rendered - target) * weights))
+def _sum_level(parts: Any, lists: TileLists, channels: int, count: int) -> list:
+    """Return the gradient of `count` Gaussians; it is 0 for those that the lists do not hold."""
+    assert lists.pieces is not None
+    splat = dr.arange(dr.uint32_array_t(type(parts)), count)
+    return sum_pieces(parts, lists.pieces, NUM_SHAPE_PARAMS + channels, splat)
+
+
+def _pull_back(
+    coordinates: Parameterization, fixed: Gaussians, variables: dict[str, Any], gradient: list
+) -> dict[str, Any]:
+    """Return the gradient with respect to variables, from that of the kernels' parameters."""
+    with dr.resume_grad():
+        traced = {name: type(value)(value) for name, value in variables.items()}
+        dr.enable_grad(traced)
+        decoded = coordinates.decode(fixed, traced)
+        rows = [*kernel_shape(decoded), *decoded.color]
+        known = [(row, g) for row, g in zip(rows, gradient, strict=True) if dr.grad_enabled(row)]
+        for row, g in known:
+            dr.set_grad(row, g)
+        dr.enqueue(dr.ADMode.Backward, [row for row, _ in known])
+        dr.traverse(dr.ADMode.Backward)
+        return {name: dr.grad(value) for name, value in traced.items()}
+
+
+def _prefix(pad: Any, count: int) -> Any:
+    """Return the first `count` entries of an array, or a number as it is."""
+    if isinstance(pad, float) or dr.width(pad) in (1, count):
+        return pad
+    return dr.gather(type(pad), pad, dr.arange(dr.uint32_array_t(type(pad)), count))
 
 
 def prefix(gaussians: Gaussians, count: int) -> Gaussians:

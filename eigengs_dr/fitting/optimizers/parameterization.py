@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 
+from ...backend.arithmetic import rsqrt, tanh
 from ...backend.arrays import types_of
 from ...gaussian.covariance import cholesky_from_factor, factor_from_cholesky
 from ...gaussian.gaussians import Gaussians
@@ -25,11 +26,15 @@ class Parameterization(NamedTuple):
         without a variable keep the values of `fixed`.
     project : callable
         ``project(fixed, variables) -> dict``: the variables, moved back into their bounds.
+    reach : callable
+        ``reach(fixed, moves) -> (pad, growth)``: how far the ellipses of the Gaussians reach, in
+        pixels and as a factor, if every entry of a variable moves by ``moves[name]``.
     """
 
     encode: Callable[[Gaussians], dict[str, Any]]
     decode: Callable[[Gaussians, dict[str, Any]], Gaussians]
     project: Callable[[Gaussians, dict[str, Any]], dict[str, Any]]
+    reach: Callable[[Gaussians, dict[str, float]], tuple[Any, float]]
 
 
 # ---------------------------------------------------------------------------------------------
@@ -39,7 +44,7 @@ class Parameterization(NamedTuple):
 
 def _size(g: Gaussians) -> Any:
     """Geometric mean of the standard deviations of a Gaussian, in pixels: ``det F = a c``."""
-    return dr.rsqrt(g.factor[0] * g.factor[2])
+    return rsqrt(g.factor[0] * g.factor[2])
 
 
 def _encode_relative(g: Gaussians) -> dict[str, Any]:
@@ -61,7 +66,21 @@ def _project_relative(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, 
     return {name: inside[name] for name in variables}
 
 
-SCALE_RELATIVE = Parameterization(_encode_relative, _decode_relative, _project_relative)
+MOVE_SHARE, GROWTH_SHARE = 0.25, 0.1
+"""How far Gaussians move and grow, relative to the sum of the rates. Steps change direction: with
+these shares, lists miss 0.3 % of the tiles just before the next build, and a fit has the same PSNR
+as with lists built in every step (512x512, 20,000 Gaussians). The strict bounds, 1 and 1, would
+make the lists half as long again."""
+
+
+def _reach_relative(fixed: Gaussians, moves: dict[str, float]) -> tuple[Any, float]:
+    pad = MOVE_SHARE * moves.get("mean", 0.0) * _size(fixed)
+    return pad, 1 + GROWTH_SHARE * moves.get("factor", 0.0)
+
+
+SCALE_RELATIVE = Parameterization(
+    _encode_relative, _decode_relative, _project_relative, _reach_relative
+)
 """Mean divided by the size of the Gaussian at the start, factor times this size, and colour. One
 learning rate then serves small and large Gaussians, and images of any size."""
 
@@ -92,7 +111,7 @@ def _atanh(x: Any) -> Any:
 def _decode_cholesky(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
     parts = {}
     if "mean" in variables:
-        x, y = (0.5 * (dr.tanh(v) + 1) for v in variables["mean"])
+        x, y = (0.5 * (tanh(v) + 1) for v in variables["mean"])
         parts["mean"] = type(fixed.mean)(x * fixed.width, y * fixed.height)
     if "cholesky" in variables:
         l1, l2, l3 = variables["cholesky"]
@@ -107,5 +126,10 @@ def _project_cholesky(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, 
     return variables
 
 
-CHOLESKY = Parameterization(_encode_cholesky, _decode_cholesky, _project_cholesky)
+def _reach_cholesky(fixed: Gaussians, moves: dict[str, float]) -> tuple[Any, float]:
+    side = 0.5 * max(fixed.width, fixed.height)  # the slope of tanh is at most 1
+    return moves.get("mean", 0.0) * side + moves.get("cholesky", 0.0) * fixed.cutoff, 1.0
+
+
+CHOLESKY = Parameterization(_encode_cholesky, _decode_cholesky, _project_cholesky, _reach_cholesky)
 """atanh of the mean in [-1, 1], Cholesky factor of the covariance in pixels, and colour."""

@@ -13,13 +13,14 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .moments import Optimizer
     from .parameterization import Parameterization
 
 OPTIMIZERS = {
     "adam": "eigengs_dr.fitting.optimizers.adam:Adam",
     "adan": "eigengs_dr.fitting.optimizers.adan:Adan",
 }
-"""Optimisers by name: `drjit.opt.Optimizer` classes, made by ``Optimizer(lr, **settings)``."""
+"""Optimisers by name: each entry makes an `Optimizer` by ``entry(**settings)``."""
 
 PARAMETERIZATIONS = {
     "scale_relative": "eigengs_dr.fitting.optimizers.parameterization:SCALE_RELATIVE",
@@ -53,11 +54,9 @@ class Schedule:
         gradient; without a warm-up they would lose some decibels of the colour solve.
     decay : float
         Fraction of the rates at the end, after half a cosine.
-    rebuild : int
-        Steps between two builds of the tile lists.
-    pad : float
-        Pixels by which a build of the lists enlarges the Gaussians, so that the lists last
-        `rebuild` steps.
+    drift : float
+        Sum of the largest rates after which the tile lists are built again. A build enlarges the
+        Gaussians by what they may move until the next build, see `Parameterization.reach`.
     redistribute_after : int
         Steps of the first phase, before redistribution; see
         `eigengs_dr.fitting.optimizers.descent.descend`.
@@ -73,15 +72,15 @@ class Schedule:
     parameterization: str = "scale_relative"
     warm_up: int = 5
     decay: float = 0.03
-    rebuild: int = 4
-    pad: float = 1.0
+    drift: float = 0.4
     redistribute_after: int = 20
     patience: int = 300
     least_gain: float = 0.01
 
-    def make_optimizer(self) -> Any:
-        """Return a new optimiser with a learning rate of 1 and no variables."""
-        return resolve_name(OPTIMIZERS[self.optimizer])(1.0, **self.settings)
+    def make_optimizer(self) -> Optimizer:
+        """Return the optimiser."""
+        made: Optimizer = resolve_name(OPTIMIZERS[self.optimizer])(**self.settings)
+        return made
 
     def variables(self) -> Parameterization:
         """Return the parameterization."""
@@ -94,3 +93,29 @@ def lr_factor(schedule: Schedule, step: int, iterations: int) -> float:
     along = 0.5 * (1 + math.cos(math.pi * step / iterations))
     left = schedule.decay + (1 - schedule.decay) * along
     return left * min(1.0, (step + 1) / max(1, schedule.warm_up))
+
+
+def next_build(schedule: Schedule, step: int, iterations: int) -> tuple[int, dict[str, float]]:
+    """Return how long the tile lists of a step last, and how far the variables move until then.
+
+    Parameters
+    ----------
+    schedule : Schedule
+    step, iterations : int
+        The step that needs lists, and the number of steps of the descent.
+
+    Returns
+    -------
+    stop : int
+        The step that needs new lists, at most `iterations`.
+    moves : dict of str to float
+        Sums of the rates of every variable.
+    """
+    largest, total, stop = max(schedule.rates.values()), 0.0, step
+    while stop < iterations:
+        factor = lr_factor(schedule, stop, iterations)
+        if stop > step and largest * (total + factor) > schedule.drift:
+            break
+        total += factor
+        stop += 1
+    return stop, {name: rate * total for name, rate in schedule.rates.items()}

@@ -16,19 +16,25 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ...backend.arithmetic import rcp
 from ...backend.arrays import types_of
 from ...backend.recording import freeze_program
 from ...gaussian.file import MAX_CUTOFF
 from ...gaussian.gaussians import Gaussians
-from ...raster.kernels import adjoint, channel_sums, forward
-from ...raster.layout import pack_parameters
+from ...raster.kernels import adjoint, channel_sums, residual, sum_channels
+from ...raster.layout import gather_run, pack_parameters
+from ...raster.lists import TileLists
 from ...raster.parameters import NUM_SHAPE_PARAMS, detached_shape, kernel_radius
 from ...raster.render import bin_gaussians, to_tiles
-from ...raster.tiles import TileLists
+from ...raster.tiles import Grid
 
 RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}
 """Tolerance by the bits of a float: a channel stops if ``r^T z``, relative to its first value, is
 smaller. A smaller ``r^T z`` is only rounding."""
+
+ROUNDING = {32: 2e-7, 64: 4e-16}
+"""Relative error of a correlation with a Gaussian, by the bits of a float. A channel with the error
+e stops too if ``r^T z`` is below ``N ROUNDING^2 |e|^2``, which rounding alone reaches."""
 
 
 class Solution(NamedTuple):
@@ -120,8 +126,7 @@ def inner_products(
 def _solve(gaussians: Gaussians, image: NDArray[Any], steps: int, warm_start: bool) -> Solution:
     types = types_of(gaussians.mean)
     n, channels = len(gaussians), gaussians.channels
-    lists = bin_gaussians(gaussians)
-    inside = to_tiles(types, np.ones(image.shape, np.float32), lists.grid)
+    lists, cutoff = bin_gaussians(gaussians), gaussians.cutoff
     shape = detached_shape(gaussians)
     if warm_start:
         x = [types.Float(c) + dr.zeros(types.Float, n) for c in gaussians.color]
@@ -132,26 +137,28 @@ def _solve(gaussians: Gaussians, image: NDArray[Any], steps: int, warm_start: bo
             dr.opaque(types.Float, m) for m in image.mean(axis=(0, 1), dtype=np.float64).tolist()
         ]
     unknowns = [dr.concat([c, b]) for c, b in zip(x, constant, strict=True)]
+    target = to_tiles(types, np.asarray(image, np.float32), lists.grid)
     dr.eval(shape, unknowns)
 
-    residual = to_tiles(types, np.asarray(image, np.float32), lists.grid)
-    residual -= _apply(shape, unknowns, lists, inside, gaussians.cutoff)
+    error, squares = _apply(shape, unknowns, lists, cutoff, target)
+    del target  # images are what takes memory here
     scale = 1 / image.size
-    squares = [dr.sum(dr.square(residual)) * scale]
-    r = _apply_transposed(shape, residual, channels, lists, gaussians.cutoff)
-    inverse = _inverse_diagonal(shape, inside, channels, lists, gaussians.cutoff)
-    z = [a * b for a, b in zip(r, inverse, strict=True)]
-    p, rz = z, [dr.dot(a, b) for a, b in zip(r, z, strict=True)]
+    residuals = [sum(dr.sum(s) for s in squares) * scale]
+    r = [-g for g in _apply_transposed(shape, error, channels, lists, cutoff)]
+    inverse = _inverse_diagonal(shape, channels, lists, cutoff)
+    p = [a * b for a, b in zip(r, inverse, strict=True)]
+    rz = [dr.dot(a, b) for a, b in zip(r, p, strict=True)]
     enough = [RELATIVE_TOLERANCE[types.bits] * a for a in rz]
-    dr.eval(p, rz, enough)
+    noise = dr.opaque(types.Float, n * ROUNDING[types.bits] ** 2)
+    dr.eval(p, rz, enough, residuals)
     with freeze_program(
         _step
     ) as take_step:  # for this solve only: a program does not notice another number of Gaussians
         for _ in range(steps):
-            unknowns, residual, p, rz, square = take_step(
-                shape, unknowns, residual, p, rz, enough, inverse, inside, lists, gaussians.cutoff
+            unknowns, error, p, rz, square = take_step(
+                shape, unknowns, error, p, rz, enough, noise, inverse, lists, cutoff
             )
-            squares.append(square * scale)
+            residuals.append(square * scale)
     index = dr.arange(types.UInt, n)
     solved = replace(
         gaussians,
@@ -159,52 +166,69 @@ def _solve(gaussians: Gaussians, image: NDArray[Any], steps: int, warm_start: bo
         background=types.FloatX([dr.gather(types.Float, u, types.UInt(n)) for u in unknowns]),
     )
     dr.eval(solved)
-    return Solution(solved, [math.sqrt(float(s[0])) for s in squares])
+    return Solution(solved, [math.sqrt(float(s[0])) for s in residuals])
 
 
 def _step(
     shape: list,
     x: list,
-    residual: Any,
+    error: Any,
     p: list,
     rz: list,
     enough: list,
+    noise: Any,
     inverse: list,
-    inside: Any,
     lists: TileLists,
     cutoff: float,
 ) -> tuple:
-    """Take one step of conjugate gradients for all channels; ``alpha = rz / |A p|^2``."""
-    Float = type(residual)
+    """Take one step of conjugate gradients for all channels; ``alpha = rz / |A p|^2``.
+
+    The error is ``A x - D``; it costs one pass over two images.
+    """
+    Float = type(error)
     channels = len(x)
-    q = _apply(shape, p, lists, inside, cutoff)
-    dr.eval(q)
-    curvature = channel_sums(dr.square(q), channels, lists.grid)
+    q, squares = _apply(shape, p, lists, cutoff)
+    dr.eval(squares)
+    curvature = [dr.sum(s) for s in squares]
     # A channel that is solved except for rounding stops: its directions would grow without bound.
     alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, curvature, strict=True)]
     x = [dr.fma(a, d, v) for a, d, v in zip(alpha, p, x, strict=True)]
-    spread = dr.tile(dr.concat(alpha), lists.grid.tiles * lists.grid.pixels)
-    residual = residual - spread * q
-    dr.eval(residual)
-    r = _apply_transposed(shape, residual, channels, lists, cutoff)
+    error, squares = _add_scaled(error, q, alpha, lists.grid)
+    r = [-g for g in _apply_transposed(shape, error, channels, lists, cutoff)]
     z = [a * b for a, b in zip(r, inverse, strict=True)]
     new_rz = [dr.dot(a, b) for a, b in zip(r, z, strict=True)]
     beta = [dr.select(a > 0, b / a, Float(0)) for a, b in zip(rz, new_rz, strict=True)]
     p = [
-        dr.select(a > least, dr.fma(b, d, v), 0)
-        for a, least, b, d, v in zip(new_rz, enough, beta, p, z, strict=True)
+        dr.select(a > dr.maximum(least, noise * e), dr.fma(b, d, v), 0)
+        for a, least, e, b, d, v in zip(new_rz, enough, squares, beta, p, z, strict=True)
     ]
-    return x, residual, p, new_rz, dr.sum(dr.square(residual))
+    return x, error, p, new_rz, sum(squares)
 
 
-def _apply(shape: list, unknowns: list, lists: TileLists, inside: Any, cutoff: float) -> Any:
-    """Return ``A c``: render the colours; the last unknown of a channel is its background."""
+def _add_scaled(image: Any, step: Any, factors: list, grid: Grid) -> tuple[Any, list]:
+    """Return ``image + factor step`` by channels, in tile layout, and the sums of its squares."""
+    types, channels = types_of(image), len(factors)
+    tile, length = dr.arange(types.UInt, grid.tiles), grid.pixels * channels
+    old, change = (gather_run(types, v, tile, length, True) for v in (image, step))
+    scaled = zip(old, change, factors * grid.pixels, strict=True)
+    new = [dr.fma(factor, c, v) for v, c, factor in scaled]
+    result = dr.empty(types.Float, grid.tiles * length)
+    dr.scatter(result, types.FloatX(new), tile)
+    squares = sum_channels([dr.square(v) for v in new], channels)
+    dr.eval(result, squares)
+    return result, [dr.sum(s) for s in squares]
+
+
+def _apply(
+    shape: list, unknowns: list, lists: TileLists, cutoff: float, target: Any = None
+) -> tuple[Any, list]:
+    """Return ``A c - D`` and the sums of its squares; the last unknown is the background."""
     types = types_of(shape[0])
     n = dr.width(shape[0])
     color = [dr.gather(types.Float, u, dr.arange(types.UInt, n)) for u in unknowns]
     background = [dr.gather(types.Float, u, types.UInt(n)) for u in unknowns]
-    image = forward(pack_parameters([*shape, *color]), background, lists, kernel_radius(cutoff))
-    return image * inside
+    packed = pack_parameters([*shape, *color])
+    return residual(packed, background, lists, kernel_radius(cutoff), target)
 
 
 def _apply_transposed(
@@ -218,12 +242,14 @@ def _apply_transposed(
     return [dr.concat([c, t]) for c, t in zip(color, totals, strict=True)]
 
 
-def _inverse_diagonal(
-    shape: list, inside: Any, channels: int, lists: TileLists, cutoff: float
-) -> list:
-    """Return one over the diagonal of ``A^T A``."""
-    diagonal = _apply_squared(shape, inside, channels, lists, cutoff)
-    return [dr.select(d > 1e-8, dr.rcp(d), 0) for d in diagonal]
+def _inverse_diagonal(shape: list, channels: int, lists: TileLists, cutoff: float) -> list:
+    """Return one over the diagonal of ``A^T A``: all channels have the same."""
+    types = types_of(shape[0])
+    packed = pack_parameters([*shape, types.Float(0)])
+    nothing = [types.Float(1)]
+    inside, _ = residual(packed, nothing, lists, kernel_radius(cutoff), None)
+    diagonal = _apply_squared(shape, inside, 1, lists, cutoff)[0]
+    return [dr.select(diagonal > 1e-8, rcp(diagonal), 0)] * channels
 
 
 def _apply_squared(shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float) -> list:
@@ -231,4 +257,4 @@ def _apply_squared(shape: list, delta: Any, channels: int, lists: TileLists, cut
     root = math.sqrt(2)
     narrow = [*shape[:2], *[f * root for f in shape[2:NUM_SHAPE_PARAMS]]]
     reach = min(cutoff * root, MAX_CUTOFF)  # beyond, the squares are 0 in any precision
-    return _apply_transposed(narrow, delta, channels, lists, reach)
+    return _apply_transposed(narrow, delta, channels, replace(lists, steep=True), reach)

@@ -7,6 +7,7 @@ from typing import Any
 
 import drjit as dr
 
+from ...backend.arithmetic import rcp, rsqrt
 from ..parameters import EXP2_SCALE
 
 MAX_FOOTPRINT = 0.4
@@ -40,7 +41,7 @@ def bound_covariance(metric: list) -> tuple[list, Any]:
     root = dr.sqrt(dr.fma(half, half, xy * xy))
     p, q = middle + root, dr.maximum(middle - root, 0)
     blind = ~((p >= floor) & dr.isfinite(p))
-    short, long = dr.rcp(dr.maximum(p, floor)), dr.rcp(dr.maximum(q, floor))
+    short, long = rcp(dr.maximum(p, floor)), rcp(dr.maximum(q, floor))
     slope = dr.select(root > 1e-6 * middle, (short - long) / (2 * root), 0)
     covariance = [dr.fma(slope, xx - q, long), slope * xy, dr.fma(slope, yy - q, long)]
     round_one = (MAX_FOOTPRINT**2, 0.0, MAX_FOOTPRINT**2)
@@ -80,7 +81,7 @@ def inside_share(shape: list, footprint: list, x: Any, y: Any, width: int, heigh
     def strip(center: Any, along: Any, across: Any, other: Any, variance: Any, side: int) -> Any:
         left = dr.fma(a, along, b * across), c * across
         rest = dr.maximum(variance - dr.fma(left[0], left[0], left[1] * left[1]), 1e-6)
-        steep = dr.rsqrt(rest) * (math.sqrt(0.5) / EXP2_SCALE)
+        steep = rsqrt(rest) * (math.sqrt(0.5) / EXP2_SCALE)
         middle = center - other
         return 0.5 * (quick_erf((side - middle) * steep) + quick_erf(middle * steep))
 

@@ -18,8 +18,9 @@ import drjit as dr
 from ...backend.arrays import types_of
 from ..evaluate import LN2, weights
 from ..layout import gather_index, unpack_parameters
+from ..lists import build_lists
 from ..parameters import NUM_SHAPE_PARAMS
-from ..tiles import Grid, build_lists
+from ..tiles import Grid
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def list_cells(
     grid = Grid(width + 2 * margin, height + 2 * margin, (side, side))
     moved = [shape[0] + margin, shape[1] + margin, *shape[2:]]
     # Lists are built for pixel centres; half a pixel of padding makes them valid for all points.
-    lists = build_lists(moved, radius, grid, pad=0.5)
+    lists = build_lists(moved, radius, grid, pad=0.5, adjoint=False)
     types = types_of(shape[0])
     ends = dr.empty(types.UInt, 2 * grid.tiles)
     dr.scatter(ends, types.UInt2(lists.begin, lists.end), lists.order)

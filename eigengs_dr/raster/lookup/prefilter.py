@@ -13,6 +13,7 @@ from typing import Any
 
 import drjit as dr
 
+from ...backend.arithmetic import rcp, rsqrt
 from ...backend.arrays import types_of
 from ..evaluate import weights, widen
 from ..layout import gather_index, gather_run, unpack_parameters
@@ -141,14 +142,14 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
         square, first, nx, _, inverse, origin = _row_of(types, sizes, k)
         x0, y0, sign = local(i, j, dr.detach(x), dr.detach(y))
         xx, xy, yy = footprint[0] + square, footprint[1] * sign, footprint[2] + square
-        side = dr.rcp(inverse)
+        side = rcp(inverse)
         low = dr.fma(types.Float(row), side, origin) - y0
         reach = lookup.cutoff * dr.sqrt(yy)
         low, high = dr.maximum(low, -reach), dr.minimum(low + side, reach)
         # At height dy the ellipse of footprint + size^2 spans lean * dy - half to lean * dy + half.
-        lean, ratio = xy * dr.rcp(yy), dr.rcp(yy)
+        lean, ratio = xy * rcp(yy), rcp(yy)
         free = dr.fma(-xy, lean, xx)
-        peak = xy * dr.rsqrt(xx) * lookup.cutoff  # dy of the rightmost point
+        peak = xy * rsqrt(xx) * lookup.cutoff  # dy of the rightmost point
 
         def half(dy: Any) -> Any:
             return dr.safe_sqrt(free * (lookup.cutoff**2 - dy * dy * ratio))

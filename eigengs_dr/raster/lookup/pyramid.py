@@ -19,6 +19,7 @@ from typing import Any
 
 import drjit as dr
 
+from ...backend.arithmetic import rcp, rsqrt
 from ...backend.arrays import ArrayTypes, types_of
 from ..evaluate import falloff
 from ..layout import gather_run
@@ -196,20 +197,20 @@ def sum_pyramid(lattice: GaussianPyramid, x: Any, y: Any, footprint: list, activ
     smallest = 0.5 * (xx + yy) - dr.sqrt(dr.fma(0.25 * (xx - yy), xx - yy, xy * xy))
     first, nx, ny, dx, dy = _pick(types, lattice.levels, smallest)
     # In spacings of the level; the values are already blurred by SAMPLE_DEVIATION^2.
-    u, v = x * dr.rcp(dx) - 0.5, y * dr.rcp(dy) - 0.5
-    xx = dr.maximum(xx * dr.square(dr.rcp(dx)) - SAMPLE_DEVIATION**2, SAMPLE_DEVIATION**2)
-    yy = dr.maximum(yy * dr.square(dr.rcp(dy)) - SAMPLE_DEVIATION**2, SAMPLE_DEVIATION**2)
-    xy = xy * dr.rcp(dx * dy)
+    u, v = x * rcp(dx) - 0.5, y * rcp(dy) - 0.5
+    xx = dr.maximum(xx * dr.square(rcp(dx)) - SAMPLE_DEVIATION**2, SAMPLE_DEVIATION**2)
+    yy = dr.maximum(yy * dr.square(rcp(dy)) - SAMPLE_DEVIATION**2, SAMPLE_DEVIATION**2)
+    xy = xy * rcp(dx * dy)
     determinant = dr.maximum(dr.fma(xx, yy, -xy * xy), 1e-6)
-    inverse = [k * dr.rcp(determinant) * EXP2_SCALE**2 for k in (yy, -2 * xy, xx)]
-    lean, free = xy * dr.rcp(yy), determinant * dr.rcp(yy)
+    inverse = [k * rcp(determinant) * EXP2_SCALE**2 for k in (yy, -2 * xy, xx)]
+    lean, free = xy * rcp(yy), determinant * rcp(yy)
     reach = SAMPLE_REACH * dr.sqrt(yy)
-    scale = dr.rsqrt(determinant) * (1 / (2 * math.pi * -math.expm1(-0.5 * SAMPLE_REACH**2)))
+    scale = rsqrt(determinant) * (1 / (2 * math.pi * -math.expm1(-0.5 * SAMPLE_REACH**2)))
 
     def row_of(j: Any) -> tuple:
         """Return the columns [i, stop] of the ellipse in one row of points."""
         down = types.Float(j) - dr.detach(v)
-        half = dr.safe_sqrt(free * (SAMPLE_REACH**2 - down * down * dr.rcp(yy)))
+        half = dr.safe_sqrt(free * (SAMPLE_REACH**2 - down * down * rcp(yy)))
         middle = dr.fma(lean, down, dr.detach(u))
         return types.Int(dr.ceil(middle - half)), types.Int(dr.floor(middle + half))
 
@@ -258,6 +259,6 @@ def _fold(types: ArrayTypes, index: Any, count: Any, wrap: str) -> Any:
     """Move the index of a point into the level; points lie half a spacing inside the borders."""
     k = types.Float(index)
     if wrap == "repeat":
-        return types.UInt(k - count * dr.floor((k + 0.5) * dr.rcp(count)))
-    k = k - 2 * count * dr.floor((k + 0.5) * dr.rcp(2 * count))
+        return types.UInt(k - count * dr.floor((k + 0.5) * rcp(count)))
+    k = k - 2 * count * dr.floor((k + 0.5) * rcp(2 * count))
     return types.UInt(dr.minimum(k, 2 * count - 1 - k))

@@ -1,0 +1,40 @@
+"""How much work one lane of a kernel gets, by backend: the one place that chooses it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ..backend.arrays import ArrayTypes
+
+
+class Granularity(NamedTuple):
+    """The share of a lane.
+
+    Attributes
+    ----------
+    rows : int
+        Rows of a tile that one lane of the sum over Gaussians owns: 1, 2 or 4.
+    visits : int
+        Largest number of tiles that one lane of the adjoint visits; a Gaussian that touches more
+        tiles gets several lanes, so that few large Gaussians fill many cores too.
+    ordered : bool
+        Whether lanes are ordered by their work. A SIMD packet of a CPU takes as long as its longest
+        lane, and ordering is cheap there; a GPU would need another sort.
+    """
+
+    rows: int
+    visits: int
+    ordered: bool
+
+
+GRANULARITY = {
+    "llvm": Granularity(rows=4, visits=16, ordered=True),
+    "cuda": Granularity(rows=1, visits=16, ordered=False),
+}
+"""Granularity by backend. On llvm a lane shares the parameters of a Gaussian among 16 pixels; on a
+GPU more lanes with fewer registers hide the latency of memory."""
+
+
+def granularity_of(types: ArrayTypes) -> Granularity:
+    """Return the granularity for the backend of some array types."""
+    return GRANULARITY[types.backend]
