@@ -97,12 +97,12 @@ def test_slopes_are_exponents():
 
 
 def test_tables_and_charts_show_each_part(tmp_path):
-    rows = [row("pixels", side, side, mean_ms=side**2 / 100) for side in (200, 100)]
+    rows = [row("pixels", n, n, mean_ms=n**2 / 100, peak_gib=n / 800) for n in (200, 100)]
     rows += [row("splats", 100, n, mean_ms=n**0.5) for n in (100, 10_000)]
     rows += [row("threads", 64, 9, n, mean_ms=8 / n) for n in (1, 2)]
     rows.append({**row("small", 64, 300), "images_per_second": 15.04})
     pixels, splats, threads, small = summarize(rows).tables
-    assert "exponent 1.00 of the pixels, memory with 0.00" in pixels.caption
+    assert "exponent 1.00 of the pixels, memory by 4,474 bytes a pixel" in pixels.caption
     assert "100x100 0.50" in splats.caption and "fits of 24 steps" in small.caption
     first = ("100x100", "100", "1.00", "100.00", "10.0", "0.50", "0.25", "0.12")
     assert lines_of(pixels)[0] == first

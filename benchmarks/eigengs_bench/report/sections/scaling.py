@@ -12,7 +12,6 @@ from eigengs_bench.harness.store import Row
 from eigengs_bench.report import frames as fr
 from eigengs_bench.report.charts import label_axes, new_figure
 
-TIME, MEMORY = "a step with lists / ms", "peak of memory / GiB"
 STYLES = ("o-", "s--", "^:", "D-.")
 
 
@@ -63,15 +62,21 @@ def _frame(rows: Sequence[Row]) -> pd.DataFrame:
     return frame.sort_values(["pixels", "gaussians", "threads"], kind="stable")
 
 
-def _slope_over(part: pd.DataFrame, x: str, y: str = "mean_ms") -> str:
-    return fr.number(slope(part[x], part[y]), 2)
+def _slope_over(part: pd.DataFrame, x: str) -> str:
+    return fr.number(slope(part[x], part.mean_ms), 2)
+
+
+def _bytes_a_pixel(part: pd.DataFrame) -> str:
+    """Compare the memory of the smallest and of the largest image."""
+    (few, low), (many, high) = part[["pixels", "peak_gib"]].to_numpy(float)[[0, -1]]
+    return fr.number((high - low) * 2**30 / (many - few) if many > few else None, 0)
 
 
 def _pixels_table(part: pd.DataFrame) -> fr.Table:
     caption = (
         "Time and memory over pixels, at equal density of Gaussians: a step grows with exponent "
-        f"{_slope_over(part, 'pixels')} of the pixels, memory with "
-        f"{_slope_over(part, 'pixels', 'peak_gib')}"
+        f"{_slope_over(part, 'pixels')} of the pixels, "
+        f"memory by {_bytes_a_pixel(part)} bytes a pixel"
     )
     return fr.grouped(caption, part, ["size", "Gaussians"], DESCENT)
 
@@ -96,19 +101,17 @@ def _fits_table(part: pd.DataFrame) -> fr.Table:
     return fr.grouped(caption, part, ["size", "Gaussians"], FITS)
 
 
-def _size_chart(part: pd.DataFrame, x: str, by: list[str]) -> Figure:
-    """Draw time and memory side by side; with `by`, a line a group."""
+def _size_chart(part: pd.DataFrame, x: str, name: str) -> Figure:
+    """Draw time and memory side by side: a line for images of one density, or of one size each."""
     figure = new_figure(10, 4.2)
-    groups = part.groupby(by, sort=False) if by else [(("equal density of Gaussians",), part)]
-    for axis, (y, label) in zip(
-        figure.subplots(1, 2), {"mean_ms": TIME, "peak_gib": MEMORY}.items(), strict=True
-    ):
-        for ((name, *_), some), style in zip(groups, STYLES, strict=False):
-            text = f"{name}, exponent {_slope_over(some, x, y)}"
-            axis.plot(some[x], some[y], style, ms=4, label=text)
-        axis.set(xscale="log", yscale="log", xlabel=x, ylabel=label)
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=8, framealpha=0.6)
+    sizes = ["equal density of Gaussians"] * len(part) if x == "pixels" else part["size"]
+    axes = figure.subplots(1, 2)
+    for (size, some), style in zip(part.groupby(np.array(sizes), sort=False), STYLES, strict=False):
+        exponent = f"{size}, exponent {_slope_over(some, x)}"
+        axes[0].plot(some[x], some.mean_ms, style, ms=4, label=exponent)
+        axes[1].plot(some[x], some.peak_gib, style, ms=4, label=size)
+    for axis, label in zip(axes, ("a step with lists / ms", "peak of memory / GiB"), strict=True):
+        label_axes(axis, name, label, "y", xscale="log")
     return figure
 
 
@@ -124,8 +127,8 @@ def _threads_chart(part: pd.DataFrame) -> Figure:
 
 
 PARTS: dict[str, tuple[Any, Any]] = {  # what makes the table of a part, and its chart
-    "pixels": (_pixels_table, partial(_size_chart, x="pixels", by=[])),
-    "splats": (_splats_table, partial(_size_chart, x="gaussians", by=["size"])),
+    "pixels": (_pixels_table, partial(_size_chart, x="pixels", name="pixels of the image")),
+    "splats": (_splats_table, partial(_size_chart, x="gaussians", name="Gaussians")),
     "threads": (_threads_table, _threads_chart),
     "small": (_fits_table, None),
 }
