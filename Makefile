@@ -97,7 +97,7 @@ bench: $(READY)
 	$(BIN)/eigengs-dr bench kernels --report build/bench/kernels.json
 
 # The page shows all that is in build/report. To show more, run these commands with more images, sets
-# or steps, and 'bench budget' and 'bench rate', then the last one.
+# or steps, and 'bench budget', 'bench rate' and 'bench scaling', then the last one.
 report: $(READY)
 	@mkdir -p $(RESULTS)
 	$(BIN)/eigengs-dr bench stability -o $(RESULTS)

@@ -5,23 +5,19 @@ from typing import Any
 
 import click
 
+from eigengs_bench.cli_single import eigen, inverse, kernels, levels, texture
 from eigengs_bench.harness.store import Task
-from eigengs_bench.names import CONDITIONS, FIGURES, NATURAL, PAPER_SETS, PRESETS, SETS, TABLES
+from eigengs_bench.names import FIGURES, NATURAL, PAPER_SETS, PARTS, PRESETS, SETS, TABLES
 from eigengs_bench.options import (
     count_option,
     data_argument,
     many_option,
     measures_rows,
     output_option,
-    prints_figures,
-    save,
     set_options,
 )
-from eigengs_dr.backend.selection import select
-from eigengs_dr.cli import options
-from eigengs_dr.cli.console import progress_bar, say
-from eigengs_dr.cli.options import ANY_PATH, EXISTING, FOLDER, backend_option, quiet_option
-from eigengs_dr.cli.outputs import check_outputs
+from eigengs_dr.cli.console import say
+from eigengs_dr.cli.options import FOLDER, quiet_option
 
 Names = tuple[str, ...]
 
@@ -144,6 +140,28 @@ def stability(task: Task, cases: Names, presets: Names) -> Any:
 
 
 @bench.command()
+@many_option("--part", "parts", PARTS, "What to vary, by default all")
+@count_option("--max-side", 4096, "Leave out larger images, in pixels; the largest have 8192.")
+@measures_rows("scaling.jsonl", iterations=24)
+def scaling(task: Task, parts: Names, max_side: int) -> Any:
+    """Measure what size costs: time of a step, of the start, and memory.
+
+    \b
+    pixels   images of 128x128 to 8192x8192 with 0.076 Gaussians a pixel
+    splats   100 to 2,000,000 Gaussians on images of one size
+    threads  1, 2, 4, ... threads on images of three sizes
+    small    images a second of whole fits of 100 steps
+
+    Every size runs in a process of its own. --iterations is the least number of steps behind a
+    mean. All sizes to 4096x4096 take some ten minutes and 5 GB, 8192x8192 needs four times as much.
+    """
+    from eigengs_bench.experiments.scaling import run
+    from eigengs_bench.report.sections.scaling import summarize
+
+    return summarize(run(task, parts or PARTS, max_side))
+
+
+@bench.command()
 @data_argument
 @many_option("--figure", "figures", FIGURES, "What to draw, by default all")
 @count_option("--images", 8, "Test images a set, for curves and radii.")
@@ -186,110 +204,5 @@ def report(folder: Path, output: Path, quiet: bool) -> None:
         click.echo(f"wrote {output / 'index.html'} and {output / 'README.md'}")
 
 
-@bench.command()
-@backend_option
-@prints_figures
-def kernels(show: Any, backend: str | None) -> Any:
-    """Time the renderer and its derivatives against plain Dr.Jit and the machine's peak."""
-    from eigengs_bench.experiments.kernels import run
-
-    return run(backend, show), ""
-
-
-@bench.command()
-@click.argument("basis", metavar="NAME|FILE")
-@click.argument("folder", type=FOLDER, metavar="FOLDER")
-@count_option("--images", 20, "The first ones of the folder.")
-@count_option("--iterations", 100, "With 0 the command measures the starts themselves.", 0)
-@backend_option
-@prints_figures
-def eigen(show: Any, basis: str, folder: Path, images: int, iterations: int, backend: Any) -> Any:
-    """Compare starts of a fit: by a model, and by the image alone."""
-    from eigengs_bench.experiments.eigen import run
-    from eigengs_dr.eigenbasis.registry import load_basis
-    from eigengs_dr.image.folder import image_files
-    from eigengs_dr.image.io import load_image
-
-    pictures = [load_image(file) for file in image_files(folder)[:images]]
-    return run(load_basis(basis, backend), pictures, iterations, show), ""
-
-
-@bench.command()
-@click.option("--variant", default="llvm_ad_rgb", show_default=True, help="Of Mitsuba.")
-@prints_figures
-def texture(show: Any, variant: str) -> Any:
-    """Time a material ball with textures of Gaussians against one with a bitmap, in Mitsuba."""
-    from eigengs_bench.experiments.texture import run
-
-    return run(variant, show), ""
-
-
-@bench.command()
-@click.argument("image", type=EXISTING, metavar="IMAGE")
-@click.option("--basis", default="natural", show_default=True, metavar="NAME|FILE")
-@many_option("--condition", "conditions", CONDITIONS, "What photos are like, by default all")
-@count_option("--steps", 200, least=2)
-@backend_option
-@click.option("--chart", type=ANY_PATH, help=".png, .svg or .pdf: PSNR over steps and seconds.")
-@click.option("--strip", type=ANY_PATH, metavar="S.png", help="Film strips: S-cameras.png, ...")
-@prints_figures
-def inverse(
-    show: Any, image: Path, conditions: Any, chart: Path, strip: Path, **settings: Any
-) -> Any:
-    """Recover a poster from photos by texels, Gaussians, coefficients of a basis, and the last two.
-
-    The image hangs on a wall in Mitsuba, and every method takes the same number of steps of
-    gradient descent. All conditions take about ten minutes.
-    """
-    names = conditions or CONDITIONS
-    strips = {name: strip.with_stem(f"{strip.stem}-{name}") for name in names} if strip else {}
-    check_outputs([chart, *strips.values()], [image])
-    for path, known in ((chart, ".png .svg .pdf"), (strip, ".png .jpg")):
-        if path and path.suffix.lower() not in known.split():
-            raise ValueError(f"{path}: the name must end in {' or '.join(known.split())}")
-    try:
-        from eigengs_bench.experiments.inverse import figures_of, run, traces_of
-    except ImportError as error:
-        raise ValueError(f"bench inverse: {error}; pip install 'eigengs-dr[plugins]'") from error
-    from eigengs_bench.report.charts import save_figure, save_strip
-    from eigengs_bench.report.frames import as_text
-    from eigengs_bench.report.sections.inverse import film_strip, results_chart, results_table
-    from eigengs_dr.image.io import load_image
-
-    results = run(image=load_image(image), conditions=names, progress=show, **settings)
-    for name, path in strips.items():
-        save_strip(path, film_strip(results[name]))
-    if chart:
-        save_figure(chart, results_chart(results))
-    figures = {"results": figures_of(results), "traces": traces_of(results)}
-    return figures, as_text(results_table(results))
-
-
-@bench.command()
-@click.argument("image", type=EXISTING, required=False)
-@output_option
-@count_option("--gaussians", 5000)
-@count_option("--levels", 4)
-@count_option("--iterations", 1000)
-@options.seed_option
-@backend_option
-@quiet_option
-def levels(image: Path | None, output: Path, quiet: bool, **settings: Any) -> None:
-    """Chart PSNR over how many Gaussians of a set are drawn: levels.svg and levels.csv in FOLDER.
-
-    Without IMAGE the command fits a photo of scikit-image, at 256x256 pixels.
-    """
-    output.mkdir(parents=True, exist_ok=True)
-    check_outputs([output / "levels.svg", output / "levels.csv"], [image] if image else [])
-    select(settings["backend"])
-    from eigengs_bench.experiments.levels import SAMPLE, SIDE, run
-    from eigengs_bench.report.sections.levels import summarize
-    from eigengs_dr.image.io import load_image
-    from eigengs_dr.image.resize import center_crop
-    from eigengs_dr.image.samples import sample
-
-    pixels = load_image(image) if image else center_crop(sample(SAMPLE), SIDE, SIDE)
-    with progress_bar(quiet) as show:
-        points = run(pixels, progress=show, **settings)
-    points.to_csv(output / "levels.csv", index=False)
-    save(summarize(points, image.name if image else SAMPLE), output, quiet)
+for command in (kernels, eigen, texture, inverse, levels):
+    bench.add_command(command)

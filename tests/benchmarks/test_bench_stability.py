@@ -129,7 +129,7 @@ def test_a_set_that_is_not_finite_is_seen(backend):
 
 
 def test_a_case_alone_tells_its_memory(backend, monkeypatch, tmp_path):
-    monkeypatch.setattr(stability, "_peak", lambda: -1.0)  # of this process
+    monkeypatch.setattr(stability, "peak_gib", lambda: -1.0)  # of this process
     [(name, work)] = stability.jobs(
         task_in(tmp_path, backend, seed=3), [small(alone=True)], ["default"]
     )

@@ -1,19 +1,16 @@
 """Hard cases times presets: which stay finite, and which end no worse than they started."""
 
-import sys
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from multiprocessing import get_context
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from eigengs_bench.experiments.stability_cases import Case
+from eigengs_bench.harness.alone import measure_alone, peak_gib
 from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.tiling import tiling
 from eigengs_bench.harness.timing import Image, Moment, decibels, follow
@@ -44,9 +41,9 @@ def run(task: Task, cases: Iterable[Case], presets: Sequence[str]) -> list[Row]:
 def jobs(task: Task, cases: Iterable[Case], presets: Sequence[str]) -> Iterator[Job]:
     """Name the cells of the matrix."""
     for case, name in product(cases, presets):
-        measured = _measure_alone if case.alone else measure_cell
         job = {"case": case.name, "preset": name, "seed": task.seed, "iterations": case.iterations}
-        yield job, partial(measured, case, name, task.seed, task.backend)
+        work = partial(measure_cell, case, name, task.seed, task.backend)
+        yield job, partial(measure_alone, f"case {case.name!r}", work) if case.alone else work
 
 
 def tiles_of(task: Task, smooth: Case) -> dict[str, Image]:
@@ -74,7 +71,7 @@ def measure_cell(case: Case, preset: str, seed: int, backend: str | None) -> Row
     if encodes and len(load_basis(BASIS, backend).gaussians) > most:
         return {"needs": f"a basis with at most {most} Gaussians"}
     followed = moments(case, image, preset, seed, backend)
-    memory = {"peak_gib": _peak()} if case.alone else {}  # before the judgement takes its own
+    memory = {"peak_gib": peak_gib()} if case.alone else {}  # before the judgement takes its own
     return {**_score(followed, image), **memory}
 
 
@@ -136,25 +133,3 @@ def _round_to_half(gaussians: Gaussians) -> Gaussians:
 
     names = ("mean", "factor", "color", "background")
     return replace(gaussians, **{name: half(name) for name in names})
-
-
-def _measure_alone(case: Case, preset: str, seed: int, backend: str | None) -> Row:
-    """Measure a cell in a new process, which has the peak of memory of the cell alone."""
-    try:
-        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-            return pool.submit(measure_cell, case, preset, seed, backend).result()
-    except BrokenProcessPool:
-        raise ValueError(
-            f"case {case.name!r}: its process was ended, as it is where memory runs out; "
-            "free some, or leave the case out"
-        ) from None
-
-
-def _peak() -> float | None:
-    """Most memory of this process so far, in GiB; None on Windows."""
-    if sys.platform == "win32":
-        return None
-    import resource
-
-    unit = 30 if sys.platform == "darwin" else 20
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << unit)

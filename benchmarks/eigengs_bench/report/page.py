@@ -14,7 +14,7 @@ from eigengs_bench.experiments.figures import LIST, read_list
 from eigengs_bench.harness.store import Row, code_name, count_codes, read
 from eigengs_bench.report.charts import draw
 from eigengs_bench.report.frames import Section, as_text, remark
-from eigengs_bench.report.sections import budget, methods, pareto, rate, stability
+from eigengs_bench.report.sections import budget, methods, pareto, rate, scaling, stability
 from eigengs_bench.report.sections.losses import where_default_loses
 from eigengs_dr.storage.atomic import atomic_write
 
@@ -28,6 +28,7 @@ SECTIONS: tuple[tuple[str, tuple[str, ...], Callable[..., Section]], ...] = (
     ("Where default loses", ("tables.jsonl", "stability.jsonl"), where_default_loses),
     ("Gaussians that a PSNR takes", ("budget.jsonl",), budget.summarize),
     ("Bytes that a PSNR takes", ("rate.jsonl",), rate.summarize),
+    ("What size costs", ("scaling.jsonl",), scaling.summarize),
 )
 
 
