@@ -28,7 +28,7 @@ class Granularity(NamedTuple):
 
 
 GRANULARITY = {
-    "llvm": Granularity(rows=4, visits=16, ordered=True),
+    "llvm": Granularity(rows=4, visits=8, ordered=True),
     "cuda": Granularity(rows=1, visits=16, ordered=False),
 }
 """Granularity by backend. On llvm a lane shares the parameters of a Gaussian among 16 pixels; on a
