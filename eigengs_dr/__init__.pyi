@@ -2,6 +2,8 @@
 
 from .backend.selection import BackendError
 from .codec.bit_allocation import PackResult, pack
+from .collection.fit_many import fit_many
+from .collection.run import ImageRow, RunInterrupted
 from .eigenbasis.eigengs import EigenGS
 from .eigenbasis.pca.basis import Eigenbasis
 from .fitting.fit import Fit, FitInterrupted, fit
@@ -26,11 +28,14 @@ __all__ = [
     "FitInterrupted",
     "Gaussians",
     "ImageError",
+    "ImageRow",
     "PackResult",
+    "RunInterrupted",
     "concatenate",
     "fit",
     "fit_for_scene",
     "fit_levels",
+    "fit_many",
     "from_tensors",
     "level_counts",
     "load_image",
