@@ -126,7 +126,7 @@ def _summary(records: list[Record], folder: Path, seconds: float) -> str:
     fitted = [record for record in records if "psnr_rgb" in record]
     counts = Counter(record["stopped"] for record in records)
     others = "".join(f", {counts[k]} {k}" for k in ("skipped", "failed") if counts[k])
-    text = f"{len(fitted)} images fitted{others} in {seconds:.1f} s"
+    text = f"{len(fitted)} image{'s' * (len(fitted) != 1)} fitted{others} in {seconds:.1f} s"
     if fitted:
         ycbcr, rgb = (
             sum(record[key] for record in fitted) / len(fitted)

@@ -22,8 +22,8 @@ from .sources import Images, list_sources, make_folder, plan_output
 WRITERS = 2
 """Threads that compress and write results: 5,000 Gaussians take 6 ms."""
 
-MAX_WRITING = 8
-"""Largest number of results that wait for their file."""
+MAX_WRITING, MAX_WRITING_BYTES = 32, 1 << 26
+"""Largest number of results that wait for their file, and bytes of their images."""
 
 FAILURES = (ValueError, OSError, MemoryError)
 """Errors of one image, which do not end the run."""
@@ -120,6 +120,9 @@ class Finished(NamedTuple):
     pixels: Pixels | None
 
 
+Writing = tuple[Finished, Future[None] | None]
+"""An image, and its file if that is being written."""
+
 Work = Callable[[list[Pixels]], Iterator[Outcome]]
 """``work(images)`` yields the outcome of every image of a group, in order."""
 
@@ -181,7 +184,7 @@ def _run(
     decoded: Generator[Decoded, None, None], work: Work, may_join: MayJoin
 ) -> Generator[Finished, None, None]:
     """Work on groups of images, and write each result while the next ones are computed."""
-    writing: deque[tuple[Finished, Future[None] | None]] = deque()
+    writing: deque[Writing] = deque()
     with (
         closing(decoded),
         ThreadPoolExecutor(WRITERS, thread_name_prefix="write") as pool,
@@ -192,7 +195,7 @@ def _run(
             for group in _group(decoded, may_join):
                 for finished, gaussians in _work_on(group, work):
                     writing.append((finished, _write(pool, finished.row.output, gaussians)))
-                    while writing and (len(writing) > MAX_WRITING or _is_written(writing[0])):
+                    while writing and (_are_many(writing) or _is_written(writing[0])):
                         yield _written(*writing.popleft())
                     if interrupted():
                         raise KeyboardInterrupt
@@ -254,7 +257,12 @@ def _write(
     return pool.submit(write, output, data)
 
 
-def _is_written(entry: tuple[Finished, Future[None] | None]) -> bool:
+def _are_many(writing: deque[Writing]) -> bool:
+    held = sum(0 if item.pixels is None else item.pixels.nbytes for item, _ in writing)
+    return len(writing) > MAX_WRITING or held > MAX_WRITING_BYTES
+
+
+def _is_written(entry: Writing) -> bool:
     return entry[1] is None or entry[1].done()
 
 
