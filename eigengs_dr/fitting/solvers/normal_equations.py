@@ -33,9 +33,11 @@ GROUP, WIDE_GROUP = 3, 12
 """Planes that one adjoint correlates. An image has 3. Where there are 12, an adjoint of 12 takes
 70 % of the time of four adjoints of 3, which evaluate the weights four times; 24 are no faster."""
 
-SOLVE_THREADS = 2
-"""Threads that share the columns of a back-substitution, with one thread of BLAS each: 48 columns
-of 5,000 Gaussians take half the time. SuperLU does not hold the interpreter lock."""
+SOLVE_THREADS, SHARED_COLUMNS = 2, 12
+"""Threads that share the columns of a back-substitution, with one thread of BLAS each, and the
+least number of columns to share. 48 columns of 5,000 Gaussians take half the time. With the 3 of
+one image, the threads and those of Dr.Jit wait for each other, and `EigenGS.encode` takes 1.2 times
+as long. SuperLU does not hold the interpreter lock."""
 
 _ONE_BLAS_THREAD = Lock()
 """Held while the number of BLAS threads, which is one for the process, is changed."""
@@ -69,7 +71,7 @@ class Block(NamedTuple):
     def divide(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ``(A^T A + ridge)^-1`` times a column (n,) or columns (n, M)."""
         columns = np.asarray(sums, np.float32, order="F")
-        if columns.ndim == 1 or columns.shape[1] == 1:
+        if columns.ndim == 1 or columns.shape[1] < SHARED_COLUMNS:
             return self.factor.solve(columns).astype(np.float64)
         shares = np.array_split(columns, SOLVE_THREADS, axis=1)
         with _ONE_BLAS_THREAD, _blas().limit(limits=1, user_api="blas"):
@@ -173,7 +175,7 @@ class NormalEquations:
                 rows = self._correlate_group(images[group], group.stop - group.start)
                 for column, row in zip(range(group.start, len(images)), rows, strict=False):
                     result[:-1, column] = row.numpy()
-        result[-1] = images.sum(axis=(1, 2), dtype=np.float64)
+        result[-1] = images.sum(axis=2).sum(axis=1, dtype=np.float64)
         return result
 
     def _correlate_group(self, planes: NDArray[np.float32], number: int) -> list:

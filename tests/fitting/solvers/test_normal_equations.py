@@ -165,3 +165,14 @@ def test_a_matrix_too_large_is_refused(backend, monkeypatch):
     monkeypatch.setattr("eigengs_dr.fitting.solvers.normal_equations.MAX_WEIGHTS", 100)
     with pytest.raises(ValueError, match=r"the Gaussians cover [\d,]+ pixels in all, over 100"):
         NormalEquations(random_scene().on(backend))
+
+
+def test_many_planes_at_once(backend):
+    """Wide adjoints, and back-substitutions in threads, give what single ones give."""
+    equations = NormalEquations(random_scene(3).on(backend), 4)
+    planes = images(17)
+    together = equations.correlate(planes)
+    alone = np.hstack([equations.correlate(plane[None]) for plane in planes])
+    np.testing.assert_allclose(together, alone, rtol=1e-6, atol=1e-6)
+    solved = np.hstack([equations.solve(alone[:, k : k + 1]) for k in range(17)])
+    np.testing.assert_allclose(equations.solve(together), solved, atol=1e-5)
