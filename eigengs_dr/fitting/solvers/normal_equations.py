@@ -29,15 +29,25 @@ from ...raster.layout import pack_parameters, unpack_parameters
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ...raster.render import bin_gaussians, to_tiles
 
-GROUP, WIDE_GROUP = 3, 12
-"""Planes that one adjoint correlates. An image has 3. Where there are 12, an adjoint of 12 takes
-70 % of the time of four adjoints of 3, which evaluate the weights four times; 24 are no faster."""
+GROUP = 3
+"""Planes that one adjoint correlates: as many as an image has channels, so that all calls share one
+program."""
 
-SOLVE_THREADS, SHARED_COLUMNS = 2, 12
-"""Threads that share the columns of a back-substitution, with one thread of BLAS each, and the
-least number of columns to share. 48 columns of 5,000 Gaussians take half the time. With the 3 of
-one image, the threads and those of Dr.Jit wait for each other, and `EigenGS.encode` takes 1.2 times
-as long. SuperLU does not hold the interpreter lock."""
+THREADS, BATCH = 2, 48
+"""Threads that share the work on many columns, and columns of one sparse product. SciPy's sparse
+products and SuperLU do not hold the interpreter lock."""
+
+MIN_BATCH = 12
+"""Least number of columns for sparse products and threads. With 48 columns, 5,000 Gaussians and
+256x256 pixels, a sparse product takes a third of the time of adjoints, and a back-substitution in
+threads half. With the 3 of one image, the product takes longer, and threads and those of Dr.Jit
+wait for each other."""
+
+MAX_KEPT_WEIGHTS = 1 << 24
+"""Largest number of weights that stay in memory for sparse products, in 128 MiB."""
+
+STRIP = 2048
+"""Pixels that are transposed at once; the planes of a strip stay in the cache."""
 
 _ONE_BLAS_THREAD = Lock()
 """Held while the number of BLAS threads, which is one for the process, is changed."""
@@ -71,11 +81,11 @@ class Block(NamedTuple):
     def divide(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ``(A^T A + ridge)^-1`` times a column (n,) or columns (n, M)."""
         columns = np.asarray(sums, np.float32, order="F")
-        if columns.ndim == 1 or columns.shape[1] < SHARED_COLUMNS:
+        if columns.ndim == 1 or columns.shape[1] < MIN_BATCH:
             return self.factor.solve(columns).astype(np.float64)
-        shares = np.array_split(columns, SOLVE_THREADS, axis=1)
+        shares = np.array_split(columns, THREADS, axis=1)
         with _ONE_BLAS_THREAD, _blas().limit(limits=1, user_api="blas"):
-            solved = list(_solvers().map(self.factor.solve, shares))
+            solved = list(_threads().map(self.factor.solve, shares))
         return np.hstack(solved).astype(np.float64)
 
 
@@ -86,9 +96,9 @@ def _blas() -> ThreadpoolController:
 
 
 @cache
-def _solvers() -> ThreadPoolExecutor:
-    """Return the threads that share back-substitutions."""
-    return ThreadPoolExecutor(SOLVE_THREADS, thread_name_prefix="solve")
+def _threads() -> ThreadPoolExecutor:
+    """Return the threads that share work on many columns."""
+    return ThreadPoolExecutor(THREADS, thread_name_prefix="columns")
 
 
 class NormalEquations:
@@ -123,11 +133,14 @@ class NormalEquations:
         double = matrix.astype(np.float64)
         self.gram = (double @ double.T).tocsr()
         self.coverage = np.asarray(matrix.sum(axis=1), np.float64)
+        ends = [self.count * k // THREADS for k in range(THREADS + 1)]
+        few = matrix.nnz <= MAX_KEPT_WEIGHTS
+        self.shares = [matrix[slice(*pair)] for pair in pairwise(ends)] if few else []
         ends = [0, low, self.count] if low else [0, self.count]
         self.blocks = [self._block(slice(*pair)) for pair in pairwise(ends)]
         with dr.suspend_grad():
-            zero, shape = types_of(gaussians.mean).Float(0), kernel_shape(gaussians)
-            self.packed = {n: pack_parameters([*shape, *[zero] * n]) for n in (GROUP, WIDE_GROUP)}
+            types = types_of(gaussians.mean)
+            self.packed = pack_parameters([*kernel_shape(gaussians), *[types.Float(0)] * GROUP])
             self.lists = bin_gaussians(gaussians)
 
     def _block(self, rows: slice) -> Block:
@@ -163,31 +176,41 @@ class NormalEquations:
         Returns
         -------
         ndarray of float64, shape (N + 1, M)
-            Cost: one adjoint with respect to colours for every `WIDE_GROUP` planes, and for every
-            `GROUP` of the rest.
+            Cost: one sparse product for `MIN_BATCH` to `BATCH` planes, one adjoint with respect
+            to colours for every `GROUP` of fewer planes.
         """
         result = np.empty((self.count + 1, len(images)))
-        wide = len(images) - len(images) % WIDE_GROUP
-        groups = [slice(k, k + WIDE_GROUP) for k in range(0, wide, WIDE_GROUP)]
-        groups += [slice(k, k + GROUP) for k in range(wide, len(images), GROUP)]
-        with dr.suspend_grad():
-            for group in groups:
-                rows = self._correlate_group(images[group], group.stop - group.start)
-                for column, row in zip(range(group.start, len(images)), rows, strict=False):
-                    result[:-1, column] = row.numpy()
+        for first in range(0, len(images), BATCH):
+            planes = images[first : first + BATCH]
+            many = self.shares and len(planes) >= MIN_BATCH
+            sums = self._multiply(planes) if many else self._adjoint(planes)
+            result[:-1, first : first + len(planes)] = sums
         result[-1] = images.sum(axis=2).sum(axis=1, dtype=np.float64)
         return result
 
-    def _correlate_group(self, planes: NDArray[np.float32], number: int) -> list:
-        """Return ``A^T D`` of up to `number` planes as rows, padded to this number."""
-        missing = [(0, number - len(planes)), (0, 0), (0, 0)]
-        padded = np.pad(planes, missing) if len(planes) < number else planes
-        packed = self.packed[number]
-        types = types_of(packed)
-        delta = to_tiles(types, np.moveaxis(padded, 0, 2), self.lists.grid)
-        rows = adjoint(packed, delta, number, self.lists, self.radius, True)
-        dr.eval(rows)
-        return rows
+    def _multiply(self, planes: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return ``A^T D`` of many planes, shape (N, M), by sparse products."""
+        flat = planes.reshape(len(planes), -1)
+        columns = np.empty(flat.shape[::-1], np.float32)
+        for first in range(0, len(columns), STRIP):
+            columns[first : first + STRIP] = flat[:, first : first + STRIP].T
+        return np.vstack(list(_threads().map(lambda share: share @ columns, self.shares)))
+
+    def _adjoint(self, planes: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return ``A^T D`` of few planes, shape (N, M), by Dr.Jit."""
+        result = np.empty((self.count, len(planes)), np.float32)
+        types = types_of(self.packed)
+        with dr.suspend_grad():
+            for first in range(0, len(planes), GROUP):
+                group = planes[first : first + GROUP]
+                missing = [(0, GROUP - len(group)), (0, 0), (0, 0)]
+                padded = np.pad(group, missing) if len(group) < GROUP else group
+                delta = to_tiles(types, np.moveaxis(padded, 0, 2), self.lists.grid)
+                rows = adjoint(self.packed, delta, GROUP, self.lists, self.radius, True)
+                dr.eval(rows)
+                for column, row in zip(range(first, first + len(group)), rows, strict=False):
+                    result[:, column] = row.numpy()
+        return result
 
     def solve(self, correlations: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the least-squares coefficients for the result of `correlate`.
