@@ -74,8 +74,8 @@ def test_one_failure_does_not_fail_its_group(backend, monkeypatch):
 
 def test_groups_are_bounded(monkeypatch):
     small, large = np.zeros((10, 10, 3), np.float32), np.zeros((2000, 2000, 3), np.float32)
-    assert encode_many._may_join([small] * 15, small)
-    assert not encode_many._may_join([small] * 16, small)
+    assert encode_many._may_join([small] * 31, small)
+    assert not encode_many._may_join([small] * 32, small)
     assert not encode_many._may_join([large], large)
 
 

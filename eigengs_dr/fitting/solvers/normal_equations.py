@@ -10,17 +10,16 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from itertools import pairwise
-from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import splu
-from threadpoolctl import ThreadpoolController
 
 from ...backend.arrays import types_of
 from ...gaussian.gaussians import Gaussians
@@ -28,6 +27,7 @@ from ...raster.kernels import adjoint
 from ...raster.layout import pack_parameters
 from ...raster.parameters import kernel_radius, kernel_shape
 from ...raster.render import bin_gaussians, to_tiles
+from .block_inverse import BlockInverse, invert
 from .weight_matrix import weight_matrix
 
 GROUP = 3
@@ -35,17 +35,16 @@ GROUP = 3
 program."""
 
 THREADS = min(4, os.cpu_count() or 1)
-"""Threads that share the work on many columns. SciPy's sparse products and SuperLU do not hold the
-interpreter lock. The results do not depend on the number of threads."""
+"""Threads that share a sparse product; SciPy does not hold the interpreter lock. The result does
+not depend on their number."""
 
-BATCH, SHARE = 48, 12
-"""Columns of one sparse product, and columns that a thread back-substitutes at once."""
+BATCH = 48
+"""Columns of one sparse product."""
 
 MIN_BATCH = 12
-"""Least number of columns for sparse products and threads. With 48 columns, 5,000 Gaussians and
-256x256 pixels, a sparse product takes a third of the time of adjoints, and a back-substitution in
-threads half. With the 3 of one image, the product takes longer, and threads and those of Dr.Jit
-wait for each other."""
+"""Least number of columns for sparse products and block inverses. With 48 columns, 5,000 Gaussians
+and 256x256 pixels, a sparse product takes a third of the time of adjoints, and a block inverse a
+third of that of back-substitutions. With the 3 of one image, neither is faster."""
 
 MAX_KEPT_WEIGHTS = 1 << 24
 """Largest number of weights that stay in memory for sparse products, in 128 MiB."""
@@ -53,21 +52,23 @@ MAX_KEPT_WEIGHTS = 1 << 24
 STRIP = 2048
 """Pixels that are transposed at once; the planes of a strip stay in the cache."""
 
-_ONE_BLAS_THREAD = Lock()
-"""Held while the number of BLAS threads, which is one for the process, is changed."""
-
 RIDGE = 1e-4
 """Number added to the diagonal of ``A^T A``, relative to the mean of the diagonal. It bounds the
 colours of Gaussians that overlap much, at no visible cost."""
 
 
-class Block(NamedTuple):
+@dataclass(frozen=True)
+class Block:
     """Consecutive Gaussians with a common solve for their colours.
 
     Attributes
     ----------
     rows : slice
         Range of the Gaussians.
+    system : csr_array of float64, shape (n, n)
+        ``A^T A + ridge``.
+    positions : ndarray, shape (n, 2)
+        Means of the Gaussians.
     factor : SuperLU
         Factorisation of ``A^T A + ridge`` in single precision, which halves the memory to read for
         every image; its rounding is below the ridge.
@@ -76,24 +77,21 @@ class Block(NamedTuple):
     """
 
     rows: slice
+    system: Any
+    positions: NDArray[np.floating]
     factor: Any
     spread: NDArray[np.float64]
 
     def divide(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ``(A^T A + ridge)^-1`` times a column (n,) or columns (n, M)."""
-        columns = np.asarray(sums, np.float32, order="F")
-        if columns.ndim == 1 or columns.shape[1] < MIN_BATCH:
-            return self.factor.solve(columns).astype(np.float64)
-        shares = [columns[:, k : k + SHARE] for k in range(0, columns.shape[1], SHARE)]
-        with _ONE_BLAS_THREAD, _blas().limit(limits=1, user_api="blas"):
-            solved = list(_threads().map(self.factor.solve, shares))
-        return np.hstack(solved).astype(np.float64)
+        if sums.ndim == 2 and sums.shape[1] >= MIN_BATCH and self.inverse:
+            return self.inverse.solve(sums.astype(np.float32)).astype(np.float64)
+        return self.factor.solve(np.asarray(sums, np.float32, order="F")).astype(np.float64)
 
-
-@cache
-def _blas() -> ThreadpoolController:
-    """Return the controller of the BLAS libraries in this process."""
-    return ThreadpoolController()
+    @cached_property
+    def inverse(self) -> BlockInverse | None:
+        """``(A^T A + ridge)^-1`` for many columns, or None if it is too large."""
+        return invert(self.system, self.positions)
 
 
 @cache
@@ -130,6 +128,7 @@ class NormalEquations:
     def __init__(self, gaussians: Gaussians, low: int = 0) -> None:
         self.count, self.radius = len(gaussians), kernel_radius(gaussians.cutoff)
         self.width, self.height = gaussians.width, gaussians.height
+        self.means = gaussians.to_arrays()["mean"]
         matrix = weight_matrix(gaussians)
         double = matrix.astype(np.float64)
         self.gram = (double @ double.T).tocsr()
@@ -148,10 +147,10 @@ class NormalEquations:
         """Factorise the equations of some Gaussians."""
         gram = self.gram[rows, rows]
         ridge = max(RIDGE * gram.diagonal().mean(), 1e-12)
-        system = (gram + diags_array(np.full(gram.shape[0], ridge))).tocsc()
+        system = (gram + diags_array(np.full(gram.shape[0], ridge))).tocsr()
         try:
             factor = splu(
-                system.astype(np.float32),
+                system.tocsc().astype(np.float32),
                 permc_spec="MMD_AT_PLUS_A",
                 diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True},
@@ -162,9 +161,9 @@ class NormalEquations:
                 "differ more"
             ) from None
         coverage = self.coverage[rows]
-        block = Block(rows, factor, 0 * coverage)
+        block = Block(rows, system, self.means[rows], factor, 0 * coverage)
         spread = block.divide(coverage)
-        return block._replace(spread=spread + block.divide(coverage - system @ spread))
+        return replace(block, spread=spread + block.divide(coverage - system @ spread))
 
     def correlate(self, images: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return ``A^T D`` and, in the last row, ``1^T D``.
