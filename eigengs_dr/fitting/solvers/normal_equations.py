@@ -182,9 +182,11 @@ class NormalEquations:
         result = np.empty((self.count + 1, len(images)))
         for first in range(0, len(images), BATCH):
             planes = images[first : first + BATCH]
-            many = self.shares and len(planes) >= MIN_BATCH
-            sums = self._multiply(planes) if many else self._adjoint(planes)
-            result[:-1, first : first + len(planes)] = sums
+            sums = result[:-1, first : first + len(planes)]
+            if self.shares and len(planes) >= MIN_BATCH:
+                sums[:] = self._multiply(planes)
+            else:
+                self._adjoint(planes, sums)
         result[-1] = images.sum(axis=2).sum(axis=1, dtype=np.float64)
         return result
 
@@ -196,9 +198,8 @@ class NormalEquations:
             columns[first : first + STRIP] = flat[:, first : first + STRIP].T
         return np.vstack(list(_threads().map(lambda share: share @ columns, self.shares)))
 
-    def _adjoint(self, planes: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return ``A^T D`` of few planes, shape (N, M), by Dr.Jit."""
-        result = np.empty((self.count, len(planes)), np.float32)
+    def _adjoint(self, planes: NDArray[np.float32], result: NDArray[np.float64]) -> None:
+        """Write ``A^T D`` of few planes to an array (N, M), by Dr.Jit."""
         types = types_of(self.packed)
         with dr.suspend_grad():
             for first in range(0, len(planes), GROUP):
@@ -210,7 +211,6 @@ class NormalEquations:
                 dr.eval(rows)
                 for column, row in zip(range(first, first + len(group)), rows, strict=False):
                     result[:, column] = row.numpy()
-        return result
 
     def solve(self, correlations: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the least-squares coefficients for the result of `correlate`.
