@@ -67,9 +67,9 @@ def fit_many(
         ``progress(done, total, row)`` after every image, with its `ImageRow`; `total` is None for
         an iterator. It may raise `KeyboardInterrupt` to end the run.
     options : Any
-        Keyword arguments, the options of `eigengs_dr.fit`: gaussians, iterations, init, basis, preset, solve_steps,
-        color, seed, backend, target_psnr, target_space, max_gaussians and cutoff. A basis is read
-        once.
+        Keyword arguments, the options of `eigengs_dr.fit`: gaussians, iterations, init, basis,
+        preset, solve_steps, color, seed, backend, target_psnr, target_space, max_gaussians and
+        cutoff. A basis is read once.
 
     Returns
     -------
