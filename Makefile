@@ -11,6 +11,9 @@ PHOTO := .venv/lib/python3*/site-packages/skimage/data/coffee.png
 DATA ?= data
 RESULTS := build/report
 
+# Path of a simulator of the CUDA driver: a program that runs the command it is given.
+CUDASIM ?= $(wildcard ../shared/cudasim/cudasim)
+
 LLVM_ADVICE := install LLVM 17 or newer and libatomic (as root: Debian, Ubuntu 'apt install \
 libllvm19 libatomic1', Fedora 'dnf install llvm-libs libatomic', macOS 'brew install llvm'), \
 then make again
@@ -24,13 +27,14 @@ APT_INSTALL := apt_install() { \
 	{ $$get install $$1 || { $$get update && $$get install $$1; }; } </dev/null >/dev/null 2>&1 \
 	|| { echo "make setup: $$2" >&2; exit 1; }; }
 
-.PHONY: help setup demo scenes test test-slow docs bench report basis clean
+.PHONY: help setup demo scenes test test-slow test-cuda-sim docs bench report basis clean
 
 help:
 	@echo "make demo       fit a photo; shows PSNR, time and the pictures it wrote"
 	@echo "make scenes     render the Mitsuba scenes in scenes/, in 2 minutes"
 	@echo "make test       linters, type checker, layers, tests"
 	@echo "make test-slow  the tests that take minutes"
+	@echo "make test-cuda-sim  the cuda tests without a GPU, under the simulated driver CUDASIM=PATH"
 	@echo "make docs       build the manual, build/docs/html/index.html; every warning is an error"
 	@echo "make bench      time the renderer"
 	@echo "make report     measure a part of everything and write build/results, in half an hour; resumes after a break"
@@ -70,6 +74,15 @@ test: $(READY)
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -q -m slow
+
+# CUDASIM_APPROX: the simulated driver rounds approximate instructions as coarsely as a GPU may.
+ifeq ($(wildcard $(CUDASIM)),)
+test-cuda-sim:
+	@echo "make test-cuda-sim: skipped, no simulator of the CUDA driver; give its path by CUDASIM="
+else
+test-cuda-sim: $(READY)
+	CUDASIM_APPROX=1 $(CUDASIM) $(BIN)/python -m pytest -q -m 'gpu and not slow and not large'
+endif
 
 $(DOCS_READY): $(READY)
 	$(BIN)/python -m pip install --editable '.[docs]'

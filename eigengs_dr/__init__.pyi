@@ -1,5 +1,6 @@
 """The public names of eigengs_dr; `lazy_loader` and type checkers read this file."""
 
+from .backend.recording import exclusive
 from .backend.selection import BackendError
 from .codec.bit_allocation import PackResult, pack
 from .collection.fit_many import fit_many
@@ -32,6 +33,7 @@ __all__ = [
     "PackResult",
     "RunInterrupted",
     "concatenate",
+    "exclusive",
     "fit",
     "fit_for_scene",
     "fit_levels",

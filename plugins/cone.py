@@ -8,6 +8,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from eigengs_dr.backend.arithmetic import rcp
+
 PIXEL = 0.4
 """Standard deviation of a footprint in pixels. The random positions of samples in a pixel already
 blur by 0.29 (a box); at 0.4, one sample of a receding plane came closest to the mean of 1,024."""
@@ -76,7 +78,7 @@ def metric(si: Any, inverse: tuple, angle: float) -> tuple[list, Any]:
     u, v = u * b00 + v * b10, u * b01 + v * b11
     seen_u, seen_v = u - d * dr.dot(d, u), v - d * dr.dot(d, v)
     area = dr.squared_norm(dr.cross(u, v))
-    sharp = dr.rcp(dr.square(PIXEL * angle * t))
+    sharp = rcp(dr.square(PIXEL * angle * t))
     valid = (area > 0) & dr.isfinite(area) & (t > 0) & dr.isfinite(t)
     return [
         dr.squared_norm(seen_u) * sharp,

@@ -2,8 +2,9 @@
 
 - ``libllvm``: finds a libLLVM that works, before Dr.Jit loads one
 - ``selection``: picks llvm or cuda
+- ``arithmetic``: functions that cuda approximates too coarsely
 - ``arrays``: array types that go together; copies of NumPy arrays
-- ``recording``: frozen programs
+- ``recording``: frozen programs; one thread at a time
 - ``interrupt``: Ctrl-C and SIGTERM between steps
 - ``doctor``: what works here and what to install
 """

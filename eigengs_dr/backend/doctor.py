@@ -12,7 +12,7 @@ import sys
 from typing import Any
 
 from . import libllvm
-from .selection import version_of
+from .selection import UNTESTED_ON_GPU, version_of
 
 TRIAL = """
 import json, sys
@@ -100,7 +100,7 @@ def _details(name: str, trial: dict[str, Any]) -> str:
     """Describe the software and hardware of a backend that works."""
     versions = trial["versions"]
     if name == "cuda":
-        return f"Dr.Jit {versions['drjit']}"
+        return f"Dr.Jit {versions['drjit']}; {UNTESTED_ON_GPU}"
     library = f"LLVM {versions['libllvm']} at {versions['libllvm_path']}"
     return f"Dr.Jit {versions['drjit']}, {library}, {trial['threads']} threads on {trial['cpu']}"
 

@@ -1,14 +1,67 @@
-"""Frozen programs of Dr.Jit: traced once, replayed, and safe from the garbage collector."""
+"""Programs of Dr.Jit: one thread at a time; frozen ones are freed at a safe moment.
+
+Dr.Jit 1.5 keeps state for the whole process. While one thread records or replays a frozen program,
+another thread that traces, differentiates, records or frees a program ends the process, hangs it,
+or lets the replay fail ("determining size of variable"). One lock of this module excludes that.
+"""
 
 from __future__ import annotations
 
 import gc
+import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from typing import Any
 
 import drjit as dr
+
+_LOCK = threading.RLock()
+"""The thread that holds it may use Dr.Jit."""
+
+_retired: deque[Any] = deque()
+"""Frozen programs that nobody uses any more; `_clear_retired` frees them."""
+
+_calls = 0
+"""Calls of frozen programs under way, in the thread that holds `_LOCK`."""
+
+_COLLECTOR_LOCK = threading.RLock()
+_pauses = 0
+"""Blocks that keep the garbage collector off, in all threads."""
+_collects = False
+"""Whether the collector was on before the first of these blocks."""
+
+
+@contextmanager
+def exclusive() -> Iterator[None]:
+    """Let no other thread use Dr.Jit during a block, or during every call of a function.
+
+    The functions of this package that use Dr.Jit do so by themselves, as `eigengs_dr.fit` and
+    `eigengs_dr.render`. Use it around your own use of Dr.Jit or Mitsuba, such as `drjit.backward`
+    or `mitsuba.render`, if another thread may call this package meanwhile. Blocks of one thread
+    may nest. A block that waits for another thread must not hold what that thread waits for.
+
+    Returns
+    -------
+    context manager
+        Also a decorator, ``@exclusive()``, of functions that are no generators.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg
+    >>> import drjit as dr
+    >>> start = eg.fit(eg.sample("coffee")[:32, :32], gaussians=50, iterations=1).gaussians
+    >>> with eg.exclusive():
+    ...     dr.enable_grad(start.color)
+    ...     dr.backward(dr.sum(eg.render(start).array))
+    """
+    with _LOCK:
+        _clear_retired()
+        try:
+            yield
+        finally:
+            _clear_retired()
 
 
 @contextmanager
@@ -19,6 +72,10 @@ def freeze_program(function: Callable[..., Any]) -> Iterator[Callable[..., Any]]
     that shares NumPy's memory. The garbage collector frees such objects at any time if a reference
     cycle holds them. Therefore the collector is off during calls, and the block frees the program.
 
+    A generator that nobody reads to its end closes its block wherever Python drops it, perhaps in
+    another thread or during a recording. Therefore the end of the block only retires the program.
+    It is freed at once if no program is being called, else by the next `exclusive` block.
+
     Parameters
     ----------
     function : callable
@@ -27,13 +84,54 @@ def freeze_program(function: Callable[..., Any]) -> Iterator[Callable[..., Any]]
     Yields
     ------
     callable
-        The frozen function, with the arguments and the result of `function`.
+        The frozen function, with the arguments and the result of `function`. Its calls are
+        `exclusive`.
     """
     program = dr.freeze(function)
+
+    @wraps(function)
+    def call(*arguments: Any, **settings: Any) -> Any:
+        global _calls
+        with _LOCK, collector_off():
+            _calls += 1
+            try:
+                return program(*arguments, **settings)
+            finally:
+                _calls -= 1
+
     try:
-        yield without_collector(program)
+        yield call
     finally:
-        program.clear()
+        _retired.append(program)
+        if _LOCK.acquire(blocking=False):
+            try:
+                _clear_retired()
+            finally:
+                _LOCK.release()
+
+
+def _clear_retired() -> None:
+    """Free the programs that nobody uses any more, unless a program is being called."""
+    while _retired and not _calls:
+        _retired.popleft().clear()
+
+
+@contextmanager
+def collector_off() -> Iterator[None]:
+    """Keep Python's garbage collector off during a block; on again after the last thread's."""
+    global _pauses, _collects
+    with _COLLECTOR_LOCK:
+        if _pauses == 0:
+            _collects = gc.isenabled()
+            gc.disable()
+        _pauses += 1
+    try:
+        yield
+    finally:
+        with _COLLECTOR_LOCK:
+            _pauses -= 1
+            if _pauses == 0 and _collects:
+                gc.enable()
 
 
 def without_collector(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -55,12 +153,7 @@ def without_collector(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(function)
     def call(*arguments: Any, **settings: Any) -> Any:
-        collects = gc.isenabled()
-        gc.disable()
-        try:
+        with collector_off():
             return function(*arguments, **settings)
-        finally:
-            if collects:
-                gc.enable()
 
     return call

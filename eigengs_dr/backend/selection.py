@@ -6,6 +6,7 @@ import os
 import platform
 import re
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,11 @@ from types import ModuleType
 from typing import Any
 
 from .libllvm import MIN_VERSION, advice, load_failure, loaded_path
+
+UNTESTED_ON_GPU = "tested with a simulated driver only, not yet on a GPU"
+"""State of the cuda backend, until the whole suite has passed on a GPU."""
+
+_cuda_announced = False
 
 
 class BackendError(RuntimeError):
@@ -40,6 +46,11 @@ def select(backend: str | None = None) -> ModuleType:
     ValueError
         If `backend` has another value.
 
+    Warns
+    -----
+    UserWarning
+        At the first use of cuda in a process: `UNTESTED_ON_GPU`.
+
     Examples
     --------
     >>> from eigengs_dr.backend.selection import select
@@ -50,6 +61,7 @@ def select(backend: str | None = None) -> ModuleType:
         raise ValueError(f"backend {backend!r} is unknown; use 'llvm' or 'cuda'")
     dr = _import_drjit()
     if backend != "llvm" and dr.has_backend(dr.JitBackend.CUDA):
+        _announce_cuda()
         return dr.cuda.ad
     if backend == "cuda":
         raise BackendError("no CUDA GPU or driver was found; use backend 'llvm'")
@@ -59,6 +71,14 @@ def select(backend: str | None = None) -> ModuleType:
     if version < MIN_VERSION:
         raise BackendError(f"{loaded_path()} is LLVM {version}, which crashes Dr.Jit; {advice()}")
     return dr.llvm.ad
+
+
+def _announce_cuda() -> None:
+    """Warn of the state of the cuda backend, once in a process."""
+    global _cuda_announced
+    if not _cuda_announced:
+        _cuda_announced = True
+        warnings.warn(f"backend cuda: {UNTESTED_ON_GPU}; compare with backend 'llvm'", stacklevel=3)
 
 
 def describe(backend: str | None = None) -> dict[str, Any]:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import types_of
+from ..backend.recording import exclusive
 from ..gaussian.covariance import log_shapes, sizes_from_log_shapes
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr, to_coded
@@ -89,6 +90,7 @@ class PackResult(NamedTuple):
     steps: Steps
 
 
+@exclusive()
 def pack(
     gaussians: Gaussians,
     path: str | os.PathLike[str],

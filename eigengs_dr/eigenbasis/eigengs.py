@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.recording import exclusive
 from ..collection.run import ImageRow, RowProgress
 from ..collection.sources import Images
 from ..fitting.solvers.normal_equations import NormalEquations, squared_norms
@@ -79,6 +80,7 @@ class EigenGS:
     figures: dict[str, float] = field(default_factory=dict)
 
     @classmethod
+    @exclusive()
     def fit(
         cls,
         basis: Eigenbasis,
@@ -171,6 +173,7 @@ class EigenGS:
             return None
         return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean_image.size)
 
+    @exclusive()
     def project(self, image: ArrayLike, target_psnr: float | None = None) -> tuple[Planes, ...]:
         """Find the coefficients of an image by least squares on the rendered components.
 
@@ -204,6 +207,7 @@ class EigenGS:
         planes = self._planes(check_image(image))
         return self._coefficients(planes, self.equations.correlate(planes), False, target_psnr)
 
+    @exclusive()
     def reconstruct(
         self, coefficients: tuple[Planes, ...], size: tuple[int, int] | None = None
     ) -> Gaussians:
@@ -229,6 +233,7 @@ class EigenGS:
             raise ValueError(f"coefficients have shapes {shapes}; expected up to {self.components}")
         return self._colored(self._mean_coefficients + self._sum(coefficients), size)
 
+    @exclusive()
     def encode(
         self,
         image: ArrayLike,
@@ -334,6 +339,7 @@ class EigenGS:
         except ValueError as error:
             raise ValueError(f"{Path(path)}: {error}") from None
 
+    @exclusive()
     def _encode_group(
         self, images: list[Planes], colors: str, mean: str, target_psnr: float | None
     ) -> list[Gaussians]:

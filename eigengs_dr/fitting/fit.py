@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.interrupt import defer_interrupts
+from ..backend.recording import exclusive
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image
@@ -196,6 +197,7 @@ def fit(
     return fit_image(image, options, progress)
 
 
+@exclusive()
 def fit_image(image: ArrayLike, options: FitOptions, progress: FitProgress | None = None) -> Fit:
     """Fit an image with the options of one record; see `fit` for results and errors."""
     started = time.perf_counter()

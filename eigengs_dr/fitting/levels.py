@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..backend.interrupt import defer_interrupts
+from ..backend.recording import exclusive
 from ..gaussian.concatenate import concatenate
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image
@@ -80,6 +81,7 @@ def check_options(options: FitOptions) -> None:
         raise ValueError("levels needs preset 'default' and init 'adaptive'; leave the others out")
 
 
+@exclusive()
 def fit_levels(
     image: ArrayLike,
     gaussians: int | None = None,

@@ -8,9 +8,11 @@ from typing import Any
 
 import drjit as dr
 
+from ..backend.recording import exclusive
 from .gaussians import Gaussians, broadcast
 
 
+@exclusive()
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     """Join sets and add their backgrounds: the result renders as the sum of the sets.
 

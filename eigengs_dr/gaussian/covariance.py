@@ -13,6 +13,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.arithmetic import rsqrt
+
 Array = NDArray[np.floating]
 
 
@@ -177,4 +179,4 @@ def factor_from_cholesky(l1: Any, l2: Any, l3: Any) -> tuple[Any, Any, Any]:
     """
     yy = dr.square(l2) + dr.square(l3)
     a = dr.sqrt(yy) / dr.abs(l1 * l3)
-    return a, -l1 * l2 / yy * a, dr.rsqrt(yy)
+    return a, -l1 * l2 / yy * a, rsqrt(yy)

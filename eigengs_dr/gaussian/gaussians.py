@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import types_in, types_of, upload, upload_rows
+from ..backend.recording import exclusive
 from ..backend.selection import select
 from ..storage.npz import BadValue
 from .file import CUTOFF, SetData, check, read, write
@@ -68,6 +69,7 @@ class Gaussians:
     cutoff: float = CUTOFF
 
     @classmethod
+    @exclusive()
     def from_arrays(
         cls,
         mean: ArrayLike,
@@ -124,6 +126,7 @@ class Gaussians:
             cutoff=float(cutoff),  # a NumPy scalar would promote Dr.Jit arrays to float64
         )
 
+    @exclusive()
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Return mean (N, 2), factor (N, 3), color (N, C) and background (C,) as NumPy arrays."""
         n = len(self)
@@ -143,6 +146,7 @@ class Gaussians:
         """Number of channels."""
         return len(self.color)
 
+    @exclusive()
     def __getitem__(self, selection: Any) -> Gaussians:
         """Select Gaussians by a slice, an integer array or a boolean mask; differentiable.
 
@@ -167,6 +171,7 @@ class Gaussians:
 
         return replace(self, mean=pick(self.mean), factor=pick(self.factor), color=pick(self.color))
 
+    @exclusive()
     def scaled(self, width: int, height: int) -> Gaussians:
         """Scale the picture to another native size, in pixels; differentiable.
 
@@ -190,6 +195,7 @@ class Gaussians:
             height=height,
         )
 
+    @exclusive()
     def bounded(self) -> Gaussians:
         """Clip every parameter to its bounds.
 

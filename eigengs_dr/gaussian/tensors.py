@@ -9,12 +9,14 @@ from typing import Any
 import drjit as dr
 
 from ..backend.arrays import types_of
+from ..backend.recording import exclusive
 from .gaussians import Gaussians
 
 FIELDS = {"mean": 2, "factor": 3, "color": 0, "background": 0}
 """Parameters of a set, with their numbers of columns; 0 means the number of channels."""
 
 
+@exclusive()
 def to_tensors(gaussians: Gaussians) -> dict[str, Any]:
     """Return the parameters of a set as tensors; differentiable.
 
@@ -46,6 +48,7 @@ def to_tensors(gaussians: Gaussians) -> dict[str, Any]:
     return tensors
 
 
+@exclusive()
 def from_tensors(tensors: Mapping[str, Any], like: Gaussians) -> Gaussians:
     """Create a set from tensors; differentiable. The inverse of `to_tensors`.
 

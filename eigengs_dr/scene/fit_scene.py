@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
 
+from ..backend.recording import exclusive
 from ..fitting.initializers import FitProblem, dark_weight
 from ..fitting.optimizers.descent import descend
 from ..fitting.placement.adaptive import place_adaptive
@@ -84,6 +85,7 @@ class SceneFit(NamedTuple):
     tried: list[tuple[int, float]]
 
 
+@exclusive()
 def fit_for_scene(
     scene: Any,
     texture: str,

@@ -10,6 +10,11 @@ mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 from eigengs_dr.plugins import texture_of  # noqa: E402
 
 
+def backend():
+    """Name of the backend of the current variant."""
+    return mi.variant().split("_")[0]
+
+
 def gaussians(space="rgb", channels=3, seed=0, quiet=True):
     """A small set; a quiet one stays inside [0, 1], so that no value is clamped."""
     scene = random_scene(seed, channels=channels)
@@ -17,7 +22,7 @@ def gaussians(space="rgb", channels=3, seed=0, quiet=True):
         scene = scene._replace(
             color=0.04 * scene.color, background=np.full(channels, 0.5, np.float32)
         )
-    return scene.on("llvm", space=space)
+    return scene.on(backend(), space=space)
 
 
 def texture(g, **properties):

@@ -3,22 +3,25 @@
 import json
 import subprocess
 import sys
+import warnings
 from types import SimpleNamespace
 
 import pytest
 
 from _helpers.process import SELECT, run_python
+from eigengs_dr.backend import doctor, selection
 from eigengs_dr.backend import libllvm as module
 from eigengs_dr.backend.libllvm import PATH_VARIABLE
 from eigengs_dr.backend.selection import BackendError, describe, select
 
 
-def fake_drjit(monkeypatch, *, llvm, version):
-    """Put a Dr.Jit in place that has no GPU, and an LLVM backend or none."""
+def fake_drjit(monkeypatch, *, llvm, version, cuda=False):
+    """Put a Dr.Jit in place that has a GPU or none, and an LLVM backend or none."""
     kinds = SimpleNamespace(CUDA="cuda", LLVM="llvm")
     drjit = SimpleNamespace(
         JitBackend=kinds,
-        has_backend=lambda kind: llvm and kind == "llvm",
+        has_backend=lambda kind: {"llvm": llvm, "cuda": cuda}[kind],
+        cuda=SimpleNamespace(ad=SimpleNamespace()),
         detail=SimpleNamespace(llvm_version=lambda: version),
     )
     monkeypatch.setitem(sys.modules, "drjit", drjit)
@@ -43,6 +46,25 @@ def test_cuda_without_gpu(monkeypatch):
     fake_drjit(monkeypatch, llvm=True, version=(19, 1, 7))
     with pytest.raises(BackendError, match=r"no CUDA GPU or driver was found; use backend 'llvm'"):
         select("cuda")
+
+
+def test_first_use_of_cuda_says_that_no_gpu_was_tested(monkeypatch):
+    fake_drjit(monkeypatch, llvm=True, version=(19, 1, 7), cuda=True)
+    monkeypatch.setattr(selection, "_cuda_announced", False)
+    with pytest.warns(UserWarning, match="backend cuda: .* not yet on a GPU; compare with") as told:
+        assert select("cuda") is sys.modules["drjit"].cuda.ad
+    assert "\n" not in str(told[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        select()
+
+
+def test_doctor_says_that_no_gpu_was_tested():
+    trial = {"works": True, "versions": {"drjit": "1.5.0"}}
+    refused = {"works": False, "problem": "no"}
+    found = {"python": "3.11", "platform": "x", "llvm": refused, "cuda": trial, "libllvm": []}
+    text = doctor.describe({**found, "mitsuba": {"version": None, "variants": None}})
+    assert "cuda     works: Dr.Jit 1.5.0; tested with a simulated driver only" in text
 
 
 def test_drjit_that_cannot_be_imported(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from _helpers.sets import SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-from _helpers.texture import at, gaussians, texture  # noqa: E402
+from _helpers.texture import at, backend, gaussians, texture  # noqa: E402
 from eigengs_dr.plugins import pixel_angle, texture_of  # noqa: E402
 from eigengs_dr.plugins.cone import PIXEL, metric  # noqa: E402
 from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, bound_covariance  # noqa: E402
@@ -152,7 +152,7 @@ class TestPlane:
             }
         )
         g = both._replace(color=0.02 * both.color, background=np.full(3, 0.5)).on(
-            "llvm", space="linear"
+            backend(), space="linear"
         )
         v, u = np.mgrid[:20, :20] / 20 + 0.025
         si = dr.zeros(mi.SurfaceInteraction3f, 400)

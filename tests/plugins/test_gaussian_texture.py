@@ -9,17 +9,24 @@ from _helpers.sets import COUNT, SIZE
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 import eigengs_dr as eg  # noqa: E402
 from _helpers.texture import at, gaussians, picture, small_scene, texel_centres, texture  # noqa: E402
+from _helpers.variants import BOTH_RGB, on_both  # noqa: E402
 from eigengs_dr.image.color import to_linear  # noqa: E402
 from eigengs_dr.plugins import texture_of  # noqa: E402
 from eigengs_dr.raster.render import picture_of  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
-VARIANTS = ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral"]
+MONO, SPECTRAL = on_both("mono"), on_both("spectral")
 
 
-others = [pytest.param(name, marks=pytest.mark.slow) for name in VARIANTS[1:]]
-in_variants = pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+def in_variants(names):
+    return pytest.mark.parametrize("variant", names, indirect=True)
+
+
+others = [
+    pytest.param(name, marks=pytest.mark.slow) for name in ("llvm_ad_mono", "llvm_ad_spectral")
+]
+in_all = in_variants([*BOTH_RGB, *MONO, *SPECTRAL])
 
 
 def test_first_so_many_of_a_file(tmp_path):
@@ -52,7 +59,7 @@ class TestValues:
         found = picture(texture(g).eval(texel_centres()))
         np.testing.assert_allclose(found, to_linear(picture_of(g)), atol=1e-5)
 
-    @in_variants
+    @in_all
     def test_one_channel_is_a_number(self, variant):
         g = gaussians("data", channels=1)
         si = texel_centres()
@@ -66,14 +73,14 @@ class TestValues:
         np.testing.assert_allclose(picture([tex.eval_1(si)]), expected, atol=1e-5)
         np.testing.assert_allclose(picture([tex.eval(si)[0]]), expected, atol=1e-5)
 
-    @pytest.mark.parametrize("variant", ["llvm_ad_mono"], indirect=True)
+    @in_variants(MONO)
     def test_mono_shows_luminance(self, variant):
         g = gaussians("rgb")
         light = to_linear(eg.render(g).numpy()) @ np.float32([0.212671, 0.715160, 0.072169])
         found = picture([texture(g).eval(texel_centres())[0]])[..., 0]
         np.testing.assert_allclose(found, light, atol=1e-5)
 
-    @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+    @in_variants(SPECTRAL)
     def test_spectral_integrates_to_the_colour(self, variant):
         g = gaussians("rgb")
         lit = {
@@ -95,9 +102,9 @@ class TestValues:
         }
         scene = mi.load_dict(lit)
         colour = np.array(mi.render(scene, spp=512)).mean(axis=(0, 1))
-        mi.set_variant("llvm_ad_rgb")
+        mi.set_variant(variant.replace("spectral", "rgb"))
         expected = np.array(texture(g, to_uv=flat_middle()).eval(at(0.5, 0.5))).ravel()
-        mi.set_variant("llvm_ad_spectral")
+        mi.set_variant(variant)
         np.testing.assert_allclose(colour, expected, rtol=0.02)
 
     @pytest.mark.parametrize("seed", range(3))
@@ -224,7 +231,7 @@ def slots(g):
 
 
 class TestSlots:
-    @pytest.mark.parametrize("variant", [VARIANTS[0], *others], indirect=True)
+    @in_variants([*BOTH_RGB, *others])
     @pytest.mark.parametrize("name", SLOTS)
     def test_renders_and_differentiates(self, variant, name):
         """In every slot the picture is finite, changes with the texture, and has a gradient."""
@@ -243,10 +250,10 @@ class TestSlots:
             assert np.isfinite(gradient).all()
             assert np.abs(gradient).max() > 0, key
 
-    @in_variants
+    @in_all
     def test_lights(self, variant):
         radiance = texture_of(gaussians("linear"))
-        if variant == "llvm_ad_spectral":
+        if mi.is_spectral:
             radiance = {"type": "d65", "of": radiance}  # else it glows at equal energy
         emitter = {"type": "area", "radiance": radiance}
         scene = small_scene(None, "path", emitter=emitter)
@@ -259,7 +266,7 @@ class TestSlots:
         dr.backward(dr.mean(image))
         assert np.abs(np.array(dr.grad(parameters[key]))).max() > 0
 
-    @in_variants
+    @in_all
     def test_particles_leave_it_as_paths_find_it(self, variant):
         """Light traced from the emitter, which samples positions and wavelengths of the texture."""
         emitter = {"type": "area", "radiance": texture_of(gaussians("linear", quiet=False))}
@@ -414,14 +421,14 @@ class TestMistakes:
         with pytest.raises(ValueError, match="a lookup of three channels"):
             texture(gaussians("data", channels=1)).eval_3(at(0.5, 0.5))
 
-    @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+    @in_variants(SPECTRAL)
     @pytest.mark.parametrize("raw", [True, False])
     def test_a_spectrum_from_data(self, variant, raw):
         tex = texture(gaussians("rgb" if raw else "data"), raw=raw)
         with pytest.raises(ValueError, match="not raw data"):
             tex.eval(at(0.5, 0.5))
 
-    @pytest.mark.parametrize("variant", ["scalar_rgb"], indirect=True)
+    @in_variants(["scalar_rgb"])
     def test_scalar_variants(self, variant):
         with pytest.raises(RuntimeError, match="does not support the variant scalar_rgb; use"):
             mi.load_dict({"type": "gaussian_texture", "filename": "x.npz"})

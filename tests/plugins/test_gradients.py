@@ -9,7 +9,7 @@ from _helpers.sets import SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 import eigengs_dr as eg  # noqa: E402
-from _helpers.texture import at, gaussians, picture, small_scene, texel_centres, texture  # noqa: E402
+from _helpers.texture import at, backend, gaussians, picture, small_scene, texel_centres, texture  # noqa: E402
 from eigengs_dr.gaussian.gaussians import MIN_DEVIATION  # noqa: E402
 from eigengs_dr.plugins import gaussians_of, keep_in_bounds, texture_of  # noqa: E402
 
@@ -163,7 +163,7 @@ class TestBroken:
     @pytest.mark.parametrize("factor", [[1e-20, 0, 1], [1e-30, 0, 1e-30], [1, 1e20, 1]])
     def test_a_set_of_giants_loads(self, factor):
         g = eg.Gaussians.from_arrays(
-            [[8, 8]], [factor], [[0.5] * 3], size=(16, 16), space="linear", backend="llvm"
+            [[8, 8]], [factor], [[0.5] * 3], size=(16, 16), space="linear", backend=backend()
         )
         assert np.isfinite(np.array(texture(g, prefilter=0.01).eval(at(0.3, 0.4)))).all()
 
@@ -176,7 +176,7 @@ class TestBroken:
         parameters = mi.traverse(tex)
         parameters["factor"] = mi.TensorXf(broken.astype(np.float32))
         parameters.update()
-        g = kept._replace(color=0.04 * kept.color, background=np.full(3, 0.5)).on("llvm")
+        g = kept._replace(color=0.04 * kept.color, background=np.full(3, 0.5)).on(backend())
         np.testing.assert_allclose(
             picture(tex.eval_3(texel_centres())), eg.render(g).numpy(), atol=1e-5
         )
@@ -212,9 +212,9 @@ class TestBroken:
 class TestModel:
     @pytest.fixture
     def saved(self, tmp_path):
-        model = small_model("llvm")
+        model = small_model(backend())
         model.save(tmp_path / "m.npz")
-        return str(tmp_path / "m.npz"), eg.EigenGS.load(tmp_path / "m.npz", "llvm")
+        return str(tmp_path / "m.npz"), eg.EigenGS.load(tmp_path / "m.npz", backend())
 
     def test_coefficients_give_the_model_s_picture(self, saved):
         path, model = saved

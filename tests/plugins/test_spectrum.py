@@ -9,22 +9,14 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
+from _helpers.variants import on_both  # noqa: E402
 from eigengs_dr.plugins import spectrum  # noqa: E402
 
-pytestmark = pytest.mark.mitsuba
-
-
-@pytest.fixture(autouse=True)
-def spectral():
-    """The spectral variant, for the length of a test."""
-    before = mi.variant()
-    try:
-        mi.set_variant("llvm_ad_spectral")
-    except (ImportError, AttributeError) as error:
-        pytest.skip(f"no llvm_ad_spectral: {error}")
-    yield
-    if before is not None:
-        mi.set_variant(before)
+pytestmark = [
+    pytest.mark.mitsuba,
+    pytest.mark.usefixtures("variant"),
+    pytest.mark.parametrize("variant", on_both("spectral"), indirect=True),
+]
 
 
 def evaluate(colors, wavelengths):

@@ -1,0 +1,12 @@
+"""Variants of Mitsuba, as parameters of tests."""
+
+import pytest
+
+
+def on_both(kind):
+    """The variant of a kind of colour, such as "rgb", for each backend."""
+    return [f"llvm_ad_{kind}", pytest.param(f"cuda_ad_{kind}", marks=pytest.mark.gpu)]
+
+
+BOTH_RGB = on_both("rgb")
+"""The variants of tests that name none."""

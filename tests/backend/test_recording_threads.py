@@ -1,0 +1,159 @@
+"""Several threads of one process: fits, the garbage collector, and programs that are dropped."""
+
+import gc
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.waves import default, picture, start
+from eigengs_dr.backend import recording
+from eigengs_dr.backend.recording import collector_off, exclusive, freeze_program
+from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.initializers import FitProblem
+from eigengs_dr.fitting.optimizers.descent import descend
+
+WAIT = 30
+"""Seconds after which a thread that does not answer fails its test."""
+
+
+def run_in_thread(function):
+    """Run a function to its end in another thread; return its result or raise its error."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(function).result(WAIT)
+
+
+def test_fits_in_four_threads_have_the_bits_of_fits_one_by_one(backend):
+    image = picture()
+
+    def fit_one(number):
+        found = eg.fit(np.roll(image, number, axis=0), gaussians=40, iterations=4, backend=backend)
+        arrays = found.gaussians.to_arrays()
+        return b"".join(arrays[name].tobytes() for name in arrays) + found.image.tobytes()
+
+    alone = [fit_one(number) for number in range(40)]
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(fit_one, range(40), timeout=4 * WAIT)) == alone
+
+
+def test_gradients_beside_fits_have_the_bits_of_gradients_alone(backend):
+    def gradient(_):
+        with eg.exclusive():
+            gaussians, _ = start(backend)
+            dr.enable_grad(gaussians.mean)
+            rendered = eg.render(replace(gaussians, color=gaussians.color + 1))
+            dr.backward(dr.sum(dr.square(rendered.array)))
+            return dr.grad(gaussians.mean).numpy().tobytes()
+
+    alone = gradient(None)
+    with ThreadPoolExecutor(3) as pool:
+        fits = [
+            pool.submit(eg.fit, picture(), gaussians=40, iterations=4, backend=backend)
+            for _ in range(4)
+        ]
+        assert set(pool.map(gradient, range(20), timeout=WAIT)) == {alone}
+        assert len({fit.result(WAIT).image.tobytes() for fit in fits}) == 1
+
+
+@pytest.mark.parametrize("use", ["fit", "arrays"])
+def test_calls_wait_for_the_block_of_another_thread(use):
+    image = picture()
+    calls = {
+        "fit": lambda: eg.fit(image, gaussians=40, iterations=0, backend="llvm"),
+        "arrays": start("llvm")[0].to_arrays,
+    }
+    done = threading.Event()
+    thread = threading.Thread(target=lambda: (calls[use](), done.set()))
+    with exclusive():
+        thread.start()
+        assert not done.wait(0.2)
+    assert done.wait(WAIT)
+    thread.join()
+
+
+def test_the_collector_stays_off_until_the_last_thread_is_done():
+    inside, leave = threading.Event(), threading.Event()
+
+    def other():
+        with collector_off():
+            inside.set()
+            assert leave.wait(WAIT)
+
+    thread = threading.Thread(target=other)
+    with collector_off():
+        thread.start()
+        assert inside.wait(WAIT)
+    assert not gc.isenabled()
+    leave.set()
+    thread.join()
+    assert gc.isenabled()
+
+
+def half_read(backend):
+    """A descent of which one step was taken."""
+    gaussians, target = start(backend)
+    sets = descend(FitProblem(gaussians, target), default(redistribute_after=0), 5)
+    next(sets)
+    next(sets)
+    return sets
+
+
+def frozen_block(Float):
+    """A generator inside the block of a program that has run once."""
+    with freeze_program(lambda x: x + 1) as call:
+        yield call(Float(1))
+
+
+@pytest.mark.parametrize("in_thread", [False, True])
+def test_a_program_dropped_during_a_recording_is_freed_after_it(backend, in_thread):
+    Float = select(backend).Float
+    blocks = [frozen_block(Float)]
+    next(blocks[0])
+    drop = blocks.clear  # Dr.Jit looks into the lists of a closure, not into methods
+
+    def drops(x):
+        run_in_thread(drop) if in_thread else drop()
+        assert len(recording._retired) == 1
+        return 2 * x
+
+    with freeze_program(drops) as call:
+        assert dr.all(call(Float(1, 2)) == Float(2, 4))
+        with exclusive():
+            assert not recording._retired
+        assert dr.all(call(Float(3, 4)) == Float(6, 8))
+
+
+def test_a_descent_that_another_thread_drops_during_a_recording(backend):
+    Float = select(backend).Float
+    drop = [half_read(backend)].clear
+
+    def drops(x):
+        run_in_thread(drop)
+        return 2 * x
+
+    with freeze_program(drops) as call:
+        for x in (1, 2, 3):
+            assert dr.all(call(Float(x, x)) == 2 * x)
+
+
+def test_a_descent_dropped_in_another_thread_is_freed_by_the_thread_that_computes(backend):
+    dropped = [half_read(backend)]
+    with exclusive():
+        run_in_thread(dropped.clear)
+        assert len(recording._retired) == 1
+    assert not recording._retired
+
+
+def test_a_descent_dropped_at_rest_is_freed_at_once(backend):
+    half_read(backend).close()
+    assert not recording._retired
+
+
+def test_errors_leave_the_lock(backend):
+    with pytest.raises(ValueError, match="gaussians"):
+        eg.fit(picture(), gaussians=-1, backend=backend)
+    assert run_in_thread(lambda: eg.fit(picture(), gaussians=9, iterations=0).iterations) == 0
