@@ -3,6 +3,8 @@
 from .backend.recording import exclusive
 from .backend.selection import BackendError
 from .codec.bit_allocation import PackResult, pack
+from .collection.fit_many import fit_many
+from .collection.run import ImageRow, RunInterrupted
 from .eigenbasis.eigengs import EigenGS
 from .eigenbasis.pca.basis import Eigenbasis
 from .fitting.fit import Fit, FitInterrupted, fit
@@ -27,12 +29,15 @@ __all__ = [
     "FitInterrupted",
     "Gaussians",
     "ImageError",
+    "ImageRow",
     "PackResult",
+    "RunInterrupted",
     "concatenate",
     "exclusive",
     "fit",
     "fit_for_scene",
     "fit_levels",
+    "fit_many",
     "from_tensors",
     "level_counts",
     "load_image",

@@ -59,7 +59,10 @@ def say(text: str) -> None:
     text : str
         Several lines are joined to one.
     """
-    click.echo(f"{NAME}: {' '.join(text.split())}", err=True)
+    from tqdm import tqdm
+
+    with tqdm.external_write_mode(file=sys.stderr, nolock=True):
+        click.echo(f"{NAME}: {' '.join(text.split())}", err=True)
 
 
 @contextmanager
@@ -93,6 +96,37 @@ def progress_bar(quiet: bool) -> Iterator[Callable[..., None]]:
             bar.total = total
             if row and "psnr_rgb" in row:
                 bar.set_postfix_str(f"{row['psnr_rgb']:.2f} dB", refresh=False)
+            bar.update(done - bar.n)
+
+        yield show
+
+
+@contextmanager
+def images_bar(quiet: bool, total: int) -> Iterator[Callable[[float, str], None]]:
+    """Show a bar of many images, with images per second, if standard error is a terminal.
+
+    Parameters
+    ----------
+    quiet : bool
+        Show nothing.
+    total : int
+        Number of images.
+
+    Yields
+    ------
+    callable
+        ``show(done, label)``: the number of images that are done, which need not be whole, and a
+        label such as the PSNR of the last image. Inside the block `say` writes above the bar.
+    """
+    from tqdm import tqdm
+
+    silent = quiet or sys.stderr is None
+    layout = "{bar} {n:.0f} of {total} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
+    options = {"unit": " images", "leave": False, "bar_format": layout}
+    with tqdm(total=total, disable=True if silent else None, **options) as bar:
+
+        def show(done: float, label: str) -> None:
+            bar.set_postfix_str(label, refresh=False)
             bar.update(done - bar.n)
 
         yield show

@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
-from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +15,7 @@ from ..fitting.options import DEFAULT_BASIS, FitOptions
 from ..fitting.presets import PRESETS
 from ..image.color import SPACES
 from .console import INTERRUPTED, progress_bar, say
+from .fit_many import fit_several
 from .options import ANY_PATH, backend_option, choice, describe_run, quiet_option, report_option
 from .outputs import check_outputs, name_outputs
 from .report import write_report
@@ -74,6 +74,7 @@ INPUT = click.Path(exists=True, path_type=Path)
     help="Seed of --init random.",
 )
 @click.option("--preview", type=ANY_PATH, help="Picture (or folder) of photo, fit and outlines.")
+@click.option("--overwrite", is_flag=True, help="Fit images of several whose results exist.")
 @backend_option
 @report_option
 @quiet_option
@@ -85,6 +86,7 @@ def fit(
     output: Path | None,
     levels: int | None,
     preview: Path | None,
+    overwrite: bool,
     report: Path | None,
     quiet: bool,
     **settings: Any,
@@ -92,11 +94,13 @@ def fit(
     """Fit images by sums of Gaussians.
 
     An IMAGE may be a folder of images. For several images, -o and --preview name folders, and the
-    files in them have the names of the images. An image that cannot be fitted is left out; the exit
-    code is then 2.
+    files in them have the names of the images. An image whose result exists is skipped, so that the
+    same command continues a run; --overwrite fits it again. An image that cannot be fitted is left
+    out; the exit code is then 2.
 
-    Ctrl-C writes the best fit so far and exits with code 130. If --target-psnr cannot be reached,
-    the command says so, writes the best fit and exits with code 1.
+    Ctrl-C writes the best fit so far of one image, or ends after the last complete one of several,
+    and exits with code 130. If --target-psnr cannot be reached, the command says so, writes the
+    best fit and exits with code 1.
 
     \b
     Examples:
@@ -104,13 +108,16 @@ def fit(
       eigengs-dr fit photo.jpg -o photo.npz --gaussians 20000 --report photo.json
       eigengs-dr fit photo.jpg -o photo.npz --target-psnr 38
       eigengs-dr fit photo.jpg -o photo.npz --basis natural --iterations 100
-      eigengs-dr fit photos/ -o fits/ --preview previews/ --iterations 300
+      eigengs-dr fit photos/ -o fits/ --iterations 300 --report fits.json
+      eigengs-dr fit photos/ extra.png -o fits/ --overwrite --preview previews/
       eigengs-dr fit roughness.png -o roughness.npz --color data
     """
+    from ..fitting.levels import check_options
     from ..image.io import SAVE_OPTIONS
 
     options = FitOptions(**settings)
-    _check_levels(options, levels)
+    if levels is not None:
+        check_options(options)
     paths = _expand(images)
     several = len(paths) > 1 or any(path.is_dir() for path in images)
     outputs = name_outputs(paths, output, [".npz"], several)
@@ -119,22 +126,26 @@ def fit(
     if output is None:
         _check_replaced(outputs)
     select(options.backend)
-    run = _fitter(options, levels)
-    records: list[dict[str, Any]] = []
-    for path, target, picture in zip_longest(paths, outputs, previews):
-        try:
-            records.append(_fit_one(path, target, picture, quiet, options, run))
-        except (ValueError, OSError) as error:
-            if not several:
-                raise
-            say(f"error: {error}")
-            records.append({"input": str(path), "error": str(error), "stopped": "failed"})
-        if records[-1]["stopped"] == "interrupted":
-            break
+    _note_mean(options)
+    if several:
+        measured = report is not None
+        records, interrupted = fit_several(
+            paths, outputs[0].parent, previews, options, levels, overwrite, quiet, measured
+        )
+    else:
+        picture = previews[0] if previews else None
+        records = [
+            _fit_one(paths[0], outputs[0], picture, quiet, options, _fitter(options, levels))
+        ]
+        interrupted = records[0]["stopped"] == "interrupted"
     if report:
         figures = {"images": records} if several else records[0]
         run_figures = describe_run(context, options.backend) | _decisive(options, levels)
         write_report(report, run_figures | figures)
+    if interrupted and not several:
+        say(f"interrupted; the best fit so far is in {outputs[0]}")
+    if interrupted:
+        context.exit(INTERRUPTED)
     _exit(context, records, options)
 
 
@@ -170,18 +181,14 @@ def _check_replaced(outputs: list[Path]) -> None:
             raise ValueError(f"{path}: exists and is no set of Gaussians; choose a name with -o")
 
 
-def _check_levels(options: FitOptions, levels: int | None) -> None:
-    """Raise ValueError if the other options exclude levels of detail."""
-    if levels is None:
-        return
-    if options.target_psnr is not None:
-        raise ValueError("levels and target_psnr exclude each other; give one of them")
-    if options.preset != "default" or options.initializer != "adaptive":
-        raise ValueError("levels needs preset 'default' and init 'adaptive'; leave the others out")
+def _note_mean(options: FitOptions) -> None:
+    """Say that the mean image is not in the file, if the preset keeps it as pixels."""
+    if options.initializer == "eigen" and options.method.mean == "dense":
+        say("note: the file holds the Gaussians alone; the mean image stays in the basis")
 
 
 def _fitter(options: FitOptions, levels: int | None) -> Callable[..., "Fit"]:
-    """Return ``run(image, progress)``, which fits one image; read the model once for all."""
+    """Return ``run(image, progress)``, which fits one image."""
     from ..fitting.fit import fit_image
     from ..fitting.levels import fit_levels
 
@@ -192,8 +199,6 @@ def _fitter(options: FitOptions, levels: int | None) -> Callable[..., "Fit"]:
     if options.initializer == "eigen":
         from ..eigenbasis.registry import load_basis
 
-        if options.method.mean == "dense":
-            say("note: the file holds the Gaussians alone; the mean image stays in the basis")
         model = load_basis(options.basis or DEFAULT_BASIS, options.backend)
         options = replace(options, basis=model)
     return lambda image, progress: fit_image(image, options, progress)
@@ -264,10 +269,7 @@ def _measure(image: Any, result: "Fit", color: str) -> dict[str, float]:
 
 
 def _exit(context: click.Context, records: list[dict[str, Any]], options: FitOptions) -> None:
-    """Report an interrupted or failed fit, and exit with its code."""
-    if records[-1]["stopped"] == "interrupted":
-        say(f"interrupted; the best fit so far is in {records[-1]['output']}")
-        context.exit(INTERRUPTED)
+    """Report fits that missed the target, and exit with the code of a failure."""
     if any(record["stopped"] == "failed" for record in records):
         context.exit(FAILED)
     failures = [record for record in records if record["stopped"] == "out of reach"]

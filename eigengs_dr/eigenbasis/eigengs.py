@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.recording import exclusive
+from ..collection.run import ImageRow, RowProgress
+from ..collection.sources import Images
 from ..fitting.solvers.normal_equations import NormalEquations, squared_norms
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import to_planes
@@ -26,6 +28,7 @@ from ..image.resize import resample
 from ..storage import npz
 from .components.solve import ComponentFit, State, fit_components, with_colors
 from .components.split import split_reason, wants_split
+from .encode_many import check_encoding, encode_each
 from .model_file import FORMAT, VERSION, from_members, layout_of, to_members
 from .options import TrainOptions
 from .pca.basis import Eigenbasis
@@ -265,26 +268,43 @@ class EigenGS:
         UserWarning
             If all components miss the target; the result then uses all of them.
         """
-        for name, value, valid in (
-            ("colors", colors, ("exact", "projected")),
-            ("mean", mean, ("gaussians", "dense")),
-        ):
-            if value not in valid:
-                raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(valid)}")
-        if colors == "exact" and target_psnr is not None:
-            raise ValueError("target_psnr chooses components; use it with colors 'projected'")
-        pixels = check_image(image)
-        size = (pixels.shape[1], pixels.shape[0])
-        planes = self._planes(pixels)
-        if mean == "dense":
-            planes = planes - self.mean_image
-        correlations = self.equations.correlate(planes)
-        if colors == "exact":
-            return self._colored(self.equations.solve(correlations), size)
-        coefficients = self._coefficients(planes, correlations, mean == "dense", target_psnr)
-        if mean == "dense":
-            return self._colored(self._sum(coefficients), size)
-        return self.reconstruct(coefficients, size)
+        check_encoding(colors, mean, target_psnr)
+        return self._encode_group([check_image(image)], colors, mean, target_psnr)[0]
+
+    def encode_many(
+        self,
+        images: Images,
+        output: str | os.PathLike[str] | None = None,
+        *,
+        overwrite: bool = False,
+        colors: str = "exact",
+        mean: str = "gaussians",
+        target_psnr: float | None = None,
+        progress: RowProgress | None = None,
+    ) -> list[ImageRow]:
+        """Encode many images; a bad image is a row with its error and does not end the run.
+
+        Parameters
+        ----------
+        images, output, overwrite, progress
+            See `eigengs_dr.fit_many`. ``ImageRow.result`` is a `Gaussians`, if there is no output
+            folder; rows have no PSNR.
+        colors, mean, target_psnr
+            See `encode`. The Gaussians equal those of `encode` to float32 rounding.
+
+        Returns
+        -------
+        list of ImageRow
+            One row for each image, in order.
+
+        Raises
+        ------
+        ValueError, OSError, RunInterrupted
+            See `encode` and `eigengs_dr.fit_many`.
+        """
+        check_encoding(colors, mean, target_psnr)
+        group = partial(self._encode_group, colors=colors, mean=mean, target_psnr=target_psnr)
+        return encode_each(group, images, output, overwrite, progress)
 
     def dense_mean(self, width: int, height: int) -> Planes:
         """Return the pixels of the mean image, shape (height, width, C), in the model's space."""
@@ -318,6 +338,34 @@ class EigenGS:
             return cls(**from_members(arrays, backend))
         except ValueError as error:
             raise ValueError(f"{Path(path)}: {error}") from None
+
+    @exclusive()
+    def _encode_group(
+        self, images: list[Planes], colors: str, mean: str, target_psnr: float | None
+    ) -> list[Gaussians]:
+        """Encode checked images (H, W, 3) of any size together; see `encode`."""
+        sizes = [(pixels.shape[1], pixels.shape[0]) for pixels in images]
+        planes = np.concatenate([self._planes(pixels) for pixels in images])
+        channels, centred = len(self.weights), mean == "dense"
+        if centred:
+            planes -= np.tile(self.mean_image, (len(images), 1, 1))
+        correlations = self.equations.correlate(planes)
+        parts = [slice(k, k + channels) for k in range(0, len(planes), channels)]
+        if colors == "exact":
+            solved = self.equations.solve(correlations)
+            return [
+                self._colored(solved[:, part], size)
+                for part, size in zip(parts, sizes, strict=True)
+            ]
+        result = []
+        for part, size in zip(parts, sizes, strict=True):
+            products = correlations[:, part]
+            coefficients = self._coefficients(planes[part], products, centred, target_psnr)
+            if centred:
+                result.append(self._colored(self._sum(coefficients), size))
+            else:
+                result.append(self.reconstruct(coefficients, size))
+        return result
 
     def _planes(self, pixels: Planes) -> Planes:
         """Convert an RGB image to the size and space of the model, shape (C, H, W)."""

@@ -73,6 +73,14 @@ def level_counts(count: int, levels: int) -> list[int]:
     return [count // LEVEL_RATIO**k for k in reversed(range(levels))]
 
 
+def check_options(options: FitOptions) -> None:
+    """Raise ValueError if the options of a fit exclude levels of detail."""
+    if options.target_psnr is not None:
+        raise ValueError("levels and target_psnr exclude each other; give one of them")
+    if options.preset != "default" or options.initializer != "adaptive":
+        raise ValueError("levels needs preset 'default' and init 'adaptive'; leave the others out")
+
+
 @exclusive()
 def fit_levels(
     image: ArrayLike,

@@ -8,7 +8,8 @@ from hypothesis import given
 
 from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
-from eigengs_dr.fitting.solvers.normal_equations import RIDGE, NormalEquations, weight_matrix
+from eigengs_dr.fitting.solvers.normal_equations import RIDGE, NormalEquations
+from eigengs_dr.fitting.solvers.weight_matrix import weight_matrix
 from eigengs_dr.raster.render import render
 
 
@@ -162,6 +163,17 @@ def test_blocks_fit_what_is_left(backend):
 
 
 def test_a_matrix_too_large_is_refused(backend, monkeypatch):
-    monkeypatch.setattr("eigengs_dr.fitting.solvers.normal_equations.MAX_WEIGHTS", 100)
+    monkeypatch.setattr("eigengs_dr.fitting.solvers.weight_matrix.MAX_WEIGHTS", 100)
     with pytest.raises(ValueError, match=r"the Gaussians cover [\d,]+ pixels in all, over 100"):
         NormalEquations(random_scene().on(backend))
+
+
+def test_many_planes_at_once(backend):
+    """Sparse products, and back-substitutions in threads, give what single ones give."""
+    equations = NormalEquations(random_scene(3).on(backend), 4)
+    planes = images(17)
+    together = equations.correlate(planes)
+    alone = np.hstack([equations.correlate(plane[None]) for plane in planes])
+    np.testing.assert_allclose(together, alone, rtol=1e-6, atol=1e-6)
+    solved = np.hstack([equations.solve(alone[:, k : k + 1]) for k in range(17)])
+    np.testing.assert_allclose(equations.solve(together), solved, atol=1e-5)

@@ -1,0 +1,139 @@
+"""The command ``eigengs-dr fit`` for several images: one run, one row of the report each."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from .console import images_bar, say
+
+if TYPE_CHECKING:
+    from ..collection.run import Finished
+    from ..fitting.options import FitOptions
+
+Record = dict[str, Any]
+
+
+def fit_several(
+    paths: list[Path],
+    folder: Path,
+    previews: list[Path],
+    options: FitOptions,
+    levels: int | None,
+    overwrite: bool,
+    quiet: bool,
+    measure: bool,
+) -> tuple[list[Record], bool]:
+    """Fit images into a folder, and say what failed as it fails.
+
+    Parameters
+    ----------
+    paths : list of Path
+        Image files.
+    folder : Path
+        Folder of the results.
+    previews : list of Path
+        A picture for each image, or none.
+    options, levels, overwrite
+        See `eigengs_dr.fit_many`.
+    quiet : bool
+        Show no bar and no summary.
+    measure : bool
+        Also compute SSIM and MS-SSIM, for a report.
+
+    Returns
+    -------
+    records : list of dict
+        A record for each image that is done; its key "stopped" is "skipped", "failed" or that of
+        `eigengs_dr.Fit`.
+    interrupted : bool
+        Whether Ctrl-C ended the run.
+    """
+    from ..collection.fit_many import fit_each
+
+    started, records = time.perf_counter(), list[Record]()
+    interrupted = False
+    with images_bar(quiet, len(paths)) as show:
+        label = ""
+
+        def step(share: float) -> None:
+            show(len(records) + min(share, 1), label)
+
+        _, images = fit_each(paths, folder, overwrite, options, levels, step)
+        try:
+            with closing(images):
+                for finished in images:
+                    preview = previews[len(records)] if previews else None
+                    records.append(_record(finished, preview, options.color, measure))
+                    if records[-1]["stopped"] == "failed":
+                        say(f"error: {records[-1]['error']}")
+                    elif finished.row.psnr_rgb is not None:
+                        label = f"{finished.row.psnr_rgb:.2f} dB"
+                    show(len(records), label)
+        except KeyboardInterrupt:
+            interrupted = True
+    if interrupted:
+        done = f"{len(records)} of {len(paths)} images are done"
+        say(f"interrupted; {done}; the same command fits the others")
+    if not quiet:
+        click.echo(_summary(records, folder, time.perf_counter() - started))
+    return records, interrupted
+
+
+def _record(finished: Finished, preview: Path | None, color: str, measure: bool) -> Record:
+    """Return the figures of one image, and write its preview."""
+    import eigengs_dr as eg
+
+    from ..image.metrics import float_space
+    from .pictures import comparison
+
+    row, pixels = finished
+    record: Record = {"input": str(row.input), "output": str(row.output)}
+    if pixels is None or row.status != "done":
+        reason = {"error": row.error} if row.error else {}
+        return {**record, "stopped": row.status, **reason}
+    result = row.result
+    record |= {
+        "width": row.width,
+        "height": row.height,
+        "gaussians": row.gaussians,
+        "iterations": result.iterations,
+        "stopped": result.stopped,
+        "seconds": result.seconds,
+        "seconds_init": result.seconds_init,
+        "psnr_ycbcr": row.psnr_ycbcr,
+        "psnr_rgb": row.psnr_rgb,
+    }
+    if preview:
+        try:
+            eg.save_image(preview, comparison(pixels, result.image, result.gaussians))
+        except ValueError as error:
+            return {**record, "stopped": "failed", "error": str(error)}
+    if measure:
+        record["ssim"] = eg.ssim(pixels, result.image)
+        record["ms_ssim"] = eg.ms_ssim(pixels, result.image, space=float_space(color))
+        record["trace"] = result.trace
+    return record
+
+
+def _summary(records: list[Record], folder: Path, seconds: float) -> str:
+    """Describe a run for a terminal."""
+    fitted = [record for record in records if "psnr_rgb" in record]
+    counts = Counter(record["stopped"] for record in records)
+    others = "".join(f", {counts[k]} {k}" for k in ("skipped", "failed") if counts[k])
+    text = f"{len(fitted)} image{'s' * (len(fitted) != 1)} fitted{others} in {seconds:.1f} s"
+    if fitted:
+        ycbcr, rgb = (
+            sum(record[key] for record in fitted) / len(fitted)
+            for key in ("psnr_ycbcr", "psnr_rgb")
+        )
+        rate = f" ({len(fitted) / seconds:.2g} images/s)"
+        text += f"{rate}\n  mean psnr_ycbcr {ycbcr:.2f} dB, psnr_rgb {rgb:.2f} dB"
+    if counts["skipped"]:
+        text += "\n  --overwrite fits the skipped images, whose results exist, again"
+    return f"{text}\n  wrote {folder}" if fitted else text

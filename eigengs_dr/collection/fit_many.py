@@ -1,0 +1,174 @@
+"""The function `fit_many`, which fits Gaussians to each of many images."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..backend.selection import select
+from ..fitting.fit import Fit, fit_image
+from ..fitting.levels import check_options, fit_levels
+from ..fitting.options import DEFAULT_BASIS, FitOptions
+from ..image.metrics import float_space, psnr
+from .run import FAILURES, Finished, ImageRow, Outcome, RowProgress, collect, run_images
+from .sources import Images
+
+MAX_GROUP_SIDE = 256
+"""Longer side, in pixels, of the largest images that are fitted in groups."""
+
+MAX_GROUP_PIXELS = 1 << 20
+"""Largest number of pixels of a group: 16 images of 256x256, or 256 of 64x64."""
+
+LOAD_BASIS = "eigengs_dr.eigenbasis.registry:load_basis"
+"""The loader of bases, ``module:function``; its module is imported when a fit needs it."""
+
+Pixels = NDArray[np.float32]
+Step = Callable[[float], None]
+"""``step(share)``: which share of the current image is done, from 0 to 1."""
+
+
+def fit_many(
+    images: Images,
+    output: str | os.PathLike[str] | None = None,
+    *,
+    overwrite: bool = False,
+    levels: int | None = None,
+    progress: RowProgress | None = None,
+    **options: Any,
+) -> list[ImageRow]:
+    """Fit many images; a bad image is a row with its error and does not end the run.
+
+    Files are decoded and results are written by threads while other images are fitted. Memory does
+    not grow with the number of images if there is an output folder.
+
+    Parameters
+    ----------
+    images : path-like or iterable
+        A folder; or an iterable of files and of arrays (H, W, 3), (H, W, 1) or (H, W). The name of
+        an image is the stem of its file; arrays are named by their number, as in "000012".
+    output : path-like, optional
+        Folder of the results, ``NAME.npz`` for each image; it is created if it is missing. Each
+        file is written completely or not at all. By default the results stay in memory.
+    overwrite : bool, optional
+        Fit images whose output exists. By default such images are skipped, whatever the options of
+        the earlier run were: a run that was interrupted continues if it is repeated. A file that
+        is no set of Gaussians is never replaced.
+    levels : int, optional
+        Number of levels of detail; see `eigengs_dr.fit_levels`, whose options alone then apply.
+    progress : callable, optional
+        ``progress(done, total, row)`` after every image, with its `ImageRow`; `total` is None for
+        an iterator. It may raise `KeyboardInterrupt` to end the run.
+    options : Any
+        Keyword arguments, the options of `eigengs_dr.fit`: gaussians, iterations, init, basis,
+        preset, solve_steps, color, seed, backend, target_psnr, target_space, max_gaussians and
+        cutoff. A basis is read once.
+
+    Returns
+    -------
+    list of ImageRow
+        One row for each image, in order.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range, two images have one name, or there is no image. In an
+        iterator, the second image of one name has a row with an error instead.
+    TypeError
+        If an option is unknown.
+    OSError
+        If the output folder cannot be written.
+    BackendError
+        If the backend is not available.
+    RunInterrupted
+        After Ctrl-C or SIGTERM: a `KeyboardInterrupt` with the rows until then. Their files are
+        complete. The image that was interrupted has no file.
+
+    Notes
+    -----
+    Each result equals the result of `eigengs_dr.fit` for this image, bit for bit.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg
+    >>> photo = eg.sample("coffee")[:64, :64]
+    >>> rows = eg.fit_many([photo, photo[:32]], gaussians=200, iterations=10)
+    >>> [(row.name, row.status, row.gaussians) for row in rows]
+    [('000000', 'done', 200), ('000001', 'done', 200)]
+    """
+    total, finished = fit_each(images, output, overwrite, FitOptions(**options), levels)
+    return collect(total, finished, output is None, progress)
+
+
+def fit_each(
+    images: Images,
+    output: str | os.PathLike[str] | None,
+    overwrite: bool,
+    options: FitOptions,
+    levels: int | None = None,
+    step: Step | None = None,
+) -> tuple[int | None, Generator[Finished, None, None]]:
+    """Return the number of images, if it is known, and a generator that fits them.
+
+    Arguments and errors as for `fit_many`. Each `Finished` image has its pixels and its `Fit`.
+    """
+    if levels is not None:
+        check_options(options)
+    select(options.backend)
+    if options.initializer == "eigen":
+        model = resolve_name(LOAD_BASIS)(options.basis or DEFAULT_BASIS, options.backend)
+        options = replace(options, basis=model)
+    work = partial(_fit_group, options=options, levels=levels, step=step)
+    folder = None if output is None else Path(output)
+    return run_images(images, folder, overwrite, options.color == "data", work, _may_join)
+
+
+def _may_join(group: list[Pixels], pixels: Pixels) -> bool:
+    """Group small images of one size, up to `MAX_GROUP_PIXELS`."""
+    height, width, _ = pixels.shape
+    enough = (len(group) + 1) * height * width > MAX_GROUP_PIXELS
+    return group[0].shape == pixels.shape and max(height, width) <= MAX_GROUP_SIDE and not enough
+
+
+def _fit_group(
+    images: list[Pixels], options: FitOptions, levels: int | None, step: Step | None
+) -> Iterator[Outcome]:
+    """Fit images of one size, one after the other."""
+
+    def progress(iteration: int, iterations: int, row: dict[str, Any]) -> None:
+        if step:
+            step(iteration / max(1, iterations))
+
+    for pixels in images:
+        try:
+            result = _fit_one(pixels, options, levels, progress)
+        except FAILURES as error:
+            yield Outcome(None, None, {"error": str(error) or type(error).__name__})
+        else:
+            yield Outcome(result.gaussians, result, _figures(pixels, result, options.color))
+
+
+def _fit_one(
+    pixels: Pixels, options: FitOptions, levels: int | None, progress: Callable[..., None]
+) -> Fit:
+    if levels is None:
+        return fit_image(pixels, options, progress)
+    names = ("gaussians", "iterations", "color", "seed", "backend")
+    common = {name: getattr(options, name) for name in names}
+    return fit_levels(pixels, levels=levels, progress=progress, **common)
+
+
+def _figures(pixels: Pixels, result: Fit, color: str) -> dict[str, Any]:
+    """Return the figures of a fit for its row."""
+    return {
+        "psnr_ycbcr": psnr(pixels, result.image, space=float_space(color)),
+        "psnr_rgb": psnr(pixels, result.image, space="rgb"),
+        "seconds": result.seconds,
+    }

@@ -1,0 +1,134 @@
+"""The images of a run: their names, and what is known of each before it is read."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..gaussian.file import FORMAT
+from ..image.folder import image_files
+from ..storage import npz
+from ..storage.atomic import require_writable
+
+Images = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | ArrayLike]
+"""A folder, or any iterable of image files and arrays."""
+
+
+class Source(NamedTuple):
+    """One image of a run.
+
+    Attributes
+    ----------
+    name : str
+        Stem of the file, or the number of the array with six digits.
+    image : Path or array_like
+    output : Path or None
+        The file of the result; None keeps the result in memory.
+    status : str
+        "skipped" or "failed" if the image needs no work; else empty.
+    error : str
+        Why the status is "failed".
+    """
+
+    name: str
+    image: Any
+    output: Path | None = None
+    status: str = ""
+    error: str = ""
+
+    @property
+    def path(self) -> Path | None:
+        """The file of the image; None for an array."""
+        return self.image if isinstance(self.image, Path) else None
+
+
+def list_sources(images: Images) -> Iterable[Source]:
+    """Name the images of a run.
+
+    Parameters
+    ----------
+    images : path-like or iterable
+        A folder; or an iterable of files and of arrays, see `eigengs_dr.image.io.check_image`.
+
+    Returns
+    -------
+    iterable of Source
+        A list, if `images` has a length; else an iterator that reads `images` when it is read. In
+        an iterator, an image whose name is taken has the status "failed".
+
+    Raises
+    ------
+    ValueError
+        If two images have one name, there is no image, or `images` is one array of one image.
+    """
+    if isinstance(images, (str, os.PathLike)):
+        images = image_files(Path(images))
+    if isinstance(images, np.ndarray) and (images.ndim < 3 or images.shape[2:] in ((1,), (3,))):
+        raise ValueError(f"images: found one array of shape {images.shape}; pass a list of images")
+    if not isinstance(images, (Sequence, np.ndarray)):
+        return _name_each(images)
+    if len(images) == 0:
+        raise ValueError("images: found none; pass at least one image")
+    sources = list(_name_each(images))
+    for source in sources:
+        if source.error:
+            raise ValueError(source.error)
+    return sources
+
+
+def _name_each(images: Iterable[Any]) -> Iterator[Source]:
+    """Name images one by one; a name that is taken is an error of the image."""
+    taken = dict[str, Any]()
+    for number, image in enumerate(images):
+        is_file = isinstance(image, (str, os.PathLike))
+        item = Path(image) if is_file else image
+        name = item.stem if is_file else f"{number:06d}"
+        if name in taken:
+            error = f"{item if is_file else name}: {taken[name]} has this name too; rename one"
+            yield Source(name, item, status="failed", error=error)
+            continue
+        taken[name] = item if is_file else f"image {number}"
+        yield Source(name, item)
+
+
+def make_folder(output: Path) -> None:
+    """Create the folder of the results, and check that files can be written there.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be created or written.
+    """
+    if output.exists() and not output.is_dir():
+        raise OSError(f"{output}: is a file; many images need a folder")
+    output.mkdir(parents=True, exist_ok=True)
+    require_writable(output / "probe.npz")
+
+
+def plan_output(source: Source, folder: Path, overwrite: bool) -> Source:
+    """Give a source its output file, and skip it if the file holds a result.
+
+    A file that holds something else, such as a basis, is never replaced.
+    """
+    if source.status:
+        return source
+    output = folder / f"{source.name}.npz"
+    planned = source._replace(output=output)
+    if not output.exists():
+        return planned
+    if not _is_set(output):
+        error = f"{output}: exists and is no set of Gaussians; move it, or use another folder"
+        return planned._replace(status="failed", error=error)
+    return planned if overwrite else planned._replace(status="skipped")
+
+
+def _is_set(path: Path) -> bool:
+    try:
+        return npz.format_of(path) == FORMAT
+    except (ValueError, OSError):
+        return False

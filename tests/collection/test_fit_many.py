@@ -1,0 +1,238 @@
+"""Many images in one run: rows, resuming, interrupts, memory."""
+
+import weakref
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import eigengs_dr as eg
+from _helpers.command import smooth_pixels
+from eigengs_dr.collection import fit_many as fit_many_module
+from eigengs_dr.collection import read_ahead, run
+from eigengs_dr.image import io
+
+QUICK = {"gaussians": 20, "iterations": 2}
+
+
+@pytest.fixture
+def photos(tmp_path):
+    """A folder of four images of two sizes."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number, (name, width) in enumerate([("a", 32), ("b", 32), ("c", 24), ("d", 32)]):
+        pixels = np.roll(smooth_pixels(width, 24), 3 * number, axis=1)
+        Image.fromarray(pixels).save(folder / f"{name}.png")
+    return folder
+
+
+@pytest.fixture
+def output(tmp_path):
+    return tmp_path / "fits"
+
+
+def statuses(rows):
+    return {row.name: row.status for row in rows}
+
+
+def files_in(folder):
+    return sorted(path.name for path in Path(folder).iterdir())
+
+
+def same(first, second):
+    """Whether two sets are equal bit for bit."""
+    a, b = first.to_arrays(), second.to_arrays()
+    return all(np.array_equal(a[key], b[key]) for key in a)
+
+
+def test_results_are_those_of_single_fits(photos, output):
+    rows = eg.fit_many(photos, output, **QUICK)
+    assert [row.name for row in rows] == ["a", "b", "c", "d"]
+    for row in rows:
+        image = eg.load_image(row.input)
+        alone = eg.fit(image, **QUICK)
+        assert same(eg.Gaussians.load(row.output), alone.gaussians)
+        assert (row.width, row.height, row.gaussians) == (image.shape[1], 24, 20)
+        assert row.psnr_rgb == eg.psnr(image, alone.image)
+        assert row.psnr_ycbcr > row.psnr_rgb > 10 and row.seconds > 0
+        assert row.result is None
+
+
+def test_arrays_stay_in_memory_without_an_output():
+    images = [smooth_pixels(32, 24), smooth_pixels(32, 24)[..., 0]]
+    rows = eg.fit_many(images, **QUICK)
+    assert [row.name for row in rows] == ["000000", "000001"]
+    for row, image in zip(rows, images, strict=True):
+        assert same(row.result.gaussians, eg.fit(image, **QUICK).gaussians)
+        assert row.input is None and row.output is None
+
+
+def test_an_iterator_may_reuse_its_array():
+    def frames():
+        buffer = np.zeros((24, 32, 3), np.float32)
+        for value in (0.2, 0.4, 0.6):
+            buffer[:] = value
+            yield buffer
+
+    rows = eg.fit_many(frames(), gaussians=1, iterations=0)
+    means = [row.result.image.mean() for row in rows]
+    assert means == pytest.approx([0.2, 0.4, 0.6], abs=0.02)
+
+
+def test_levels_of_detail(photos, output):
+    [row, *_] = eg.fit_many(photos, output, levels=2, **QUICK)
+    alone = eg.fit_levels(eg.load_image(row.input), levels=2, **QUICK)
+    assert same(eg.Gaussians.load(row.output), alone.gaussians)
+
+
+def test_bad_images_among_good_ones(photos, output):
+    (photos / "b.png").write_text("no image")
+    broken = np.full((24, 32, 3), np.nan, np.float32)
+    small = np.zeros((2, 2, 3), np.float32)
+    sources = [photos / "a.png", photos / "b.png", broken, small, photos / "d.png"]
+    rows = eg.fit_many(sources, output, **QUICK)
+    assert [row.status for row in rows] == ["done", "failed", "failed", "failed", "done"]
+    assert str(photos / "b.png") in rows[1].error
+    assert rows[2].error.startswith("000002: ") and "not finite" in rows[2].error
+    assert rows[3].error.startswith("000003: ") and "gaussians is 20" in rows[3].error
+    assert files_in(output) == ["a.npz", "d.npz"]
+
+
+def test_files_that_exist_are_skipped(photos, output):
+    eg.fit_many([photos / "b.png"], output, **QUICK)
+    before = (output / "b.npz").read_bytes()
+    rows = eg.fit_many(photos, output, gaussians=10, iterations=0)
+    assert statuses(rows) == {"a": "done", "b": "skipped", "c": "done", "d": "done"}
+    assert (output / "b.npz").read_bytes() == before
+    rows = eg.fit_many(photos, output, overwrite=True, gaussians=10, iterations=0)
+    assert set(statuses(rows).values()) == {"done"}
+    assert len(eg.Gaussians.load(output / "b.npz")) == 10
+
+
+def test_a_file_of_another_kind_is_never_replaced(photos, output):
+    output.mkdir()
+    (output / "b.npz").write_bytes(b"something else")
+    for overwrite in (False, True):
+        rows = eg.fit_many(photos, output, overwrite=overwrite, **QUICK)
+        assert statuses(rows)["b"] == "failed"
+        assert "no set of Gaussians" in rows[1].error
+    assert (output / "b.npz").read_bytes() == b"something else"
+
+
+def test_two_images_of_one_name(photos, output, tmp_path):
+    (tmp_path / "more").mkdir()
+    other = (photos / "a.png").rename(tmp_path / "more" / "b.png")
+    sources = [photos / "b.png", other]
+    with pytest.raises(ValueError, match=r"more.b\.png: .*photos.b\.png has this name too"):
+        eg.fit_many(sources, output, **QUICK)
+    assert not output.exists()
+    rows = eg.fit_many(iter(sources), output, **QUICK)
+    assert [row.status for row in rows] == ["done", "failed"]
+    assert "this name" in rows[1].error
+
+
+@pytest.mark.parametrize("place", ["between", "inside"])
+def test_ctrl_c_leaves_what_is_done(photos, output, place, monkeypatch):
+    def press(done, total, row):
+        assert total == 4
+        if done == 2:
+            raise KeyboardInterrupt
+
+    complete, fitted = fit_many_module.fit_image, []
+
+    def interrupted(*arguments):
+        fitted.append(complete(*arguments))
+        if len(fitted) == 3:
+            raise eg.FitInterrupted(fitted[-1])
+        return fitted[-1]
+
+    if place == "inside":
+        monkeypatch.setattr(fit_many_module, "fit_image", interrupted)
+    with pytest.raises(eg.RunInterrupted) as stopped:
+        eg.fit_many(photos, output, progress=press if place == "between" else None, **QUICK)
+    assert [row.name for row in stopped.value.rows] == ["a", "b"]
+    left = files_in(output)
+    assert left[:2] == ["a.npz", "b.npz"] and "d.npz" not in left
+    for name in left:
+        assert len(eg.Gaussians.load(output / name)) == 20
+    monkeypatch.undo()
+    rows = eg.fit_many(photos, output, **QUICK)
+    assert [row.status for row in rows[:2]] == ["skipped", "skipped"]
+    assert files_in(output) == ["a.npz", "b.npz", "c.npz", "d.npz"]
+
+
+def test_a_result_that_cannot_be_written(photos, output, monkeypatch):
+    write = run.write
+
+    def full_disk(path, data):
+        if path.name == "b.npz":
+            raise OSError(28, "No space left on device", str(path))
+        write(path, data)
+
+    monkeypatch.setattr(run, "write", full_disk)
+    rows = eg.fit_many(photos, output, **QUICK)
+    assert statuses(rows) == {"a": "done", "b": "failed", "c": "done", "d": "done"}
+    assert rows[1].error == f"{output / 'b.npz'}: No space left on device"
+
+
+def test_images_read_ahead_are_few(tmp_path, output, monkeypatch):
+    """Their number follows from their size; the images of a group come on top."""
+    path = tmp_path / "a.png"
+    Image.fromarray(smooth_pixels(32, 24)).save(path)
+    sources = [path.with_name(f"{number}.png") for number in range(40)]
+    alive, most = weakref.WeakSet(), []
+
+    class Pixels(np.ndarray):
+        __hash__ = object.__hash__
+
+    def load(source, keep_grey=False):
+        pixels = eg_load(path, keep_grey).view(Pixels)
+        alive.add(pixels)
+        most.append(len(alive))
+        return pixels
+
+    eg_load = io.load_image
+    monkeypatch.setattr(io, "load_image", load)
+    size = 4 * 24 * 32 * 3
+    monkeypatch.setattr(read_ahead, "MAX_WAITING_BYTES", 5 * size)
+    monkeypatch.setattr(fit_many_module, "MAX_GROUP_PIXELS", 3 * 24 * 32)
+    rows = eg.fit_many(sources, output, gaussians=5, iterations=0)
+    assert all(row.status == "done" for row in rows) and len(most) == 40
+    # Waiting images, a group and its successor, and results whose files are written.
+    assert max(most) <= 5 + 1 + 3 + 1 + run.MAX_WRITING + 1
+    monkeypatch.setattr(read_ahead, "MAX_WAITING_BYTES", 1)
+    assert read_ahead._max_waiting(size) == 1 and read_ahead._max_waiting(0) == read_ahead.THREADS
+
+
+def test_groups_keep_the_order(monkeypatch, photos, output):
+    """Images of one size are worked on together; images without work do not part them."""
+    groups = []
+    together = fit_many_module._fit_group
+
+    def recorded(images, **settings):
+        groups.append(len(images))
+        return together(images, **settings)
+
+    monkeypatch.setattr(fit_many_module, "_fit_group", recorded)
+    (photos / "aa.png").write_text("no image")
+    rows = eg.fit_many(photos, output, **QUICK)
+    assert [row.name for row in rows] == ["a", "aa", "b", "c", "d"]
+    assert groups == [2, 1, 1]
+
+
+def test_mistakes_are_found_before_the_work(photos, output, tmp_path):
+    with pytest.raises(TypeError, match="gausians"):
+        eg.fit_many(photos, output, gausians=9)
+    with pytest.raises(ValueError, match="found none"):
+        eg.fit_many([], output)
+    with pytest.raises(ValueError, match="list of images"):
+        eg.fit_many(smooth_pixels(32, 24), output)
+    with pytest.raises(ValueError, match="holds no images"):
+        eg.fit_many(tmp_path, output)
+    with pytest.raises(ValueError, match="exclude each other"):
+        eg.fit_many(photos, output, levels=2, target_psnr=30)
+    assert not output.exists()
+    output.write_text("a file")
+    with pytest.raises(OSError, match="need a folder"):
+        eg.fit_many(photos, output, **QUICK)
