@@ -65,6 +65,30 @@ def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> li
         return list(pool.map(function, items))
 
 
+def by_strips(
+    function: Callable[[NDArray[np.float32]], NDArray[np.float32]], image: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Apply a function of single pixels to an image without large temporary arrays.
+
+    Parameters
+    ----------
+    function : callable
+        Returns an array of the shape of its argument.
+    image : ndarray of float32, shape (H, W, C)
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W, C)
+    """
+    result = np.empty(image.shape, np.float32)
+
+    def fill(rows: slice) -> None:
+        result[rows] = function(image[rows])
+
+    map_threads(fill, strips(*image.shape[:2]))
+    return result
+
+
 def available_cores() -> int:
     """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):  # not on macOS

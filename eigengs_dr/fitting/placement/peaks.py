@@ -83,13 +83,13 @@ def residual_peaks(
     parts = map_threads(
         lambda rows: _local_maxima(missed, spacing, weight, rows), strips(height, width)
     )
-    found = _Maxima(*(np.concatenate(values) for values in zip(*parts, strict=True)))
-    order = np.argsort(-found.gain, kind="stable")
-    found = _Maxima(*(values[order] for values in found))
-    reach = np.ceil(SUPPRESSION_RADIUS * found.size.astype(np.float64)).astype(np.intp)
-    chosen = _keep_apart(found.row, found.column, reach, count, (height, width))
-    mean = np.stack([found.column[chosen] + 0.5, found.row[chosen] + 0.5], axis=1)
-    return mean, found.size[chosen].astype(np.float64), found.color[chosen]
+    row, column, gain, size, color = (np.concatenate(v) for v in zip(*parts, strict=True))
+    order = np.argsort(-gain, kind="stable")
+    row, column, size, color = row[order], column[order], size[order], color[order]
+    reach = np.ceil(SUPPRESSION_RADIUS * size.astype(np.float64)).astype(np.intp)
+    chosen = _keep_apart(row, column, reach, count, (height, width))
+    mean = np.stack([column[chosen] + 0.5, row[chosen] + 0.5], axis=1)
+    return mean, size[chosen].astype(np.float64), color[chosen]
 
 
 def _local_maxima(missed: Array, spacing: float, weight: Array | None, rows: slice) -> _Maxima:
