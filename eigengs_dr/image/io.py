@@ -73,7 +73,8 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
             raise ImageError(f"{path}: the file is empty (0 bytes); copy or export it again")
         with Image.open(path) as file:
             frames = getattr(file, "n_frames", 1)
-            pixels, transparent = _pixels(ImageOps.exif_transpose(file))
+            ImageOps.exif_transpose(file, in_place=True)  # a copy only if it turns the image
+            pixels, transparent = _pixels(file)
     except ImageError:
         raise
     except FileNotFoundError:
@@ -168,7 +169,7 @@ def save_image(path: str | Path, image: ArrayLike) -> None:
         pixels[rows] = to_8bit(floats[rows])
 
     map_threads(fill, strips(height, width))
-    pixels = pixels[..., 0] if pixels.shape[2] == 1 else pixels
+    pixels = pixels[..., 0] if floats.shape[2] == 1 else pixels
     try:
         with atomic_write(path) as temporary:
             Image.fromarray(pixels).save(temporary, **SAVE_OPTIONS[suffix])
@@ -207,7 +208,8 @@ def _pixels(image: "Image") -> tuple[NDArray[Any], bool]:
     if image.mode == "F" or image.mode.startswith("I;16"):
         return np.asarray(image), False
     if not image.has_transparency_data:
-        return np.asarray(image if image.mode in ("1", "L") else image.convert("RGB")), False
+        # `convert` copies the image even if the mode stays.
+        return np.asarray(image if image.mode in ("1", "L", "RGB") else image.convert("RGB")), False
     pixels = np.asarray(image.convert("RGBA"))
     shown = np.empty((*pixels.shape[:2], 3), np.float32)
 
