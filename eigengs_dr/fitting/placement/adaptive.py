@@ -59,7 +59,7 @@ def place_adaptive(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Place and shape Gaussians by the second derivatives of an image.
 
-    Beside the image, the function holds about 16 bytes per pixel and 200 bytes per Gaussian.
+    Beside the image, the function holds about 15 bytes per pixel.
 
     Parameters
     ----------
