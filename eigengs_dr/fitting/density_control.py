@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..backend.arrays import types_of
 from ..gaussian.concatenate import concatenate
 from ..gaussian.gaussians import Gaussians
-from .placement.density import residual_peaks
+from .placement.peaks import residual_peaks
 from .redistribute import residual
 from .solvers.conjugate_gradient import inner_products, solve
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..image.color import rgb_to_ycbcr, to_linear
+from ..image.strips import by_strips
 
 if TYPE_CHECKING:
     from ..gaussian.gaussians import Gaussians
@@ -123,10 +124,10 @@ def initialize(pixels: NDArray[np.float32], options: FitOptions) -> FitProblem:
 def make_target(pixels: NDArray[np.float32], color: str) -> FitTarget:
     """Convert pixels (H, W, C) to the space of the colours, and weigh the errors there."""
     if color == "ycbcr":
-        return FitTarget(pixels, rgb_to_ycbcr(pixels))
+        return FitTarget(pixels, by_strips(rgb_to_ycbcr, pixels))
     if color == "linear":
-        light = to_linear(pixels)
-        return FitTarget(pixels, light, dark_weight(light))
+        light = by_strips(to_linear, pixels)
+        return FitTarget(pixels, light, by_strips(dark_weight, light))
     return FitTarget(pixels, pixels)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..gaussian.file import CUTOFF, MAX_CUTOFF
 from ..image.color import SPACES
 from ..image.metrics import MAX_PSNR
+from ..raster.limits import check_index_range
 from .initializers import INITIALIZERS
 from .presets import PRESETS, Preset
 
@@ -85,13 +86,14 @@ class FitOptions:
         return "eigen" if self.basis is not None else self.method.init
 
     def check_image(self, pixels: NDArray[np.float32]) -> None:
-        """Raise ValueError if the options ask for more Gaussians than an image has pixels.
+        """Raise ValueError for more Gaussians than pixels, and for an image too large to index.
 
         Parameters
         ----------
         pixels : ndarray of float32, shape (H, W, C)
         """
-        height, width = pixels.shape[:2]
+        height, width, channels = pixels.shape
+        check_index_range(width, height, channels)
         for name in ("gaussians", "max_gaussians"):
             count = getattr(self, name)
             if count is not None and not 1 <= count <= width * height:

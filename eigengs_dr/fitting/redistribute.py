@@ -26,10 +26,11 @@ from numpy.typing import NDArray
 from ..backend.arrays import types_of
 from ..gaussian.gaussians import Gaussians
 from ..image.resize import resample
+from ..image.strips import map_threads, strips
 from ..raster.render import render
 from .initializers import PLACEMENTS, FitProblem, FitTarget, Placement
 from .options import FitOptions
-from .placement.adaptive import Density, density_from_hessian, place_adaptive
+from .placement.adaptive import Density, place_adaptive
 from .placement.density import target_density
 from .solvers.conjugate_gradient import solve
 
@@ -49,7 +50,7 @@ def start_from_placement(target: FitTarget, options: FitOptions) -> FitProblem:
     start = Gaussians.from_arrays(
         mean,
         factor,
-        np.zeros(shape) if method.solves else generator.uniform(0, 1, shape),
+        np.zeros(shape, np.float32) if method.solves else generator.uniform(0, 1, shape),
         size=(target.values.shape[1], target.values.shape[0]),
         space=options.color,
         backend=options.backend,
@@ -99,15 +100,17 @@ def redistribute(
     Gaussians
         The new set. It keeps no Gaussian of the old set.
     """
-    missed = residual(gaussians, target)
-    error = np.square(missed if weight is None else missed * weight).sum(axis=2)
+    error = squared_error(residual(gaussians, target), weight)
     old = gaussians.to_arrays()["mean"]
 
-    def density(bend: Array, spacing: float) -> Array:
-        height, width = bend.shape[1:]  # the placement may shrink the image
+    def density(default: Array) -> Array:
+        height, width = default.shape
+        if (height, width) == error.shape:
+            return target_density(old, error, default)
+        # The placement shrinks the image.
         there = old * np.array([width / gaussians.width, height / gaussians.height])
         here = np.maximum(resample(error[..., None], width, height)[..., 0], 0)
-        return target_density(there, here, density_from_hessian(bend, spacing))
+        return target_density(there, here, default)
 
     return place_like(gaussians, image, target, count, density, solve_steps)
 
@@ -129,7 +132,7 @@ def place_like(
     placed = Gaussians.from_arrays(
         mean,
         factor,
-        np.zeros((count, gaussians.channels)),
+        np.zeros((count, gaussians.channels), np.float32),
         size=(gaussians.width, gaussians.height),
         space=gaussians.space,
         backend=types_of(gaussians.mean).backend,
@@ -142,3 +145,20 @@ def residual(gaussians: Gaussians, target: NDArray[np.float32]) -> NDArray[np.fl
     """Return the target minus the rendering of a set, both in its space: shape (H, W, C)."""
     shown = render(replace(dr.detach(gaussians), space="data"))
     return np.asarray(target - shown.numpy(), np.float32)
+
+
+def squared_error(missed: Array, weight: Array | None = None) -> NDArray[np.float32]:
+    """Return the sum of the squares of the channels of a residual (H, W, C): shape (H, W).
+
+    The weight, of the same shape, is a factor of the errors before squaring.
+    """
+    error = np.zeros(missed.shape[:2], np.float32)
+
+    def add_up(rows: slice) -> None:
+        for channel in range(missed.shape[2]):
+            part = missed[rows, :, channel]
+            part = part if weight is None else part * weight[rows, :, channel]
+            error[rows] += np.square(part)
+
+    map_threads(add_up, strips(*missed.shape[:2]))
+    return error

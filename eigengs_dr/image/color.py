@@ -62,7 +62,9 @@ def rgb_to_ycbcr(image: NDArray[Any]) -> NDArray[Any]:
     array([0.9216, 0.502 , 0.502 ])
     """
     image = _check_rgb(image)
-    return image @ RGB_TO_YCBCR.T.astype(image.dtype) + YCBCR_OFFSET.astype(image.dtype)
+    result = image @ RGB_TO_YCBCR.T.astype(image.dtype)
+    result += YCBCR_OFFSET.astype(image.dtype)
+    return result
 
 
 def ycbcr_to_rgb(image: NDArray[Any]) -> NDArray[Any]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..storage.atomic import atomic_write
+from .strips import map_threads, strips
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -72,7 +73,8 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
             raise ImageError(f"{path}: the file is empty (0 bytes); copy or export it again")
         with Image.open(path) as file:
             frames = getattr(file, "n_frames", 1)
-            pixels, transparent = _pixels(ImageOps.exif_transpose(file))
+            ImageOps.exif_transpose(file, in_place=True)  # a copy only if it turns the image
+            pixels, transparent = _pixels(file)
     except ImageError:
         raise
     except FileNotFoundError:
@@ -99,7 +101,9 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
     return _check_range(_rgb(pixels, str(path), keep_grey), str(path))
 
 
-def check_image(image: ArrayLike, keep_grey: bool = False) -> NDArray[np.float32]:
+def check_image(
+    image: ArrayLike, keep_grey: bool = False, copy: bool = True
+) -> NDArray[np.float32]:
     """Convert an array to a float32 image, and refuse an array that is not an image.
 
     Parameters
@@ -109,11 +113,13 @@ def check_image(image: ArrayLike, keep_grey: bool = False) -> NDArray[np.float32
         overshoot [0, 1] by 0.5, as in resampled images; they are not clamped.
     keep_grey : bool, optional
         Return one channel if the image is grey.
+    copy : bool, optional
+        Without it, a C-contiguous image of float32 is returned as it is.
 
     Returns
     -------
     ndarray of float32, shape (H, W, 3) or (H, W, 1)
-        RGB. The array is C-contiguous and shares no memory with `image`.
+        RGB. The array is C-contiguous. It shares no memory with `image`, unless `copy` is False.
 
     Raises
     ------
@@ -127,7 +133,7 @@ def check_image(image: ArrayLike, keep_grey: bool = False) -> NDArray[np.float32
     array([[0. , 0.2],
            [0.4, 1. ]], dtype=float32)
     """
-    return _check_range(_rgb(image, "image", keep_grey), "image")
+    return _check_range(_rgb(image, "image", keep_grey, copy), "image")
 
 
 def save_image(path: str | Path, image: ArrayLike) -> None:
@@ -155,8 +161,15 @@ def save_image(path: str | Path, image: ArrayLike) -> None:
     if suffix not in SAVE_OPTIONS:
         known = " ".join(SAVE_OPTIONS)
         raise ImageError(f"{path}: image suffix {suffix!r} is unknown; use one of {known}")
-    pixels = to_8bit(_rgb(image, "image", keep_grey=True)).astype(np.uint8)
-    pixels = pixels[..., 0] if pixels.shape[2] == 1 else pixels
+    floats = _rgb(image, "image", keep_grey=True, copy=False)
+    height, width = floats.shape[:2]
+    pixels = np.empty(floats.shape, np.uint8)
+
+    def fill(rows: slice) -> None:
+        pixels[rows] = to_8bit(floats[rows])
+
+    map_threads(fill, strips(height, width))
+    pixels = pixels[..., 0] if floats.shape[2] == 1 else pixels
     try:
         with atomic_write(path) as temporary:
             Image.fromarray(pixels).save(temporary, **SAVE_OPTIONS[suffix])
@@ -168,20 +181,24 @@ def save_image(path: str | Path, image: ArrayLike) -> None:
         raise ImageError(message) from error
 
 
-def to_8bit(image: NDArray[Any]) -> NDArray[Any]:
+def to_8bit(image: NDArray[Any], out: NDArray[Any] | None = None) -> NDArray[Any]:
     """Scale, clamp and round an image to 8 bits, and return the values as floats.
 
     Parameters
     ----------
     image : ndarray of float
         0 is black, 1 is white.
+    out : ndarray of float, optional
+        Receives the result; may be `image`.
 
     Returns
     -------
     ndarray, same shape and dtype
         Whole numbers from 0 to 255; NaN stays NaN.
     """
-    return np.rint(np.clip(image, 0, 1) * 255)
+    clipped = np.clip(image, 0, 1, out=out)
+    clipped *= 255
+    return np.rint(clipped, out=clipped)
 
 
 def _pixels(image: "Image") -> tuple[NDArray[Any], bool]:
@@ -191,13 +208,23 @@ def _pixels(image: "Image") -> tuple[NDArray[Any], bool]:
     if image.mode == "F" or image.mode.startswith("I;16"):
         return np.asarray(image), False
     if not image.has_transparency_data:
-        return np.asarray(image if image.mode in ("1", "L") else image.convert("RGB")), False
-    pixels = np.asarray(image.convert("RGBA")).astype(np.float32) / 255
-    color, alpha = pixels[..., :3], pixels[..., 3:]
-    return 1 - alpha * (1 - color), bool(alpha.min() < 1)
+        # `convert` copies the image even if the mode stays.
+        return np.asarray(image if image.mode in ("1", "L", "RGB") else image.convert("RGB")), False
+    pixels = np.asarray(image.convert("RGBA"))
+    shown = np.empty((*pixels.shape[:2], 3), np.float32)
+
+    def show_over_white(rows: slice) -> None:
+        part = pixels[rows].astype(np.float32) / 255
+        color, alpha = part[..., :3], part[..., 3:]
+        shown[rows] = 1 - alpha * (1 - color)
+
+    map_threads(show_over_white, strips(*shown.shape[:2]))
+    return shown, bool(pixels[..., 3].min() < 255)
 
 
-def _rgb(image: ArrayLike, name: str, keep_grey: bool = False) -> NDArray[np.float32]:
+def _rgb(
+    image: ArrayLike, name: str, keep_grey: bool = False, copy: bool = True
+) -> NDArray[np.float32]:
     """Scale to float32 and replicate grey to RGB; errors call the image `name`."""
     try:
         array = np.asarray(image)
@@ -216,18 +243,27 @@ def _rgb(image: ArrayLike, name: str, keep_grey: bool = False) -> NDArray[np.flo
     if kind not in "bf" and not (kind == "u" and array.itemsize <= 2):
         expected = "expected uint8, uint16 or floats in [0, 1]"
         raise ImageError(f"{name}: pixels are {array.dtype}; {expected}")
-    if kind == "f" and not np.isfinite(array).all():
+    # The extremes are finite only if all pixels are; they need no array of flags.
+    if kind == "f" and not (np.isfinite(array.min()) and np.isfinite(array.max())):
         bad = np.argwhere(~np.isfinite(array).all(axis=2))
         row, column = bad[0].tolist()
         raise ImageError(
             f"{name}: {len(bad)} of {array.shape[0] * array.shape[1]} pixels are not finite, "
             f"the first at [{row}, {column}]; replace them, as with np.nan_to_num"
         )
+    channels = array.shape[2] if keep_grey else 3
+    as_it_is = array.dtype == np.float32 and array.shape[2] == channels
+    if as_it_is and not copy and array.flags.c_contiguous:
+        return array
     peak = np.iinfo(array.dtype).max if kind == "u" else 1
-    with np.errstate(over="ignore"):  # callers clamp or refuse the infinities
-        pixels = np.divide(array, peak, dtype=np.float32)
-    channels = pixels.shape[2] if keep_grey else 3
-    return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], channels)))
+    pixels = np.empty((*array.shape[:2], channels), np.float32)
+
+    def fill(rows: slice) -> None:
+        with np.errstate(over="ignore"):  # callers clamp or refuse the infinities
+            pixels[rows] = np.divide(array[rows], peak, dtype=np.float32)
+
+    map_threads(fill, strips(*pixels.shape[:2]))
+    return pixels
 
 
 def _check_range(pixels: NDArray[np.float32], name: str) -> NDArray[np.float32]:

@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .color import rgb_to_ycbcr
+from .color import RGB_TO_YCBCR, rgb_to_ycbcr
 from .io import to_8bit
+from .strips import map_threads, strips
 
 WINDOW = 11
 """Side of the Gaussian window of SSIM and MS-SSIM, in pixels."""
@@ -41,7 +42,8 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     Returns
     -------
     float
-        ``10 log10(peak^2 / mse)``; infinite for equal images, NaN if a pixel is NaN.
+        ``10 log10(peak^2 / mse)``; infinite for equal images, NaN if a pixel is NaN. Computed in
+        double precision, strip by strip: the function makes no copy of an image.
 
     Raises
     ------
@@ -53,16 +55,29 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     >>> round(psnr(np.zeros((4, 4, 3)), np.full((4, 4, 3), 0.1), space="ycbcr"), 2)
     26.09
     """
-    a, b = _pair(a, b)
-    if space == "rgb":
-        error = (to_8bit(a) - to_8bit(b)) / 255
-    elif space == "ycbcr":
-        error = rgb_to_ycbcr(a) - rgb_to_ycbcr(b)
-    elif space == "data":
-        error = a - b
-    else:
+    if space not in ("rgb", "ycbcr", "data"):
         raise ValueError(f"space {space!r} is unknown; use 'rgb', 'ycbcr' or 'data'")
-    return psnr_from_mse(float(np.mean(np.square(error))))
+    x, y = _pair(a, b)
+
+    def squares(rows: slice) -> float:
+        return _squared_error(x[rows].astype(np.float64), y[rows].astype(np.float64), space)
+
+    return psnr_from_mse(sum(map_threads(squares, strips(*x.shape[:2]))) / x.size)
+
+
+def _squared_error(a: NDArray[np.float64], b: NDArray[np.float64], space: str) -> float:
+    """Return the sum of the squared differences of two images in a space; overwrite both."""
+    if space == "rgb":
+        for image in (a, b):
+            to_8bit(image, out=image)
+    np.subtract(a, b, out=a)
+    if space == "ycbcr":
+        # |M d|^2 = trace(M d d^T M^T): the sums of the products of R, G and B are enough.
+        difference = a.reshape(-1, 3)
+        products = difference.T @ difference
+        return float(np.trace(RGB_TO_YCBCR @ products @ RGB_TO_YCBCR.T))
+    np.square(a, out=a)
+    return float(a.sum()) / (255**2 if space == "rgb" else 1)
 
 
 def float_space(color: str) -> str:
@@ -108,11 +123,11 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
     """
     from skimage.metrics import structural_similarity  # the import takes 0.3 s
 
-    a, b = _pair(a, b)
+    x, y = (image.astype(np.float64) for image in _pair(a, b))
     similarity = structural_similarity(
-        np.clip(a, 0, 1),
-        np.clip(b, 0, 1),
-        win_size=_window_size(a.shape[:2]),
+        np.clip(x, 0, 1),
+        np.clip(y, 0, 1),
+        win_size=_window_size(x.shape[:2]),
         data_range=1,
         channel_axis=2,
         gaussian_weights=True,
@@ -165,8 +180,8 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     """
     if space not in ("ycbcr", "data"):
         raise ValueError(f"space {space!r} is unknown; use 'ycbcr' or 'data'")
-    a, b = _pair(a, b)
-    planes = [rgb_to_ycbcr(image) if space == "ycbcr" else image for image in (a, b)]
+    pair = [image.astype(np.float64) for image in _pair(a, b)]
+    planes = [rgb_to_ycbcr(image) if space == "ycbcr" else image for image in pair]
     x, y = (np.moveaxis(image, 2, 0) for image in planes)
     side = min(x.shape[1:])
     scales = max(1, sum(side >> j >= WINDOW for j in range(len(SCALE_WEIGHTS))))
@@ -180,9 +195,9 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     return float(product.mean())
 
 
-def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return both images as float64 RGB of one shape (H, W, 3); grey is replicated."""
-    x, y = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return both images as RGB of one shape (H, W, 3) without a copy; grey is replicated."""
+    x, y = np.asarray(a), np.asarray(b)
     if x.shape != y.shape:
         raise ValueError(f"images have shapes {x.shape} and {y.shape}; crop or scale one of them")
     if x.ndim != 3 or x.shape[2] not in (1, 3) or x.size == 0:

@@ -3,6 +3,8 @@
 - ``random``: uniform, as GaussianImage does
 - ``grid``: a hexagonal grid
 - ``adaptive``: by the second derivatives of the image
-- ``density``: the density that an error asks for; peaks of a residual
+- ``density``: the density that an error asks for
+- ``peaks``: the peaks of a residual
 - ``hilbert_scan``: pixels in the order of a Hilbert curve
+- ``nearest``: the centre nearest to each pixel
 """

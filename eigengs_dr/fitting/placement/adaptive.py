@@ -15,11 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...gaussian.covariance import factor_from_covariance
+from ...image.blur import blur, gaussian_taps
 from ...image.resize import resample
-from .hilbert_scan import hilbert_order
+from ...image.strips import map_threads, strips, with_border
+from .hilbert_scan import Square, hilbert_squares
+from .nearest import center_pixels, nearest_center, sum_by_center
 
 Array = NDArray[np.floating]
-Density = Callable[[Array, float], Array]
+Density = Callable[[Array], Array]
 
 IMAGE_BLUR = 0.18
 """Standard deviation of the blur of the image, in spacings: it removes details that no Gaussian can
@@ -56,6 +59,8 @@ def place_adaptive(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Place and shape Gaussians by the second derivatives of an image.
 
+    Beside the image, the function holds about 15 bytes per pixel.
+
     Parameters
     ----------
     image : ndarray, shape (H, W, C)
@@ -65,8 +70,8 @@ def place_adaptive(
     generator : numpy.random.Generator, optional
         Not used: the result is a function of the image.
     density : callable, optional
-        ``density(bend, spacing)`` returns the Gaussians per pixel, up to a factor, for the result
-        of `hessian_energy` on the image or on a smaller one; by default `density_from_hessian`.
+        ``density(default)`` returns the Gaussians per pixel, up to a factor, for the density (H, W)
+        by `density_from_hessian` of the image or of a smaller one, which it may overwrite.
 
     Returns
     -------
@@ -80,17 +85,17 @@ def place_adaptive(
     if spacing >= 2 * WORKING_SPACING:
         times = int(spacing / WORKING_SPACING)
         size = -(-width // times), -(-height // times)
-        small = resample(image.astype(np.float32), *size)
+        small = resample(image.astype(np.float32, copy=False), *size)
         mean, factor = place_adaptive(small, count, density=density)
         x, y = width / small.shape[1], height / small.shape[0]
         return mean * (x, y), factor / (x, y, y)
-    bend = hessian_energy(image, spacing)
-    per_pixel = normalize_density((density or density_from_hessian)(bend, spacing), count)
+    per_pixel = density_from_hessian(image, spacing)
+    per_pixel = normalize_density(density(per_pixel) if density else per_pixel, count)
     mean = lloyd_step(stratify_along_hilbert(per_pixel, count), per_pixel)
-    return mean, shapes_from_hessian(mean, per_pixel, bend, spacing)
+    return mean, shapes_from_hessian(mean, per_pixel, image, spacing)
 
 
-def hessian_energy(image: Array, spacing: float) -> NDArray[np.float32]:
+def hessian_energy(image: Array, spacing: float, rows: slice | None = None) -> NDArray[np.float32]:
     """Return the squared Hessian ``sum_c H_c H_c`` of a blurred image plus isotropic noise.
 
     Parameters
@@ -98,38 +103,81 @@ def hessian_energy(image: Array, spacing: float) -> NDArray[np.float32]:
     image : ndarray, shape (H, W, C)
     spacing : float
         Distance between Gaussians in pixels.
+    rows : slice, optional
+        Rows of the image to compute; by default all.
 
     Returns
     -------
-    ndarray of float32, shape (3, H, W)
+    ndarray of float32, shape (3, R, W)
         The entries xx, yy and xy.
     """
-    from scipy.ndimage import correlate1d, gaussian_filter
-
-    channels = np.moveaxis(image, 2, 0).astype(np.float32)
-    channels = gaussian_filter(channels, (0, IMAGE_BLUR * spacing, IMAGE_BLUR * spacing))
-    slope, bend = [-0.5, 0.0, 0.5], [1.0, -2.0, 1.0]
-    xx = correlate1d(channels, bend, axis=2, mode="nearest")
-    yy = correlate1d(channels, bend, axis=1, mode="nearest")
-    xy = correlate1d(correlate1d(channels, slope, 2, mode="nearest"), slope, 1, mode="nearest")
+    height, width, channels = image.shape
+    rows = slice(0, height) if rows is None else rows
+    taps = gaussian_taps(IMAGE_BLUR * spacing)
     noise = (NOISE_SLOPE / spacing**2) ** 2 / 2
-    squared = np.stack([xx * xx + xy * xy, yy * yy + xy * xy, xy * (xx + yy)]).sum(axis=1)
-    return squared + np.array([noise, noise, 0], np.float32)[:, None, None]
+    energy = np.empty((3, rows.stop - rows.start, width), np.float32)
+    energy[:2], energy[2] = noise, 0
+    for channel in range(channels):
+
+        def plane(part: slice, channel: int = channel) -> NDArray[np.float32]:
+            return image[part, :, channel].astype(np.float32, order="C")
+
+        xx, yy, xy = _hessian(blur(with_border(plane, rows, height, len(taps)), taps))
+        across = xy * xy
+        energy[0] += xx * xx + across
+        energy[1] += yy * yy + across
+        xy *= xx + yy
+        energy[2] += xy
+    return energy
 
 
-def density_from_hessian(bend: Array, spacing: float) -> Array:
-    """Return the density (H, W) for a squared Hessian, up to a factor; see `hessian_energy`."""
-    from scipy.ndimage import gaussian_filter
+def _hessian(plane: Array) -> tuple[Array, Array, Array]:
+    """Return the second differences xx, yy and xy of a plane without its outermost pixels."""
+    middle = plane[1:-1, 1:-1]
+    # Differences of neighbours first: those of close floats are exact.
+    xx = (plane[1:-1, 2:] - middle) - (middle - plane[1:-1, :-2])
+    yy = (plane[2:, 1:-1] - middle) - (middle - plane[:-2, 1:-1])
+    slope = 0.5 * (plane[:, 2:] - plane[:, :-2])
+    return xx, yy, 0.5 * (slope[2:] - slope[:-2])
 
-    mean = gaussian_filter(bend[0] + bend[1], DENSITY_BLUR * spacing)
-    return np.power(mean, DENSITY_EXPONENT, dtype=np.float64)
+
+def density_from_hessian(image: Array, spacing: float) -> NDArray[np.float32]:
+    """Return the density (H, W) by the squared Hessian of an image (H, W, C), up to a factor."""
+    height, width = image.shape[:2]
+    taps = gaussian_taps(DENSITY_BLUR * spacing)
+    density = np.empty((height, width), np.float32)
+
+    def trace(rows: slice) -> Array:
+        bend = hessian_energy(image, spacing, rows)
+        return np.asarray(bend[0] + bend[1])
+
+    def fill(rows: slice) -> None:
+        mean = blur(with_border(trace, rows, height, len(taps) - 1), taps)
+        np.power(mean, np.float32(DENSITY_EXPONENT), out=density[rows])
+
+    map_threads(fill, strips(height, width))
+    return density
 
 
-def normalize_density(density: Array, count: int) -> NDArray[np.float64]:
-    """Scale a density to a sum of about `count` Gaussians, with at most one per pixel."""
-    per_pixel: NDArray[np.float64] = density.astype(np.float64)
-    for _ in range(5):  # each round moves the excess of full pixels to the others
-        per_pixel = np.minimum(per_pixel * (count / per_pixel.sum()), 1.0)
+def normalize_density(density: Array, count: int) -> NDArray[np.float32]:
+    """Scale a density to a sum of about `count` Gaussians, with at most one per pixel.
+
+    An array of float32 is scaled in place, and returned.
+    """
+    per_pixel = density.astype(np.float32, copy=False)
+    parts = strips(*per_pixel.shape)
+    factor = count / sum(map_threads(lambda rows: per_pixel[rows].sum(dtype=np.float64), parts))
+
+    def scaled(rows: slice) -> Array:
+        return np.minimum(per_pixel[rows] * np.float32(factor), np.float32(1))
+
+    for _ in range(4):  # each round moves the excess of full pixels to the others
+        factor *= count / sum(map_threads(lambda rows: scaled(rows).sum(dtype=np.float64), parts))
+
+    def scale(rows: slice) -> None:
+        per_pixel[rows] = scaled(rows)
+
+    map_threads(scale, parts)
     return per_pixel
 
 
@@ -141,59 +189,87 @@ def stratify_along_hilbert(density: Array, count: int) -> NDArray[np.float64]:
     ndarray of float64, shape (count, 2)
         Centroids in pixels, in the order of the curve: neighbours in memory are close in space.
     """
-    height, width = density.shape
-    order = hilbert_order(height, width)
-    mass = density.ravel()[order]
-    total = np.concatenate([[0.0], np.cumsum(mass)])
-    cuts = np.linspace(0, total[-1], count + 1)
+    squares = hilbert_squares(*density.shape)
+    mass = map_threads(
+        lambda square: density[square.rows, square.columns].sum(dtype=np.float64), squares
+    )
+    begin = np.concatenate([[0.0], np.cumsum(mass)])
+    cuts = np.linspace(0, begin[-1], count + 1)
+    first = np.searchsorted(cuts, begin)
+    first[-1] = count + 1
+    moments = np.empty((count + 1, 2))
 
-    def centroid(position: Array) -> Array:
-        moment = np.concatenate([[0.0], np.cumsum(mass * position)])
-        return np.diff(np.interp(cuts, total, moment)) * (count / total[-1])
+    def integrate(number: int) -> Array:
+        """Fill in the moments of the curve from the start of a square to the cuts in it."""
+        own = slice(first[number], first[number + 1])
+        moments[own], total = _moments(density, squares[number], cuts[own] - begin[number])
+        return total
 
-    return np.stack([centroid(order % width + 0.5), centroid(order // width + 0.5)], axis=1)
+    totals = np.array(map_threads(integrate, range(len(squares))))
+    before = np.cumsum(totals, axis=0) - totals
+    for number in range(len(squares)):
+        moments[first[number] : first[number + 1]] += before[number]
+    return np.diff(moments, axis=0) * (count / begin[-1])
+
+
+def _moments(density: Array, square: Square, cuts: Array) -> tuple[Array, Array]:
+    """Return the moments (n, 2) of a square up to some masses along the curve, and its total."""
+    row, column = square.order()
+    mass = density[square.rows, square.columns][row, column].astype(np.float64)
+    mass_before = np.concatenate([[0.0], np.cumsum(mass)])
+    # The curve visits pixels, so the moment is linear in the mass between the ends of a pixel.
+    found, totals = np.empty((len(cuts), 2)), np.empty(2)
+    for axis, position in enumerate((column + square.columns.start, row + square.rows.start)):
+        moment = np.concatenate([[0.0], np.cumsum(mass * (position + 0.5))])
+        found[:, axis] = np.interp(cuts, mass_before, moment)
+        totals[axis] = moment[-1]
+    return found, totals
 
 
 def lloyd_step(mean: Array, density: Array) -> NDArray[np.float64]:
     """Take one Lloyd step: move each centre to the centroid of the pixels nearest to it."""
-    count = len(mean)
+    height, width = density.shape
     owner = nearest_center(mean, density.shape)
-    rows, columns = np.indices(density.shape).reshape(2, -1)
-    mass = np.bincount(owner, density.ravel(), count)
-    moment = [np.bincount(owner, density.ravel() * (v + 0.5), count) for v in (columns, rows)]
-    moves = mass > 0
+    x, y = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
+    mass, *moments = sum_by_center(owner, len(mean), [(density,), (density, x), (density, y)])
     result = np.array(mean, np.float64)
-    result[moves] = np.stack(moment, axis=1)[moves] / mass[moves, None]
+    moves = mass > 0
+    for axis in (0, 1):
+        result[moves, axis] = moments[axis][moves] / mass[moves]
     return result
 
 
-def nearest_center(mean: Array, shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """Return the index of the centre nearest to each pixel, shape (H W,).
-
-    If several centres lie in one pixel, only the last counts.
-    """
-    from scipy.ndimage import distance_transform_edt
-
-    column, row = _pixels(mean, shape)
-    owner = np.full(shape, -1)
-    owner[row, column] = np.arange(len(mean))
-    y, x = distance_transform_edt(owner < 0, return_distances=False, return_indices=True)
-    return owner[y, x].ravel()
-
-
 def shapes_from_hessian(
-    mean: Array, density: Array, bend: Array, spacing: float
+    mean: Array, density: Array, image: Array, spacing: float
 ) -> NDArray[np.float64]:
     """Return factors (N, 3): size by the density, ratio and angle of the axes by the Hessian."""
-    from scipy.ndimage import gaussian_filter
+    height, width = density.shape
+    column, row = center_pixels(mean, density.shape)
+    taps = gaussian_taps(DIRECTION_BLUR * spacing)
+    order = np.argsort(row, kind="stable")
+    rows_in_order = row[order]
+    factor = np.empty((len(mean), 3))
 
-    column, row = _pixels(mean, density.shape)
-    xx, yy, xy = (
-        gaussian_filter(b, DIRECTION_BLUR * spacing)[row, column].astype(float) for b in bend
-    )
+    def energy(rows: slice) -> Array:
+        return hessian_energy(image, spacing, rows)
+
+    def fill(rows: slice) -> None:
+        first, last = np.searchsorted(rows_in_order, [rows.start, rows.stop])
+        own = order[first:last]
+        bend = blur(with_border(energy, rows, height, len(taps) - 1), taps)
+        bend = bend[:, row[own] - rows.start, column[own]].astype(np.float64)
+        factor[own] = _factors(bend, density[row[own], column[own]].astype(np.float64))
+
+    map_threads(fill, strips(height, width))
+    return factor
+
+
+def _factors(bend: Array, density: Array) -> NDArray[np.float64]:
+    """Return factors (N, 3) for squared Hessians (3, N) and densities (N,)."""
+    xx, yy, xy = bend
     split = np.hypot(xx - yy, 2 * xy)
     ratio = 1 + (MAX_STRETCH - 1) * split / (xx + yy)
-    variance = RELATIVE_SIZE**2 / density[row, column]
+    variance = RELATIVE_SIZE**2 / density
     along, across = variance * ratio, variance / ratio
     angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # the direction of the largest second derivative
     cos, sin = np.cos(angle), np.sin(angle)
@@ -202,9 +278,3 @@ def shapes_from_hessian(
         (across - along) * cos * sin,
         across * sin**2 + along * cos**2,
     )
-
-
-def _pixels(mean: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
-    """Return the columns and rows of the pixels of the centres."""
-    column = np.clip(mean[:, 0].astype(int), 0, shape[1] - 1)
-    return column, np.clip(mean[:, 1].astype(int), 0, shape[0] - 1)

@@ -30,13 +30,11 @@ def test_density_of_any_image(drawn):
     image, count = drawn
     pixels = image.shape[0] * image.shape[1]
     spacing = float(np.sqrt(pixels / count))
-    density = normalize_density(
-        density_from_hessian(hessian_energy(image, spacing), spacing), count
-    )
+    density = normalize_density(density_from_hessian(image, spacing), count)
     assert density.shape == image.shape[:2]
     assert (density > 0).all()
     assert density.max() <= 1
-    assert density.sum() <= count * (1 + 1e-9)
+    assert density.sum(dtype=float) <= count * (1 + 1e-5)
 
 
 @pytest.mark.parametrize("count", [1, 10, 100, 400])
@@ -44,9 +42,8 @@ def test_density_sums_to_the_count(count):
     y, x = np.indices((40, 40)) / 40
     image = np.stack([np.sin(7 * x * x + y), np.cos(9 * y), x * y], axis=-1).astype(np.float32)
     spacing = float(np.sqrt(1600 / count))
-    assert normalize_density(
-        density_from_hessian(hessian_energy(image, spacing), spacing), count
-    ).sum() == pytest.approx(count)
+    density = normalize_density(density_from_hessian(image, spacing), count)
+    assert density.sum(dtype=float) == pytest.approx(count, rel=1e-5)
 
 
 def test_bending_of_a_parabola():
@@ -153,9 +150,9 @@ def test_splats_far_apart_are_placed_on_a_smaller_image():
 def test_density_given_to_adaptive_is_followed():
     image = np.zeros((40, 40, 3), np.float32)
 
-    def left(bend, spacing):
-        density = np.full(bend.shape[1:], 1e-6)
-        density[:, : bend.shape[2] // 2] = 1
+    def left(default):
+        density = np.full(default.shape, 1e-6)
+        density[:, : default.shape[1] // 2] = 1
         return density
 
     mean, _ = place_adaptive(image, 100, density=left)

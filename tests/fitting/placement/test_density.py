@@ -1,14 +1,10 @@
-"""The density that an error asks for, and the peaks of a residual."""
+"""The density that an error asks for."""
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from eigengs_dr.fitting.placement.density import (
     ERROR_EXPONENT,
-    SUPPRESSION_RADIUS,
-    residual_peaks,
     target_density,
 )
 
@@ -22,7 +18,7 @@ def squares(side):
 def test_equal_shares_of_error_leave_the_density_as_it_was():
     """Splats on a grid, each with the same error: nothing is gained by moving any."""
     density = target_density(squares(30), np.ones((30, 30)), np.ones((30, 30)))
-    np.testing.assert_allclose(density, density.mean(), rtol=1e-9)
+    np.testing.assert_allclose(density, density.mean(dtype=float), rtol=1e-6)
 
 
 @pytest.mark.parametrize("times", [0.1, 10.0, 100.0])
@@ -54,30 +50,9 @@ def test_among_neighbours_density_follows_the_bending():
     bending = np.ones((32, 32))
     bending[:, 4:8] = 5
     density = target_density(mean, np.ones((32, 32)), bending)
-    np.testing.assert_allclose(density / density[0, 0], bending, rtol=1e-9)
+    np.testing.assert_allclose(density / density[0, 0], bending, rtol=1e-6)
 
 
 def test_nothing_missed_and_nothing_bent_is_still_a_density():
     density = target_density(np.array([[5.0, 5.0]]), np.zeros((8, 8)), np.full((8, 8), 1e-30))
     assert np.isfinite(density).all() and (density > 0).all()
-
-
-@pytest.mark.parametrize("deviation", [6.0, 1.5, 0.6])
-def test_gain_of_a_place_is_what_a_splat_takes(deviation):
-    """Of a residual that is one round splat of a tried size, also where it is below a pixel."""
-    y, x = np.indices((64, 64)) + 0.5
-    splat = 0.7 * np.exp(-((x - 32.5) ** 2 + (y - 30.5) ** 2) / (2 * deviation**2))
-    mean, size, color = residual_peaks(splat[..., None], 1, deviation)
-    np.testing.assert_allclose(mean, [[32.5, 30.5]])
-    np.testing.assert_allclose(size, [deviation])
-    np.testing.assert_allclose(color, [[0.7]], rtol=0.01)
-
-
-@given(st.integers(0, 40))
-def test_places_keep_apart_and_never_exceed(count):
-    missed = np.random.default_rng(count).normal(size=(24, 20, 3))
-    mean, size, color = residual_peaks(missed, count, 4.0)
-    assert len(mean) == len(size) == len(color) <= count
-    for k in range(len(mean)):
-        away = np.abs(mean[k + 1 :] - mean[k]).max(axis=1)
-        assert (away > np.ceil(SUPPRESSION_RADIUS * size[k])).all()

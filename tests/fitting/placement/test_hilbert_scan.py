@@ -6,7 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from _helpers.sets import few
-from eigengs_dr.fitting.placement.hilbert_scan import hilbert_order
+from eigengs_dr.fitting.placement.hilbert_scan import SQUARE, hilbert_squares
+
+
+def hilbert_order(height, width):
+    """The indices ``row * width + column`` of all pixels, in the order of the curve."""
+    parts = []
+    for square in hilbert_squares(height, width):
+        row, column = square.order()
+        parts.append((square.rows.start + row) * width + square.columns.start + column)
+    return np.concatenate(parts)
 
 
 @few
@@ -33,3 +42,16 @@ def test_hilbert_curve_stays_in_a_quarter(side):
         row, column = np.divmod(parts, side)
         assert (np.ptp(row, axis=1) == block - 1).all()
         assert (np.ptp(column, axis=1) == block - 1).all()
+
+
+def test_squares_of_a_large_image_are_cut_from_one_curve():
+    """The order does not depend on the side of the squares, and the squares overhang the image."""
+    height, width = SQUARE + 3, 2 * SQUARE - 5
+    order = hilbert_order(height, width)
+    assert len(hilbert_squares(height, width)) == 4
+    np.testing.assert_array_equal(np.sort(order), np.arange(height * width))
+    row, column = np.divmod(hilbert_order(2 * SQUARE, 2 * SQUARE), 2 * SQUARE)
+    inside = (row < height) & (column < width)
+    np.testing.assert_array_equal(order, row[inside] * width + column[inside])
+    steps = np.abs(np.diff(row)) + np.abs(np.diff(column))
+    assert (steps == 1).all()

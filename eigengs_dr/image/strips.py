@@ -1,0 +1,130 @@
+"""Strips of rows of a large image: bounded temporary arrays, and several threads.
+
+The borders of the strips depend only on the size of the image, so a result does not depend on the
+number of threads.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+STRIP_PIXELS = 1 << 19
+"""Pixels of a strip. A plane of it, in single precision, takes 2 MB: larger strips leave the cache,
+and with smaller ones threads wait for each other and borders of filters are computed twice."""
+
+MAX_THREADS = 8
+"""Largest number of threads: Python lets only one of them start an operation at a time."""
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def strips(height: int, width: int) -> list[slice]:
+    """Divide an image into strips of about `STRIP_PIXELS` pixels.
+
+    Parameters
+    ----------
+    height, width : int
+        Size of the image in pixels.
+
+    Returns
+    -------
+    list of slice
+        The rows of each strip, from top to bottom.
+    """
+    rows = max(1, STRIP_PIXELS // max(width, 1))
+    return [slice(first, min(first + rows, height)) for first in range(0, height, rows)]
+
+
+def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """Call a function for every item on several threads, and return the results in order.
+
+    Parameters
+    ----------
+    function : callable
+        NumPy releases the lock of the interpreter, so operations on large arrays run in parallel.
+    items : iterable
+        A single item is handled without another thread.
+
+    Returns
+    -------
+    list
+        ``[function(item) for item in items]``; the first error is raised.
+    """
+    items = list(items)
+    threads = min(MAX_THREADS, available_cores(), len(items))
+    if threads < 2:
+        return [function(item) for item in items]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(function, items))
+
+
+def by_strips(
+    function: Callable[[NDArray[np.float32]], NDArray[np.float32]], image: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Apply a function of single pixels to an image without large temporary arrays.
+
+    Parameters
+    ----------
+    function : callable
+        Returns an array of the shape of its argument.
+    image : ndarray of float32, shape (H, W, C)
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W, C)
+    """
+    result = np.empty(image.shape, np.float32)
+
+    def fill(rows: slice) -> None:
+        result[rows] = function(image[rows])
+
+    map_threads(fill, strips(*image.shape[:2]))
+    return result
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def with_border(
+    read: Callable[[slice], NDArray[Any]],
+    rows: slice,
+    height: int,
+    border: int,
+    mode: Any = "symmetric",
+) -> NDArray[Any]:
+    """Return rows of an image with the pixels around them, beyond the image too.
+
+    Parameters
+    ----------
+    read : callable
+        ``read(rows)`` returns rows of the image: shape (..., R, W).
+    rows : slice
+        Rows from `strips`.
+    height : int
+        Number of rows of the image.
+    border : int
+        Pixels to add on each of the four sides.
+    mode : {"symmetric", "constant"}
+        How the image continues beyond its edges: mirrored, or with zeros.
+
+    Returns
+    -------
+    ndarray, shape (..., R + 2 border, W + 2 border)
+        The same values for any division into strips.
+    """
+    first, last = max(0, rows.start - border), min(height, rows.stop + border)
+    inside = read(slice(first, last))
+    above, below = border - (rows.start - first), border - (last - rows.stop)
+    pad = [(0, 0)] * (inside.ndim - 2) + [(above, below), (border, border)]
+    return np.pad(inside, pad, mode)

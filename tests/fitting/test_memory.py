@@ -1,0 +1,56 @@
+"""The memory of a fit, said beforehand."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from eigengs_dr.fitting import memory
+from eigengs_dr.fitting.memory import check_memory, estimate_memory
+
+
+def test_memory_grows_with_every_argument():
+    least = estimate_memory(100, 100, 1, 1000)
+    for larger in (
+        (200, 100, 1, 1000),
+        (100, 200, 1, 1000),
+        (100, 100, 3, 1000),
+        (100, 100, 1, 2000),
+    ):
+        assert estimate_memory(*larger) > least
+
+
+def test_line_names_size_count_and_memory(monkeypatch):
+    monkeypatch.setattr(memory, "installed_memory", lambda: None)
+    gigabytes = estimate_memory(4096, 2048, 3, 640_000) / 1e9
+    assert check_memory(4096, 2048, 3, 640_000) == (
+        f"640,000 Gaussians on 4096x2048 pixels take about {gigabytes:.1f} GB of memory"
+    )
+
+
+def test_fit_larger_than_the_machine_is_refused_in_one_line(monkeypatch):
+    monkeypatch.setattr(memory, "installed_memory", lambda: 1_000_000_000)
+    with pytest.raises(
+        ValueError, match=r"this machine has 1\.0 GB: scale the image down"
+    ) as found:
+        check_memory(8192, 8192, 3, 5_000_000)
+    assert "\n" not in str(found.value)
+
+
+FIT = """
+import json, resource
+import eigengs_dr as eg
+from eigengs_dr.image.resize import resample
+eg.fit(resample(eg.sample("astronaut"), 1024, 1024), gaussians=80_000, iterations=10)
+print(json.dumps(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss has another unit elsewhere")
+def test_estimate_is_near_the_measured_memory():
+    """If this fails after a change of the renderer, measure the constants again."""
+    done = subprocess.run([sys.executable, "-c", FIT], capture_output=True, text=True, check=True)
+    measured = json.loads(done.stdout.splitlines()[-1])
+    assert estimate_memory(1024, 1024, 3, 80_000) == pytest.approx(measured, rel=0.4)
