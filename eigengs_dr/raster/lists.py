@@ -213,9 +213,14 @@ def _transpose_by_counting(
     """
     starts = np.concatenate([[0], last.numpy()]).astype(np.int32)
     by_tile = _transpose(tile.numpy()[:entries].view(np.int32), starts, grid.tiles)
-    splat = np.zeros(_padded(entries), np.uint32)
-    splat[:entries] = by_tile.indices
-    return upload(types.UInt, splat), upload(types.UInt, by_tile.indptr.astype(np.uint32))
+    splat = dr.zeros(types.UInt, _padded(entries))
+    dr.make_opaque(splat)
+    if entries:
+        indices = types.UInt(by_tile.indices.view(np.uint32))
+        dr.scatter(splat, indices, dr.arange(types.UInt, entries))
+        dr.eval(splat)
+        dr.sync_thread()  # the copy may read NumPy's memory until here
+    return splat, upload(types.UInt, by_tile.indptr.view(np.uint32))
 
 
 def _transpose(columns: NDArray[np.int32], starts: NDArray[np.int32], number: int) -> Any:

@@ -22,6 +22,10 @@ from .parameters import KernelParameters, detached_shape, kernel_radius, kernel_
 from .tiles import Grid
 
 
+TILE_ROWS = 64
+"""Rows of tiles that `to_tiles` copies at a time: large images need no second copy in memory."""
+
+
 @exclusive()
 def render(
     gaussians: Gaussians,
@@ -249,8 +253,16 @@ def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
     height, width, channels = image.shape
     tile_width, tile_height = grid.tile
     over = (grid.ny * tile_height - height, grid.nx * tile_width - width)
-    padded = np.pad(image, [(0, over[0]), (0, over[1]), (0, 0)]) if any(over) else image
-    # Pixels and channels share an axis: a row of a tile is then copied as one run.
-    tiled = padded.reshape(grid.ny, tile_height, grid.nx, tile_width * channels)
-    flat = tiled.transpose(0, 2, 1, 3).reshape(-1)
-    return upload(types.Float, flat)
+    result = dr.empty(types.Float, grid.tiles * grid.pixels * channels)
+    run = grid.nx * grid.pixels * channels  # of a row of tiles
+    for first in range(0, grid.ny, TILE_ROWS):
+        strip = image[first * tile_height : (first + TILE_ROWS) * tile_height]
+        rows = -(-len(strip) // tile_height)
+        if over[1] or len(strip) < rows * tile_height:
+            strip = np.pad(strip, [(0, rows * tile_height - len(strip)), (0, over[1]), (0, 0)])
+        # Pixels and channels share an axis: a row of a tile is then copied as one run.
+        tiled = strip.reshape(rows, tile_height, grid.nx, tile_width * channels)
+        flat = upload(types.Float, tiled.transpose(0, 2, 1, 3).reshape(-1))
+        dr.scatter(result, flat, first * run + dr.arange(types.UInt, rows * run))
+        dr.eval(result)
+    return result

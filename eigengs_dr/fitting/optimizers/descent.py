@@ -104,6 +104,7 @@ def _run_phase(
     """Yield the set after every step of one phase."""
     fixed = problem.gaussians
     types, grid = types_of(fixed.mean), Grid(fixed.width, fixed.height)
+    dr.flush_malloc_cache()  # what the colour solve took would stay reserved
     state, variables = start_descent(fixed, schedule), schedule.variables()
     target = to_tiles(types, problem.target, grid)
     weight = None if problem.weight is None else to_tiles(types, problem.weight, grid)
@@ -115,7 +116,7 @@ def _run_phase(
             if step == stop:
                 stop, moves = next_build(schedule, step, iterations)
                 pad, growth = variables.reach(state.gaussians, moves)
-                counts = (*levels, len(fixed))
+                counts, lists = (*levels, len(fixed)), []  # old lists make room for new ones
                 lists = [
                     bin_gaussians(prefix(state.gaussians, n), _prefix(pad, n), growth)
                     for n in counts
