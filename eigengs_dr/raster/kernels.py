@@ -33,6 +33,7 @@ class _Blocks(NamedTuple):
     run : UInt32
         Index of the block in tile layout: the block holds the run of pixels ``[run, run + 1)``
         times `pixels`.
+    tile : UInt32
     x, y : Float
         First pixel centre.
     begin, end : UInt32
@@ -42,6 +43,7 @@ class _Blocks(NamedTuple):
     """
 
     run: Any
+    tile: Any
     x: Any
     y: Any
     begin: Any
@@ -63,9 +65,9 @@ def _blocks(types: ArrayTypes, lists: TileLists) -> _Blocks:
         lane = dr.arange(types.UInt, lists.grid.tiles * parts)
         part = lane % parts
         tile, begin, end = (dr.gather(types.UInt, v, lane // parts) for v in (tile, begin, end))
-    x = types.Float(tile % lists.grid.nx * width) + 0.5
-    y = types.Float(tile // lists.grid.nx * height + part * rows) + 0.5
-    return _Blocks(tile * parts + part, x, y, begin, end, (width, rows))
+    column, row = lists.grid.first_pixel(tile)
+    x, y = types.Float(column) + 0.5, types.Float(row + part * rows) + 0.5
+    return _Blocks(tile * parts + part, tile, x, y, begin, end, (width, rows))
 
 
 def _sum_blocks(
@@ -78,6 +80,9 @@ def _sum_blocks(
     """
     types = types_of(packed)
     number = NUM_SHAPE_PARAMS + len(start)
+    if lists.grid.images > 1:
+        image = lists.grid.image_of(blocks.tile)
+        start = [dr.gather(types.Float, b, image) for b in start]
 
     def contributions(p: list, steep: bool) -> list:
         shape, color = p[:NUM_SHAPE_PARAMS], p[NUM_SHAPE_PARAMS:]
@@ -122,7 +127,7 @@ def forward(packed: Any, start: list, lists: TileLists, radius: float, tangent: 
     ----------
     packed : Float
         `NUM_SHAPE_PARAMS` + channels parameters per Gaussian, from `pack_parameters`.
-    start : list of Float
+    start : list of Float, shape (1,) or (images,)
         Initial value of each channel: the background.
     lists : TileLists
     radius : float
@@ -172,7 +177,7 @@ def residual(
     delta : Float, shape (tiles * pixels * channels,)
         ``m e`` in tile layout.
     squares : list of Float, shape (lanes,)
-        For each channel, the sums of ``e^2`` over the pixels of each lane.
+        For each channel, the sums of ``e^2`` over the pixels of each lane; `sum_lanes` adds them.
     """
     types = types_of(packed)
     grid, channels = lists.grid, len(start)
@@ -276,8 +281,8 @@ def adjoint_pieces(
         active = i < pieces.end
         tile = gather_index(types, pieces.tile, i, active)
         d = gather_run(types, delta, tile, length, active)
-        x = types.Float(tile % grid.nx * tile_size[0]) + 0.5
-        y = types.Float(tile // grid.nx * tile_size[1]) + 0.5
+        column, row = grid.first_pixel(tile)
+        x, y = types.Float(column) + 0.5, types.Float(row) + 0.5
         color = sums[-channels:]
 
         def cotangent(k: int, w: Any) -> Any:
@@ -348,14 +353,33 @@ def sum_pieces(parts: Any, pieces: Pieces, number: int, splat: Any = None) -> li
     return sums
 
 
+def sum_lanes(values: list, lists: TileLists) -> list:
+    """Add values of the lanes of `residual` for each image; return Floats of shape (images,)."""
+    dr.eval(values)
+    if lists.grid.images == 1:
+        return [dr.sum(v) for v in values]
+    run = _blocks(types_of(values[0]), lists).run
+    rows = [dr.empty(type(v), dr.width(v)) for v in values]
+    for row, v in zip(rows, values, strict=True):
+        dr.scatter(row, v, run)
+    return [sum_by_image(row, lists.grid) for row in rows]
+
+
+def sum_by_image(values: Any, grid: Grid) -> Any:
+    """Add values of all images, image after image; return a Float of shape (images,)."""
+    if grid.images == 1:
+        return dr.sum(values)
+    return dr.block_sum(values, dr.width(values) // grid.images)
+
+
 def channel_sums(image: Any, channels: int, grid: Grid) -> list:
-    """Sum each channel of an image in tile layout; return a list of Float, shape (1,)."""
+    """Sum each channel of images in tile layout; return a list of Float, shape (images,)."""
     types = types_of(image)
     tile = dr.arange(types.UInt, grid.tiles)
     values = gather_run(types, image, tile, grid.pixels * channels, True)
     sums = sum_channels(values, channels)
     dr.eval(sums)  # one kernel for all channels
-    return [dr.sum(s) for s in sums]
+    return [sum_by_image(s, grid) for s in sums]
 
 
 def sum_channels(values: list, channels: int) -> list:

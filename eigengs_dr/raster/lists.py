@@ -194,8 +194,13 @@ def _emit_tiles(
     tiles = dr.zeros(types.UInt, capacity)
     dr.make_opaque(tiles)
 
+    image = types.UInt(0)
+    if grid.images > 1:
+        image = dr.arange(types.UInt, dr.width(start)) // (dr.width(start) // grid.images)
+
     def emit(tile: Any, column: Any, row: Any, active: Any, slot: Any) -> Any:
-        dr.scatter(tiles, types.UInt(tile), slot, active & (slot < last))
+        tile = types.UInt(tile) + image * (grid.nx * grid.ny)
+        dr.scatter(tiles, tile, slot, active & (slot < last))
         return slot + dr.select(active, types.UInt(1), 0)
 
     done = for_each_tile(shape, radius, grid, emit, start, pad=pad, label="list tiles")
@@ -253,6 +258,8 @@ def _lanes(types: ArrayTypes, grid: Grid, starts: Any) -> tuple[Any, Any, Any]:
         length = np.diff(starts.numpy().astype(np.int64))
         x, y = np.arange(grid.nx) // TILE_WINDOW, np.arange(grid.ny) // TILE_WINDOW
         window = (x + y[:, None] * (x[-1] + 1)).ravel()
+        per_image = window[-1] + 1
+        window = (window + per_image * np.arange(grid.images)[:, None]).ravel()
         tile = upload(types.UInt, _descending(length, window))
     return tile, dr.gather(types.UInt, starts, tile), dr.gather(types.UInt, starts, tile + 1)
 

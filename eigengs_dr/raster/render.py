@@ -21,7 +21,6 @@ from .lists import TileLists, build_lists
 from .parameters import KernelParameters, detached_shape, kernel_radius, kernel_shape
 from .tiles import Grid
 
-
 TILE_ROWS = 64
 """Rows of tiles that `to_tiles` copies at a time: large images need no second copy in memory."""
 
@@ -140,7 +139,11 @@ def decode_parameters(gaussians: Gaussians) -> KernelParameters:
 
 
 def bin_gaussians(
-    gaussians: Gaussians, pad: Any = 0.0, growth: float = 1.0, adjoint: bool = True
+    gaussians: Gaussians,
+    pad: Any = 0.0,
+    growth: float = 1.0,
+    adjoint: bool = True,
+    images: int = 1,
 ) -> TileLists:
     """List the Gaussians of every tile of the image at native size.
 
@@ -153,6 +156,8 @@ def bin_gaussians(
         Factor by which ellipses are enlarged, for the same reason.
     adjoint : bool, optional
         Whether the lists serve reverse-mode differentiation too.
+    images : int, optional
+        Number of images of a batch, see `Grid`.
 
     Returns
     -------
@@ -166,7 +171,7 @@ def bin_gaussians(
     cutoff = gaussians.cutoff
     if not 0 < cutoff <= MAX_CUTOFF:
         raise ValueError(f"cutoff is {cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}")
-    grid = Grid(gaussians.width, gaussians.height)
+    grid = Grid(gaussians.width, gaussians.height, images=images)
     shape = detached_shape(gaussians)
     return build_lists(shape, kernel_radius(cutoff), grid, pad, growth, adjoint)
 
@@ -253,7 +258,7 @@ def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
     height, width, channels = image.shape
     tile_width, tile_height = grid.tile
     over = (grid.ny * tile_height - height, grid.nx * tile_width - width)
-    result = dr.empty(types.Float, grid.tiles * grid.pixels * channels)
+    result = dr.empty(types.Float, grid.nx * grid.ny * grid.pixels * channels)
     run = grid.nx * grid.pixels * channels  # of a row of tiles
     for first in range(0, grid.ny, TILE_ROWS):
         strip = image[first * tile_height : (first + TILE_ROWS) * tile_height]
@@ -266,3 +271,19 @@ def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
         dr.scatter(result, flat, first * run + dr.arange(types.UInt, rows * run))
         dr.eval(result)
     return result
+
+
+def batch_to_tiles(types: ArrayTypes, images: NDArray[Any]) -> Any:
+    """Upload images (M, height, width, channels) in tile layout, image after image."""
+    grid = Grid(images.shape[2], images.shape[1])
+    return dr.concat([to_tiles(types, image, grid) for image in images])
+
+
+def batch_from_tiles(image: Any, grid: Grid, channels: int) -> NDArray[Any]:
+    """Copy a batch of images from tile layout to an array (M, height, width, channels)."""
+    tile_width, tile_height = grid.tile
+    tiles = image.numpy().reshape(grid.images, grid.ny, grid.nx, tile_height, tile_width, channels)
+    whole = tiles.transpose(0, 1, 3, 2, 4, 5).reshape(
+        grid.images, grid.ny * tile_height, grid.nx * tile_width, channels
+    )
+    return np.ascontiguousarray(whole[:, : grid.height, : grid.width])

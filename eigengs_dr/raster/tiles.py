@@ -23,11 +23,16 @@ pixels in registers and visits 1.7 pixels for each pixel inside the ellipse (8x8
 
 @dataclass(frozen=True)
 class Grid:
-    """Division of a `width` x `height` image into `nx` x `ny` tiles; the last may overhang."""
+    """Division of `width` x `height` images into `nx` x `ny` tiles each; the last may overhang.
+
+    Several images are one batch: their tiles follow each other, and each has as many Gaussians as
+    the others, which follow each other too. All coordinates are those of the own image.
+    """
 
     width: int
     height: int
     tile: tuple[int, int] = TILE
+    images: int = 1
 
     @property
     def nx(self) -> int:
@@ -41,8 +46,19 @@ class Grid:
 
     @property
     def tiles(self) -> int:
-        """Number of tiles."""
-        return self.nx * self.ny
+        """Number of tiles of all images."""
+        return self.nx * self.ny * self.images
+
+    def image_of(self, tile: Any) -> Any:
+        """Return the image of a tile, by its index among the tiles of all images."""
+        return tile // (self.nx * self.ny)
+
+    def first_pixel(self, tile: Any) -> tuple[Any, Any]:
+        """Return the column and the row of the first pixel of a tile in its image, as integers."""
+        row = tile // self.nx
+        if self.images > 1:
+            row = row % self.ny
+        return tile % self.nx * self.tile[0], row * self.tile[1]
 
     @property
     def pixels(self) -> int:

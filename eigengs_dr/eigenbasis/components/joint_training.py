@@ -24,7 +24,7 @@ from ...fitting.optimizers.parameterization import CHOLESKY
 from ...fitting.placement.random import place_random
 from ...gaussian.file import CUTOFF
 from ...gaussian.gaussians import Gaussians
-from ...raster.kernels import adjoint, residual
+from ...raster.kernels import adjoint, residual, sum_lanes
 from ...raster.layout import pack_parameters
 from ...raster.lists import TileLists
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
@@ -251,8 +251,7 @@ def _move_group(
     gradient = [g * scale for g in adjoint(packed, delta, GROUP, lists, radius)]
     error = type(target)(0)
     if told:
-        dr.eval(squares)
-        error = sum(dr.sum(s) for s in squares)
+        error = sum(sum_lanes(squares, lists))
     added = [s + g for s, g in zip(sums, [*gradient[:NUM_SHAPE_PARAMS], error], strict=True)]
     slopes = type(rows)(gradient[NUM_SHAPE_PARAMS:])
     rows, moments = OPTIMIZER.step(rows, slopes, tuple(moments), rate, time)

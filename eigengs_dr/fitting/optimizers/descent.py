@@ -16,7 +16,7 @@ import numpy as np
 from ...backend.arrays import ArrayTypes, types_of, upload
 from ...backend.recording import freeze_program
 from ...gaussian.gaussians import Gaussians
-from ...raster.kernels import adjoint_pieces, residual, sum_pieces
+from ...raster.kernels import adjoint_pieces, residual, sum_lanes, sum_pieces
 from ...raster.layout import pack_parameters
 from ...raster.lists import TileLists
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
@@ -176,8 +176,7 @@ def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()
             factor: Any = 2 / number
             if levels:
                 # The sum of the logarithms of the errors, so that no level suffers for another.
-                dr.eval(squares)
-                mean = sum(dr.sum(s) for s in squares) * (1 / number)
+                mean = sum(sum_lanes(squares, listed)) * (1 / number)
                 factor = factor / (mean + MSE_EPSILON)
             sums = _sum_level(parts, listed, channels, len(fixed))
             before = gradient or [0.0] * len(sums)

@@ -17,15 +17,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.arithmetic import rcp
-from ...backend.arrays import types_of
+from ...backend.arrays import types_of, upload
 from ...backend.recording import freeze_program
 from ...gaussian.file import MAX_CUTOFF
 from ...gaussian.gaussians import Gaussians
-from ...raster.kernels import adjoint, channel_sums, residual, sum_channels
+from ...raster.kernels import (
+    adjoint,
+    channel_sums,
+    residual,
+    sum_by_image,
+    sum_channels,
+    sum_lanes,
+)
 from ...raster.layout import gather_run, pack_parameters
 from ...raster.lists import TileLists
 from ...raster.parameters import NUM_SHAPE_PARAMS, detached_shape, kernel_radius
-from ...raster.render import bin_gaussians, to_tiles
+from ...raster.render import batch_to_tiles, bin_gaussians, to_tiles
 from ...raster.tiles import Grid
 
 RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}
@@ -90,7 +97,34 @@ def solve(
     if steps < 0:
         raise ValueError(f"solve: steps is {steps}; it must be at least 0")
     with dr.suspend_grad():
-        return _solve(gaussians, image, steps, warm_start)
+        lists = bin_gaussians(gaussians)
+        target = to_tiles(types_of(gaussians.mean), np.asarray(image, np.float32), lists.grid)
+        start = _start(gaussians, image[None], warm_start)
+        return _solve(gaussians, lists, target, start, steps)
+
+
+def solve_batch(gaussians: Gaussians, images: NDArray[Any], steps: int = 10) -> Solution:
+    """Find the best colours and backgrounds for several images of one size at once.
+
+    Every image has its own step lengths, as in `solve`: its result does not depend on the others.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        The Gaussians of all images, image after image, equally many for each.
+    images : ndarray, shape (M, H, W, C)
+    steps : int, optional
+        Number of steps.
+
+    Returns
+    -------
+    Solution
+        The background of the set has one value for each image. The residuals are over all images.
+    """
+    with dr.suspend_grad():
+        lists = bin_gaussians(gaussians, images=len(images))
+        target = batch_to_tiles(types_of(gaussians.mean), images)
+        return _solve(gaussians, lists, target, _start(gaussians, images, False), steps)
 
 
 def inner_products(
@@ -114,70 +148,69 @@ def inner_products(
     """
     with dr.suspend_grad():
         types = types_of(gaussians.mean)
-        n = len(gaussians)
         lists = bin_gaussians(gaussians)
         delta = to_tiles(types, np.asarray(image, np.float32), lists.grid)
         shape = detached_shape(gaussians)
         product = _apply_squared if squared else _apply_transposed
         rows = product(shape, delta, image.shape[2], lists, gaussians.cutoff)
-        return np.stack([row.numpy()[:n] for row in rows], axis=1)
+        return np.stack([row.numpy() for row in rows[0]], axis=1)
 
 
-def _solve(gaussians: Gaussians, image: NDArray[Any], steps: int, warm_start: bool) -> Solution:
-    types = types_of(gaussians.mean)
-    n, channels = len(gaussians), gaussians.channels
-    lists, cutoff = bin_gaussians(gaussians), gaussians.cutoff
+Unknowns = tuple[list, list]
+"""Colours of all Gaussians and backgrounds of all images: a Float for each channel in both."""
+
+
+def _start(gaussians: Gaussians, images: NDArray[Any], warm: bool) -> Unknowns:
+    """Return the first unknowns: those of the set, or zero and the mean of each image."""
+    types, n = types_of(gaussians.mean), len(gaussians)
+    if warm:
+        color = [types.Float(c) + dr.zeros(types.Float, n) for c in gaussians.color]
+        return color, [types.Float(b) for b in gaussians.background]
+    means = images.mean(axis=(1, 2), dtype=np.float64).T
+    color = [dr.zeros(types.Float, n) for _ in means]
+    dr.make_opaque(color)
+    return color, [upload(types.Float, row) for row in means]
+
+
+def _solve(
+    gaussians: Gaussians, lists: TileLists, target: Any, x: Unknowns, steps: int
+) -> Solution:
+    types, cutoff = types_of(gaussians.mean), gaussians.cutoff
+    grid, channels = lists.grid, gaussians.channels
     shape = detached_shape(gaussians)
-    if warm_start:
-        x = [types.Float(c) + dr.zeros(types.Float, n) for c in gaussians.color]
-        constant = [types.Float(b) for b in gaussians.background]
-    else:
-        x = [dr.zeros(types.Float, n) for _ in range(channels)]
-        constant = [
-            dr.opaque(types.Float, m) for m in image.mean(axis=(0, 1), dtype=np.float64).tolist()
-        ]
-    unknowns = [dr.concat([c, b]) for c, b in zip(x, constant, strict=True)]
-    target = to_tiles(types, np.asarray(image, np.float32), lists.grid)
-    dr.eval(shape, unknowns)
+    dr.eval(shape, x)
 
-    error, squares = _apply(shape, unknowns, lists, cutoff, target)
-    del target  # images are what takes memory here
-    scale = 1 / image.size
-    residuals = [sum(dr.sum(s) for s in squares) * scale]
-    r = [-g for g in _apply_transposed(shape, error, channels, lists, cutoff)]
+    error, lanes = _apply(shape, x, lists, cutoff, target)
+    scale = 1 / (grid.width * grid.height * grid.images * channels)
+    residuals = [dr.sum(sum(sum_lanes(lanes, lists))) * scale]
+    r = _negate(_apply_transposed(shape, error, channels, lists, cutoff))
     inverse = _inverse_diagonal(shape, channels, lists, cutoff)
-    p = [a * b for a, b in zip(r, inverse, strict=True)]
-    rz = [dr.dot(a, b) for a, b in zip(r, p, strict=True)]
+    p = _multiply(r, inverse)
+    rz = _dots(r, p, grid)
     enough = [RELATIVE_TOLERANCE[types.bits] * a for a in rz]
-    noise = dr.opaque(types.Float, n * ROUNDING[types.bits] ** 2)
+    noise = dr.opaque(types.Float, len(gaussians) / grid.images * ROUNDING[types.bits] ** 2)
     dr.eval(p, rz, enough, residuals)
-    with freeze_program(
-        _step
-    ) as take_step:  # for this solve only: a program does not notice another number of Gaussians
+    # For this solve only: a program does not notice another number of Gaussians.
+    with freeze_program(_step) as take_step:
         for _ in range(steps):
-            unknowns, error, p, rz, square = take_step(
-                shape, unknowns, error, p, rz, enough, noise, inverse, lists, cutoff
+            x, error, p, rz, square = take_step(
+                shape, x, error, p, rz, enough, noise, inverse, lists, cutoff
             )
             residuals.append(square * scale)
-    index = dr.arange(types.UInt, n)
-    solved = replace(
-        gaussians,
-        color=types.FloatX([dr.gather(types.Float, u, index) for u in unknowns]),
-        background=types.FloatX([dr.gather(types.Float, u, types.UInt(n)) for u in unknowns]),
-    )
+    solved = replace(gaussians, color=types.FloatX(x[0]), background=types.FloatX(x[1]))
     dr.eval(solved)
     return Solution(solved, [math.sqrt(float(s[0])) for s in residuals])
 
 
 def _step(
     shape: list,
-    x: list,
+    x: Unknowns,
     error: Any,
-    p: list,
+    p: Unknowns,
     rz: list,
     enough: list,
     noise: Any,
-    inverse: list,
+    inverse: Unknowns,
     lists: TileLists,
     cutoff: float,
 ) -> tuple:
@@ -185,24 +218,64 @@ def _step(
 
     The error is ``A x - D``; it costs one pass over two images.
     """
-    Float = type(error)
-    channels = len(x)
-    q, squares = _apply(shape, p, lists, cutoff)
-    dr.eval(squares)
-    curvature = [dr.sum(s) for s in squares]
+    Float, grid, channels = type(error), lists.grid, len(rz)
+    q, lanes = _apply(shape, p, lists, cutoff)
+    curvature = sum_lanes(lanes, lists)
     # A channel that is solved except for rounding stops: its directions would grow without bound.
     alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, curvature, strict=True)]
-    x = [dr.fma(a, d, v) for a, d, v in zip(alpha, p, x, strict=True)]
-    error, squares = _add_scaled(error, q, alpha, lists.grid)
-    r = [-g for g in _apply_transposed(shape, error, channels, lists, cutoff)]
-    z = [a * b for a, b in zip(r, inverse, strict=True)]
-    new_rz = [dr.dot(a, b) for a, b in zip(r, z, strict=True)]
-    beta = [dr.select(a > 0, b / a, Float(0)) for a, b in zip(rz, new_rz, strict=True)]
-    p = [
-        dr.select(a > dr.maximum(least, noise * e), dr.fma(b, d, v), 0)
-        for a, least, e, b, d, v in zip(new_rz, enough, squares, beta, p, z, strict=True)
+    dr.eval(alpha)
+    x = _add_multiple(x, alpha, p, grid)
+    error, squares = _add_scaled(error, q, alpha, grid)
+    r = _negate(_apply_transposed(shape, error, channels, lists, cutoff))
+    z = _multiply(r, inverse)
+    new_rz = _dots(r, z, grid)
+    goes_on = [
+        a > dr.maximum(least, noise * e)
+        for a, least, e in zip(new_rz, enough, squares, strict=True)
     ]
-    return x, error, p, new_rz, sum(squares)
+    beta = [
+        dr.select(go & (a > 0), b / a, Float(0))
+        for go, a, b in zip(goes_on, rz, new_rz, strict=True)
+    ]
+    factor = [dr.select(go, Float(1), 0) for go in goes_on]
+    dr.eval(beta, factor)
+    p = _add_multiple(_add_multiple(([0.0] * channels,) * 2, factor, z, grid), beta, p, grid)
+    return x, error, p, new_rz, dr.sum(sum(squares))
+
+
+def _negate(x: Unknowns) -> Unknowns:
+    return [-v for v in x[0]], [-v for v in x[1]]
+
+
+def _multiply(x: Unknowns, y: Unknowns) -> Unknowns:
+    color, background = (
+        [a * b for a, b in zip(u, v, strict=True)] for u, v in zip(x, y, strict=True)
+    )
+    return color, background
+
+
+def _dots(x: Unknowns, y: Unknowns, grid: Grid) -> list:
+    """Return the inner products for each channel, Floats of shape (images,)."""
+    color, background = _multiply(x, y)
+    dr.eval(color)
+    return [sum_by_image(c, grid) + b for c, b in zip(color, background, strict=True)]
+
+
+def _add_multiple(x: Unknowns, factors: list, y: Unknowns, grid: Grid) -> Unknowns:
+    """Return ``x + factor y``; a factor has one value for each image."""
+    color = [
+        dr.fma(_spread(f, dr.width(b), grid), b, a)
+        for a, f, b in zip(x[0], factors, y[0], strict=True)
+    ]
+    return color, [dr.fma(f, b, a) for a, f, b in zip(x[1], factors, y[1], strict=True)]
+
+
+def _spread(values: Any, count: int, grid: Grid) -> Any:
+    """Repeat the value of each image for its part of `count` entries."""
+    if grid.images == 1:
+        return values
+    index = dr.arange(dr.uint32_array_t(type(values)), count) // (count // grid.images)
+    return dr.gather(type(values), values, index)
 
 
 def _add_scaled(image: Any, step: Any, factors: list, grid: Grid) -> tuple[Any, list]:
@@ -210,49 +283,48 @@ def _add_scaled(image: Any, step: Any, factors: list, grid: Grid) -> tuple[Any, 
     types, channels = types_of(image), len(factors)
     tile, length = dr.arange(types.UInt, grid.tiles), grid.pixels * channels
     old, change = (gather_run(types, v, tile, length, True) for v in (image, step))
-    scaled = zip(old, change, factors * grid.pixels, strict=True)
+    spread = [_spread(f, grid.tiles, grid) for f in factors]
+    scaled = zip(old, change, spread * grid.pixels, strict=True)
     new = [dr.fma(factor, c, v) for v, c, factor in scaled]
     result = dr.empty(types.Float, grid.tiles * length)
     dr.scatter(result, types.FloatX(new), tile)
     squares = sum_channels([dr.square(v) for v in new], channels)
     dr.eval(result, squares)
-    return result, [dr.sum(s) for s in squares]
+    return result, [sum_by_image(s, grid) for s in squares]
 
 
 def _apply(
-    shape: list, unknowns: list, lists: TileLists, cutoff: float, target: Any = None
+    shape: list, x: Unknowns, lists: TileLists, cutoff: float, target: Any = None
 ) -> tuple[Any, list]:
-    """Return ``A c - D`` and the sums of its squares; the last unknown is the background."""
-    types = types_of(shape[0])
-    n = dr.width(shape[0])
-    color = [dr.gather(types.Float, u, dr.arange(types.UInt, n)) for u in unknowns]
-    background = [dr.gather(types.Float, u, types.UInt(n)) for u in unknowns]
-    packed = pack_parameters([*shape, *color])
-    return residual(packed, background, lists, kernel_radius(cutoff), target)
+    """Return ``A x - D``, and for each lane the sums of its squares."""
+    packed = pack_parameters([*shape, *x[0]])
+    return residual(packed, x[1], lists, kernel_radius(cutoff), target)
 
 
 def _apply_transposed(
     shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float
-) -> list:
-    """Return ``A^T d``: correlations with every Gaussian and, last, the sum of every channel."""
+) -> Unknowns:
+    """Return ``A^T d``: correlations with every Gaussian, and the sum of every channel."""
     types = types_of(delta)
     packed = pack_parameters([*shape, *[types.Float(0)] * channels])
     color = adjoint(packed, delta, channels, lists, kernel_radius(cutoff), color_only=True)
-    totals = channel_sums(delta, channels, lists.grid)
-    return [dr.concat([c, t]) for c, t in zip(color, totals, strict=True)]
+    return color, channel_sums(delta, channels, lists.grid)
 
 
-def _inverse_diagonal(shape: list, channels: int, lists: TileLists, cutoff: float) -> list:
+def _inverse_diagonal(shape: list, channels: int, lists: TileLists, cutoff: float) -> Unknowns:
     """Return one over the diagonal of ``A^T A``: all channels have the same."""
     types = types_of(shape[0])
     packed = pack_parameters([*shape, types.Float(0)])
-    nothing = [types.Float(1)]
-    inside, _ = residual(packed, nothing, lists, kernel_radius(cutoff), None)
-    diagonal = _apply_squared(shape, inside, 1, lists, cutoff)[0]
-    return [dr.select(diagonal > 1e-8, rcp(diagonal), 0)] * channels
+    ones = dr.full(types.Float, 1, lists.grid.images)
+    inside, _ = residual(packed, [ones], lists, kernel_radius(cutoff), None)
+    diagonal = _apply_squared(shape, inside, 1, lists, cutoff)
+    color, background = ([dr.select(d > 1e-8, rcp(d), 0) for d in part] for part in diagonal)
+    return color * channels, background * channels
 
 
-def _apply_squared(shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float) -> list:
+def _apply_squared(
+    shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float
+) -> Unknowns:
     """Apply `_apply_transposed` with ``w^2``, the weight of a Gaussian narrower by sqrt 2."""
     root = math.sqrt(2)
     narrow = [*shape[:2], *[f * root for f in shape[2:NUM_SHAPE_PARAMS]]]
