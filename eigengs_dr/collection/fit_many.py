@@ -18,14 +18,16 @@ from ..fitting.fit import Fit, fit_image
 from ..fitting.levels import check_options, fit_levels
 from ..fitting.options import DEFAULT_BASIS, FitOptions
 from ..image.metrics import float_space, psnr
+from .fit_batch import fit_batch, fits_in_batches
 from .run import FAILURES, Finished, ImageRow, Outcome, RowProgress, collect, run_images
 from .sources import Images
 
 MAX_GROUP_SIDE = 256
 """Longer side, in pixels, of the largest images that are fitted in groups."""
 
-MAX_GROUP_PIXELS = 1 << 20
-"""Largest number of pixels of a group: 16 images of 256x256, or 256 of 64x64."""
+MAX_GROUP_PIXELS = 1 << 18
+"""Largest number of pixels of a group: 4 images of 256x256, or 64 of 64x64. Larger groups are not
+faster, and an interrupt loses the group under way."""
 
 LOAD_BASIS = "eigengs_dr.eigenbasis.registry:load_basis"
 """The loader of bases, ``module:function``; its module is imported when a fit needs it."""
@@ -93,7 +95,10 @@ def fit_many(
 
     Notes
     -----
-    Each result equals the result of `eigengs_dr.fit` for this image, bit for bit.
+    Small images of one size that follow each other are fitted in groups, see
+    `eigengs_dr.collection.fit_batch`. A result does not depend on the other images of its group,
+    and equals the result of `eigengs_dr.fit` except for rounding. Images of more than 256 pixels a
+    side, and fits from a basis or with a target PSNR, are fitted alone, with equal bits.
 
     Examples
     --------
@@ -132,20 +137,32 @@ def fit_each(
 
 def _may_join(group: list[Pixels], pixels: Pixels) -> bool:
     """Group small images of one size, up to `MAX_GROUP_PIXELS`."""
-    height, width, _ = pixels.shape
-    enough = (len(group) + 1) * height * width > MAX_GROUP_PIXELS
-    return group[0].shape == pixels.shape and max(height, width) <= MAX_GROUP_SIDE and not enough
+    enough = (len(group) + 1) * pixels.shape[0] * pixels.shape[1] > MAX_GROUP_PIXELS
+    return group[0].shape == pixels.shape and _is_small(pixels) and not enough
+
+
+def _is_small(pixels: Pixels) -> bool:
+    return max(pixels.shape[:2]) <= MAX_GROUP_SIDE
 
 
 def _fit_group(
     images: list[Pixels], options: FitOptions, levels: int | None, step: Step | None
 ) -> Iterator[Outcome]:
-    """Fit images of one size, one after the other."""
+    """Fit images of one size, together if they are small."""
 
     def progress(iteration: int, iterations: int, row: dict[str, Any]) -> None:
         if step:
             step(iteration / max(1, iterations))
 
+    if levels is None and _is_small(images[0]) and fits_in_batches(options):
+        try:
+            results = fit_batch(np.stack(images), options, step)
+        except FAILURES:
+            pass  # below, each image says what is wrong with it
+        else:
+            for pixels, result in zip(images, results, strict=True):
+                yield Outcome(result.gaussians, result, _figures(pixels, result, options.color))
+            return
     for pixels in images:
         try:
             result = _fit_one(pixels, options, levels, progress)

@@ -75,7 +75,9 @@ class FitProblem(NamedTuple):
     gaussians : Gaussians
         The set before the first step.
     target : ndarray of float32, shape (H, W, C)
-        The image in the space of the set, minus the mean image if the mean image stays pixels.
+        The image in the space of the set, minus the mean image if the mean image stays pixels. For
+        a batch, (M, H, W, C): the set holds the Gaussians of all images, image after image, and
+        its background has M values.
     weight : ndarray of float32, shape (H, W, C), or None
         Factor of the errors before squaring.
     base_image : ndarray of float32, shape (H, W, 3), or None

@@ -101,18 +101,23 @@ def redistribute(
         The new set. It keeps no Gaussian of the old set.
     """
     error = squared_error(residual(gaussians, target), weight)
-    old = gaussians.to_arrays()["mean"]
+    density = density_for_error(gaussians.to_arrays()["mean"], error)
+    return place_like(gaussians, image, target, count, density, solve_steps)
+
+
+def density_for_error(mean: Array, error: NDArray[np.float32]) -> Density:
+    """Return the density of a new set for the means (N, 2) and the error (H, W) of the old set."""
 
     def density(default: Array) -> Array:
         height, width = default.shape
         if (height, width) == error.shape:
-            return target_density(old, error, default)
+            return target_density(mean, error, default)
         # The placement shrinks the image.
-        there = old * np.array([width / gaussians.width, height / gaussians.height])
+        there = mean * np.array([width / error.shape[1], height / error.shape[0]])
         here = np.maximum(resample(error[..., None], width, height)[..., 0], 0)
         return target_density(there, here, default)
 
-    return place_like(gaussians, image, target, count, density, solve_steps)
+    return density
 
 
 def place_like(

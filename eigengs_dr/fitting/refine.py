@@ -105,7 +105,7 @@ def refine(
                     progress(step, iterations, trace[-1])
                 if interrupted():
                     break
-                if step in marks and _is_plateau(trace, schedule):
+                if step in marks and is_plateau(trace, schedule):
                     stopped = "plateau"
                     break
         if interrupted():
@@ -134,7 +134,7 @@ def measure(
     }
 
 
-def _is_plateau(trace: list[dict[str, Any]], schedule: Schedule) -> bool:
+def is_plateau(trace: list[dict[str, Any]], schedule: Schedule) -> bool:
     """Return whether the last `patience` steps gained less than `least_gain` decibels."""
     last = trace[-1]
     if last["psnr_ycbcr"] > MAX_PSNR:

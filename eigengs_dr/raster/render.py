@@ -274,7 +274,12 @@ def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
 
 
 def batch_to_tiles(types: ArrayTypes, images: NDArray[Any]) -> Any:
-    """Upload images (M, height, width, channels) in tile layout, image after image."""
+    """Upload images (M, height, width, channels) in tile layout, image after image.
+
+    An image (height, width, channels) is a batch of one.
+    """
+    if images.ndim == 3:
+        return to_tiles(types, images, Grid(images.shape[1], images.shape[0]))
     grid = Grid(images.shape[2], images.shape[1])
     return dr.concat([to_tiles(types, image, grid) for image in images])
 

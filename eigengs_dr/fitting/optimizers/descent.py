@@ -20,7 +20,7 @@ from ...raster.kernels import adjoint_pieces, residual, sum_lanes, sum_pieces
 from ...raster.layout import pack_parameters
 from ...raster.lists import TileLists
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
-from ...raster.render import bin_gaussians, to_tiles
+from ...raster.render import batch_to_tiles, bin_gaussians
 from ...raster.tiles import Grid
 from ..initializers import FitProblem
 from .parameterization import Parameterization
@@ -103,11 +103,12 @@ def _run_phase(
 ) -> Generator[Gaussians, None, None]:
     """Yield the set after every step of one phase."""
     fixed = problem.gaussians
-    types, grid = types_of(fixed.mean), Grid(fixed.width, fixed.height)
+    types = types_of(fixed.mean)
+    images = len(problem.target) if problem.target.ndim == 4 else 1
     dr.flush_malloc_cache()  # what the colour solve took would stay reserved
     state, variables = start_descent(fixed, schedule), schedule.variables()
-    target = to_tiles(types, problem.target, grid)
-    weight = None if problem.weight is None else to_tiles(types, problem.weight, grid)
+    target = batch_to_tiles(types, problem.target)
+    weight = None if problem.weight is None else batch_to_tiles(types, problem.weight)
     factors = [lr_factor(schedule, step, iterations) for step in range(iterations)]
     rates = rate_table(types, schedule, factors)
     stop = 0
@@ -118,7 +119,9 @@ def _run_phase(
                 pad, growth = variables.reach(state.gaussians, moves)
                 counts, lists = (*levels, len(fixed)), []  # old lists make room for new ones
                 lists = [
-                    bin_gaussians(prefix(state.gaussians, n), _prefix(pad, n), growth)
+                    bin_gaussians(
+                        prefix(state.gaussians, n), _prefix(pad, n), growth, images=images
+                    )
                     for n in counts
                 ]
             index = dr.opaque(types.UInt, step)

@@ -1,0 +1,254 @@
+"""Fits of several images of one size in one program.
+
+The Gaussians of all images are one set, image after image, and the tiles of all images are one
+list of tiles. A small image alone would wait for launches most of the time.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pkgutil import resolve_name
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from ..backend.arrays import types_of
+from ..backend.interrupt import defer_interrupts
+from ..backend.recording import exclusive
+from ..fitting.fit import Fit
+from ..fitting.initializers import PLACEMENTS, FitProblem, FitTarget, Placement, make_target
+from ..fitting.optimizers.descent import descend
+from ..fitting.options import FitOptions
+from ..fitting.placement.adaptive import place_adaptive
+from ..fitting.redistribute import density_for_error, squared_error
+from ..fitting.refine import is_plateau, trace_steps
+from ..fitting.solvers.conjugate_gradient import solve_batch
+from ..gaussian.gaussians import Gaussians
+from ..image.color import to_coded
+from ..image.metrics import float_space, psnr
+from ..raster.kernels import forward
+from ..raster.layout import pack_parameters
+from ..raster.parameters import kernel_parameters, kernel_radius
+from ..raster.render import batch_from_tiles, bin_gaussians, decode_parameters
+
+Images = NDArray[np.float32]
+
+
+def fits_in_batches(options: FitOptions) -> bool:
+    """Return whether `fit_batch` takes these options: a placement, a colour solve and no search."""
+    return (
+        options.initializer in PLACEMENTS and options.method.solves and options.target_psnr is None
+    )
+
+
+@exclusive()
+def fit_batch(
+    images: Images, options: FitOptions, progress: Callable[[float], None] | None = None
+) -> list[Fit]:
+    """Fit several images of one size together.
+
+    Parameters
+    ----------
+    images : ndarray of float32, shape (M, H, W, C)
+        Images from `eigengs_dr.image.io.check_image`.
+    options : FitOptions
+        Options for which `fits_in_batches` is true.
+    progress : callable, optional
+        ``progress(share)`` every 10 steps, with the share of the steps that are done.
+
+    Returns
+    -------
+    list of Fit
+        The results of `eigengs_dr.fit` except for rounding. A result does not depend on the other
+        images. The seconds are an equal share of the whole time.
+
+    Raises
+    ------
+    ValueError
+        If the options do not fit the size of the images.
+    KeyboardInterrupt
+        After Ctrl-C or SIGTERM; there is no result then.
+    """
+    started = time.perf_counter()
+    options.check_image(images[0])
+    schedule, marks = options.method.schedule, trace_steps(options.iterations)
+    problem = _start(images, options)
+    seconds_init = time.perf_counter() - started
+    records = [_Record() for _ in images]
+    with (
+        defer_interrupts() as interrupted,
+        closing(descend(problem, schedule, options.iterations)) as sets,
+    ):
+        for step, reached in enumerate(sets):
+            if step in marks:
+                seconds = (time.perf_counter() - started) / len(images)
+                for record, shown, pixels in zip(
+                    records, _pictures(reached, len(images)), images, strict=True
+                ):
+                    if record.stopped != "plateau":
+                        record.judge(step, seconds, reached, shown, pixels, schedule)
+                if all(record.stopped == "plateau" for record in records):
+                    break
+            if step % 10 == 0:
+                dr.sync_thread()
+                if progress:
+                    progress(step / max(1, options.iterations))
+            if interrupted():
+                raise KeyboardInterrupt
+    share = (time.perf_counter() - started) / len(images)
+    return _results(records, share, seconds_init / len(images))
+
+
+@dataclass
+class _Record:
+    """The trace and the best set of one image."""
+
+    trace: list[dict[str, Any]] = field(default_factory=list)
+    highest: float = -math.inf
+    best: Gaussians | None = None
+    picture: Images | None = None
+    stopped: str = "iterations"
+
+    def judge(
+        self,
+        step: int,
+        seconds: float,
+        reached: Gaussians,
+        shown: Images,
+        pixels: Images,
+        schedule: Any,
+    ) -> None:
+        """Add a row to the trace, keep the best set, and notice a plateau."""
+        figures = {
+            "iteration": step,
+            "seconds": seconds,
+            "psnr_ycbcr": psnr(shown, pixels, space=float_space(reached.space)),
+            "psnr_rgb": psnr(shown, pixels, space="rgb"),
+        }
+        self.trace.append(figures)
+        if figures["psnr_ycbcr"] > self.highest:
+            self.best, self.highest, self.picture = reached, figures["psnr_ycbcr"], shown
+        if is_plateau(self.trace, schedule):
+            self.stopped = "plateau"
+
+
+def _start(images: Images, options: FitOptions) -> FitProblem:
+    """Place the Gaussians of every image, and solve for the colours of all of them."""
+    place: Placement = resolve_name(PLACEMENTS[options.initializer])
+    targets = [make_target(pixels, options.color) for pixels in images]
+    shown = [_shown(t, options) for t in targets]
+    count = options.count_for(images[0])
+    placed = [place(s, count, np.random.default_rng(options.seed)) for s in shown]
+    values = np.stack([t.values for t in targets])
+    weights = [t.weight for t in targets if t.weight is not None]
+    weight = np.stack(weights) if weights else None
+    like = _stack(placed, values.shape, options)
+    start = solve_batch(like, values, options.solve_steps).gaussians
+    anew = partial(_redistribute, shown=shown, values=values, weight=weight, options=options)
+    again = anew if options.initializer == "adaptive" else None
+    return FitProblem(start, values, weight, redistribute=again)
+
+
+def _shown(target: FitTarget, options: FitOptions) -> Images:
+    """Return the image that shapes the Gaussians; linear light would neglect dark parts."""
+    return target.pixels if options.color == "linear" else target.values
+
+
+def _stack(placed: list, shape: tuple[int, ...], options: FitOptions) -> Gaussians:
+    """Return the Gaussians of all images as one set, without colours."""
+    mean, factor = (np.concatenate(parts) for parts in zip(*placed, strict=True))
+    return Gaussians.from_arrays(
+        mean,
+        factor,
+        np.zeros((len(mean), shape[3]), np.float32),
+        size=(shape[2], shape[1]),
+        space=options.color,
+        backend=options.backend,
+        cutoff=options.cutoff,
+    ).bounded()
+
+
+def _redistribute(
+    gaussians: Gaussians,
+    count: int,
+    *,
+    shown: list[Images],
+    values: Images,
+    weight: Images | None,
+    options: FitOptions,
+) -> Gaussians:
+    """Place all sets anew, as `eigengs_dr.fitting.redistribute.redistribute` does for one."""
+    missed = values - _sum(replace(gaussians, space="data"), len(values))
+    means = _numpy(gaussians.mean).reshape(len(values), -1, 2)
+    placed = []
+    for k, image in enumerate(shown):
+        error = squared_error(missed[k], None if weight is None else weight[k])
+        density = density_for_error(means[k], error)
+        placed.append(place_adaptive(image, count // len(values), density=density))
+    return solve_batch(_stack(placed, values.shape, options), values, options.solve_steps).gaussians
+
+
+def _pictures(gaussians: Gaussians, images: int) -> Images:
+    """Render all images for display: as `eigengs_dr.raster.render.picture_of` does one."""
+    shown = _sum(gaussians, images)
+    return to_coded(np.maximum(shown, 0)) if gaussians.space == "linear" else shown
+
+
+def _sum(gaussians: Gaussians, images: int) -> Images:
+    """Render all images: RGB for a set in YCbCr."""
+    plain = gaussians.space == "data"
+    parameters = kernel_parameters(gaussians) if plain else decode_parameters(gaussians)
+    lists = bin_gaussians(gaussians, adjoint=False, images=images)
+    packed = pack_parameters([*parameters.shape, *parameters.color])
+    radius = kernel_radius(gaussians.cutoff)
+    image = forward(packed, parameters.background, lists, radius)
+    return batch_from_tiles(image, lists.grid, len(parameters.background))
+
+
+def _numpy(rows: Any) -> NDArray[Any]:
+    """Return nested Dr.Jit arrays as the columns of a NumPy array."""
+    return np.stack([row.numpy() for row in rows], axis=1)
+
+
+def _results(records: list[_Record], seconds: float, seconds_init: float) -> list[Fit]:
+    """Cut the best set of every image out of the sets of all images."""
+    arrays: dict[int, dict[str, NDArray[Any]]] = {}
+    results = []
+    for k, record in enumerate(records):
+        best, picture = record.best, record.picture
+        assert best is not None and picture is not None
+        if id(best) not in arrays:  # `records` keeps every set, so that an id stays its own
+            names = ("mean", "factor", "color", "background")
+            arrays[id(best)] = {name: _numpy(getattr(best, name)) for name in names}
+        found = arrays[id(best)]
+        count = len(found["mean"]) // len(records)
+        mine = slice(k * count, (k + 1) * count)
+        gaussians = Gaussians.from_arrays(
+            found["mean"][mine],
+            found["factor"][mine],
+            found["color"][mine],
+            found["background"][k],
+            size=(best.width, best.height),
+            space=best.space,
+            backend=types_of(best.mean).backend,
+            cutoff=best.cutoff,
+        )
+        results.append(
+            Fit(
+                gaussians=gaussians,
+                trace=record.trace,
+                image=picture,
+                seconds=seconds,
+                seconds_init=seconds_init,
+                iterations=record.trace[-1]["iteration"],
+                stopped=record.stopped,
+            )
+        )
+    return results
