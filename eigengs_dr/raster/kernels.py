@@ -354,10 +354,10 @@ def sum_pieces(parts: Any, pieces: Pieces, number: int, splat: Any = None) -> li
 
 
 def sum_lanes(values: list, lists: TileLists) -> list:
-    """Add values of the lanes of `residual` for each image; return Floats of shape (images,)."""
-    dr.eval(values)
-    if lists.grid.images == 1:
-        return [dr.sum(v) for v in values]
+    """Add values of the lanes of `residual` for each image; return Floats of shape (images,).
+
+    The sums run in the order of tiles, not of lanes: a sum does not depend on other images.
+    """
     run = _blocks(types_of(values[0]), lists).run
     rows = [dr.empty(type(v), dr.width(v)) for v in values]
     for row, v in zip(rows, values, strict=True):
