@@ -78,8 +78,8 @@ class TileLists:
     capacity : int
         Size of `splat`, for the same reason as in `Pieces`.
     steep : bool
-        Whether weights need exponentials at every pixel, because a Gaussian is too narrow or a tile
-        is not 4 pixels wide; see `eigengs_dr.raster.evaluate.weights`.
+        Whether weights take exponentials at every pixel, because a Gaussian is too narrow, a tile
+        is not 4 pixels wide or exponentials cost less; see `eigengs_dr.raster.evaluate.weights`.
     """
 
     grid: Grid
@@ -135,13 +135,13 @@ def build_lists(
     wide = dr.opaque(types.Float, radius * growth)
     pad = dr.opaque(types.Float, pad) if isinstance(pad, float) else pad
     touched = _count_tiles(types, shape, wide, grid, pad)
-    visits, UInt64 = granularity_of(types).visits, dr.uint64_array_t(types.UInt)
-    number = (touched + (visits - 1)) // visits
+    share, UInt64 = granularity_of(types), dr.uint64_array_t(types.UInt)
+    number = (touched + (share.visits - 1)) // share.visits
     # One prefix sum for the tiles and the pieces: each sum fits into 32 bits.
     both = dr.fma(UInt64(number), 1 << 32, UInt64(touched))
     dr.schedule(touched, number, both)  # in the kernel of the sum
     entries, steep = _read_totals(types, touched, is_steep(shape, radius) & (touched > 0))
-    steep = steep or grid.tile[0] != TILE[0]
+    steep = steep or not share.products or grid.tile[0] != TILE[0]
     if entries >= MAX_LIST_ENTRIES:
         raise ValueError(
             f"{dr.width(touched)} Gaussians touch {entries} tiles, the limit is "

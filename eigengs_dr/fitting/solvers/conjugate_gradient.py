@@ -166,7 +166,7 @@ def _solve(gaussians: Gaussians, image: NDArray[Any], steps: int, warm_start: bo
         background=types.FloatX([dr.gather(types.Float, u, types.UInt(n)) for u in unknowns]),
     )
     dr.eval(solved)
-    return Solution(solved, [math.sqrt(float(s[0])) for s in residuals])
+    return Solution(solved, np.sqrt(dr.concat(residuals).numpy()).tolist())  # one copy to the host
 
 
 def _step(
