@@ -8,6 +8,7 @@ channel after channel. A lane then reads or writes one contiguous run with packe
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -69,7 +70,7 @@ def _blocks(types: ArrayTypes, lists: TileLists) -> _Blocks:
 
 def _shares(types: ArrayTypes, grid: Grid) -> tuple[int, int]:
     """Return the rows of a block, and the number of blocks of a tile."""
-    rows = min(granularity_of(types).rows, grid.tile[1])
+    rows = math.gcd(granularity_of(types).rows, grid.tile[1])
     return rows, grid.tile[1] // rows
 
 
