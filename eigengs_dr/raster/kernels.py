@@ -348,13 +348,14 @@ def sum_pieces(parts: Any, pieces: Pieces, number: int, splat: Any = None) -> li
     if splat is None:
         splat = dr.arange(types.UInt, count)
     known = splat < count
-    shares = dr.width(parts) // (-(-number // 4) * 4 * dr.width(pieces.slot))
-    begin = dr.gather(types.UInt, pieces.first, splat, known) * shares
-    end = begin + dr.gather(types.UInt, pieces.number, splat, known) * shares
+    begin = dr.gather(types.UInt, pieces.first, splat, known)
+    end = begin + dr.gather(types.UInt, pieces.number, splat, known)
+    length = dr.width(parts) // dr.width(pieces.slot)  # of the shares of all lanes of a piece
+    stride = -(-number // 4) * 4
 
     def add(i: Any, sums: list) -> tuple:
-        values = unpack_parameters(parts, i, number, i < end)
-        return i + 1, [s + v for s, v in zip(sums, values, strict=True)]
+        values = gather_run(types, parts, i, length, i < end)
+        return i + 1, [sum(values[k::stride], s) for k, s in enumerate(sums)]
 
     sums: list = dr.while_loop(
         (begin, [types.Float(0) for _ in range(number)]),
