@@ -8,6 +8,7 @@ channel after channel. A lane then reads or writes one contiguous run with packe
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -57,9 +58,8 @@ class _Blocks(NamedTuple):
 
 def _blocks(types: ArrayTypes, lists: TileLists) -> _Blocks:
     """Divide every tile into blocks of `Granularity.rows` rows, one for each lane."""
-    width, height = lists.grid.tile
-    rows = min(granularity_of(types).rows, height)
-    parts = height // rows
+    width, _ = lists.grid.tile
+    rows, parts = _shares(types, lists.grid)
     tile, begin, end, part = lists.order, lists.begin, lists.end, types.UInt(0)
     if parts > 1:  # neighbouring lanes share a tile, and write one contiguous run together
         lane = dr.arange(types.UInt, lists.grid.tiles * parts)
@@ -68,6 +68,12 @@ def _blocks(types: ArrayTypes, lists: TileLists) -> _Blocks:
     column, row = lists.grid.first_pixel(tile)
     x, y = types.Float(column) + 0.5, types.Float(row + part * rows) + 0.5
     return _Blocks(tile * parts + part, tile, x, y, begin, end, (width, rows))
+
+
+def _shares(types: ArrayTypes, grid: Grid) -> tuple[int, int]:
+    """Return the rows of a block, and the number of blocks of a tile."""
+    rows = math.gcd(granularity_of(types).rows, grid.tile[1])
+    return rows, grid.tile[1] // rows
 
 
 def _sum_blocks(
@@ -268,21 +274,32 @@ def adjoint_pieces(
 ) -> Any:
     """Return the packed sums of every piece, for `sum_pieces`; parameters as for `adjoint`.
 
-    Cost per visit of a tile: a gather of delta, 6 exponentials, and per pixel 2 operations for the
-    weight, 2 for the cutoff, 2 per channel and 5 for the shape.
+    A lane owns the same rows of all tiles of its piece, see `Granularity.rows`. Cost per visit of
+    4x4 pixels: a gather of delta, 6 exponentials, and per pixel 2 operations for the weight, 2 for
+    the cutoff, 2 per channel and 5 for the shape.
     """
     types = types_of(packed)
     grid, pieces, tile_size = lists.grid, lists.pieces, lists.grid.tile
     assert pieces is not None
-    splat = unpack_parameters(packed, pieces.splat, NUM_SHAPE_PARAMS + channels)
-    shape, length = splat[:NUM_SHAPE_PARAMS], grid.pixels * channels
+    rows, shares = _shares(types, grid)
+    index, begin, end, slot = pieces.splat, pieces.begin, pieces.end, pieces.slot
+    part = types.UInt(0)
+    if shares > 1:  # neighbouring lanes visit the same tiles, and read one contiguous run together
+        lane = dr.arange(types.UInt, dr.width(slot) * shares)
+        part, owner = lane % shares, lane // shares
+        index, begin, end, slot = (
+            dr.gather(types.UInt, v, owner) for v in (index, begin, end, slot)
+        )
+    splat = unpack_parameters(packed, index, NUM_SHAPE_PARAMS + channels)
+    shape, block = splat[:NUM_SHAPE_PARAMS], (tile_size[0], rows)
+    length = block[0] * rows * channels
 
     def add_tile(i: Any, sums: list) -> tuple:
-        active = i < pieces.end
+        active = i < end
         tile = gather_index(types, pieces.tile, i, active)
-        d = gather_run(types, delta, tile, length, active)
+        d = gather_run(types, delta, tile * shares + part, length, active)
         column, row = grid.first_pixel(tile)
-        x, y = types.Float(column) + 0.5, types.Float(row) + 0.5
+        x, y = types.Float(column) + 0.5, types.Float(row + part * rows) + 0.5
         color = sums[-channels:]
 
         def cotangent(k: int, w: Any) -> Any:
@@ -293,24 +310,24 @@ def adjoint_pieces(
             return g
 
         if color_only:
-            for k, w in enumerate(weights(shape, x, y, tile_size, radius, lists.steep)):
+            for k, w in enumerate(weights(shape, x, y, block, radius, lists.steep)):
                 cotangent(k, w)
             return i + 1, color
-        gradient = weights_vjp(shape, x, y, tile_size, radius, cotangent, lists.steep)
+        gradient = weights_vjp(shape, x, y, block, radius, cotangent, lists.steep)
         return i + 1, [s + g for s, g in zip(sums, gradient, strict=False)] + color
 
     number = channels if color_only else NUM_SHAPE_PARAMS + channels
     sums = dr.while_loop(
-        (types.UInt(pieces.begin), [types.Float(0) for _ in range(number)]),
-        lambda i, sums: i < pieces.end,
+        (types.UInt(begin), [types.Float(0) for _ in range(number)]),
+        lambda i, sums: i < end,
         add_tile,
         label="pull back",
         max_iterations=-1,
     )[-1]
     stride = -(-number // 4) * 4
-    parts = dr.empty(types.Float, stride * dr.width(pieces.slot))
+    parts = dr.empty(types.Float, stride * shares * dr.width(pieces.slot))
     values = [*sums, *[types.Float(0)] * (stride - number)]
-    dr.scatter(parts, types.FloatX(values), pieces.slot)
+    dr.scatter(parts, types.FloatX(values), slot * shares + part)
     return parts
 
 
@@ -332,16 +349,18 @@ def sum_pieces(parts: Any, pieces: Pieces, number: int, splat: Any = None) -> li
     list of `number` Float
     """
     types = types_of(parts)
-    count = dr.width(pieces.first) - 1
+    count = dr.width(pieces.first)
     if splat is None:
         splat = dr.arange(types.UInt, count)
     known = splat < count
     begin = dr.gather(types.UInt, pieces.first, splat, known)
-    end = dr.gather(types.UInt, pieces.first, splat + 1, known)
+    end = begin + dr.gather(types.UInt, pieces.number, splat, known)
+    length = dr.width(parts) // dr.width(pieces.slot)  # of the shares of all lanes of a piece
+    stride = -(-number // 4) * 4
 
     def add(i: Any, sums: list) -> tuple:
-        values = unpack_parameters(parts, i, number, i < end)
-        return i + 1, [s + v for s, v in zip(sums, values, strict=True)]
+        values = gather_run(types, parts, i, length, i < end)
+        return i + 1, [sum(values[k::stride], s) for k, s in enumerate(sums)]
 
     sums: list = dr.while_loop(
         (begin, [types.Float(0) for _ in range(number)]),

@@ -215,7 +215,7 @@ def pairs_by_splat(lists):
     tile, splat, begin, end = (
         getattr(pieces, k).numpy().astype(int) for k in ("tile", "splat", "begin", "end")
     )
-    found = np.zeros((lists.grid.tiles, dr.width(pieces.first) - 1), int)
+    found = np.zeros((lists.grid.tiles, dr.width(pieces.first)), int)
     for n, i, j in zip(splat, begin, end, strict=True):
         np.add.at(found[:, n], tile[i:j], 1)
     return found, end - begin
@@ -239,9 +239,12 @@ def test_pieces_are_the_transpose(backend, scene, pad, growth):
     assert found.max(initial=0) <= 1
     np.testing.assert_array_equal(found, pairs_by_tile(lists, len(scene.mean)))
     assert visits.max(initial=0) <= GRANULARITY[backend].visits
-    slot, first = lists.pieces.slot.numpy(), lists.pieces.first.numpy().astype(int)
+    slot, first, number = (
+        getattr(lists.pieces, k).numpy().astype(int) for k in ("slot", "first", "number")
+    )
     assert sorted(slot) == list(range(len(slot)))
-    owner = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    np.testing.assert_array_equal(first, np.cumsum(number) - number)
+    owner = np.repeat(np.arange(len(number)), number)
     splat = np.empty(len(slot), int)
     splat[slot] = lists.pieces.splat.numpy()
     np.testing.assert_array_equal(splat[: len(owner)], owner)

@@ -199,7 +199,7 @@ def _solve(
             residuals.append(square * scale)
     solved = replace(gaussians, color=types.FloatX(x[0]), background=types.FloatX(x[1]))
     dr.eval(solved)
-    return Solution(solved, [math.sqrt(float(s[0])) for s in residuals])
+    return Solution(solved, np.sqrt(dr.concat(residuals).numpy()).tolist())  # one copy to the host
 
 
 def _step(
