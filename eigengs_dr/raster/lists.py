@@ -12,22 +12,19 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, types_of, upload
 from .evaluate import is_steep
 from .granularity import granularity_of
+from .lanes import order_lanes
 from .tiles import TILE, Grid, for_each_row, for_each_tile
-from .transpose import transpose_by_counting, transpose_by_sorting, transpose_pattern
+from .transpose import transpose_by_counting, transpose_by_sorting
 
 MAX_LIST_ENTRIES = 1 << 28
 """Largest number of entries in the lists of all tiles; they take 4 GiB while they are built."""
 
 TILE_WINDOW = 32
 """Side in tiles of the squares within which tiles are ordered by the length of their lists."""
-
-PACKET = 16
-"""Lanes of a SIMD packet; those of AVX-512."""
 
 PIECE_WINDOW = 2048
 """Pieces among which the pieces are ordered by their length."""
@@ -227,43 +224,8 @@ def _lanes(types: ArrayTypes, grid: Grid, starts: Any) -> tuple[Any, Any, Any]:
         window = (x + y[:, None] * (x[-1] + 1)).ravel()
         per_image = window[-1] + 1
         window = (window + per_image * np.arange(grid.images)[:, None]).ravel()
-        tile = upload(types.UInt, _order(length, window))
+        tile = upload(types.UInt, order_lanes(length, window))
     return tile, dr.gather(types.UInt, starts, tile), dr.gather(types.UInt, starts, tile + 1)
-
-
-def _order(length: NDArray[np.int64], window: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Return the order of lanes: like lengths in a packet, and packets dealt out evenly."""
-    order = _descending(length, window)
-    return order[_deal(length[order])]
-
-
-def _deal(length: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return an order of lanes that spreads empty packets evenly among the others.
-
-    Dr.Jit cuts a launch on llvm into blocks of neighbouring lanes, two for each core. Pieces leave
-    a tenth to a third of their lanes empty, all at the end: the last block would have no work. In
-    simulation, the longest thread had 1.27 times the mean work on 2 cores, 1.46 times on 16 and
-    1.51 times on 64; dealt out 1.01, 1.10 and 1.15 times (512x512, 20,000 Gaussians).
-    """
-    count = len(length) // PACKET * PACKET
-    full = length[:count].reshape(-1, PACKET).any(axis=1)
-    place = np.empty(len(full))
-    for kind in (full, ~full):
-        place[kind] = (np.arange(kind.sum()) + 0.5) / max(1, kind.sum())
-    packets = np.argsort(place, kind="stable")
-    lanes = (packets[:, None] * PACKET + np.arange(PACKET)).ravel()
-    return np.concatenate([lanes, np.arange(count, len(length))])
-
-
-def _descending(length: NDArray[np.int64], window: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Return the stable order by window, then by descending length."""
-    levels = int(length.max(initial=0)) + 1
-    keys = window * levels + (levels - 1 - length)
-    starts = np.arange(len(keys) + 1, dtype=np.int32)
-    order: NDArray[np.int32] = transpose_pattern(
-        keys.astype(np.int32), starts, (int(window.max()) + 1) * levels
-    ).indices
-    return order.view(np.uint32)
 
 
 def _cut(types: ArrayTypes, tile: Any, tiles: tuple, slots: tuple, entries: int) -> Pieces:
@@ -301,6 +263,6 @@ def _cut(types: ArrayTypes, tile: Any, tiles: tuple, slots: tuple, entries: int)
     slot = dr.arange(types.UInt, capacity)
     if granularity_of(types).ordered:
         lengths = (end - begin).numpy().astype(np.int64)
-        slot = upload(types.UInt, _order(lengths, np.arange(capacity) // PIECE_WINDOW))
+        slot = upload(types.UInt, order_lanes(lengths, np.arange(capacity) // PIECE_WINDOW))
         splat, begin, end = (dr.gather(types.UInt, v, slot) for v in (splat, begin, end))
     return Pieces(tile, splat, begin, end, slot, first, number, (dr.width(tile), capacity))

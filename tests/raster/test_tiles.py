@@ -14,7 +14,7 @@ from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, 
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.granularity import GRANULARITY
-from eigengs_dr.raster.lists import _descending, build_lists
+from eigengs_dr.raster.lists import build_lists
 from eigengs_dr.raster.tiles import TILE, Grid, for_each_tile
 
 RADIUS = 3.0
@@ -196,17 +196,6 @@ def test_lanes_are_all_tiles_by_length_within_windows(backend):
         assert (np.diff(length) <= 0).all()
     else:
         np.testing.assert_array_equal(lists.order.numpy(), np.arange(lists.grid.tiles))
-
-
-def test_windows_keep_neighbours_together():
-    window = np.repeat([0, 1, 2], 50)
-    length = np.random.default_rng(0).integers(0, 9, 150)
-    order = _descending(length, window)
-    np.testing.assert_array_equal(window[order], window)
-    for part in np.split(length[order], 3):
-        assert (np.diff(part) <= 0).all()
-    again = np.lexsort((np.arange(150), -length, window))
-    np.testing.assert_array_equal(order, again)
 
 
 def pairs_by_splat(lists):
