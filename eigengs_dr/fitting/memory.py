@@ -13,17 +13,18 @@ largest resident memory of processes that fit a mosaic of photos with the backen
 
 | image | channels | Gaussians | measured | estimated |
 |---|---|---|---|---|
-| 512x512 | 3 | 20,000 | 0.23 GB | 0.24 GB |
-| 2,048x2,048 | 3 | 20,000 | 0.79 GB | 0.80 GB |
-| 2,048x2,048 | 3 | 320,000 | 1.03 GB | 1.03 GB |
-| 2,048x2,048 | 1 | 320,000 | 0.81 GB | 0.81 GB |
-| 4,000x3,000 | 3 | 5,000 | 1.46 GB | 1.49 GB |
-| 4,096x4,096 | 3 | 1,280,000 | 2.95 GB | 2.91 GB |
+| 512x512 | 3 | 20,000 | 0.23 GB | 0.23 GB |
+| 1,024x1,024 | 3 | 80,000 | 0.44 GB | 0.51 GB |
+| 2,048x2,048 | 3 | 20,000 | 0.79 GB | 0.74 GB |
+| 2,048x2,048 | 3 | 320,000 | 0.97 to 1.03 GB | 0.98 GB |
+| 2,048x2,048 | 1 | 320,000 | 0.81 GB | 0.76 GB |
+| 4,000x3,000 | 3 | 5,000 | 1.47 GB | 1.43 GB |
+| 4,096x4,096 | 3 | 1,280,000 | 2.95 GB | 2.86 GB |
 
-The second and the third row give `BYTES_PER_GAUSSIAN`, the third and the fourth `BYTES_PER_VALUE`,
-the second and the fifth `BYTES_PER_PIXEL`, and what is left `BYTES_PER_STRIP_PIXEL`."""
+Rows of equal size give `BYTES_PER_GAUSSIAN` and `BYTES_PER_VALUE`, the two largest sizes
+`BYTES_PER_PIXEL`, and the others `BYTES_PER_STRIP_PIXEL`."""
 
-BYTES_PER_STRIP_PIXEL = 250.0
+BYTES_PER_STRIP_PIXEL = 200.0
 """Memory of the temporary arrays of a placement, for each pixel of the strips under way."""
 
 BYTES_PER_PIXEL = 12.0
@@ -49,7 +50,7 @@ def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> i
     Returns
     -------
     int
-        Bytes, to about a tenth for sets that `eigengs_dr.fit` places. Large Gaussians touch more
+        Bytes, to about a sixth for sets that `eigengs_dr.fit` places. Large Gaussians touch more
         tiles and take more.
     """
     pixels = width * height
