@@ -16,6 +16,7 @@ from ..fitting.presets import PRESETS
 from ..image.color import SPACES
 from .console import INTERRUPTED, progress_bar, say
 from .fit_many import fit_several
+from .memory import announce_memory
 from .options import ANY_PATH, backend_option, choice, describe_run, quiet_option, report_option
 from .outputs import check_outputs, name_outputs
 from .report import write_report
@@ -125,6 +126,8 @@ def fit(
     check_outputs([*outputs, *previews, report], [*paths, *_basis_file(options)])
     if output is None:
         _check_replaced(outputs)
+    if not several:
+        announce_memory(paths[0], options, quiet)
     select(options.backend)
     _note_mean(options)
     if several:

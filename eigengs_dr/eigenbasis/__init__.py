@@ -3,6 +3,8 @@
 - ``pca``: the principal components
 - ``components``: shared Gaussians for all components: shapes and weights
 - ``eigengs``: the model `EigenGS`
+- ``encoder``: an image to Gaussians of the model
+- ``encode_many``: many images, in groups
 - ``projection``: coefficients of an image
 - ``options``: the options of a training, checked once
 - ``training``: a folder of images to a model

@@ -20,20 +20,19 @@ from numpy.typing import ArrayLike, NDArray
 from ..backend.recording import exclusive
 from ..collection.run import ImageRow, RowProgress
 from ..collection.sources import Images
-from ..fitting.solvers.normal_equations import NormalEquations, squared_norms
+from ..fitting.solvers.normal_equations import NormalEquations
 from ..gaussian.gaussians import Gaussians
-from ..image.folder import to_planes
 from ..image.io import check_image
 from ..image.resize import resample
 from ..storage import npz
-from .components.solve import ComponentFit, State, fit_components, with_colors
+from .components.solve import ComponentFit, State, fit_components
 from .components.split import split_reason, wants_split
 from .encode_many import check_encoding, encode_each
+from .encoder import Encoder
 from .model_file import FORMAT, VERSION, from_members, layout_of, to_members
 from .options import TrainOptions
 from .pca.basis import Eigenbasis
 from .pca.truncation import TruncationCurve, curve_from_eigenvalues
-from .projection import ComponentProjector
 
 Planes = NDArray[np.float32]
 TrainProgress = Callable[[int, int, dict[str, Any]], None]
@@ -204,8 +203,7 @@ class EigenGS:
         UserWarning
             If all components miss the target; the result then has all of them.
         """
-        planes = self._planes(check_image(image))
-        return self._coefficients(planes, self.equations.correlate(planes), False, target_psnr)
+        return self._encoder.project(check_image(image, copy=False), target_psnr)
 
     @exclusive()
     def reconstruct(
@@ -225,13 +223,7 @@ class EigenGS:
         ValueError
             If there is not one array for each channel, or one has over k_c coefficients.
         """
-        shapes = [np.shape(values) for values in coefficients]
-        if len(shapes) != len(self.weights) or not all(
-            len(shape) == 1 and shape[0] <= k
-            for shape, k in zip(shapes, self.components, strict=True)
-        ):
-            raise ValueError(f"coefficients have shapes {shapes}; expected up to {self.components}")
-        return self._colored(self._mean_coefficients + self._sum(coefficients), size)
+        return self._encoder.reconstruct(coefficients, size)
 
     @exclusive()
     def encode(
@@ -269,7 +261,8 @@ class EigenGS:
             If all components miss the target; the result then uses all of them.
         """
         check_encoding(colors, mean, target_psnr)
-        return self._encode_group([check_image(image)], colors, mean, target_psnr)[0]
+        pixels = check_image(image, copy=False)
+        return self._encoder.encode([pixels], colors, mean, target_psnr)[0]
 
     def encode_many(
         self,
@@ -303,7 +296,8 @@ class EigenGS:
             See `encode` and `eigengs_dr.fit_many`.
         """
         check_encoding(colors, mean, target_psnr)
-        group = partial(self._encode_group, colors=colors, mean=mean, target_psnr=target_psnr)
+        encode = exclusive()(self._encoder.encode)
+        group = partial(encode, colors=colors, mean=mean, target_psnr=target_psnr)
         return encode_each(group, images, output, overwrite, progress)
 
     def dense_mean(self, width: int, height: int) -> Planes:
@@ -339,89 +333,12 @@ class EigenGS:
         except ValueError as error:
             raise ValueError(f"{Path(path)}: {error}") from None
 
-    @exclusive()
-    def _encode_group(
-        self, images: list[Planes], colors: str, mean: str, target_psnr: float | None
-    ) -> list[Gaussians]:
-        """Encode checked images (H, W, 3) of any size together; see `encode`."""
-        sizes = [(pixels.shape[1], pixels.shape[0]) for pixels in images]
-        planes = np.concatenate([self._planes(pixels) for pixels in images])
-        channels, centred = len(self.weights), mean == "dense"
-        if centred:
-            planes -= np.tile(self.mean_image, (len(images), 1, 1))
-        correlations = self.equations.correlate(planes)
-        parts = [slice(k, k + channels) for k in range(0, len(planes), channels)]
-        if colors == "exact":
-            solved = self.equations.solve(correlations)
-            return [
-                self._colored(solved[:, part], size)
-                for part, size in zip(parts, sizes, strict=True)
-            ]
-        result = []
-        for part, size in zip(parts, sizes, strict=True):
-            products = correlations[:, part]
-            coefficients = self._coefficients(planes[part], products, centred, target_psnr)
-            if centred:
-                result.append(self._colored(self._sum(coefficients), size))
-            else:
-                result.append(self.reconstruct(coefficients, size))
-        return result
-
-    def _planes(self, pixels: Planes) -> Planes:
-        """Convert an RGB image to the size and space of the model, shape (C, H, W)."""
-        width, height = self.gaussians.width, self.gaussians.height
-        if pixels.shape[:2] != (height, width):
-            pixels = resample(pixels, width, height)
-        return to_planes(pixels, self.gaussians.space).reshape(-1, height, width)
-
-    def _colored(
-        self, coefficients: NDArray[np.float64], size: tuple[int, int] | None
-    ) -> Gaussians:
-        """Return the shapes of the model with colours and background, scaled to a size."""
-        result = with_colors(self.gaussians, coefficients, self.gaussians.space)
-        return result.scaled(*size) if size else result
-
-    @cached_property
+    @property
     def equations(self) -> NormalEquations:
         """Normal equations of all Gaussians, with their factors."""
-        return NormalEquations(self.gaussians, self.low)
+        return self._encoder.equations
 
     @cached_property
-    def _mean_coefficients(self) -> NDArray[np.float64]:
-        """Colours and background of the mean image, shape (N + 1, C)."""
-        arrays = self.gaussians.to_arrays()
-        return np.vstack([arrays["color"], arrays["background"]]).astype(np.float64)
-
-    @cached_property
-    def _mean_product(self) -> NDArray[np.float64]:
-        """Correlations of the rendered mean image with all Gaussians, shape (N + 1, C)."""
-        return self.equations.product(self._mean_coefficients)
-
-    @cached_property
-    def _projector(self) -> ComponentProjector:
-        """Least squares on the rendered components."""
-        return ComponentProjector(self.equations, self.weights)
-
-    def _coefficients(
-        self,
-        planes: Planes,
-        correlations: NDArray[np.float64],
-        centred: bool,
-        target_psnr: float | None,
-    ) -> tuple[Planes, ...]:
-        """Solve least squares on the rendered components; `centred` planes lack the mean image."""
-        products = correlations if centred else correlations - self._mean_product
-        if target_psnr is None:
-            return self._projector.coefficients(products)
-        lengths = squared_norms(planes)
-        if not centred:
-            lengths = self.equations.error(self._mean_coefficients, correlations, lengths)
-        return self._projector.coefficients_for_psnr(products, lengths, planes.size, target_psnr)
-
-    def _sum(self, coefficients: tuple[Any, ...]) -> NDArray[np.float64]:
-        """Return ``sum_j a_j psi_nj`` of each channel, shape (N + 1, C)."""
-        columns = []
-        for weights, values in zip(self.weights, coefficients, strict=True):
-            values = np.asarray(values, np.float32)
-            columns.append(np.einsum("j,jn->n", values, weights[: len(values)]))
-        return np.stack(columns, axis=1).astype(np.float64)
+    def _encoder(self) -> Encoder:
+        """The functions of `eigengs_dr.eigenbasis.encoder`, with what they compute once."""
+        return Encoder(self.gaussians, self.weights, self.mean_image, self.low)

@@ -201,7 +201,7 @@ def fit(
 def fit_image(image: ArrayLike, options: FitOptions, progress: FitProgress | None = None) -> Fit:
     """Fit an image with the options of one record; see `fit` for results and errors."""
     started = time.perf_counter()
-    pixels = check_image(image, keep_grey=options.color == "data")
+    pixels = check_image(image, keep_grey=options.color == "data", copy=False)
     options.check_image(pixels)
     with defer_interrupts() as interrupted:
         start = initialize(pixels, _first_try(pixels, options))

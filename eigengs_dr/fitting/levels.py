@@ -132,7 +132,7 @@ def fit_levels(
     options = FitOptions(
         gaussians=gaussians, iterations=iterations, color=color, seed=seed, backend=backend
     )
-    pixels = check_image(image, keep_grey=color == "data")
+    pixels = check_image(image, keep_grey=color == "data", copy=False)
     options.check_image(pixels)
     counts = level_counts(options.count_for(pixels), levels)
     schedule = options.method.schedule

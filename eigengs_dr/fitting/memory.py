@@ -4,29 +4,37 @@ from __future__ import annotations
 
 import os
 
+from ..image.strips import MAX_THREADS, STRIP_PIXELS, available_cores
+
 BASE_BYTES = 140e6
 """Memory of Python, libLLVM and the compiled programs. This and the constants below follow the
-largest resident memory of processes that fit a mosaic of photos with the backend llvm, 10 steps:
+largest resident memory of processes that fit a mosaic of photos with the backend llvm on 2 cores,
+10 steps:
 
 | image | channels | Gaussians | measured | estimated |
 |---|---|---|---|---|
-| 512x512 | 3 | 20,000 | 0.20 GB | 0.21 GB |
-| 2,048x2,048 | 3 | 20,000 | 1.14 GB | 1.06 GB |
-| 2,048x2,048 | 3 | 320,000 | 1.27 GB | 1.18 GB |
-| 2,048x2,048 | 1 | 320,000 | 1.00 GB | 0.92 GB |
-| 4,096x4,096 | 3 | 1,280,000 | 4.03 GB | 4.31 GB |
+| 512x512 | 3 | 20,000 | 0.23 GB | 0.23 GB |
+| 1,024x1,024 | 3 | 80,000 | 0.44 GB | 0.51 GB |
+| 2,048x2,048 | 3 | 20,000 | 0.79 GB | 0.74 GB |
+| 2,048x2,048 | 3 | 320,000 | 0.97 to 1.03 GB | 0.98 GB |
+| 2,048x2,048 | 1 | 320,000 | 0.81 GB | 0.76 GB |
+| 4,000x3,000 | 3 | 5,000 | 1.47 GB | 1.43 GB |
+| 4,096x4,096 | 3 | 1,280,000 | 2.95 GB | 2.86 GB |
 
-The second and the third row give `BYTES_PER_GAUSSIAN`, the third and the fourth `BYTES_PER_VALUE`,
-the others `BYTES_PER_PIXEL`."""
+Rows of equal size give `BYTES_PER_GAUSSIAN` and `BYTES_PER_VALUE`, the two largest sizes
+`BYTES_PER_PIXEL`, and the others `BYTES_PER_STRIP_PIXEL`."""
 
-BYTES_PER_PIXEL = 120.0
-"""Memory of the lists of tiles, which cover the whole image, for each pixel."""
+BYTES_PER_STRIP_PIXEL = 200.0
+"""Memory of the temporary arrays of a placement, for each pixel of the strips under way."""
 
-BYTES_PER_VALUE = 32.0
-"""Memory of the images, for each pixel and channel: 8 images in single precision."""
+BYTES_PER_PIXEL = 12.0
+"""Memory of the density and of the lists of tiles, for each pixel."""
 
-BYTES_PER_GAUSSIAN = 430.0
-"""Memory of the parameters, of the optimiser and of the placement, for each Gaussian."""
+BYTES_PER_VALUE = 26.0
+"""Memory of the images, for each pixel and channel: between 6 and 7 images in single precision."""
+
+BYTES_PER_GAUSSIAN = 780.0
+"""Memory of the parameters, of the colour solve and of the lists, for each Gaussian."""
 
 
 def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> int:
@@ -42,12 +50,14 @@ def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> i
     Returns
     -------
     int
-        Bytes, to about a tenth for sets that `eigengs_dr.fit` places. Large Gaussians touch more
+        Bytes, to about a sixth for sets that `eigengs_dr.fit` places. Large Gaussians touch more
         tiles and take more.
     """
     pixels = width * height
+    in_strips = min(pixels, STRIP_PIXELS * min(MAX_THREADS, available_cores()))
     return round(
         BASE_BYTES
+        + in_strips * BYTES_PER_STRIP_PIXEL
         + pixels * (BYTES_PER_PIXEL + channels * BYTES_PER_VALUE)
         + gaussians * BYTES_PER_GAUSSIAN
     )

@@ -34,5 +34,5 @@ def check_index_range(
     if values > MAX_VALUES:
         raise ValueError(
             f"an image of {width}x{height} pixels and {channels} channels has {values:,} values, "
-            f"the limit is {MAX_VALUES:,}: scale it down or fit parts of it"
+            f"the limit is {MAX_VALUES:,}: scale it down or work on parts of it"
         )

@@ -15,11 +15,13 @@ from ..backend.recording import exclusive
 from ..gaussian.file import MAX_CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode, to_coded
-from .kernels import adjoint, channel_sums, forward
+from .adjoint import adjoint
+from .kernels import channel_sums, forward
 from .layout import gather_run, pack_parameters
+from .limits import check_index_range
 from .lists import TileLists, build_lists
 from .parameters import KernelParameters, detached_shape, kernel_radius, kernel_shape
-from .tiles import Grid
+from .tiles import TILE, Grid
 
 TILE_ROWS = 64
 """Rows of tiles that `to_tiles` copies at a time: large images need no second copy in memory."""
@@ -55,7 +57,8 @@ def render(
     Raises
     ------
     ValueError
-        If a side is not positive or the cutoff is not in (0, 12].
+        If a side is not positive, the image is too large to index by 32 bits, or the cutoff is not
+        in (0, 12].
 
     Notes
     -----
@@ -74,6 +77,7 @@ def render(
     ((8, 8, 1), (16, 16, 1))
     """
     width, height = _size(gaussians, width, height)
+    check_index_range(width, height, gaussians.channels, TILE)
     scaled = gaussians.scaled(width, height)
     if cutoff is not None:
         # A NumPy scalar would promote Dr.Jit arrays to float64.

@@ -6,6 +6,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.families import family, small_model, splits
 from eigengs_dr.eigenbasis import encode_many
+from eigengs_dr.eigenbasis.encoder import Encoder
 from eigengs_dr.image.io import save_image
 
 
@@ -58,14 +59,14 @@ def test_files_a_bad_one_and_resuming(backend, tmp_path):
 
 def test_one_failure_does_not_fail_its_group(backend, monkeypatch):
     model = small_model(backend)
-    planes = type(model)._planes
+    planes = Encoder.planes
 
     def no_memory_for_white(self, pixels):
         if pixels.mean() == 1:
             raise MemoryError
         return planes(self, pixels)
 
-    monkeypatch.setattr(type(model), "_planes", no_memory_for_white)
+    monkeypatch.setattr(Encoder, "planes", no_memory_for_white)
     image = family(1, seed=3)[0]
     rows = model.encode_many([image, np.ones_like(image), image])
     assert [row.status for row in rows] == ["done", "failed", "done"]

@@ -14,7 +14,7 @@ from eigengs_dr.fitting import initializers as starting
 from eigengs_dr.fitting.fit import FitInterrupted, fit
 from eigengs_dr.fitting.placement.grid import place_grid
 from eigengs_dr.fitting.presets import PRESETS
-from eigengs_dr.image.color import to_coded, to_linear
+from eigengs_dr.image.color import SPACES, to_coded, to_linear
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import picture_of, render
 
@@ -231,10 +231,15 @@ def test_kinds_of_images(backend):
         np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
-def test_the_image_is_left_alone(backend):
+@pytest.mark.parametrize("color", SPACES)
+def test_the_image_is_left_alone(backend, color):
+    """An image of float32 is not copied, so nothing may write to it: it can be read-only."""
     image = picture()
-    fit(image, SPLATS, 3, backend=backend)
+    image.setflags(write=False)
+    found = fit(image, SPLATS, 3, color=color, backend=backend)
     np.testing.assert_array_equal(image, picture())
+    expected = fit(picture().astype(np.float64), SPLATS, 3, color=color, backend=backend)
+    np.testing.assert_array_equal(found.image, expected.image)
 
 
 @pytest.mark.parametrize("counts", [(50, 100, 200), (200, 100, 50)], ids=["growing", "shrinking"])

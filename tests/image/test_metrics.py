@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import correlate2d
 from skimage import color, metrics
 
+from eigengs_dr.image import strips
 from eigengs_dr.image.metrics import ms_ssim, psnr, ssim
 
 SIZES = [(1, 1), (1, 9), (2, 3), (10, 11), (12, 40), (23, 22), (45, 50)]
@@ -79,6 +80,15 @@ def test_ssim_equals_its_definition(rng):
     window = gaussian_window(11)
     expected = [np.mean(similarity_maps(a[..., i], b[..., i], window)[0]) for i in range(3)]
     assert ssim(a, b) == pytest.approx(np.mean(expected), abs=1e-12)
+
+
+@pytest.mark.parametrize("metric", [ssim, ms_ssim])
+def test_similarity_does_not_depend_on_the_strips(rng, metric, monkeypatch):
+    a = picture(rng, 190, 177).astype(np.float32)
+    b = noisy(rng, a, 0.05).astype(np.float32)
+    whole = metric(a, b)
+    monkeypatch.setattr(strips, "STRIP_PIXELS", 7 * 177)
+    assert metric(a, b) == pytest.approx(whole, abs=1e-12)
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -188,6 +188,12 @@ def test_bad_size(backend, asked):
     assert "\n" not in str(error.value)
 
 
+def test_size_beyond_32_bits_is_refused_before_it_is_allocated(backend):
+    with pytest.raises(ValueError, match="37838x37838 pixels and 3 channels has") as error:
+        render(random_scene().on(backend), width=37838, height=37838)
+    assert "\n" not in str(error.value)
+
+
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
 def test_cutoff_of_numpy(backend, kind):
     gaussians = random_scene().on(backend)

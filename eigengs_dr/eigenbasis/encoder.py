@@ -1,0 +1,163 @@
+"""Images to Gaussians of a model: colours by least squares on its shapes or on its components."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..fitting.solvers.normal_equations import NormalEquations, squared_norms
+from ..gaussian.gaussians import Gaussians
+from ..image.folder import to_planes
+from ..image.resize import resample
+from .components.solve import with_colors
+from .projection import Coefficients, ComponentProjector
+
+Planes = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Encoder:
+    """What images of one model share, and the functions that need it.
+
+    Attributes
+    ----------
+    gaussians, weights, mean_image, low
+        See `eigengs_dr.EigenGS`.
+    """
+
+    gaussians: Gaussians
+    weights: tuple[Planes, ...]
+    mean_image: Planes
+    low: int
+
+    @cached_property
+    def equations(self) -> NormalEquations:
+        """Normal equations of all Gaussians, with their factors."""
+        return NormalEquations(self.gaussians, self.low)
+
+    def project(self, image: Planes, target_psnr: float | None) -> Coefficients:
+        """Return the coefficients of a checked image (H, W, 3); see `eigengs_dr.EigenGS.project`.
+
+        Parameters
+        ----------
+        image : ndarray of float32, shape (H, W, 3)
+        target_psnr : float or None
+        """
+        planes = self.planes(image)
+        return self._coefficients(planes, self.equations.correlate(planes), False, target_psnr)
+
+    def reconstruct(
+        self, coefficients: Sequence[Any], size: tuple[int, int] | None = None
+    ) -> Gaussians:
+        """Turn coefficients into Gaussians; see `eigengs_dr.EigenGS.reconstruct`.
+
+        Parameters
+        ----------
+        coefficients : sequence of C array_like, shape (m_c,)
+        size : (int, int), optional
+
+        Raises
+        ------
+        ValueError
+            If there is not one array for each channel, or one has too many coefficients.
+        """
+        shapes = [np.shape(values) for values in coefficients]
+        most = tuple(len(weights) for weights in self.weights)
+        if len(shapes) != len(most) or not all(
+            len(shape) == 1 and shape[0] <= k for shape, k in zip(shapes, most, strict=True)
+        ):
+            raise ValueError(f"coefficients have shapes {shapes}; expected up to {most}")
+        return self._colored(self._mean_coefficients + self._sum(coefficients), size)
+
+    def encode(
+        self, images: list[Planes], colors: str, mean: str, target_psnr: float | None
+    ) -> list[Gaussians]:
+        """Encode checked images of any size together; see `eigengs_dr.EigenGS.encode`.
+
+        Parameters
+        ----------
+        images : list of ndarray of float32, shape (H, W, 3)
+        colors, mean, target_psnr
+            Checked by `eigengs_dr.eigenbasis.encode_many.check_encoding`.
+        """
+        sizes = [(pixels.shape[1], pixels.shape[0]) for pixels in images]
+        planes = np.concatenate([self.planes(pixels) for pixels in images])
+        channels, centred = len(self.weights), mean == "dense"
+        if centred:
+            planes -= np.tile(self.mean_image, (len(images), 1, 1))
+        correlations = self.equations.correlate(planes)
+        parts = [slice(k, k + channels) for k in range(0, len(planes), channels)]
+        if colors == "exact":
+            solved = self.equations.solve(correlations)
+            return [
+                self._colored(solved[:, part], size)
+                for part, size in zip(parts, sizes, strict=True)
+            ]
+        result = []
+        for part, size in zip(parts, sizes, strict=True):
+            products = correlations[:, part]
+            coefficients = self._coefficients(planes[part], products, centred, target_psnr)
+            if centred:
+                result.append(self._colored(self._sum(coefficients), size))
+            else:
+                result.append(self.reconstruct(coefficients, size))
+        return result
+
+    def planes(self, pixels: Planes) -> Planes:
+        """Convert an RGB image to the size and space of the model, shape (C, H, W)."""
+        width, height = self.gaussians.width, self.gaussians.height
+        if pixels.shape[:2] != (height, width):
+            pixels = resample(pixels, width, height)
+        return to_planes(pixels, self.gaussians.space).reshape(-1, height, width)
+
+    def _colored(
+        self, coefficients: NDArray[np.float64], size: tuple[int, int] | None
+    ) -> Gaussians:
+        """Return the shapes of the model with colours and background, scaled to a size."""
+        result = with_colors(self.gaussians, coefficients, self.gaussians.space)
+        return result.scaled(*size) if size else result
+
+    @cached_property
+    def _mean_coefficients(self) -> NDArray[np.float64]:
+        """Colours and background of the mean image, shape (N + 1, C)."""
+        arrays = self.gaussians.to_arrays()
+        return np.vstack([arrays["color"], arrays["background"]]).astype(np.float64)
+
+    @cached_property
+    def _mean_product(self) -> NDArray[np.float64]:
+        """Correlations of the rendered mean image with all Gaussians, shape (N + 1, C)."""
+        return self.equations.product(self._mean_coefficients)
+
+    @cached_property
+    def _projector(self) -> ComponentProjector:
+        """Least squares on the rendered components."""
+        return ComponentProjector(self.equations, self.weights)
+
+    def _coefficients(
+        self,
+        planes: Planes,
+        correlations: NDArray[np.float64],
+        centred: bool,
+        target_psnr: float | None,
+    ) -> Coefficients:
+        """Solve least squares on the rendered components; `centred` planes lack the mean image."""
+        products = correlations if centred else correlations - self._mean_product
+        if target_psnr is None:
+            return self._projector.coefficients(products)
+        lengths = squared_norms(planes)
+        if not centred:
+            lengths = self.equations.error(self._mean_coefficients, correlations, lengths)
+        return self._projector.coefficients_for_psnr(products, lengths, planes.size, target_psnr)
+
+    def _sum(self, coefficients: Sequence[Any]) -> NDArray[np.float64]:
+        """Return ``sum_j a_j psi_nj`` of each channel, shape (N + 1, C)."""
+        columns = []
+        for weights, values in zip(self.weights, coefficients, strict=True):
+            values = np.asarray(values, np.float32)
+            columns.append(np.einsum("j,jn->n", values, weights[: len(values)]))
+        return np.stack(columns, axis=1).astype(np.float64)
