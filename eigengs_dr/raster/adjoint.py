@@ -63,7 +63,7 @@ def adjoint_pieces(
     """Return the packed sums of every piece, for `sum_pieces`; parameters as for `adjoint`.
 
     A lane owns the same rows of all tiles of its piece, see `Granularity.rows`. Cost per visit of
-    4x4 pixels: a gather of delta, 6 exponentials, and per pixel 2 operations for the weight, 2 for
+    4x4 pixels: a gather of delta, 7 exponentials, and per pixel 2 operations for the weight, 2 for
     the cutoff, 2 per channel and 5 for the shape.
     """
     types = types_of(packed)

@@ -77,7 +77,7 @@ def _sum_blocks(
 ) -> list:
     """Sum the Gaussians of every block; return a list of Float, pixels times channels.
 
-    Cost per entry of the lists: one gather of parameters, and for a block of 4x4 pixels 6
+    Cost per entry of the lists: one gather of parameters, and for a block of 4x4 pixels 7
     exponentials, 60 operations for the weights and the cutoff, and an fma per pixel and channel.
     """
     types = types_of(packed)

@@ -117,7 +117,7 @@ def _run_phase(
         for step in range(iterations):
             if step == stop:
                 stop, moves = next_build(schedule, step, iterations)
-                pad, growth = variables.reach(state.gaussians, moves)
+                pad, growth = variables.reach(fixed, moves)
                 counts, lists = (*levels, len(fixed)), []  # old lists make room for new ones
                 lists = [
                     bin_gaussians(

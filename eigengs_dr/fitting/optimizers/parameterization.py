@@ -74,8 +74,9 @@ make the lists half as long again."""
 
 
 def _reach_relative(fixed: Gaussians, moves: dict[str, float]) -> tuple[Any, float]:
-    pad = MOVE_SHARE * moves.get("mean", 0.0) * _size(fixed)
-    return pad, 1 + GROWTH_SHARE * moves.get("factor", 0.0)
+    # An array, because another literal in every build would compile the kernels again.
+    share = dr.opaque(types_of(fixed.mean).Float, MOVE_SHARE * moves.get("mean", 0.0))
+    return share * _size(fixed), 1 + GROWTH_SHARE * moves.get("factor", 0.0)
 
 
 SCALE_RELATIVE = Parameterization(
