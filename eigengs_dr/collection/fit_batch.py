@@ -66,8 +66,8 @@ def fit_batch(
     Returns
     -------
     list of Fit
-        The results of `eigengs_dr.fit` except for rounding. A result does not depend on the other
-        images. The seconds are an equal share of the whole time.
+        The results of `eigengs_dr.fit`, on llvm bit for bit: sums run in the same order. A result
+        does not depend on the other images. The seconds are an equal share of the whole time.
 
     Raises
     ------

@@ -96,9 +96,8 @@ def fit_many(
     Notes
     -----
     Small images of one size that follow each other are fitted in groups, see
-    `eigengs_dr.collection.fit_batch`. A result does not depend on the other images of its group,
-    and equals the result of `eigengs_dr.fit` except for rounding. Images of more than 256 pixels a
-    side, and fits from a basis or with a target PSNR, are fitted alone, with equal bits.
+    `eigengs_dr.collection.fit_batch`. A result does not depend on the other images. On llvm it
+    equals the result of `eigengs_dr.fit` bit for bit.
 
     Examples
     --------

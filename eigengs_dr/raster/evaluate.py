@@ -19,7 +19,7 @@ LN2 = math.log(2)
 
 
 def exp2_neg(q: Any) -> Any:
-    """Return ``2^-q`` for ``-126 <= q <= 126``: relative error < 3e-7.
+    """Return ``2^-q`` for ``-126 <= q <= 126``: relative error < 3e-7, on cuda < 5e-7.
 
     On llvm, single precision costs half of `drjit.exp2`: split ``q = n - f`` into an integer n and
     ``|f| <= 1/2``; a polynomial gives ``2^f``, and n is subtracted from its exponent bits. Outside

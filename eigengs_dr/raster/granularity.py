@@ -13,23 +13,27 @@ class Granularity(NamedTuple):
     Attributes
     ----------
     rows : int
-        Rows of a tile that one lane of the sum over Gaussians owns: 1, 2 or 4.
+        Rows of a tile that one lane owns, of the sum over Gaussians and of the adjoint: 1, 2 or 4.
     visits : int
         Largest number of tiles that one lane of the adjoint visits; a Gaussian that touches more
         tiles gets several lanes, so that few large Gaussians fill many cores too.
     ordered : bool
         Whether lanes are ordered by their work. A SIMD packet of a CPU takes as long as its longest
         lane, and ordering is cheap there; a GPU would need another sort.
+    products : bool
+        Whether weights along a row continue one exponential by products, where that is accurate. On
+        a GPU an exponential is one instruction, and products would cost more.
     """
 
     rows: int
     visits: int
     ordered: bool
+    products: bool
 
 
 GRANULARITY = {
-    "llvm": Granularity(rows=4, visits=8, ordered=True),
-    "cuda": Granularity(rows=1, visits=16, ordered=False),
+    "llvm": Granularity(rows=4, visits=8, ordered=True, products=True),
+    "cuda": Granularity(rows=1, visits=16, ordered=False, products=False),
 }
 """Granularity by backend. On llvm a lane shares the parameters of a Gaussian among 16 pixels; on a
 GPU more lanes with fewer registers hide the latency of memory."""

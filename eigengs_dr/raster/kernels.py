@@ -1,4 +1,4 @@
-"""The sum over all Gaussians, its error, and its adjoint.
+"""The sum over all Gaussians and its error, one lane per block of rows of a tile.
 
 ``I(x) = background + sum_n c_n w_n(x)`` with the weights of `eigengs_dr.raster.evaluate`.
 
@@ -8,21 +8,18 @@ channel after channel. A lane then reads or writes one contiguous run with packe
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import drjit as dr
 
 from ..backend.arrays import ArrayTypes, types_of
-from .evaluate import weights, weights_vjp
+from .evaluate import weights
 from .granularity import granularity_of
 from .layout import gather_index, gather_run, unpack_parameters
-from .lists import Pieces, TileLists
+from .lists import TileLists
 from .parameters import NUM_SHAPE_PARAMS
 from .tiles import Grid
-
-# ---------------------------------------------------------------------------------------------
-#  Sum over Gaussians, one lane per block of rows of a tile
-# ---------------------------------------------------------------------------------------------
 
 
 class _Blocks(NamedTuple):
@@ -57,9 +54,8 @@ class _Blocks(NamedTuple):
 
 def _blocks(types: ArrayTypes, lists: TileLists) -> _Blocks:
     """Divide every tile into blocks of `Granularity.rows` rows, one for each lane."""
-    width, height = lists.grid.tile
-    rows = min(granularity_of(types).rows, height)
-    parts = height // rows
+    width, _ = lists.grid.tile
+    rows, parts = shares_of(types, lists.grid)
     tile, begin, end, part = lists.order, lists.begin, lists.end, types.UInt(0)
     if parts > 1:  # neighbouring lanes share a tile, and write one contiguous run together
         lane = dr.arange(types.UInt, lists.grid.tiles * parts)
@@ -68,6 +64,12 @@ def _blocks(types: ArrayTypes, lists: TileLists) -> _Blocks:
     column, row = lists.grid.first_pixel(tile)
     x, y = types.Float(column) + 0.5, types.Float(row + part * rows) + 0.5
     return _Blocks(tile * parts + part, tile, x, y, begin, end, (width, rows))
+
+
+def shares_of(types: ArrayTypes, grid: Grid) -> tuple[int, int]:
+    """Return the rows of a block, and the number of blocks of a tile."""
+    rows = math.gcd(granularity_of(types).rows, grid.tile[1])
+    return rows, grid.tile[1] // rows
 
 
 def _sum_blocks(
@@ -215,149 +217,11 @@ def _inside(blocks: _Blocks, grid: Grid) -> list | None:
     ]
 
 
-# ---------------------------------------------------------------------------------------------
-#  Adjoint, one lane per piece of a Gaussian
-# ---------------------------------------------------------------------------------------------
-
-
-def adjoint(
-    packed: Any,
-    delta: Any,
-    channels: int,
-    lists: TileLists,
-    radius: float,
-    color_only: bool = False,
-) -> list:
-    """Return the gradient of ``<delta, forward(packed)>`` with respect to all parameters.
-
-    A lane owns a piece of a Gaussian, visits its tiles, gathers delta there and sums in registers;
-    `sum_pieces` adds the pieces. Without atomic operations, every run gives the same result.
-
-    Parameters
-    ----------
-    packed : Float
-        As for `forward`.
-    delta : Float
-        Derivative of a loss with respect to the image, in tile layout.
-    channels : int
-    lists : TileLists
-        With pieces.
-    radius : float
-        As for `forward`.
-    color_only : bool, optional
-        Omit the derivatives with respect to the shapes.
-
-    Returns
-    -------
-    list of Float, shape (N,)
-        Derivatives with respect to mean x, mean y, a, b, c (unless `color_only`) and the channels.
-    """
-    assert lists.pieces is not None, "the lists were built without adjoint=True"
-    number = channels if color_only else NUM_SHAPE_PARAMS + channels
-    parts = adjoint_pieces(packed, delta, channels, lists, radius, color_only)
-    return sum_pieces(parts, lists.pieces, number)
-
-
-def adjoint_pieces(
-    packed: Any,
-    delta: Any,
-    channels: int,
-    lists: TileLists,
-    radius: float,
-    color_only: bool = False,
-) -> Any:
-    """Return the packed sums of every piece, for `sum_pieces`; parameters as for `adjoint`.
-
-    Cost per visit of a tile: a gather of delta, 6 exponentials, and per pixel 2 operations for the
-    weight, 2 for the cutoff, 2 per channel and 5 for the shape.
-    """
-    types = types_of(packed)
-    grid, pieces, tile_size = lists.grid, lists.pieces, lists.grid.tile
-    assert pieces is not None
-    splat = unpack_parameters(packed, pieces.splat, NUM_SHAPE_PARAMS + channels)
-    shape, length = splat[:NUM_SHAPE_PARAMS], grid.pixels * channels
-
-    def add_tile(i: Any, sums: list) -> tuple:
-        active = i < pieces.end
-        tile = gather_index(types, pieces.tile, i, active)
-        d = gather_run(types, delta, tile, length, active)
-        column, row = grid.first_pixel(tile)
-        x, y = types.Float(column) + 0.5, types.Float(row) + 0.5
-        color = sums[-channels:]
-
-        def cotangent(k: int, w: Any) -> Any:
-            g = type(w)(0)
-            for c in range(channels):
-                color[c] = dr.fma(w, d[k * channels + c], color[c])
-                g = dr.fma(splat[NUM_SHAPE_PARAMS + c], d[k * channels + c], g)
-            return g
-
-        if color_only:
-            for k, w in enumerate(weights(shape, x, y, tile_size, radius, lists.steep)):
-                cotangent(k, w)
-            return i + 1, color
-        gradient = weights_vjp(shape, x, y, tile_size, radius, cotangent, lists.steep)
-        return i + 1, [s + g for s, g in zip(sums, gradient, strict=False)] + color
-
-    number = channels if color_only else NUM_SHAPE_PARAMS + channels
-    sums = dr.while_loop(
-        (types.UInt(pieces.begin), [types.Float(0) for _ in range(number)]),
-        lambda i, sums: i < pieces.end,
-        add_tile,
-        label="pull back",
-        max_iterations=-1,
-    )[-1]
-    stride = -(-number // 4) * 4
-    parts = dr.empty(types.Float, stride * dr.width(pieces.slot))
-    values = [*sums, *[types.Float(0)] * (stride - number)]
-    dr.scatter(parts, types.FloatX(values), pieces.slot)
-    return parts
-
-
-def sum_pieces(parts: Any, pieces: Pieces, number: int, splat: Any = None) -> list:
-    """Add the results of the pieces of every Gaussian, in the order of the pieces.
-
-    Parameters
-    ----------
-    parts : Float
-        From `adjoint_pieces`.
-    pieces : Pieces
-    number : int
-        Number of derivatives of a Gaussian.
-    splat : UInt32, optional
-        Gaussians, by default all. Those that the lists do not hold have the sum 0.
-
-    Returns
-    -------
-    list of `number` Float
-    """
-    types = types_of(parts)
-    count = dr.width(pieces.first) - 1
-    if splat is None:
-        splat = dr.arange(types.UInt, count)
-    known = splat < count
-    begin = dr.gather(types.UInt, pieces.first, splat, known)
-    end = dr.gather(types.UInt, pieces.first, splat + 1, known)
-
-    def add(i: Any, sums: list) -> tuple:
-        values = unpack_parameters(parts, i, number, i < end)
-        return i + 1, [s + v for s, v in zip(sums, values, strict=True)]
-
-    sums: list = dr.while_loop(
-        (begin, [types.Float(0) for _ in range(number)]),
-        lambda i, sums: i < end,
-        add,
-        label="sum pieces",
-        max_iterations=-1,
-    )[-1]
-    return sums
-
-
 def sum_lanes(values: list, lists: TileLists) -> list:
-    """Add values of the lanes of `residual` for each image; return Floats of shape (images,)."""
-    dr.eval(values)
-    if lists.grid.images == 1:
-        return [dr.sum(v) for v in values]
+    """Add values of the lanes of `residual` for each image; return Floats of shape (images,).
+
+    The sums run in the order of tiles, not of lanes: a sum does not depend on other images.
+    """
     run = _blocks(types_of(values[0]), lists).run
     rows = [dr.empty(type(v), dr.width(v)) for v in values]
     for row, v in zip(rows, values, strict=True):

@@ -49,9 +49,11 @@ def unpack_parameters(packed: Any, index: Any, number: int, active: Any = True) 
 
 
 def gather_index(types: ArrayTypes, splat: Any, i: Any, active: Any) -> Any:
-    """Return ``splat[i]`` by the gather of a pair, 8 times as fast on the CPU as a single gather.
+    """Return ``splat[i]``, on the CPU by the gather of a pair: 8 times as fast as a single gather.
 
     `splat` must have an even length.
     """
+    if types.backend == "cuda":
+        return dr.gather(types.UInt, splat, i, active)
     pair = dr.gather(types.UInt2, splat, i >> 1, active)
     return dr.select((i & 1) == 0, pair[0], pair[1])

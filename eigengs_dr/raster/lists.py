@@ -12,13 +12,13 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from ..backend.arrays import ArrayTypes, types_of, upload
 from .evaluate import is_steep
 from .granularity import granularity_of
+from .lanes import order_lanes
 from .tiles import TILE, Grid, for_each_row, for_each_tile
+from .transpose import transpose_by_counting, transpose_by_sorting
 
 MAX_LIST_ENTRIES = 1 << 28
 """Largest number of entries in the lists of all tiles; they take 4 GiB while they are built."""
@@ -42,8 +42,8 @@ class Pieces:
         Gaussian of each piece, and its range in `tile`; empty for the padding at the end.
     slot : UInt32, shape (pieces,)
         Position of the result of a piece: the pieces of one Gaussian are neighbours.
-    first : UInt32, shape (N + 1,)
-        Range ``[first[n], first[n + 1])`` of the slots of Gaussian n.
+    first, number : UInt32, shape (N,)
+        Slots ``[first, first + number)`` of each Gaussian.
     capacity : (int, int)
         Sizes of `tile` and `slot`. A replay of a frozen program of Dr.Jit 1.5 infers the sizes of
         its arrays from those of its arguments, and may write outside of memory if one changes. The
@@ -56,6 +56,7 @@ class Pieces:
     end: Any
     slot: Any
     first: Any
+    number: Any
     capacity: tuple[int, int]
 
 
@@ -77,8 +78,8 @@ class TileLists:
     capacity : int
         Size of `splat`, for the same reason as in `Pieces`.
     steep : bool
-        Whether weights need exponentials at every pixel, because a Gaussian is too narrow or a tile
-        is not 4 pixels wide; see `eigengs_dr.raster.evaluate.weights`.
+        Whether weights take exponentials at every pixel, because a Gaussian is too narrow, a tile
+        is not 4 pixels wide or exponentials cost less; see `eigengs_dr.raster.evaluate.weights`.
     """
 
     grid: Grid
@@ -134,19 +135,27 @@ def build_lists(
     wide = dr.opaque(types.Float, radius * growth)
     pad = dr.opaque(types.Float, pad) if isinstance(pad, float) else pad
     touched = _count_tiles(types, shape, wide, grid, pad)
+    share, UInt64 = granularity_of(types), dr.uint64_array_t(types.UInt)
+    number = (touched + (share.visits - 1)) // share.visits
+    # One prefix sum for the tiles and the pieces: each sum fits into 32 bits.
+    both = dr.fma(UInt64(number), 1 << 32, UInt64(touched))
+    dr.schedule(touched, number, both)  # in the kernel of the sum
     entries, steep = _read_totals(types, touched, is_steep(shape, radius) & (touched > 0))
-    steep = steep or grid.tile[0] != TILE[0]
+    steep = steep or not share.products or grid.tile[0] != TILE[0]
     if entries >= MAX_LIST_ENTRIES:
         raise ValueError(
             f"{dr.width(touched)} Gaussians touch {entries} tiles, the limit is "
             f"{MAX_LIST_ENTRIES}: use fewer or smaller Gaussians, or a smaller image"
         )
-    start = dr.prefix_sum(touched)
+    before = dr.prefix_sum(both)
+    start, first = types.UInt(before), types.UInt(before >> 32)
     last = start + touched
+    dr.schedule(first, last)
     tile = _emit_tiles(types, shape, wide, grid, pad, (start, last), _padded(entries))
-    pieces = _cut(types, tile, touched, last, entries) if adjoint else None
-    transpose = _transpose_by_counting if types.backend == "llvm" else _transpose_by_sorting
-    splat, starts = transpose(types, grid, tile, last, entries)
+    pieces = _cut(types, tile, (start, last), (first, number), entries) if adjoint else None
+    dr.eval(tile)
+    transpose = transpose_by_counting if types.backend == "llvm" else transpose_by_sorting
+    splat, starts = transpose(types, grid.tiles, tile, last, entries, dr.width(tile))
     order, begin, end = _lanes(types, grid, starts)
     lists = TileLists(grid, splat, begin, end, order, pieces, dr.width(splat), steep)
     dr.eval(lists)
@@ -173,7 +182,6 @@ def _count_tiles(types: ArrayTypes, shape: list, radius: Any, grid: Grid, pad: A
 
 def _read_totals(types: ArrayTypes, touched: Any, steep: Any) -> tuple[int, bool]:
     """Read the number of all entries, and whether a Gaussian is steep, in one copy."""
-    dr.eval(touched, steep)
     UInt64 = dr.uint64_array_t(types.UInt)
     # The sum of both needs one reduction: the flags count in the bits above all entries.
     total = int(dr.sum(dr.fma(UInt64(dr.select(steep, 1, 0)), 1 << 40, UInt64(touched)))[0])
@@ -191,9 +199,9 @@ def _emit_tiles(
 ) -> Any:
     """Write the tiles of each Gaussian to its slots ``[start, last)``."""
     start, last = slots
+    # Zeros, because rounding could let the two walks differ by a tile in different programs.
     tiles = dr.zeros(types.UInt, capacity)
     dr.make_opaque(tiles)
-
     image = types.UInt(0)
     if grid.images > 1:
         image = dr.arange(types.UInt, dr.width(start)) // (dr.width(start) // grid.images)
@@ -203,52 +211,8 @@ def _emit_tiles(
         dr.scatter(tiles, tile, slot, active & (slot < last))
         return slot + dr.select(active, types.UInt(1), 0)
 
-    done = for_each_tile(shape, radius, grid, emit, start, pad=pad, label="list tiles")
-    dr.eval(done, tiles)
+    dr.schedule(for_each_tile(shape, radius, grid, emit, start, pad=pad, label="list tiles"), tiles)
     return tiles
-
-
-def _transpose_by_counting(
-    types: ArrayTypes, grid: Grid, tile: Any, last: Any, entries: int
-) -> tuple[Any, Any]:
-    """Return the Gaussians by tile, and the starts of the lists, by SciPy's counting sort.
-
-    The counting sort is one pass over the entries on one core, and 18 times as fast as a sort of
-    keys on 450,000 entries.
-    """
-    starts = np.concatenate([[0], last.numpy()]).astype(np.int32)
-    by_tile = _transpose(tile.numpy()[:entries].view(np.int32), starts, grid.tiles)
-    splat = dr.zeros(types.UInt, _padded(entries))
-    dr.make_opaque(splat)
-    if entries:
-        indices = types.UInt(by_tile.indices.view(np.uint32))
-        dr.scatter(splat, indices, dr.arange(types.UInt, entries))
-        dr.eval(splat)
-        dr.sync_thread()  # the copy may read NumPy's memory until here
-    return splat, upload(types.UInt, by_tile.indptr.view(np.uint32))
-
-
-def _transpose(columns: NDArray[np.int32], starts: NDArray[np.int32], number: int) -> Any:
-    """Return the transpose of a sparse pattern of rows, with its indices in ascending order."""
-    ones = np.ones(len(columns), np.int8)
-    return csr_array((ones, columns, starts), shape=(len(starts) - 1, number)).tocsc()
-
-
-def _transpose_by_sorting(
-    types: ArrayTypes, grid: Grid, tile: Any, last: Any, entries: int
-) -> tuple[Any, Any]:
-    """Return the Gaussians by tile, and the starts of the lists, by sorting tile * N + index."""
-    count, capacity = dr.width(last), dr.width(tile)
-    Key = types.UInt if grid.tiles * count < 2**32 - 1 else dr.uint64_array_t(types.UInt)
-    i = dr.arange(types.UInt, capacity)
-    owner = types.UInt(
-        dr.binary_search(0, count, lambda n: dr.gather(types.UInt, last, types.UInt(n)) <= i)
-    )
-    keys = dr.select(i < entries, Key(tile) * count + Key(owner), Key(grid.tiles * count))
-    keys = dr.sort(keys)
-    needle = Key(dr.arange(types.UInt, grid.tiles + 1)) * count
-    starts = dr.binary_search(0, capacity, lambda k: dr.gather(Key, keys, types.UInt(k)) < needle)
-    return types.UInt(keys % count), types.UInt(starts)
 
 
 def _lanes(types: ArrayTypes, grid: Grid, starts: Any) -> tuple[Any, Any, Any]:
@@ -260,32 +224,32 @@ def _lanes(types: ArrayTypes, grid: Grid, starts: Any) -> tuple[Any, Any, Any]:
         window = (x + y[:, None] * (x[-1] + 1)).ravel()
         per_image = window[-1] + 1
         window = (window + per_image * np.arange(grid.images)[:, None]).ravel()
-        tile = upload(types.UInt, _descending(length, window))
+        tile = upload(types.UInt, order_lanes(length, window))
     return tile, dr.gather(types.UInt, starts, tile), dr.gather(types.UInt, starts, tile + 1)
 
 
-def _descending(length: NDArray[np.int64], window: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Return the stable order by window, then by descending length."""
-    levels = int(length.max(initial=0)) + 1
-    keys = window * levels + (levels - 1 - length)
-    starts = np.arange(len(keys) + 1, dtype=np.int32)
-    order: NDArray[np.int32] = _transpose(
-        keys.astype(np.int32), starts, (int(window.max()) + 1) * levels
-    ).indices
-    return order.view(np.uint32)
+def _cut(types: ArrayTypes, tile: Any, tiles: tuple, slots: tuple, entries: int) -> Pieces:
+    """Cut the tiles of every Gaussian into pieces of like length, at most the granularity.
 
-
-def _cut(types: ArrayTypes, tile: Any, touched: Any, last: Any, entries: int) -> Pieces:
-    """Cut the tiles of every Gaussian into pieces of like length, at most the granularity."""
-    visits, count = granularity_of(types).visits, dr.width(touched)
-    number = (touched + (visits - 1)) // visits
-    stop = dr.prefix_sum(number) + number
+    Parameters
+    ----------
+    tile : UInt32
+        Tiles, Gaussian after Gaussian.
+    tiles : tuple of UInt32, shape (N,)
+        Start and end of the tiles of each Gaussian.
+    slots : tuple of UInt32, shape (N,)
+        First piece and number of pieces of each Gaussian.
+    entries : int
+        Number of tiles of all Gaussians.
+    """
+    (start, last), (first, number) = tiles, slots
+    count, stop = dr.width(number), first + number
     # At most one piece of a Gaussian is not full, which bounds their number without reading it.
-    capacity = _padded(count + entries // visits)
+    capacity = _padded(count + entries // granularity_of(types).visits)
     splat, begin, end = (dr.zeros(types.UInt, capacity) for _ in range(3))
     dr.make_opaque(splat, begin, end)
-    owner, start = dr.arange(types.UInt, count), last - touched
-    length = types.UInt(dr.ceil(types.Float(touched) / types.Float(dr.maximum(number, 1))))
+    owner = dr.arange(types.UInt, count)
+    length = types.UInt(dr.ceil(types.Float(last - start) / types.Float(dr.maximum(number, 1))))
 
     def write(i: Any, at: Any) -> tuple:
         active = i < stop
@@ -294,16 +258,11 @@ def _cut(types: ArrayTypes, tile: Any, touched: Any, last: Any, entries: int) ->
         dr.scatter(end, dr.minimum(at + length, last), i, active)
         return i + 1, at + length
 
-    dr.eval(
-        dr.while_loop((stop - number, start), lambda i, at: i < stop, write, label="cut pieces"),
-        splat,
-        begin,
-        end,
-    )
+    done = dr.while_loop((first, start), lambda i, at: i < stop, write, label="cut pieces")
+    dr.eval(done, splat, begin, end)
     slot = dr.arange(types.UInt, capacity)
     if granularity_of(types).ordered:
         lengths = (end - begin).numpy().astype(np.int64)
-        slot = upload(types.UInt, _descending(lengths, np.arange(capacity) // PIECE_WINDOW))
+        slot = upload(types.UInt, order_lanes(lengths, np.arange(capacity) // PIECE_WINDOW))
         splat, begin, end = (dr.gather(types.UInt, v, slot) for v in (splat, begin, end))
-    first = dr.concat([types.UInt(0), stop])
-    return Pieces(tile, splat, begin, end, slot, first, (dr.width(tile), capacity))
+    return Pieces(tile, splat, begin, end, slot, first, number, (dr.width(tile), capacity))

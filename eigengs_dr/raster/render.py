@@ -15,7 +15,8 @@ from ..backend.recording import exclusive
 from ..gaussian.file import MAX_CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode, to_coded
-from .kernels import adjoint, channel_sums, forward
+from .adjoint import adjoint
+from .kernels import channel_sums, forward
 from .layout import gather_run, pack_parameters
 from .limits import check_index_range
 from .lists import TileLists, build_lists

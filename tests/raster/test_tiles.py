@@ -14,7 +14,7 @@ from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, 
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.granularity import GRANULARITY
-from eigengs_dr.raster.lists import _descending, build_lists
+from eigengs_dr.raster.lists import build_lists
 from eigengs_dr.raster.tiles import TILE, Grid, for_each_tile
 
 RADIUS = 3.0
@@ -198,24 +198,13 @@ def test_lanes_are_all_tiles_by_length_within_windows(backend):
         np.testing.assert_array_equal(lists.order.numpy(), np.arange(lists.grid.tiles))
 
 
-def test_windows_keep_neighbours_together():
-    window = np.repeat([0, 1, 2], 50)
-    length = np.random.default_rng(0).integers(0, 9, 150)
-    order = _descending(length, window)
-    np.testing.assert_array_equal(window[order], window)
-    for part in np.split(length[order], 3):
-        assert (np.diff(part) <= 0).all()
-    again = np.lexsort((np.arange(150), -length, window))
-    np.testing.assert_array_equal(order, again)
-
-
 def pairs_by_splat(lists):
     """The pairs of the pieces as a matrix (tiles, N), and the number of visits of every piece."""
     pieces = lists.pieces
     tile, splat, begin, end = (
         getattr(pieces, k).numpy().astype(int) for k in ("tile", "splat", "begin", "end")
     )
-    found = np.zeros((lists.grid.tiles, dr.width(pieces.first) - 1), int)
+    found = np.zeros((lists.grid.tiles, dr.width(pieces.first)), int)
     for n, i, j in zip(splat, begin, end, strict=True):
         np.add.at(found[:, n], tile[i:j], 1)
     return found, end - begin
@@ -239,9 +228,12 @@ def test_pieces_are_the_transpose(backend, scene, pad, growth):
     assert found.max(initial=0) <= 1
     np.testing.assert_array_equal(found, pairs_by_tile(lists, len(scene.mean)))
     assert visits.max(initial=0) <= GRANULARITY[backend].visits
-    slot, first = lists.pieces.slot.numpy(), lists.pieces.first.numpy().astype(int)
+    slot, first, number = (
+        getattr(lists.pieces, k).numpy().astype(int) for k in ("slot", "first", "number")
+    )
     assert sorted(slot) == list(range(len(slot)))
-    owner = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    np.testing.assert_array_equal(first, np.cumsum(number) - number)
+    owner = np.repeat(np.arange(len(number)), number)
     splat = np.empty(len(slot), int)
     splat[slot] = lists.pieces.splat.numpy()
     np.testing.assert_array_equal(splat[: len(owner)], owner)

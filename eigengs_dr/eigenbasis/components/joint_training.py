@@ -24,7 +24,8 @@ from ...fitting.optimizers.parameterization import CHOLESKY
 from ...fitting.placement.random import place_random
 from ...gaussian.file import CUTOFF
 from ...gaussian.gaussians import Gaussians
-from ...raster.kernels import adjoint, residual, sum_lanes
+from ...raster.adjoint import adjoint
+from ...raster.kernels import residual, sum_lanes
 from ...raster.layout import pack_parameters
 from ...raster.lists import TileLists
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape

@@ -16,7 +16,8 @@ import numpy as np
 from ...backend.arrays import ArrayTypes, types_of, upload
 from ...backend.recording import freeze_program
 from ...gaussian.gaussians import Gaussians
-from ...raster.kernels import adjoint_pieces, residual, sum_lanes, sum_pieces
+from ...raster.adjoint import adjoint_pieces, sum_pieces
+from ...raster.kernels import residual, sum_lanes
 from ...raster.layout import pack_parameters
 from ...raster.lists import TileLists
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape

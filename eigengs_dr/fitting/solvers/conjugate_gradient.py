@@ -21,14 +21,8 @@ from ...backend.arrays import types_of, upload
 from ...backend.recording import freeze_program
 from ...gaussian.file import MAX_CUTOFF
 from ...gaussian.gaussians import Gaussians
-from ...raster.kernels import (
-    adjoint,
-    channel_sums,
-    residual,
-    sum_by_image,
-    sum_channels,
-    sum_lanes,
-)
+from ...raster.adjoint import adjoint
+from ...raster.kernels import channel_sums, residual, sum_by_image, sum_channels, sum_lanes
 from ...raster.layout import gather_run, pack_parameters
 from ...raster.lists import TileLists
 from ...raster.parameters import NUM_SHAPE_PARAMS, detached_shape, kernel_radius
@@ -199,7 +193,7 @@ def _solve(
             residuals.append(square * scale)
     solved = replace(gaussians, color=types.FloatX(x[0]), background=types.FloatX(x[1]))
     dr.eval(solved)
-    return Solution(solved, [math.sqrt(float(s[0])) for s in residuals])
+    return Solution(solved, np.sqrt(dr.concat(residuals).numpy()).tolist())  # one copy to the host
 
 
 def _step(

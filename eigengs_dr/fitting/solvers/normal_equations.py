@@ -23,7 +23,7 @@ from scipy.sparse.linalg import splu
 
 from ...backend.arrays import types_of
 from ...gaussian.gaussians import Gaussians
-from ...raster.kernels import adjoint
+from ...raster.adjoint import adjoint
 from ...raster.layout import pack_parameters
 from ...raster.parameters import kernel_radius, kernel_shape
 from ...raster.render import bin_gaussians, to_tiles

@@ -1,0 +1,160 @@
+"""The adjoint of the sum over all Gaussians: one lane per piece of a Gaussian."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from ..backend.arrays import types_of
+from .evaluate import weights, weights_vjp
+from .kernels import shares_of
+from .layout import gather_index, gather_run, unpack_parameters
+from .lists import Pieces, TileLists
+from .parameters import NUM_SHAPE_PARAMS
+
+
+def adjoint(
+    packed: Any,
+    delta: Any,
+    channels: int,
+    lists: TileLists,
+    radius: float,
+    color_only: bool = False,
+) -> list:
+    """Return the gradient of ``<delta, forward(packed)>`` with respect to all parameters.
+
+    A lane owns a piece of a Gaussian, visits its tiles, gathers delta there and sums in registers;
+    `sum_pieces` adds the pieces. Without atomic operations, every run gives the same result.
+
+    Parameters
+    ----------
+    packed : Float
+        As for `forward`.
+    delta : Float
+        Derivative of a loss with respect to the image, in tile layout.
+    channels : int
+    lists : TileLists
+        With pieces.
+    radius : float
+        As for `forward`.
+    color_only : bool, optional
+        Omit the derivatives with respect to the shapes.
+
+    Returns
+    -------
+    list of Float, shape (N,)
+        Derivatives with respect to mean x, mean y, a, b, c (unless `color_only`) and the channels.
+    """
+    assert lists.pieces is not None, "the lists were built without adjoint=True"
+    number = channels if color_only else NUM_SHAPE_PARAMS + channels
+    parts = adjoint_pieces(packed, delta, channels, lists, radius, color_only)
+    return sum_pieces(parts, lists.pieces, number)
+
+
+def adjoint_pieces(
+    packed: Any,
+    delta: Any,
+    channels: int,
+    lists: TileLists,
+    radius: float,
+    color_only: bool = False,
+) -> Any:
+    """Return the packed sums of every piece, for `sum_pieces`; parameters as for `adjoint`.
+
+    A lane owns the same rows of all tiles of its piece, see `Granularity.rows`. Cost per visit of
+    4x4 pixels: a gather of delta, 6 exponentials, and per pixel 2 operations for the weight, 2 for
+    the cutoff, 2 per channel and 5 for the shape.
+    """
+    types = types_of(packed)
+    grid, pieces, tile_size = lists.grid, lists.pieces, lists.grid.tile
+    assert pieces is not None
+    rows, shares = shares_of(types, grid)
+    index, begin, end, slot = pieces.splat, pieces.begin, pieces.end, pieces.slot
+    part = types.UInt(0)
+    if shares > 1:  # neighbouring lanes visit the same tiles, and read one contiguous run together
+        lane = dr.arange(types.UInt, dr.width(slot) * shares)
+        part, owner = lane % shares, lane // shares
+        index, begin, end, slot = (
+            dr.gather(types.UInt, v, owner) for v in (index, begin, end, slot)
+        )
+    splat = unpack_parameters(packed, index, NUM_SHAPE_PARAMS + channels)
+    shape, block = splat[:NUM_SHAPE_PARAMS], (tile_size[0], rows)
+    length = block[0] * rows * channels
+
+    def add_tile(i: Any, sums: list) -> tuple:
+        active = i < end
+        tile = gather_index(types, pieces.tile, i, active)
+        d = gather_run(types, delta, tile * shares + part, length, active)
+        column, row = grid.first_pixel(tile)
+        x, y = types.Float(column) + 0.5, types.Float(row + part * rows) + 0.5
+        color = sums[-channels:]
+
+        def cotangent(k: int, w: Any) -> Any:
+            g = type(w)(0)
+            for c in range(channels):
+                color[c] = dr.fma(w, d[k * channels + c], color[c])
+                g = dr.fma(splat[NUM_SHAPE_PARAMS + c], d[k * channels + c], g)
+            return g
+
+        if color_only:
+            for k, w in enumerate(weights(shape, x, y, block, radius, lists.steep)):
+                cotangent(k, w)
+            return i + 1, color
+        gradient = weights_vjp(shape, x, y, block, radius, cotangent, lists.steep)
+        return i + 1, [s + g for s, g in zip(sums, gradient, strict=False)] + color
+
+    number = channels if color_only else NUM_SHAPE_PARAMS + channels
+    sums = dr.while_loop(
+        (types.UInt(begin), [types.Float(0) for _ in range(number)]),
+        lambda i, sums: i < end,
+        add_tile,
+        label="pull back",
+        max_iterations=-1,
+    )[-1]
+    stride = -(-number // 4) * 4
+    parts = dr.empty(types.Float, stride * shares * dr.width(pieces.slot))
+    values = [*sums, *[types.Float(0)] * (stride - number)]
+    dr.scatter(parts, types.FloatX(values), slot * shares + part)
+    return parts
+
+
+def sum_pieces(parts: Any, pieces: Pieces, number: int, splat: Any = None) -> list:
+    """Add the results of the pieces of every Gaussian, in the order of the pieces.
+
+    Parameters
+    ----------
+    parts : Float
+        From `adjoint_pieces`.
+    pieces : Pieces
+    number : int
+        Number of derivatives of a Gaussian.
+    splat : UInt32, optional
+        Gaussians, by default all. Those that the lists do not hold have the sum 0.
+
+    Returns
+    -------
+    list of `number` Float
+    """
+    types = types_of(parts)
+    count = dr.width(pieces.first)
+    if splat is None:
+        splat = dr.arange(types.UInt, count)
+    known = splat < count
+    begin = dr.gather(types.UInt, pieces.first, splat, known)
+    end = begin + dr.gather(types.UInt, pieces.number, splat, known)
+    length = dr.width(parts) // dr.width(pieces.slot)  # of the shares of all lanes of a piece
+    stride = -(-number // 4) * 4
+
+    def add(i: Any, sums: list) -> tuple:
+        values = gather_run(types, parts, i, length, i < end)
+        return i + 1, [sum(values[k::stride], s) for k, s in enumerate(sums)]
+
+    sums: list = dr.while_loop(
+        (begin, [types.Float(0) for _ in range(number)]),
+        lambda i, sums: i < end,
+        add,
+        label="sum pieces",
+        max_iterations=-1,
+    )[-1]
+    return sums

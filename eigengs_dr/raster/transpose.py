@@ -1,0 +1,114 @@
+"""The transpose of the tiles by Gaussian: the Gaussians by tile, in ascending order.
+
+On llvm a counting sort on one core is 18 times as fast as a sort of keys in Dr.Jit (450,000
+entries). On cuda a radix sort needs no copy to the host.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from ..backend.arrays import ArrayTypes, upload
+
+RADIX_BITS = 8
+"""Largest number of bits of one pass of the radix sort. A pass of Dr.Jit keeps the order of equal
+keys up to 9 bits on cuda, where its counts fit into shared memory."""
+
+
+def transpose_by_counting(
+    types: ArrayTypes, number: int, tile: Any, last: Any, entries: int, capacity: int
+) -> tuple[Any, Any]:
+    """Transpose by SciPy's counting sort: one pass over the entries, on the host.
+
+    Parameters
+    ----------
+    types : ArrayTypes
+    number : int
+        Number of tiles.
+    tile : UInt32
+        Tiles, Gaussian after Gaussian; only the first `entries` are used.
+    last : UInt32, shape (N,)
+        End of the tiles of each Gaussian.
+    entries : int
+        Number of pairs of a Gaussian and a tile.
+    capacity : int
+        Size of the result, at least `entries`.
+
+    Returns
+    -------
+    splat : UInt32, shape (capacity,)
+        Gaussians, tile after tile, and padding in [0, N).
+    starts : UInt32, shape (number + 1,)
+        Range ``[starts[t], starts[t + 1])`` of tile t in `splat`.
+    """
+    starts = np.concatenate([[0], last.numpy()]).astype(np.int32)
+    by_tile = transpose_pattern(tile.numpy()[:entries].view(np.int32), starts, number)
+    splat = dr.zeros(types.UInt, capacity)
+    dr.make_opaque(splat)
+    if entries:
+        indices = types.UInt(by_tile.indices.view(np.uint32))
+        dr.scatter(splat, indices, dr.arange(types.UInt, entries))
+        dr.eval(splat)
+        dr.sync_thread()  # the copy may read NumPy's memory until here
+    return splat, upload(types.UInt, by_tile.indptr.view(np.uint32))
+
+
+def transpose_pattern(columns: NDArray[np.int32], starts: NDArray[np.int32], number: int) -> Any:
+    """Return the transpose of a sparse pattern of rows, with its indices in ascending order."""
+    ones = np.ones(len(columns), np.int8)
+    return csr_array((ones, columns, starts), shape=(len(starts) - 1, number)).tocsc()
+
+
+def transpose_by_sorting(
+    types: ArrayTypes, number: int, tile: Any, last: Any, entries: int, capacity: int
+) -> tuple[Any, Any]:
+    """Transpose by a stable radix sort of the bits that tiles need, on the device.
+
+    The entries are in the order of Gaussians, and a stable sort by tile keeps it. No copy goes to
+    the host, and numbers are in arrays: as literals, they would compile the programs again for
+    every size. Parameters and results as for `transpose_by_counting`.
+    """
+    UInt, bits = types.UInt, (number - 1).bit_length()
+    i, real = dr.arange(UInt, capacity), dr.opaque(UInt, entries)
+    # Padding gets the largest key: it comes after the entries, and stays there.
+    key = dr.select(i < real, dr.gather(UInt, tile, i), (1 << bits) - 1)
+    owner = _search(dr.opaque(UInt, dr.width(last)), last, i + 1)
+    key, splat = _sort_stably(key, dr.select(i < real, owner, 0), bits)
+    return splat, _search(real, key, dr.arange(UInt, number + 1))
+
+
+def _sort_stably(key: Any, value: Any, bits: int) -> tuple[Any, Any]:
+    """Sort keys of some bits, and values by their keys, from the lowest digit to the highest.
+
+    `drjit.sort` always sorts all 32 or 64 bits.
+    """
+    UInt = type(key)
+    passes = -(-bits // RADIX_BITS)
+    width = -(-bits // max(1, passes))
+    for k in range(passes):
+        digit = (key >> (k * width)) & ((1 << width) - 1)
+        dr.eval(digit, key, value)
+        order = dr.detail.block_mkperm(digit, dr.width(key), 1 << width)
+        key, value = dr.gather(UInt, key, order), dr.gather(UInt, value, order)
+    dr.eval(key, value)
+    return key, value
+
+
+def _search(size: Any, values: Any, bound: Any) -> Any:
+    """Return how many of the first `size` values, which ascend, are below each bound.
+
+    The steps depend on the number of bits of the width only, so that few programs serve all sizes;
+    `drjit.binary_search` has the size in its program.
+    """
+    UInt, found = type(values), dr.zeros(type(values), dr.width(bound))
+    for bit in reversed(range(dr.width(values).bit_length())):
+        index = found + (1 << bit)
+        valid = index <= size
+        below = dr.gather(UInt, values, index - 1, valid) < bound
+        found = dr.select(valid & below, index, found)
+    return found
