@@ -80,7 +80,8 @@ def _squared_error(a: NDArray[np.float64], b: NDArray[np.float64], space: str) -
         # |M d|^2 = trace(M d d^T M^T): the sums of the products of R, G and B are enough.
         difference = a.reshape(-1, 3)
         products = difference.T @ difference
-        return float(np.trace(RGB_TO_YCBCR @ products @ RGB_TO_YCBCR.T))
+        with np.errstate(invalid="ignore"):  # an image that is not finite has the PSNR NaN
+            return float(np.trace(RGB_TO_YCBCR @ products @ RGB_TO_YCBCR.T))
     np.square(a, out=a)
     return float(a.sum()) / (255**2 if space == "rgb" else 1)
 

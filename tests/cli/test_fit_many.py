@@ -39,15 +39,16 @@ def test_the_same_command_continues(photos, tmp_path):
 
 
 def test_ctrl_c_keeps_what_is_done(photos, tmp_path, monkeypatch):
-    complete, fitted = fit_many_module.fit_image, []
+    complete, fitted = fit_many_module.fit_batch, []
 
     def interrupted(*arguments):
         fitted.append(complete(*arguments))
         if len(fitted) == 2:
-            raise eg.FitInterrupted(fitted[-1])
+            raise KeyboardInterrupt
         return fitted[-1]
 
-    monkeypatch.setattr(fit_many_module, "fit_image", interrupted)
+    monkeypatch.setattr(fit_many_module, "MAX_GROUP_PIXELS", 1)  # every image is a group
+    monkeypatch.setattr(fit_many_module, "fit_batch", interrupted)
     report = tmp_path / "r.json"
     result = run("fit", photos, "-o", tmp_path / "fits", "--report", report, *QUICK)
     assert result.exit_code == 130

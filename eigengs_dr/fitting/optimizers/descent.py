@@ -106,7 +106,6 @@ def _run_phase(
     fixed = problem.gaussians
     types = types_of(fixed.mean)
     images = len(problem.target) if problem.target.ndim == 4 else 1
-    dr.flush_malloc_cache()  # what the colour solve took would stay reserved
     state, variables = start_descent(fixed, schedule), schedule.variables()
     target = batch_to_tiles(types, problem.target)
     weight = None if problem.weight is None else batch_to_tiles(types, problem.weight)

@@ -72,7 +72,7 @@ class Schedule:
     parameterization: str = "scale_relative"
     warm_up: int = 5
     decay: float = 0.03
-    drift: float = 0.4
+    drift: float = 0.5
     redistribute_after: int = 20
     patience: int = 300
     least_gain: float = 0.01

@@ -184,6 +184,7 @@ def _solve(
     enough = [RELATIVE_TOLERANCE[types.bits] * a for a in rz]
     noise = dr.opaque(types.Float, len(gaussians) / grid.images * ROUNDING[types.bits] ** 2)
     dr.eval(p, rz, enough, residuals)
+    dr.flush_malloc_cache()  # what the lists and the start took would stay reserved
     # For this solve only: a program does not notice another number of Gaussians.
     with freeze_program(_step) as take_step:
         for _ in range(steps):
@@ -193,6 +194,8 @@ def _solve(
             residuals.append(square * scale)
     solved = replace(gaussians, color=types.FloatX(x[0]), background=types.FloatX(x[1]))
     dr.eval(solved)
+    del error, p, r, inverse
+    dr.flush_malloc_cache()
     return Solution(solved, np.sqrt(dr.concat(residuals).numpy()).tolist())  # one copy to the host
 
 
