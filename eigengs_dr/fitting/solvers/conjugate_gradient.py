@@ -28,6 +28,7 @@ from ...raster.lists import TileLists
 from ...raster.parameters import NUM_SHAPE_PARAMS, detached_shape, kernel_radius
 from ...raster.render import batch_to_tiles, bin_gaussians, to_tiles
 from ...raster.tiles import Grid
+from .unknowns import Unknowns, add_multiple, dots, multiply, negate, spread
 
 RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}
 """Tolerance by the bits of a float: a channel stops if ``r^T z``, relative to its first value, is
@@ -150,10 +151,6 @@ def inner_products(
         return np.stack([row.numpy() for row in rows[0]], axis=1)
 
 
-Unknowns = tuple[list, list]
-"""Colours of all Gaussians and backgrounds of all images: a Float for each channel in both."""
-
-
 def _start(gaussians: Gaussians, images: NDArray[Any], warm: bool) -> Unknowns:
     """Return the first unknowns: those of the set, or zero and the mean of each image."""
     types, n = types_of(gaussians.mean), len(gaussians)
@@ -177,10 +174,10 @@ def _solve(
     error, lanes = _apply(shape, x, lists, cutoff, target)
     scale = 1 / (grid.width * grid.height * grid.images * channels)
     residuals = [dr.sum(sum(sum_lanes(lanes, lists))) * scale]
-    r = _negate(_apply_transposed(shape, error, channels, lists, cutoff))
+    r = negate(_apply_transposed(shape, error, channels, lists, cutoff))
     inverse = _inverse_diagonal(shape, channels, lists, cutoff)
-    p = _multiply(r, inverse)
-    rz = _dots(r, p, grid)
+    p = multiply(r, inverse)
+    rz = dots(r, p, grid)
     enough = [RELATIVE_TOLERANCE[types.bits] * a for a in rz]
     noise = dr.opaque(types.Float, len(gaussians) / grid.images * ROUNDING[types.bits] ** 2)
     dr.eval(p, rz, enough, residuals)
@@ -221,11 +218,11 @@ def _step(
     # A channel that is solved except for rounding stops: its directions would grow without bound.
     alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, curvature, strict=True)]
     dr.eval(alpha)
-    x = _add_multiple(x, alpha, p, grid)
+    x = add_multiple(x, alpha, p, grid)
     error, squares = _add_scaled(error, q, alpha, grid)
-    r = _negate(_apply_transposed(shape, error, channels, lists, cutoff))
-    z = _multiply(r, inverse)
-    new_rz = _dots(r, z, grid)
+    r = negate(_apply_transposed(shape, error, channels, lists, cutoff))
+    z = multiply(r, inverse)
+    new_rz = dots(r, z, grid)
     goes_on = [
         a > dr.maximum(least, noise * e)
         for a, least, e in zip(new_rz, enough, squares, strict=True)
@@ -236,43 +233,8 @@ def _step(
     ]
     factor = [dr.select(go, Float(1), 0) for go in goes_on]
     dr.eval(beta, factor)
-    p = _add_multiple(_add_multiple(([0.0] * channels,) * 2, factor, z, grid), beta, p, grid)
+    p = add_multiple(add_multiple(([0.0] * channels,) * 2, factor, z, grid), beta, p, grid)
     return x, error, p, new_rz, dr.sum(sum(squares))
-
-
-def _negate(x: Unknowns) -> Unknowns:
-    return [-v for v in x[0]], [-v for v in x[1]]
-
-
-def _multiply(x: Unknowns, y: Unknowns) -> Unknowns:
-    color, background = (
-        [a * b for a, b in zip(u, v, strict=True)] for u, v in zip(x, y, strict=True)
-    )
-    return color, background
-
-
-def _dots(x: Unknowns, y: Unknowns, grid: Grid) -> list:
-    """Return the inner products for each channel, Floats of shape (images,)."""
-    color, background = _multiply(x, y)
-    dr.eval(color)
-    return [sum_by_image(c, grid) + b for c, b in zip(color, background, strict=True)]
-
-
-def _add_multiple(x: Unknowns, factors: list, y: Unknowns, grid: Grid) -> Unknowns:
-    """Return ``x + factor y``; a factor has one value for each image."""
-    color = [
-        dr.fma(_spread(f, dr.width(b), grid), b, a)
-        for a, f, b in zip(x[0], factors, y[0], strict=True)
-    ]
-    return color, [dr.fma(f, b, a) for a, f, b in zip(x[1], factors, y[1], strict=True)]
-
-
-def _spread(values: Any, count: int, grid: Grid) -> Any:
-    """Repeat the value of each image for its part of `count` entries."""
-    if grid.images == 1:
-        return values
-    index = dr.arange(dr.uint32_array_t(type(values)), count) // (count // grid.images)
-    return dr.gather(type(values), values, index)
 
 
 def _add_scaled(image: Any, step: Any, factors: list, grid: Grid) -> tuple[Any, list]:
@@ -280,8 +242,8 @@ def _add_scaled(image: Any, step: Any, factors: list, grid: Grid) -> tuple[Any, 
     types, channels = types_of(image), len(factors)
     tile, length = dr.arange(types.UInt, grid.tiles), grid.pixels * channels
     old, change = (gather_run(types, v, tile, length, True) for v in (image, step))
-    spread = [_spread(f, grid.tiles, grid) for f in factors]
-    scaled = zip(old, change, spread * grid.pixels, strict=True)
+    factors = [spread(f, grid.tiles, grid) for f in factors]
+    scaled = zip(old, change, factors * grid.pixels, strict=True)
     new = [dr.fma(factor, c, v) for v, c, factor in scaled]
     result = dr.empty(types.Float, grid.tiles * length)
     dr.scatter(result, types.FloatX(new), tile)

@@ -1,0 +1,50 @@
+"""The unknowns of the colour solve: vectors with a part for each image of a batch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from ...raster.kernels import sum_by_image
+from ...raster.tiles import Grid
+
+Unknowns = tuple[list, list]
+"""Colours of all Gaussians and backgrounds of all images: a Float for each channel in both."""
+
+
+def negate(x: Unknowns) -> Unknowns:
+    """Return ``-x``."""
+    return [-v for v in x[0]], [-v for v in x[1]]
+
+
+def multiply(x: Unknowns, y: Unknowns) -> Unknowns:
+    """Return the products of all entries."""
+    color, background = (
+        [a * b for a, b in zip(u, v, strict=True)] for u, v in zip(x, y, strict=True)
+    )
+    return color, background
+
+
+def dots(x: Unknowns, y: Unknowns, grid: Grid) -> list:
+    """Return the inner products for each channel, Floats of shape (images,)."""
+    color, background = multiply(x, y)
+    dr.eval(color)
+    return [sum_by_image(c, grid) + b for c, b in zip(color, background, strict=True)]
+
+
+def add_multiple(x: Unknowns, factors: list, y: Unknowns, grid: Grid) -> Unknowns:
+    """Return ``x + factor y``; a factor has one value for each image."""
+    color = [
+        dr.fma(spread(f, dr.width(b), grid), b, a)
+        for a, f, b in zip(x[0], factors, y[0], strict=True)
+    ]
+    return color, [dr.fma(f, b, a) for a, f, b in zip(x[1], factors, y[1], strict=True)]
+
+
+def spread(values: Any, count: int, grid: Grid) -> Any:
+    """Repeat the value of each image for its part of `count` entries."""
+    if grid.images == 1:
+        return values
+    index = dr.arange(dr.uint32_array_t(type(values)), count) // (count // grid.images)
+    return dr.gather(type(values), values, index)
