@@ -3,5 +3,6 @@
 - ``sources``: names and outputs of the images
 - ``read_ahead``: images decoded by threads before they are needed, in bounded memory
 - ``run``: the loop over groups of images, with a row for each image
+- ``fit_batch``: the fit of several small images in one program
 - ``fit_many``: `fit_many`, the fit of many images
 """

@@ -3,8 +3,10 @@
 - ``evaluate``: the weight of one Gaussian at a block of pixels, and its derivatives
 - ``parameters``: Gaussians in the units of the kernels
 - ``layout``: where parameters lie in memory
-- ``tiles``: which Gaussians touch which tile
-- ``kernels``: the sum over all Gaussians (forward) and its gradient (adjoint)
+- ``limits``: sizes that 32-bit indices can number
+- ``binning``: which Gaussians touch which tile
+- ``kernels``: the sum over all Gaussians and its error
+- ``adjoint``: its gradient
 - ``render``: the differentiable operation and `render`
 - ``reference``: slow renderers to compare with
 - ``lookup``: the sum at scattered points, for textures

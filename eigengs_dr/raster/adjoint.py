@@ -7,10 +7,10 @@ from typing import Any
 import drjit as dr
 
 from ..backend.arrays import types_of
+from .binning.lists import Pieces, TileLists
 from .evaluate import weights, weights_vjp
 from .kernels import shares_of
 from .layout import gather_index, gather_run, unpack_parameters
-from .lists import Pieces, TileLists
 from .parameters import NUM_SHAPE_PARAMS
 
 

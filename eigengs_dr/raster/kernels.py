@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import drjit as dr
 
 from ..backend.arrays import ArrayTypes, types_of
+from .binning.granularity import granularity_of
+from .binning.lists import TileLists
+from .binning.tiles import Grid
 from .evaluate import weights
-from .granularity import granularity_of
 from .layout import gather_index, gather_run, unpack_parameters
-from .lists import TileLists
 from .parameters import NUM_SHAPE_PARAMS
-from .tiles import Grid
 
 
 class _Blocks(NamedTuple):

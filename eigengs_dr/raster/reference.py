@@ -8,8 +8,8 @@ import drjit as dr
 import numpy as np
 
 from ..backend.arrays import types_of
+from .binning.lists import TileLists
 from .evaluate import weights
-from .lists import TileLists
 from .parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_radius
 
 

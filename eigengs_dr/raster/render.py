@@ -16,12 +16,12 @@ from ..gaussian.file import MAX_CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode, to_coded
 from .adjoint import adjoint
+from .binning.lists import TileLists, build_lists
+from .binning.tiles import TILE, Grid
 from .kernels import channel_sums, forward
 from .layout import gather_run, pack_parameters
 from .limits import check_index_range
-from .lists import TileLists, build_lists
 from .parameters import KernelParameters, detached_shape, kernel_radius, kernel_shape
-from .tiles import TILE, Grid
 
 TILE_ROWS = 64
 """Rows of tiles that `to_tiles` copies at a time: large images need no second copy in memory."""

@@ -25,6 +25,7 @@ from _helpers.waves import SIDE, SPLATS
 from eigengs_dr.gaussian.concatenate import concatenate
 from eigengs_dr.gaussian.file import CUTOFF, MAX_CUTOFF
 from eigengs_dr.image.color import rgb_to_ycbcr, ycbcr_to_rgb
+from eigengs_dr.raster.binning.tiles import TILE
 from eigengs_dr.raster.reference import render_plain
 from eigengs_dr.raster.render import (
     bin_gaussians,
@@ -34,7 +35,6 @@ from eigengs_dr.raster.render import (
     render,
     to_tensor,
 )
-from eigengs_dr.raster.tiles import TILE
 
 SMOOTH = 6.0
 """A cutoff whose edge, exp(-18), is below rounding: invariants hold at every pixel."""

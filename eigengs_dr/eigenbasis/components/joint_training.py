@@ -25,12 +25,12 @@ from ...fitting.placement.random import place_random
 from ...gaussian.file import CUTOFF
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint
+from ...raster.binning.lists import TileLists
+from ...raster.binning.tiles import Grid
 from ...raster.kernels import residual, sum_lanes
 from ...raster.layout import pack_parameters
-from ...raster.lists import TileLists
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ...raster.render import bin_gaussians, to_tiles
-from ...raster.tiles import Grid
 
 RATE = 1e-3
 """Initial learning rate of all variables."""

@@ -24,8 +24,8 @@ from ...fitting.optimizers.schedule import Schedule, lr_factor
 from ...fitting.placement.grid import place_grid
 from ...fitting.solvers.conjugate_gradient import solve
 from ...gaussian.gaussians import Gaussians
+from ...raster.binning.tiles import Grid
 from ...raster.render import bin_gaussians, to_tiles
-from ...raster.tiles import Grid
 
 Planes = NDArray[np.float32]
 State = dict[str, NDArray[Any]]

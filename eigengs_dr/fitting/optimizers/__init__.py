@@ -2,6 +2,7 @@
 
 - ``schedule``: rates, their decay, and the registries
 - ``parameterization``: the variables that an optimiser moves
+- ``moments``: the interface of optimisers, and moving averages
 - ``adam``: Adam
 - ``adan``: Adan
 - ``descent``: the steps

@@ -17,12 +17,12 @@ from ...backend.arrays import ArrayTypes, types_of, upload
 from ...backend.recording import freeze_program
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint_pieces, sum_pieces
+from ...raster.binning.lists import TileLists
+from ...raster.binning.tiles import Grid
 from ...raster.kernels import residual, sum_lanes
 from ...raster.layout import pack_parameters
-from ...raster.lists import TileLists
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ...raster.render import batch_to_tiles, bin_gaussians
-from ...raster.tiles import Grid
 from ..initializers import FitProblem
 from .parameterization import Parameterization
 from .schedule import MIN_PHASE_RATIO, Schedule, lr_factor, next_build

@@ -22,12 +22,12 @@ from ...backend.recording import freeze_program
 from ...gaussian.file import MAX_CUTOFF
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint
+from ...raster.binning.lists import TileLists
+from ...raster.binning.tiles import Grid
 from ...raster.kernels import channel_sums, residual, sum_by_image, sum_channels, sum_lanes
 from ...raster.layout import gather_run, pack_parameters
-from ...raster.lists import TileLists
 from ...raster.parameters import NUM_SHAPE_PARAMS, detached_shape, kernel_radius
 from ...raster.render import batch_to_tiles, bin_gaussians, to_tiles
-from ...raster.tiles import Grid
 from .unknowns import Unknowns, add_multiple, dots, multiply, negate, spread
 
 RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}

@@ -6,8 +6,8 @@ from typing import Any
 
 import drjit as dr
 
+from ...raster.binning.tiles import Grid
 from ...raster.kernels import sum_by_image
-from ...raster.tiles import Grid
 
 Unknowns = tuple[list, list]
 """Colours of all Gaussians and backgrounds of all images: a Float for each channel in both."""

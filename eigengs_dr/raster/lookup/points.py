@@ -16,11 +16,11 @@ from typing import Any
 import drjit as dr
 
 from ...backend.arrays import types_of
+from ..binning.lists import build_lists
+from ..binning.tiles import Grid
 from ..evaluate import LN2, weights
 from ..layout import gather_index, unpack_parameters
-from ..lists import build_lists
 from ..parameters import NUM_SHAPE_PARAMS
-from ..tiles import Grid
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from typing import Any
 
 import drjit as dr
 
-from ..backend.arithmetic import rcp, rsqrt
-from ..backend.arrays import types_of
+from ...backend.arithmetic import rcp, rsqrt
+from ...backend.arrays import types_of
 
 TILE = (4, 4)
 """Width and height of a tile in pixels. Measured on 2 cores with AVX-512: 4x4 keeps the sums of 16

@@ -13,8 +13,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..backend.arrays import ArrayTypes, types_of, upload
-from .evaluate import is_steep
+from ...backend.arrays import ArrayTypes, types_of, upload
+from ..evaluate import is_steep
 from .granularity import granularity_of
 from .lanes import order_lanes
 from .tiles import TILE, Grid, for_each_row, for_each_tile
@@ -110,7 +110,7 @@ def build_lists(
     Parameters
     ----------
     shape : list of 5 Float, shape (N,)
-        As for `eigengs_dr.raster.tiles.tile_columns`.
+        As for `eigengs_dr.raster.binning.tiles.tile_columns`.
     radius : float
         Cutoff in the units of the factor.
     grid : Grid

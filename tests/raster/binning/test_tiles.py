@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.granularity import GRANULARITY
-from eigengs_dr.raster.lists import build_lists
-from eigengs_dr.raster.tiles import TILE, Grid, for_each_tile
+from eigengs_dr.raster.binning.granularity import GRANULARITY
+from eigengs_dr.raster.binning.lists import build_lists
+from eigengs_dr.raster.binning.tiles import TILE, Grid, for_each_tile
 
 RADIUS = 3.0
 GRID = Grid(*SIZE)

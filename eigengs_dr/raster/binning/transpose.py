@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from ..backend.arrays import ArrayTypes, upload
+from ...backend.arrays import ArrayTypes, upload
 
 RADIX_BITS = 8
 """Largest number of bits of one pass of the radix sort. A pass of Dr.Jit keeps the order of equal

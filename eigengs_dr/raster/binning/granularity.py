@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from ..backend.arrays import ArrayTypes
+from ...backend.arrays import ArrayTypes
 
 
 class Granularity(NamedTuple):
