@@ -80,7 +80,7 @@ def weights(
     Returns
     -------
     list of Float
-        Weights in [0, 1], row after row.
+        Weights in [0, 1], row after row; on cuda up to 5e-7 above 1, the error of its exponential.
     """
     return [w for row in _rows(shape, x, y, tile, radius, steep) for w in row[0]]
 
