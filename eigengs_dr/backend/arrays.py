@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import sys
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -81,6 +82,19 @@ def _types(module: str, bits: int) -> ArrayTypes:
         backend=module.split(".")[1],
         bits=bits,
     )
+
+
+def release_memory() -> None:
+    """Give memory that is free back to the system: that of Dr.Jit, and that of the C library.
+
+    Both keep what was freed for later. After a step of a fit that takes much memory, nothing later
+    asks for blocks of these sizes.
+    """
+    dr.flush_malloc_cache()
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc; others have none
+        if trim is not None:
+            trim(0)
 
 
 def upload(kind: Any, values: NDArray[Any]) -> Any:

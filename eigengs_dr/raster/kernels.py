@@ -238,12 +238,26 @@ def sum_by_image(values: Any, grid: Grid) -> Any:
 
 def channel_sums(image: Any, channels: int, grid: Grid) -> list:
     """Sum each channel of images in tile layout; return a list of Float, shape (images,)."""
-    types = types_of(image)
-    tile = dr.arange(types.UInt, grid.tiles)
-    values = gather_run(types, image, tile, grid.pixels * channels, True)
-    sums = sum_channels(values, channels)
+    sums = sum_channels(_pixels(image, channels, grid), channels)
     dr.eval(sums)  # one kernel for all channels
     return [sum_by_image(s, grid) for s in sums]
+
+
+def channel_moments(image: Any, channels: int, grid: Grid) -> tuple[list, list]:
+    """Sum the values and the squares of each channel, as `channel_sums`, in one pass."""
+    values = _pixels(image, channels, grid)
+    sums = sum_channels(values, channels)
+    squares = sum_channels([dr.square(v) for v in values], channels)
+    dr.eval(sums, squares)
+    return [sum_by_image(s, grid) for s in sums], [sum_by_image(s, grid) for s in squares]
+
+
+def _pixels(image: Any, channels: int, grid: Grid) -> list:
+    """Read the values of each tile of images in tile layout."""
+    types = types_of(image)
+    return gather_run(
+        types, image, dr.arange(types.UInt, grid.tiles), grid.pixels * channels, True
+    )
 
 
 def sum_channels(values: list, channels: int) -> list:

@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.arithmetic import rcp
-from ...backend.arrays import types_of, upload
+from ...backend.arrays import release_memory, types_of, upload
 from ...backend.recording import freeze_program
 from ...gaussian.file import MAX_CUTOFF
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint
 from ...raster.binning.lists import TileLists
 from ...raster.binning.tiles import Grid
-from ...raster.kernels import channel_sums, residual, sum_by_image, sum_channels, sum_lanes
+from ...raster.kernels import channel_moments, channel_sums, residual, sum_lanes
 from ...raster.layout import gather_run, pack_parameters
 from ...raster.parameters import NUM_SHAPE_PARAMS, detached_shape, kernel_radius
 from ...raster.render import batch_to_tiles, bin_gaussians, to_tiles
@@ -92,10 +92,10 @@ def solve(
     if steps < 0:
         raise ValueError(f"solve: steps is {steps}; it must be at least 0")
     with dr.suspend_grad():
-        lists = bin_gaussians(gaussians)
-        target = to_tiles(types_of(gaussians.mean), np.asarray(image, np.float32), lists.grid)
         start = _start(gaussians, image[None], warm_start)
-        return _solve(gaussians, lists, target, start, steps)
+        solution = _solve(gaussians, bin_gaussians(gaussians), image, start, steps)
+    release_memory()  # the lists too
+    return solution
 
 
 def solve_batch(gaussians: Gaussians, images: NDArray[Any], steps: int = 10) -> Solution:
@@ -118,8 +118,7 @@ def solve_batch(gaussians: Gaussians, images: NDArray[Any], steps: int = 10) -> 
     """
     with dr.suspend_grad():
         lists = bin_gaussians(gaussians, images=len(images))
-        target = batch_to_tiles(types_of(gaussians.mean), images)
-        return _solve(gaussians, lists, target, _start(gaussians, images, False), steps)
+        return _solve(gaussians, lists, images, _start(gaussians, images, False), steps)
 
 
 def inner_products(
@@ -164,41 +163,60 @@ def _start(gaussians: Gaussians, images: NDArray[Any], warm: bool) -> Unknowns:
 
 
 def _solve(
-    gaussians: Gaussians, lists: TileLists, target: Any, x: Unknowns, steps: int
+    gaussians: Gaussians, lists: TileLists, image: NDArray[Any], x: Unknowns, steps: int
 ) -> Solution:
+    """Solve for an image, or for a batch of images, from the unknowns x.
+
+    Beside the lists, memory holds two images in a step: the error ``A x - D`` and ``A p``.
+    """
     types, cutoff = types_of(gaussians.mean), gaussians.cutoff
     grid, channels = lists.grid, gaussians.channels
     shape = detached_shape(gaussians)
     dr.eval(shape, x)
 
+    target = batch_to_tiles(types, np.asarray(image, np.float32))
     error, lanes = _apply(shape, x, lists, cutoff, target)
-    scale = 1 / (grid.width * grid.height * grid.images * channels)
-    residuals = [dr.sum(sum(sum_lanes(lanes, lists))) * scale]
+    squares = [sum_lanes(lanes, lists)]
+    dr.eval(error, squares)
+    del target
     r = negate(_apply_transposed(shape, error, channels, lists, cutoff))
     inverse = _inverse_diagonal(shape, channels, lists, cutoff)
     p = multiply(r, inverse)
     rz = dots(r, p, grid)
     enough = [RELATIVE_TOLERANCE[types.bits] * a for a in rz]
     noise = dr.opaque(types.Float, len(gaussians) / grid.images * ROUNDING[types.bits] ** 2)
-    dr.eval(p, rz, enough, residuals)
+    dr.eval(p, rz, enough)
+    del r
     dr.flush_malloc_cache()  # what the lists and the start took would stay reserved
     # For this solve only: a program does not notice another number of Gaussians.
-    with freeze_program(_step) as take_step:
+    with freeze_program(_advance) as advance, freeze_program(_turn) as turn:
         for _ in range(steps):
-            x, error, p, rz, square = take_step(
-                shape, x, error, p, rz, enough, noise, inverse, lists, cutoff
-            )
-            residuals.append(square * scale)
+            x, q, alpha = advance(shape, x, p, rz, lists, cutoff)
+            _add_in_place(error, q, alpha, grid)
+            del q  # before the next one
+            p, rz, square = turn(shape, error, p, rz, enough, noise, inverse, lists, cutoff)
+            squares.append(square)
+    scale = 1 / (grid.width * grid.height * grid.images * channels)
+    residuals = [dr.sum(sum(square)) * scale for square in squares]
     solved = replace(gaussians, color=types.FloatX(x[0]), background=types.FloatX(x[1]))
-    dr.eval(solved)
-    del error, p, r, inverse
-    dr.flush_malloc_cache()
+    dr.eval(solved, residuals)
     return Solution(solved, np.sqrt(dr.concat(residuals).numpy()).tolist())  # one copy to the host
 
 
-def _step(
+def _advance(
+    shape: list, x: Unknowns, p: Unknowns, rz: list, lists: TileLists, cutoff: float
+) -> tuple[Unknowns, Any, list]:
+    """Move x along p to the least error; return x, ``q = A p``, and ``alpha = rz / |q|^2``."""
+    q, lanes = _apply(shape, p, lists, cutoff)
+    curvature = sum_lanes(lanes, lists)
+    # A channel that is solved except for rounding stops: its directions would grow without bound.
+    alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, curvature, strict=True)]
+    dr.eval(alpha)
+    return add_multiple(x, alpha, p, lists.grid), q, alpha
+
+
+def _turn(
     shape: list,
-    x: Unknowns,
     error: Any,
     p: Unknowns,
     rz: list,
@@ -207,20 +225,12 @@ def _step(
     inverse: Unknowns,
     lists: TileLists,
     cutoff: float,
-) -> tuple:
-    """Take one step of conjugate gradients for all channels; ``alpha = rz / |A p|^2``.
-
-    The error is ``A x - D``; it costs one pass over two images.
-    """
+) -> tuple[Unknowns, list, list]:
+    """Return the next direction p, its rz, and the sums of the squares of the error."""
     Float, grid, channels = type(error), lists.grid, len(rz)
-    q, lanes = _apply(shape, p, lists, cutoff)
-    curvature = sum_lanes(lanes, lists)
-    # A channel that is solved except for rounding stops: its directions would grow without bound.
-    alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, curvature, strict=True)]
-    dr.eval(alpha)
-    x = add_multiple(x, alpha, p, grid)
-    error, squares = _add_scaled(error, q, alpha, grid)
-    r = negate(_apply_transposed(shape, error, channels, lists, cutoff))
+    color = _correlate(shape, error, channels, lists, cutoff)
+    sums, squares = channel_moments(error, channels, grid)
+    r = negate((color, sums))
     z = multiply(r, inverse)
     new_rz = dots(r, z, grid)
     goes_on = [
@@ -234,22 +244,23 @@ def _step(
     factor = [dr.select(go, Float(1), 0) for go in goes_on]
     dr.eval(beta, factor)
     p = add_multiple(add_multiple(([0.0] * channels,) * 2, factor, z, grid), beta, p, grid)
-    return x, error, p, new_rz, dr.sum(sum(squares))
+    return p, new_rz, squares
 
 
-def _add_scaled(image: Any, step: Any, factors: list, grid: Grid) -> tuple[Any, list]:
-    """Return ``image + factor step`` by channels, in tile layout, and the sums of its squares."""
-    types, channels = types_of(image), len(factors)
-    tile, length = dr.arange(types.UInt, grid.tiles), grid.pixels * channels
-    old, change = (gather_run(types, v, tile, length, True) for v in (image, step))
+def _add_in_place(image: Any, step: Any, factors: list, grid: Grid) -> None:
+    """Add ``factor step`` by channels to an image in tile layout, in the memory of the image.
+
+    A frozen program would copy the image, because it may not change its arguments. No two lanes
+    write the same pixel, so that no atomic operations are needed.
+    """
+    types = types_of(image)
+    tile, length = dr.arange(types.UInt, grid.tiles), grid.pixels * len(factors)
+    change = gather_run(types, step, tile, length, True)
     factors = [spread(f, grid.tiles, grid) for f in factors]
-    scaled = zip(old, change, factors * grid.pixels, strict=True)
-    new = [dr.fma(factor, c, v) for v, c, factor in scaled]
-    result = dr.empty(types.Float, grid.tiles * length)
-    dr.scatter(result, types.FloatX(new), tile)
-    squares = sum_channels([dr.square(v) for v in new], channels)
-    dr.eval(result, squares)
-    return result, [sum_by_image(s, grid) for s in squares]
+    added = [c * f for c, f in zip(change, factors * grid.pixels, strict=True)]
+    add, alone = dr.ReduceOp.Add, dr.ReduceMode.NoConflicts
+    dr.scatter_reduce(add, image, types.FloatX(added), tile, mode=alone)
+    dr.eval(image)
 
 
 def _apply(
@@ -264,10 +275,14 @@ def _apply_transposed(
     shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float
 ) -> Unknowns:
     """Return ``A^T d``: correlations with every Gaussian, and the sum of every channel."""
-    types = types_of(delta)
-    packed = pack_parameters([*shape, *[types.Float(0)] * channels])
-    color = adjoint(packed, delta, channels, lists, kernel_radius(cutoff), color_only=True)
+    color = _correlate(shape, delta, channels, lists, cutoff)
     return color, channel_sums(delta, channels, lists.grid)
+
+
+def _correlate(shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float) -> list:
+    """Return for each channel the correlations of an image with every Gaussian."""
+    packed = pack_parameters([*shape, *[type(delta)(0)] * channels])
+    return adjoint(packed, delta, channels, lists, kernel_radius(cutoff), color_only=True)
 
 
 def _inverse_diagonal(shape: list, channels: int, lists: TileLists, cutoff: float) -> Unknowns:

@@ -14,9 +14,11 @@ class Granularity(NamedTuple):
     ----------
     rows : int
         Rows of a tile that one lane owns, of the sum over Gaussians and of the adjoint: 1, 2 or 4.
-    visits : int
-        Largest number of tiles that one lane of the adjoint visits; a Gaussian that touches more
-        tiles gets several lanes, so that few large Gaussians fill many cores too.
+    visits, long_visits : int
+        Largest number of tiles that one lane of the adjoint visits, and the number where lists are
+        long enough to keep `MIN_PIECES` lanes busy. A Gaussian that touches more tiles gets several
+        lanes, so that few large Gaussians fill many cores too; fewer lanes have fewer results to
+        store and to add.
     ordered : bool
         Whether lanes are ordered by their work. A SIMD packet of a CPU takes as long as its longest
         lane, and ordering is cheap there; a GPU would need another sort.
@@ -27,13 +29,21 @@ class Granularity(NamedTuple):
 
     rows: int
     visits: int
+    long_visits: int
     ordered: bool
     products: bool
 
+    def visits_for(self, entries: int) -> int:
+        """Return the largest number of tiles of one lane, for the pairs in the lists of an image."""
+        return self.long_visits if entries >= MIN_PIECES * self.long_visits else self.visits
+
+
+MIN_PIECES = 1 << 15
+"""Pieces that keep all cores of a large CPU busy."""
 
 GRANULARITY = {
-    "llvm": Granularity(rows=4, visits=8, ordered=True, products=True),
-    "cuda": Granularity(rows=1, visits=16, ordered=False, products=False),
+    "llvm": Granularity(rows=4, visits=16, long_visits=64, ordered=True, products=True),
+    "cuda": Granularity(rows=1, visits=16, long_visits=16, ordered=False, products=False),
 }
 """Granularity by backend. On llvm a lane shares the parameters of a Gaussian among 16 pixels; on a
 GPU more lanes with fewer registers hide the latency of memory."""

@@ -136,10 +136,7 @@ def build_lists(
     pad = dr.opaque(types.Float, pad) if isinstance(pad, float) else pad
     touched = _count_tiles(types, shape, wide, grid, pad)
     share, UInt64 = granularity_of(types), dr.uint64_array_t(types.UInt)
-    number = (touched + (share.visits - 1)) // share.visits
-    # One prefix sum for the tiles and the pieces: each sum fits into 32 bits.
-    both = dr.fma(UInt64(number), 1 << 32, UInt64(touched))
-    dr.schedule(touched, number, both)  # in the kernel of the sum
+    dr.schedule(touched)  # in the kernel of the sum
     entries, steep = _read_totals(types, touched, is_steep(shape, radius) & (touched > 0))
     steep = steep or not share.products or grid.tile[0] != TILE[0]
     if entries >= MAX_LIST_ENTRIES:
@@ -147,12 +144,21 @@ def build_lists(
             f"{dr.width(touched)} Gaussians touch {entries} tiles, the limit is "
             f"{MAX_LIST_ENTRIES}: use fewer or smaller Gaussians, or a smaller image"
         )
+    visits = share.visits_for(entries // grid.images)
+    number = (touched + (visits - 1)) // visits
+    # One prefix sum for the tiles and the pieces: each sum fits into 32 bits.
+    both = dr.fma(UInt64(number), 1 << 32, UInt64(touched))
+    dr.schedule(number)
     before = dr.prefix_sum(both)
     start, first = types.UInt(before), types.UInt(before >> 32)
     last = start + touched
     dr.schedule(first, last)
     tile = _emit_tiles(types, shape, wide, grid, pad, (start, last), _padded(entries))
-    pieces = _cut(types, tile, (start, last), (first, number), entries) if adjoint else None
+    pieces = None
+    if adjoint:
+        # At most one piece of a Gaussian is not full, which bounds their number without reading it.
+        capacity = _padded(dr.width(number) + entries // visits)
+        pieces = _cut(types, tile, (start, last), (first, number), capacity)
     dr.eval(tile)
     transpose = transpose_by_counting if types.backend == "llvm" else transpose_by_sorting
     splat, starts = transpose(types, grid.tiles, tile, last, entries, dr.width(tile))
@@ -228,7 +234,7 @@ def _lanes(types: ArrayTypes, grid: Grid, starts: Any) -> tuple[Any, Any, Any]:
     return tile, dr.gather(types.UInt, starts, tile), dr.gather(types.UInt, starts, tile + 1)
 
 
-def _cut(types: ArrayTypes, tile: Any, tiles: tuple, slots: tuple, entries: int) -> Pieces:
+def _cut(types: ArrayTypes, tile: Any, tiles: tuple, slots: tuple, capacity: int) -> Pieces:
     """Cut the tiles of every Gaussian into pieces of like length, at most the granularity.
 
     Parameters
@@ -239,13 +245,11 @@ def _cut(types: ArrayTypes, tile: Any, tiles: tuple, slots: tuple, entries: int)
         Start and end of the tiles of each Gaussian.
     slots : tuple of UInt32, shape (N,)
         First piece and number of pieces of each Gaussian.
-    entries : int
-        Number of tiles of all Gaussians.
+    capacity : int
+        Number of pieces, with padding.
     """
     (start, last), (first, number) = tiles, slots
     count, stop = dr.width(number), first + number
-    # At most one piece of a Gaussian is not full, which bounds their number without reading it.
-    capacity = _padded(count + entries // granularity_of(types).visits)
     splat, begin, end = (dr.zeros(types.UInt, capacity) for _ in range(3))
     dr.make_opaque(splat, begin, end)
     owner = dr.arange(types.UInt, count)

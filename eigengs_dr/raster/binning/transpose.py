@@ -48,20 +48,18 @@ def transpose_by_counting(
     """
     starts = np.concatenate([[0], last.numpy()]).astype(np.int32)
     by_tile = transpose_pattern(tile.numpy()[:entries].view(np.int32), starts, number)
-    splat = dr.zeros(types.UInt, capacity)
-    dr.make_opaque(splat)
-    if entries:
-        indices = types.UInt(by_tile.indices.view(np.uint32))
-        dr.scatter(splat, indices, dr.arange(types.UInt, entries))
-        dr.eval(splat)
-        dr.sync_thread()  # the copy may read NumPy's memory until here
+    splat = dr.empty(types.UInt, capacity)
+    dr.eval(splat)
+    memory = splat.numpy()  # on llvm a view: no second copy of the largest array
+    memory[:entries], memory[entries:] = by_tile.indices, 0
     return splat, upload(types.UInt, by_tile.indptr.view(np.uint32))
 
 
 def transpose_pattern(columns: NDArray[np.int32], starts: NDArray[np.int32], number: int) -> Any:
     """Return the transpose of a sparse pattern of rows, with its indices in ascending order."""
-    ones = np.ones(len(columns), np.int8)
-    return csr_array((ones, columns, starts), shape=(len(starts) - 1, number)).tocsc()
+    # The values mean nothing: memory that is never written takes no room.
+    unused = np.empty(len(columns), np.int8)
+    return csr_array((unused, columns, starts), shape=(len(starts) - 1, number)).tocsc()
 
 
 def transpose_by_sorting(
