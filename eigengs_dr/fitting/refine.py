@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian.gaussians import Gaussians
-from ..image.metrics import MAX_PSNR, float_space, psnr
-from ..raster.render import picture_of
+from ..image.metrics import MAX_PSNR, float_space, psnrs_by_rows
+from ..raster.picture import picture_rows
 from .initializers import FitProblem
 from .optimizers.descent import descend
 from .optimizers.schedule import Schedule
@@ -124,14 +124,14 @@ def measure(
     base_image: NDArray[np.float32] | None = None,
 ) -> dict[str, Any]:
     """Return the seconds, psnr_ycbcr and psnr_rgb of a set for a row of the trace of `refine`."""
-    rendered = picture_of(gaussians)
-    if base_image is not None:
-        rendered = rendered + base_image
-    return {
-        "seconds": time.perf_counter() - started,
-        "psnr_ycbcr": psnr(rendered, image, space=float_space(gaussians.space)),
-        "psnr_rgb": psnr(rendered, image, space="rgb"),
-    }
+    read = picture_rows(gaussians)
+    seconds = time.perf_counter() - started
+
+    def shown(rows: slice) -> NDArray[np.floating]:
+        return read(rows) if base_image is None else read(rows) + base_image[rows]
+
+    ycbcr, rgb = psnrs_by_rows(shown, image, [float_space(gaussians.space), "rgb"])
+    return {"seconds": seconds, "psnr_ycbcr": ycbcr, "psnr_rgb": rgb}
 
 
 def is_plateau(trace: list[dict[str, Any]], schedule: Schedule) -> bool:

@@ -1,7 +1,7 @@
 """Similarity of two images: PSNR in RGB and YCbCr, SSIM and MS-SSIM."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -63,11 +63,39 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     if space not in ("rgb", "ycbcr", "data"):
         raise ValueError(f"space {space!r} is unknown; use 'rgb', 'ycbcr' or 'data'")
     x, y = _pair(a, b)
+    return psnrs_by_rows(x.__getitem__, y, [space])[0]
 
-    def squares(rows: slice) -> float:
-        return _squared_error(x[rows].astype(np.float64), y[rows].astype(np.float64), space)
 
-    return psnr_from_mse(sum(map_threads(squares, strips(*x.shape[:2]))) / x.size)
+def psnrs_by_rows(
+    read: Callable[[slice], NDArray[np.floating]],
+    image: NDArray[np.floating],
+    spaces: Sequence[str],
+) -> list[float]:
+    """Compute `psnr` in several spaces, between an image and another that is read by strips.
+
+    Parameters
+    ----------
+    read : callable
+        ``read(rows)`` returns rows of the first image; several threads call it at once.
+    image : ndarray of float, shape (H, W, 3) or (H, W, 1)
+        The second image.
+    spaces : sequence of str
+        See `psnr`.
+
+    Returns
+    -------
+    list of float
+        One PSNR for each space, in decibels.
+    """
+
+    def squares(rows: slice) -> list[float]:
+        a, b = read(rows), image[rows]
+        return [
+            _squared_error(a.astype(np.float64), b.astype(np.float64), space) for space in spaces
+        ]
+
+    sums = np.sum(map_threads(squares, strips(*image.shape[:2])), axis=0)
+    return [psnr_from_mse(float(s) / image.size) for s in sums]
 
 
 def _squared_error(a: NDArray[np.float64], b: NDArray[np.float64], space: str) -> float:

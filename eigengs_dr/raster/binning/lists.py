@@ -173,7 +173,7 @@ def _padded(count: int) -> int:
 
     Frozen programs are traced again for another size, so that sizes should change seldom.
     """
-    step = max(16, 1 << max(0, count.bit_length() - 3))
+    step = max(16, 1 << max(0, min(count.bit_length() - 3, 20)))
     return (count // step + 1) * step
 
 
