@@ -196,22 +196,18 @@ def for_each_tile(
     PyTree
         The final `state`.
     """
-    row, stop = tile_rows(shape, radius, grid, pad)
-    column, last = tile_columns(shape, radius, grid, row, pad)
 
-    def body(row: Any, column: Any, last: Any, state: Any) -> tuple:
-        state = visit(row * grid.nx + column, column, row, column < last, state)
-        column = column + 1
-        done = column >= last
-        row = dr.select(done, row + 1, row)
-        next_column, next_last = tile_columns(shape, radius, grid, row, pad)
-        column = dr.select(done, next_column, column)
-        return row, column, dr.select(done, next_last, last), state
+    def visit_row(row: Any, first: Any, last: Any, state: Any) -> Any:
+        def body(column: Any, state: Any) -> tuple:
+            tile = row * grid.nx + column
+            return column + 1, visit(tile, column, row, column < last, state)
 
-    return dr.while_loop(
-        (row, column, last, state),
-        lambda row, *rest: row < stop,
-        body,
-        label=label,
-        max_iterations=-1,
-    )[-1]
+        return dr.while_loop(
+            (first, state),
+            lambda column, state: column < last,
+            body,
+            label=label,
+            max_iterations=-1,
+        )[-1]
+
+    return for_each_row(shape, radius, grid, visit_row, state, pad=pad, label=label)
