@@ -6,34 +6,34 @@ import os
 
 from ..image.strips import MAX_THREADS, STRIP_PIXELS, available_cores
 
-BASE_BYTES = 140e6
+BASE_BYTES = 130e6
 """Memory of Python, libLLVM and the compiled programs. This and the constants below follow the
 largest resident memory of processes that fit a mosaic of photos with the backend llvm on 2 cores,
 10 steps:
 
 | image | channels | Gaussians | measured | estimated |
 |---|---|---|---|---|
-| 512x512 | 3 | 20,000 | 0.23 GB | 0.23 GB |
-| 1,024x1,024 | 3 | 80,000 | 0.44 GB | 0.51 GB |
-| 2,048x2,048 | 3 | 20,000 | 0.79 GB | 0.74 GB |
-| 2,048x2,048 | 3 | 320,000 | 0.97 to 1.03 GB | 0.98 GB |
-| 2,048x2,048 | 1 | 320,000 | 0.81 GB | 0.76 GB |
-| 4,000x3,000 | 3 | 5,000 | 1.47 GB | 1.43 GB |
-| 4,096x4,096 | 3 | 1,280,000 | 2.95 GB | 2.86 GB |
+| 512x512 | 3 | 20,000 | 0.20 GB | 0.21 GB |
+| 1,024x1,024 | 3 | 80,000 | 0.38 GB | 0.44 GB |
+| 2,048x2,048 | 3 | 20,000 | 0.64 GB | 0.62 GB |
+| 2,048x2,048 | 3 | 320,000 | 0.88 GB | 0.84 GB |
+| 2,048x2,048 | 1 | 320,000 | 0.63 GB | 0.65 GB |
+| 4,000x3,000 | 3 | 5,000 | 1.17 GB | 1.16 GB |
+| 4,096x4,096 | 3 | 1,280,000 | 2.37 GB | 2.43 GB |
 
 Rows of equal size give `BYTES_PER_GAUSSIAN` and `BYTES_PER_VALUE`, the two largest sizes
 `BYTES_PER_PIXEL`, and the others `BYTES_PER_STRIP_PIXEL`."""
 
-BYTES_PER_STRIP_PIXEL = 200.0
+BYTES_PER_STRIP_PIXEL = 170.0
 """Memory of the temporary arrays of a placement, for each pixel of the strips under way."""
 
-BYTES_PER_PIXEL = 12.0
+BYTES_PER_PIXEL = 5.0
 """Memory of the density and of the lists of tiles, for each pixel."""
 
-BYTES_PER_VALUE = 26.0
-"""Memory of the images, for each pixel and channel: between 6 and 7 images in single precision."""
+BYTES_PER_VALUE = 22.0
+"""Memory of the images, for each pixel and channel: between 5 and 6 images in single precision."""
 
-BYTES_PER_GAUSSIAN = 780.0
+BYTES_PER_GAUSSIAN = 730.0
 """Memory of the parameters, of the colour solve and of the lists, for each Gaussian."""
 
 
