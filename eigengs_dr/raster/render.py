@@ -23,6 +23,7 @@ from .layout import gather_run, pack_parameters
 from .limits import check_index_range
 from .parameters import KernelParameters, detached_shape, kernel_radius, kernel_shape
 
+
 @exclusive()
 def render(
     gaussians: Gaussians,
