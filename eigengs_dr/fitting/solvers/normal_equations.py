@@ -188,7 +188,7 @@ class NormalEquations:
             Cost: one sparse product for `MIN_BATCH` to `BATCH` planes, one adjoint with respect
             to colours for every `GROUP` of fewer planes.
         """
-        result = np.empty((self.count + 1, len(images)), order="F")
+        result = np.empty((self.count + 1, len(images)))
         for first in range(0, len(images), BATCH):
             planes = images[first : first + BATCH]
             sums = result[:-1, first : first + len(planes)]
