@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..fitting.solvers.normal_equations import NormalEquations, squared_norms
 from ..gaussian.gaussians import Gaussians
+from ..image.color import RGB_TO_YCBCR, YCBCR_OFFSET
 from ..image.folder import to_planes
 from ..image.resize import resample
 from .components.solve import with_colors
@@ -48,8 +49,8 @@ class Encoder:
         image : ndarray of float32, shape (H, W, 3)
         target_psnr : float or None
         """
-        planes = self.planes(image)
-        return self._coefficients(planes, self.equations.correlate(planes), False, target_psnr)
+        pixels = self.resized(image)
+        return self._coefficients(pixels, self._correlate([pixels]), False, target_psnr)
 
     def reconstruct(
         self, coefficients: Sequence[Any], size: tuple[int, int] | None = None
@@ -86,12 +87,12 @@ class Encoder:
             Checked by `eigengs_dr.eigenbasis.encode_many.check_encoding`.
         """
         sizes = [(pixels.shape[1], pixels.shape[0]) for pixels in images]
-        planes = np.concatenate([self.planes(pixels) for pixels in images])
+        resized = [self.resized(pixels) for pixels in images]
         channels, centred = len(self.weights), mean == "dense"
+        correlations = self._correlate(resized)
         if centred:
-            planes -= np.tile(self.mean_image, (len(images), 1, 1))
-        correlations = self.equations.correlate(planes)
-        parts = [slice(k, k + channels) for k in range(0, len(planes), channels)]
+            correlations -= np.tile(self._dense_mean_correlations, len(images))
+        parts = [slice(k, k + channels) for k in range(0, correlations.shape[1], channels)]
         if colors == "exact":
             solved = self.equations.solve(correlations)
             return [
@@ -99,21 +100,44 @@ class Encoder:
                 for part, size in zip(parts, sizes, strict=True)
             ]
         result = []
-        for part, size in zip(parts, sizes, strict=True):
+        for part, size, pixels in zip(parts, sizes, resized, strict=True):
             products = correlations[:, part]
-            coefficients = self._coefficients(planes[part], products, centred, target_psnr)
+            coefficients = self._coefficients(pixels, products, centred, target_psnr)
             if centred:
                 result.append(self._colored(self._sum(coefficients), size))
             else:
                 result.append(self.reconstruct(coefficients, size))
         return result
 
-    def planes(self, pixels: Planes) -> Planes:
-        """Convert an RGB image to the size and space of the model, shape (C, H, W)."""
+    def resized(self, pixels: Planes) -> Planes:
+        """Return an image at the size of the model."""
         width, height = self.gaussians.width, self.gaussians.height
-        if pixels.shape[:2] != (height, width):
-            pixels = resample(pixels, width, height)
-        return to_planes(pixels, self.gaussians.space).reshape(-1, height, width)
+        same = pixels.shape[:2] == (height, width)
+        return pixels if same else resample(pixels, width, height)
+
+    def _correlate(self, images: list[Planes]) -> NDArray[np.float64]:
+        """Return ``[A 1]^T x`` of all channels of images of the model's size, shape (N + 1, C M).
+
+        The conversion of RGB pixels D is affine: ``A^T (M D + o) = M A^T D + o A^T 1``. There are
+        fewer Gaussians than pixels, and the colours of "coffee" have half of the rounding error.
+        """
+        [planes, *others] = [np.moveaxis(pixels, 2, 0) for pixels in images]
+        if others:
+            # An array that NumPy makes has pixels, not planes, in its memory.
+            whole = np.empty((3 * len(images), *planes.shape[1:]), np.float32)
+            planes = np.concatenate([planes, *others], out=whole)
+        found = self.equations.correlate(planes)
+        if self.gaussians.space == "rgb":
+            return found
+        for k in range(0, found.shape[1], 3):
+            found[:, k : k + 3] = found[:, k : k + 3] @ RGB_TO_YCBCR.T + self._offsets
+        return found
+
+    @cached_property
+    def _offsets(self) -> NDArray[np.float64]:
+        """Correlations of a black image in YCbCr, shape (N + 1, 3)."""
+        pixels = self.gaussians.width * self.gaussians.height
+        return np.outer(np.append(self.equations.coverage, pixels), YCBCR_OFFSET)
 
     def _colored(
         self, coefficients: NDArray[np.float64], size: tuple[int, int] | None
@@ -134,23 +158,34 @@ class Encoder:
         return self.equations.product(self._mean_coefficients)
 
     @cached_property
+    def _dense_mean_correlations(self) -> NDArray[np.float64]:
+        """Correlations of the pixels of the mean image, shape (N + 1, C)."""
+        return self.equations.correlate(self.mean_image)
+
+    @cached_property
     def _projector(self) -> ComponentProjector:
         """Least squares on the rendered components."""
         return ComponentProjector(self.equations, self.weights)
 
     def _coefficients(
         self,
-        planes: Planes,
+        pixels: Planes,
         correlations: NDArray[np.float64],
         centred: bool,
         target_psnr: float | None,
     ) -> Coefficients:
-        """Solve least squares on the rendered components; `centred` planes lack the mean image."""
+        """Solve least squares on the rendered components for an image of the model's size.
+
+        `centred` correlations lack the mean image.
+        """
         products = correlations if centred else correlations - self._mean_product
         if target_psnr is None:
             return self._projector.coefficients(products)
-        lengths = squared_norms(planes)
-        if not centred:
+        planes = to_planes(pixels, self.gaussians.space).reshape(self.mean_image.shape)
+        if centred:
+            lengths = squared_norms(planes - self.mean_image)
+        else:
+            lengths = squared_norms(planes)
             lengths = self.equations.error(self._mean_coefficients, correlations, lengths)
         return self._projector.coefficients_for_psnr(products, lengths, planes.size, target_psnr)
 

@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import ArrayTypes, types_of, upload
+from ..backend.arrays import ArrayTypes, types_of
 from ..backend.recording import exclusive
 from ..gaussian.file import MAX_CUTOFF
 from ..gaussian.gaussians import Gaussians
@@ -22,9 +22,6 @@ from .kernels import channel_sums, forward
 from .layout import gather_run, pack_parameters
 from .limits import check_index_range
 from .parameters import KernelParameters, detached_shape, kernel_radius, kernel_shape
-
-TILE_ROWS = 64
-"""Rows of tiles that `to_tiles` copies at a time: large images need no second copy in memory."""
 
 
 @exclusive()
@@ -258,22 +255,28 @@ class _Rows(dr.CustomOp):
 
 
 def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
-    """Upload an image (height, width, channels) in tile layout; pixels outside it are 0."""
+    """Upload an image (height, width, channels) in tile layout; pixels outside it are 0.
+
+    A lane gathers one value; the distances in memory of rows, columns and channels are those of
+    pixels, or of planes that `numpy.moveaxis` shows as pixels.
+    """
     height, width, channels = image.shape
+    planes = np.moveaxis(image, 2, 0)
+    if planes.flags.c_contiguous:
+        source, strides = planes, (width, 1, height * width)
+    else:
+        source, strides = np.ascontiguousarray(image), (width * channels, channels, 1)
     tile_width, tile_height = grid.tile
-    over = (grid.ny * tile_height - height, grid.nx * tile_width - width)
-    result = dr.empty(types.Float, grid.nx * grid.ny * grid.pixels * channels)
-    run = grid.nx * grid.pixels * channels  # of a row of tiles
-    for first in range(0, grid.ny, TILE_ROWS):
-        strip = image[first * tile_height : (first + TILE_ROWS) * tile_height]
-        rows = -(-len(strip) // tile_height)
-        if over[1] or len(strip) < rows * tile_height:
-            strip = np.pad(strip, [(0, rows * tile_height - len(strip)), (0, over[1]), (0, 0)])
-        # Pixels and channels share an axis: a row of a tile is then copied as one run.
-        tiled = strip.reshape(rows, tile_height, grid.nx, tile_width * channels)
-        flat = upload(types.Float, tiled.transpose(0, 2, 1, 3).reshape(-1))
-        dr.scatter(result, flat, first * run + dr.arange(types.UInt, rows * run))
-        dr.eval(result)
+    index = dr.arange(types.UInt, grid.nx * grid.ny * grid.pixels * channels)
+    pixel, channel = index // channels, index % channels
+    column, row = grid.first_pixel(pixel // grid.pixels)
+    column += pixel % tile_width
+    row += pixel // tile_width % tile_height
+    place = row * strides[0] + column * strides[1] + channel * strides[2]
+    inside = (row < height) & (column < width)
+    result = dr.gather(types.Float, types.Float(source.reshape(-1)), place, inside)
+    dr.eval(result)
+    dr.sync_thread()  # the source may be the caller's memory
     return result
 
 

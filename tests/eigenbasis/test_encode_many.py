@@ -59,14 +59,14 @@ def test_files_a_bad_one_and_resuming(backend, tmp_path):
 
 def test_one_failure_does_not_fail_its_group(backend, monkeypatch):
     model = small_model(backend)
-    planes = Encoder.planes
+    resized = Encoder.resized
 
     def no_memory_for_white(self, pixels):
         if pixels.mean() == 1:
             raise MemoryError
-        return planes(self, pixels)
+        return resized(self, pixels)
 
-    monkeypatch.setattr(Encoder, "planes", no_memory_for_white)
+    monkeypatch.setattr(Encoder, "resized", no_memory_for_white)
     image = family(1, seed=3)[0]
     rows = model.encode_many([image, np.ones_like(image), image])
     assert [row.status for row in rows] == ["done", "failed", "done"]

@@ -6,6 +6,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 import eigengs_dr as eg
 from _helpers.families import family, small_model, splits
+from eigengs_dr.image.color import RGB_TO_YCBCR, YCBCR_OFFSET
 from eigengs_dr.image.folder import to_planes
 
 
@@ -60,18 +61,21 @@ def test_an_image_of_a_subspace_needs_no_more(backend):
 def test_encode_is_as_before_without_a_target(backend, others, split, mean):
     """The same bits as least squares on all components, written out."""
     model = small_model(backend, split)
+    equations = model.equations
+    black = np.outer(np.append(equations.coverage, 32**2), YCBCR_OFFSET)
+    seen = equations.correlate(np.moveaxis(others[0], 2, 0)) @ RGB_TO_YCBCR.T + black
     planes = to_planes(others[0], "ycbcr").reshape(3, 32, 32)
+    np.testing.assert_allclose(seen, equations.correlate(planes), rtol=1e-6)
     if mean == "dense":
-        planes = planes - model.mean_image
-    seen = model.equations.correlate(planes)
+        seen -= equations.correlate(model.mean_image)
     arrays = model.gaussians.to_arrays()
     start = np.vstack([arrays["color"], arrays["background"]]).astype(np.float64)
     if mean == "gaussians":
-        seen = seen - model.equations.product(start)
+        seen = seen - equations.product(start)
     columns = []
     for c, weights in enumerate(model.weights):
         rows = weights.astype(np.float64)
-        gram = rows @ model.equations.product(rows.T)
+        gram = rows @ equations.product(rows.T)
         gram += np.eye(len(gram)) * (1e-9 * np.trace(gram) / len(gram) + 1e-30)
         right = np.einsum("jn,n->j", weights, seen[:, c].astype(np.float32))
         a = cho_solve(cho_factor(gram, lower=True), right).astype(np.float32)

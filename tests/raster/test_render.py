@@ -22,18 +22,22 @@ from _helpers.sets import (
     scenes,
 )
 from _helpers.waves import SIDE, SPLATS
+from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.selection import select
 from eigengs_dr.gaussian.concatenate import concatenate
 from eigengs_dr.gaussian.file import CUTOFF, MAX_CUTOFF
 from eigengs_dr.image.color import rgb_to_ycbcr, ycbcr_to_rgb
-from eigengs_dr.raster.binning.tiles import TILE
+from eigengs_dr.raster.binning.tiles import TILE, Grid
 from eigengs_dr.raster.reference import render_plain
 from eigengs_dr.raster.render import (
+    batch_from_tiles,
     bin_gaussians,
     decode_parameters,
     picture_of,
     rasterize,
     render,
     to_tensor,
+    to_tiles,
 )
 
 SMOOTH = 6.0
@@ -431,3 +435,20 @@ def test_negative_light_is_black(backend):
     assert (light < 0).any()
     assert (shown[light <= 0] == 0).all()
     assert np.isfinite(shown).all()
+
+
+@pytest.mark.parametrize("size", [(8, 8), (9, 6), (1, 1)])
+@pytest.mark.parametrize("layout", ["pixels", "planes", "crop", "float64"])
+def test_tiles_of_any_memory_layout(backend, size, layout):
+    width, height = size
+    pixels = np.random.default_rng(0).uniform(size=(height + 2, width + 3, 5)).astype(np.float32)
+    image = pixels[:height, :width]
+    if layout == "planes":
+        image = np.moveaxis(np.ascontiguousarray(np.moveaxis(image, 2, 0)), 0, 2)
+    elif layout != "crop":
+        image = image.astype(np.float32 if layout == "pixels" else np.float64, order="C")
+    grid = Grid(width, height)
+    tiles = to_tiles(types_in(select(backend)), image, grid)
+    np.testing.assert_array_equal(batch_from_tiles(tiles, grid, 5)[0], image)
+    outside = grid.tiles * grid.pixels - width * height
+    assert (tiles.numpy() == 0).sum() == 5 * outside

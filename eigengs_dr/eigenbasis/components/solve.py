@@ -207,9 +207,10 @@ def with_colors(gaussians: Gaussians, coefficients: NDArray[np.float64], space: 
     """
     types = types_of(gaussians.mean)
     rows = coefficients.astype(np.float32).T
+    uploaded = upload_rows(types.Float, [*rows[:, :-1], *rows[:, -1:]])
     return replace(
         gaussians,
-        color=types.FloatX(upload_rows(types.Float, rows[:, :-1])),
-        background=types.FloatX(upload_rows(types.Float, rows[:, -1:])),
+        color=types.FloatX(uploaded[: len(rows)]),
+        background=types.FloatX(uploaded[len(rows) :]),
         space=space,
     )

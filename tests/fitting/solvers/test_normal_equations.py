@@ -66,6 +66,15 @@ def test_correlate(backend, scene):
     np.testing.assert_allclose(found, expected, atol=slack)
 
 
+def test_correlate_pixels(backend):
+    """The planes of an image may share its memory; the sums do not change from call to call."""
+    equations = NormalEquations(random_scene(1).on(backend))
+    pixels = np.ascontiguousarray(np.moveaxis(images(), 0, 2))
+    expected = equations.correlate(images())
+    for _ in range(2):
+        np.testing.assert_array_equal(equations.correlate(np.moveaxis(pixels, 2, 0)), expected)
+
+
 def test_solve_is_least_squares(backend):
     """The residual is that of NumPy's least squares: the ridge costs nothing that matters."""
     scene = random_scene(1)
