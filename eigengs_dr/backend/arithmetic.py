@@ -1,4 +1,4 @@
-"""Functions that are as accurate on cuda as on llvm: reciprocals and the hyperbolic tangent.
+"""Functions that are as accurate on cuda as on llvm, and division by an integer in an array.
 
 On cuda, Dr.Jit 1.5 takes the hardware's approximations: `drjit.rcp` and `drjit.rsqrt` of double
 precision have 20 bits (PTX: ``rcp.approx.ftz.f64``), and `drjit.tanh` of single precision has 11
@@ -7,9 +7,12 @@ precision have 20 bits (PTX: ``rcp.approx.ftz.f64``), and `drjit.tanh` of single
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+
+from .arrays import ArrayTypes
 
 TANH_NUMERATOR = (-9.64399179425052238628e-1, -9.92877231001918586564e1, -1.61468768441708447952e3)
 TANH_DENOMINATOR = (
@@ -86,6 +89,41 @@ def tanh(v: Any) -> Any:
     value = dr.select(dr.abs(exact) < TANH_SMALL, small, large)
     # Dr.Jit would differentiate both branches, and that for small v overflows at large ones.
     return _with_slope(value, 4 * decay * dr.square(share), v)
+
+
+@dataclass(frozen=True)
+class Divisor:
+    """An integer that divides others, in arrays: a literal would compile a program for each value.
+
+    LLVM and PTX divide by an array slowly, lane after lane on llvm. A product with the reciprocal
+    is exact: with ``2^(s-1) < d <= 2^s`` and ``m = ceil(2^(31+s) / d)``, the quotient of n < 2^31
+    is ``n m >> 31 + s`` (Granlund and Montgomery, "Division by Invariant Integers using
+    Multiplication", 1994).
+
+    Attributes
+    ----------
+    divisor : UInt32, shape (1,)
+    multiplier : UInt32, shape (1,)
+        The number m, in [2^31, 2^32).
+    shift : UInt32, shape (1,)
+        The number s.
+    """
+
+    divisor: Any
+    multiplier: Any
+    shift: Any
+
+    def divmod(self, n: Any) -> tuple[Any, Any]:
+        """Return the quotient and the remainder of UInt32 below 2^31."""
+        quotient = dr.mul_hi(n + n, self.multiplier) >> self.shift
+        return quotient, n - quotient * self.divisor
+
+
+def make_divisor(types: ArrayTypes, value: int) -> Divisor:
+    """Return a divisor in [1, 2^31)."""
+    shift = (value - 1).bit_length()
+    multiplier = -(-(1 << (31 + shift)) // value)
+    return Divisor(*(dr.opaque(types.UInt, v) for v in (value, multiplier, shift)))
 
 
 def _with_slope(value: Any, slope: Any, x: Any) -> Any:

@@ -134,9 +134,11 @@ def upload_rows(kind: Any, rows: Iterable[NDArray[Any]]) -> list:
     """Copy flat NumPy arrays as `upload` does, but wait only once for all copies."""
     targets = []
     for values in rows:
-        target = dr.empty(kind, len(values))
-        index = dr.arange(dr.uint32_array_t(kind), len(values))
-        dr.scatter(target, kind(np.ascontiguousarray(values)), index)
+        if dr.backend_v(kind) == dr.JitBackend.CUDA:
+            target = kind(np.ascontiguousarray(values))
+        else:
+            target = dr.empty(kind, len(values))
+            target.numpy()[:] = values  # a view: the host writes to memory of Dr.Jit
         targets.append(target)
     dr.eval(targets)
     dr.sync_thread()  # the copies may read the caller's memory until here

@@ -184,37 +184,54 @@ class Gaussians:
             raise ValueError(f"size {width}x{height}: both sides must be at least 1 pixel")
         if (width, height) == (self.width, self.height):
             return self
-        sx, sy = width / self.width, height / self.height
         types = types_of(self.mean)
+        # In arrays: as literals they would compile the program for every size.
+        sx, sy, rx, ry = (
+            dr.opaque(types.Float, ratio)
+            for ratio in (
+                width / self.width,
+                height / self.height,
+                self.width / width,
+                self.height / height,
+            )
+        )
         a, b, c = self.factor
         return replace(
             self,
             mean=types.Float2(self.mean[0] * sx, self.mean[1] * sy),
-            factor=types.Float3(a * (1 / sx), b * (1 / sy), c * (1 / sy)),
+            factor=types.Float3(a * rx, b * ry, c * ry),
             width=width,
             height=height,
         )
 
     @exclusive()
-    def bounded(self) -> Gaussians:
+    def bounded(self, size: tuple[Any, Any] | None = None) -> Gaussians:
         """Clip every parameter to its bounds.
 
         A mean lies in the image. a and c lie between 1 / (twice the longer side) and
         1 / `MIN_DEVIATION`, and b within +-1 / `MIN_DEVIATION`. A mean that is not finite becomes
         the centre of the image, a and c become 1 / `MIN_DEVIATION`, b and colours become 0.
+
+        Parameters
+        ----------
+        size : pair of Float, shape (1,), optional
+            The native width and height in arrays, if a frozen program shall serve every size.
         """
         types = types_of(self.mean)
-        low, high = 1 / (2 * max(self.width, self.height)), 1 / MIN_DEVIATION
+        if size is None:
+            size = dr.opaque(types.Float, self.width), dr.opaque(types.Float, self.height)
+        width, height = size
+        low, high = 0.5 / dr.maximum(width, height), 1 / MIN_DEVIATION
 
-        def inside(x: Any, low: float, high: float, otherwise: float) -> Any:
+        def inside(x: Any, low: Any, high: Any, otherwise: Any) -> Any:
             return dr.select(dr.isfinite(x), dr.clip(x, low, high), otherwise)
 
         a, b, c = self.factor
         return replace(
             self,
             mean=types.Float2(
-                inside(self.mean[0], 0.0, float(self.width), 0.5 * self.width),
-                inside(self.mean[1], 0.0, float(self.height), 0.5 * self.height),
+                inside(self.mean[0], 0.0, width, 0.5 * width),
+                inside(self.mean[1], 0.0, height, 0.5 * height),
             ),
             factor=types.Float3(
                 inside(a, low, high, high), inside(b, -high, high, 0.0), inside(c, low, high, high)

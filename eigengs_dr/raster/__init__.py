@@ -7,6 +7,7 @@
 - ``binning``: which Gaussians touch which tile
 - ``kernels``: the sum over all Gaussians and its error
 - ``adjoint``: its gradient
+- ``rows``: images from tile layout to rows of pixels
 - ``render``: the differentiable operation and `render`
 - ``reference``: slow renderers to compare with
 - ``lookup``: the sum at scattered points, for textures

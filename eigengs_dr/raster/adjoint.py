@@ -67,9 +67,9 @@ def adjoint_pieces(
     the cutoff, 2 per channel and 5 for the shape.
     """
     types = types_of(packed)
-    grid, pieces, tile_size = lists.grid, lists.pieces, lists.grid.tile
+    sizes, pieces, tile_size = lists.sizes, lists.pieces, lists.grid.tile
     assert pieces is not None
-    rows, shares = shares_of(types, grid)
+    rows, shares = shares_of(types, lists.grid)
     index, begin, end, slot = pieces.splat, pieces.begin, pieces.end, pieces.slot
     part = types.UInt(0)
     if shares > 1:  # neighbouring lanes visit the same tiles, and read one contiguous run together
@@ -86,7 +86,7 @@ def adjoint_pieces(
         active = i < end
         tile = gather_index(types, pieces.tile, i, active)
         d = gather_run(types, delta, tile * shares + part, length, active)
-        column, row = grid.first_pixel(tile)
+        column, row = sizes.first_pixel(tile)
         x, y = types.Float(column) + 0.5, types.Float(row + part * rows) + 0.5
         color = sums[-channels:]
 
@@ -138,9 +138,11 @@ def sum_pieces(parts: Any, pieces: Pieces, number: int, splat: Any = None) -> li
     """
     types = types_of(parts)
     count = dr.width(pieces.first)
+    known: Any = True
     if splat is None:
         splat = dr.arange(types.UInt, count)
-    known = splat < count
+    else:
+        known = splat < count
     begin = dr.gather(types.UInt, pieces.first, splat, known)
     end = begin + dr.gather(types.UInt, pieces.number, splat, known)
     length = dr.width(parts) // dr.width(pieces.slot)  # of the shares of all lanes of a piece

@@ -16,7 +16,7 @@ import drjit as dr
 from ..backend.arrays import ArrayTypes, types_of
 from .binning.granularity import granularity_of
 from .binning.lists import TileLists
-from .binning.tiles import Grid
+from .binning.tiles import Grid, GridArrays
 from .evaluate import weights
 from .layout import gather_index, gather_run, unpack_parameters
 from .parameters import NUM_SHAPE_PARAMS
@@ -61,7 +61,7 @@ def _blocks(types: ArrayTypes, lists: TileLists) -> _Blocks:
         lane = dr.arange(types.UInt, lists.grid.tiles * parts)
         part = lane % parts
         tile, begin, end = (dr.gather(types.UInt, v, lane // parts) for v in (tile, begin, end))
-    column, row = lists.grid.first_pixel(tile)
+    column, row = lists.sizes.first_pixel(tile)
     x, y = types.Float(column) + 0.5, types.Float(row + part * rows) + 0.5
     return _Blocks(tile * parts + part, tile, x, y, begin, end, (width, rows))
 
@@ -83,7 +83,7 @@ def _sum_blocks(
     types = types_of(packed)
     number = NUM_SHAPE_PARAMS + len(start)
     if lists.grid.images > 1:
-        image = lists.grid.image_of(blocks.tile)
+        image = lists.sizes.image_of(blocks.tile)
         start = [dr.gather(types.Float, b, image) for b in start]
 
     def contributions(p: list, steep: bool) -> list:
@@ -194,7 +194,7 @@ def residual(
     if weight is not None:
         factors = load(weight)
         errors = [e * m for e, m in zip(errors, factors, strict=True)]
-    inside = _inside(blocks, grid)
+    inside = _inside(blocks, lists.sizes) if grid.overhangs else None
     if inside is not None:
         errors = [dr.select(inside[k // channels], e, 0) for k, e in enumerate(errors)]
     squares = sum_channels([dr.square(e) for e in errors], channels)
@@ -205,13 +205,10 @@ def residual(
     return delta, squares
 
 
-def _inside(blocks: _Blocks, grid: Grid) -> list | None:
-    """Return whether each pixel of a block lies in the image; None if tiles do not overhang."""
-    width, height = grid.tile
-    if grid.nx * width == grid.width and grid.ny * height == grid.height:
-        return None
+def _inside(blocks: _Blocks, sizes: GridArrays) -> list:
+    """Return whether each pixel of a block lies in the image."""
     return [
-        (blocks.x + i < grid.width) & (blocks.y + j < grid.height)
+        (blocks.x + i < sizes.width) & (blocks.y + j < sizes.height)
         for j in range(blocks.size[1])
         for i in range(blocks.size[0])
     ]
@@ -255,9 +252,7 @@ def channel_moments(image: Any, channels: int, grid: Grid) -> tuple[list, list]:
 def _pixels(image: Any, channels: int, grid: Grid) -> list:
     """Read the values of each tile of images in tile layout."""
     types = types_of(image)
-    return gather_run(
-        types, image, dr.arange(types.UInt, grid.tiles), grid.pixels * channels, True
-    )
+    return gather_run(types, image, dr.arange(types.UInt, grid.tiles), grid.pixels * channels, True)
 
 
 def sum_channels(values: list, channels: int) -> list:

@@ -19,9 +19,10 @@ from .adjoint import adjoint
 from .binning.lists import TileLists, build_lists
 from .binning.tiles import TILE, Grid
 from .kernels import channel_sums, forward
-from .layout import gather_run, pack_parameters
+from .layout import pack_parameters
 from .limits import check_index_range
 from .parameters import KernelParameters, detached_shape, kernel_radius, kernel_shape
+from .rows import to_tensor
 
 
 @exclusive()
@@ -218,42 +219,6 @@ class _Rasterize(dr.CustomOp):
         self.set_grad_in("background", channel_sums(delta, self.channels, self.lists.grid))
 
 
-def to_tensor(image: Any, grid: Grid, channels: int) -> Any:
-    """Convert an image from tile layout to a tensor (height, width, channels); differentiable."""
-    types = types_of(image)
-    shape = (grid.ny * grid.tile[1], grid.nx * grid.tile[0], channels)
-    whole = types.Tensor(dr.custom(_Rows, image, grid, channels), shape)
-    if shape[:2] == (grid.height, grid.width):
-        return whole
-    return whole[: grid.height, : grid.width]
-
-
-class _Rows(dr.CustomOp):
-    """Permutation from tile layout to rows of pixels; the transpose permutes back."""
-
-    def eval(self, image: Any, grid: Grid, channels: int) -> Any:
-        types = types_of(image)
-        runs = dr.arange(types.UInt, grid.nx * grid.ny * grid.tile[1])
-        column, row = runs % grid.nx, runs // grid.nx
-        tile_row, inner = row // grid.tile[1], row % grid.tile[1]
-        self.by_row = runs
-        self.by_tile = (tile_row * grid.nx + column) * grid.tile[1] + inner
-        self.run = grid.tile[0] * channels
-        return self._permute(image, self.by_tile, self.by_row)
-
-    def forward(self) -> None:
-        self.set_grad_out(self._permute(self.grad_in("image"), self.by_tile, self.by_row))
-
-    def backward(self) -> None:
-        self.set_grad_in("image", self._permute(self.grad_out(), self.by_row, self.by_tile))
-
-    def _permute(self, values: Any, source: Any, target: Any) -> Any:
-        types = types_of(values)
-        result = dr.empty(types.Float, self.run * dr.width(source))
-        dr.scatter(result, types.FloatX(gather_run(types, values, source, self.run, True)), target)
-        return result
-
-
 def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
     """Upload an image (height, width, channels) in tile layout; pixels outside it are 0.
 
@@ -266,15 +231,19 @@ def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
         source, strides = planes, (width, 1, height * width)
     else:
         source, strides = np.ascontiguousarray(image), (width * channels, channels, 1)
+    # Sizes are in arrays, so that one program serves all images with as many channels.
+    limits = (dr.opaque(types.UInt, side) for side in (width, height))
+    steps = (dr.opaque(types.UInt, stride) for stride in strides)
     tile_width, tile_height = grid.tile
     index = dr.arange(types.UInt, grid.nx * grid.ny * grid.pixels * channels)
     pixel, channel = index // channels, index % channels
-    column, row = grid.first_pixel(pixel // grid.pixels)
+    column, row = grid.in_arrays(types).first_pixel(pixel // grid.pixels)
     column += pixel % tile_width
     row += pixel // tile_width % tile_height
-    place = row * strides[0] + column * strides[1] + channel * strides[2]
-    inside = (row < height) & (column < width)
-    result = dr.gather(types.Float, types.Float(source.reshape(-1)), place, inside)
+    place = sum(n * step for n, step in zip((row, column, channel), steps, strict=True))
+    inside = [n < limit for n, limit in zip((column, row), limits, strict=True)]
+    flat = types.Float(source.reshape(-1))
+    result = dr.gather(types.Float, flat, place, inside[0] & inside[1])
     dr.eval(result)
     dr.sync_thread()  # the source may be the caller's memory
     return result
@@ -288,7 +257,13 @@ def batch_to_tiles(types: ArrayTypes, images: NDArray[Any]) -> Any:
     if images.ndim == 3:
         return to_tiles(types, images, Grid(images.shape[1], images.shape[0]))
     grid = Grid(images.shape[2], images.shape[1])
-    return dr.concat([to_tiles(types, image, grid) for image in images])
+    length = grid.tiles * grid.pixels * images.shape[3]
+    result, index = dr.empty(types.Float, len(images) * length), dr.arange(types.UInt, length)
+    for k, image in enumerate(images):  # by a program that serves all positions and sizes
+        place = dr.opaque(types.UInt, k * length) + index
+        dr.scatter(result, to_tiles(types, image, grid), place)
+        dr.eval(result)
+    return result
 
 
 def batch_from_tiles(image: Any, grid: Grid, channels: int) -> NDArray[Any]:

@@ -36,9 +36,9 @@ from eigengs_dr.raster.render import (
     picture_of,
     rasterize,
     render,
-    to_tensor,
     to_tiles,
 )
+from eigengs_dr.raster.rows import to_tensor
 
 SMOOTH = 6.0
 """A cutoff whose edge, exp(-18), is below rounding: invariants hold at every pixel."""

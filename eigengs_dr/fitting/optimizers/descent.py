@@ -18,7 +18,6 @@ from ...backend.recording import freeze_program
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint_pieces, sum_pieces
 from ...raster.binning.lists import TileLists
-from ...raster.binning.tiles import Grid
 from ...raster.kernels import residual, sum_lanes
 from ...raster.layout import pack_parameters
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
@@ -145,7 +144,7 @@ def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()
     ----------
     schedule : Schedule
     like : Gaussians
-        A set with the size of the image.
+        A set with the channels of the image.
     levels : sequence of int, optional
         As for `descend`.
 
@@ -156,8 +155,7 @@ def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()
         descends on the mean squared error, then projects the variables into their bounds.
     """
     coordinates, optimizer = schedule.variables(), schedule.make_optimizer()
-    grid, channels = Grid(like.width, like.height), like.channels
-    number = grid.tiles * grid.pixels * channels
+    channels = like.channels
 
     def step(
         state: Descent,
@@ -176,28 +174,33 @@ def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()
             )
             parts = adjoint_pieces(state.packed, delta, channels, listed, radius)
             dr.eval(parts)
-            factor: Any = 2 / number
+            number = type(state.packed)(listed.sizes.image.divisor)
+            number = number * (listed.grid.pixels * channels)
+            factor = 2 / number
             if levels:
                 # The sum of the logarithms of the errors, so that no level suffers for another.
-                mean = sum(sum_lanes(squares, listed)) * (1 / number)
+                mean = sum(sum_lanes(squares, listed)) / number
                 factor = factor / (mean + MSE_EPSILON)
             sums = _sum_level(parts, listed, channels, len(fixed))
             before = gradient or [0.0] * len(sums)
             gradient = [g + s * factor for g, s in zip(before, sums, strict=True)]
-        return _move(state, fixed, gradient, rates, index)
+        sizes = lists[0].sizes
+        return _move(state, fixed, gradient, rates, index, (sizes.width, sizes.height))
 
-    def _move(state: Descent, fixed: Gaussians, gradient: Any, rates: Any, index: Any) -> Descent:
+    def _move(
+        state: Descent, fixed: Gaussians, gradient: Any, rates: Any, index: Any, size: tuple
+    ) -> Descent:
         """Take the step of the optimiser; all of it is one kernel with a lane per Gaussian."""
         Float = type(state.packed)
-        slopes = _pull_back(coordinates, fixed, state.variables, gradient)
+        slopes = _pull_back(coordinates, fixed, state.variables, gradient, size)
         variables, moments = {}, {}
         for k, name in enumerate(schedule.rates):
             rate = dr.gather(Float, rates, index * len(schedule.rates) + k)
             variables[name], moments[name] = optimizer.step(
                 state.variables[name], slopes[name], state.moments[name], rate, Float(index) + 1
             )
-        variables = coordinates.project(fixed, variables)
-        moved = coordinates.decode(fixed, variables)
+        variables = coordinates.project(fixed, variables, size)
+        moved = coordinates.decode(fixed, variables, size)
         return Descent(variables, moments, moved, pack(moved))
 
     return step
@@ -206,18 +209,24 @@ def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()
 def _sum_level(parts: Any, lists: TileLists, channels: int, count: int) -> list:
     """Return the gradient of `count` Gaussians; it is 0 for those that the lists do not hold."""
     assert lists.pieces is not None
-    splat = dr.arange(dr.uint32_array_t(type(parts)), count)
+    splat = None
+    if count != dr.width(lists.pieces.first):
+        splat = dr.arange(dr.uint32_array_t(type(parts)), count)
     return sum_pieces(parts, lists.pieces, NUM_SHAPE_PARAMS + channels, splat)
 
 
 def _pull_back(
-    coordinates: Parameterization, fixed: Gaussians, variables: dict[str, Any], gradient: list
+    coordinates: Parameterization,
+    fixed: Gaussians,
+    variables: dict[str, Any],
+    gradient: list,
+    size: tuple,
 ) -> dict[str, Any]:
     """Return the gradient with respect to variables, from that of the kernels' parameters."""
     with dr.resume_grad():
         traced = {name: type(value)(value) for name, value in variables.items()}
         dr.enable_grad(traced)
-        decoded = coordinates.decode(fixed, traced)
+        decoded = coordinates.decode(fixed, traced, size)
         rows = [*kernel_shape(decoded), *decoded.color]
         known = [(row, g) for row, g in zip(rows, gradient, strict=True) if dr.grad_enabled(row)]
         for row, g in known:

@@ -22,18 +22,20 @@ class Parameterization(NamedTuple):
     encode : callable
         ``encode(gaussians) -> dict`` of named arrays.
     decode : callable
-        ``decode(fixed, variables) -> Gaussians``, with `fixed` the argument of `encode`. Fields
-        without a variable keep the values of `fixed`.
+        ``decode(fixed, variables, size=None) -> Gaussians``, with `fixed` the argument of
+        `encode`. Fields without a variable keep the values of `fixed`. `size` is the width and
+        the height of `fixed`, in arrays if the program shall serve every size.
     project : callable
-        ``project(fixed, variables) -> dict``: the variables, moved back into their bounds.
+        ``project(fixed, variables, size=None) -> dict``: the variables, moved back into their
+        bounds.
     reach : callable
         ``reach(fixed, moves) -> (pad, growth)``: how far the ellipses of the Gaussians reach, in
         pixels and as a factor, if every entry of a variable moves by ``moves[name]``.
     """
 
     encode: Callable[[Gaussians], dict[str, Any]]
-    decode: Callable[[Gaussians, dict[str, Any]], Gaussians]
-    project: Callable[[Gaussians, dict[str, Any]], dict[str, Any]]
+    decode: Callable[..., Gaussians]
+    project: Callable[..., dict[str, Any]]
     reach: Callable[[Gaussians, dict[str, float]], tuple[Any, float]]
 
 
@@ -55,14 +57,16 @@ def _relative_to(g: Gaussians, size: Any) -> dict[str, Any]:
     return {"mean": g.mean / size, "factor": g.factor * size, "color": g.color}
 
 
-def _decode_relative(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
-    size = _size(fixed)
-    units = {"mean": size, "factor": 1 / size, "color": 1}
+def _decode_relative(fixed: Gaussians, variables: dict[str, Any], size: Any = None) -> Gaussians:
+    own = _size(fixed)
+    units = {"mean": own, "factor": 1 / own, "color": 1}
     return replace(fixed, **{name: value * units[name] for name, value in variables.items()})
 
 
-def _project_relative(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, Any]:
-    inside = _relative_to(_decode_relative(fixed, variables).bounded(), _size(fixed))
+def _project_relative(
+    fixed: Gaussians, variables: dict[str, Any], size: Any = None
+) -> dict[str, Any]:
+    inside = _relative_to(_decode_relative(fixed, variables).bounded(size), _size(fixed))
     return {name: inside[name] for name in variables}
 
 
@@ -97,9 +101,10 @@ CHOLESKY_BOUND = 0.5
 def _encode_cholesky(g: Gaussians) -> dict[str, Any]:
     types = types_of(g.mean)
     x, y = g.mean
+    width, height = (dr.opaque(types.Float, side) for side in (g.width, g.height))
     l1, l2, l3 = cholesky_from_factor(*g.factor)
     return {
-        "mean": types.Float2(_atanh(2 * x / g.width - 1), _atanh(2 * y / g.height - 1)),
+        "mean": types.Float2(_atanh(2 * x / width - 1), _atanh(2 * y / height - 1)),
         "cholesky": types.Float3(l1 - CHOLESKY_BOUND, l2, l3 - CHOLESKY_BOUND),
         "color": g.color,
     }
@@ -109,11 +114,12 @@ def _atanh(x: Any) -> Any:
     return dr.atanh(dr.clip(x, -0.999999, 0.999999))
 
 
-def _decode_cholesky(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
+def _decode_cholesky(fixed: Gaussians, variables: dict[str, Any], size: Any = None) -> Gaussians:
+    width, height = size or (fixed.width, fixed.height)
     parts = {}
     if "mean" in variables:
         x, y = (0.5 * (tanh(v) + 1) for v in variables["mean"])
-        parts["mean"] = type(fixed.mean)(x * fixed.width, y * fixed.height)
+        parts["mean"] = type(fixed.mean)(x * width, y * height)
     if "cholesky" in variables:
         l1, l2, l3 = variables["cholesky"]
         factor = factor_from_cholesky(l1 + CHOLESKY_BOUND, l2, l3 + CHOLESKY_BOUND)
@@ -123,7 +129,9 @@ def _decode_cholesky(fixed: Gaussians, variables: dict[str, Any]) -> Gaussians:
     return replace(fixed, **parts)
 
 
-def _project_cholesky(fixed: Gaussians, variables: dict[str, Any]) -> dict[str, Any]:
+def _project_cholesky(
+    fixed: Gaussians, variables: dict[str, Any], size: Any = None
+) -> dict[str, Any]:
     return variables
 
 

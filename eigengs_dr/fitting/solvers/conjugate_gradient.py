@@ -23,7 +23,6 @@ from ...gaussian.file import MAX_CUTOFF
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint
 from ...raster.binning.lists import TileLists
-from ...raster.binning.tiles import Grid
 from ...raster.kernels import channel_moments, channel_sums, residual, sum_lanes
 from ...raster.layout import gather_run, pack_parameters
 from ...raster.parameters import NUM_SHAPE_PARAMS, detached_shape, kernel_radius
@@ -192,15 +191,16 @@ def _solve(
     with freeze_program(_advance) as advance, freeze_program(_turn) as turn:
         for _ in range(steps):
             x, q, alpha = advance(shape, x, p, rz, lists, cutoff)
-            _add_in_place(error, q, alpha, grid)
+            _add_in_place(error, q, alpha, lists)
             del q  # before the next one
             p, rz, square = turn(shape, error, p, rz, enough, noise, inverse, lists, cutoff)
             squares.append(square)
-    scale = 1 / (grid.width * grid.height * grid.images * channels)
-    residuals = [dr.sum(sum(square)) * scale for square in squares]
+    residuals = [dr.sum(sum(square)) for square in squares]
     solved = replace(gaussians, color=types.FloatX(x[0]), background=types.FloatX(x[1]))
     dr.eval(solved, residuals)
-    return Solution(solved, np.sqrt(dr.concat(residuals).numpy()).tolist())  # one copy to the host
+    number = grid.width * grid.height * grid.images * channels
+    total = dr.concat(residuals).numpy()  # one copy to the host
+    return Solution(solved, np.sqrt(total / number).tolist())
 
 
 def _advance(
@@ -212,7 +212,7 @@ def _advance(
     # A channel that is solved except for rounding stops: its directions would grow without bound.
     alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, curvature, strict=True)]
     dr.eval(alpha)
-    return add_multiple(x, alpha, p, lists.grid), q, alpha
+    return add_multiple(x, alpha, p, lists.image), q, alpha
 
 
 def _turn(
@@ -243,20 +243,22 @@ def _turn(
     ]
     factor = [dr.select(go, Float(1), 0) for go in goes_on]
     dr.eval(beta, factor)
-    p = add_multiple(add_multiple(([0.0] * channels,) * 2, factor, z, grid), beta, p, grid)
+    nothing = ([0.0] * channels,) * 2
+    p = add_multiple(add_multiple(nothing, factor, z, lists.image), beta, p, lists.image)
     return p, new_rz, squares
 
 
-def _add_in_place(image: Any, step: Any, factors: list, grid: Grid) -> None:
+def _add_in_place(image: Any, step: Any, factors: list, lists: TileLists) -> None:
     """Add ``factor step`` by channels to an image in tile layout, in the memory of the image.
 
     A frozen program would copy the image, because it may not change its arguments. No two lanes
     write the same pixel, so that no atomic operations are needed.
     """
-    types = types_of(image)
+    types, grid = types_of(image), lists.grid
     tile, length = dr.arange(types.UInt, grid.tiles), grid.pixels * len(factors)
     change = gather_run(types, step, tile, length, True)
-    factors = [spread(f, grid.tiles, grid) for f in factors]
+    owner = lists.sizes.image_of(tile) if grid.images > 1 else None
+    factors = [spread(f, owner) for f in factors]
     added = [c * f for c, f in zip(change, factors * grid.pixels, strict=True)]
     add, alone = dr.ReduceOp.Add, dr.ReduceMode.NoConflicts
     dr.scatter_reduce(add, image, types.FloatX(added), tile, mode=alone)

@@ -33,18 +33,12 @@ def dots(x: Unknowns, y: Unknowns, grid: Grid) -> list:
     return [sum_by_image(c, grid) + b for c, b in zip(color, background, strict=True)]
 
 
-def add_multiple(x: Unknowns, factors: list, y: Unknowns, grid: Grid) -> Unknowns:
-    """Return ``x + factor y``; a factor has one value for each image."""
-    color = [
-        dr.fma(spread(f, dr.width(b), grid), b, a)
-        for a, f, b in zip(x[0], factors, y[0], strict=True)
-    ]
+def add_multiple(x: Unknowns, factors: list, y: Unknowns, image: Any) -> Unknowns:
+    """Return ``x + factor y``; a factor has one value for each image, see `spread`."""
+    color = [dr.fma(spread(f, image), b, a) for a, f, b in zip(x[0], factors, y[0], strict=True)]
     return color, [dr.fma(f, b, a) for a, f, b in zip(x[1], factors, y[1], strict=True)]
 
 
-def spread(values: Any, count: int, grid: Grid) -> Any:
-    """Repeat the value of each image for its part of `count` entries."""
-    if grid.images == 1:
-        return values
-    index = dr.arange(dr.uint32_array_t(type(values)), count) // (count // grid.images)
-    return dr.gather(type(values), values, index)
+def spread(values: Any, image: Any) -> Any:
+    """Return the value of the image of each entry; `image` is None if there is only one."""
+    return values if image is None else dr.gather(type(values), values, image)

@@ -13,11 +13,12 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from ...backend.arithmetic import make_divisor
 from ...backend.arrays import ArrayTypes, types_of, upload
 from ..evaluate import is_steep
 from .granularity import granularity_of
 from .lanes import order_lanes
-from .tiles import TILE, Grid, for_each_row, for_each_tile
+from .tiles import TILE, Grid, GridArrays, for_each_row, for_each_tile
 from .transpose import transpose_by_counting, transpose_by_sorting
 
 MAX_LIST_ENTRIES = 1 << 28
@@ -67,12 +68,16 @@ class TileLists:
     Attributes
     ----------
     grid : Grid
+    sizes : GridArrays
+        Those of `grid`.
     splat : UInt32, shape (capacity,)
         Indices of Gaussians, tile after tile; entries after the last list are not used.
     begin, end : UInt32, shape (tiles,)
         Range in `splat` of the list of the tile ``order[i]``.
     order : UInt32, shape (tiles,)
         Tiles in the order of lanes: neighbours in one SIMD packet have lists of like length.
+    image : UInt32, shape (N,), or None
+        Image of each Gaussian; None if there is only one image.
     pieces : Pieces or None
         The same pairs by Gaussian, for the adjoint; None if they were not asked for.
     capacity : int
@@ -83,10 +88,12 @@ class TileLists:
     """
 
     grid: Grid
+    sizes: GridArrays
     splat: Any
     begin: Any
     end: Any
     order: Any
+    image: Any
     pieces: Pieces | None
     capacity: int
     steep: bool
@@ -132,9 +139,9 @@ def build_lists(
     """
     types = types_of(shape[0])
     # Numbers in arrays: as literals, they would compile the programs again and again.
-    wide = dr.opaque(types.Float, radius * growth)
+    sizes, wide = grid.in_arrays(types), dr.opaque(types.Float, radius * growth)
     pad = dr.opaque(types.Float, pad) if isinstance(pad, float) else pad
-    touched = _count_tiles(types, shape, wide, grid, pad)
+    touched = _count_tiles(types, shape, wide, sizes, pad)
     share, UInt64 = granularity_of(types), dr.uint64_array_t(types.UInt)
     dr.schedule(touched)  # in the kernel of the sum
     entries, steep = _read_totals(types, touched, is_steep(shape, radius) & (touched > 0))
@@ -153,7 +160,8 @@ def build_lists(
     start, first = types.UInt(before), types.UInt(before >> 32)
     last = start + touched
     dr.schedule(first, last)
-    tile = _emit_tiles(types, shape, wide, grid, pad, (start, last), _padded(entries))
+    image = _images(types, dr.width(touched), grid)
+    tile = _emit_tiles(types, shape, wide, sizes, pad, image, (start, last), _padded(entries))
     pieces = None
     if adjoint:
         # At most one piece of a Gaussian is not full, which bounds their number without reading it.
@@ -163,9 +171,18 @@ def build_lists(
     transpose = transpose_by_counting if types.backend == "llvm" else transpose_by_sorting
     splat, starts = transpose(types, grid.tiles, tile, last, entries, dr.width(tile))
     order, begin, end = _lanes(types, grid, starts)
-    lists = TileLists(grid, splat, begin, end, order, pieces, dr.width(splat), steep)
+    lists = TileLists(grid, sizes, splat, begin, end, order, image, pieces, dr.width(splat), steep)
     dr.eval(lists)
     return lists
+
+
+def _images(types: ArrayTypes, count: int, grid: Grid) -> Any:
+    """Return the image of each of `count` Gaussians; None if there is only one image."""
+    if grid.images == 1:
+        return None
+    image, _ = make_divisor(types, count // grid.images).divmod(dr.arange(types.UInt, count))
+    dr.schedule(image)
+    return image
 
 
 def _padded(count: int) -> int:
@@ -177,7 +194,7 @@ def _padded(count: int) -> int:
     return (count // step + 1) * step
 
 
-def _count_tiles(types: ArrayTypes, shape: list, radius: Any, grid: Grid, pad: Any) -> Any:
+def _count_tiles(types: ArrayTypes, shape: list, radius: Any, grid: GridArrays, pad: Any) -> Any:
     """Return the number of tiles that each Gaussian touches, UInt32 of shape (N,)."""
 
     def add(row: Any, first: Any, last: Any, total: Any) -> Any:
@@ -198,8 +215,9 @@ def _emit_tiles(
     types: ArrayTypes,
     shape: list,
     radius: Any,
-    grid: Grid,
+    grid: GridArrays,
     pad: Any,
+    image: Any,
     slots: tuple,
     capacity: int,
 ) -> Any:
@@ -208,12 +226,10 @@ def _emit_tiles(
     # Zeros, because rounding could let the two walks differ by a tile in different programs.
     tiles = dr.zeros(types.UInt, capacity)
     dr.make_opaque(tiles)
-    image = types.UInt(0)
-    if grid.images > 1:
-        image = dr.arange(types.UInt, dr.width(start)) // (dr.width(start) // grid.images)
+    first = types.UInt(0) if image is None else image * grid.image.divisor
 
     def emit(tile: Any, column: Any, row: Any, active: Any, slot: Any) -> Any:
-        tile = types.UInt(tile) + image * (grid.nx * grid.ny)
+        tile = types.UInt(tile) + first
         dr.scatter(tiles, tile, slot, active & (slot < last))
         return slot + dr.select(active, types.UInt(1), 0)
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import drjit as dr
 
-from ...backend.arithmetic import rcp, rsqrt
-from ...backend.arrays import types_of
+from ...backend.arithmetic import Divisor, make_divisor, rcp, rsqrt
+from ...backend.arrays import ArrayTypes, types_of
 
 TILE = (4, 4)
 """Width and height of a tile in pixels. Measured on 2 cores with AVX-512: 4x4 keeps the sums of 16
@@ -49,24 +49,65 @@ class Grid:
         """Number of tiles of all images."""
         return self.nx * self.ny * self.images
 
-    def image_of(self, tile: Any) -> Any:
-        """Return the image of a tile, by its index among the tiles of all images."""
-        return tile // (self.nx * self.ny)
-
-    def first_pixel(self, tile: Any) -> tuple[Any, Any]:
-        """Return the column and the row of the first pixel of a tile in its image, as integers."""
-        row = tile // self.nx
-        if self.images > 1:
-            row = row % self.ny
-        return tile % self.nx * self.tile[0], row * self.tile[1]
-
     @property
     def pixels(self) -> int:
         """Number of pixels of one tile."""
         return self.tile[0] * self.tile[1]
 
+    @property
+    def overhangs(self) -> bool:
+        """Whether the last tiles overhang the image."""
+        return self.nx * self.tile[0] != self.width or self.ny * self.tile[1] != self.height
 
-def tile_columns(shape: list, radius: Any, grid: Grid, row: Any, pad: Any = 0.0) -> tuple[Any, Any]:
+    def in_arrays(self, types: ArrayTypes) -> GridArrays:
+        """Return the sizes in arrays, for programs that serve grids of every size."""
+        return GridArrays(
+            *(dr.opaque(types.Int, v) for v in (self.nx, self.ny)),
+            *(dr.opaque(types.Float, v) for v in (self.width, self.height)),
+            *(make_divisor(types, v) for v in (self.nx, self.nx * self.ny)),
+            self.tile,
+            self.images,
+        )
+
+
+@dataclass(frozen=True)
+class GridArrays:
+    """The sizes of a `Grid` in arrays: a number in a program compiles it anew for every size.
+
+    Attributes
+    ----------
+    nx, ny : Int32, shape (1,)
+    width, height : Float, shape (1,)
+    row, image : Divisor
+        The tiles of a row, and those of an image.
+    tile : (int, int)
+    images : int
+    """
+
+    nx: Any
+    ny: Any
+    width: Any
+    height: Any
+    row: Divisor
+    image: Divisor
+    tile: tuple[int, int]
+    images: int
+
+    def image_of(self, tile: Any) -> Any:
+        """Return the image of a tile, by its index among the tiles of all images."""
+        return self.image.divmod(tile)[0]
+
+    def first_pixel(self, tile: Any) -> tuple[Any, Any]:
+        """Return the column and the row of the first pixel of a tile in its image, as integers."""
+        if self.images > 1:
+            tile = self.image.divmod(tile)[1]
+        row, column = self.row.divmod(tile)
+        return column * self.tile[0], row * self.tile[1]
+
+
+def tile_columns(
+    shape: list, radius: Any, grid: GridArrays, row: Any, pad: Any = 0.0
+) -> tuple[Any, Any]:
     """Return the columns `[first, last)` that the ellipse of a Gaussian touches in a row of tiles.
 
     The ellipse is ``(a dx + b dy)^2 + (c dy)^2 <= radius^2``. At height dy its right edge is
@@ -80,7 +121,7 @@ def tile_columns(shape: list, radius: Any, grid: Grid, row: Any, pad: Any = 0.0)
         Mean x, mean y in pixels; a, b, c in 1 / pixels, in the units of `radius`; a > 0, c > 0.
     radius : float
         Cutoff in the units of the factor.
-    grid : Grid
+    grid : GridArrays
     row : Int32
         Row of tiles.
     pad : float or Float, optional
@@ -109,21 +150,23 @@ def tile_columns(shape: list, radius: Any, grid: Grid, row: Any, pad: Any = 0.0)
     left = dr.clip(-peak, low, high)
     x_right = mx + (half_width(right) - b * right) * inverse + pad
     x_left = mx - (half_width(left) + b * left) * inverse - pad
-    first = dr.clip(dr.ceil((x_left + 0.5) * (1 / width)) - 1, 0.0, float(grid.nx))
-    last = dr.clip(dr.floor((x_right - 0.5) * (1 / width)) + 1, 0.0, float(grid.nx))
+    columns = type(mx)(grid.nx)
+    first = dr.clip(dr.ceil((x_left + 0.5) * (1 / width)) - 1, 0.0, columns)
+    last = dr.clip(dr.floor((x_right - 0.5) * (1 / width)) + 1, 0.0, columns)
     hit = (low <= high) & (x_left <= x_right)  # false for NaN as well
     Int = type(row)
     return dr.select(hit, Int(first), 0), dr.select(hit, Int(last), 0)
 
 
-def tile_rows(shape: list, radius: Any, grid: Grid, pad: Any = 0.0) -> tuple[Any, Any]:
+def tile_rows(shape: list, radius: Any, grid: GridArrays, pad: Any = 0.0) -> tuple[Any, Any]:
     """Return the rows of tiles `[first, last)` that the ellipse may touch; see `tile_columns`."""
     Int = types_of(shape[0]).Int
     my, c = shape[1], shape[4]
     height = grid.tile[1]
     reach = radius * rcp(c) + pad
-    first = dr.clip(dr.ceil((my - reach + 0.5) * (1 / height)) - 1, 0.0, float(grid.ny))
-    last = dr.clip(dr.floor((my + reach - 0.5) * (1 / height)) + 1, 0.0, float(grid.ny))
+    rows = type(my)(grid.ny)
+    first = dr.clip(dr.ceil((my - reach + 0.5) * (1 / height)) - 1, 0.0, rows)
+    last = dr.clip(dr.floor((my + reach - 0.5) * (1 / height)) + 1, 0.0, rows)
     finite = dr.isfinite(sum(shape))
     return dr.select(finite, Int(first), 0), dr.select(finite, Int(last), 0)
 
@@ -131,7 +174,7 @@ def tile_rows(shape: list, radius: Any, grid: Grid, pad: Any = 0.0) -> tuple[Any
 def for_each_row(
     shape: list,
     radius: float,
-    grid: Grid,
+    grid: GridArrays,
     visit: Callable[..., Any],
     state: Any,
     *,
@@ -166,7 +209,7 @@ def for_each_row(
 def for_each_tile(
     shape: list,
     radius: float,
-    grid: Grid,
+    grid: GridArrays,
     visit: Callable[..., Any],
     state: Any,
     *,
