@@ -82,8 +82,8 @@ def _sum_blocks(
     """
     types = types_of(packed)
     number = NUM_SHAPE_PARAMS + len(start)
-    if lists.grid.images > 1:
-        image = lists.sizes.image_of(blocks.tile)
+    image = lists.sizes.image_of(blocks.tile)
+    if image is not None:
         start = [dr.gather(types.Float, b, image) for b in start]
 
     def contributions(p: list, steep: bool) -> list:

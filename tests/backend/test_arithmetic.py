@@ -1,10 +1,13 @@
-"""Reciprocals and the hyperbolic tangent: as accurate as NumPy's on every backend."""
+"""Reciprocals, the hyperbolic tangent and integer division: as good as NumPy's everywhere."""
 
 import drjit as dr
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from eigengs_dr.backend.arithmetic import TANH_SMALL, rcp, rsqrt, tanh
+from _helpers.sets import few
+from eigengs_dr.backend.arithmetic import TANH_SMALL, make_divisor, rcp, rsqrt, tanh
 
 TOLERANCE = {32: 1e-6, 64: 1e-14}
 """Relative error by precision: Dr.Jit's own functions miss it on cuda in one of the two."""
@@ -59,3 +62,21 @@ def test_arrays_of_several(types):
         found = function(pair)
         assert type(found) is type(pair)
         assert dr.all(found.y == function(pair.y))
+
+
+@few
+@given(divisor=st.integers(1, 2**31 - 1), values=st.lists(st.integers(0, 2**31 - 1), max_size=20))
+def test_division_by_an_integer_is_exact(types, divisor, values):
+    """Also next to multiples, and up to the largest values."""
+    near = [k * divisor + d for k in (1, 2, 2**31 // divisor) for d in (-1, 0, 1)]
+    n = np.array([v for v in [0, 2**31 - 1, *near, *values] if 0 <= v < 2**31], np.uint32)
+    quotient, remainder = make_divisor(types, divisor).divmod(types.UInt(n))
+    np.testing.assert_array_equal(quotient.numpy(), n // divisor)
+    np.testing.assert_array_equal(remainder.numpy(), n % divisor)
+
+
+@pytest.mark.parametrize("divisor", [1, 2, 3, 4, 7, 64, 65, 2**30, 2**30 + 1, 2**31 - 1])
+def test_division_by_special_integers_is_exact(types, divisor):
+    n = np.array([0, 1, divisor - 1, divisor, 2**31 - 1], np.uint32)
+    quotient, _ = make_divisor(types, divisor).divmod(types.UInt(n))
+    np.testing.assert_array_equal(quotient.numpy(), n // divisor)

@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.backend.arrays import types_of, upload
 from eigengs_dr.backend.selection import select
 
 
@@ -24,3 +24,14 @@ def test_types_of_refuses_integers_and_arrays_without_derivatives(backend):
     for array in (select(backend).UInt32(1), getattr(dr, backend).Float(1)):
         with pytest.raises(TypeError, match="expected float arrays"):
             types_of(array)
+
+
+@pytest.mark.parametrize("offset", [0, 1, 3])
+@pytest.mark.parametrize("count", [0, 1, 17])
+def test_upload_copies(types, count, offset):
+    """From memory of any alignment, and from values of another dtype."""
+    values = np.arange(offset + count, dtype=np.float32)[offset:]
+    single, integers = upload(types.Float, values), upload(types.UInt, values.astype(np.int64))
+    values += 1
+    for found in (single, integers):
+        np.testing.assert_array_equal(found.numpy(), values - 1)

@@ -72,15 +72,16 @@ class Descent:
         The variables that the optimiser moves.
     moments : dict of str to tuple
         The state of the optimiser for each variable.
-    gaussians : Gaussians
-        The set of these variables.
+    gaussians : Gaussians or None
+        The set of these variables. A step does not need it, and each array that a frozen program
+        gets costs a microsecond.
     packed : Float
         The parameters of this set for the kernels.
     """
 
     variables: dict[str, Any]
     moments: dict[str, tuple]
-    gaussians: Gaussians
+    gaussians: Any
     packed: Any
 
 
@@ -124,7 +125,9 @@ def _run_phase(
                     for n in counts
                 ]
             index = dr.opaque(types.UInt, step)
-            state = take_step(state, fixed, target, weight, lists, rates, index)
+            state = take_step(
+                replace(state, gaussians=None), fixed, target, weight, lists, rates, index
+            )
             yield state.gaussians
 
 
@@ -174,8 +177,7 @@ def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()
             )
             parts = adjoint_pieces(state.packed, delta, channels, listed, radius)
             dr.eval(parts)
-            number = type(state.packed)(listed.sizes.image.divisor)
-            number = number * (listed.grid.pixels * channels)
+            number = listed.sizes.width * listed.sizes.height * channels
             factor = 2 / number
             if levels:
                 # The sum of the logarithms of the errors, so that no level suffers for another.

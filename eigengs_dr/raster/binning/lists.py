@@ -226,7 +226,7 @@ def _emit_tiles(
     # Zeros, because rounding could let the two walks differ by a tile in different programs.
     tiles = dr.zeros(types.UInt, capacity)
     dr.make_opaque(tiles)
-    first = types.UInt(0) if image is None else image * grid.image.divisor
+    first = types.UInt(0) if grid.image is None else image * grid.image.divisor
 
     def emit(tile: Any, column: Any, row: Any, active: Any, slot: Any) -> Any:
         tile = types.UInt(tile) + first

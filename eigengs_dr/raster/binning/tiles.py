@@ -61,45 +61,48 @@ class Grid:
 
     def in_arrays(self, types: ArrayTypes) -> GridArrays:
         """Return the sizes in arrays, for programs that serve grids of every size."""
-        return GridArrays(
-            *(dr.opaque(types.Int, v) for v in (self.nx, self.ny)),
-            *(dr.opaque(types.Float, v) for v in (self.width, self.height)),
-            *(make_divisor(types, v) for v in (self.nx, self.nx * self.ny)),
-            self.tile,
-            self.images,
-        )
+        width, height = (dr.opaque(types.Float, v) for v in (self.width, self.height))
+        row, ny = make_divisor(types, self.nx), dr.opaque(types.Int, self.ny)
+        image = make_divisor(types, self.nx * self.ny) if self.images > 1 else None
+        return GridArrays(width, height, ny, row, image, self.tile)
 
 
 @dataclass(frozen=True)
 class GridArrays:
     """The sizes of a `Grid` in arrays: a number in a program compiles it anew for every size.
 
+    There are few of them, because each costs a frozen program a microsecond a call.
+
     Attributes
     ----------
-    nx, ny : Int32, shape (1,)
     width, height : Float, shape (1,)
-    row, image : Divisor
-        The tiles of a row, and those of an image.
+    ny : Int32, shape (1,)
+    row : Divisor
+        The number of tiles of a row.
+    image : Divisor or None
+        The number of tiles of an image; None if there is only one image.
     tile : (int, int)
-    images : int
     """
 
-    nx: Any
-    ny: Any
     width: Any
     height: Any
+    ny: Any
     row: Divisor
-    image: Divisor
+    image: Divisor | None
     tile: tuple[int, int]
-    images: int
+
+    @property
+    def nx(self) -> Any:
+        """Number of columns of tiles, as Int32."""
+        return dr.int32_array_t(self.row.divisor)(self.row.divisor)
 
     def image_of(self, tile: Any) -> Any:
-        """Return the image of a tile, by its index among the tiles of all images."""
-        return self.image.divmod(tile)[0]
+        """Return the image of a tile, by its index among all tiles; None for a single image."""
+        return None if self.image is None else self.image.divmod(tile)[0]
 
     def first_pixel(self, tile: Any) -> tuple[Any, Any]:
         """Return the column and the row of the first pixel of a tile in its image, as integers."""
-        if self.images > 1:
+        if self.image is not None:
             tile = self.image.divmod(tile)[1]
         row, column = self.row.divmod(tile)
         return column * self.tile[0], row * self.tile[1]

@@ -1,0 +1,78 @@
+"""Programs of Dr.Jit: one serves images of every size, and sets of every number of Gaussians."""
+
+from contextlib import contextmanager
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+
+
+def picture(width, height, seed=0):
+    y, x = (v[..., None] for v in np.mgrid[:height, :width])
+    wave = 0.5 + 0.3 * np.sin(x / 7 + np.arange(3)) * np.cos(y / 5)
+    return (wave + np.random.default_rng(seed).normal(0, 0.05, wave.shape)).astype(np.float32)
+
+
+@contextmanager
+def programs():
+    """Collect the names of the programs that a block runs."""
+    names = set()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        yield names
+        names.update(k["hash"] for k in dr.kernel_history([dr.KernelType.JIT]))
+
+
+def programs_of(call, *arguments):
+    with programs() as names:
+        call(*arguments)
+    assert names
+    return names
+
+
+def check_sharing(call, sizes):
+    """The programs of the first size serve the others."""
+    first, *others = (programs_of(call, *size) for size in sizes)
+    for other in others:
+        assert other <= first
+
+
+SIZES = [(60, 68, 290), (96, 40, 500), (64, 104, 301)]
+"""Width, height and number of Gaussians; the width is a power of two or not. Dr.Jit merges programs
+of like size, therefore no two arrays of one rendering may happen to have the same size."""
+
+OVERHANGING = [(61, 67, 290), (97, 39, 500)]
+"""Sizes that are no multiples of a tile."""
+
+
+@pytest.mark.parametrize("sizes", [SIZES, OVERHANGING], ids=["whole", "overhanging"])
+@pytest.mark.parametrize("preset", ["default", "gaussianimage"])
+def test_fits_of_all_sizes_share_their_programs(backend, preset, sizes):
+    def fit(width, height, count):
+        image, options = picture(width, height), {"preset": preset, "backend": backend}
+        eg.fit(image, gaussians=count, iterations=30, seed=0, **options)
+
+    check_sharing(fit, sizes)
+
+
+def test_fits_of_many_images_share_their_programs(backend):
+    def fit(width, height, count, images):
+        photos = [picture(width, height, seed) for seed in range(images)]
+        list(eg.fit_many(photos, gaussians=count, iterations=10, backend=backend))
+
+    check_sharing(fit, [(*size, 2 + k) for k, size in enumerate(SIZES)])
+
+
+@pytest.mark.parametrize("sizes", [SIZES, OVERHANGING], ids=["whole", "overhanging"])
+def test_renderings_of_all_sizes_share_their_programs(backend, sizes):
+    gaussians = eg.fit(picture(32, 32), gaussians=50, iterations=0, backend=backend).gaussians
+
+    def differentiate(width, height, _):
+        dr.enable_grad(gaussians.mean, gaussians.color)
+        dr.backward(dr.sum(eg.render(gaussians, width, height).array))
+        dr.eval(dr.grad(gaussians.mean), dr.grad(gaussians.color))
+        dr.disable_grad(gaussians)
+
+    check_sharing(differentiate, sizes)
