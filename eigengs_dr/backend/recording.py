@@ -20,8 +20,8 @@ import drjit as dr
 _LOCK = threading.RLock()
 """The thread that holds it may use Dr.Jit."""
 
-_retired: deque[Any] = deque()
-"""Frozen programs that nobody uses any more; `_clear_retired` frees them."""
+_retired: deque[Callable[[], Any]] = deque()
+"""Functions that free programs and arrays that nobody uses any more; for `_clear_retired`."""
 
 _calls = 0
 """Calls of frozen programs under way, in the thread that holds `_LOCK`."""
@@ -102,18 +102,41 @@ def freeze_program(function: Callable[..., Any]) -> Iterator[Callable[..., Any]]
     try:
         yield call
     finally:
-        _retired.append(program)
-        if _LOCK.acquire(blocking=False):
-            try:
-                _clear_retired()
-            finally:
-                _LOCK.release()
+        _retire(program.clear)
+
+
+@contextmanager
+def release_later(*objects: Any) -> Iterator[None]:
+    """Keep objects during a block, and release them after it as `freeze_program` its program.
+
+    For a generator that holds arrays of its caller, because they may share NumPy's memory.
+
+    Parameters
+    ----------
+    *objects
+        Such as a set of Gaussians.
+    """
+    kept = list(objects)
+    try:
+        yield
+    finally:
+        _retire(kept.clear)
+
+
+def _retire(release: Callable[[], Any]) -> None:
+    """Call a function that frees objects, at once or when no program is being called."""
+    _retired.append(release)
+    if _LOCK.acquire(blocking=False):
+        try:
+            _clear_retired()
+        finally:
+            _LOCK.release()
 
 
 def _clear_retired() -> None:
-    """Free the programs that nobody uses any more, unless a program is being called."""
+    """Free what nobody uses any more, unless a program is being called."""
     while _retired and not _calls:
-        _retired.popleft().clear()
+        _retired.popleft()()
 
 
 @contextmanager

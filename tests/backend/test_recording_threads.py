@@ -1,6 +1,9 @@
 """Several threads of one process: fits, the garbage collector, and programs that are dropped."""
 
 import gc
+import os
+import sys
+import textwrap
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -10,6 +13,7 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.process import run_python
 from _helpers.waves import default, picture, start
 from eigengs_dr.backend import recording
 from eigengs_dr.backend.recording import collector_off, exclusive, freeze_program
@@ -140,11 +144,49 @@ def test_a_descent_that_another_thread_drops_during_a_recording(backend):
             assert dr.all(call(Float(x, x)) == 2 * x)
 
 
+DROP_WHILE_RECORDING = """
+    import drjit as dr
+    from _helpers.waves import default, start
+    from eigengs_dr.backend.recording import freeze_program
+    from eigengs_dr.backend.selection import select
+    from eigengs_dr.fitting.initializers import FitProblem
+    from eigengs_dr.fitting.optimizers.descent import descend
+
+    def half_read():
+        gaussians, target = start({backend!r})  # arrays that share NumPy's memory
+        sets = descend(FitProblem(gaussians, target), default(redistribute_after=0), 5)
+        for _ in range({count}):
+            next(sets)
+        return sets
+
+    drop = [half_read()].clear
+    Float = select({backend!r}).Float
+
+    def drops(x):
+        y = dr.gather(Float, x, dr.arange(dr.uint32_array_t(Float), 2))
+        drop()
+        return x + y
+
+    with freeze_program(drops) as call:
+        for x in (1, 2, 3):
+            assert dr.all(call(Float(x, x)) == 2 * x)
+    print("whole")
+"""
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_descent_that_a_program_drops_while_it_is_recorded(backend, count):
+    """Dr.Jit ends the process if an array that shares NumPy's memory is freed then."""
+    code = textwrap.dedent(DROP_WHILE_RECORDING).format(backend=backend, count=count)
+    run = run_python(code, PYTHONPATH=os.pathsep.join(sys.path))
+    assert run.stdout == "whole\n", run.stderr
+
+
 def test_a_descent_dropped_in_another_thread_is_freed_by_the_thread_that_computes(backend):
     dropped = [half_read(backend)]
     with exclusive():
         run_in_thread(dropped.clear)
-        assert len(recording._retired) == 1
+        assert len(recording._retired) == 2  # the program, and the set of the caller
     assert not recording._retired
 
 

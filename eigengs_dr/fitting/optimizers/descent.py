@@ -14,7 +14,7 @@ import drjit as dr
 import numpy as np
 
 from ...backend.arrays import ArrayTypes, types_of, upload
-from ...backend.recording import freeze_program
+from ...backend.recording import freeze_program, release_later
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint_pieces, sum_pieces
 from ...raster.binning.lists import TileLists
@@ -52,14 +52,15 @@ def descend(
     Gaussians
         The current set. Steps run asynchronously: its arrays may not be computed yet.
     """
-    yield problem.gaussians
-    first = schedule.redistribute_after
-    if problem.redistribute and first > 0 and iterations >= MIN_PHASE_RATIO * first:
-        for current in _run_phase(problem, schedule, first):
-            yield current
-        anew = problem.redistribute(dr.detach(current), len(current))
-        problem, iterations = problem._replace(gaussians=anew), iterations - first
-    yield from _run_phase(problem, schedule, iterations, levels)
+    with release_later(problem):  # a set of the caller may share NumPy's memory
+        yield problem.gaussians
+        first = schedule.redistribute_after
+        if problem.redistribute and first > 0 and iterations >= MIN_PHASE_RATIO * first:
+            for current in _run_phase(problem, schedule, first):
+                yield current
+            anew = problem.redistribute(dr.detach(current), len(current))
+            problem, iterations = problem._replace(gaussians=anew), iterations - first
+        yield from _run_phase(problem, schedule, iterations, levels)
 
 
 @dataclass(frozen=True)
