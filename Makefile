@@ -76,12 +76,14 @@ test-slow: $(READY)
 	$(BIN)/python -m pytest -q -m slow
 
 # CUDASIM_APPROX: the simulated driver rounds approximate instructions as coarsely as a GPU may.
+# It compiles every program with gcc at its first use, within the time of the test.
 ifeq ($(wildcard $(CUDASIM)),)
 test-cuda-sim:
 	@echo "make test-cuda-sim: skipped, no simulator of the CUDA driver; give its path by CUDASIM="
 else
 test-cuda-sim: $(READY)
-	CUDASIM_APPROX=1 $(CUDASIM) $(BIN)/python -m pytest -q -m 'gpu and not slow and not large'
+	CUDASIM_APPROX=1 $(CUDASIM) $(BIN)/python -m pytest -q -rs --timeout 3000 \
+		-m 'gpu and not slow and not large'
 endif
 
 $(DOCS_READY): $(READY)

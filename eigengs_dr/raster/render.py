@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import ArrayTypes, types_of
+from ..backend.arrays import ArrayTypes
 from ..backend.recording import exclusive
 from ..gaussian.file import MAX_CUTOFF
 from ..gaussian.gaussians import Gaussians

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from _helpers.sets import random_scene
 
+from _helpers.sets import random_scene
 from eigengs_dr.raster.picture import picture_rows
 from eigengs_dr.raster.render import picture_of
 
