@@ -82,7 +82,8 @@ test-cuda-sim:
 	@echo "make test-cuda-sim: skipped, no simulator of the CUDA driver; give its path by CUDASIM="
 else
 test-cuda-sim: $(READY)
-	CUDASIM_APPROX=1 $(CUDASIM) $(BIN)/python -m pytest -q -rs --timeout 3000 \
+	CUDASIM_APPROX=1 CUDASIM_PYTHON=$(CURDIR)/$(BIN)/python \
+		$(CUDASIM) $(BIN)/python -m pytest -q -rs --timeout 3000 \
 		-m 'gpu and not slow and not large'
 endif
 
