@@ -34,7 +34,7 @@ class Granularity(NamedTuple):
     products: bool
 
     def visits_for(self, entries: int) -> int:
-        """Return the largest number of tiles of one lane, for the pairs in the lists of an image."""
+        """Return the largest number of tiles of a lane, for the pairs in the lists of an image."""
         return self.long_visits if entries >= MIN_PIECES * self.long_visits else self.visits
 
 
