@@ -221,7 +221,9 @@ class Gaussians:
         if size is None:
             size = dr.opaque(types.Float, self.width), dr.opaque(types.Float, self.height)
         width, height = size
-        low, high = 0.5 / dr.maximum(width, height), 1 / MIN_DEVIATION
+        # In double precision, because cuda divides approximately in single.
+        longer = dr.float64_array_t(types.Float)(dr.maximum(width, height))
+        low, high = types.Float(0.5 / longer), 1 / MIN_DEVIATION
 
         def inside(x: Any, low: Any, high: Any, otherwise: Any) -> Any:
             return dr.select(dr.isfinite(x), dr.clip(x, low, high), otherwise)

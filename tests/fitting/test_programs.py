@@ -32,11 +32,15 @@ def programs_of(call, *arguments):
     return names
 
 
-def check_sharing(call, sizes):
+MORE = {"llvm": 0, "cuda": 3}
+"""Programs that a size may add. On cuda, a sort and a search have one for each number of bits."""
+
+
+def check_sharing(backend, call, sizes):
     """The programs of the first size serve the others."""
     first, *others = (programs_of(call, *size) for size in sizes)
     for other in others:
-        assert other <= first
+        assert len(other - first) <= MORE[backend]
 
 
 SIZES = [(60, 68, 290), (96, 40, 500), (64, 104, 301)]
@@ -54,7 +58,7 @@ def test_fits_of_all_sizes_share_their_programs(backend, preset, sizes):
         image, options = picture(width, height), {"preset": preset, "backend": backend}
         eg.fit(image, gaussians=count, iterations=30, seed=0, **options)
 
-    check_sharing(fit, sizes)
+    check_sharing(backend, fit, sizes)
 
 
 def test_fits_of_many_images_share_their_programs(backend):
@@ -62,7 +66,7 @@ def test_fits_of_many_images_share_their_programs(backend):
         photos = [picture(width, height, seed) for seed in range(images)]
         list(eg.fit_many(photos, gaussians=count, iterations=10, backend=backend))
 
-    check_sharing(fit, [(*size, 2 + k) for k, size in enumerate(SIZES)])
+    check_sharing(backend, fit, [(*size, 2 + k) for k, size in enumerate(SIZES)])
 
 
 @pytest.mark.parametrize("sizes", [SIZES, OVERHANGING], ids=["whole", "overhanging"])
@@ -75,4 +79,4 @@ def test_renderings_of_all_sizes_share_their_programs(backend, sizes):
         dr.eval(dr.grad(gaussians.mean), dr.grad(gaussians.color))
         dr.disable_grad(gaussians)
 
-    check_sharing(differentiate, sizes)
+    check_sharing(backend, differentiate, sizes)
