@@ -32,8 +32,9 @@ def programs_of(call, *arguments):
     return names
 
 
-MORE = {"llvm": 0, "cuda": 3}
-"""Programs that a size may add. On cuda, a sort and a search have one for each number of bits."""
+MORE = {"llvm": 0, "cuda": 5}
+"""Programs that a size may add. On cuda, two searches, the keys and the two passes of the sort of
+`eigengs_dr.raster.binning.transpose` depend on the number of bits of a size."""
 
 
 def check_sharing(backend, call, sizes):
