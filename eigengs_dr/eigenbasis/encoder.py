@@ -193,6 +193,8 @@ class Encoder:
         """Return ``sum_j a_j psi_nj`` of each channel, shape (N + 1, C)."""
         columns = []
         for weights, values in zip(self.weights, coefficients, strict=True):
-            values = np.asarray(values, np.float32)
-            columns.append(np.einsum("j,jn->n", values, weights[: len(values)]))
+            column, values = np.zeros(weights.shape[1], np.float32), np.asarray(values, np.float32)
+            if len(values):  # an empty einsum was NaN once, in one of some ten runs of the tests
+                np.einsum("j,jn->n", values, weights[: len(values)], out=column)
+            columns.append(column)
         return np.stack(columns, axis=1).astype(np.float64)
