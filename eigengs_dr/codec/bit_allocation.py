@@ -4,7 +4,7 @@ The error of rounding is ``D = sum_g k_g Delta_g^2`` with a step ``Delta_g`` for
 parameter. One bit less for each of the ``n_g`` numbers of a kind doubles its step. The allocation
 is optimal if all ``k_g Delta_g^2 / n_g`` are equal (reverse water-filling; Cover and Thomas,
 Elements of Information Theory, section 10.3.3). `pack` measures the ``k_g`` and then searches one
-common factor of the steps.
+common factor of the steps, see `eigengs_dr.codec.step_search`.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from ..raster.render import render
 from .egs import MAX_SECTIONS, SUFFIX, EgsContent, to_bytes, write
 from .error_feedback import quantize_with_feedback, to_gaussians
 from .quantization import Steps
+from .step_search import Attempt, smallest_within
 
 Array = NDArray[np.floating]
 
@@ -52,10 +53,6 @@ visible effect would get an infinite step."""
 
 NEGLIGIBLE = 1 / 32
 """Fraction of a step at which the error is a thousandth."""
-
-HALVINGS = 4
-"""Halvings of the interval of the common factor, whose ends differ by a factor of sqrt(2). The last
-halving saves 0.04 bits per number."""
 
 TOO_FINE = "pack: no rounding is fine enough for the budget; allow more dB"
 
@@ -168,9 +165,17 @@ def pack(
         return packed, max(error * (limits[-1] / limit) for error, limit in after)
 
     start = _water_fill(attempt, gaussians, limits[-1])
-    packed, _ = _search(attempt, start, limits[-1])
+
+    def scaled(octaves: float) -> Attempt:
+        packed, error = attempt(_steps(np.array(start) * 2**octaves))
+        added = (error + unseen - before[-1]) / (limits[-1] + unseen - before[-1])
+        return Attempt(added, packed, to_bytes(packed) if error <= limits[-1] else b"")
+
+    found = smallest_within(scaled)
+    if found is None:
+        raise ValueError(TOO_FINE)
+    packed, content = found.packed, found.content
     error = errors(to_gaussians(packed, gaussians))[-1]
-    content = to_bytes(packed)
     write(path, content)
     return PackResult(
         gaussians=Gaussians.load(path, types_of(gaussians.mean).backend),
@@ -198,29 +203,6 @@ def _water_fill(
     room = max(limit - start, 0.1 * limit)
     steps = np.sqrt(room / numbers.sum() * numbers / cost)
     return _steps(np.minimum(steps, np.array(MAX_STEPS) * unit))
-
-
-def _search(attempt: Callable[[Steps], _Candidate], steps: Steps, limit: float) -> _Candidate:
-    """Find the largest common factor of the steps with an error within the limit."""
-
-    def scaled(power: float) -> _Candidate:
-        return attempt(_steps(np.array(steps) * 2**power))
-
-    power, best = 0.0, scaled(0.0)
-    if best[1] <= limit:
-        while power < 4 and (wider := scaled(power + 0.5))[1] <= limit:
-            power, best = power + 0.5, wider
-    else:
-        while best[1] > limit:
-            power -= 0.5
-            if power < -12:
-                raise ValueError(TOO_FINE)
-            best = scaled(power)
-    for k in range(HALVINGS):
-        tried = scaled(power + 0.5 ** (k + 2))
-        if tried[1] <= limit:
-            power, best = power + 0.5 ** (k + 2), tried
-    return best
 
 
 def _steps(values: Array) -> Steps:

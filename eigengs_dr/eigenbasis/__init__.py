@@ -7,6 +7,7 @@
 - ``encode_many``: many images, in groups
 - ``projection``: coefficients of an image
 - ``options``: the options of a training, checked once
+- ``model_fit``: an eigenbasis to a model
 - ``training``: a folder of images to a model
 - ``evaluation``: a model on images held out
 - ``initializer``: a model as the start of a fit

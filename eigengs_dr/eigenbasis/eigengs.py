@@ -8,11 +8,8 @@ These are the same Gaussians, with colours from one matrix product (eq. 2 and 3 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,22 +17,18 @@ from numpy.typing import ArrayLike, NDArray
 from ..backend.recording import exclusive
 from ..collection.run import ImageRow, RowProgress
 from ..collection.sources import Images
-from ..fitting.solvers.normal_equations import NormalEquations
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image
 from ..image.resize import resample
-from ..storage import npz
-from .components.solve import ComponentFit, State, fit_components
-from .components.split import split_reason, wants_split
 from .encode_many import check_encoding, encode_each
 from .encoder import Encoder
-from .model_file import FORMAT, VERSION, from_members, layout_of, to_members
+from .model_file import read_members, write_model
+from .model_fit import TrainProgress, fit_model
 from .options import TrainOptions
 from .pca.basis import Eigenbasis
 from .pca.truncation import TruncationCurve, curve_from_eigenvalues
 
 Planes = NDArray[np.float32]
-TrainProgress = Callable[[int, int, dict[str, Any]], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,36 +120,7 @@ class EigenGS:
             steps=steps,
             seed=seed,
         )
-        steps = options.training_steps
-        split, figures = wants_split(basis, gaussians, frequency_aware, backend)
-        total = steps * (2 if split else 1)
-
-        def save(states: list[State]) -> None:
-            if progress:
-                progress(sum(int(state["step"]) for state in states), total, {})
-
-        component_fit = fit_components(
-            basis, gaussians, split, preset, steps, seed, backend, save=save
-        )
-        reason = split_reason(basis, gaussians, frequency_aware, figures)
-        return cls.from_fit(basis, component_fit, figures, split_reason=reason)
-
-    @classmethod
-    def from_fit(
-        cls, basis: Eigenbasis, fitted: ComponentFit, figures: dict[str, float], **notes: Any
-    ) -> EigenGS:
-        """Build a model from a basis, a fit of its components, more figures and attributes."""
-        return cls(
-            gaussians=fitted.gaussians,
-            weights=fitted.weights,
-            eigenvalues=basis.eigenvalues,
-            mean_image=basis.mean,
-            low=fitted.low,
-            low_components=fitted.low_components,
-            variance=basis.variance,
-            figures={**fitted.figures, **figures},
-            **notes,
-        )
+        return cls(**fit_model(basis, options, backend, progress))
 
     @property
     def components(self) -> tuple[int, ...]:
@@ -203,7 +167,7 @@ class EigenGS:
         UserWarning
             If all components miss the target; the result then has all of them.
         """
-        return self._encoder.project(check_image(image, copy=False), target_psnr)
+        return self.encoder.project(check_image(image, copy=False), target_psnr)
 
     @exclusive()
     def reconstruct(
@@ -223,7 +187,7 @@ class EigenGS:
         ValueError
             If there is not one array for each channel, or one has over k_c coefficients.
         """
-        return self._encoder.reconstruct(coefficients, size)
+        return self.encoder.reconstruct(coefficients, size)
 
     @exclusive()
     def encode(
@@ -262,7 +226,7 @@ class EigenGS:
         """
         check_encoding(colors, mean, target_psnr)
         pixels = check_image(image, copy=False)
-        return self._encoder.encode([pixels], colors, mean, target_psnr)[0]
+        return self.encoder.encode([pixels], colors, mean, target_psnr)[0]
 
     def encode_many(
         self,
@@ -296,7 +260,7 @@ class EigenGS:
             See `encode` and `eigengs_dr.fit_many`.
         """
         check_encoding(colors, mean, target_psnr)
-        encode = exclusive()(self._encoder.encode)
+        encode = exclusive()(self.encoder.encode)
         group = partial(encode, colors=colors, mean=mean, target_psnr=target_psnr)
         return encode_each(group, images, output, overwrite, progress)
 
@@ -312,7 +276,7 @@ class EigenGS:
         OSError
             If the file cannot be written; an existing file is then unchanged.
         """
-        npz.write(path, FORMAT, VERSION, to_members(self))
+        write_model(path, self)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], backend: str | None = None) -> EigenGS:
@@ -326,19 +290,9 @@ class EigenGS:
         OSError
             If the file cannot be opened.
         """
-        version = npz.read_version(path, FORMAT, VERSION)
-        arrays = npz.read(path, FORMAT, VERSION, layout_of(version))
-        try:
-            return cls(**from_members(arrays, backend))
-        except ValueError as error:
-            raise ValueError(f"{Path(path)}: {error}") from None
-
-    @property
-    def equations(self) -> NormalEquations:
-        """Normal equations of all Gaussians, with their factors."""
-        return self._encoder.equations
+        return cls(**read_members(path, backend))
 
     @cached_property
-    def _encoder(self) -> Encoder:
+    def encoder(self) -> Encoder:
         """The functions of `eigengs_dr.eigenbasis.encoder`, with what they compute once."""
         return Encoder(self.gaussians, self.weights, self.mean_image, self.low)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import BASIS_SPACES
+from ..storage import npz
 from ..storage.npz import Field
 from .pca.basis_file import ENERGY_TOLERANCE, require_descending
 
@@ -48,9 +51,19 @@ LAYOUT: dict[str, Field] = {
 """Arrays of a file; version 2 added the last three, for the truncation curve and the split."""
 
 
-def layout_of(version: int) -> dict[str, Field]:
-    """Return the arrays of a file of a version, 1 or 2."""
-    return LAYOUT_V1 if version < 2 else LAYOUT
+def write_model(path: str | os.PathLike[str], model: Any) -> None:
+    """Write the file of a model, all or nothing; see `eigengs_dr.EigenGS.save`."""
+    npz.write(path, FORMAT, VERSION, to_members(model))
+
+
+def read_members(path: str | os.PathLike[str], backend: str | None) -> dict[str, Any]:
+    """Read a file, and return the arguments of `eigengs_dr.EigenGS`; see `EigenGS.load`."""
+    version = npz.read_version(path, FORMAT, VERSION)
+    arrays = npz.read(path, FORMAT, VERSION, LAYOUT_V1 if version < 2 else LAYOUT)
+    try:
+        return from_members(arrays, backend)
+    except ValueError as error:
+        raise ValueError(f"{Path(path)}: {error}") from None
 
 
 def to_members(model: Any) -> dict[str, NDArray[Any]]:

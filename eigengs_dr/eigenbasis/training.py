@@ -20,10 +20,10 @@ from ..backend.interrupt import defer_interrupts
 from ..image.folder import image_files, read_blocks
 from ..image.io import ImageError
 from ..storage.checkpoint import Checkpoint
-from .components.solve import State, fit_components
-from .components.split import split_reason, wants_split
+from .components.solve import State
 from .eigengs import EigenGS
 from .evaluation import evaluate, truncation_curve_on
+from .model_fit import fit_model
 from .options import TrainOptions
 from .pca.basis import Eigenbasis, check_components
 from .pca.incremental_pca import EigenState, block_length, empty_state, merge, rank_for
@@ -108,7 +108,7 @@ def train(
         held_out = files[HELD_OUT - 1 :: HELD_OUT]
         training = [path for i, path in enumerate(files) if i % HELD_OUT != HELD_OUT - 1]
         with defer_interrupts() as pressed:
-            run = Run(checkpoint, settings, steps, backend, progress, pressed)
+            run = Run(checkpoint, settings, backend, progress, pressed)
             try:
                 held_out = held_out[:MAX_HELD_OUT]
                 basis = _basis(training, held_out, run)
@@ -146,7 +146,6 @@ class Run(NamedTuple):
 
     checkpoint: Checkpoint
     settings: TrainOptions
-    steps: int
     backend: str | None
     progress: StageProgress
     pressed: Callable[[], bool]
@@ -207,41 +206,27 @@ def _basis(files: list[Path], held_out: list[Path], run: Run) -> Eigenbasis:
 
 def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS:
     """Fit Gaussians to the components, and save checkpoints."""
-    settings, checkpoint = run.settings, run.checkpoint
+    checkpoint = run.checkpoint
     run.stop_if_pressed()
     run.progress("weights", 0, 1)
-    split, figures = wants_split(basis, settings.gaussians, settings.frequency_aware, run.backend)
     saved = time.perf_counter()
+
+    def advance(step: int, steps: int, row: dict[str, Any]) -> None:
+        if steps:
+            run.progress("shapes", step, steps)
 
     def save(states: list[State]) -> None:
         nonlocal saved
-        done = sum(int(state["step"]) for state in states)
-        if run.steps:
-            run.progress("shapes", done, run.steps * (2 if split else 1))
-            if run.pressed() or time.perf_counter() - saved > SAVE_SECONDS:
-                saved = time.perf_counter()
-                flat = {f"{i}.{k}": v for i, state in enumerate(states) for k, v in state.items()}
-                checkpoint.save("shapes", flat)
+        trains = run.settings.training_steps > 0
+        if trains and (run.pressed() or time.perf_counter() - saved > SAVE_SECONDS):
+            saved = time.perf_counter()
+            flat = {f"{i}.{k}": v for i, state in enumerate(states) for k, v in state.items()}
+            checkpoint.save("shapes", flat)
         run.stop_if_pressed()
 
-    component_fit = fit_components(
-        basis,
-        settings.gaussians,
-        split,
-        settings.preset,
-        run.steps,
-        settings.seed,
-        run.backend,
-        _states(checkpoint.load("shapes") or {}),
-        save,
-    )
-    return EigenGS.from_fit(
-        basis,
-        component_fit,
-        figures,
-        split_reason=split_reason(basis, settings.gaussians, settings.frequency_aware, figures),
-        held_out=np.zeros(0) if fall is None else fall.psnr,
-    )
+    states = _states(checkpoint.load("shapes") or {})
+    members = fit_model(basis, run.settings, run.backend, advance, states, save)
+    return EigenGS(**members, held_out=np.zeros(0) if fall is None else fall.psnr)
 
 
 def _states(flat: dict[str, Any]) -> list[State]:

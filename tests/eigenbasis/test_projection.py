@@ -61,7 +61,7 @@ def test_an_image_of_a_subspace_needs_no_more(backend):
 def test_encode_is_as_before_without_a_target(backend, others, split, mean):
     """The same bits as least squares on all components, written out."""
     model = small_model(backend, split)
-    equations = model.equations
+    equations = model.encoder.equations
     black = np.outer(np.append(equations.coverage, 32**2), YCBCR_OFFSET)
     seen = equations.correlate(np.moveaxis(others[0], 2, 0)) @ RGB_TO_YCBCR.T + black
     planes = to_planes(others[0], "ycbcr").reshape(3, 32, 32)

@@ -4,4 +4,5 @@
 - ``split``: the frequency-aware split
 - ``shape_training``: training of shapes by random combinations of components
 - ``joint_training``: training of shapes and weights together, as the paper does
+- ``joint_state``: the state of that training
 """

@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.arrays import ArrayTypes, types_in, types_of, upload
+from ...backend.arrays import ArrayTypes, types_in, upload
 from ...backend.recording import freeze_program
 from ...backend.selection import select
 from ...fitting.optimizers.adan import Adan
@@ -31,6 +31,7 @@ from ...raster.kernels import residual, sum_lanes
 from ...raster.layout import pack_parameters
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ...raster.render import bin_gaussians, to_tiles
+from .joint_state import JointState, decode_shapes
 
 RATE = 1e-3
 """Initial learning rate of all variables."""
@@ -49,72 +50,6 @@ Gaussians more often."""
 OPTIMIZER = Adan()
 
 Planes = NDArray[np.float32]
-
-
-class JointState(NamedTuple):
-    """State of a joint training of N Gaussians and P components after some steps.
-
-    Attributes
-    ----------
-    step : int
-        Number of finished steps.
-    loss : float
-        Mean squared error over all pixels of the scaled components, before the update of the last
-        step; NaN before the first step.
-    size : (int, int)
-        Width and height in pixels.
-    bounds : ndarray of float32, shape (C, 2)
-        Smallest and largest value of all components of a channel; 0 for a channel without any.
-    counts : tuple of C ints
-        Number of components of each channel.
-    rows : ndarray of float32, shape (5, 5 + P, N)
-        Variables; then m, v, n and the last gradient of `eigengs_dr.fitting.optimizers.adan.Adan`.
-        The first 5 rows of each are the mean and the factor in `CHOLESKY` coordinates; each other
-        row holds the scaled weights of one component.
-    """
-
-    step: int
-    loss: float
-    size: tuple[int, int]
-    bounds: NDArray[np.float32]
-    counts: tuple[int, ...]
-    rows: NDArray[np.float32]
-
-    def gaussians(self, backend: str | None = None) -> Gaussians:
-        """Return N Gaussians with one channel of zeros, in the space "data"."""
-        types = types_in(select(backend))
-        return _placed(
-            [upload(types.Float, row) for row in self.rows[0, :NUM_SHAPE_PARAMS]], self.size
-        )
-
-    def weights(self) -> tuple[Planes, ...]:
-        """Return the weights of the components without the scaling.
-
-        The scaled weight ``w_nj`` of Gaussian n in component j and the bounds of the channel give
-        ``psi'_nj = w_nj (max - min)`` and ``beta_j = min``.
-
-        Returns
-        -------
-        tuple of C ndarrays of float32, shape (k_c, N + 1)
-            Row j holds psi'_nj of all Gaussians, then the background beta_j.
-        """
-        parts = np.split(self.rows[0, NUM_SHAPE_PARAMS:], np.cumsum(self.counts)[:-1])
-        return tuple(
-            np.pad(part * (high - low), [(0, 0), (0, 1)], constant_values=low)
-            for part, (low, high) in zip(parts, self.bounds, strict=True)
-        )
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the state as plain arrays, for a checkpoint."""
-        return {name: np.asarray(value) for name, value in self._asdict().items()}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> JointState:
-        """Rebuild a state from the result of `arrays`; the next steps then give equal bits."""
-        width, height = arrays["size"].tolist()
-        counts = tuple(arrays["counts"].tolist())
-        step, loss = int(arrays["step"]), float(arrays["loss"])
-        return cls(step, loss, (width, height), arrays["bounds"], counts, arrays["rows"])
 
 
 def train_jointly(
@@ -213,7 +148,7 @@ def _train(
         for step in range(state.step, steps):
             rate = dr.opaque(types.Float, RATE * 0.5 ** (step // HALVED))
             time = dr.opaque(types.Float, step + 1)
-            current = _placed(shape[0], state.size)
+            current = decode_shapes(shape[0], state.size)
             values = kernel_shape(current)
             dr.eval(values)
             # New lists in every step are cheaper than larger lists that last several steps.
@@ -265,7 +200,7 @@ def _move_shape(shape: list, gradient: list, size: tuple[int, int], rate: Any, t
     with dr.resume_grad():
         traced = type(rows)(rows)
         dr.enable_grad(traced)
-        values = kernel_shape(_placed(traced, size))
+        values = kernel_shape(decode_shapes(traced, size))
         dr.backward(sum(v * g for v, g in zip(values, gradient, strict=True)))
         slopes = dr.grad(traced)
     rows, moments = OPTIMIZER.step(rows, slopes, tuple(moments), rate, time)
@@ -301,12 +236,3 @@ def _targets(types: ArrayTypes, components: tuple[Planes, ...], state: JointStat
         planes = np.zeros((*group[0].shape, GROUP), np.float32)
         planes[..., : len(group)] = np.stack(group, axis=-1)
         yield to_tiles(types, planes, Grid(*state.size))
-
-
-def _placed(rows: Any, size: tuple[int, int]) -> Gaussians:
-    """Decode 5 rows of `CHOLESKY` coordinates to Gaussians without colour."""
-    types = types_of(rows[0])
-    x, y, *factor = rows
-    color, background = (dr.zeros(types.FloatX, (1, n)) for n in (dr.width(x), 1))
-    blank = Gaussians(types.Float2(0), types.Float3(1), color, background, *size, "data")
-    return CHOLESKY.decode(blank, {"mean": types.Float2(x, y), "cholesky": types.Float3(*factor)})

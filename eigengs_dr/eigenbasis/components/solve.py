@@ -16,7 +16,8 @@ from ...gaussian.concatenate import concatenate
 from ...gaussian.gaussians import Gaussians
 from ...image.metrics import psnr_from_mse
 from ..pca.basis import Eigenbasis
-from .joint_training import JointState, train_jointly
+from .joint_state import JointState
+from .joint_training import train_jointly
 from .shape_training import on_grid, shapes_of, train_shapes
 from .split import FrequencyBand, frequency_bands, low_component_count
 
