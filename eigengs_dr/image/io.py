@@ -1,6 +1,8 @@
 """Image files and arrays: load, check, save."""
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,16 +67,28 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
     ImageError
         If the file is missing, empty, damaged, too large or not an image.
     """
+    path = Path(path)
+    with open_picture(path) as file:
+        frames = getattr(file, "n_frames", 1)
+        pixels, transparent = picture_pixels(file)
+    if transparent:
+        warnings.warn(f"{path}: transparent pixels are shown over white", stacklevel=2)
+    if frames > 1:
+        warnings.warn(f"{path}: holds {frames} frames, the first is used", stacklevel=2)
+    return _check_range(_rgb(pixels, str(path), keep_grey), str(path))
+
+
+@contextmanager
+def open_picture(path: Path) -> "Iterator[Image]":
+    """Open an image file with Pillow, turned as its EXIF header says; errors as `load_image`."""
     from PIL import Image, ImageOps, UnidentifiedImageError  # 0.05 s
 
-    path = Path(path)
     try:
         if path.stat().st_size == 0:
             raise ImageError(f"{path}: the file is empty (0 bytes); copy or export it again")
         with Image.open(path) as file:
-            frames = getattr(file, "n_frames", 1)
             ImageOps.exif_transpose(file, in_place=True)  # a copy only if it turns the image
-            pixels, transparent = _pixels(file)
+            yield file
     except ImageError:
         raise
     except FileNotFoundError:
@@ -89,16 +103,12 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
         ) from None
     except Image.DecompressionBombError:
         limit = f"{2 * (Image.MAX_IMAGE_PIXELS or 0):,}"
-        raise ImageError(f"{path}: has more than {limit} pixels; scale it down first") from None
+        raise ImageError(
+            f"{path}: has more than {limit} pixels; scale it down first, or fit it in blocks"
+        ) from None
     except Exception as error:  # on damaged files Pillow's decoders raise many types
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise ImageError(f"{path}: damaged or unsupported ({reason}); export it again") from error
-
-    if transparent:
-        warnings.warn(f"{path}: transparent pixels are shown over white", stacklevel=2)
-    if frames > 1:
-        warnings.warn(f"{path}: holds {frames} frames, the first is used", stacklevel=2)
-    return _check_range(_rgb(pixels, str(path), keep_grey), str(path))
 
 
 def check_image(
@@ -201,7 +211,7 @@ def to_8bit(image: NDArray[Any], out: NDArray[Any] | None = None) -> NDArray[Any
     return np.rint(clipped, out=clipped)
 
 
-def _pixels(image: "Image") -> tuple[NDArray[Any], bool]:
+def picture_pixels(image: "Image") -> tuple[NDArray[Any], bool]:
     """Return the pixels of a Pillow image, and whether some of them are transparent."""
     if image.mode == "I":  # 16-bit grey of PGM files comes as 32-bit integers
         return np.asarray(image) / 65535, False
