@@ -102,8 +102,9 @@ def fit_large(
     color, solve_steps, cutoff, backend : optional
         See `eigengs_dr.fit`.
     progress : callable, optional
-        ``progress(done, total, row)`` with the steps of all blocks that are done, the number of all
-        steps, and a row with the keys blocks and blocks_done.
+        ``progress(done, total, row)``: what is done of a stage, in blocks or steps of blocks. The
+        row has the key stage ("survey", "place", "density", "place", "fit", "mend", "measure", in
+        this order; the first pair with "density" for long fits alone), and blocks, their number.
     client : distributed.Client, optional
         Where blocks are fitted; by default in this process.
 

@@ -11,8 +11,12 @@ from numpy.typing import NDArray
 PHASES = 4
 """Number of phases, see `Block`."""
 
-HALO_SPACINGS = 8.0
-"""Width of a halo, in spacings of the Gaussians. See `choose_halo`."""
+HALO_SPACINGS = 5.0
+"""Width of a halo, in mean distances of the Gaussians. On 1,024x1,024 pixels in blocks of 256, 60
+steps, the 16 pixels around borders have 32.18, 32.20 and 32.22 dB with 4, 5 and 8."""
+
+MIN_HALO = 16
+"""Least width of a halo in pixels."""
 
 
 class Block(NamedTuple):
@@ -58,6 +62,11 @@ class Block(NamedTuple):
         rows, columns = self.window_rows, self.window_columns
         return np.array([columns.stop - columns.start, rows.stop - rows.start], np.float64)
 
+    def open_sides(self, width: int, height: int) -> tuple[bool, bool, bool, bool]:
+        """Return whether an image goes on left of the window, above, right of it and below."""
+        rows, columns = self.window_rows, self.window_columns
+        return columns.start > 0, rows.start > 0, columns.stop < width, rows.stop < height
+
     @property
     def pixels(self) -> int:
         """Number of pixels of the core."""
@@ -66,7 +75,7 @@ class Block(NamedTuple):
 
 def choose_halo(spacing: float) -> int:
     """Return the width of a halo in pixels, for a mean distance of Gaussians in pixels."""
-    return max(16, math.ceil(HALO_SPACINGS * spacing))
+    return max(MIN_HALO, math.ceil(HALO_SPACINGS * spacing))
 
 
 def divide(width: int, height: int, side: int, halo: int) -> list[Block]:

@@ -16,14 +16,19 @@ from ..fitting.optimizers.schedule import MIN_PHASE_RATIO
 from ..fitting.options import FitOptions
 from ..gaussian.file import SetData
 from ..storage.checkpoint import Checkpoint
-from .block import FitTask, PlaceTask, Settings, fit_block, place, survey
+from .block import FitTask, PlaceTask, Settings, find_density, fit_block, mend_seam, place, survey
 from .draw import compare, compare_tasks
-from .grid import PHASES, Block, deal
+from .grid import PHASES, Block, choose_halo, deal
 from .place import OldSet
-from .sets import BlockSets
+from .seams import seams
+from .sets import Arrays, BlockSets
 from .source import Source, Window
 
 Progress = Callable[[int, int, dict[str, Any]], None]
+
+
+MEND_SHARE = 0.15
+"""Steps of `_mend`, as a fraction of those of a fit."""
 
 
 class Run:
@@ -63,8 +68,8 @@ class Run:
         self.image, self.blocks, self.options, self.executor = image, blocks, options, executor
         self.checkpoint, self.progress, self.pressed = checkpoint, progress, pressed
         spacing = (image.width * image.height / options.gaussians) ** 0.5
-        self.settings = Settings(options, spacing)
-        self.resumed = self.steps_done = self.blocks_done = 0
+        self.settings = Settings(options, (image.width, image.height), spacing)
+        self.resumed, self.stage, self.done, self.total = 0, "", 0, 0
 
     def fit(self) -> SetData:
         """Place and fit all Gaussians; a long fit places them again where error was left."""
@@ -75,6 +80,7 @@ class Run:
             old, mass = self._find_density(self._place(mass), first)
             steps -= first
         sets = self._fit_blocks(self._place(mass, old), steps)
+        self._mend(sets, round(MEND_SHARE * steps))
         background = np.array(self.settings.background, np.float32)
         return SetData(
             sets.arrays | {"background": background},
@@ -85,6 +91,7 @@ class Run:
 
     def measure(self, data: SetData) -> tuple[float, float]:
         """Return the sums of the squared errors for psnr_ycbcr and psnr_rgb."""
+        self._begin("measure", len(self.blocks))
         tasks = compare_tasks(self.image, data, self.blocks, self.options.backend)
         sums = {b.number: value for b, value in self._map(compare, tasks, self.blocks)}
         ycbcr, rgb = np.sum([value for _, value in sorted(sums.items())], axis=0).tolist()
@@ -92,6 +99,7 @@ class Run:
 
     def _survey(self) -> NDArray[np.float64]:
         """Return the masses of all blocks, and set the background: the mean of the image."""
+        self._begin("survey", len(self.blocks))
         tasks = (PlaceTask(self._window(block), block) for block in self.blocks)
         found = {b.number: value for b, value in self._map(survey, tasks, self.blocks)}
         figures = np.array([[value.mass, *value.total] for _, value in sorted(found.items())])
@@ -116,6 +124,7 @@ class Run:
                     seen = OldSet(arrays["mean"], arrays["ratio"][:, 0])
                 yield PlaceTask(self._window(block), block, count, seen)
 
+        self._begin("place", len(self.blocks))
         for block, (mean, factor) in self._map(place, tasks(), self.blocks):
             placed.put(block, {"mean": mean, "factor": factor})
         return placed
@@ -125,9 +134,14 @@ class Run:
         old = BlockSets(self.blocks, placed.counts(), ("mean", "ratio"))
         mass = np.empty(len(self.blocks))
 
-        # Errors hardly differ between both sides of a border, so that blocks need no phases.
-        tasks = partial(self._task, placed, None, steps)
-        for block, found in self._fitted("density", self.blocks, tasks, steps):
+        def make_task(block: Block) -> FitTask:
+            # Errors hardly differ between both sides of a border, so that blocks need no phases.
+            arrays, own = placed.in_window(block)
+            mean, factor = arrays["mean"], arrays["factor"]
+            return FitTask(self._window(block), block, mean, factor, None, own, None, steps)
+
+        self._begin("density", len(self.blocks) * steps)
+        for block, found in self._fitted("density", find_density, self.blocks, make_task, steps):
             mass[block.number] = found["mass"][0]
             old.put(block, found)
         return old, mass
@@ -136,63 +150,88 @@ class Run:
         """Fit all blocks, phase by phase."""
         names, options = ("mean", "factor", "color"), self.options
         sets = BlockSets(self.blocks, placed.counts(), names, self.image.channels, options.cutoff)
-        tasks = partial(self._task, placed, sets, steps)
+
+        def make_task(block: Block) -> FitTask:
+            earlier = [other for other in self.blocks if other.phase < block.phase]
+            arrays, own = placed.in_window(block, without=earlier)
+            mean, factor, fixed = arrays["mean"], arrays["factor"], sets.touching(block, earlier)
+            return FitTask(self._window(block), block, mean, factor, None, own, fixed, steps)
+
+        self._begin("fit", len(self.blocks) * steps)
         for phase in range(PHASES):
             blocks = [block for block in self.blocks if block.phase == phase]
-            for block, found in self._fitted("fit", blocks, tasks, steps):
+            for block, found in self._fitted("fit", fit_block, blocks, make_task, steps):
                 sets.put(block, found)
         return sets
 
-    def _task(self, placed: BlockSets, sets: BlockSets | None, steps: int, block: Block) -> FitTask:
-        """Return the task of a block beside the sets of earlier phases, or of none for a trial."""
-        earlier = [] if sets is None else [b for b in self.blocks if b.phase < block.phase]
-        arrays, own = placed.in_window(block, without=earlier)
-        fixed = None if sets is None else sets.touching(block, earlier)
-        mean, factor = arrays["mean"], arrays["factor"]
-        return FitTask(self._window(block), block, mean, factor, own, steps, fixed)
+    def _mend(self, sets: BlockSets, steps: int) -> None:
+        """Move the Gaussians along all borders of blocks, phase by phase."""
+        size, halo = (self.image.width, self.image.height), choose_halo(self.settings.spacing)
+        strips = seams(self.blocks, *size, self.settings.spacing, halo)
+        near = dict[int, tuple[NDArray[np.intp], NDArray[np.intp]]]()
+
+        def make_task(strip: Block) -> FitTask:
+            own, fixed = (sets.take(rows, strip) for rows in near[strip.number])
+            return FitTask(
+                self._window(strip), strip, **own, own=slice(None), fixed=fixed, iterations=steps
+            )
+
+        self._begin("mend", len(strips) * steps)
+        for phase in range(PHASES):
+            own = [strip for strip in strips if strip.phase == phase]
+            near |= {strip.number: sets.around(strip) for strip in own}
+            own = [strip for strip in own if len(near[strip.number][0])]
+            # Strips of one phase may see each other by large Gaussians, so that all wait for all.
+            found = list(self._fitted("seam", mend_seam, own, make_task, steps))
+            for strip, arrays in found:
+                sets.replace(near[strip.number][0], arrays, strip)
 
     def _fitted(
         self,
-        name: str,
-        blocks: list[Block],
+        stage: str,
+        function: Any,
+        parts: list[Block],
         make_task: Callable[[Block], FitTask],
         steps: int,
-    ) -> Iterator[tuple[Block, dict[str, NDArray[Any]]]]:
-        """Yield blocks that an earlier call has fitted, then fit the others and keep them."""
+    ) -> Iterator[tuple[Block, Arrays]]:
+        """Yield the parts that an earlier call has fitted, then fit the others and keep them."""
         waiting = list[Block]()
-        for block in blocks:
-            found = self.checkpoint.load(f"{name}{block.number}") if self.checkpoint else None
+        for part in parts:
+            found = self.checkpoint.load(f"{stage}{part.number}") if self.checkpoint else None
             if found is None:
-                waiting.append(block)
+                waiting.append(part)
                 continue
-            yield block, found
             self.resumed += 1
             self._advance(steps)
-        function: Any = fit_block
+            yield part, found
         if self.pressed is not None:
-            function = partial(fit_block, step_done=self._step_done)
-        for block, found in self._map(function, map(make_task, waiting), waiting):
+            function = partial(function, step_done=self._step_done)
+        for part, found in self._map(function, map(make_task, waiting), waiting, steps):
             if self.checkpoint is not None:
-                self.checkpoint.save(f"{name}{block.number}", found)
-            yield block, found
-            self._advance(steps)
+                self.checkpoint.save(f"{stage}{part.number}", found)
+            yield part, found
 
     def _map(
-        self, function: Any, tasks: Iterator[Any], blocks: list[Block]
+        self, function: Any, tasks: Iterator[Any], parts: list[Block], steps: int = 1
     ) -> Iterator[tuple[Block, Any]]:
-        """Run the tasks of blocks, and yield the blocks with their results."""
+        """Run the tasks of some parts, and yield the parts with their results."""
         with closing(self.executor.map(function, tasks, self.settings)) as ended:
             for done in ended:
                 if done.lost:
                     raise RuntimeError(f"{self.image.name}: {done.lost}")
-                yield blocks[done.index], done.value
+                self._advance(steps)
+                yield parts[done.index], done.value
                 self._stop_if_pressed()
 
     def _window(self, block: Block) -> Window:
         return self.image.window(block.window_rows, block.window_columns)
 
+    def _begin(self, stage: str, total: int) -> None:
+        self.stage, self.done, self.total = stage, 0, total
+        self._show(0)
+
     def _advance(self, steps: int) -> None:
-        self.steps_done += steps
+        self.done += steps
         self._show(0)
 
     def _step_done(self, step: int) -> None:
@@ -201,9 +240,8 @@ class Run:
 
     def _show(self, step: int) -> None:
         if self.progress:
-            number = len(self.blocks)
-            total = self.options.iterations * number
-            self.progress(self.steps_done + step, total, {"blocks": number})
+            row = {"stage": self.stage, "blocks": len(self.blocks)}
+            self.progress(self.done + step, self.total, row)
 
     def _stop_if_pressed(self) -> None:
         if self.pressed is not None and self.pressed():

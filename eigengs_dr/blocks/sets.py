@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian.crop import crop, reaches
+from ..gaussian.crop import crop, reaches, touches
 from ..gaussian.file import CUTOFF, SetData
 from .grid import Block, neighbors
 
@@ -50,6 +50,7 @@ class BlockSets:
     ) -> None:
         ends = np.cumsum(counts).tolist()
         self.blocks, self.cutoff = blocks, cutoff
+        self.size = np.array([blocks[-1].columns.stop, blocks[-1].rows.stop])
         self.parts = [slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
         self.arrays: Arrays = {
             name: np.empty((ends[-1], COLUMNS.get(name, channels)), np.float32) for name in names
@@ -66,9 +67,7 @@ class BlockSets:
         for name, rows in self.arrays.items():
             rows[part] = found[name] + block.corner if name == "mean" else found[name]
         if "factor" in self.arrays:
-            mean, reach = self.arrays["mean"][part], np.stack(reaches(self._data(block)), axis=1)
-            box = (mean - reach).min(axis=0), (mean + reach).max(axis=0)
-            self._boxes[block.number] = np.concatenate(box)
+            self._measure(block)
 
     def in_window(self, block: Block, without: Sequence[Block] = ()) -> tuple[Arrays, slice]:
         """Return the Gaussians whose means lie in the window of a block, in the window's pixels.
@@ -119,14 +118,66 @@ class BlockSets:
         dict of str to ndarray
             Mean, factor and color.
         """
-        left, top = block.corner.tolist()
-        width, height = block.window_size.astype(int).tolist()
         found = [{name: rows[:0] for name, rows in self.arrays.items()}]
         for other in others:
-            box = self._boxes[other.number]
-            if (box[:2] <= (left + width, top + height)).all() and (box[2:] >= (left, top)).all():
-                found.append(crop(self._data(other), (left, top), (width, height)).arrays)
+            if self._reaches(other, block):
+                found.append(crop(self._data(other), *_window(block)).arrays)
         return {name: np.concatenate([part[name] for part in found]) for name in self.arrays}
+
+    def around(self, strip: Block) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the rows whose means lie in the core of a part, and others that touch its window.
+
+        Gaussians that reach beyond the window are others: a fit of it would not see all they do.
+
+        Returns
+        -------
+        inside, around : ndarray of int, shape (n,)
+        """
+        core = np.array([[strip.columns.start, strip.rows.start]])
+        end = np.array([[strip.columns.stop, strip.rows.stop]])
+        low, high = strip.corner, strip.corner + strip.window_size
+        low, high = np.where(low > 0, low, -np.inf), np.where(high < self.size, high, np.inf)
+        inside, around = [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
+        for block in self.blocks:
+            if self._reaches(block, strip):
+                first, data = self.parts[block.number].start, self._data(block)
+                mean, reach = data.arrays["mean"], np.stack(reaches(data), axis=1)
+                own = np.all((mean >= core) & (mean < end), axis=1)
+                own &= np.all((mean - reach >= low) & (mean + reach <= high), axis=1)
+                seen = touches(data, *_window(strip)) & ~own
+                inside.append(np.flatnonzero(own) + first)
+                around.append(np.flatnonzero(seen) + first)
+        return np.concatenate(inside), np.concatenate(around)
+
+    def take(self, rows: NDArray[np.intp], part: Block) -> Arrays:
+        """Return some rows, with means in pixels of the window of a part."""
+        arrays = {name: values[rows] for name, values in self.arrays.items()}
+        arrays["mean"] = (arrays["mean"] - part.corner).astype(np.float32)
+        return arrays
+
+    def replace(self, rows: NDArray[np.intp], found: Arrays, part: Block) -> None:
+        """Set some rows; their means are in pixels of the window of a part."""
+        for name, values in self.arrays.items():
+            values[rows] = found[name] + part.corner if name == "mean" else found[name]
+        for block in self.blocks:
+            own = self.parts[block.number]
+            if ((rows >= own.start) & (rows < own.stop)).any():
+                self._measure(block)
+
+    def _measure(self, block: Block) -> None:
+        """Note the box that the Gaussians of a block touch: left, top, right, bottom."""
+        mean = self.arrays["mean"][self.parts[block.number]]
+        reach = np.stack(reaches(self._data(block)), axis=1)
+        box = (mean - reach).min(axis=0), (mean + reach).max(axis=0)
+        self._boxes[block.number] = np.concatenate(box)
+
+    def _reaches(self, block: Block, part: Block) -> bool:
+        """Whether some Gaussians of a block may touch the window of a part."""
+        (left, top), (width, height) = _window(part)
+        box = self._boxes[block.number]
+        return bool(
+            (box[:2] <= (left + width, top + height)).all() and (box[2:] >= (left, top)).all()
+        )
 
     def _data(self, block: Block) -> SetData:
         """Return the Gaussians of a block as a set."""
@@ -134,3 +185,9 @@ class BlockSets:
         arrays = {name: rows[part] for name, rows in self.arrays.items()}
         arrays["background"] = np.zeros(1, np.float32)
         return SetData(arrays, (1, 1), "data", self.cutoff)
+
+
+def _window(part: Block) -> tuple[tuple[float, float], tuple[int, int]]:
+    """Return the corner and the size of the window of a part."""
+    (left, top), (width, height) = part.corner.tolist(), part.window_size.astype(int).tolist()
+    return (left, top), (width, height)

@@ -61,15 +61,17 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
             f"{file}: format is {file_format[:40]!r}, expected one of {', '.join(kinds)}"
         )
     kind, load, describe, draw = kinds[file_format]
-    content = load(file)
-    facts = {"file": str(file), "kind": kind, "bytes": file.stat().st_size, **describe(content)}
+    facts: dict[str, Any] = {"file": str(file), "kind": kind, "bytes": file.stat().st_size}
+    if kind == "image" and not packed.is_egs(file):
+        facts |= _describe_head(setfile.read_head(file))
+    else:
+        facts |= describe(load(file))
     if kind == "image":
-        pixels = content.width * content.height
-        facts["bpp"] = round(8 * facts["bytes"] / pixels, 4)
+        facts["bpp"] = round(8 * facts["bytes"] / (facts["width"] * facts["height"]), 4)
     if packed.is_egs(file):
         facts |= _describe_packed(packed.read(file))
     if picture:
-        save_image(picture, draw(content))
+        save_image(picture, draw(load(file)))
     click.echo(json.dumps(facts, indent=2) if as_json else _text(**facts))
 
 
@@ -81,6 +83,18 @@ def _describe_image(gaussians: Any) -> dict[str, Any]:
         "channels": gaussians.channels,
         "space": gaussians.space,
         "cutoff": gaussians.cutoff,
+    }
+
+
+def _describe_head(head: Any) -> dict[str, Any]:
+    """Describe a set that is not read: a large one takes gigabytes."""
+    return {
+        "gaussians": head.gaussians,
+        "width": head.size[0],
+        "height": head.size[1],
+        "channels": head.channels,
+        "space": head.space,
+        "cutoff": head.cutoff,
     }
 
 

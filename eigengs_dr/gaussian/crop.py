@@ -33,19 +33,27 @@ def crop(
         It renders as the region does in the whole set, up to rounding. The Gaussians keep their
         order. The set may be empty: then the region shows the background alone.
     """
-    mean = data.arrays["mean"]
-    touches = np.ones(len(mean), bool)
-    for axis, reach in enumerate(reaches(data)):
-        half = 0.5 * size[axis] / scale[axis]
-        away = np.abs(mean[:, axis] - np.float32(corner[axis] + half))
-        touches &= away <= reach * np.float32(1.001) + np.float32(half + 1)
     x, y = scale
-    arrays = {name: values[touches] for name, values in data.arrays.items() if name != "background"}
+    seen = touches(data, corner, (size[0] / x, size[1] / y))
+    arrays = {name: values[seen] for name, values in data.arrays.items() if name != "background"}
     arrays["background"] = data.arrays["background"]
     shifted = (arrays["mean"].astype(np.float64) - corner) * scale
     arrays["mean"] = shifted.astype(np.float32)
     arrays["factor"] = (arrays["factor"] / np.array([x, y, y])).astype(np.float32)
     return data._replace(arrays=arrays, size=size)
+
+
+def touches(
+    data: SetData, corner: tuple[float, float], size: tuple[float, float]
+) -> NDArray[np.bool_]:
+    """Return which Gaussians touch a region, by its corner and its size in native pixels."""
+    mean = data.arrays["mean"]
+    seen = np.ones(len(mean), bool)
+    for axis, reach in enumerate(reaches(data)):
+        half = 0.5 * size[axis]
+        away = np.abs(mean[:, axis] - np.float32(corner[axis] + half))
+        seen &= away <= reach * np.float32(1.001) + np.float32(half + 1)
+    return seen
 
 
 def reaches(data: SetData) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
