@@ -36,7 +36,7 @@ class Done(NamedTuple):
         None. Else empty.
     """
 
-    index: int
+    index: int  # type: ignore[assignment]  # hides the method of tuples
     value: Any
     lost: str = ""
 
@@ -54,7 +54,11 @@ class Executor(Protocol):
     workers: int
 
     def map(
-        self, function: Function, tasks: Iterable[Any], shared: Any = None
+        self,
+        function: Function,
+        tasks: Iterable[Any],
+        shared: Any = None,
+        at_once: int | None = None,
     ) -> Generator[Done, None, None]:
         """Call ``function(task, shared)`` for every task, and yield the results.
 
@@ -67,6 +71,9 @@ class Executor(Protocol):
             workers become free, a few ahead.
         shared : Any
             What all tasks use; it travels once.
+        at_once : int, optional
+            Largest number of tasks that are drawn and have not ended; by default some more than
+            there are workers.
 
         Yields
         ------
@@ -88,7 +95,11 @@ class LocalExecutor:
     workers = 1
 
     def map(
-        self, function: Function, tasks: Iterable[Any], shared: Any = None
+        self,
+        function: Function,
+        tasks: Iterable[Any],
+        shared: Any = None,
+        at_once: int | None = None,
     ) -> Generator[Done, None, None]:
         """Call ``function(task, shared)`` for every task; see `Executor.map`."""
         for index, task in enumerate(tasks):

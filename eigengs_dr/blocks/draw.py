@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,11 +12,13 @@ from numpy.typing import NDArray
 from ..gaussian.crop import crop
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
+from ..image.io import save_image, to_8bit
 from ..image.metrics import float_space, squared_error
 from ..raster.render import picture_of
+from ..storage.atomic import atomic_write
 from .grid import Block
 from .source import Source, Window
-from .tiff import TILE_SIDE
+from .tiff import TIFF_SUFFIXES, TILE_SIDE, write_tiles
 
 BAND_PIXELS = 1 << 22
 """Pixels of a band of a picture that is drawn at once; one takes some 100 bytes."""
@@ -63,8 +66,8 @@ def draw_region(
 
     Yields
     ------
-    ndarray, shape (R, width, C)
-        Every band but the last has a multiple of 256 rows.
+    ndarray of uint8, shape (R, width, C)
+        Clamped and rounded; every band but the last has a multiple of 256 rows.
     """
     left, top, native_width, native_height = region
     width, height = size
@@ -74,7 +77,56 @@ def draw_region(
     rows = max(1, BAND_PIXELS // width // TILE_SIDE) * TILE_SIDE
     for first in range(0, height, rows):
         band = width, min(rows, height - first)
-        yield draw(crop(data, (0, first / scale[1]), band, scale), backend)
+        part = crop(data, (0, first / scale[1]), band, scale)
+        yield to_8bit(draw(part, backend)).astype(np.uint8)
+
+
+def save_region(
+    path: Path,
+    data: SetData,
+    region: tuple[int, int, int, int],
+    size: tuple[int, int],
+    backend: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Draw a region of a set into a file with 8 bits per channel, completely or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        A .tif or .tiff file is written by tiles, in the memory of a band. Other files, see
+        `eigengs_dr.save_image`, need the whole picture: 3 bytes a pixel.
+    data, region, size, backend
+        See `draw_region`.
+    progress : callable, optional
+        ``progress(done, total)`` with rows of the picture.
+
+    Raises
+    ------
+    ImageError
+        If the suffix is unknown or the file cannot be written.
+    OSError
+        If the .tif file cannot be written.
+    """
+    shape = size[1], size[0], len(data.arrays["background"])
+
+    def bands() -> Iterator[Picture]:
+        done = 0
+        for band in draw_region(data, region, size, backend):
+            yield band
+            done += len(band)
+            if progress:
+                progress(done, shape[0])
+
+    if path.suffix.lower() in TIFF_SUFFIXES:
+        with atomic_write(path) as temporary:
+            write_tiles(temporary, shape, bands())
+        return
+    picture, first = np.empty(shape, np.uint8), 0
+    for band in bands():
+        picture[first : first + len(band)] = band
+        first += len(band)
+    save_image(path, picture)
 
 
 class CompareTask(NamedTuple):

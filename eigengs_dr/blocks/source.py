@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..image.io import ImageError, check_image, open_picture, picture_pixels
-from .tiff import read_window, window_shape
+from .tiff import TIFF_SUFFIXES, read_window, window_shape
 
 MAX_SIDE = 1 << 16
 """Longest side of a set of Gaussians, in pixels."""
@@ -137,7 +137,7 @@ def _open_file(path: Path, keep_grey: bool) -> Source:
         state = path.stat()
     except OSError as error:
         raise ImageError(f"{path}: {error.strerror or error}; check the path") from None
-    if path.suffix.lower() in (".tif", ".tiff"):
+    if path.suffix.lower() in TIFF_SUFFIXES:
         shape = window_shape(absolute)
     if shape is not None:
         read = partial(read_window, absolute)
@@ -145,9 +145,8 @@ def _open_file(path: Path, keep_grey: bool) -> Source:
         shape = _array_shape(absolute)
         read = partial(_read_array, absolute)
     else:
-        with _any_size(), open_picture(path) as picture:
-            width, height = picture.size
-            shape = (height, width, 1 if picture.mode in GREY else 3)
+        picture = _decoded(absolute, state.st_mtime_ns)
+        shape = (picture.height, picture.width, 1 if picture.mode in GREY else 3)
         read = partial(_read_picture, absolute, state.st_mtime_ns)
     identity = {"file": absolute, "bytes": state.st_size, "modified": state.st_mtime_ns}
 
@@ -195,7 +194,7 @@ def _read_picture(path: str, modified: int, rows: slice, columns: slice) -> Arra
 @lru_cache(maxsize=1)
 def _decoded(path: str, modified: int) -> Any:
     """Decode a file, and keep it for the next window; `modified` tells its versions apart."""
-    with _any_size(), open_picture(Path(path)) as picture:
+    with any_size(), open_picture(Path(path)) as picture:
         picture.load()
         return picture
 
@@ -206,7 +205,7 @@ def forget_pictures() -> None:
 
 
 @contextmanager
-def _any_size() -> Iterator[None]:
+def any_size() -> Iterator[None]:
     """Let Pillow open images of any size during a block; `_checked` bounds the sides."""
     from PIL import Image
 

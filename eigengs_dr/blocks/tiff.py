@@ -15,6 +15,8 @@ MAX_SEGMENT = 1 << 26
 """Values of the largest strip or tile that is decoded for a window. A file of one compressed strip
 is better decoded once."""
 
+TIFF_SUFFIXES = (".tif", ".tiff")
+
 TILE_SIDE = 256
 """Side of the tiles of files that `write_tiles` writes, in pixels."""
 

@@ -36,7 +36,7 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
       eigengs-dr info natural
       eigengs-dr info model.npz --preview components.png
     """
-    from ..image.io import SAVE_OPTIONS, save_image
+    from ..image.io import SAVE_OPTIONS
 
     [picture] = name_outputs([file], preview, list(SAVE_OPTIONS)) if preview else [None]
     check_outputs([picture], [file])
@@ -48,11 +48,10 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     from ..gaussian import file as setfile
     from ..gaussian.gaussians import Gaussians
     from ..storage import npz
-    from .pictures import component_sheet
 
     kinds: dict[str, tuple[str, Any, Any, Any]] = {
-        setfile.FORMAT: ("image", Gaussians.load, _describe_image, _rendered),
-        modelfile.FORMAT: ("model", EigenGS.load, _describe_model, component_sheet),
+        setfile.FORMAT: ("image", Gaussians.load, _describe_image, _draw_image),
+        modelfile.FORMAT: ("model", EigenGS.load, _describe_model, _draw_model),
     }
     file = SHIPPED.get(str(file), file)
     file_format = setfile.FORMAT if packed.is_egs(file) else npz.format_of(file)
@@ -71,7 +70,7 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     if packed.is_egs(file):
         facts |= _describe_packed(packed.read(file))
     if picture:
-        save_image(picture, draw(load(file)))
+        draw(file, picture)
     click.echo(json.dumps(facts, indent=2) if as_json else _text(**facts))
 
 
@@ -156,8 +155,18 @@ def _text(fall: Any = (), **facts: Any) -> str:
     return "\n".join(lines)
 
 
-def _rendered(gaussians: Any) -> Any:
-    from ..raster.render import picture_of
+def _draw_image(file: Path, picture: Path) -> None:
+    from ..blocks.draw import save_region
+    from ..gaussian.file import read
 
-    check_pixels(gaussians.width, gaussians.height)
-    return picture_of(gaussians)
+    data = read(file)
+    check_pixels(*data.size)
+    save_region(picture, data, (0, 0, *data.size), data.size)
+
+
+def _draw_model(file: Path, picture: Path) -> None:
+    from ..eigenbasis.eigengs import EigenGS
+    from ..image.io import save_image
+    from .pictures import component_sheet
+
+    save_image(picture, component_sheet(EigenGS.load(file)))

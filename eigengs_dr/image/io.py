@@ -164,13 +164,14 @@ def save_image(path: str | Path, image: ArrayLike) -> None:
         If the array is not an image, the suffix is unknown or the file cannot be written. An
         existing file does not change.
     """
-    from PIL import Image
-
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in SAVE_OPTIONS:
         known = " ".join(SAVE_OPTIONS)
         raise ImageError(f"{path}: image suffix {suffix!r} is unknown; use one of {known}")
+    ready = isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.size
+    if ready and image.shape[2:] in ((1,), (3,)):  # type: ignore[union-attr]
+        return _write(path, np.asarray(image))  # large pictures need no copy
     floats = _rgb(image, "image", keep_grey=True, copy=False)
     height, width = floats.shape[:2]
     pixels = np.empty(floats.shape, np.uint8)
@@ -179,10 +180,17 @@ def save_image(path: str | Path, image: ArrayLike) -> None:
         pixels[rows] = to_8bit(floats[rows])
 
     map_threads(fill, strips(height, width))
-    pixels = pixels[..., 0] if floats.shape[2] == 1 else pixels
+    _write(path, pixels)
+
+
+def _write(path: Path, pixels: NDArray[np.uint8]) -> None:
+    """Write pixels (H, W, C) as the suffix of the path says."""
+    from PIL import Image
+
+    pixels = pixels[..., 0] if pixels.shape[2] == 1 else pixels
     try:
         with atomic_write(path) as temporary:
-            Image.fromarray(pixels).save(temporary, **SAVE_OPTIONS[suffix])
+            Image.fromarray(pixels).save(temporary, **SAVE_OPTIONS[path.suffix.lower()])
     except (OSError, ValueError) as error:
         message = str(error)
         if not message.startswith(f"{path}: "):  # errors of atomic_write are clear already
