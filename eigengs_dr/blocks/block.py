@@ -5,7 +5,15 @@ belong to other blocks. Blocks are fitted in four phases, so that neighbours nev
 Gaussians of a neighbour that is done stay fixed, and the block fits what they leave. Those of a
 neighbour that is not move too: they stand in for what it will draw, and the result leaves them out.
 So every border has a side that has seen the other. At the end some steps move the Gaussians of both
-sides of a border, with all others fixed. TABLE
+sides of a border, with all others fixed. PSNR in dB of the 16 pixels around borders, and elsewhere
+beyond 32 pixels (1,024x1,024 pixels in blocks of 256, one Gaussian for 20 pixels):
+
+| method | 200 steps | 1,000 steps |
+|---|---|---|
+| all blocks at once, with stand-ins alone (an earlier version) | 30.65, 36.40 | 27.38, 37.77 |
+| in phases | 35.85, 36.48 | 37.03, 37.93 |
+| in phases, then along the borders | 36.09, 36.48 | 37.41, 37.93 |
+| a fit of the whole | 36.14, 36.49 | 37.60, 37.94 |
 """
 
 from __future__ import annotations

@@ -181,8 +181,10 @@ def plan(image: Source, options: FitOptions, side: int) -> tuple[list[Block], Fi
     if not isinstance(side, (int, np.integer)) or side < MIN_SIDE:
         raise ValueError(f"block is {side!r}; it must be at least {MIN_SIDE} pixels, and whole")
     pixels = image.width * image.height
-    count = options.gaussians or max(1, pixels // PIXELS_PER_GAUSSIAN)
-    spacing = (pixels / count) ** 0.5
+    count = options.gaussians
+    if count is None:
+        count = max(1, pixels // PIXELS_PER_GAUSSIAN)
+    spacing = (pixels / max(count, 1)) ** 0.5
     blocks = divide(image.width, image.height, side, choose_halo(spacing))
     least = max(len(blocks), -(-pixels // round(MAX_SPACING**2)))
     if count < least:
@@ -200,4 +202,6 @@ def plan(image: Source, options: FitOptions, side: int) -> tuple[list[Block], Fi
 def _decisive(options: FitOptions, side: int) -> dict[str, Any]:
     """Return the options on which the result depends."""
     names = ("gaussians", "iterations", "color", "solve_steps", "cutoff")
-    return {name: getattr(options, name) for name in names} | {"block": int(side)}
+    values = {name: getattr(options, name) for name in names} | {"block": side}
+    # JSON has no numbers of NumPy.
+    return {k: v.item() if isinstance(v, np.generic) else v for k, v in values.items()}

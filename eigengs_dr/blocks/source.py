@@ -188,7 +188,9 @@ def _read_array(path: str, rows: slice, columns: slice) -> Array:
 def _read_picture(path: str, modified: int, rows: slice, columns: slice) -> Array:
     """Return a part of a file that Pillow decodes."""
     box = (columns.start, rows.start, columns.stop, rows.stop)
-    return picture_pixels(_decoded(path, modified).crop(box))[0]
+    picture = _decoded(path, modified)
+    with any_size():
+        return picture_pixels(picture.crop(box))[0]
 
 
 @lru_cache(maxsize=1)

@@ -107,9 +107,7 @@ def _sums_by_rows(
 
     def squares(rows: slice) -> list[float]:
         a, b = read(rows), image[rows]
-        return [
-            _sum_squares(a.astype(np.float64), b.astype(np.float64), space) for space in spaces
-        ]
+        return [_sum_squares(a.astype(np.float64), b.astype(np.float64), space) for space in spaces]
 
     sums = np.sum(map_threads(squares, strips(*image.shape[:2])), axis=0)
     return [float(total) for total in sums]

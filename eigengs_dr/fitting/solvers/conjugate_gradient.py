@@ -98,9 +98,8 @@ def solve(
         color, free = _start(gaussians, image[None], warm_start)
         if background is not None:
             free = [upload(types.Float, row) for row in np.asarray(background)[:, None]]
-        lists, hold = bin_gaussians(gaussians), background is not None
-        solution = _solve(gaussians, lists, image, (color, free), steps, hold)
-        del lists
+        start, hold = (color, free), background is not None
+        solution = _solve(gaussians, bin_gaussians(gaussians), image, start, steps, hold)
     release_memory()  # the lists too
     return solution
 
