@@ -44,13 +44,17 @@ class WindowGaussians(Gaussians):
         return cls(**values, reach=reach, open_sides=open_sides)
 
     @exclusive()
-    def bounded(self) -> WindowGaussians:
-        """Clip every parameter to its bounds, and the factor to what the window allows."""
-        inside = super().bounded()
+    def bounded(self, size: tuple[Any, Any] | None = None) -> WindowGaussians:
+        """Clip every parameter to its bounds, and the factor to what the window allows.
+
+        For `size` see `eigengs_dr.Gaussians.bounded`.
+        """
+        inside = super().bounded(size)
+        width, height = (self.width, self.height) if size is None else size
         left, top, right, bottom = self.open_sides
         (x, y), (a, b, c) = inside.mean, inside.factor
-        reach_x = self._allowed(self.reach[0], x, left, self.width - x, right)
-        reach_y = self._allowed(self.reach[1], y, top, self.height - y, bottom)
+        reach_x = self._allowed(self.reach[0], x, left, width - x, right)
+        reach_y = self._allowed(self.reach[1], y, top, height - y, bottom)
         if reach_y is not None:
             c = dr.maximum(c, self.cutoff / reach_y)
         if reach_x is not None:
