@@ -2,6 +2,7 @@
 
 from .backend.recording import exclusive
 from .backend.selection import BackendError
+from .blocks.fit_large import LargeFit, fit_large
 from .codec.bit_allocation import PackResult, pack
 from .collection.fit_many import fit_many
 from .collection.run import ImageRow, RunInterrupted
@@ -30,12 +31,14 @@ __all__ = [
     "Gaussians",
     "ImageError",
     "ImageRow",
+    "LargeFit",
     "PackResult",
     "RunInterrupted",
     "concatenate",
     "exclusive",
     "fit",
     "fit_for_scene",
+    "fit_large",
     "fit_levels",
     "fit_many",
     "from_tensors",

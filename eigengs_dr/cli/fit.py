@@ -1,9 +1,7 @@
 """The command ``eigengs-dr fit``: fit images by Gaussians."""
 
-import time
 from collections.abc import Callable
 from dataclasses import fields, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +12,10 @@ from ..fitting.initializers import INITIALIZERS
 from ..fitting.options import DEFAULT_BASIS, FitOptions
 from ..fitting.presets import PRESETS
 from ..image.color import SPACES
-from .console import INTERRUPTED, progress_bar, say
+from .console import INTERRUPTED, say
+from .fit_large import block_side, check_large, fit_by_blocks
 from .fit_many import fit_several
+from .fit_one import fit_one
 from .memory import announce_memory
 from .options import ANY_PATH, backend_option, choice, describe_run, quiet_option, report_option
 from .outputs import check_outputs, name_outputs
@@ -49,6 +49,12 @@ INPUT = click.Path(exists=True, path_type=Path)
     help="Space of --target-psnr.",
 )
 @click.option("--max-gaussians", type=int, metavar="N", help="Limit for --target-psnr.")
+@click.option(
+    "--blocks",
+    type=int,
+    metavar="SIZE",
+    help="Fit by blocks of so many pixels a side.  [default: where memory needs it, of 1024]",
+)
 @click.option("--levels", type=int, metavar="N", help="Levels of detail, each 4 times larger.")
 @click.option(
     "--iterations",
@@ -85,6 +91,7 @@ def fit(
     /,
     images: tuple[Path, ...],
     output: Path | None,
+    blocks: int | None,
     levels: int | None,
     preview: Path | None,
     overwrite: bool,
@@ -103,6 +110,9 @@ def fit(
     and exits with code 130. If --target-psnr cannot be reached, the command says so, writes the
     best fit and exits with code 1.
 
+    An image that is too large for this machine is fitted by blocks, with one Gaussian for 20 pixels
+    by default. Ctrl-C then keeps the blocks that are done, and the same command goes on.
+
     \b
     Examples:
       eigengs-dr fit photo.jpg
@@ -112,6 +122,7 @@ def fit(
       eigengs-dr fit photos/ -o fits/ --iterations 300 --report fits.json
       eigengs-dr fit photos/ extra.png -o fits/ --overwrite --preview previews/
       eigengs-dr fit roughness.png -o roughness.npz --color data
+      eigengs-dr fit huge.tif -o huge.npz --blocks 1024
     """
     from ..fitting.levels import check_options
     from ..image.io import SAVE_OPTIONS
@@ -126,26 +137,31 @@ def fit(
     check_outputs([*outputs, *previews, report], [*paths, *_basis_file(options)])
     if output is None:
         _check_replaced(outputs)
-    if not several:
+    side = blocks or block_side(paths[0], several, options, levels, preview)
+    if side:
+        check_large(options, levels, preview, several)
+    elif not several:
         announce_memory(paths[0], options, quiet)
     select(options.backend)
     _note_mean(options)
-    if several:
+    if side:
+        record, interrupted = fit_by_blocks(paths[0], outputs[0], side, options, quiet)
+        records = [record]
+    elif several:
         measured = report is not None
         records, interrupted = fit_several(
             paths, outputs[0].parent, previews, options, levels, overwrite, quiet, measured
         )
     else:
         picture = previews[0] if previews else None
-        records = [
-            _fit_one(paths[0], outputs[0], picture, quiet, options, _fitter(options, levels))
-        ]
+        records = [fit_one(paths[0], outputs[0], picture, quiet, options, _fitter(options, levels))]
         interrupted = records[0]["stopped"] == "interrupted"
     if report:
         figures = {"images": records} if several else records[0]
         run_figures = describe_run(context, options.backend) | _decisive(options, levels)
+        run_figures["block"] = side
         write_report(report, run_figures | figures)
-    if interrupted and not several:
+    if interrupted and not several and not side:
         say(f"interrupted; the best fit so far is in {outputs[0]}")
     if interrupted:
         context.exit(INTERRUPTED)
@@ -207,70 +223,6 @@ def _fitter(options: FitOptions, levels: int | None) -> Callable[..., "Fit"]:
     return lambda image, progress: fit_image(image, options, progress)
 
 
-def _fit_one(
-    path: Path,
-    output: Path,
-    preview: Path | None,
-    quiet: bool,
-    options: FitOptions,
-    run: Callable[..., "Fit"],
-) -> dict[str, Any]:
-    """Fit one image, write its files, and return its figures."""
-    import eigengs_dr as eg
-
-    from ..fitting.fit import FitInterrupted
-    from .pictures import comparison
-
-    started = time.perf_counter()
-    with progress_bar(quiet) as show:
-        show(f"{path.name}: load", 0, 1)
-        image = eg.load_image(path, keep_grey=options.color == "data")
-        loaded = time.perf_counter()
-        try:
-            result = run(image, progress=partial(show, path.name))
-        except FitInterrupted as interrupt:
-            result = interrupt.result
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
-        result.gaussians.save(output)
-        show(f"{path.name}: measure", 0, 1)
-        figures = _measure(image, result, options.color)
-        if preview:
-            eg.save_image(preview, comparison(image, result.image, result.gaussians))
-    record = {
-        "input": str(path),
-        "output": str(output),
-        "width": image.shape[1],
-        "height": image.shape[0],
-        "gaussians": len(result.gaussians),
-        "iterations": result.iterations,
-        "stopped": result.stopped,
-        "seconds": result.seconds,
-        "seconds_init": result.seconds_init,
-        "seconds_load": loaded - started,
-        "seconds_total": time.perf_counter() - started,
-        **figures,
-        "trace": result.trace,
-    }
-    if not quiet:
-        click.echo(_summary(record, preview, options.color))
-    return record
-
-
-def _measure(image: Any, result: "Fit", color: str) -> dict[str, float]:
-    """Compare a fit with its image."""
-    import eigengs_dr as eg
-
-    from ..image.metrics import float_space
-
-    return {
-        "psnr_ycbcr": eg.psnr(image, result.image, space=float_space(color)),
-        "psnr_rgb": eg.psnr(image, result.image, space="rgb"),
-        "ssim": eg.ssim(image, result.image),
-        "ms_ssim": eg.ms_ssim(image, result.image, space=float_space(color)),
-    }
-
-
 def _exit(context: click.Context, records: list[dict[str, Any]], options: FitOptions) -> None:
     """Report fits that missed the target, and exit with the code of a failure."""
     if any(record["stopped"] == "failed" for record in records):
@@ -285,16 +237,3 @@ def _exit(context: click.Context, records: list[dict[str, Any]], options: FitOpt
         )
     if failures:
         context.exit(MISSED)
-
-
-def _summary(record: dict[str, Any], preview: Path | None, color: str) -> str:
-    """Describe a fit for a terminal."""
-    from ..image.metrics import float_space
-
-    text = (
-        "{input}: {width}x{height}, {gaussians} Gaussians, {iterations} iterations "
-        "in {seconds:.1f} s ({seconds_total:.1f} s with loading and measuring)\n"
-        "  psnr_{space} {psnr_ycbcr:.2f} dB, psnr_rgb {psnr_rgb:.2f} dB, "
-        "SSIM {ssim:.4f}, MS-SSIM {ms_ssim:.4f}\n  wrote {output}"
-    ).format(**record, space=float_space(color))
-    return f"{text}\n  wrote {preview} (photo, fit and outlines side by side)" if preview else text

@@ -36,7 +36,7 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
       eigengs-dr info natural
       eigengs-dr info model.npz --preview components.png
     """
-    from ..image.io import SAVE_OPTIONS, save_image
+    from ..image.io import SAVE_OPTIONS
 
     [picture] = name_outputs([file], preview, list(SAVE_OPTIONS)) if preview else [None]
     check_outputs([picture], [file])
@@ -48,11 +48,10 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     from ..gaussian import file as setfile
     from ..gaussian.gaussians import Gaussians
     from ..storage import npz
-    from .pictures import component_sheet
 
     kinds: dict[str, tuple[str, Any, Any, Any]] = {
-        setfile.FORMAT: ("image", Gaussians.load, _describe_image, _rendered),
-        modelfile.FORMAT: ("model", EigenGS.load, _describe_model, component_sheet),
+        setfile.FORMAT: ("image", Gaussians.load, _describe_image, _draw_image),
+        modelfile.FORMAT: ("model", EigenGS.load, _describe_model, _draw_model),
     }
     file = SHIPPED.get(str(file), file)
     file_format = setfile.FORMAT if packed.is_egs(file) else npz.format_of(file)
@@ -61,15 +60,17 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
             f"{file}: format is {file_format[:40]!r}, expected one of {', '.join(kinds)}"
         )
     kind, load, describe, draw = kinds[file_format]
-    content = load(file)
-    facts = {"file": str(file), "kind": kind, "bytes": file.stat().st_size, **describe(content)}
+    facts: dict[str, Any] = {"file": str(file), "kind": kind, "bytes": file.stat().st_size}
+    if kind == "image" and not packed.is_egs(file):
+        facts |= _describe_head(setfile.read_head(file))
+    else:
+        facts |= describe(load(file))
     if kind == "image":
-        pixels = content.width * content.height
-        facts["bpp"] = round(8 * facts["bytes"] / pixels, 4)
+        facts["bpp"] = round(8 * facts["bytes"] / (facts["width"] * facts["height"]), 4)
     if packed.is_egs(file):
         facts |= _describe_packed(packed.read(file))
     if picture:
-        save_image(picture, draw(content))
+        draw(file, picture)
     click.echo(json.dumps(facts, indent=2) if as_json else _text(**facts))
 
 
@@ -81,6 +82,18 @@ def _describe_image(gaussians: Any) -> dict[str, Any]:
         "channels": gaussians.channels,
         "space": gaussians.space,
         "cutoff": gaussians.cutoff,
+    }
+
+
+def _describe_head(head: Any) -> dict[str, Any]:
+    """Describe a set that is not read: a large one takes gigabytes."""
+    return {
+        "gaussians": head.gaussians,
+        "width": head.size[0],
+        "height": head.size[1],
+        "channels": head.channels,
+        "space": head.space,
+        "cutoff": head.cutoff,
     }
 
 
@@ -142,8 +155,18 @@ def _text(fall: Any = (), **facts: Any) -> str:
     return "\n".join(lines)
 
 
-def _rendered(gaussians: Any) -> Any:
-    from ..raster.render import picture_of
+def _draw_image(file: Path, picture: Path) -> None:
+    from ..blocks.draw import save_region
+    from ..gaussian.file import read
 
-    check_pixels(gaussians.width, gaussians.height)
-    return picture_of(gaussians)
+    data = read(file)
+    check_pixels(*data.size)
+    save_region(picture, data, (0, 0, *data.size), data.size)
+
+
+def _draw_model(file: Path, picture: Path) -> None:
+    from ..eigenbasis.eigengs import EigenGS
+    from ..image.io import save_image
+    from .pictures import component_sheet
+
+    save_image(picture, component_sheet(EigenGS.load(file)))

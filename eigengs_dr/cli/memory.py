@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..fitting.memory import check_memory, estimate_memory
+from ..fitting.memory import check_memory, estimate_memory, installed_memory
 from ..fitting.options import FitOptions, default_count
 from .console import say
 
 NOTABLE = 1_000_000_000
 """Bytes from which on a fit says its memory."""
 
+COMFORTABLE = 0.5
+"""Share of the installed memory up to which an image is fitted as a whole."""
+
 TURNED = range(5, 9)
 """EXIF orientations that swap width and height."""
-
-GREY = ("1", "L", "I", "I;16", "I;16B", "I;16L", "F")
-"""Modes of Pillow for images of one channel."""
 
 ORIENTATION = 0x0112
 """EXIF tag of the orientation."""
@@ -39,30 +39,50 @@ def announce_memory(path: Path, options: FitOptions, quiet: bool) -> None:
     ValueError
         If this machine has too little memory.
     """
+    problem = _problem(path, options)
+    if problem is None:
+        return
+    try:
+        line = check_memory(*problem)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    if estimate_memory(*problem) >= NOTABLE and not quiet:
+        say(line)
+
+
+def needs_blocks(path: Path, options: FitOptions) -> bool:
+    """Return whether the fit of a whole image takes more than a comfortable share of the memory."""
+    problem, installed = _problem(path, options), installed_memory()
+    if problem is None or installed is None:
+        return False
+    return estimate_memory(*problem) > COMFORTABLE * installed
+
+
+def _problem(path: Path, options: FitOptions) -> tuple[int, int, int, int] | None:
+    """Return width, height, channels and Gaussians of a fit, or None if they are not known."""
     from ..fitting.fit import PIXELS_PER_FIRST_GAUSSIAN
 
     size = _image_size(path)
     if size is None:
-        return
+        return None
     width, height, grey = size
     count = options.gaussians or default_count(width * height)
     if options.target_psnr is not None:
         count = max(1, width * height // PIXELS_PER_FIRST_GAUSSIAN)
-    arguments = width, height, 1 if grey and options.color == "data" else 3, count
-    try:
-        line = check_memory(*arguments)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    if estimate_memory(*arguments) >= NOTABLE and not quiet:
-        say(line)
+    return width, height, 1 if grey and options.color == "data" else 3, count
 
 
 def _image_size(path: Path) -> tuple[int, int, bool] | None:
     """Return width, height and whether an image file is grey, or None if it cannot be opened."""
     from PIL import Image
 
+    from ..blocks.source import GREY, any_size
+    from ..blocks.tiff import TIFF_SUFFIXES, window_shape
+
+    if path.suffix.lower() in TIFF_SUFFIXES and (shape := window_shape(str(path))):
+        return shape[1], shape[0], shape[2] == 1
     try:
-        with Image.open(path) as file:
+        with any_size(), Image.open(path) as file:
             width, height = file.size
             # Pillow decodes a PNG file to find its EXIF data; they seldom turn it.
             turned = file.format != "PNG" and file.getexif().get(ORIENTATION) in TURNED

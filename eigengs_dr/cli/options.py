@@ -14,9 +14,11 @@ EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 ANY_PATH = click.Path(path_type=Path)
 
-MAX_PIXELS = 1 << 26
-"""Pixels of the largest picture to render, with 3 more on each axis for the tiles of thin
-pictures; the largest takes some 6 GiB."""
+MAX_PIXELS = 1 << 29
+"""Pixels of the largest picture to render, except into TIFF files; it takes 3 bytes a pixel."""
+
+MAX_SIDE = 1 << 17
+"""Longest side of a picture to render into a TIFF file."""
 
 backend_option = click.option(
     "--backend",
@@ -64,10 +66,36 @@ class Counts(click.ParamType):
         return counts if len(counts) > 1 else counts[0]
 
 
-def check_pixels(width: int, height: int) -> tuple[int, int]:
-    """Return the width and height of a picture; refuse one that is too large to render."""
-    if width < 1 or height < 1 or (width + 3) * (height + 3) > MAX_PIXELS:
-        raise click.UsageError(f"{width}x{height}: expected 1 to {MAX_PIXELS:,} pixels")
+class Region(click.ParamType):
+    """Left, top, width and height in pixels, as in "100,50,640,480"."""
+
+    name = "X,Y,W,H"
+
+    def convert(self, value: Any, param: Any, context: Any) -> tuple[int, int, int, int]:
+        """Parse the text of an option as four numbers."""
+        match = re.fullmatch(r"(\d+),(\d+),(\d+),(\d+)", value)
+        if not match or not int(match[3]) or not int(match[4]):
+            self.fail(
+                f"{value}: expected left, top, width and height, such as 100,50,640,480",
+                param,
+                context,
+            )
+        left, top, width, height = (int(number) for number in match.groups())
+        return left, top, width, height
+
+
+def check_pixels(width: int, height: int, by_parts: bool = False) -> tuple[int, int]:
+    """Return the width and height of a picture; refuse one that is too large to render.
+
+    A picture that is written by parts may be larger than one that is held in memory.
+    """
+    if by_parts:
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+            raise click.UsageError(f"{width}x{height}: expected sides of 1 to {MAX_SIDE:,} pixels")
+    elif width < 1 or height < 1 or width * height > MAX_PIXELS:
+        raise click.UsageError(
+            f"{width}x{height}: expected 1 to {MAX_PIXELS:,} pixels, or a .tif file"
+        )
     return width, height
 
 

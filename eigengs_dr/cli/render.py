@@ -6,10 +6,12 @@ from pathlib import Path
 import click
 
 from ..backend.selection import select
+from .console import progress_bar
 from .options import (
     ANY_PATH,
     EXISTING,
     MAX_PIXELS,
+    Region,
     Size,
     backend_option,
     check_pixels,
@@ -23,6 +25,7 @@ from .outputs import check_outputs, name_outputs
 @click.option(
     "-o", "--output", required=True, type=ANY_PATH, metavar="Y.png", help="Picture to write."
 )
+@click.option("--region", type=Region(), help="Left, top, width, height: a part of the image.")
 @click.option("--scale", type=float, metavar="S", help="Factor on the native size, such as 0.5.")
 @click.option("--size", type=Size(), help="Width and height in pixels, such as 1024x768.")
 @click.option(
@@ -36,42 +39,64 @@ from .outputs import check_outputs, name_outputs
 def render(
     file: Path,
     output: Path,
+    region: tuple[int, int, int, int] | None,
     scale: float | None,
     size: tuple[int, int] | None,
     first: int | None,
     backend: str | None,
     quiet: bool,
 ) -> None:
-    """Render a fitted image at any size.
+    """Render a fitted image at any size, or a region of it.
 
-    Without --scale and --size, the picture has the native size. A fit in linear light is written
-    as sRGB. A fit of data is written unchanged; one channel gives a grey picture.
+    Without --scale and --size, the picture has the native size of the image or of the region. A
+    fit in linear light is written as sRGB. A fit of data is written unchanged; one channel gives a
+    grey picture. Large pictures are drawn in bands; a .tif file takes no more memory than a band.
 
     \b
     Examples:
       eigengs-dr render photo.npz -o photo.png
-      eigengs-dr render photo.npz -o large.png --scale 4
+      eigengs-dr render photo.npz -o large.tif --scale 4
       eigengs-dr render photo.npz -o icon.png --size 64x48 --first 500
+      eigengs-dr render huge.npz -o part.png --region 4000,2500,800,600 --scale 2
     """
     if scale is not None and size is not None:
         raise click.UsageError("--scale and --size exclude each other; give one of them")
+    from ..blocks.tiff import TIFF_SUFFIXES
     from ..image.io import SAVE_OPTIONS
 
     [output] = name_outputs([file], output, list(SAVE_OPTIONS))
     check_outputs([output], [file])
     select(backend)
-    import eigengs_dr as eg
+    from ..blocks.draw import save_region
+    from ..gaussian.file import read
 
-    from ..raster.render import picture_of
-
-    gaussians = eg.Gaussians.load(file, backend=backend)
-    if first is not None and first > len(gaussians):
-        raise ValueError(f"{file}: --first is {first}; the file has {len(gaussians)} Gaussians")
-    gaussians = gaussians[:first]
-    width, height = size or _scaled(gaussians.width, gaussians.height, scale)
-    eg.save_image(output, picture_of(gaussians, width, height))
+    data = read(file)
+    count = len(data.arrays["mean"])
+    if first is not None:
+        if first > count:
+            raise ValueError(f"{file}: --first is {first}; the file has {count} Gaussians")
+        count = first
+        parts = {name: data.arrays[name][:first] for name in ("mean", "factor", "color")}
+        data = data._replace(arrays=data.arrays | parts)
+    left, top, width, height = region = region or (0, 0, *data.size)
+    if left + width > data.size[0] or top + height > data.size[1]:
+        raise ValueError(
+            f"{file}: --region {left},{top},{width},{height} is not inside the image of "
+            f"{data.size[0]}x{data.size[1]} pixels"
+        )
+    by_parts = output.suffix.lower() in TIFF_SUFFIXES
+    size = check_pixels(*(size or _scaled(width, height, scale)), by_parts)
+    with progress_bar(quiet) as show:
+        save_region(
+            output,
+            data,
+            region,
+            size,
+            backend,
+            lambda done, total: show(f"{output.name}: draw", done, total),
+        )
     if not quiet:
-        click.echo(f"{file}: {len(gaussians):,} Gaussians\n  wrote {output} ({width}x{height})")
+        click.echo(f"{file}: {count:,} Gaussians\n  wrote {output} ({size[0]}x{size[1]})")
 
 
 def _scaled(width: int, height: int, scale: float | None) -> tuple[int, int]:
@@ -80,4 +105,4 @@ def _scaled(width: int, height: int, scale: float | None) -> tuple[int, int]:
     if not (math.isfinite(scale) and scale > 0):
         raise click.UsageError(f"--scale {scale}: expected a number above 0, such as 2 or 0.5")
     scale = min(scale, MAX_PIXELS)
-    return check_pixels(max(1, round(width * scale)), max(1, round(height * scale)))
+    return max(1, round(width * scale)), max(1, round(height * scale))

@@ -26,10 +26,17 @@ MAX_CUTOFF = 12.0
 """Largest cutoff, in standard deviations. The fast exponential needs a bound, and ``exp(-72)`` is
 below single precision."""
 
+MAX_ENTRIES = 1 << 30
+"""Largest number of elements of one array: 357 million Gaussians."""
+
+PLAIN_COUNT = 1 << 20
+"""Number of Gaussians from which on a set is stored without compression, which would save 9 % of
+the bytes for 20 times the time."""
+
 LAYOUT: dict[str, Field] = {
-    "mean": Field("f4", 2),
-    "factor": Field("f4", 2),
-    "color": Field("f4", 2),
+    "mean": Field("f4", 2, MAX_ENTRIES),
+    "factor": Field("f4", 2, MAX_ENTRIES),
+    "color": Field("f4", 2, MAX_ENTRIES),
     "background": Field("f4", 1),
     "size": Field("i8", 1),
     "space": Field("U", 0),
@@ -79,9 +86,40 @@ def write(path: str | os.PathLike[str], data: SetData) -> None:
     """
     if Path(path).suffix.lower() == ".egs":
         raise ValueError(f"{path}: only eigengs_dr.pack writes .egs files; save as .npz")
-    members = {name: array.astype(np.float32) for name, array in data.arrays.items()}
+    members = {name: np.asarray(array, np.float32) for name, array in data.arrays.items()}
     members |= {"size": np.array(data.size, np.int64), "space": np.array(data.space)}
-    npz.write(path, FORMAT, VERSION, members | {"cutoff": np.array(data.cutoff, np.float64)})
+    members["cutoff"] = np.array(data.cutoff, np.float64)
+    npz.write(path, FORMAT, VERSION, members, compressed=len(members["mean"]) < PLAIN_COUNT)
+
+
+class SetHead(NamedTuple):
+    """What a file of a set says without its large arrays; see `SetData`."""
+
+    gaussians: int
+    channels: int
+    size: tuple[int, int]
+    space: str
+    cutoff: float
+
+
+def read_head(path: Path) -> SetHead:
+    """Read what an ``.npz`` file of a set holds, without its Gaussians.
+
+    Raises
+    ------
+    ValueError
+        If the file has another format or a newer version, or its header is damaged.
+    OSError
+        If the file cannot be opened.
+    """
+    version = npz.read_version(path, FORMAT, VERSION)
+    small = {name: LAYOUT[name] for name in ("size", "space")}
+    small |= {} if version < 2 else {"cutoff": CUTOFF_FIELD}
+    found = npz.read(path, FORMAT, VERSION, small)
+    count, channels = npz.read_shapes(path, FORMAT, VERSION, {"color": LAYOUT["color"]})["color"]
+    width, height = found["size"].tolist()
+    cutoff = float(found.get("cutoff", np.array(CUTOFF)))
+    return SetHead(count, channels, (width, height), str(found["space"]), cutoff)
 
 
 def read(path: Path, sections: int | None = None) -> SetData:

@@ -1,6 +1,8 @@
 """Image files and arrays: load, check, save."""
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,16 +67,28 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
     ImageError
         If the file is missing, empty, damaged, too large or not an image.
     """
+    path = Path(path)
+    with open_picture(path) as file:
+        frames = getattr(file, "n_frames", 1)
+        pixels, transparent = picture_pixels(file)
+    if transparent:
+        warnings.warn(f"{path}: transparent pixels are shown over white", stacklevel=2)
+    if frames > 1:
+        warnings.warn(f"{path}: holds {frames} frames, the first is used", stacklevel=2)
+    return _check_range(_rgb(pixels, str(path), keep_grey), str(path))
+
+
+@contextmanager
+def open_picture(path: Path) -> "Iterator[Image]":
+    """Open an image file with Pillow, turned as its EXIF header says; errors as `load_image`."""
     from PIL import Image, ImageOps, UnidentifiedImageError  # 0.05 s
 
-    path = Path(path)
     try:
         if path.stat().st_size == 0:
             raise ImageError(f"{path}: the file is empty (0 bytes); copy or export it again")
         with Image.open(path) as file:
-            frames = getattr(file, "n_frames", 1)
             ImageOps.exif_transpose(file, in_place=True)  # a copy only if it turns the image
-            pixels, transparent = _pixels(file)
+            yield file
     except ImageError:
         raise
     except FileNotFoundError:
@@ -89,16 +103,12 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
         ) from None
     except Image.DecompressionBombError:
         limit = f"{2 * (Image.MAX_IMAGE_PIXELS or 0):,}"
-        raise ImageError(f"{path}: has more than {limit} pixels; scale it down first") from None
+        raise ImageError(
+            f"{path}: has more than {limit} pixels; scale it down first, or fit it in blocks"
+        ) from None
     except Exception as error:  # on damaged files Pillow's decoders raise many types
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise ImageError(f"{path}: damaged or unsupported ({reason}); export it again") from error
-
-    if transparent:
-        warnings.warn(f"{path}: transparent pixels are shown over white", stacklevel=2)
-    if frames > 1:
-        warnings.warn(f"{path}: holds {frames} frames, the first is used", stacklevel=2)
-    return _check_range(_rgb(pixels, str(path), keep_grey), str(path))
 
 
 def check_image(
@@ -154,13 +164,14 @@ def save_image(path: str | Path, image: ArrayLike) -> None:
         If the array is not an image, the suffix is unknown or the file cannot be written. An
         existing file does not change.
     """
-    from PIL import Image
-
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in SAVE_OPTIONS:
         known = " ".join(SAVE_OPTIONS)
         raise ImageError(f"{path}: image suffix {suffix!r} is unknown; use one of {known}")
+    ready = isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.size
+    if ready and image.shape[2:] in ((1,), (3,)):  # type: ignore[union-attr]
+        return _write(path, np.asarray(image))  # large pictures need no copy
     floats = _rgb(image, "image", keep_grey=True, copy=False)
     height, width = floats.shape[:2]
     pixels = np.empty(floats.shape, np.uint8)
@@ -169,10 +180,17 @@ def save_image(path: str | Path, image: ArrayLike) -> None:
         pixels[rows] = to_8bit(floats[rows])
 
     map_threads(fill, strips(height, width))
-    pixels = pixels[..., 0] if floats.shape[2] == 1 else pixels
+    _write(path, pixels)
+
+
+def _write(path: Path, pixels: NDArray[np.uint8]) -> None:
+    """Write pixels (H, W, C) as the suffix of the path says."""
+    from PIL import Image
+
+    pixels = pixels[..., 0] if pixels.shape[2] == 1 else pixels
     try:
         with atomic_write(path) as temporary:
-            Image.fromarray(pixels).save(temporary, **SAVE_OPTIONS[suffix])
+            Image.fromarray(pixels).save(temporary, **SAVE_OPTIONS[path.suffix.lower()])
     except (OSError, ValueError) as error:
         message = str(error)
         if not message.startswith(f"{path}: "):  # errors of atomic_write are clear already
@@ -201,7 +219,7 @@ def to_8bit(image: NDArray[Any], out: NDArray[Any] | None = None) -> NDArray[Any
     return np.rint(clipped, out=clipped)
 
 
-def _pixels(image: "Image") -> tuple[NDArray[Any], bool]:
+def picture_pixels(image: "Image") -> tuple[NDArray[Any], bool]:
     """Return the pixels of a Pillow image, and whether some of them are transparent."""
     if image.mode == "I":  # 16-bit grey of PGM files comes as 32-bit integers
         return np.asarray(image) / 65535, False

@@ -60,10 +60,20 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     >>> round(psnr(np.zeros((4, 4, 3)), np.full((4, 4, 3), 0.1), space="ycbcr"), 2)
     26.09
     """
+    x, _ = _pair(a, b)
+    return psnr_from_mse(squared_error(a, b, space) / x.size)
+
+
+def squared_error(a: ArrayLike, b: ArrayLike, space: str) -> float:
+    """Return the sum of the squared errors of two images, of which `psnr` takes the mean.
+
+    Sums of the parts of an image add up to that of the whole. Grey images count as three channels.
+    For parameters and errors see `psnr`.
+    """
     if space not in ("rgb", "ycbcr", "data"):
         raise ValueError(f"space {space!r} is unknown; use 'rgb', 'ycbcr' or 'data'")
     x, y = _pair(a, b)
-    return psnrs_by_rows(x.__getitem__, y, [space])[0]
+    return _sums_by_rows(x.__getitem__, y, [space])[0]
 
 
 def psnrs_by_rows(
@@ -87,18 +97,23 @@ def psnrs_by_rows(
     list of float
         One PSNR for each space, in decibels.
     """
+    return [psnr_from_mse(total / image.size) for total in _sums_by_rows(read, image, spaces)]
+
+
+def _sums_by_rows(
+    read: Callable[[slice], NDArray[Any]], image: NDArray[Any], spaces: Sequence[str]
+) -> list[float]:
+    """Return the sums of the squared errors in several spaces, see `psnrs_by_rows`."""
 
     def squares(rows: slice) -> list[float]:
         a, b = read(rows), image[rows]
-        return [
-            _squared_error(a.astype(np.float64), b.astype(np.float64), space) for space in spaces
-        ]
+        return [_sum_squares(a.astype(np.float64), b.astype(np.float64), space) for space in spaces]
 
     sums = np.sum(map_threads(squares, strips(*image.shape[:2])), axis=0)
-    return [psnr_from_mse(float(s) / image.size) for s in sums]
+    return [float(total) for total in sums]
 
 
-def _squared_error(a: NDArray[np.float64], b: NDArray[np.float64], space: str) -> float:
+def _sum_squares(a: NDArray[np.float64], b: NDArray[np.float64], space: str) -> float:
     """Return the sum of the squared differences of two images in a space; overwrite both."""
     if space == "rgb":
         for image in (a, b):

@@ -8,7 +8,7 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
@@ -122,6 +122,22 @@ def format_of(path: str | os.PathLike[str]) -> str:
         return str(_member(archive, "format", Field("U", 0)))
 
 
+def read_shapes(
+    path: str | os.PathLike[str], name: str, version: int, layout: dict[str, Field]
+) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the arrays of `layout` by their headers alone.
+
+    For parameters and errors see `read`. A damaged array is not noticed.
+    """
+    read_version(path, name, version)
+    with _opened(Path(path), name) as archive:
+        shapes = {}
+        for key, field in layout.items():
+            with _member_file(archive, key) as (file, entry):
+                shapes[key] = _checked_header(file, entry, key, field)[0]
+        return shapes
+
+
 @contextmanager
 def _opened(path: Path, name: str) -> Iterator[zipfile.ZipFile]:
     """Open a file, and turn every error inside the block into one line."""
@@ -138,31 +154,47 @@ def _opened(path: Path, name: str) -> Iterator[zipfile.ZipFile]:
             ) from None
 
 
-def _member(archive: zipfile.ZipFile, key: str, field: Field) -> NDArray[Any]:
-    """Check the header of one array, then read the array."""
+@contextmanager
+def _member_file(archive: zipfile.ZipFile, key: str) -> Iterator[tuple[IO[bytes], zipfile.ZipInfo]]:
+    """Open one array of an archive."""
     try:
         entry = archive.getinfo(f"{key}.npy")
     except KeyError:
         raise BadValue(f"key '{key}' is missing") from None
     with archive.open(entry) as file:
-        major = npy.read_magic(file)
-        read_header = npy.read_array_header_1_0 if major == (1, 0) else npy.read_array_header_2_0
-        shape, fortran, dtype = read_header(file)
-        expected = np.dtype(field.kind)
-        fits = dtype.kind == "U" if expected.kind == "U" else dtype == expected
-        if not fits or len(shape) != field.ndim:
-            kind = "text" if expected.kind == "U" else expected.name
-            raise BadValue(
-                f"key '{key}' is {len(shape)}-dimensional {dtype}, "
-                f"expected {field.ndim}-dimensional {kind}"
-            )
-        if min(shape, default=0) < 0:
-            raise BadValue(f"key '{key}' has the negative shape {shape}")
+        yield file, entry
+
+
+def _checked_header(
+    file: IO[bytes], entry: zipfile.ZipInfo, key: str, field: Field
+) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Read and check the header of one array: shape, order and dtype."""
+    major = npy.read_magic(file)
+    read_header = npy.read_array_header_1_0 if major == (1, 0) else npy.read_array_header_2_0
+    shape, fortran, dtype = read_header(file)
+    expected = np.dtype(field.kind)
+    fits = dtype.kind == "U" if expected.kind == "U" else dtype == expected
+    if not fits or len(shape) != field.ndim:
+        kind = "text" if expected.kind == "U" else expected.name
+        raise BadValue(
+            f"key '{key}' is {len(shape)}-dimensional {dtype}, "
+            f"expected {field.ndim}-dimensional {kind}"
+        )
+    if min(shape, default=0) < 0:
+        raise BadValue(f"key '{key}' has the negative shape {shape}")
+    count = math.prod(shape)
+    if dtype.kind == "U" and dtype.itemsize > 4 * 64:
+        raise BadValue(f"key '{key}' is a text of over 64 characters")
+    if count > field.most or count * dtype.itemsize > entry.file_size:
+        raise BadValue(f"key '{key}' claims shape {shape}, more than the file holds")
+    return shape, fortran, dtype
+
+
+def _member(archive: zipfile.ZipFile, key: str, field: Field) -> NDArray[Any]:
+    """Check the header of one array, then read the array."""
+    with _member_file(archive, key) as (file, entry):
+        shape, fortran, dtype = _checked_header(file, entry, key, field)
         count = math.prod(shape)
-        if dtype.kind == "U" and dtype.itemsize > 4 * 64:
-            raise BadValue(f"key '{key}' is a text of over 64 characters")
-        if count > field.most or count * dtype.itemsize > entry.file_size:
-            raise BadValue(f"key '{key}' claims shape {shape}, more than the file holds")
         data = file.read(count * dtype.itemsize)
     if len(data) != count * dtype.itemsize:
         raise BadValue(f"key '{key}' is cut off")

@@ -24,6 +24,10 @@ MIN_ERROR_SHARE = 1e-3
 """Smallest error of a Gaussian, relative to the average, so that no part of an image gets empty."""
 
 
+NO_ERROR = 1e-12
+"""Smallest squared error of a Gaussian: parts without any error keep some Gaussians too."""
+
+
 QUERY = 1 << 16
 """Number of Gaussians whose neighbours are found at once; bounds the memory."""
 
@@ -48,21 +52,46 @@ def target_density(mean: Array, error: Array, bending: Array) -> NDArray[np.floa
         Gaussians, with q = `ERROR_EXPONENT`.
     """
     owner = nearest_center(mean, error.shape)
+    ratio = density_ratio(mean, owner, error, bending)
+    density = bending.astype(np.float32, copy=False)
+    scale_by_owner(density, owner, ratio / ratio.mean())
+    return density
+
+
+def density_ratio(
+    mean: Array, owner: NDArray[np.int32], error: Array, bending: Array
+) -> NDArray[np.float64]:
+    """Return the ratio of the density for the error to that for the second derivatives.
+
+    For the other parameters see `target_density`. Ratios of several parts of an image have one
+    scale: together they give a density of the whole image.
+
+    Parameters
+    ----------
+    owner : ndarray of int32, shape (H, W)
+        The Gaussian nearest to each pixel, by `nearest_center`.
+
+    Returns
+    -------
+    ndarray of float64, shape (N,)
+        For the pixels of each old Gaussian.
+    """
     share, mass = _average_neighbors(
         mean, np.stack(sum_by_center(owner, len(mean), [(error,), (bending,)]))
     )
-    share = np.maximum(share, MIN_ERROR_SHARE * share.mean()) ** (1 / (ERROR_EXPONENT + 1))
-    if not share.any():  # the old set has no error
-        share = np.ones(len(mean))
-    ratio = share / np.maximum(mass, 1e-9 * mass.mean())
-    ratio = (ratio / ratio.mean()).astype(np.float32)
-    density = bending.astype(np.float32, copy=False)
+    share = np.maximum(share, max(MIN_ERROR_SHARE * share.mean(), NO_ERROR))
+    ratio = share ** (1 / (ERROR_EXPONENT + 1)) / np.maximum(mass, 1e-9 * mass.mean())
+    return np.asarray(ratio, np.float64)
+
+
+def scale_by_owner(density: NDArray[np.float32], owner: NDArray[np.int32], ratio: Array) -> None:
+    """Multiply a density (H, W) in place by the ratio (N,) of the Gaussian that owns each pixel."""
+    factor = ratio.astype(np.float32)
 
     def scale(rows: slice) -> None:
-        density[rows] *= ratio[owner[rows]]
+        density[rows] *= factor[owner[rows]]
 
     map_threads(scale, strips(*density.shape))
-    return density
 
 
 def _average_neighbors(mean: Array, values: Array) -> Array:

@@ -59,6 +59,7 @@ def solve(
     image: NDArray[Any],
     steps: int = 10,
     warm_start: bool = False,
+    background: NDArray[Any] | None = None,
 ) -> Solution:
     """Find the colours and the background that fit an image best on fixed shapes.
 
@@ -75,6 +76,8 @@ def solve(
         Number of steps. Few steps regularise the colours of Gaussians that overlap much.
     warm_start : bool, optional
         Start from the colours and background of the set instead of zero and the mean of the image.
+    background : ndarray, shape (C,), optional
+        The background of the result. By default the best one is found.
 
     Returns
     -------
@@ -91,8 +94,12 @@ def solve(
     if steps < 0:
         raise ValueError(f"solve: steps is {steps}; it must be at least 0")
     with dr.suspend_grad():
-        start = _start(gaussians, image[None], warm_start)
-        solution = _solve(gaussians, bin_gaussians(gaussians), image, start, steps)
+        types = types_of(gaussians.mean)
+        color, free = _start(gaussians, image[None], warm_start)
+        if background is not None:
+            free = [upload(types.Float, row) for row in np.asarray(background)[:, None]]
+        start, hold = (color, free), background is not None
+        solution = _solve(gaussians, bin_gaussians(gaussians), image, start, steps, hold)
     release_memory()  # the lists too
     return solution
 
@@ -162,7 +169,12 @@ def _start(gaussians: Gaussians, images: NDArray[Any], warm: bool) -> Unknowns:
 
 
 def _solve(
-    gaussians: Gaussians, lists: TileLists, image: NDArray[Any], x: Unknowns, steps: int
+    gaussians: Gaussians,
+    lists: TileLists,
+    image: NDArray[Any],
+    x: Unknowns,
+    steps: int,
+    hold_background: bool = False,
 ) -> Solution:
     """Solve for an image, or for a batch of images, from the unknowns x.
 
@@ -180,6 +192,8 @@ def _solve(
     del target
     r = negate(_apply_transposed(shape, error, channels, lists, cutoff))
     inverse = _inverse_diagonal(shape, channels, lists, cutoff)
+    if hold_background:  # a direction of 0 never moves it
+        inverse = inverse[0], [dr.opaque(types.Float, 0)] * channels
     p = multiply(r, inverse)
     rz = dots(r, p, grid)
     enough = [RELATIVE_TOLERANCE[types.bits] * a for a in rz]

@@ -1,0 +1,10 @@
+"""Large images: fitted by blocks and drawn by strips, in the memory of one block.
+
+- ``source``: windows of files and arrays
+- ``grid``: blocks, their windows, and their shares of the Gaussians
+- ``place``: where the Gaussians of a block start
+- ``block``: the fit of one block
+- ``fit_large``: `fit_large`, the fit of all blocks
+- ``draw``: regions and strips of a picture, and their PSNR
+- ``tiff``: large TIFF files
+"""

@@ -1,0 +1,158 @@
+"""Regions and whole pictures of large sets, drawn part by part, and their PSNR."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..gaussian.crop import crop
+from ..gaussian.file import SetData
+from ..gaussian.gaussians import Gaussians
+from ..image.io import save_image, to_8bit
+from ..image.metrics import float_space, squared_error
+from ..raster.render import picture_of
+from ..storage.atomic import atomic_write
+from .grid import Block
+from .source import Source, Window
+from .tiff import TIFF_SUFFIXES, TILE_SIDE, write_tiles
+
+BAND_PIXELS = 1 << 22
+"""Pixels of a band of a picture that is drawn at once; one takes some 100 bytes."""
+
+Picture = NDArray[Any]
+
+
+def draw(data: SetData, backend: str | None = None) -> Picture:
+    """Draw a set, which may be empty, at its own size, as `eigengs_dr.picture_of` does."""
+    if len(data.arrays["mean"]) == 0:
+        # A Gaussian without colour: the background is converted as in other sets.
+        channels = len(data.arrays["background"])
+        data = data._replace(
+            arrays=data.arrays
+            | {
+                "mean": np.zeros((1, 2), np.float32),
+                "factor": np.array([[1, 0, 1]], np.float32),
+                "color": np.zeros((1, channels), np.float32),
+            }
+        )
+    gaussians = Gaussians.from_arrays(
+        **data.arrays, size=data.size, space=data.space, backend=backend, cutoff=data.cutoff
+    )
+    return picture_of(gaussians)
+
+
+def draw_region(
+    data: SetData,
+    region: tuple[int, int, int, int],
+    size: tuple[int, int],
+    backend: str | None = None,
+) -> Iterator[Picture]:
+    """Draw a region of a set at any size, in bands of rows from top to bottom.
+
+    Memory is that of a band and of the set.
+
+    Parameters
+    ----------
+    data : SetData
+    region : (int, int, int, int)
+        Left, top, width and height in native pixels of the set.
+    size : (int, int)
+        Width and height of the picture in pixels.
+    backend : {"llvm", "cuda"}, optional
+
+    Yields
+    ------
+    ndarray of uint8, shape (R, width, C)
+        Clamped and rounded; every band but the last has a multiple of 256 rows.
+    """
+    left, top, native_width, native_height = region
+    width, height = size
+    scale = width / native_width, height / native_height
+    if (native_width, native_height) != data.size:
+        data = crop(data, (left, top), (native_width, native_height))
+    rows = max(1, BAND_PIXELS // width // TILE_SIDE) * TILE_SIDE
+    for first in range(0, height, rows):
+        band = width, min(rows, height - first)
+        part = crop(data, (0, first / scale[1]), band, scale)
+        yield to_8bit(draw(part, backend)).astype(np.uint8)
+
+
+def save_region(
+    path: Path,
+    data: SetData,
+    region: tuple[int, int, int, int],
+    size: tuple[int, int],
+    backend: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Draw a region of a set into a file with 8 bits per channel, completely or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        A .tif or .tiff file is written by tiles, in the memory of a band. Other files, see
+        `eigengs_dr.save_image`, need the whole picture: 3 bytes a pixel.
+    data, region, size, backend
+        See `draw_region`.
+    progress : callable, optional
+        ``progress(done, total)`` with rows of the picture.
+
+    Raises
+    ------
+    ImageError
+        If the suffix is unknown or the file cannot be written.
+    OSError
+        If the .tif file cannot be written.
+    """
+    shape = size[1], size[0], len(data.arrays["background"])
+
+    def bands() -> Iterator[Picture]:
+        done = 0
+        for band in draw_region(data, region, size, backend):
+            yield band
+            done += len(band)
+            if progress:
+                progress(done, shape[0])
+
+    if path.suffix.lower() in TIFF_SUFFIXES:
+        with atomic_write(path) as temporary:
+            write_tiles(temporary, shape, bands())
+        return
+    picture, first = np.empty(shape, np.uint8), 0
+    for band in bands():
+        picture[first : first + len(band)] = band
+        first += len(band)
+    save_image(path, picture)
+
+
+class CompareTask(NamedTuple):
+    """A part of an image, and the Gaussians that it shows."""
+
+    window: Window
+    data: SetData
+    backend: str | None
+
+
+def compare_tasks(
+    source: Source, data: SetData, blocks: list[Block], backend: str | None
+) -> Iterator[CompareTask]:
+    """Yield the comparisons of all blocks of a set with its image."""
+    band, shown = slice(0, 0), data
+    for block in blocks:
+        if block.rows != band:  # few Gaussians to look through for every block of a row
+            band = block.rows
+            shown = crop(data, (0, band.start), (source.width, band.stop - band.start))
+        size = (block.columns.stop - block.columns.start, band.stop - band.start)
+        part = crop(shown, (block.columns.start, 0), size)
+        yield CompareTask(source.window(block.rows, block.columns), part, backend)
+
+
+def compare(task: CompareTask, shared: Any = None) -> tuple[float, float]:
+    """Return the sums of the squared errors of a part in the spaces of psnr_ycbcr and psnr_rgb."""
+    pixels, shown = task.window.read(), draw(task.data, task.backend)
+    space = float_space(task.data.space)
+    return squared_error(shown, pixels, space), squared_error(shown, pixels, "rgb")

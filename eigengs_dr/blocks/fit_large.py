@@ -1,0 +1,207 @@
+"""The function `fit_large`, which fits images of any size block by block."""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ..backend.executor import executor_for
+from ..backend.interrupt import defer_interrupts
+from ..backend.selection import select
+from ..fitting.options import FitOptions
+from ..gaussian.file import CUTOFF, write
+from ..gaussian.gaussians import Gaussians
+from ..image.metrics import psnr_from_mse
+from ..storage.atomic import require_writable
+from ..storage.checkpoint import Checkpoint
+from .grid import Block, choose_halo, divide
+from .run import Progress, Run
+from .source import Source, forget_pictures, open_source
+
+BLOCK_SIDE = 1024
+"""Default side of a block in pixels."""
+
+MIN_SIDE = 32
+"""Smallest side of a block in pixels."""
+
+PIXELS_PER_GAUSSIAN = 20
+"""Pixels for a Gaussian by default."""
+
+MAX_SPACING = 16.0
+"""Largest mean distance of Gaussians in pixels. With fewer, halos would be as large as blocks, and
+a smaller version of the image gives the same set."""
+
+
+@dataclass(frozen=True)
+class LargeFit:
+    """Result of `fit_large`.
+
+    Attributes
+    ----------
+    gaussians : Gaussians
+        The fitted set; its Gaussians follow each other block by block.
+    psnr_ycbcr, psnr_rgb : float
+        PSNR in dB, as in the trace of `eigengs_dr.Fit`, measured block by block.
+    blocks : int
+        Number of blocks.
+    resumed : int
+        Number of blocks, of all rounds, that an earlier call had fitted.
+    iterations : int
+        Number of steps of every block.
+    seconds : float
+        The whole time of this call.
+    """
+
+    gaussians: Gaussians = field(repr=False)
+    psnr_ycbcr: float
+    psnr_rgb: float
+    blocks: int
+    resumed: int
+    iterations: int
+    seconds: float
+
+
+def fit_large(
+    source: Any,
+    output: str | os.PathLike[str] | None = None,
+    *,
+    gaussians: int | None = None,
+    iterations: int = 1000,
+    block: int = BLOCK_SIDE,
+    color: str = "ycbcr",
+    solve_steps: int = 10,
+    cutoff: float = CUTOFF,
+    backend: str | None = None,
+    progress: Progress | None = None,
+    client: Any = None,
+) -> LargeFit:
+    """Fit an image of any size block by block, in the memory of one block.
+
+    Parameters
+    ----------
+    source : path-like or array
+        A TIFF file by strips or tiles and a ``.npy`` file are read by windows; other files are
+        decoded whole, into 4 bytes a pixel. Or an array (H, W, 3), (H, W, 1) or (H, W): NumPy's,
+        also memory-mapped, zarr's or Dask's, of which parts are read by slices.
+    output : path-like, optional
+        The ``.npz`` file of the result. Blocks that are done wait in a folder beside it, of the
+        same name with ".checkpoint" added, until the run succeeds. By default the result and the
+        blocks stay in memory.
+    gaussians : int, optional
+        Number of Gaussians, at least one for 256 pixels; by default one for 20 pixels. The blocks
+        get them where the image needs them.
+    iterations : int, optional
+        Number of steps of every block.
+    block : int, optional
+        Largest side of a block in pixels, at least 32.
+    color, solve_steps, cutoff, backend : optional
+        See `eigengs_dr.fit`.
+    progress : callable, optional
+        ``progress(done, total, row)``: what is done of a stage, in blocks or steps of blocks. The
+        row has the key stage ("survey", "place", "density", "place", "fit", "mend", "measure", in
+        this order; the first pair with "density" for long fits alone), and blocks, their number.
+    client : distributed.Client, optional
+        Where blocks are fitted; by default in this process.
+
+    Returns
+    -------
+    LargeFit
+
+    Raises
+    ------
+    ValueError
+        If the image is unusable, an argument is out of range, or the folder of an interrupted run
+        belongs to another image or to other options.
+    OSError
+        If the output cannot be written.
+    BackendError
+        If the backend is not available.
+    KeyboardInterrupt
+        After Ctrl-C or SIGTERM. The folder keeps the blocks that are done: repeat the call to go
+        on.
+
+    Notes
+    -----
+    The result draws no random numbers. It does not depend on the order of the blocks, nor on where
+    they are fitted or whether the run was interrupted.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg
+    >>> result = eg.fit_large(eg.sample("coffee")[:96, :128], iterations=10, block=64)
+    >>> result.blocks, len(result.gaussians)
+    (4, 614)
+    """
+    started = time.perf_counter()
+    options = FitOptions(
+        gaussians=gaussians,
+        iterations=iterations,
+        color=color,
+        solve_steps=solve_steps,
+        cutoff=cutoff,
+        backend=backend,
+    )
+    image = open_source(source, keep_grey=color == "data")
+    blocks, options = plan(image, options, block)
+    select(backend)
+    keep: Any = nullcontext()
+    if output is not None:
+        require_writable(output)
+        keep = Checkpoint(output, image.identity | _decisive(options, block), [])
+    try:
+        with keep as checkpoint, defer_interrupts() if client is None else nullcontext() as pressed:
+            run = Run(image, blocks, options, executor_for(client), checkpoint, progress, pressed)
+            data = run.fit()
+            errors = run.measure(data)
+            if output is not None:
+                write(output, data)
+    finally:
+        forget_pictures()
+    ycbcr, rgb = (psnr_from_mse(e / (3 * image.width * image.height)) for e in errors)
+    result = Gaussians.from_arrays(
+        **data.arrays, size=data.size, space=data.space, backend=backend, cutoff=data.cutoff
+    )
+    seconds = time.perf_counter() - started
+    return LargeFit(result, ycbcr, rgb, len(blocks), run.resumed, iterations, seconds)
+
+
+def plan(image: Source, options: FitOptions, side: int) -> tuple[list[Block], FitOptions]:
+    """Return the blocks of a fit, and the options with the number of Gaussians.
+
+    Raises
+    ------
+    ValueError
+        If the blocks are too small, or the Gaussians too few or too many.
+    """
+    if not isinstance(side, (int, np.integer)) or side < MIN_SIDE:
+        raise ValueError(f"block is {side!r}; it must be at least {MIN_SIDE} pixels, and whole")
+    pixels = image.width * image.height
+    count = options.gaussians
+    if count is None:
+        count = max(1, pixels // PIXELS_PER_GAUSSIAN)
+    spacing = (pixels / max(count, 1)) ** 0.5
+    blocks = divide(image.width, image.height, side, choose_halo(spacing))
+    least = max(len(blocks), -(-pixels // round(MAX_SPACING**2)))
+    if count < least:
+        raise ValueError(
+            f"gaussians is {count}; blocks of {side} pixels on {image.width}x{image.height} need "
+            f"at least {least:,}: use more, or fit a smaller version of the image"
+        )
+    if count > pixels:
+        raise ValueError(
+            f"gaussians is {count}; an image of {image.width}x{image.height} takes 1 to {pixels}"
+        )
+    return blocks, replace(options, gaussians=count)
+
+
+def _decisive(options: FitOptions, side: int) -> dict[str, Any]:
+    """Return the options on which the result depends."""
+    names = ("gaussians", "iterations", "color", "solve_steps", "cutoff")
+    values = {name: getattr(options, name) for name in names} | {"block": side}
+    # JSON has no numbers of NumPy.
+    return {k: v.item() if isinstance(v, np.generic) else v for k, v in values.items()}

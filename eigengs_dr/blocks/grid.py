@@ -1,0 +1,177 @@
+"""The division of a large image into blocks, and of the Gaussians among them."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+PHASES = 4
+"""Number of phases, see `Block`."""
+
+HALO_SPACINGS = 5.0
+"""Width of a halo, in mean distances of the Gaussians. On 1,024x1,024 pixels in blocks of 256, 60
+steps, the 16 pixels around borders have 32.18, 32.20 and 32.22 dB with 4, 5 and 8."""
+
+MIN_HALO = 16
+"""Least width of a halo in pixels."""
+
+
+class Block(NamedTuple):
+    """A part of an image with its surroundings.
+
+    Attributes
+    ----------
+    number : int
+        Place in the order of the blocks: row after row, from the left to the right.
+    rows, columns : slice
+        The core. The cores of all blocks tile the image.
+    window_rows, window_columns : slice
+        The core with its halo. All windows of an image have one size, so that all fits have one
+        program; at the edges of the image the halo of the other sides is larger.
+    phase : int
+        From 0 to 3: blocks of one phase do not touch each other, not even at a corner.
+    """
+
+    number: int
+    rows: slice
+    columns: slice
+    window_rows: slice
+    window_columns: slice
+    phase: int
+
+    @property
+    def core(self) -> tuple[slice, slice]:
+        """Rows and columns of the core, counted from the corner of the window."""
+        top, left = self.window_rows.start, self.window_columns.start
+        return (
+            slice(self.rows.start - top, self.rows.stop - top),
+            slice(self.columns.start - left, self.columns.stop - left),
+        )
+
+    @property
+    def corner(self) -> NDArray[np.float64]:
+        """Left and top of the window, in pixels of the image."""
+        return np.array([self.window_columns.start, self.window_rows.start], np.float64)
+
+    @property
+    def window_size(self) -> NDArray[np.float64]:
+        """Width and height of the window in pixels."""
+        rows, columns = self.window_rows, self.window_columns
+        return np.array([columns.stop - columns.start, rows.stop - rows.start], np.float64)
+
+    def open_sides(self, width: int, height: int) -> tuple[bool, bool, bool, bool]:
+        """Return whether an image goes on left of the window, above, right of it and below."""
+        rows, columns = self.window_rows, self.window_columns
+        return columns.start > 0, rows.start > 0, columns.stop < width, rows.stop < height
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of the core."""
+        return (self.rows.stop - self.rows.start) * (self.columns.stop - self.columns.start)
+
+
+def choose_halo(spacing: float) -> int:
+    """Return the width of a halo in pixels, for a mean distance of Gaussians in pixels."""
+    return max(MIN_HALO, math.ceil(HALO_SPACINGS * spacing))
+
+
+def divide(width: int, height: int, side: int, halo: int) -> list[Block]:
+    """Divide an image into blocks of nearly equal size.
+
+    Parameters
+    ----------
+    width, height : int
+        Size of the image in pixels.
+    side : int
+        Largest side of a core.
+    halo : int
+        Pixels around a core that belong to its window too, where the image has them.
+
+    Returns
+    -------
+    list of Block
+
+    Examples
+    --------
+    >>> [(b.columns, b.window_columns) for b in divide(200, 100, 100, 8)]
+    [(slice(0, 100, None), slice(0, 116, None)), (slice(100, 200, None), slice(84, 200, None))]
+    """
+    rows, columns = _parts(height, side, halo), _parts(width, side, halo)
+    blocks = list[Block]()
+    for i, (core_rows, window_rows) in enumerate(rows):
+        for j, (core_columns, window_columns) in enumerate(columns):
+            phase = 2 * (i % 2) + j % 2
+            block = Block(len(blocks), core_rows, core_columns, window_rows, window_columns, phase)
+            blocks.append(block)
+    return blocks
+
+
+def _parts(length: int, side: int, halo: int) -> list[tuple[slice, slice]]:
+    """Return the cores and the windows along one axis."""
+    number = -(-length // side)
+    cuts = [k * length // number for k in range(number + 1)]
+    cores = [slice(cuts[k], cuts[k + 1]) for k in range(number)]
+    window = min(length, -(-length // number) + 2 * halo)
+    starts = [min(max(0, core.start - halo), length - window) for core in cores]
+    return [(core, slice(start, start + window)) for core, start in zip(cores, starts, strict=True)]
+
+
+def neighbors(block: Block, blocks: list[Block]) -> list[Block]:
+    """Return the blocks whose cores touch the window of a block, with itself, in order."""
+    return [
+        other
+        for other in blocks
+        if _overlap(other.rows, block.window_rows) and _overlap(other.columns, block.window_columns)
+    ]
+
+
+def _overlap(a: slice, b: slice) -> bool:
+    return bool(a.start < b.stop and b.start < a.stop)
+
+
+def deal(mass: NDArray[np.float64], pixels: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Deal Gaussians to blocks in proportion to their masses.
+
+    Parameters
+    ----------
+    mass : ndarray, shape (B,)
+        Integral of the density of Gaussians over each block, up to a common factor.
+    pixels : ndarray of int, shape (B,)
+        Pixels of each block; no block gets more Gaussians.
+    count : int
+        Number of Gaussians, from B to the sum of the pixels.
+
+    Returns
+    -------
+    ndarray of int64, shape (B,)
+        At least 1 each; the sum is `count`.
+
+    Examples
+    --------
+    >>> deal(np.array([1.0, 2.0, 0.0]), np.array([100, 100, 100]), 31)
+    array([10, 20,  1])
+    """
+    wanted = np.zeros(len(mass))
+    full = np.zeros(len(mass), bool)
+    share = np.maximum(mass, 1e-12 * mass.sum()) if mass.sum() > 0 else np.ones(len(mass))
+    while True:  # each round fills at least one block, or ends
+        left = count - pixels[full].sum()
+        wanted = np.where(full, pixels, share * (left / max(share[~full].sum(), 1e-300)))
+        over = (wanted > pixels) & ~full
+        if not over.any():
+            break
+        full |= over
+    dealt = np.clip(np.floor(wanted).astype(np.int64), 1, pixels)
+    # The rest goes to the largest fractions; too much, by the blocks that got 1, is taken back.
+    order = np.argsort(dealt - wanted, kind="stable")
+    missing = count - int(dealt.sum())
+    while missing:
+        step = 1 if missing > 0 else -1
+        able = order[(dealt < pixels)[order]] if step > 0 else order[::-1][(dealt > 1)[order[::-1]]]
+        chosen = able[: abs(missing)]
+        dealt[chosen] += step
+        missing -= step * len(chosen)
+    return dealt

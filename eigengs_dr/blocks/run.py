@@ -1,0 +1,260 @@
+"""The rounds of a fit by blocks: survey, placement, fit, and the error that is left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..backend.executor import Executor
+from ..fitting.optimizers.schedule import MIN_PHASE_RATIO
+from ..fitting.options import FitOptions
+from ..gaussian.file import SetData
+from ..storage.checkpoint import Checkpoint
+from .block import FitTask, PlaceTask, Settings, find_density, fit_block, mend_seam, place, survey
+from .draw import compare, compare_tasks
+from .grid import PHASES, Block, choose_halo, deal
+from .place import OldSet
+from .seams import seams
+from .sets import Arrays, BlockSets
+from .source import Source, Window
+
+Progress = Callable[[int, int, dict[str, Any]], None]
+
+
+MEND_SHARE = 0.15
+"""Steps of `_mend`, as a fraction of those of a fit."""
+
+
+class Run:
+    """One call of `eigengs_dr.fit_large`.
+
+    Parameters
+    ----------
+    image : Source
+    blocks : list of Block
+    options : FitOptions
+        With the number of Gaussians.
+    executor : Executor
+    checkpoint : Checkpoint, optional
+        Where blocks that are done wait for the end of the run.
+    progress : callable, optional
+        See `eigengs_dr.fit_large`.
+    pressed : callable, optional
+        ``pressed()``: whether the run shall end; None on a cluster.
+
+    Attributes
+    ----------
+    resumed : int
+        Number of blocks, of all rounds, that an earlier call had fitted.
+    """
+
+    def __init__(
+        self,
+        image: Source,
+        blocks: list[Block],
+        options: FitOptions,
+        executor: Executor,
+        checkpoint: Checkpoint | None = None,
+        progress: Progress | None = None,
+        pressed: Callable[[], bool] | None = None,
+    ) -> None:
+        assert options.gaussians is not None
+        self.image, self.blocks, self.options, self.executor = image, blocks, options, executor
+        self.checkpoint, self.progress, self.pressed = checkpoint, progress, pressed
+        spacing = (image.width * image.height / options.gaussians) ** 0.5
+        self.settings = Settings(options, (image.width, image.height), spacing)
+        self.resumed, self.stage, self.done, self.total = 0, "", 0, 0
+
+    def fit(self) -> SetData:
+        """Place and fit all Gaussians; a long fit places them again where error was left."""
+        mass = self._survey()
+        steps, first = self.options.iterations, self.options.method.schedule.redistribute_after
+        old = None
+        if steps >= MIN_PHASE_RATIO * first:
+            old, mass = self._find_density(self._place(mass), first)
+            steps -= first
+        sets = self._fit_blocks(self._place(mass, old), steps)
+        self._mend(sets, round(MEND_SHARE * steps))
+        background = np.array(self.settings.background, np.float32)
+        return SetData(
+            sets.arrays | {"background": background},
+            (self.image.width, self.image.height),
+            self.options.color,
+            self.options.cutoff,
+        )
+
+    def measure(self, data: SetData) -> tuple[float, float]:
+        """Return the sums of the squared errors for psnr_ycbcr and psnr_rgb."""
+        self._begin("measure", len(self.blocks))
+        tasks = compare_tasks(self.image, data, self.blocks, self.options.backend)
+        sums = {b.number: value for b, value in self._map(compare, tasks, self.blocks)}
+        ycbcr, rgb = np.sum([value for _, value in sorted(sums.items())], axis=0).tolist()
+        return ycbcr, rgb
+
+    def _survey(self) -> NDArray[np.float64]:
+        """Return the masses of all blocks, and set the background: the mean of the image."""
+        self._begin("survey", len(self.blocks))
+        tasks = (PlaceTask(self._window(block), block) for block in self.blocks)
+        found = {b.number: value for b, value in self._map(survey, tasks, self.blocks)}
+        figures = np.array([[value.mass, *value.total] for _, value in sorted(found.items())])
+        mean = figures[:, 1:].sum(axis=0) / (self.image.width * self.image.height)
+        self.settings = replace(self.settings, background=tuple(mean.tolist()))
+        if self.checkpoint is not None:
+            _check_unchanged(self.checkpoint, figures)
+        return figures[:, 0]
+
+    def _place(self, mass: NDArray[np.float64], old: BlockSets | None = None) -> BlockSets:
+        """Deal the Gaussians to the blocks by their masses, and place them."""
+        assert self.options.gaussians is not None
+        pixels = np.array([block.pixels for block in self.blocks])
+        counts = deal(mass, pixels, self.options.gaussians)
+        placed = BlockSets(self.blocks, counts, ("mean", "factor"))
+
+        def tasks() -> Iterator[PlaceTask]:
+            for block, count in zip(self.blocks, counts.tolist(), strict=True):
+                seen = None
+                if old is not None:
+                    arrays, _ = old.in_window(block)
+                    seen = OldSet(arrays["mean"], arrays["ratio"][:, 0])
+                yield PlaceTask(self._window(block), block, count, seen)
+
+        self._begin("place", len(self.blocks))
+        for block, (mean, factor) in self._map(place, tasks(), self.blocks):
+            placed.put(block, {"mean": mean, "factor": factor})
+        return placed
+
+    def _find_density(self, placed: BlockSets, steps: int) -> tuple[BlockSets, NDArray[np.float64]]:
+        """Fit all blocks for some steps; return means, ratios and masses of the wanted density."""
+        old = BlockSets(self.blocks, placed.counts(), ("mean", "ratio"))
+        mass = np.empty(len(self.blocks))
+
+        def make_task(block: Block) -> FitTask:
+            # Errors hardly differ between both sides of a border, so that blocks need no phases.
+            arrays, own = placed.in_window(block)
+            mean, factor = arrays["mean"], arrays["factor"]
+            return FitTask(self._window(block), block, mean, factor, None, own, None, steps)
+
+        self._begin("density", len(self.blocks) * steps)
+        for block, found in self._fitted("density", find_density, self.blocks, make_task, steps):
+            mass[block.number] = found["mass"][0]
+            old.put(block, found)
+        return old, mass
+
+    def _fit_blocks(self, placed: BlockSets, steps: int) -> BlockSets:
+        """Fit all blocks, phase by phase."""
+        names, options = ("mean", "factor", "color"), self.options
+        sets = BlockSets(self.blocks, placed.counts(), names, self.image.channels, options.cutoff)
+
+        def make_task(block: Block) -> FitTask:
+            earlier = [other for other in self.blocks if other.phase < block.phase]
+            arrays, own = placed.in_window(block, without=earlier)
+            mean, factor, fixed = arrays["mean"], arrays["factor"], sets.touching(block, earlier)
+            return FitTask(self._window(block), block, mean, factor, None, own, fixed, steps)
+
+        self._begin("fit", len(self.blocks) * steps)
+        for phase in range(PHASES):
+            blocks = [block for block in self.blocks if block.phase == phase]
+            for block, found in self._fitted("fit", fit_block, blocks, make_task, steps):
+                sets.put(block, found)
+        return sets
+
+    def _mend(self, sets: BlockSets, steps: int) -> None:
+        """Move the Gaussians along all borders of blocks, phase by phase."""
+        size, halo = (self.image.width, self.image.height), choose_halo(self.settings.spacing)
+        strips = seams(self.blocks, *size, self.settings.spacing, halo)
+        near = dict[int, tuple[NDArray[np.intp], NDArray[np.intp]]]()
+
+        def make_task(strip: Block) -> FitTask:
+            own, fixed = (sets.take(rows, strip) for rows in near[strip.number])
+            return FitTask(
+                self._window(strip), strip, **own, own=slice(None), fixed=fixed, iterations=steps
+            )
+
+        self._begin("mend", len(strips) * steps)
+        for phase in range(PHASES):
+            own = [strip for strip in strips if strip.phase == phase]
+            near |= {strip.number: sets.around(strip) for strip in own}
+            own = [strip for strip in own if len(near[strip.number][0])]
+            # Strips of one phase may see each other by large Gaussians, so that all wait for all.
+            found = list(self._fitted("seam", mend_seam, own, make_task, steps))
+            for strip, arrays in found:
+                sets.replace(near[strip.number][0], arrays, strip)
+
+    def _fitted(
+        self,
+        stage: str,
+        function: Any,
+        parts: list[Block],
+        make_task: Callable[[Block], FitTask],
+        steps: int,
+    ) -> Iterator[tuple[Block, Arrays]]:
+        """Yield the parts that an earlier call has fitted, then fit the others and keep them."""
+        waiting = list[Block]()
+        for part in parts:
+            found = self.checkpoint.load(f"{stage}{part.number}") if self.checkpoint else None
+            if found is None:
+                waiting.append(part)
+                continue
+            self.resumed += 1
+            self._advance(steps)
+            yield part, found
+        if self.pressed is not None:
+            function = partial(function, step_done=self._step_done)
+        for part, found in self._map(function, map(make_task, waiting), waiting, steps):
+            if self.checkpoint is not None:
+                self.checkpoint.save(f"{stage}{part.number}", found)
+            yield part, found
+
+    def _map(
+        self, function: Any, tasks: Iterator[Any], parts: list[Block], steps: int = 1
+    ) -> Iterator[tuple[Block, Any]]:
+        """Run the tasks of some parts, and yield the parts with their results."""
+        with closing(self.executor.map(function, tasks, self.settings)) as ended:
+            for done in ended:
+                if done.lost:
+                    raise RuntimeError(f"{self.image.name}: {done.lost}")
+                self._advance(steps)
+                yield parts[done.index], done.value
+                self._stop_if_pressed()
+
+    def _window(self, block: Block) -> Window:
+        return self.image.window(block.window_rows, block.window_columns)
+
+    def _begin(self, stage: str, total: int) -> None:
+        self.stage, self.done, self.total = stage, 0, total
+        self._show(0)
+
+    def _advance(self, steps: int) -> None:
+        self.done += steps
+        self._show(0)
+
+    def _step_done(self, step: int) -> None:
+        self._show(step)
+        self._stop_if_pressed()
+
+    def _show(self, step: int) -> None:
+        if self.progress:
+            row = {"stage": self.stage, "blocks": len(self.blocks)}
+            self.progress(self.done + step, self.total, row)
+
+    def _stop_if_pressed(self) -> None:
+        if self.pressed is not None and self.pressed():
+            raise KeyboardInterrupt
+
+
+def _check_unchanged(checkpoint: Checkpoint, figures: NDArray[np.float64]) -> None:
+    """Raise ValueError if a checkpoint belongs to another image."""
+    known = checkpoint.load("survey")
+    if known is None:
+        checkpoint.save("survey", {"figures": figures})
+    elif not np.array_equal(known["figures"], figures):
+        raise ValueError(
+            f"{checkpoint.folder}: holds an interrupted run of another image; "
+            "delete the folder to start again"
+        )

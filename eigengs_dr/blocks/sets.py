@@ -1,0 +1,193 @@
+"""The Gaussians of all blocks in common arrays, block after block."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..gaussian.crop import crop, reaches, touches
+from ..gaussian.file import CUTOFF, SetData
+from .grid import Block, neighbors
+
+Arrays = dict[str, NDArray[Any]]
+
+COLUMNS = {"mean": 2, "factor": 3, "ratio": 1}
+"""Numbers of a Gaussian in the arrays; a colour has as many as the image has channels."""
+
+
+class BlockSets:
+    """Arrays with a row for each Gaussian, in pixels of the image.
+
+    Parameters
+    ----------
+    blocks : list of Block
+    counts : ndarray of int, shape (B,)
+        Number of Gaussians of each block.
+    names : sequence of str
+        The arrays: mean and others.
+    channels : int, optional
+        Channels of a colour.
+    cutoff : float, optional
+        Standard deviations at which a Gaussian ends.
+
+    Attributes
+    ----------
+    arrays : dict of str to ndarray of float32, shape (N, columns)
+    parts : list of slice
+        The rows of each block.
+    """
+
+    def __init__(
+        self,
+        blocks: list[Block],
+        counts: NDArray[Any],
+        names: tuple[str, ...],
+        channels: int = 3,
+        cutoff: float = CUTOFF,
+    ) -> None:
+        ends = np.cumsum(counts).tolist()
+        self.blocks, self.cutoff = blocks, cutoff
+        self.size = np.array([blocks[-1].columns.stop, blocks[-1].rows.stop])
+        self.parts = [slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+        self.arrays: Arrays = {
+            name: np.empty((ends[-1], COLUMNS.get(name, channels)), np.float32) for name in names
+        }
+        self._boxes = np.empty((len(blocks), 4))
+
+    def counts(self) -> NDArray[np.int64]:
+        """Return the number of Gaussians of each block."""
+        return np.array([part.stop - part.start for part in self.parts])
+
+    def put(self, block: Block, found: Arrays) -> None:
+        """Set the rows of a block; its means are in pixels of its window."""
+        part = self.parts[block.number]
+        for name, rows in self.arrays.items():
+            rows[part] = found[name] + block.corner if name == "mean" else found[name]
+        if "factor" in self.arrays:
+            self._measure(block)
+
+    def in_window(self, block: Block, without: Sequence[Block] = ()) -> tuple[Arrays, slice]:
+        """Return the Gaussians whose means lie in the window of a block, in the window's pixels.
+
+        Parameters
+        ----------
+        block : Block
+        without : sequence of Block, optional
+            Blocks whose Gaussians are left out.
+
+        Returns
+        -------
+        arrays : dict of str to ndarray
+        own : slice
+            Those of the block itself: all of them lie in its window.
+        """
+        low, high = block.corner, block.corner + block.window_size
+        found: dict[str, list[NDArray[Any]]] = {name: [] for name in self.arrays}
+        before, own = 0, slice(0, 0)
+        out = {other.number for other in without}
+        for other in neighbors(block, self.blocks):
+            if other.number in out:
+                continue
+            part = self.parts[other.number]
+            mean = self.arrays["mean"][part]
+            inside = np.all((mean >= low) & (mean <= high), axis=1)
+            if other.number == block.number:
+                inside = np.ones(len(mean), bool)  # rounding may move one across the edge
+                own = slice(before, before + len(mean))
+            before += int(inside.sum())
+            for name, rows in found.items():
+                rows.append(self.arrays[name][part][inside])
+        arrays = {name: np.concatenate(rows) for name, rows in found.items()}
+        arrays["mean"] = (arrays["mean"] - low).astype(np.float32)
+        return arrays, own
+
+    def touching(self, block: Block, others: list[Block]) -> Arrays:
+        """Return the Gaussians of other blocks that touch the window of a block, in its pixels.
+
+        Parameters
+        ----------
+        block : Block
+        others : list of Block
+            Blocks whose rows are set.
+
+        Returns
+        -------
+        dict of str to ndarray
+            Mean, factor and color.
+        """
+        found = [{name: rows[:0] for name, rows in self.arrays.items()}]
+        for other in others:
+            if self._reaches(other, block):
+                found.append(crop(self._data(other), *_window(block)).arrays)
+        return {name: np.concatenate([part[name] for part in found]) for name in self.arrays}
+
+    def around(self, strip: Block) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the rows whose means lie in the core of a part, and others that touch its window.
+
+        Gaussians that reach beyond the window are others: a fit of it would not see all they do.
+
+        Returns
+        -------
+        inside, around : ndarray of int, shape (n,)
+        """
+        core = np.array([[strip.columns.start, strip.rows.start]])
+        end = np.array([[strip.columns.stop, strip.rows.stop]])
+        low, high = strip.corner, strip.corner + strip.window_size
+        low, high = np.where(low > 0, low, -np.inf), np.where(high < self.size, high, np.inf)
+        inside, around = [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
+        for block in self.blocks:
+            if self._reaches(block, strip):
+                first, data = self.parts[block.number].start, self._data(block)
+                mean, reach = data.arrays["mean"], np.stack(reaches(data), axis=1)
+                own = np.all((mean >= core) & (mean < end), axis=1)
+                own &= np.all((mean - reach >= low) & (mean + reach <= high), axis=1)
+                seen = touches(data, *_window(strip)) & ~own
+                inside.append(np.flatnonzero(own) + first)
+                around.append(np.flatnonzero(seen) + first)
+        return np.concatenate(inside), np.concatenate(around)
+
+    def take(self, rows: NDArray[np.intp], part: Block) -> Arrays:
+        """Return some rows, with means in pixels of the window of a part."""
+        arrays = {name: values[rows] for name, values in self.arrays.items()}
+        arrays["mean"] = (arrays["mean"] - part.corner).astype(np.float32)
+        return arrays
+
+    def replace(self, rows: NDArray[np.intp], found: Arrays, part: Block) -> None:
+        """Set some rows; their means are in pixels of the window of a part."""
+        for name, values in self.arrays.items():
+            values[rows] = found[name] + part.corner if name == "mean" else found[name]
+        for block in self.blocks:
+            own = self.parts[block.number]
+            if ((rows >= own.start) & (rows < own.stop)).any():
+                self._measure(block)
+
+    def _measure(self, block: Block) -> None:
+        """Note the box that the Gaussians of a block touch: left, top, right, bottom."""
+        mean = self.arrays["mean"][self.parts[block.number]]
+        reach = np.stack(reaches(self._data(block)), axis=1)
+        box = (mean - reach).min(axis=0), (mean + reach).max(axis=0)
+        self._boxes[block.number] = np.concatenate(box)
+
+    def _reaches(self, block: Block, part: Block) -> bool:
+        """Whether some Gaussians of a block may touch the window of a part."""
+        (left, top), (width, height) = _window(part)
+        box = self._boxes[block.number]
+        return bool(
+            (box[:2] <= (left + width, top + height)).all() and (box[2:] >= (left, top)).all()
+        )
+
+    def _data(self, block: Block) -> SetData:
+        """Return the Gaussians of a block as a set."""
+        part = self.parts[block.number]
+        arrays = {name: rows[part] for name, rows in self.arrays.items()}
+        arrays["background"] = np.zeros(1, np.float32)
+        return SetData(arrays, (1, 1), "data", self.cutoff)
+
+
+def _window(part: Block) -> tuple[tuple[float, float], tuple[int, int]]:
+    """Return the corner and the size of the window of a part."""
+    (left, top), (width, height) = part.corner.tolist(), part.window_size.astype(int).tolist()
+    return (left, top), (width, height)

@@ -1,0 +1,219 @@
+"""Large images, read by windows: TIFF and ``.npy`` files, arrays, and what Pillow decodes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..image.io import ImageError, check_image, open_picture, picture_pixels
+from .tiff import TIFF_SUFFIXES, read_window, window_shape
+
+MAX_SIDE = 1 << 16
+"""Longest side of a set of Gaussians, in pixels."""
+
+GREY = ("1", "L", "I", "I;16", "I;16B", "I;16L", "F")
+"""Modes of Pillow for opaque images of one channel."""
+
+Array = NDArray[Any]
+Read = Callable[[slice, slice], Array]
+
+
+class Window(NamedTuple):
+    """A part of an image that is read when it is needed, perhaps in another process.
+
+    Attributes
+    ----------
+    load : callable
+        Returns the pixels in the dtype of the source. It holds a path, or the pixels.
+    keep_grey : bool
+        Whether a grey image has one channel instead of three.
+    name : str
+        The image and the part, for errors.
+    """
+
+    load: Callable[[], Array]
+    keep_grey: bool
+    name: str
+
+    def read(self) -> NDArray[np.float32]:
+        """Return the pixels: float32 of shape (h, w, 3), or (h, w, 1).
+
+        Raises
+        ------
+        ImageError
+            If the file cannot be read, or a pixel is not finite or far outside [0, 1].
+        """
+        pixels = self.load()
+        try:
+            return check_image(pixels, keep_grey=self.keep_grey, copy=False)
+        except ImageError as error:
+            raise ImageError(f"{self.name}: {str(error).removeprefix('image: ')}") from None
+
+
+@dataclass(frozen=True)
+class Source:
+    """A large image.
+
+    Attributes
+    ----------
+    width, height : int
+        Pixels.
+    channels : int
+        Channels of a fit: 1 or 3.
+    name : str
+        The path of the file, or "image".
+    identity : dict
+        What tells this image from others, in numbers and texts.
+    cut : callable
+        ``cut(rows, columns)`` returns what `Window.load` holds.
+    keep_grey : bool
+        See `Window`.
+    """
+
+    width: int
+    height: int
+    channels: int
+    name: str
+    identity: dict[str, Any]
+    cut: Callable[[slice, slice], Callable[[], Array]]
+    keep_grey: bool
+
+    def window(self, rows: slice, columns: slice) -> Window:
+        """Return a part of the image."""
+        part = f"rows {rows.start} to {rows.stop}, columns {columns.start} to {columns.stop}"
+        return Window(self.cut(rows, columns), self.keep_grey, f"{self.name}, {part}")
+
+
+def open_source(source: Any, keep_grey: bool = False) -> Source:
+    """Open a large image without reading its pixels.
+
+    Parameters
+    ----------
+    source : path-like or array
+        A file: TIFF of grey or RGB by strips or tiles, and ``.npy``, are read by windows. Pillow
+        decodes other files (PNG, JPEG, TIFF of other kinds) whole, into 4 bytes a pixel.
+        Or an array (H, W, 3), (H, W, 1) or (H, W) of a type that `eigengs_dr.load_image` knows, of
+        which ``source[top:bottom, left:right]`` is a part: NumPy's, also memory-mapped, zarr's,
+        Dask's.
+    keep_grey : bool, optional
+        Whether a grey image has one channel instead of three.
+
+    Returns
+    -------
+    Source
+
+    Raises
+    ------
+    ImageError
+        If there is no such file, it is no image, or the shape or the size is wrong.
+    """
+    if isinstance(source, (str, os.PathLike)):
+        return _open_file(Path(source), keep_grey)
+    if not hasattr(source, "shape") or not hasattr(source, "dtype"):
+        kind = type(source).__name__
+        raise ImageError(f"image: is a {kind}; pass a file or an array of shape (H, W, 3)")
+    shape, dtype = tuple(int(side) for side in source.shape), np.dtype(source.dtype)
+    identity = {"shape": list(shape), "dtype": dtype.str}
+
+    def cut(rows: slice, columns: slice) -> Callable[[], Array]:
+        return partial(np.asarray, np.asarray(source[rows, columns]))
+
+    return _checked("image", shape, identity, cut, keep_grey)
+
+
+def _open_file(path: Path, keep_grey: bool) -> Source:
+    absolute = os.path.abspath(path)
+    shape: tuple[int, ...] | None = None
+    read: Read
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise ImageError(f"{path}: {error.strerror or error}; check the path") from None
+    if path.suffix.lower() in TIFF_SUFFIXES:
+        shape = window_shape(absolute)
+    if shape is not None:
+        read = partial(read_window, absolute)
+    elif path.suffix.lower() == ".npy":
+        shape = _array_shape(absolute)
+        read = partial(_read_array, absolute)
+    else:
+        picture = _decoded(absolute, state.st_mtime_ns)
+        shape = (picture.height, picture.width, 1 if picture.mode in GREY else 3)
+        read = partial(_read_picture, absolute, state.st_mtime_ns)
+    identity = {"file": absolute, "bytes": state.st_size, "modified": state.st_mtime_ns}
+
+    def cut(rows: slice, columns: slice) -> Callable[[], Array]:
+        return partial(read, rows, columns)
+
+    return _checked(str(path), shape, identity, cut, keep_grey)
+
+
+def _checked(
+    name: str,
+    shape: tuple[int, ...],
+    identity: dict[str, Any],
+    cut: Callable[[slice, slice], Callable[[], Array]],
+    keep_grey: bool,
+) -> Source:
+    """Return a source, or refuse what is no image or too large."""
+    if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] not in (1, 3)):
+        raise ImageError(f"{name}: shape {shape}, expected (H, W) or (H, W, 3)")
+    if not all(1 <= side <= MAX_SIDE for side in shape[:2]):
+        raise ImageError(f"{name}: {shape[1]}x{shape[0]} pixels; sides go from 1 to {MAX_SIDE:,}")
+    grey = len(shape) == 2 or shape[2] == 1
+    channels = 1 if grey and keep_grey else 3
+    return Source(shape[1], shape[0], channels, name, identity, cut, keep_grey)
+
+
+def _array_shape(path: str) -> tuple[int, ...]:
+    try:
+        return tuple(np.load(path, mmap_mode="r", allow_pickle=False).shape)
+    except (ValueError, EOFError, OSError) as error:
+        raise ImageError(f"{path}: not a readable .npy file ({error})") from None
+
+
+def _read_array(path: str, rows: slice, columns: slice) -> Array:
+    """Read a part of a ``.npy`` file; the map of the file ends with the call."""
+    return np.array(np.load(path, mmap_mode="r", allow_pickle=False)[rows, columns])
+
+
+def _read_picture(path: str, modified: int, rows: slice, columns: slice) -> Array:
+    """Return a part of a file that Pillow decodes."""
+    box = (columns.start, rows.start, columns.stop, rows.stop)
+    picture = _decoded(path, modified)
+    with any_size():
+        return picture_pixels(picture.crop(box))[0]
+
+
+@lru_cache(maxsize=1)
+def _decoded(path: str, modified: int) -> Any:
+    """Decode a file, and keep it for the next window; `modified` tells its versions apart."""
+    with any_size(), open_picture(Path(path)) as picture:
+        picture.load()
+        return picture
+
+
+def forget_pictures() -> None:
+    """Free the memory of the file that Pillow decoded last."""
+    _decoded.cache_clear()
+
+
+@contextmanager
+def any_size() -> Iterator[None]:
+    """Let Pillow open images of any size during a block; `_checked` bounds the sides."""
+    from PIL import Image
+
+    before = Image.MAX_IMAGE_PIXELS
+    Image.MAX_IMAGE_PIXELS = None
+    try:
+        yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = before

@@ -1,0 +1,94 @@
+"""The command ``eigengs-dr fit`` for one image, fitted as a whole."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from .console import progress_bar
+
+if TYPE_CHECKING:
+    from ..fitting.fit import Fit
+    from ..fitting.options import FitOptions
+
+
+def fit_one(
+    path: Path,
+    output: Path,
+    preview: Path | None,
+    quiet: bool,
+    options: FitOptions,
+    run: Callable[..., Fit],
+) -> dict[str, Any]:
+    """Fit one image, write its files, and return its figures."""
+    import eigengs_dr as eg
+
+    from ..fitting.fit import FitInterrupted
+    from .pictures import comparison
+
+    started = time.perf_counter()
+    with progress_bar(quiet) as show:
+        show(f"{path.name}: load", 0, 1)
+        image = eg.load_image(path, keep_grey=options.color == "data")
+        loaded = time.perf_counter()
+        try:
+            result = run(image, progress=partial(show, path.name))
+        except FitInterrupted as interrupt:
+            result = interrupt.result
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+        result.gaussians.save(output)
+        show(f"{path.name}: measure", 0, 1)
+        figures = _measure(image, result, options.color)
+        if preview:
+            eg.save_image(preview, comparison(image, result.image, result.gaussians))
+    record = {
+        "input": str(path),
+        "output": str(output),
+        "width": image.shape[1],
+        "height": image.shape[0],
+        "gaussians": len(result.gaussians),
+        "iterations": result.iterations,
+        "stopped": result.stopped,
+        "seconds": result.seconds,
+        "seconds_init": result.seconds_init,
+        "seconds_load": loaded - started,
+        "seconds_total": time.perf_counter() - started,
+        **figures,
+        "trace": result.trace,
+    }
+    if not quiet:
+        click.echo(_summary(record, preview, options.color))
+    return record
+
+
+def _measure(image: Any, result: Fit, color: str) -> dict[str, float]:
+    """Compare a fit with its image."""
+    import eigengs_dr as eg
+
+    from ..image.metrics import float_space
+
+    return {
+        "psnr_ycbcr": eg.psnr(image, result.image, space=float_space(color)),
+        "psnr_rgb": eg.psnr(image, result.image, space="rgb"),
+        "ssim": eg.ssim(image, result.image),
+        "ms_ssim": eg.ms_ssim(image, result.image, space=float_space(color)),
+    }
+
+
+def _summary(record: dict[str, Any], preview: Path | None, color: str) -> str:
+    """Describe a fit for a terminal."""
+    from ..image.metrics import float_space
+
+    text = (
+        "{input}: {width}x{height}, {gaussians} Gaussians, {iterations} iterations "
+        "in {seconds:.1f} s ({seconds_total:.1f} s with loading and measuring)\n"
+        "  psnr_{space} {psnr_ycbcr:.2f} dB, psnr_rgb {psnr_rgb:.2f} dB, "
+        "SSIM {ssim:.4f}, MS-SSIM {ms_ssim:.4f}\n  wrote {output}"
+    ).format(**record, space=float_space(color))
+    return f"{text}\n  wrote {preview} (photo, fit and outlines side by side)" if preview else text

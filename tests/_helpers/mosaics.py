@@ -1,0 +1,47 @@
+"""Pictures with unlike parts, and executors that run tasks in other ways."""
+
+import numpy as np
+
+import eigengs_dr as eg
+from eigengs_dr.backend.executor import Done
+
+
+def mosaic(side=256):
+    """Parts of photos, whose borders are none of blocks of 64 or 96 pixels; uint8."""
+    parts = [
+        eg.sample("coffee")[60:180, 100:220],
+        eg.sample("astronaut")[20:140, 180:300],
+        eg.sample("chelsea")[80:200, 120:240],
+    ]
+    tiles = -(-side // 120)
+    rows = [
+        np.concatenate([parts[(row + column) % 3] for column in range(tiles)], axis=1)
+        for row in range(tiles)
+    ]
+    return np.rint(255 * np.concatenate(rows)[:side, :side]).astype(np.uint8)
+
+
+class Backwards:
+    """An executor that works on the last task first."""
+
+    workers = 1
+
+    def map(self, function, tasks, shared=None, at_once=None):
+        for index, task in reversed(list(enumerate(tasks))):
+            yield Done(index, function(task, shared))
+
+
+class Sliced:
+    """An array on disk that is read by slices alone, as those of zarr and Dask are."""
+
+    def __init__(self, pixels):
+        self.pixels, self.largest = pixels, 0
+        self.shape, self.dtype = pixels.shape, pixels.dtype
+
+    def __getitem__(self, part):
+        found = self.pixels[part]
+        self.largest = max(self.largest, found.size)
+        return found
+
+    def __array__(self, *arguments, **options):
+        raise AssertionError("the whole array was read")

@@ -1,0 +1,292 @@
+"""Fits by blocks: no seams, the same bits in any order, and no work lost."""
+
+import numpy as np
+import pytest
+import tifffile
+
+import eigengs_dr as eg
+from _helpers.mosaics import Backwards, Sliced, mosaic
+from _helpers.process import run_python
+from eigengs_dr.blocks import run as rounds
+from eigengs_dr.blocks.draw import save_region
+from eigengs_dr.gaussian.file import read
+
+FEW = {"gaussians": 700, "iterations": 10, "block": 64, "backend": "llvm"}
+"""Settings of a fit of 128x128 pixels in four blocks."""
+
+
+def arrays_of(result):
+    return result.gaussians.to_arrays()
+
+
+def assert_same_bits(one, other):
+    for name, values in arrays_of(one).items():
+        np.testing.assert_array_equal(values, arrays_of(other)[name], err_msg=name)
+
+
+def near_borders(side, block, distance):
+    """Which pixels of a square lie near a border of blocks."""
+    number = -(-side // block)
+    cuts = np.array([k * side // number for k in range(1, number)])
+    near = (np.abs(np.arange(side)[:, None] + 0.5 - cuts) < distance).any(axis=1)
+    return near[:, None] | near
+
+
+def psnr_in(mask, picture, pixels):
+    error = np.square(picture.clip(0, 1) - pixels / 255.0).mean(axis=2)
+    return -10 * np.log10(error[mask].mean())
+
+
+@pytest.mark.parametrize("iterations", [40, pytest.param(300, marks=pytest.mark.slow)])
+def test_no_seam_is_left(iterations):
+    """Near borders and elsewhere, the error is that of a fit of the whole."""
+    pixels = mosaic(256)
+    settings = {"gaussians": 3000, "iterations": iterations, "backend": "llvm"}
+    blocks = eg.fit_large(pixels, block=96, **settings)
+    assert blocks.blocks == 9 and len(blocks.gaussians) == 3000
+    whole = eg.fit(pixels, **settings)
+    shown = eg.picture_of(blocks.gaussians)
+    for mask in (near_borders(256, 96, 16), ~near_borders(256, 96, 16)):
+        assert psnr_in(mask, shown, pixels) > psnr_in(mask, whole.image, pixels) - 0.2
+    assert blocks.psnr_rgb == pytest.approx(eg.psnr(shown, pixels / 255.0), abs=1e-3)
+    assert blocks.psnr_ycbcr == pytest.approx(
+        eg.psnr(shown, pixels / 255.0, space="ycbcr"), abs=1e-3
+    )
+
+
+def test_smooth_picture_has_no_seam():
+    """Large Gaussians of a flat sky reach over borders."""
+    y, x = np.mgrid[:192, :192] / 192
+    sky = np.stack([0.3 + 0.3 * y, 0.5 + 0.2 * x * y, 0.9 - 0.2 * y], axis=2).astype(np.float32)
+    sky[120:, 100:] += 0.1 * np.sin(40 * x[120:, 100:, None])
+    shown = eg.picture_of(
+        eg.fit_large(sky, gaussians=1800, iterations=30, block=64, backend="llvm").gaussians
+    )
+    whole = eg.fit(sky, gaussians=1800, iterations=30, backend="llvm").image
+    near = near_borders(192, 64, 8)
+    near[110:] = False
+    assert psnr_in(near, shown, 255 * sky) > min(50, psnr_in(near, whole, 255 * sky) - 1)
+
+
+def test_gaussians_follow_the_picture():
+    pixels = np.full((128, 128, 3), 90, np.uint8)
+    pixels[:64, :64] = mosaic(64)
+    mean = arrays_of(eg.fit_large(pixels, **FEW))["mean"]
+    assert (mean < 64).all(axis=1).mean() > 0.5  # on a quarter of the pixels
+
+
+@pytest.mark.parametrize("iterations", [10, 200])
+def test_order_of_blocks_does_not_matter(iterations):
+    settings = FEW | {"iterations": iterations}
+    one = eg.fit_large(mosaic(128), **settings)
+    assert_same_bits(one, eg.fit_large(mosaic(128), client=Backwards(), **settings))
+
+
+def test_kind_of_source_does_not_matter(tmp_path):
+    pixels = mosaic(128)
+    tifffile.imwrite(tmp_path / "a.tif", pixels, photometric="rgb", tile=(32, 32))
+    np.save(tmp_path / "a.npy", pixels)
+    sliced = Sliced(pixels)
+    one = eg.fit_large(pixels, **FEW)
+    for source in (tmp_path / "a.tif", tmp_path / "a.npy", sliced):
+        assert_same_bits(one, eg.fit_large(source, **FEW))
+    assert sliced.largest < pixels.size
+
+
+@pytest.mark.parametrize("color", ["rgb", "linear", "data"])
+def test_spaces(color):
+    result = eg.fit_large(mosaic(96)[..., :1], **FEW | {"color": color, "gaussians": 500})
+    assert result.gaussians.space == color
+    assert result.gaussians.channels == (1 if color == "data" else 3)
+    assert result.psnr_rgb > 22
+
+
+def test_one_block_is_the_whole():
+    result = eg.fit_large(mosaic(64), gaussians=200, iterations=20, backend="llvm")
+    whole = eg.fit(mosaic(64), gaussians=200, iterations=20, backend="llvm")
+    assert result.blocks == 1
+    assert result.psnr_rgb == pytest.approx(whole.trace[-1]["psnr_rgb"], abs=0.3)
+
+
+def test_flat_image():
+    result = eg.fit_large(np.full((96, 96), 100, np.uint8), block=48, iterations=10)
+    assert result.psnr_rgb > 60
+
+
+class Stop(Exception):
+    """The end of a run from outside."""
+
+
+@pytest.mark.parametrize("stage", ["fit", "mend", "density"])
+def test_interrupted_run_goes_on(tmp_path, stage):
+    pixels, output = mosaic(128), tmp_path / "a.npz"
+    settings = FEW | {"iterations": 200 if stage == "density" else 20}
+    whole = eg.fit_large(pixels, **settings)
+
+    def stop(done, total, row):
+        if row["stage"] == stage and done >= total / 2:
+            raise Stop
+
+    with pytest.raises(Stop):
+        eg.fit_large(pixels, output, progress=stop, **settings)
+    folder = tmp_path / "a.npz.checkpoint"
+    assert folder.is_dir() and not output.exists()
+    again = eg.fit_large(pixels, output, **settings)
+    assert again.resumed >= 1
+    assert_same_bits(whole, again)
+    assert not folder.exists()
+    saved = eg.Gaussians.load(output, backend="llvm").to_arrays()
+    np.testing.assert_array_equal(saved["mean"], arrays_of(whole)["mean"])
+
+
+def test_ctrl_c_keeps_finished_blocks(tmp_path):
+    code = f"""
+import os, signal
+import eigengs_dr as eg
+from _helpers.mosaics import mosaic
+def stop(done, total, row):
+    if row["stage"] == "fit" and done >= total / 2:
+        os.kill(os.getpid(), signal.SIGINT)
+try:
+    eg.fit_large(mosaic(128), {str(tmp_path / "a.npz")!r}, progress=stop, **{FEW!r})
+except KeyboardInterrupt:
+    print("stopped")
+"""
+    process = run_python(code, PYTHONPATH=_paths())
+    assert process.stdout == "stopped\n", process.stderr
+    result = eg.fit_large(mosaic(128), tmp_path / "a.npz", **FEW)
+    assert result.resumed >= 1
+    assert_same_bits(result, eg.fit_large(mosaic(128), **FEW))
+
+
+def _paths():
+    import os
+    from pathlib import Path
+
+    import eigengs_dr
+
+    root = Path(eigengs_dr.__file__).parents[1]
+    return os.pathsep.join([str(root), str(root / "tests")])
+
+
+def test_folder_of_another_run_is_refused(tmp_path):
+    pixels, output = mosaic(128), tmp_path / "a.npz"
+
+    def stop(done, total, row):
+        if row["stage"] == "mend":
+            raise Stop
+
+    with pytest.raises(Stop):
+        eg.fit_large(pixels, output, progress=stop, **FEW)
+    with pytest.raises(ValueError, match="with gaussians 700 instead of 701"):
+        eg.fit_large(pixels, output, **FEW | {"gaussians": 701})
+    with pytest.raises(ValueError, match="interrupted run of another image"):
+        eg.fit_large(pixels[::-1], output, **FEW)
+    assert eg.fit_large(pixels, output, **FEW).resumed == 4
+
+
+def test_progress():
+    rows = []
+    eg.fit_large(
+        mosaic(128),
+        **FEW,
+        progress=lambda done, total, row: rows.append((row["stage"], done, total)),
+    )
+    stages = list(dict.fromkeys(stage for stage, _, _ in rows))
+    assert stages == ["survey", "place", "fit", "mend", "measure"]
+    for stage in stages:
+        done = [(d, t) for s, d, t in rows if s == stage]
+        assert done[0][0] == 0 and done[-1][0] == done[-1][1]
+        assert done == sorted(done)
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"block": 8}, "block is 8; it must be at least 32"),
+        ({"block": 64.5}, "block is 64.5"),
+        ({"gaussians": 10}, "at least 64: use more, or fit a smaller version"),
+        ({"gaussians": 128 * 128 + 1}, "takes 1 to 16384"),
+        ({"gaussians": 0}, "gaussians is 0; blocks"),
+        ({"iterations": -1}, "iterations is -1"),
+        ({"color": "cmyk"}, "color 'cmyk' is unknown"),
+        ({"cutoff": 0}, "cutoff is 0"),
+    ],
+)
+def test_bad_options(options, reason):
+    with pytest.raises(ValueError, match=reason):
+        eg.fit_large(mosaic(128), **FEW | options)
+
+
+def test_bad_pixel_ends_the_run_before_the_fit(tmp_path):
+    pixels = mosaic(128) / np.float32(255)
+    pixels[100, 20] = np.inf
+    with pytest.raises(eg.ImageError, match=r"rows 0 to 114, columns 0 to 114: 1 of"):
+        eg.fit_large(pixels, tmp_path / "a.npz", **FEW)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_output_that_cannot_be_written():
+    with pytest.raises(OSError, match="gone"):
+        eg.fit_large(mosaic(128), "/gone/a.npz", **FEW)
+
+
+def test_lost_task_is_one_line():
+    class Losing(Backwards):
+        def map(self, function, tasks, shared=None, at_once=None):
+            from eigengs_dr.backend.executor import Done
+
+            yield Done(0, None, "a task ended its worker 3 times")
+
+    with pytest.raises(RuntimeError, match="image: a task ended its worker 3 times"):
+        eg.fit_large(mosaic(128), **FEW, client=Losing())
+
+
+def test_steps_never_make_a_block_worse(monkeypatch):
+    monkeypatch.setattr(rounds, "MEND_SHARE", 0)
+    solved = eg.fit_large(mosaic(128), **FEW | {"iterations": 0})
+    fitted = eg.fit_large(mosaic(128), **FEW)
+    assert fitted.psnr_ycbcr > solved.psnr_ycbcr
+
+
+@pytest.mark.slow
+def test_memory_is_that_of_a_block(tmp_path):
+    """Four times the pixels take little more: the Gaussians, and no image."""
+    measure = """
+import resource, sys
+import numpy as np
+import eigengs_dr as eg
+from eigengs_dr.blocks.draw import save_region
+from eigengs_dr.gaussian.file import read
+from pathlib import Path
+folder, side = Path(sys.argv[1]) if len(sys.argv) > 1 else Path({folder!r}), {side}
+eg.fit_large(folder / "{side}.npy", folder / "{side}.npz", iterations=2, block=256)
+data = read(folder / "{side}.npz")
+save_region(folder / "{side}.tif", data, (0, 0, side, side), (2 * side, 2 * side))
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+    used = {}
+    for side in (1024, 2048):
+        tile = mosaic(256)
+        np.save(tmp_path / f"{side}.npy", np.tile(tile, (side // 256, side // 256, 1)))
+        process = run_python(measure.format(folder=str(tmp_path), side=side), PYTHONPATH=_paths())
+        assert process.returncode == 0, process.stderr
+        used[side] = int(process.stdout) * 1024
+    more = 2048**2 - 1024**2
+    assert used[2048] - used[1024] < 12 * more  # one image more in single precision
+
+
+def test_written_set_draws_by_strips(tmp_path, monkeypatch):
+    from eigengs_dr.blocks import draw
+
+    result = eg.fit_large(mosaic(128), tmp_path / "a.npz", **FEW)
+    data = read(tmp_path / "a.npz")
+    whole = np.rint(255 * eg.picture_of(result.gaussians, 512, 512).clip(0, 1))
+    monkeypatch.setattr(draw, "BAND_PIXELS", 1)
+    bands = list(draw.draw_region(data, (0, 0, 128, 128), (512, 512), "llvm"))
+    assert [band.shape for band in bands] == [(256, 512, 3)] * 2
+    assert np.abs(np.concatenate(bands) - whole).max() <= 1
+    for name in ("a.png", "a.tif"):
+        save_region(tmp_path / name, data, (0, 0, 128, 128), (512, 512), "llvm")
+        found = np.rint(255 * eg.load_image(tmp_path / name))
+        np.testing.assert_array_equal(found, np.concatenate(bands))

@@ -1,0 +1,86 @@
+"""Blocks, and the Gaussians dealt to them."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eigengs_dr.blocks.grid import choose_halo, deal, divide, neighbors
+from eigengs_dr.blocks.seams import seams
+
+
+@given(st.integers(1, 300), st.integers(1, 300), st.integers(20, 120), st.integers(0, 40))
+def test_cores_tile_the_image_inside_their_windows(width, height, side, halo):
+    covered = np.zeros((height, width), int)
+    blocks = divide(width, height, side, halo)
+    for number, block in enumerate(blocks):
+        assert block.number == number
+        covered[block.rows, block.columns] += 1
+        window = np.zeros((height, width), int)[block.window_rows, block.window_columns]
+        assert window.shape == tuple(block.window_size[::-1])
+        assert block.pixels == window[block.core].size
+        for core, around, length in (
+            (block.rows, block.window_rows, height),
+            (block.columns, block.window_columns, width),
+        ):
+            assert core.stop - core.start <= side
+            assert 0 <= around.start <= max(0, core.start - halo)
+            assert min(length, core.stop + halo) <= around.stop <= length
+    assert (covered == 1).all()
+    assert len({tuple(block.window_size) for block in blocks}) == 1
+
+
+def test_blocks_of_one_phase_do_not_touch():
+    blocks = divide(400, 300, 100, 16)
+    for block in blocks:
+        near = neighbors(block, blocks)
+        assert block in near
+        assert [other for other in near if other.phase == block.phase] == [block]
+
+
+def test_window_knows_where_the_image_goes_on():
+    first, last = divide(200, 100, 100, 8)
+    assert first.open_sides(200, 100) == (False, False, True, False)
+    assert last.open_sides(200, 100) == (True, False, False, False)
+
+
+@given(
+    st.lists(st.floats(0, 1e3), min_size=1, max_size=20),
+    st.integers(0, 2**31),
+    st.floats(0, 1),
+)
+def test_dealt_gaussians_are_all_and_fit(mass, seed, share):
+    pixels = np.random.default_rng(seed).integers(1, 50, len(mass))
+    count = len(mass) + round(share * (pixels.sum() - len(mass)))
+    dealt = deal(np.array(mass), pixels, count)
+    assert dealt.sum() == count
+    assert (dealt >= 1).all() and (dealt <= pixels).all()
+
+
+def test_gaussians_follow_the_picture():
+    dealt = deal(np.array([1.0, 2.0, 5.0]), np.array([1000, 1000, 1000]), 800)
+    assert dealt.tolist() == [100, 200, 500]
+    # A full block leaves the rest to the others.
+    assert deal(np.array([1.0, 8.0, 1.0]), np.array([100, 100, 100]), 200).tolist() == [50, 100, 50]
+
+
+def test_strips_lie_along_all_borders():
+    blocks = divide(300, 200, 100, 20)
+    strips = seams(blocks, 300, 200, 4.0, 20)
+    assert len(strips) == 2 * 2 + 3  # two vertical borders of two blocks, one border of three
+    seen = np.zeros((200, 300), int)
+    for strip in strips:
+        seen[strip.rows, strip.columns] += 1
+    assert (seen[:, 84:116] >= 1).all() and (seen[84:116] >= 1).all()
+    assert not seen[:84, :84].any()
+    for phase in range(4):
+        once = np.zeros((200, 300), int)
+        for strip in strips:
+            if strip.phase == phase:
+                once[strip.rows, strip.columns] += 1
+        assert once.max() == 1
+
+
+@pytest.mark.parametrize("spacing", [1.0, 4.5, 16.0])
+def test_halo_grows_with_the_spacing(spacing):
+    assert choose_halo(spacing) == max(16, np.ceil(5 * spacing))

@@ -1,0 +1,80 @@
+"""Parts of a set."""
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from eigengs_dr.blocks.draw import draw
+from eigengs_dr.gaussian.crop import crop, reaches, touches
+from eigengs_dr.gaussian.file import SetData
+
+
+def random_set(count=200, size=(96, 64), space="ycbcr"):
+    """Gaussians of many sizes and angles."""
+    rng = np.random.default_rng(3)
+    mean = rng.uniform(0, size, (count, 2))
+    a, c = np.exp(rng.uniform(-2.5, 0.5, (2, count)))
+    factor = np.stack([a, rng.normal(0, 0.3, count), c], axis=1)
+    color = rng.normal(0, 0.3, (count, 3))
+    arrays = {"mean": mean, "factor": factor, "color": color, "background": [0.4, 0.5, 0.5]}
+    return SetData({k: np.asarray(v, np.float32) for k, v in arrays.items()}, size, space)
+
+
+def whole(data):
+    return eg.picture_of(
+        eg.Gaussians.from_arrays(**data.arrays, size=data.size, space=data.space, backend="llvm")
+    )
+
+
+@pytest.mark.parametrize(
+    "region", [(0, 0, 96, 64), (13, 7, 30, 21), (90, 60, 6, 4), (0, 63, 96, 1)]
+)
+def test_part_draws_what_the_whole_shows(region):
+    data, (left, top, width, height) = random_set(), region
+    part = crop(data, (left, top), (width, height))
+    assert part.size == (width, height)
+    shown = whole(data)[top : top + height, left : left + width]
+    np.testing.assert_allclose(draw(part, "llvm"), shown, atol=2e-5)
+
+
+def test_scaled_part():
+    data = random_set()
+    part = crop(data, (10, 20), (60, 40), (2.0, 2.0))
+    large = whole(
+        data._replace(arrays=crop(data, (0, 0), (192, 128), (2.0, 2.0)).arrays, size=(192, 128))
+    )
+    np.testing.assert_allclose(draw(part, "llvm"), large[40:80, 20:80], atol=2e-5)
+
+
+def test_only_gaussians_that_touch_are_kept():
+    data = random_set()
+    part = crop(data, (40, 30), (8, 8))
+    assert 0 < len(part.arrays["mean"]) < len(data.arrays["mean"])
+    kept = touches(data, (40, 30), (8, 8))
+    np.testing.assert_array_equal(part.arrays["color"], data.arrays["color"][kept])
+
+
+def test_reach_is_where_a_gaussian_ends():
+    data = SetData(
+        {
+            "mean": np.array([[30, 20]], np.float32),
+            "factor": np.array([[0.5, 0.3, 0.4]], np.float32),
+            "color": np.ones((1, 1), np.float32),
+            "background": np.zeros(1, np.float32),
+        },
+        (60, 40),
+        "data",
+    )
+    rows, columns = np.nonzero(whole(data)[..., 0])
+    (across,), (down,) = reaches(data)
+    assert np.abs(columns + 0.5 - 30).max() == pytest.approx(across, abs=1)
+    assert np.abs(rows + 0.5 - 20).max() == pytest.approx(down, abs=1)
+
+
+def test_part_without_gaussians_is_background():
+    data = random_set(1)
+    data.arrays["mean"][:] = 2
+    data.arrays["factor"][:] = [2, 0, 2]
+    part = crop(data, (50, 30), (4, 3))
+    assert len(part.arrays["mean"]) == 0
+    np.testing.assert_allclose(draw(part, "llvm"), whole(data)[30:33, 50:54], atol=1e-6)
