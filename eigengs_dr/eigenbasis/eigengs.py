@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.recording import exclusive
-from ..collection.run import ImageRow, RowProgress
+from ..collection.row import ImageRow, RowProgress
 from ..collection.sources import Images
 from ..fitting.solvers.normal_equations import NormalEquations
 from ..gaussian.gaussians import Gaussians

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..collection.run import FAILURES, ImageRow, Outcome, RowProgress, collect, run_images
+from ..collection.plan import run_images
+from ..collection.row import ImageRow, Outcome, RowProgress, collect
+from ..collection.run import FAILURES, Job
 from ..collection.sources import Images
 from ..gaussian.gaussians import Gaussians
 
@@ -60,9 +62,9 @@ def encode_each(
     images, output, overwrite, progress
         See `eigengs_dr.EigenGS.encode_many`, also for results and errors.
     """
-    work = partial(_encode_group, encode=encode)
+    job = Job(lambda: partial(_encode_group, encode=encode), _may_join)
     folder = None if output is None else Path(output)
-    total, finished = run_images(images, folder, overwrite, False, work, _may_join)
+    total, finished = run_images(images, folder, overwrite, job)
     return collect(total, finished, folder is None, progress)
 
 

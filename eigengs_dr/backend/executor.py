@@ -1,0 +1,140 @@
+"""Where tasks run: in this process, or on the workers of a cluster.
+
+Functions that take ``client`` ask `executor_for` for an `Executor`. This module knows no cluster:
+`EXECUTORS` names the module that does, and the first client of that kind imports it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterable
+from pkgutil import resolve_name
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+EXECUTORS = {"distributed": "eigengs_dr.cluster.executor:ClusterExecutor"}
+"""Executors by the package that defines the class of the client; each entry, ``module:class``,
+makes an `Executor` of a client."""
+
+Function = Callable[[Any, Any], Any]
+"""``function(task, shared)``, a function of a module."""
+
+
+class ClusterError(RuntimeError):
+    """A cluster cannot be used or is lost; the message is one line."""
+
+
+class Done(NamedTuple):
+    """A task that has ended.
+
+    Attributes
+    ----------
+    index : int
+        Place of the task among the tasks, from 0.
+    value : Any
+        What the function returned.
+    lost : str
+        One line, if the task ended its worker so often that it is given up; the value is then
+        None. Else empty.
+    """
+
+    index: int  # type: ignore[assignment]  # hides the method of tuples
+    value: Any
+    lost: str = ""
+
+
+@runtime_checkable
+class Executor(Protocol):
+    """A place where tasks run.
+
+    Attributes
+    ----------
+    workers : int
+        Number of processes that run tasks.
+    """
+
+    workers: int
+
+    def map(
+        self,
+        function: Function,
+        tasks: Iterable[Any],
+        shared: Any = None,
+        at_once: int | None = None,
+    ) -> Generator[Done, None, None]:
+        """Call ``function(task, shared)`` for every task, and yield the results.
+
+        Parameters
+        ----------
+        function : callable
+            A function of a module. It may run twice for one task, if a worker is lost.
+        tasks : iterable
+            Tasks of NumPy arrays, paths, numbers, bytes, and records of these. They are drawn when
+            workers become free, a few ahead.
+        shared : Any
+            What all tasks use; it travels once.
+        at_once : int, optional
+            Largest number of tasks that are drawn and have not ended; by default some more than
+            there are workers.
+
+        Yields
+        ------
+        Done
+            In this process in order; on a cluster as the tasks end.
+
+        Raises
+        ------
+        ClusterError
+            If the cluster is lost.
+        Exception
+            What the function raises.
+        """
+
+
+class LocalExecutor:
+    """The `Executor` of this process: one task after the other, without copies."""
+
+    workers = 1
+
+    def map(
+        self,
+        function: Function,
+        tasks: Iterable[Any],
+        shared: Any = None,
+        at_once: int | None = None,
+    ) -> Generator[Done, None, None]:
+        """Call ``function(task, shared)`` for every task; see `Executor.map`."""
+        for index, task in enumerate(tasks):
+            yield Done(index, function(task, shared))
+
+
+def executor_for(client: Any = None) -> Executor:
+    """Return the executor of a client.
+
+    Parameters
+    ----------
+    client : distributed.Client, Executor or None
+        None stands for this process.
+
+    Returns
+    -------
+    Executor
+
+    Raises
+    ------
+    TypeError
+        If no executor is known for the type of the client.
+    ClusterError
+        If the workers of the client cannot be used.
+    """
+    if client is None:
+        return LocalExecutor()
+    if isinstance(client, Executor) and _package(client) not in EXECUTORS:
+        return client
+    if _package(client) not in EXECUTORS:
+        kind = f"{type(client).__module__}.{type(client).__name__}"
+        raise TypeError(f"client is a {kind}; pass a distributed.Client, or None")
+    executor: Executor = resolve_name(EXECUTORS[_package(client)])(client)
+    return executor
+
+
+def _package(client: Any) -> str:
+    return type(client).__module__.partition(".")[0]
