@@ -66,7 +66,7 @@ def local_cluster(workers: int, **settings: object) -> LocalCluster:
     settings : object
         More arguments of `distributed.LocalCluster`.
     """
-    options = {"dashboard_address": None, "silence_logs": logging.CRITICAL, **settings}
+    options = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL, **settings}
     return LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, **options)
 
 

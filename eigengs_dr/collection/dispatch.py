@@ -30,6 +30,9 @@ CHUNK_SECONDS = 4.0
 """Aim for the time of a chunk. A task costs Dask some milliseconds, and a lost worker loses half a
 chunk on average."""
 
+LAST_CHUNK_SECONDS = 1.5
+"""Aim for the time of the last chunks; shorter ones would part groups of images."""
+
 FIRST_CHUNK, MAX_CHUNK = 4, 256
 """Images of the first chunks, before the time of one is known, and of the largest."""
 
@@ -204,11 +207,16 @@ class _Chunks:
             yield Finished(row_of(source), place=source.place)
 
     def _length(self, drawn: int) -> int:
-        """Return the number of images of a chunk; the last chunks are small, so that all end."""
-        length = CHUNK_SECONDS / max(self._seconds, 1e-6)
+        """Return the number of images of a chunk, a power of 2, as small images go in groups.
+
+        The last chunks are shorter, so that all workers end at about the same time.
+        """
+        seconds = CHUNK_SECONDS
         if self.total is not None:
-            length = min(length, (self.total - drawn) / (2 * self.workers))
-        return max(1, min(int(length), MAX_CHUNK))
+            share = self._seconds * (self.total - drawn) / (2 * self.workers)
+            seconds = min(seconds, max(share, LAST_CHUNK_SECONDS))
+        length = min(max(1, int(seconds / max(self._seconds, 1e-6))), MAX_CHUNK)
+        return 1 << (length.bit_length() - 1)
 
     def _begin(self, sources: list[Source]) -> Chunk:
         self.start([source.name for source in sources])

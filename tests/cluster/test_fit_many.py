@@ -213,3 +213,17 @@ def test_the_number_of_workers_changes_no_bit(photos, output, expected, workers)
     with connect(f"local:{workers}") as client:
         eg.fit_many(photos, output, client=client, **QUICK)
     assert_complete(output, expected)
+
+
+def test_encoded_images_are_those_of_this_process(client, photos, output):
+    model = small_model("llvm")
+    here = model.encode_many(photos)
+    rows = model.encode_many(photos, client=client)
+    model.encode_many(photos, output, client=client)
+    for row, other in zip(rows, here, strict=True):
+        found, expected = row.result.to_arrays(), other.result.to_arrays()
+        stored = eg.Gaussians.load(output / f"{row.name}.npz").to_arrays()
+        for name, values in expected.items():
+            # Groups share matrix products, whose rounding depends on their width.
+            np.testing.assert_allclose(found[name], values, atol=2e-5)
+            np.testing.assert_allclose(stored[name], values, atol=2e-5)
