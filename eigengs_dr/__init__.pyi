@@ -1,11 +1,12 @@
 """The public names of eigengs_dr; `lazy_loader` and type checkers read this file."""
 
+from .backend.executor import ClusterError
 from .backend.recording import exclusive
 from .backend.selection import BackendError
 from .blocks.fit_large import LargeFit, fit_large
 from .codec.bit_allocation import PackResult, pack
 from .collection.fit_many import fit_many
-from .collection.run import ImageRow, RunInterrupted
+from .collection.row import ImageRow, RunInterrupted
 from .eigenbasis.eigengs import EigenGS
 from .eigenbasis.pca.basis import Eigenbasis
 from .fitting.fit import Fit, FitInterrupted, fit
@@ -24,6 +25,7 @@ __version__: str
 
 __all__ = [
     "BackendError",
+    "ClusterError",
     "EigenGS",
     "Eigenbasis",
     "Fit",

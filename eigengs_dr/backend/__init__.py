@@ -6,5 +6,6 @@
 - ``arrays``: array types that go together; copies of NumPy arrays
 - ``recording``: frozen programs; one thread at a time
 - ``interrupt``: Ctrl-C and SIGTERM between steps
+- ``executor``: where tasks run, in this process or on a cluster
 - ``doctor``: what works here and what to install
 """

@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from ..backend.executor import ClusterError
 from ..backend.selection import BackendError
 
 NAME = "eigengs-dr"
@@ -40,7 +41,7 @@ class Program(click.Group):
         except OSError as error:
             complete = error.filename is not None and error.strerror is not None
             say(f"error: {error.filename}: {error.strerror}" if complete else f"error: {error}")
-        except (ValueError, BackendError) as error:
+        except (ValueError, BackendError, ClusterError) as error:
             say(f"error: {error}")
         except RuntimeError as error:
             # Dr.Jit raises this error for a second Ctrl-C while it traces a program.

@@ -1,6 +1,6 @@
 """The command ``eigengs-dr fit``: fit images by Gaussians."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,12 +12,22 @@ from ..fitting.initializers import INITIALIZERS
 from ..fitting.options import DEFAULT_BASIS, FitOptions
 from ..fitting.presets import PRESETS
 from ..image.color import SPACES
+from .cluster import open_cluster
 from .console import INTERRUPTED, say
 from .fit_large import block_side, check_large, fit_by_blocks
 from .fit_many import fit_several
 from .fit_one import fit_one
 from .memory import announce_memory
-from .options import ANY_PATH, backend_option, choice, describe_run, quiet_option, report_option
+from .options import (
+    ANY_PATH,
+    ImageSource,
+    backend_option,
+    choice,
+    cluster_option,
+    describe_run,
+    quiet_option,
+    report_option,
+)
 from .outputs import check_outputs, name_outputs
 from .report import write_report
 
@@ -30,11 +40,9 @@ MISSED = 1
 FAILED = 2
 """Exit code if one of several images cannot be fitted."""
 
-INPUT = click.Path(exists=True, path_type=Path)
-
 
 @click.command()
-@click.argument("images", nargs=-1, required=True, type=INPUT, metavar="IMAGE...")
+@click.argument("images", nargs=-1, required=True, type=ImageSource(), metavar="IMAGE...")
 @click.option(
     "-o", "--output", type=ANY_PATH, help=".npz file or folder.  [default: the current folder]"
 )
@@ -82,6 +90,7 @@ INPUT = click.Path(exists=True, path_type=Path)
 )
 @click.option("--preview", type=ANY_PATH, help="Picture (or folder) of photo, fit and outlines.")
 @click.option("--overwrite", is_flag=True, help="Fit images of several whose results exist.")
+@cluster_option
 @backend_option
 @report_option
 @quiet_option
@@ -89,22 +98,24 @@ INPUT = click.Path(exists=True, path_type=Path)
 def fit(
     context: click.Context,
     /,
-    images: tuple[Path, ...],
+    images: tuple[Path | str, ...],
     output: Path | None,
     blocks: int | None,
     levels: int | None,
     preview: Path | None,
     overwrite: bool,
+    cluster: str | None,
     report: Path | None,
     quiet: bool,
     **settings: Any,
 ) -> None:
     """Fit images by sums of Gaussians.
 
-    An IMAGE may be a folder of images. For several images, -o and --preview name folders, and the
-    files in them have the names of the images. An image whose result exists is skipped, so that the
-    same command continues a run; --overwrite fits it again. An image that cannot be fitted is left
-    out; the exit code is then 2.
+    An IMAGE may be a folder of images, a pattern in quotes, or a URL. For several images, -o and
+    --preview name folders, and the files in them have the names of the images; manifest.jsonl has a
+    row for each. An image whose result exists is skipped, so that the same command continues a run;
+    --overwrite fits it again. An image that cannot be fitted is left out; the exit code is then 2.
+    With --cluster the processes of a Dask cluster fit the images, with the same results.
 
     Ctrl-C writes the best fit so far of one image, or ends after the last complete one of several,
     and exits with code 130. If --target-psnr cannot be reached, the command says so, writes the
@@ -121,6 +132,8 @@ def fit(
       eigengs-dr fit photo.jpg -o photo.npz --basis natural --iterations 100
       eigengs-dr fit photos/ -o fits/ --iterations 300 --report fits.json
       eigengs-dr fit photos/ extra.png -o fits/ --overwrite --preview previews/
+      eigengs-dr fit "photos/**/*.jpg" -o fits/ --cluster local:4
+      eigengs-dr fit s3://bucket/photos/ -o /shared/fits/ --cluster tcp://node1:8786
       eigengs-dr fit roughness.png -o roughness.npz --color data
       eigengs-dr fit huge.tif -o huge.npz --blocks 1024
     """
@@ -130,31 +143,39 @@ def fit(
     options = FitOptions(**settings)
     if levels is not None:
         check_options(options)
-    paths = _expand(images)
-    several = len(paths) > 1 or any(path.is_dir() for path in images)
+    paths = [file for source in images for file in _expand(source)]
+    several = len(paths) > 1 or paths != list(images)
+    if cluster and (preview or not (several or blocks)):
+        raise ValueError("--cluster takes several images, or --blocks, and no --preview")
     outputs = name_outputs(paths, output, [".npz"], several)
     previews = name_outputs(paths, preview, list(SAVE_OPTIONS), several) if preview else []
     check_outputs([*outputs, *previews, report], [*paths, *_basis_file(options)])
     if output is None:
         _check_replaced(outputs)
-    side = blocks or block_side(paths[0], several, options, levels, preview)
+    side = blocks or block_side(Path(paths[0]), several, options, levels, preview)
     if side:
         check_large(options, levels, preview, several)
     elif not several:
-        announce_memory(paths[0], options, quiet)
-    select(options.backend)
+        announce_memory(Path(paths[0]), options, quiet)
+    if not cluster:
+        select(options.backend)
     _note_mean(options)
     if side:
-        record, interrupted = fit_by_blocks(paths[0], outputs[0], side, options, quiet)
+        with open_cluster(cluster) as client:
+            record, interrupted = fit_by_blocks(
+                Path(paths[0]), outputs[0], side, options, quiet, client
+            )
         records = [record]
     elif several:
-        measured = report is not None
-        records, interrupted = fit_several(
-            paths, outputs[0].parent, previews, options, levels, overwrite, quiet, measured
-        )
+        folder, measured = outputs[0].parent, report is not None
+        with open_cluster(cluster) as client:
+            records, interrupted = fit_several(
+                paths, folder, previews, options, levels, overwrite, quiet, measured, client
+            )
     else:
         picture = previews[0] if previews else None
-        records = [fit_one(paths[0], outputs[0], picture, quiet, options, _fitter(options, levels))]
+        fitter = _fitter(options, levels)
+        records = [fit_one(Path(paths[0]), outputs[0], picture, quiet, options, fitter)]
         interrupted = records[0]["stopped"] == "interrupted"
     if report:
         figures = {"images": records} if several else records[0]
@@ -177,11 +198,11 @@ def _decisive(options: FitOptions, levels: int | None) -> dict[str, Any]:
     return settings | {"levels": levels}
 
 
-def _expand(images: tuple[Path, ...]) -> list[Path]:
-    """Replace folders by the images in them."""
-    from ..image.folder import image_files
+def _expand(source: Path | str) -> Sequence[Path | str]:
+    """Replace a folder, a pattern or a URL by the images that it stands for."""
+    from ..collection.sources import list_files
 
-    return [file for path in images for file in (image_files(path) if path.is_dir() else [path])]
+    return [source] if isinstance(source, Path) and source.is_file() else list_files(source)
 
 
 def _basis_file(options: FitOptions) -> list[Path]:

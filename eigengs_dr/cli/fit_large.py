@@ -60,7 +60,7 @@ def block_side(
 
 
 def fit_by_blocks(
-    path: Path, output: Path, side: int, options: FitOptions, quiet: bool
+    path: Path, output: Path, side: int, options: FitOptions, quiet: bool, client: Any = None
 ) -> tuple[dict[str, Any], bool]:
     """Fit one image by blocks into a file.
 
@@ -73,6 +73,8 @@ def fit_by_blocks(
         Options that `check_large` accepts.
     quiet : bool
         Show no bar and no summary.
+    client : distributed.Client, optional
+        Where blocks are fitted.
 
     Returns
     -------
@@ -90,7 +92,9 @@ def fit_by_blocks(
     with progress_bar(quiet) as show:
         progress = partial(_show, show, path.name)
         try:
-            result = fit_large(path, output, block=side, progress=progress, **settings)
+            result = fit_large(
+                path, output, block=side, progress=progress, client=client, **settings
+            )
         except KeyboardInterrupt:
             record["seconds"] = time.perf_counter() - started
             say(

@@ -13,14 +13,14 @@ import click
 from .console import images_bar, say
 
 if TYPE_CHECKING:
-    from ..collection.run import Finished
+    from ..collection.row import Finished
     from ..fitting.options import FitOptions
 
 Record = dict[str, Any]
 
 
 def fit_several(
-    paths: list[Path],
+    paths: list[Path | str],
     folder: Path,
     previews: list[Path],
     options: FitOptions,
@@ -28,13 +28,14 @@ def fit_several(
     overwrite: bool,
     quiet: bool,
     measure: bool,
+    client: Any = None,
 ) -> tuple[list[Record], bool]:
     """Fit images into a folder, and say what failed as it fails.
 
     Parameters
     ----------
-    paths : list of Path
-        Image files.
+    paths : list of Path or str
+        Image files, or their URLs.
     folder : Path
         Folder of the results.
     previews : list of Path
@@ -44,7 +45,9 @@ def fit_several(
     quiet : bool
         Show no bar and no summary.
     measure : bool
-        Also compute SSIM and MS-SSIM, for a report.
+        Also compute SSIM and MS-SSIM, for a report. On a cluster they are not computed.
+    client : distributed.Client, optional
+        See `eigengs_dr.fit_many`.
 
     Returns
     -------
@@ -56,7 +59,7 @@ def fit_several(
     """
     from ..collection.fit_many import fit_each
 
-    started, records = time.perf_counter(), list[Record]()
+    started, records = time.perf_counter(), dict[int, Record]()
     interrupted = False
     with images_bar(quiet, len(paths)) as show:
         label = ""
@@ -64,14 +67,15 @@ def fit_several(
         def step(share: float) -> None:
             show(len(records) + min(share, 1), label)
 
-        _, images = fit_each(paths, folder, overwrite, options, levels, step)
+        _, images = fit_each(paths, folder, overwrite, options, levels, step, client)
         try:
             with closing(images):
                 for finished in images:
-                    preview = previews[len(records)] if previews else None
-                    records.append(_record(finished, preview, options.color, measure))
-                    if records[-1]["stopped"] == "failed":
-                        say(f"error: {records[-1]['error']}")
+                    preview = previews[finished.place] if previews else None
+                    record = _record(finished, preview, options.color, measure)
+                    records[finished.place] = record
+                    if record["stopped"] == "failed":
+                        say(f"error: {record['error']}")
                     elif finished.row.psnr_rgb is not None:
                         label = f"{finished.row.psnr_rgb:.2f} dB"
                     show(len(records), label)
@@ -80,9 +84,10 @@ def fit_several(
     if interrupted:
         done = f"{len(records)} of {len(paths)} images are done"
         say(f"interrupted; {done}; the same command fits the others")
+    ordered = [records[place] for place in sorted(records)]
     if not quiet:
-        click.echo(_summary(records, folder, time.perf_counter() - started))
-    return records, interrupted
+        click.echo(_summary(ordered, folder, time.perf_counter() - started))
+    return ordered, interrupted
 
 
 def _record(finished: Finished, preview: Path | None, color: str, measure: bool) -> Record:
@@ -92,23 +97,17 @@ def _record(finished: Finished, preview: Path | None, color: str, measure: bool)
     from ..image.metrics import float_space
     from .pictures import comparison
 
-    row, pixels = finished
+    row, pixels = finished.row, finished.pixels
     record: Record = {"input": str(row.input), "output": str(row.output)}
-    if pixels is None or row.status != "done":
+    if row.status != "done":
         reason = {"error": row.error} if row.error else {}
         return {**record, "stopped": row.status, **reason}
+    names = ("width", "height", "gaussians", "iterations", "stopped", "seconds")
+    record |= {name: getattr(row, name) for name in (*names, "psnr_ycbcr", "psnr_rgb")}
+    if pixels is None:  # it stays with the worker that fitted it
+        return record
     result = row.result
-    record |= {
-        "width": row.width,
-        "height": row.height,
-        "gaussians": row.gaussians,
-        "iterations": result.iterations,
-        "stopped": result.stopped,
-        "seconds": result.seconds,
-        "seconds_init": result.seconds_init,
-        "psnr_ycbcr": row.psnr_ycbcr,
-        "psnr_rgb": row.psnr_rgb,
-    }
+    record["seconds_init"] = result.seconds_init
     if preview:
         try:
             eg.save_image(preview, comparison(pixels, result.image, result.gaussians))

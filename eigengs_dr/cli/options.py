@@ -1,5 +1,6 @@
 """Options of several commands, and the record of a run in a report."""
 
+import glob
 import re
 import shlex
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 import click
 
 from ..backend.selection import describe
+from ..collection.remote import is_url
 from .console import NAME
 
 EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -38,6 +40,13 @@ quiet_option = click.option("--quiet", is_flag=True, help="Show no progress and 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 
+cluster_option = click.option(
+    "--cluster",
+    metavar="local[:N]|tcp://HOST:PORT|FILE",
+    help="Work on N processes here, or on a Dask cluster.",
+)
+
+
 class Size(click.ParamType):
     """Width and height in pixels, as in "1024x768"."""
 
@@ -49,6 +58,20 @@ class Size(click.ParamType):
         if not match:
             self.fail(f"{value}: expected width and height, such as 1024x768", param, context)
         return check_pixels(int(match[1]), int(match[2]))
+
+
+class ImageSource(click.Path):
+    """An image file, a folder of images, a pattern such as "a/*.png", or a URL of one of them."""
+
+    def __init__(self) -> None:
+        super().__init__(exists=True, path_type=Path)
+
+    def convert(self, value: Any, param: Any, context: Any) -> Any:
+        """Return a `Path`, or the text of a URL; a pattern need not exist."""
+        if is_url(value):
+            return value
+        pattern = glob.has_magic(str(value)) and not Path(value).exists()
+        return Path(value) if pattern else super().convert(value, param, context)
 
 
 class Counts(click.ParamType):

@@ -4,18 +4,19 @@ import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from ..collection.remote import stem_of
 from ..storage.atomic import require_writable
 
 
 def name_outputs(
-    inputs: Sequence[Path], output: Path | None, suffixes: Sequence[str], folder: bool = False
+    inputs: Sequence[Path | str], output: Path | None, suffixes: Sequence[str], folder: bool = False
 ) -> list[Path]:
     """Name one output file for each input.
 
     Parameters
     ----------
-    inputs : sequence of Path
-        The input files.
+    inputs : sequence of Path or str
+        The input files, or their URLs.
     output : Path or None
         The output file or folder. Several inputs need a folder; it is created if it is missing.
         Files in a folder have the names of the inputs. None is the current folder.
@@ -48,7 +49,7 @@ def name_outputs(
     twice = next((path for k, path in enumerate(inputs) if real[k] in real[:k]), None)
     if twice:
         raise ValueError(f"{twice}: is given twice; give it once")
-    names = [path.stem + suffixes[0] for path in inputs]
+    names = [stem_of(path) + suffixes[0] for path in inputs]
     duplicate = next((name for name in names if names.count(name) > 1), None)
     if duplicate:
         raise ValueError(f"{output / duplicate}: two images have this name; rename one of them")
@@ -56,15 +57,15 @@ def name_outputs(
     return [output / name for name in names]
 
 
-def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> None:
+def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | str]) -> None:
     """Check that every output can be written and overwrites neither an input nor another output.
 
     Parameters
     ----------
     outputs : iterable of Path or None
         The files to write; None is skipped.
-    inputs : iterable of Path
-        The files to read.
+    inputs : iterable of Path or str
+        The files to read, or their URLs.
 
     Raises
     ------

@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from ..backend.selection import select
+from .cluster import open_cluster
 from .console import INTERRUPTED, progress_bar, say
 from .options import (
     ANY_PATH,
@@ -14,6 +15,7 @@ from .options import (
     Size,
     backend_option,
     choice,
+    cluster_option,
     describe_run,
     quiet_option,
     report_option,
@@ -77,6 +79,7 @@ MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
 @choice("--color", ["ycbcr", "rgb"], "Space of the components.")
 @seed_option
 @click.option("--preview", type=ANY_PATH, help="Picture of the components.")
+@cluster_option
 @backend_option
 @report_option
 @quiet_option
@@ -86,6 +89,7 @@ def train(
     /,
     folder: Path,
     output: Path,
+    cluster: str | None,
     backend: str | None,
     preview: Path | None,
     report: Path | None,
@@ -97,13 +101,15 @@ def train(
     A model is one set of Gaussians that renders all principal components of the images. One image
     in ten is held out and measured at the end. --energy counts the variance of each channel of
     the training images; --target-psnr measures PCA, in --color, of the images held out. After
-    Ctrl-C or a crash, the same command resumes from the folder MODEL.npz.checkpoint.
+    Ctrl-C or a crash, the same command resumes from the folder MODEL.npz.checkpoint. With --cluster
+    the processes of a Dask cluster find the components; all see FOLDER and MODEL.npz.
 
     \b
     Examples:
       eigengs-dr train photos/ -o photos.npz --preview photos.png
       eigengs-dr train faces/ -o faces.npz --size 128x128 --components 90,30,30
       eigengs-dr train photos/ -o photos.npz --target-psnr 24
+      eigengs-dr train /shared/faces/ -o /shared/faces.npz --cluster tcp://node1:8786
       eigengs-dr fit photo.jpg --basis photos.npz
     """
     from ..image.folder import image_files
@@ -117,8 +123,8 @@ def train(
 
     settings = _settings(**options)
     try:
-        with progress_bar(quiet) as show:
-            result = training.train(folder, output, settings, backend, show)
+        with open_cluster(cluster) as client, progress_bar(quiet) as show:
+            result = training.train(folder, output, settings, backend, show, client)
     except training.Interrupted as error:
         say(f"interrupted; {error}")
         context.exit(INTERRUPTED)

@@ -11,7 +11,6 @@ from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.selection import select
 from ..fitting.fit import Fit, fit_image
@@ -19,7 +18,9 @@ from ..fitting.levels import check_options, fit_levels
 from ..fitting.options import DEFAULT_BASIS, FitOptions
 from ..image.metrics import float_space, psnr
 from .fit_batch import fit_batch, fits_in_batches
-from .run import FAILURES, Finished, ImageRow, Outcome, RowProgress, collect, run_images
+from .plan import run_images
+from .row import Finished, ImageRow, Outcome, Pixels, RowProgress, collect
+from .run import FAILURES, Job, Work
 from .sources import Images
 
 MAX_GROUP_SIDE = 256
@@ -30,9 +31,10 @@ MAX_GROUP_PIXELS = 1 << 18
 faster, and an interrupt loses the group under way."""
 
 LOAD_BASIS = "eigengs_dr.eigenbasis.registry:load_basis"
-"""The loader of bases, ``module:function``; its module is imported when a fit needs it."""
+PACK_BASIS = "eigengs_dr.eigenbasis.registry:pack_basis"
+"""The loader of bases, and the function that makes one travel, ``module:function``; their module is
+imported when a fit needs it."""
 
-Pixels = NDArray[np.float32]
 Step = Callable[[float], None]
 """``step(share)``: which share of the current image is done, from 0 to 1."""
 
@@ -44,6 +46,7 @@ def fit_many(
     overwrite: bool = False,
     levels: int | None = None,
     progress: RowProgress | None = None,
+    client: Any = None,
     **options: Any,
 ) -> list[ImageRow]:
     """Fit many images; a bad image is a row with its error and does not end the run.
@@ -54,11 +57,14 @@ def fit_many(
     Parameters
     ----------
     images : path-like or iterable
-        A folder; or an iterable of files and of arrays (H, W, 3), (H, W, 1) or (H, W). The name of
-        an image is the stem of its file; arrays are named by their number, as in "000012".
+        A folder, a glob such as ``"photos/**/*.jpg"``, or a URL of one of them; or an iterable of
+        files, of URLs and of arrays (H, W, 3), (H, W, 1) or (H, W). The name of an image is the
+        stem of its file; arrays are named by their number, as in "000012". URLs need fsspec, from
+        the extra ``cluster``.
     output : path-like, optional
         Folder of the results, ``NAME.npz`` for each image; it is created if it is missing. Each
-        file is written completely or not at all. By default the results stay in memory.
+        file is written completely or not at all. ``manifest.jsonl`` has a row for each image. By
+        default the results stay in memory.
     overwrite : bool, optional
         Fit images whose output exists. By default such images are skipped, whatever the options of
         the earlier run were: a run that was interrupted continues if it is repeated. A file that
@@ -68,6 +74,10 @@ def fit_many(
     progress : callable, optional
         ``progress(done, total, row)`` after every image, with its `ImageRow`; `total` is None for
         an iterator. It may raise `KeyboardInterrupt` to end the run.
+    client : distributed.Client, optional
+        Fit on the workers of this Dask cluster; None is this process. Workers read the files and
+        write the results, so they need the same file system, or URLs. The results have the same
+        bits whatever the number of workers.
     options : Any
         Keyword arguments, the options of `eigengs_dr.fit`: gaussians, iterations, init, basis,
         preset, solve_steps, color, seed, backend, target_psnr, target_space, max_gaussians and
@@ -86,9 +96,11 @@ def fit_many(
     TypeError
         If an option is unknown.
     OSError
-        If the output folder cannot be written.
+        If the output folder cannot be written, or another run writes into it.
     BackendError
         If the backend is not available.
+    ClusterError
+        If the cluster cannot be used, or is lost. The same call continues the run.
     RunInterrupted
         After Ctrl-C or SIGTERM: a `KeyboardInterrupt` with the rows until then. Their files are
         complete. The image that was interrupted has no file.
@@ -107,7 +119,8 @@ def fit_many(
     >>> [(row.name, row.status, row.gaussians) for row in rows]
     [('000000', 'done', 200), ('000001', 'done', 200)]
     """
-    total, finished = fit_each(images, output, overwrite, FitOptions(**options), levels)
+    settings = FitOptions(**options)
+    total, finished = fit_each(images, output, overwrite, settings, levels, client=client)
     return collect(total, finished, output is None, progress)
 
 
@@ -118,20 +131,37 @@ def fit_each(
     options: FitOptions,
     levels: int | None = None,
     step: Step | None = None,
+    client: Any = None,
 ) -> tuple[int | None, Generator[Finished, None, None]]:
     """Return the number of images, if it is known, and a generator that fits them.
 
-    Arguments and errors as for `fit_many`. Each `Finished` image has its pixels and its `Fit`.
+    Arguments and errors as for `fit_many`. In this process, each `Finished` image has its pixels
+    and its `Fit`, they come in order, and `step` is called. On a cluster they come as they end.
     """
     if levels is not None:
         check_options(options)
+    if client is not None and options.initializer == "eigen":
+        basis = resolve_name(PACK_BASIS)(options.basis or DEFAULT_BASIS, options.backend)
+        options = replace(options, basis=basis)
+    make_work = partial(fit_work, options, levels, None if client is not None else step)
+    job = Job(make_work, _may_join, keep_grey=options.color == "data")
+    folder = None if output is None else Path(output)
+    return run_images(images, folder, overwrite, job, client)
+
+
+def fit_work(options: FitOptions, levels: int | None = None, step: Step | None = None) -> Work:
+    """Return the `Work` of a fit of many images, with the basis loaded.
+
+    Raises
+    ------
+    BackendError, ValueError
+        If the backend is not available, or the basis is not.
+    """
     select(options.backend)
     if options.initializer == "eigen":
         model = resolve_name(LOAD_BASIS)(options.basis or DEFAULT_BASIS, options.backend)
         options = replace(options, basis=model)
-    work = partial(_fit_group, options=options, levels=levels, step=step)
-    folder = None if output is None else Path(output)
-    return run_images(images, folder, overwrite, options.color == "data", work, _may_join)
+    return partial(_fit_group, options=options, levels=levels, step=step)
 
 
 def _may_join(group: list[Pixels], pixels: Pixels) -> bool:
@@ -187,4 +217,6 @@ def _figures(pixels: Pixels, result: Fit, color: str) -> dict[str, Any]:
         "psnr_ycbcr": psnr(pixels, result.image, space=float_space(color)),
         "psnr_rgb": psnr(pixels, result.image, space="rgb"),
         "seconds": result.seconds,
+        "iterations": result.iterations,
+        "stopped": result.stopped,
     }

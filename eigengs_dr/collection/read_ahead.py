@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..image import io
+from .remote import load_url
 from .sources import Source
 
 THREADS = 2
@@ -34,10 +35,13 @@ class Decoded(NamedTuple):
         With the status "failed" and the error if the image cannot be read.
     pixels : ndarray of float32, shape (H, W, C), or None
         None if the source needs no work.
+    may_pass : bool
+        Whether the failure may pass: the network did not bring the image.
     """
 
     source: Source
     pixels: NDArray[np.float32] | None = None
+    may_pass: bool = False
 
 
 def read_ahead(sources: Iterable[Source], keep_grey: bool) -> Generator[Decoded, None, None]:
@@ -82,8 +86,8 @@ def _max_waiting(largest: int) -> int:
 
 
 def _submit(pool: ThreadPoolExecutor, source: Source, keep_grey: bool) -> Future[Decoded]:
-    """Start to decode a file; decode an array, or pass a source without work on, at once."""
-    if isinstance(source.image, Path) and not source.status:
+    """Start to read a file; check an array, or pass a source without work on, at once."""
+    if source.path is not None and not source.status:
         return pool.submit(_decode, source, keep_grey)
     done: Future[Decoded] = Future()
     done.set_result(Decoded(source) if source.status else _decode(source, keep_grey))
@@ -93,9 +97,13 @@ def _submit(pool: ThreadPoolExecutor, source: Source, keep_grey: bool) -> Future
 def _decode(source: Source, keep_grey: bool) -> Decoded:
     """Read one image, or note why it cannot be read."""
     try:
+        if isinstance(source.image, str):
+            return Decoded(source, load_url(source.image, keep_grey))
         if isinstance(source.image, Path):
             return Decoded(source, io.load_image(source.image, keep_grey))
         return Decoded(source, io.check_image(source.image, keep_grey))
     except io.ImageError as error:
         text = str(error) if source.path else f"{source.name}: {str(error).removeprefix('image: ')}"
         return Decoded(source._replace(status="failed", error=text))
+    except OSError as error:
+        return Decoded(source._replace(status="failed", error=str(error)), may_pass=True)

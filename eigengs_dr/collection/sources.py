@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -14,9 +15,11 @@ from ..gaussian.file import FORMAT
 from ..image.folder import image_files
 from ..storage import npz
 from ..storage.atomic import require_writable
+from .manifest import STARTED, Manifest
+from .remote import is_url, list_urls, stem_of
 
 Images = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | ArrayLike]
-"""A folder, or any iterable of image files and arrays."""
+"""A folder, a glob, a URL of one of them, or any iterable of image files, their URLs and arrays."""
 
 
 class Source(NamedTuple):
@@ -26,13 +29,18 @@ class Source(NamedTuple):
     ----------
     name : str
         Stem of the file, or the number of the array with six digits.
-    image : Path or array_like
+    image : Path, str or array_like
+        A file, a URL, or the pixels.
     output : Path or None
         The file of the result; None keeps the result in memory.
     status : str
         "skipped" or "failed" if the image needs no work; else empty.
     error : str
         Why the status is "failed".
+    place : int
+        Place among the images of the run, from 0.
+    figures : dict
+        Attributes of the `ImageRow` of a skipped image.
     """
 
     name: str
@@ -40,11 +48,13 @@ class Source(NamedTuple):
     output: Path | None = None
     status: str = ""
     error: str = ""
+    place: int = 0
+    figures: dict[str, Any] = {}  # noqa: RUF012  # never changed
 
     @property
-    def path(self) -> Path | None:
-        """The file of the image; None for an array."""
-        return self.image if isinstance(self.image, Path) else None
+    def path(self) -> Path | str | None:
+        """The file or the URL of the image; None for an array."""
+        return self.image if isinstance(self.image, (Path, str)) else None
 
 
 def list_sources(images: Images) -> Iterable[Source]:
@@ -53,7 +63,8 @@ def list_sources(images: Images) -> Iterable[Source]:
     Parameters
     ----------
     images : path-like or iterable
-        A folder; or an iterable of files and of arrays, see `eigengs_dr.image.io.check_image`.
+        A folder, a glob such as ``"photos/**/*.jpg"``, or a URL of a folder, a glob or a file; or
+        an iterable of files, of URLs and of arrays, see `eigengs_dr.image.io.check_image`.
 
     Returns
     -------
@@ -67,7 +78,7 @@ def list_sources(images: Images) -> Iterable[Source]:
         If two images have one name, there is no image, or `images` is one array of one image.
     """
     if isinstance(images, (str, os.PathLike)):
-        images = image_files(Path(images))
+        images = list_files(images)
     if isinstance(images, np.ndarray) and (images.ndim < 3 or images.shape[2:] in ((1,), (3,))):
         raise ValueError(f"images: found one array of shape {images.shape}; pass a list of images")
     if not isinstance(images, (Sequence, np.ndarray)):
@@ -81,19 +92,47 @@ def list_sources(images: Images) -> Iterable[Source]:
     return sources
 
 
+def list_files(images: str | os.PathLike[str]) -> Sequence[str | Path]:
+    """List the images of a folder, a glob or a URL.
+
+    Parameters
+    ----------
+    images : path-like
+        See `list_sources`.
+
+    Returns
+    -------
+    sequence of Path or str
+        Files or URLs, sorted by name.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    if is_url(images):
+        return list_urls(str(images))
+    if glob.has_magic(os.fspath(images)) and not os.path.exists(images):
+        files = sorted(Path(name) for name in glob.glob(os.fspath(images), recursive=True))
+        if not files:
+            raise ValueError(f"{images}: no file has such a name; check the pattern")
+        return files
+    return image_files(Path(images))
+
+
 def _name_each(images: Iterable[Any]) -> Iterator[Source]:
     """Name images one by one; a name that is taken is an error of the image."""
     taken = dict[str, Any]()
     for number, image in enumerate(images):
         is_file = isinstance(image, (str, os.PathLike))
-        item = Path(image) if is_file else image
-        name = item.stem if is_file else f"{number:06d}"
+        item = Path(image) if is_file and not is_url(image) else image
+        name = stem_of(item) if is_file else f"{number:06d}"
         if name in taken:
             error = f"{item if is_file else name}: {taken[name]} has this name too; rename one"
-            yield Source(name, item, status="failed", error=error)
+            yield Source(name, item, status="failed", error=error, place=number)
             continue
         taken[name] = item if is_file else f"image {number}"
-        yield Source(name, item)
+        yield Source(name, item, place=number)
 
 
 def make_folder(output: Path) -> None:
@@ -110,21 +149,39 @@ def make_folder(output: Path) -> None:
     require_writable(output / "probe.npz")
 
 
-def plan_output(source: Source, folder: Path, overwrite: bool) -> Source:
-    """Give a source its output file, and skip it if the file holds a result.
+def plan_output(source: Source, manifest: Manifest, overwrite: bool) -> Source:
+    """Give a source its output file, and skip it if the file is its result.
 
-    A file that holds something else, such as a basis, is never replaced.
+    Parameters
+    ----------
+    source : Source
+    manifest : Manifest
+        The manifest of the output folder. If it says that a run began the image and did not end it,
+        the image is done again.
+    overwrite : bool
+        Do images again whose result exists. A file that holds something else, such as a basis, is
+        never replaced.
     """
     if source.status:
         return source
-    output = folder / f"{source.name}.npz"
+    output = manifest.path.with_name(f"{source.name}.npz")
     planned = source._replace(output=output)
     if not output.exists():
         return planned
+    row = manifest.rows.get(source.name, {})
+    if row.get("status") == "done" and not overwrite:
+        return planned._replace(status="skipped", figures=_figures(row))
     if not _is_set(output):
         error = f"{output}: exists and is no set of Gaussians; move it, or use another folder"
         return planned._replace(status="failed", error=error)
-    return planned if overwrite else planned._replace(status="skipped")
+    again = overwrite or row.get("status") in (STARTED, "failed")
+    return planned if again else planned._replace(status="skipped")
+
+
+def _figures(row: dict[str, Any]) -> dict[str, Any]:
+    """Return the figures of a row of a manifest, which may come from another version."""
+    names = ("width", "height", "gaussians", "psnr_ycbcr", "psnr_rgb", "seconds", "iterations")
+    return {name: row.get(name) for name in names}
 
 
 def _is_set(path: Path) -> bool:

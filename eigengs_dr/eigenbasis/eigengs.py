@@ -10,17 +10,21 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from pkgutil import resolve_name
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.recording import exclusive
-from ..collection.run import ImageRow, RowProgress
+from ..collection.fit_many import PACK_BASIS
+from ..collection.row import ImageRow, RowProgress
+from ..collection.run import Work
 from ..collection.sources import Images
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image
 from ..image.resize import resample
-from .encode_many import check_encoding, encode_each
+from .encode_many import check_encoding, encode_each, group_work, packed_work
 from .encoder import Encoder
 from .model_file import read_members, write_model
 from .model_fit import TrainProgress, fit_model
@@ -238,16 +242,18 @@ class EigenGS:
         mean: str = "gaussians",
         target_psnr: float | None = None,
         progress: RowProgress | None = None,
+        client: Any = None,
     ) -> list[ImageRow]:
         """Encode many images; a bad image is a row with its error and does not end the run.
 
         Parameters
         ----------
-        images, output, overwrite, progress
+        images, output, overwrite, progress, client
             See `eigengs_dr.fit_many`. ``ImageRow.result`` is a `Gaussians`, if there is no output
             folder; rows have no PSNR.
         colors, mean, target_psnr
-            See `encode`. The Gaussians equal those of `encode` to float32 rounding.
+            See `encode`. The Gaussians equal those of `encode` to float32 rounding, whatever the
+            number of workers.
 
         Returns
         -------
@@ -260,9 +266,23 @@ class EigenGS:
             See `encode` and `eigengs_dr.fit_many`.
         """
         check_encoding(colors, mean, target_psnr)
+        options = (colors, mean, target_psnr)
+        if client is None:
+            work = partial(self.encode_work, *options)
+        else:
+            work = partial(packed_work, resolve_name(PACK_BASIS)(self), *options)
+        return encode_each(work, images, output, overwrite, progress, client)
+
+    def encode_work(self, colors: str, mean: str, target_psnr: float | None) -> Work:
+        """Return the work of `encode_many` on groups of images, with checked options of `encode`.
+
+        Parameters
+        ----------
+        colors, mean, target_psnr
+            See `encode`.
+        """
         encode = exclusive()(self.encoder.encode)
-        group = partial(encode, colors=colors, mean=mean, target_psnr=target_psnr)
-        return encode_each(group, images, output, overwrite, progress)
+        return group_work(partial(encode, colors=colors, mean=mean, target_psnr=target_psnr))
 
     def dense_mean(self, width: int, height: int) -> Planes:
         """Return the pixels of the mean image, shape (height, width, C), in the model's space."""

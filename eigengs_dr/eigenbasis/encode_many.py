@@ -7,13 +7,21 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..collection.run import FAILURES, ImageRow, Outcome, RowProgress, collect, run_images
+from ..collection.fit_many import LOAD_BASIS
+from ..collection.plan import run_images
+from ..collection.row import ImageRow, Outcome, RowProgress, collect
+from ..collection.run import FAILURES, Job, Work
 from ..collection.sources import Images
 from ..gaussian.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from .registry import PackedModel
 
 MAX_GROUP = 32
 """Largest number of images that are encoded together. With the basis "natural", groups of 8, 16 and
@@ -44,25 +52,53 @@ def check_encoding(colors: str, mean: str, target_psnr: float | None) -> None:
         raise ValueError("target_psnr chooses components; use it with colors 'projected'")
 
 
-def encode_each(
-    encode: EncodeGroup,
-    images: Images,
-    output: str | os.PathLike[str] | None,
-    overwrite: bool,
-    progress: RowProgress | None,
-) -> list[ImageRow]:
-    """Encode many images.
+def group_work(encode: EncodeGroup) -> Work:
+    """Return the work on groups of images.
 
     Parameters
     ----------
     encode : callable
         ``encode(images)`` returns the Gaussians of every image of a group.
-    images, output, overwrite, progress
+    """
+    return partial(_encode_group, encode=encode)
+
+
+def packed_work(
+    packed: str | PackedModel, colors: str, mean: str, target_psnr: float | None
+) -> Work:
+    """Return the work on groups of images, on a worker of a cluster.
+
+    Parameters
+    ----------
+    packed : PackedModel or str
+        The result of `eigengs_dr.eigenbasis.registry.pack_basis`.
+    colors, mean, target_psnr
+        See `eigengs_dr.EigenGS.encode`.
+    """
+    work: Work = resolve_name(LOAD_BASIS)(packed).encode_work(colors, mean, target_psnr)
+    return work
+
+
+def encode_each(
+    make_work: Callable[[], Work],
+    images: Images,
+    output: str | os.PathLike[str] | None,
+    overwrite: bool,
+    progress: RowProgress | None,
+    client: Any = None,
+) -> list[ImageRow]:
+    """Encode many images.
+
+    Parameters
+    ----------
+    make_work : callable
+        Returns the work; on a cluster it travels.
+    images, output, overwrite, progress, client
         See `eigengs_dr.EigenGS.encode_many`, also for results and errors.
     """
-    work = partial(_encode_group, encode=encode)
+    job = Job(make_work, _may_join)
     folder = None if output is None else Path(output)
-    total, finished = run_images(images, folder, overwrite, False, work, _may_join)
+    total, finished = run_images(images, folder, overwrite, job, client)
     return collect(total, finished, folder is None, progress)
 
 

@@ -3,22 +3,81 @@
 from __future__ import annotations
 
 import os
-from functools import cache
+from dataclasses import dataclass, fields
+from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
 
 from ..backend.arrays import types_of
+from ..gaussian.file import SetData
+from ..gaussian.gaussians import Gaussians
 from .eigengs import EigenGS
 
 SHIPPED = {"natural": Path(__file__).parent / "data" / "natural.npz"}
 """Files of the package's models, by name; see ``tools/train_natural.py``."""
 
 
-def load_basis(basis: str | os.PathLike[str] | EigenGS, backend: str | None = None) -> EigenGS:
-    """Load a model by name or file.
+@dataclass(frozen=True, eq=False)
+class PackedModel:
+    """A model as NumPy arrays, for another process.
+
+    Attributes
+    ----------
+    shapes : SetData
+        The Gaussians of the model.
+    members : dict
+        The other attributes of `eigengs_dr.EigenGS`.
+    backend : str or None
+        The backend of the model.
+    """
+
+    shapes: SetData
+    members: dict[str, Any]
+    backend: str | None
+
+    @cached_property
+    def model(self) -> EigenGS:
+        """The model, with the bits of the first; it is built once in a process."""
+        arrays, size, space, cutoff = self.shapes
+        gaussians = Gaussians.from_arrays(
+            **arrays, size=size, space=space, cutoff=cutoff, backend=self.backend
+        )
+        return EigenGS(gaussians, **self.members)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the model here: arrays of Dr.Jit do not travel."""
+        return {key: value for key, value in self.__dict__.items() if key != "model"}
+
+
+def pack_basis(
+    basis: str | os.PathLike[str] | EigenGS, backend: str | None = None
+) -> str | PackedModel:
+    """Return a model in a form that travels to another process, for `load_basis` there.
 
     Parameters
     ----------
     basis : str, path-like or EigenGS
+        As for `load_basis`, also for errors. A name of `SHIPPED` stays a name.
+    backend : {"llvm", "cuda"}, optional
+        Backend there.
+    """
+    if basis in SHIPPED:
+        return str(basis)
+    model = load_basis(basis)
+    gaussians, size = model.gaussians, (model.gaussians.width, model.gaussians.height)
+    shapes = SetData(gaussians.to_arrays(), size, gaussians.space, gaussians.cutoff)
+    names = [field.name for field in fields(EigenGS) if field.name != "gaussians"]
+    return PackedModel(shapes, {name: getattr(model, name) for name in names}, backend)
+
+
+def load_basis(
+    basis: str | os.PathLike[str] | EigenGS | PackedModel, backend: str | None = None
+) -> EigenGS:
+    """Load a model by name or file.
+
+    Parameters
+    ----------
+    basis : str, path-like, EigenGS or PackedModel
         A name of `SHIPPED`, whose file is read once; a file; or a model, which is returned.
     backend : {"llvm", "cuda"}, optional
 
@@ -28,6 +87,8 @@ def load_basis(basis: str | os.PathLike[str] | EigenGS, backend: str | None = No
         If the name or file does not exist, the file is no model, or the model is on another
         backend.
     """
+    if isinstance(basis, PackedModel):
+        basis = basis.model
     if isinstance(basis, EigenGS):
         current = types_of(basis.gaussians.mean).backend
         if backend not in (None, current):

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..backend.executor import executor_for
 from ..backend.interrupt import defer_interrupts
 from ..image.folder import image_files, read_blocks
 from ..image.io import ImageError
@@ -27,6 +28,7 @@ from .model_fit import fit_model
 from .options import TrainOptions
 from .pca.basis import Eigenbasis, check_components
 from .pca.incremental_pca import EigenState, block_length, empty_state, merge, rank_for
+from .pca.shards import ShardOptions, is_large, shard_block_length, shard_states
 from .pca.truncation import TruncationCurve
 
 HELD_OUT = 10
@@ -66,6 +68,7 @@ def train(
     settings: TrainOptions,
     backend: str | None = None,
     progress: StageProgress = lambda stage, done, total: None,
+    client: Any = None,
 ) -> Training:
     """Train a model on a folder of images and write it.
 
@@ -82,11 +85,17 @@ def train(
     backend : {"llvm", "cuda"}, optional
     progress : callable, optional
         ``progress(stage, done, total)``.
+    client : distributed.Client, optional
+        Find the components on the workers of this Dask cluster, see
+        `eigengs_dr.Eigenbasis.from_images`. The images and the checkpoint must lie on a file system
+        that they share.
 
     Raises
     ------
     Interrupted
         After Ctrl-C.
+    ClusterError
+        If the cluster cannot be used, or is lost; the same call resumes.
     ValueError
         If no image can be read, or the settings are wrong or differ from the checkpoint.
     OSError
@@ -108,7 +117,7 @@ def train(
         held_out = files[HELD_OUT - 1 :: HELD_OUT]
         training = [path for i, path in enumerate(files) if i % HELD_OUT != HELD_OUT - 1]
         with defer_interrupts() as pressed:
-            run = Run(checkpoint, settings, backend, progress, pressed)
+            run = Run(checkpoint, settings, backend, progress, pressed, client)
             try:
                 held_out = held_out[:MAX_HELD_OUT]
                 basis = _basis(training, held_out, run)
@@ -149,8 +158,9 @@ class Run(NamedTuple):
     backend: str | None
     progress: StageProgress
     pressed: Callable[[], bool]
+    client: Any = None
 
-    def stop_if_pressed(self, *done: int) -> None:
+    def stop_if_pressed(self, *done: Any) -> None:
         """Raise `Interrupted` after Ctrl-C."""
         if self.pressed():
             kept = self.checkpoint.holds_work
@@ -167,6 +177,27 @@ def _basis(files: list[Path], held_out: list[Path], run: Run) -> Eigenbasis:
     settings, checkpoint = run.settings, run.checkpoint
     if (path := checkpoint.folder / "basis.npz").exists():
         return Eigenbasis.load(path)
+    ranks = tuple(rank_for(k) for k in check_components(settings.components))
+    large = run.client is not None or is_large(files)
+    state = (_state_of_shards if large else _state)(files, ranks, run)
+    basis = Eigenbasis.from_state(
+        state, settings.size, settings.components, settings.energy, settings.color
+    )
+    if settings.target_psnr is not None:
+        if (fall := truncation_curve_on(basis, held_out, run.stop_if_pressed)) is None:
+            raise ValueError(
+                f"target_psnr needs images that are held out, one in {HELD_OUT}, and none can be "
+                "read; give more images, or use energy"
+            )
+        basis = basis.truncated(fall.rank_for_psnr(settings.target_psnr))
+    basis.save(path)
+    checkpoint.remove("pca*")
+    return basis
+
+
+def _state(files: list[Path], ranks: tuple[int, ...], run: Run) -> EigenState:
+    """Merge the images block by block; the checkpoint holds the state after each block."""
+    settings, checkpoint = run.settings, run.checkpoint
     arrays = checkpoint.load("pca")
     state = EigenState.from_arrays(arrays) if arrays else empty_state(settings.size, settings.seed)
     first = int(arrays["next"]) if arrays else 0
@@ -176,7 +207,6 @@ def _basis(files: list[Path], held_out: list[Path], run: Run) -> Eigenbasis:
         run.progress("components", first + done, len(files))
         run.stop_if_pressed()
 
-    ranks = [rank_for(k) for k in check_components(settings.components)]
     source = read_blocks(files[first:], settings.size, settings.color, length, advance)
     try:
         with closing(source) as blocks:
@@ -189,19 +219,28 @@ def _basis(files: list[Path], held_out: list[Path], run: Run) -> Eigenbasis:
         if not state.count:  # else an earlier run has read some images, and only the rest is bad
             raise
         warnings.warn(f"the remaining images were skipped: {error}", stacklevel=2)
-    basis = Eigenbasis.from_state(
-        state, settings.size, settings.components, settings.energy, settings.color
+    return state
+
+
+def _state_of_shards(files: list[Path], ranks: tuple[int, ...], run: Run) -> EigenState:
+    """Merge the images in shards; the checkpoint holds the states of shards."""
+    settings = run.settings
+
+    def report(done: int, total: int) -> None:
+        run.progress("components", done, total)
+        run.stop_if_pressed()
+
+    options = ShardOptions(
+        settings.size,
+        settings.color,
+        ranks,
+        settings.seed,
+        shard_block_length(settings.size, len(files)),
+        run.checkpoint.folder,
+        advance=None if run.client is not None else run.stop_if_pressed,
     )
-    if settings.target_psnr is not None:
-        if (fall := truncation_curve_on(basis, held_out, run.stop_if_pressed)) is None:
-            raise ValueError(
-                f"target_psnr needs images that are held out, one in {HELD_OUT}, and none can be "
-                "read; give more images, or use energy"
-            )
-        basis = basis.truncated(fall.rank_for_psnr(settings.target_psnr))
-    basis.save(path)
-    checkpoint.remove("pca")
-    return basis
+    sources = [path.absolute() for path in files]
+    return shard_states(sources, options, executor_for(run.client), report)
 
 
 def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS:

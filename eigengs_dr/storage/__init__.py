@@ -3,4 +3,5 @@
 - ``atomic``: replaces a file in one step
 - ``npz``: arrays with a format, a version and checks
 - ``checkpoint``: the work of an unfinished training
+- ``lock``: a folder for one run at a time
 """

@@ -1,10 +1,19 @@
 """Files that are written completely or not at all."""
 
 import os
+import re
 import secrets
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+TEMPORARY = re.compile(r"\.[0-9a-f]{16}")
+"""Names of temporary files, without their suffix."""
+
+STALE_SECONDS = 60.0
+"""Age from which on a temporary file is what a killed process left; a write takes milliseconds, and
+its file is young until the end."""
 
 
 @contextmanager
@@ -51,6 +60,27 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
             # The error of a full disk has no name, or the name of the temporary file.
             raise OSError(error.errno, error.strerror or str(error), str(path)) from error
         raise
+
+
+def remove_stale(folder: Path) -> None:
+    """Delete the temporary files of processes that were killed while they wrote.
+
+    Parameters
+    ----------
+    folder : Path
+        A folder of results. Files younger than `STALE_SECONDS` stay: they may be written now.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be deleted.
+    """
+    now = time.time()
+    for path in folder.glob(".*"):
+        if TEMPORARY.fullmatch(path.stem):
+            with suppress(FileNotFoundError):
+                if now - path.stat().st_mtime > STALE_SECONDS:
+                    path.unlink()
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:

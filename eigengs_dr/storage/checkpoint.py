@@ -99,10 +99,7 @@ class Checkpoint:
         OSError
             If the file cannot be written; an existing file does not change.
         """
-        fields = {key: [array.dtype.str[1:], array.ndim] for key, array in arrays.items()}
-        layout = np.frombuffer(json.dumps(fields).encode(), np.uint8)
-        members = {"layout": layout, **arrays}
-        npz.write(self.folder / f"{name}.npz", FORMAT, VERSION, members, compressed=False)
+        write_arrays(self.folder / f"{name}.npz", arrays)
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
         """Return the arrays that were saved under a name, or None.
@@ -115,16 +112,43 @@ class Checkpoint:
         path = self.folder / f"{name}.npz"
         if not path.exists():
             return None
-        layout = npz.read(path, FORMAT, VERSION, {"layout": npz.Field("u1", 1)})["layout"]
-        try:
-            fields = {
-                key: npz.Field(kind, ndim, MAX_ENTRIES)
-                for key, (kind, ndim) in json.loads(layout.tobytes()).items()
-            }
-        except (ValueError, AttributeError, TypeError):
-            raise ValueError(f"{path}: layout is damaged") from None
-        return npz.read(path, FORMAT, VERSION, fields)
+        return read_arrays(path)
 
-    def remove(self, name: str) -> None:
-        """Delete the arrays that were saved under a name."""
-        (self.folder / f"{name}.npz").unlink(missing_ok=True)
+    def remove(self, pattern: str) -> None:
+        """Delete the arrays that were saved under a name, or under all names of a pattern."""
+        for path in self.folder.glob(f"{pattern}.npz"):
+            path.unlink(missing_ok=True)
+
+
+def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    """Write arrays of any names and types to a file, in one step.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written; an existing file does not change.
+    """
+    fields = {key: [array.dtype.str[1:], array.ndim] for key, array in arrays.items()}
+    layout = np.frombuffer(json.dumps(fields).encode(), np.uint8)
+    npz.write(path, FORMAT, VERSION, {"layout": layout, **arrays}, compressed=False)
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read arrays that `write_arrays` wrote.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged.
+    OSError
+        If the file cannot be opened.
+    """
+    layout = npz.read(path, FORMAT, VERSION, {"layout": npz.Field("u1", 1)})["layout"]
+    try:
+        fields = {
+            key: npz.Field(kind, ndim, MAX_ENTRIES)
+            for key, (kind, ndim) in json.loads(layout.tobytes()).items()
+        }
+    except (ValueError, AttributeError, TypeError):
+        raise ValueError(f"{path}: layout is damaged") from None
+    return npz.read(path, FORMAT, VERSION, fields)

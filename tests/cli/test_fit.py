@@ -78,7 +78,10 @@ def test_fit_several_images_into_folders(photo, tmp_path):
     settings = ["--gaussians", 20, "--iterations", 1, "--report", tmp_path / "r.json"]
     folders = ["-o", tmp_path / "fits", "--preview", tmp_path / "previews"]
     succeeded(run("fit", photo, other, *folders, *settings))
-    assert sorted(path.name for path in (tmp_path / "fits").iterdir()) == ["other.npz", "photo.npz"]
+    assert sorted(path.name for path in (tmp_path / "fits").glob("*.npz")) == [
+        "other.npz",
+        "photo.npz",
+    ]
     assert (tmp_path / "previews" / "other.png").exists()
     report = json.loads((tmp_path / "r.json").read_text())
     assert [row["width"] for row in report["images"]] == [32, 20]
@@ -310,7 +313,11 @@ def test_a_folder_is_fitted(photo, tmp_path):
     for name in ("a.png", "b.png"):
         shutil.copy(photo, folder / name)
     succeeded(run("fit", folder, "-o", tmp_path / "fits", *QUICK))
-    assert sorted(p.name for p in (tmp_path / "fits").iterdir()) == ["a.npz", "b.npz"]
+    assert sorted(p.name for p in (tmp_path / "fits").iterdir()) == [
+        "a.npz",
+        "b.npz",
+        "manifest.jsonl",
+    ]
 
 
 def test_a_folder_of_one_image_is_fitted(photo, tmp_path):
@@ -319,7 +326,7 @@ def test_a_folder_of_one_image_is_fitted(photo, tmp_path):
     shutil.copy(photo, folder / "a.png")
     outputs = ["-o", tmp_path / "fits", "--preview", tmp_path / "previews", "--report", report]
     succeeded(run("fit", folder, *outputs, *QUICK))
-    assert [p.name for p in (tmp_path / "fits").iterdir()] == ["a.npz"]
+    assert sorted(p.name for p in (tmp_path / "fits").iterdir()) == ["a.npz", "manifest.jsonl"]
     assert [p.name for p in (tmp_path / "previews").iterdir()] == ["a.png"]
     assert len(json.loads(report.read_text())["images"]) == 1
 
@@ -358,7 +365,11 @@ def test_a_bad_image_does_not_end_a_folder(photo, tmp_path):
     result = run("fit", folder, "-o", tmp_path / "fits", "--report", report, *QUICK)
     assert result.exit_code == 2
     assert "b.png" in result.stderr and result.stderr.count("\n") == 1
-    assert sorted(p.name for p in (tmp_path / "fits").iterdir()) == ["a.npz", "c.npz"]
+    assert sorted(p.name for p in (tmp_path / "fits").iterdir()) == [
+        "a.npz",
+        "c.npz",
+        "manifest.jsonl",
+    ]
     images = json.loads(report.read_text())["images"]
     assert [image["stopped"] for image in images] == ["iterations", "failed", "iterations"]
     assert "b.png" in images[1]["error"]

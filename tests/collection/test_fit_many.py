@@ -96,7 +96,7 @@ def test_bad_images_among_good_ones(photos, output):
     assert str(photos / "b.png") in rows[1].error
     assert rows[2].error.startswith("000002: ") and "not finite" in rows[2].error
     assert rows[3].error.startswith("000003: ") and "gaussians is 20" in rows[3].error
-    assert files_in(output) == ["a.npz", "d.npz"]
+    assert files_in(output) == ["a.npz", "d.npz", "manifest.jsonl"]
 
 
 def test_files_that_exist_are_skipped(photos, output):
@@ -154,12 +154,12 @@ def test_ctrl_c_leaves_what_is_done(photos, output, place, monkeypatch):
     assert [row.name for row in stopped.value.rows] == ["a", "b"]
     left = files_in(output)
     assert left[:2] == ["a.npz", "b.npz"] and "d.npz" not in left
-    for name in left:
+    for name in left[:-1]:
         assert len(eg.Gaussians.load(output / name)) == 20
     monkeypatch.undo()
     rows = eg.fit_many(photos, output, **QUICK)
     assert [row.status for row in rows[:2]] == ["skipped", "skipped"]
-    assert files_in(output) == ["a.npz", "b.npz", "c.npz", "d.npz"]
+    assert files_in(output) == ["a.npz", "b.npz", "c.npz", "d.npz", "manifest.jsonl"]
 
 
 def test_a_result_that_cannot_be_written(photos, output, monkeypatch):

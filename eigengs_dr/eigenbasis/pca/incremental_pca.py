@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,10 @@ class EigenState:
         Sum over the images of the squared distance to the mean.
     examples : ndarray of float32, shape (n, C, d)
         At most `EXAMPLES` images, each with the same probability.
+    lost : ndarray of float64, shape (C,)
+        Bound on what truncation has taken: each step adds the largest scatter that it drops. The
+        scatter of the images along any direction exceeds that of the state by at most as much, and
+        so does each of its eigenvalues (Weyl): ``0 <= exact_j - scatter_j <= lost``.
     """
 
     count: int
@@ -63,6 +67,7 @@ class EigenState:
     scatter: tuple[NDArray[np.float64], ...]
     squares: NDArray[np.float64]
     examples: NDArray[np.float32]
+    lost: NDArray[np.float64]
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the state as plain arrays, for a checkpoint."""
@@ -72,6 +77,7 @@ class EigenState:
             "mean": self.mean,
             "squares": self.squares,
             "examples": self.examples,
+            "lost": self.lost,
         }
         for c, (rows, scatter) in enumerate(zip(self.rows, self.scatter, strict=True)):
             result |= {f"rows{c}": rows, f"scatter{c}": scatter}
@@ -81,6 +87,7 @@ class EigenState:
     def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> EigenState:
         """Rebuild a state from the result of `arrays`; the next blocks then give equal bits."""
         channels = range(len(arrays["mean"]))
+        arrays = {"lost": np.zeros(len(channels)), **arrays}  # absent in an older checkpoint
         return cls(
             int(arrays["count"]),
             int(arrays["seed"]),
@@ -89,22 +96,24 @@ class EigenState:
             tuple(arrays[f"scatter{c}"] for c in channels),
             arrays["squares"],
             arrays["examples"],
+            arrays["lost"],
         )
 
 
-def empty_state(size: tuple[int, int], seed: int = 0) -> EigenState:
-    """Return the state of no images, with three channels of a size (width, height)."""
+def empty_state(size: tuple[int, int], seed: int = 0, channels: int = 3) -> EigenState:
+    """Return the state of no images, with channels of a size (width, height)."""
     if seed < 0:
         raise ValueError(f"seed is {seed}; expected no negative number")
     pixels = size[0] * size[1]
     return EigenState(
         count=0,
         seed=seed,
-        mean=np.zeros((3, pixels)),
-        rows=(np.zeros((0, pixels), np.float32),) * 3,
-        scatter=(np.zeros(0),) * 3,
-        squares=np.zeros(3),
-        examples=np.zeros((0, 3, pixels), np.float32),
+        mean=np.zeros((channels, pixels)),
+        rows=(np.zeros((0, pixels), np.float32),) * channels,
+        scatter=(np.zeros(0),) * channels,
+        squares=np.zeros(channels),
+        examples=np.zeros((0, channels, pixels), np.float32),
+        lost=np.zeros(channels),
     )
 
 
@@ -149,25 +158,82 @@ def merge(state: EigenState, block: NDArray[np.float32], rank: Sequence[int]) ->
     mean = block.mean(axis=0, dtype=np.float64)
     # This shift towards the old mean gives the new images the scatter of both last terms.
     block -= (mean + np.sqrt(n / (n + b)) * (state.mean - mean)).astype(np.float32)
-    rows, scatter, squares = [], [], []
-    for c, most in enumerate(rank):
-        gram = _gram(state.rows[c], state.scatter[c], block[:, c])
-        squares.append(np.trace(gram[len(state.rows[c]) :, len(state.rows[c]) :]))
-        values, weights = _largest_eigenpairs(gram, most, FLOOR * (n + b) * block.shape[2])
-        weights[: len(state.rows[c])] *= np.sqrt(state.scatter[c])[:, None]
-        directions = _rotate(state.rows[c], block[:, c], weights.T.astype(np.float32))
-        directions, values = _orthonormalize(directions, values)
-        rows.append(directions)
-        scatter.append(values)
+    floor = FLOOR * (n + b) * block.shape[2]
+    parts = [
+        _add_rows(state.rows[c], state.scatter[c], block[:, c], most, floor)
+        for c, most in enumerate(rank)
+    ]
     return EigenState(
         count=n + b,
         seed=state.seed,
         mean=state.mean + b / (n + b) * (mean - state.mean),
-        rows=tuple(rows),
-        scatter=tuple(scatter),
-        squares=state.squares + squares,
+        rows=tuple(part.rows for part in parts),
+        scatter=tuple(part.scatter for part in parts),
+        squares=state.squares + [part.added for part in parts],
         examples=examples,
+        lost=state.lost + [part.dropped for part in parts],
     )
+
+
+def merge_states(first: EigenState, second: EigenState, rank: Sequence[int]) -> EigenState:
+    """Return the state of the images of two states, by the equation of `merge`.
+
+    Parameters
+    ----------
+    first, second : EigenState
+        States of different images; they do not change.
+    rank : sequence of C ints
+        Most rows to keep of each channel.
+
+    Returns
+    -------
+    EigenState
+    """
+    if not second.count or not first.count:
+        return second if second.count else first
+    n, m = first.count, second.count
+    shift = np.sqrt(n / (n + m) * m) * (second.mean - first.mean)
+    floor = FLOOR * (n + m) * first.mean.shape[1]
+    parts = []
+    for c, most in enumerate(rank):
+        scaled = np.sqrt(second.scatter[c]).astype(np.float32)[:, None] * second.rows[c]
+        block = np.vstack([scaled, shift[c].astype(np.float32)])
+        parts.append(_add_rows(first.rows[c], first.scatter[c], block, most, floor))
+    return EigenState(
+        count=n + m,
+        seed=first.seed,
+        mean=first.mean + m / (n + m) * (second.mean - first.mean),
+        rows=tuple(part.rows for part in parts),
+        scatter=tuple(part.scatter for part in parts),
+        squares=first.squares + second.squares + (shift**2).sum(axis=1),
+        examples=_join_examples(first, second),
+        lost=first.lost + second.lost + [part.dropped for part in parts],
+    )
+
+
+class _Added(NamedTuple):
+    """Rows and their scatter after a step, the trace it added, the largest value it dropped."""
+
+    rows: NDArray[np.float32]
+    scatter: NDArray[np.float64]
+    added: float
+    dropped: float
+
+
+def _add_rows(
+    rows: NDArray[np.float32],
+    scatter: NDArray[np.float64],
+    block: NDArray[np.float32],
+    most: int,
+    floor: float,
+) -> _Added:
+    """Add the rows of a block to a scatter matrix ``rows^T diag(scatter) rows``."""
+    gram = _gram(rows, scatter, block)
+    added = float(np.trace(gram[len(rows) :, len(rows) :]))
+    values, weights, dropped = _largest_eigenpairs(gram, most, floor)
+    weights[: len(rows)] *= np.sqrt(scatter)[:, None]
+    directions = _rotate(rows, block, weights.T.astype(np.float32))
+    return _Added(*_orthonormalize(directions, values), added, dropped)
 
 
 def _gram(
@@ -192,12 +258,13 @@ def _product(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float
 
 def _largest_eigenpairs(
     gram: NDArray[np.float64], most: int, floor: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the largest eigenvalues, descending, and the weights of rows in unit eigenvectors."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return the largest eigenvalues, descending, the weights of rows, and the next eigenvalue."""
     values, vectors = np.linalg.eigh(gram, UPLO="L")
-    values, vectors = values[::-1][:most], vectors[:, ::-1][:, :most]
-    significant = values > max(floor, NOISE * np.trace(gram))
-    return values[significant], vectors[:, significant] / np.sqrt(values[significant])
+    values, vectors = values[::-1], vectors[:, ::-1]
+    kept = min(most, int((values > max(floor, NOISE * np.trace(gram))).sum()))
+    dropped = max(0.0, float(values[kept])) if kept < len(values) else 0.0
+    return values[:kept], vectors[:, :kept] / np.sqrt(values[:kept]), dropped
 
 
 def _rotate(
@@ -234,3 +301,17 @@ def _draw_examples(state: EigenState, block: NDArray[np.float32]) -> NDArray[np.
         if place < EXAMPLES:
             examples[place : place + 1] = [image.copy()]
     return np.stack(examples)
+
+
+def _join_examples(first: EigenState, second: EigenState) -> NDArray[np.float32]:
+    """Draw examples of two states: each place takes one of a state by the share of its images."""
+    n, m = first.count, second.count
+    share = np.random.default_rng((first.seed, n, m)).random(EXAMPLES) < n / (n + m)
+    waiting = [list(first.examples), list(second.examples)]
+    joined = []
+    for own in share:
+        order = waiting if own else waiting[::-1]
+        source = order[0] or order[1]
+        if source:
+            joined.append(source.pop(0))
+    return np.stack(joined)

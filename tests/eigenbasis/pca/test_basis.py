@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.decomposition import PCA
 
-import eigengs_dr.eigenbasis.pca.basis as pca
 from _helpers.errors import one_line
 from _helpers.low_rank import HEIGHT, SIZE, WIDTH, assert_same, basis_of, family, planes
+from eigengs_dr.eigenbasis.pca import accumulate
 from eigengs_dr.eigenbasis.pca import incremental_pca as incremental
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 from eigengs_dr.image.folder import image_files
@@ -178,7 +178,7 @@ def test_interruption_of_a_merge_leaves_no_thread(tmp_path, monkeypatch, blocks_
         raise KeyboardInterrupt
 
     blocks_of(4)
-    monkeypatch.setattr(pca, "merge", interrupted)
+    monkeypatch.setattr(accumulate, "merge", interrupted)
     with pytest.raises(KeyboardInterrupt) as caught:  # its traceback keeps the frames alive
         Eigenbasis.from_images(tmp_path, SIZE, 2)
     assert not [t for t in threading.enumerate() if t.name.startswith("decode")]

@@ -1,0 +1,269 @@
+"""The images of a run on the workers of a cluster, a chunk of images a task.
+
+A worker reads its images, writes their results and returns their rows. Chunks change no result.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..backend.executor import Executor
+from ..backend.recording import exclusive
+from ..fitting.fit import Fit
+from ..gaussian.file import SetData
+from ..gaussian.gaussians import Gaussians
+from .row import Finished
+from .run import Job, row_of, run_job
+from .sources import Source
+
+CHUNK_SECONDS = 4.0
+"""Aim for the time of a chunk. A task costs Dask some milliseconds, and a lost worker loses half a
+chunk on average."""
+
+LAST_CHUNK_SECONDS = 1.5
+"""Aim for the time of the last chunks; shorter ones would part groups of images."""
+
+FIRST_CHUNK, MAX_CHUNK = 4, 256
+"""Images of the first chunks, before the time of one is known, and of the largest."""
+
+MAX_CHUNK_BYTES = 1 << 24
+"""Bytes of the arrays of a chunk: the scheduler keeps a copy until the chunk is done."""
+
+RETRIES = 2
+"""Repetitions of an image whose failure may pass: a full disk, a network."""
+
+
+class Chunk(NamedTuple):
+    """Images for one task.
+
+    Attributes
+    ----------
+    sources : list of Source
+        With absolute paths.
+    keep_results : bool
+        Whether the results travel back.
+    """
+
+    sources: list[Source]
+    keep_results: bool
+
+
+class ChunkResult(NamedTuple):
+    """What a worker returns for a chunk: an entry for each image, its time, and its warnings."""
+
+    finished: list[Finished]
+    seconds: float
+    notes: list[str]
+
+
+def run_chunk(chunk: Chunk, job: Job) -> ChunkResult:
+    """Work on the images of a chunk; this function runs on a worker.
+
+    Parameters
+    ----------
+    chunk : Chunk
+    job : Job
+
+    Returns
+    -------
+    ChunkResult
+        Results of Dr.Jit as NumPy arrays, and no pixels.
+    """
+    started, finished = time.perf_counter(), list[Finished]()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        for entry in run_job(chunk.sources, job):
+            result = _to_arrays(entry.row.result) if chunk.keep_results else None
+            finished.append(entry._replace(row=replace(entry.row, result=result), pixels=None))
+    notes = [str(note.message) for note in caught if issubclass(note.category, UserWarning)]
+    return ChunkResult(finished, time.perf_counter() - started, notes)
+
+
+def dispatch(
+    sources: Iterable[Source],
+    job: Job,
+    executor: Executor,
+    start: Callable[[list[str]], None],
+    total: int | None,
+    keep_results: bool,
+) -> Generator[Finished, None, None]:
+    """Work on images by an executor.
+
+    Parameters
+    ----------
+    sources : iterable of Source
+        With their output files.
+    job : Job
+    executor : Executor
+    start : callable
+        ``start(names)`` before images travel to a worker.
+    total : int or None
+        Number of images, if it is known.
+    keep_results : bool
+        Whether `ImageRow.result` holds the result.
+
+    Yields
+    ------
+    Finished
+        One for each image, in any order, without pixels. An image whose failure may pass is
+        repeated up to `RETRIES` times. If a chunk ends its worker, its images are repeated one by
+        one, so that an image fails for its own fault only.
+
+    Raises
+    ------
+    ClusterError
+        If the cluster is lost.
+    """
+    chunks = _Chunks(sources, total, executor.workers, start, keep_results)
+    again = deque[Source]()
+    tries = Counter[int]()
+
+    def settle(chunk: Chunk, result: ChunkResult) -> Iterator[Finished]:
+        for note in result.notes:
+            warnings.warn(note, stacklevel=2)
+        for source, entry in zip(chunk.sources, result.finished, strict=True):
+            tries[source.place] += 1
+            if entry.may_pass and tries[source.place] <= RETRIES:
+                again.append(source)
+            else:
+                yield _received(entry, chunks.named.pop(source.place))
+
+    with closing(executor.map(run_chunk, chunks, job)) as done:
+        for index, result, lost in done:
+            chunk = chunks.under_way.pop(index)
+            if lost and len(chunk.sources) == 1:
+                yield _lost(chunks.named.pop(chunk.sources[0].place), lost)
+            elif lost:
+                again.extend(chunk.sources)
+            else:
+                chunks.note_time(result.seconds / len(chunk.sources))
+                yield from settle(chunk, result)
+            yield from chunks.without_work()
+    yield from chunks.without_work()
+    while again:
+        singles = [Chunk([source], keep_results) for source in again]
+        again.clear()
+        with closing(executor.map(run_chunk, singles, job, at_once=1)) as done:
+            for index, result, lost in done:
+                chunk = singles[index]
+                if lost:
+                    yield _lost(chunks.named.pop(chunk.sources[0].place), lost)
+                else:
+                    yield from settle(chunk, result)
+
+
+@dataclass(eq=False)
+class _Chunks:
+    """An iterator of chunks, which the executor draws when workers become free."""
+
+    sources: Iterable[Source]
+    total: int | None
+    workers: int
+    start: Callable[[list[str]], None]
+    keep_results: bool
+
+    def __post_init__(self) -> None:
+        self.under_way: dict[int, Chunk] = {}
+        self.named: dict[int, Source] = {}  # the sources as the user named them, by place
+        self._passed = deque[Source]()
+        self._begun = 0
+        self._seconds = CHUNK_SECONDS / FIRST_CHUNK
+
+    def __iter__(self) -> Iterator[Chunk]:
+        chunk, held, drawn = list[Source](), 0, 0
+        for source in self.sources:
+            drawn += 1
+            if source.status:
+                self._passed.append(source)
+                continue
+            if source.path is None:
+                source = source._replace(image=np.array(source.image))  # its owner may reuse it
+                held += source.image.nbytes
+            chunk.append(source)
+            if len(chunk) >= self._length(drawn) or held >= MAX_CHUNK_BYTES:
+                yield self._begin(chunk)
+                chunk, held = [], 0
+        if chunk:
+            yield self._begin(chunk)
+
+    def note_time(self, seconds: float) -> None:
+        """Learn how long an image takes."""
+        self._seconds = seconds
+
+    def without_work(self) -> Iterator[Finished]:
+        """Yield the images that were drawn and need no work."""
+        while self._passed:
+            source = self._passed.popleft()
+            yield Finished(row_of(source), place=source.place)
+
+    def _length(self, drawn: int) -> int:
+        """Return the number of images of a chunk, a power of 2, as small images go in groups.
+
+        The last chunks are shorter, so that all workers end at about the same time.
+        """
+        seconds = CHUNK_SECONDS
+        if self.total is not None:
+            share = self._seconds * (self.total - drawn) / (2 * self.workers)
+            seconds = min(seconds, max(share, LAST_CHUNK_SECONDS))
+        length = min(max(1, int(seconds / max(self._seconds, 1e-6))), MAX_CHUNK)
+        return 1 << (length.bit_length() - 1)
+
+    def _begin(self, sources: list[Source]) -> Chunk:
+        self.start([source.name for source in sources])
+        self.named.update({source.place: source for source in sources})
+        chunk = Chunk([_absolute(source) for source in sources], self.keep_results)
+        self.under_way[self._begun] = chunk
+        self._begun += 1
+        return chunk
+
+
+def _absolute(source: Source) -> Source:
+    """Name files from the root: a worker runs in another folder."""
+    image = source.image.absolute() if isinstance(source.image, Path) else source.image
+    output = None if source.output is None else Path(os.path.abspath(source.output))
+    return source._replace(image=image, output=output)
+
+
+def _received(entry: Finished, source: Source) -> Finished:
+    """Return what a worker sent, with the names that the user gave."""
+    result = _from_arrays(entry.row.result)
+    row = replace(entry.row, input=source.path, output=source.output, result=result)
+    return Finished(row, place=source.place)
+
+
+def _lost(source: Source, reason: str) -> Finished:
+    row = replace(row_of(source), status="failed", error=f"{source.path or source.name}: {reason}")
+    return Finished(row, place=source.place)
+
+
+def _to_arrays(result: Any) -> Any:
+    """Replace the sets of a result by NumPy arrays."""
+    if isinstance(result, Fit):
+        return replace(result, gaussians=_to_arrays(result.gaussians))
+    if isinstance(result, Gaussians):
+        size = (result.width, result.height)
+        return SetData(result.to_arrays(), size, result.space, result.cutoff)
+    return result
+
+
+@exclusive()
+def _from_arrays(result: Any) -> Any:
+    """Undo `_to_arrays`."""
+    if isinstance(result, Fit):
+        return replace(result, gaussians=_from_arrays(result.gaussians))
+    if isinstance(result, SetData):
+        arrays: dict[str, Any] = result.arrays
+        return Gaussians.from_arrays(
+            **arrays, size=result.size, space=result.space, cutoff=result.cutoff
+        )
+    return result

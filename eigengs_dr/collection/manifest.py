@@ -1,0 +1,159 @@
+"""The manifest of an output folder: one row an image, from which a run continues.
+
+``manifest.jsonl`` holds one JSON object a line. During a run it is a journal: an image that begins
+has a line with the status "started", and its last line says what became of it. So a result whose
+run ended before its row was written is known to be unfinished, and is computed again; a result
+that no run began belongs to somebody else, and is kept. The end of a run leaves one line an image,
+sorted by name.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable
+from contextlib import ExitStack, suppress
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from ..storage.atomic import atomic_write, remove_stale
+from ..storage.lock import lock_folder
+from .row import ImageRow
+
+NAME = "manifest.jsonl"
+"""Name of the file in the output folder."""
+
+STARTED = "started"
+"""Status of an image whose work has begun."""
+
+STATUSES = ("done", "skipped", "failed", STARTED)
+
+KEYS = [field.name for field in fields(ImageRow) if field.name != "result"]
+"""Keys of a row."""
+
+Row = dict[str, Any]
+
+
+class Manifest:
+    """The manifest of a folder; a context manager that holds the lock of the folder.
+
+    Parameters
+    ----------
+    folder : Path
+        An existing folder.
+
+    Attributes
+    ----------
+    rows : dict of str to dict
+        The last row of each image, by its name.
+
+    Raises
+    ------
+    OSError
+        If another run writes into the folder, or the file cannot be read or written.
+    ValueError
+        If the file is no manifest.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / NAME
+        self.rows: dict[str, Row] = {}
+
+    def __enter__(self) -> Manifest:
+        with ExitStack() as stack:
+            stack.enter_context(lock_folder(self.path.parent))
+            remove_stale(self.path.parent)
+            self.rows, clean = read_manifest(self.path)
+            if not clean:
+                self._rewrite()  # else the next row would continue a half line
+            self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+            stack.callback(os.close, self._file)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *details: Any) -> None:
+        """Leave one row an image, and free the folder."""
+        # If the disk is too full for a second file, the journal holds the same rows.
+        with self._stack, suppress(OSError):
+            self._rewrite()
+            remove_stale(self.path.parent)
+
+    def start(self, names: Iterable[str]) -> None:
+        """Record that the work on some images begins."""
+        self._append([{"name": name, "status": STARTED} for name in names])
+
+    def add(self, row: ImageRow) -> None:
+        """Record what became of an image. A skipped image keeps the row of its result."""
+        if row.status == "skipped" and row.name in self.rows:
+            return
+        self._append([_to_json(row)])
+
+    def _append(self, rows: list[Row]) -> None:
+        """Write lines at the end of the file."""
+        text = "".join(json.dumps(row) + "\n" for row in rows).encode()
+        try:
+            while text:  # a disk that is nearly full takes a part of it
+                text = text[os.write(self._file, text) :]
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.path)) from error
+        self.rows.update({row["name"]: row for row in rows})
+
+    def _rewrite(self) -> None:
+        with atomic_write(self.path) as temporary:
+            lines = (json.dumps(self.rows[name]) + "\n" for name in sorted(self.rows))
+            temporary.write_text("".join(lines), encoding="utf-8")
+
+
+def read_manifest(path: Path) -> tuple[dict[str, Row], bool]:
+    """Read a manifest.
+
+    Parameters
+    ----------
+    path : Path
+        The file; it need not exist.
+
+    Returns
+    -------
+    rows : dict of str to dict
+        The last row of each image, by its name.
+    clean : bool
+        False if the last line is cut off, as after a crash; it is then left out.
+
+    Raises
+    ------
+    ValueError
+        If the file holds something else than rows.
+    OSError
+        If the file cannot be read.
+    """
+    rows: dict[str, Row] = {}
+    if not path.exists():
+        return rows, True
+    lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
+    for number, line in enumerate(lines[:-1], 1):
+        try:
+            row = json.loads(line)
+            if row["status"] not in STATUSES or not isinstance(row["name"], str):
+                raise ValueError
+        except (ValueError, TypeError, KeyError):
+            raise ValueError(
+                f"{path}: line {number} is no row of a manifest; move the file, or use another "
+                "folder"
+            ) from None
+        rows[row["name"]] = row
+    return rows, not lines[-1]
+
+
+def _to_json(row: ImageRow) -> Row:
+    """Return a row as types of JSON; the output without its folder, which may move."""
+    plain: Row = {}
+    for key in KEYS:
+        value = getattr(row, key)
+        if isinstance(value, Path):
+            value = value.name if key == "output" else str(value)
+        if isinstance(value, float) and not math.isfinite(value):
+            value = None
+        plain[key] = value.item() if hasattr(value, "item") else value
+    return plain

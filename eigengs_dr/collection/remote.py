@@ -1,0 +1,110 @@
+"""Images behind URLs, such as ``s3://bucket/photos/*.jpg``, by fsspec.
+
+fsspec comes with the extra ``cluster``. It knows ``http``, ``zip``, ``memory`` and others itself;
+stores such as ``s3`` and ``gcs`` need the package that its message names.
+"""
+
+from __future__ import annotations
+
+import glob
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..image.io import SAVE_OPTIONS, ImageError, load_image
+
+
+def is_url(name: Any) -> bool:
+    """Whether a name is a URL, as in ``s3://bucket/a.png`` or ``zip://a.png::all.zip``."""
+    return isinstance(name, str) and "://" in name
+
+
+def stem_of(file: Path | str) -> str:
+    """Return the name of a file or of a URL, without folders and suffix."""
+    return PurePosixPath(file.partition("::")[0]).stem if isinstance(file, str) else file.stem
+
+
+def list_urls(url: str) -> list[str]:
+    """List the images of a folder or a glob behind a URL.
+
+    Parameters
+    ----------
+    url : str
+        A folder, a pattern, or one file, which need not exist.
+
+    Returns
+    -------
+    list of str
+        URLs of the files, sorted. Of a folder, the files with the suffix of an image.
+
+    Raises
+    ------
+    ImageError
+        If the place cannot be read, or has no such file.
+    """
+    try:
+        system, path = _fsspec().core.url_to_fs(url)
+        if glob.has_magic(path):
+            names = [name for name in system.glob(path) if not system.isdir(name)]
+        elif system.isdir(path):
+            names = [name for name in system.ls(path, detail=False) if _is_image(name)]
+        else:
+            return [url]
+    except ImageError:
+        raise
+    except Exception as error:  # each store raises its own types
+        raise ImageError(f"{url}: cannot be listed ({_reason(error)}); check the URL") from error
+    if not names:
+        raise ImageError(f"{url}: holds no images; check the URL")
+    outer = url.partition("::")[2]
+    tail = f"::{outer}" if outer else ""
+    return sorted(system.unstrip_protocol(name) + tail for name in names)
+
+
+def load_url(url: str, keep_grey: bool = False) -> NDArray[np.float32]:
+    """Read an image behind a URL; see `eigengs_dr.image.io.load_image`.
+
+    Raises
+    ------
+    ImageError
+        If fsspec is missing, or the file is not an image; the message names the URL.
+    OSError
+        If the file cannot be read, which may pass; the message names the URL.
+    """
+    suffix = PurePosixPath(url.partition("::")[0]).suffix
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / f"image{suffix}"
+        system = _fsspec()
+        try:
+            with system.open(url, "rb") as remote:
+                file.write_bytes(remote.read())
+        except Exception as error:  # each store raises its own types
+            raise OSError(f"{url}: cannot be read ({_reason(error)})") from error
+        try:
+            return load_image(file, keep_grey)
+        except ImageError as error:
+            raise ImageError(str(error).replace(str(file), url)) from None
+
+
+def _fsspec() -> ModuleType:
+    try:
+        import fsspec
+    except ImportError:
+        raise ImageError(
+            "images behind URLs need fsspec; type: pip install 'eigengs-dr[cluster]'"
+        ) from None
+    module: ModuleType = fsspec
+    return module
+
+
+def _is_image(name: str) -> bool:
+    path = PurePosixPath(name)
+    return path.suffix.lower() in SAVE_OPTIONS and not path.name.startswith(".")
+
+
+def _reason(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

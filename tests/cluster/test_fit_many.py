@@ -1,0 +1,229 @@
+"""Fits of a folder on two processes: the bits of one, and what survives."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import dask
+import numpy as np
+import pytest
+from distributed import Client
+from PIL import Image
+
+import eigengs_dr as eg
+from _helpers.clusters import (
+    QUICK,
+    DieInWrite,
+    files_of,
+    fill_disk,
+    folder_of_photos,
+    slow_writes,
+)
+from _helpers.families import small_model
+from eigengs_dr.cluster.connect import connect, local_cluster
+from eigengs_dr.collection.manifest import NAME, read_manifest
+
+
+@pytest.fixture
+def photos(tmp_path):
+    return folder_of_photos(tmp_path / "photos", 12)
+
+
+@pytest.fixture
+def output(tmp_path):
+    return tmp_path / "fits"
+
+
+@pytest.fixture
+def expected(photos, tmp_path):
+    """The results of this process."""
+    eg.fit_many(photos, tmp_path / "here", **QUICK)
+    return files_of(tmp_path / "here")
+
+
+def assert_complete(output, expected):
+    """Nothing is lost, nothing is there twice, and nothing is half."""
+    assert files_of(output) == expected
+    names = sorted(path.name for path in output.iterdir())
+    assert names == [*expected, NAME]
+    rows, clean = read_manifest(output / NAME)
+    assert clean and len((output / NAME).read_text().splitlines()) == len(expected)
+    assert {row["status"] for row in rows.values()} == {"done"}
+
+
+def test_the_bits_of_one_process(client, photos, output, expected):
+    rows = eg.fit_many(photos, output, client=client, **QUICK)
+    assert [row.name for row in rows] == sorted(path.stem for path in photos.iterdir())
+    assert_complete(output, expected)
+    again = eg.fit_many(photos, output, client=client, **QUICK)
+    assert {row.status for row in again} == {"skipped"}
+    assert [row.psnr_rgb for row in again] == [row.psnr_rgb for row in rows]
+
+
+def test_a_basis_and_results_travel(client):
+    model = small_model("llvm")
+    images = [np.full((32, 32, 3), value, np.float32) for value in (0.3, 0.6)]
+    options = {"basis": model, "iterations": 2, "backend": "llvm"}
+    here = eg.fit_many(images, **options)
+    for row, other in zip(eg.fit_many(images, client=client, **options), here, strict=True):
+        for name, values in other.result.gaussians.to_arrays().items():
+            np.testing.assert_array_equal(row.result.gaussians.to_arrays()[name], values)
+
+
+def test_mistakes_are_said_as_in_one_process(client, photos, output):
+    with pytest.raises(ValueError, match="neither a file nor one of"):
+        eg.fit_many(photos, output, client=client, basis="nothing")
+    (photos / "03.png").write_text("no image")
+    rows = eg.fit_many(photos, output, client=client, **QUICK)
+    assert [row.name for row in rows if row.status == "failed"] == ["03"]
+    assert "03.png: not an image that Pillow knows" in rows[3].error
+
+
+def test_a_worker_that_is_killed(client, photos, output, expected):
+    """It loses what it does, which another worker does again."""
+    killed = []
+
+    def kill(done, total, row):
+        if not killed:
+            killed.append(next(iter(client.run(os.getpid).values())))
+            os.kill(killed[0], signal.SIGKILL)
+
+    rows = eg.fit_many(photos, output, client=client, progress=kill, **QUICK)
+    assert killed and [row.status for row in rows] == ["done"] * 12
+    assert_complete(output, expected)
+
+
+def test_an_image_that_kills_its_worker(client, photos, output, expected):
+    """It fails alone; the same call fits it when the cause is gone."""
+    client.register_plugin(DieInWrite("05.npz"), name="patch")  # also in workers to come
+    rows = eg.fit_many(photos, output, client=client, **QUICK)
+    assert [row.name for row in rows if row.status == "failed"] == ["05"]
+    assert "05.png: its worker ended 2 times" in rows[5].error
+    client.unregister_worker_plugin("patch")
+    client.restart()
+    rows = eg.fit_many(photos, output, client=client, **QUICK)
+    assert [row.name for row in rows if row.status == "done"] == ["05"]
+    left = [path for path in output.iterdir() if path.name.startswith(".")]
+    for path in left:  # what the killed worker left goes when it is old
+        os.utime(path, (0, 0))
+    eg.fit_many(photos, output, client=client, **QUICK)
+    assert_complete(output, expected)
+
+
+def test_a_full_disk_at_a_worker(client, photos, output, expected):
+    """The other worker writes the image; if all disks are full, the image fails."""
+    addresses = list(client.run(os.getpid))
+    client.run(fill_disk, workers=addresses[:1])
+    rows = eg.fit_many(photos, output, client=client, **QUICK)
+    client.run(fill_disk)
+    more = eg.fit_many(photos, output, overwrite=True, client=client, **QUICK)
+    assert {row.status for row in more} == {"failed"}
+    assert more[0].error == f"{output / '00.npz'}: No space left on device"
+    client.restart()
+    eg.fit_many(photos, output, client=client, **QUICK)
+    assert_complete(output, expected)
+    assert {row.status for row in rows} <= {"done", "failed"}
+
+
+def test_two_runs_into_one_folder(client, photos, output, expected):
+    refused = []
+
+    def second(done, total, row):
+        if not refused:
+            with pytest.raises(OSError, match="writes into this folder") as error:
+                eg.fit_many(photos, output, **QUICK)
+            refused.append(str(error.value))
+
+    eg.fit_many(photos, output, client=client, progress=second, **QUICK)
+    assert refused and "\n" not in refused[0]
+    assert_complete(output, expected)
+
+
+def test_ctrl_c_leaves_what_is_done(client, photos, output, expected):
+    def press(done, total, row):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(eg.RunInterrupted) as stopped:
+        eg.fit_many(photos, output, client=client, progress=press, **QUICK)
+    assert len(stopped.value.rows) == 3
+    rows = eg.fit_many(photos, output, client=client, **QUICK)
+    assert sum(row.status == "skipped" for row in rows) == 3
+    assert_complete(output, expected)
+
+
+def test_a_scheduler_that_goes_away(photos, output, expected, tmp_path):
+    """The run ends with one line, and the same call continues without the cluster."""
+    file = tmp_path / "scheduler.json"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+
+    def start(*arguments):
+        command = [sys.executable, "-m", "dask", *arguments]
+        return subprocess.Popen(
+            command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+
+    options = ["--scheduler-file", str(file)]
+    processes = [start("scheduler", "--port", "0", "--no-dashboard", *options)]
+    try:
+        deadline = time.monotonic() + 60
+        while not file.exists() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        processes.append(start("worker", "--nthreads", "1", "--no-dashboard", *options))
+
+        def kill(done, total, row):
+            processes[0].kill()
+
+        with connect(str(file)) as client:
+            client.wait_for_workers(1, timeout=60)
+            client.run(slow_writes)
+            with pytest.raises(eg.ClusterError, match=r"the scheduler tcp://.* is gone") as error:
+                eg.fit_many(photos, output, client=client, progress=kill, **QUICK)
+        assert "\n" not in str(error.value)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    rows = eg.fit_many(photos, output, **QUICK)
+    assert {row.status for row in rows} == {"skipped", "done"}
+    assert_complete(output, expected)
+
+
+@pytest.mark.slow
+def test_a_worker_without_memory(photos, output, expected):
+    """An image that no worker can hold fails; the others do not."""
+    Image.fromarray(np.zeros((9000, 9000, 3), np.uint8)).save(photos / "05.png", compress_level=1)
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
+        local_cluster(2, memory_limit="800MB") as cluster,
+        Client(cluster) as client,
+    ):
+        rows = eg.fit_many(photos, output, client=client, **QUICK)
+    assert [row.name for row in rows if row.status == "failed"] == ["05"]
+    assert "it may need more memory than a worker has" in rows[5].error
+    found = files_of(output)
+    assert found == {name: expected[name] for name in expected if name != "05.npz"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 3])
+def test_the_number_of_workers_changes_no_bit(photos, output, expected, workers):
+    with connect(f"local:{workers}") as client:
+        eg.fit_many(photos, output, client=client, **QUICK)
+    assert_complete(output, expected)
+
+
+def test_encoded_images_are_those_of_this_process(client, photos, output):
+    model = small_model("llvm")
+    here = model.encode_many(photos)
+    rows = model.encode_many(photos, client=client)
+    model.encode_many(photos, output, client=client)
+    for row, other in zip(rows, here, strict=True):
+        found, expected = row.result.to_arrays(), other.result.to_arrays()
+        stored = eg.Gaussians.load(output / f"{row.name}.npz").to_arrays()
+        for name, values in expected.items():
+            # Groups share matrix products, whose rounding depends on their width.
+            np.testing.assert_allclose(found[name], values, atol=2e-5)
+            np.testing.assert_allclose(stored[name], values, atol=2e-5)

@@ -1,0 +1,126 @@
+"""Chunks of images by an executor that ends them in any order and may lose them."""
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.clusters import QUICK, Here, files_of, folder_of_photos
+from eigengs_dr.collection import dispatch as module
+from eigengs_dr.collection import run
+
+
+@pytest.fixture
+def photos(tmp_path):
+    return folder_of_photos(tmp_path / "photos", 12)
+
+
+def test_results_are_those_of_this_process(photos, tmp_path):
+    seen = []
+
+    def progress(done, total, row):
+        seen.append((done, total, row.name))
+
+    rows = eg.fit_many(photos, tmp_path / "far", client=Here(), progress=progress, **QUICK)
+    here = eg.fit_many(photos, tmp_path / "here", **QUICK)
+    assert files_of(tmp_path / "far") == files_of(tmp_path / "here")
+    for row, other in zip(rows, here, strict=True):
+        assert (row.name, row.input, row.width) == (other.name, other.input, other.width)
+        assert row.psnr_rgb == other.psnr_rgb and row.output.name == other.output.name
+        assert row.result is None
+    assert [done for done, _, _ in seen] == list(range(1, 13)) and seen[0][1] == 12
+    assert [name for _, _, name in seen] != sorted(name for _, _, name in seen)
+
+
+def test_results_travel_back_without_an_output():
+    images = [np.full((24, 32, 3), value, np.float32) for value in (0.2, 0.4, 0.6)]
+    rows = eg.fit_many(iter(images), client=Here(), gaussians=4, iterations=1)
+    for row, image in zip(rows, images, strict=True):
+        alone = eg.fit(image, gaussians=4, iterations=1)
+        for name, values in alone.gaussians.to_arrays().items():
+            np.testing.assert_array_equal(row.result.gaussians.to_arrays()[name], values)
+        np.testing.assert_array_equal(row.result.image, alone.image)
+
+
+def test_relative_names_reach_workers_whole(photos, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    executor = Here()
+    rows = eg.fit_many("photos", "fits", client=executor, **QUICK)
+    sources = [source for task in executor.tasks for source in task.sources]
+    assert all(s.image.is_absolute() and s.output.is_absolute() for s in sources)
+    assert str(rows[0].input) == "photos/00.png" and str(rows[0].output) == "fits/00.npz"
+
+
+def test_images_of_a_lost_chunk_are_done_one_by_one(photos, tmp_path):
+    executor = Here(lost=["02"])
+    rows = eg.fit_many(photos, tmp_path / "fits", client=executor, **QUICK)
+    assert [row.name for row in rows if row.status == "failed"] == ["02"]
+    assert rows[2].error == f"{photos / '02.png'}: its worker ended 2 times"
+    assert sum(row.status == "done" for row in rows) == 11
+    assert ["02", "03"] in executor.names
+    assert ["02"] in executor.names and ["03"] in executor.names
+
+
+def test_a_failure_that_may_pass_is_tried_again(photos, tmp_path, monkeypatch):
+    write, tries = run.write, []
+
+    def full_disk(path, data):
+        tries.append(path.name)
+        if path.name == "03.npz" or (path.name == "04.npz" and tries.count("04.npz") < 3):
+            raise OSError(28, "No space left on device", str(path))
+        write(path, data)
+
+    monkeypatch.setattr(run, "write", full_disk)
+    rows = eg.fit_many(photos, tmp_path / "fits", client=Here(), **QUICK)
+    assert [row.name for row in rows if row.status == "failed"] == ["03"]
+    assert rows[3].error.endswith("03.npz: No space left on device")
+    assert tries.count("03.npz") == tries.count("04.npz") == 1 + module.RETRIES
+    assert len(rows) == 12 and not list((tmp_path / "fits").glob(".*"))
+
+
+def test_images_without_work_pass_by(photos, tmp_path):
+    (photos / "05.png").write_text("no image")
+    eg.fit_many([photos / "01.png", photos / "07.png"], tmp_path / "fits", **QUICK)
+    executor = Here()
+    rows = eg.fit_many(photos, tmp_path / "fits", client=executor, **QUICK)
+    assert [row.status for row in rows].count("skipped") == 2
+    assert rows[5].status == "failed" and "05.png" in rows[5].error
+    assert not any("01" in names for names in executor.names)
+
+
+def test_chunks_grow_to_their_time_and_shrink_at_the_end(monkeypatch):
+    sources = [module.Source(str(k), "x://a", place=k) for k in range(1000)]
+    chunks = module._Chunks(sources, 1000, 2, lambda names: None, False)
+    lengths = []
+    for chunk in chunks:
+        lengths.append(len(chunk.sources))
+        chunks.note_time(module.CHUNK_SECONDS / 50)
+    assert lengths[0] == module.FIRST_CHUNK and lengths[1] == 32
+    assert sum(lengths) == 1000
+    assert sorted(lengths[1:], reverse=True) == lengths[1:]
+    assert 8 in lengths  # 0.16 s would be too short: see the last chunks
+
+
+def test_warnings_of_workers_are_said_here(tmp_path):
+    from PIL import Image
+
+    pixels = np.full((24, 32, 4), 128, np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    with pytest.warns(UserWarning, match="transparent pixels"):
+        eg.fit_many([tmp_path / "a.png"], client=Here(), **QUICK)
+
+
+def test_a_basis_travels_as_arrays(photos):
+    import pickle
+
+    from _helpers.families import small_model
+    from eigengs_dr.eigenbasis.registry import load_basis, pack_basis
+
+    model = small_model("llvm")
+    packed = pack_basis(model, "llvm")
+    load_basis(packed)
+    again = load_basis(pickle.loads(pickle.dumps(packed)), "llvm")
+    for name, values in model.gaussians.to_arrays().items():
+        np.testing.assert_array_equal(again.gaussians.to_arrays()[name], values)
+    for first, second in zip(model.weights, again.weights, strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert pack_basis("natural") == "natural"

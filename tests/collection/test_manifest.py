@@ -1,0 +1,149 @@
+"""The manifest of a folder: rows, resuming, half lines, two runs at once."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+import eigengs_dr as eg
+from _helpers.clusters import QUICK, files_of, folder_of_photos
+from eigengs_dr.collection.manifest import KEYS, NAME, Manifest, read_manifest
+from eigengs_dr.storage.lock import lock_folder
+
+
+@pytest.fixture
+def photos(tmp_path):
+    return folder_of_photos(tmp_path / "photos", 3)
+
+
+@pytest.fixture
+def output(tmp_path):
+    return tmp_path / "fits"
+
+
+def statuses(output):
+    rows, clean = read_manifest(output / NAME)
+    assert clean
+    return {name: row["status"] for name, row in rows.items()}
+
+
+def test_a_row_for_each_image(photos, output):
+    (photos / "01.png").write_text("no image")
+    rows = eg.fit_many(photos, output, **QUICK)
+    lines = (output / NAME).read_text().splitlines()
+    found = [json.loads(line) for line in lines]
+    assert [row["status"] for row in found] == ["done", "failed", "done"]
+    for row, line in zip(rows, found, strict=True):
+        assert list(line) == KEYS
+        assert line["psnr_rgb"] == row.psnr_rgb and line["seconds"] == row.seconds
+        assert line["input"] == str(row.input)
+    assert found[0]["output"] == "00.npz" and found[0]["width"] == 32
+    assert found[1]["error"] == rows[1].error
+
+
+def test_skipped_images_keep_their_figures(photos, output):
+    first = eg.fit_many(photos, output, **QUICK)
+    before = (output / NAME).read_bytes()
+    again = eg.fit_many(photos, output, **QUICK)
+    assert [row.status for row in again] == ["skipped"] * 3
+    assert [row.psnr_rgb for row in again] == [row.psnr_rgb for row in first]
+    assert (output / NAME).read_bytes() == before
+
+
+def test_an_image_that_was_begun_is_done_again(photos, output):
+    """Its file may be there, but not its row: the run ended between the two."""
+    eg.fit_many(photos, output, **QUICK)
+    with Manifest(output) as manifest:
+        manifest.start(["01"])
+    assert statuses(output)["01"] == "started"
+    rows = eg.fit_many(photos, output, **QUICK)
+    assert [row.status for row in rows] == ["skipped", "done", "skipped"]
+    assert set(statuses(output).values()) == {"done"}
+
+
+def test_a_result_of_no_run_is_kept(photos, output):
+    """As it was before there were manifests."""
+    eg.fit_many(photos, output, **QUICK)
+    (output / NAME).unlink()
+    before = files_of(output)
+    rows = eg.fit_many(photos, output, gaussians=10, iterations=0)
+    assert [row.status for row in rows] == ["skipped"] * 3 and files_of(output) == before
+    assert set(statuses(output).values()) == {"skipped"}
+
+
+def test_a_result_that_was_deleted_is_made_again(photos, output):
+    eg.fit_many(photos, output, **QUICK)
+    before = files_of(output)
+    (output / "01.npz").unlink()
+    rows = eg.fit_many(photos, output, **QUICK)
+    assert [row.status for row in rows] == ["skipped", "done", "skipped"]
+    assert files_of(output) == before
+
+
+def test_a_half_line_is_left_out(photos, output):
+    eg.fit_many(photos, output, **QUICK)
+    path = output / NAME
+    path.write_bytes(path.read_bytes()[:-40])
+    rows = eg.fit_many(photos, output, **QUICK)
+    assert [row.status for row in rows] == ["skipped", "skipped", "skipped"]
+    # The result without a row counts as one of no run.
+    assert statuses(output) == {"00": "done", "01": "done", "02": "skipped"}
+
+
+@pytest.mark.parametrize(
+    "text", ["a,b\n1,2\n", '{"name": "a"}\n', "[1]\n", '{"name": 1, "status": "done"}\n']
+)
+def test_another_file_of_this_name_is_kept(photos, output, text):
+    output.mkdir()
+    (output / NAME).write_text(text)
+    with pytest.raises(ValueError, match="is no row of a manifest; move the file"):
+        eg.fit_many(photos, output, **QUICK)
+    assert (output / NAME).read_text() == text
+    assert [path.name for path in output.iterdir()] == [NAME]
+
+
+def test_two_runs_into_one_folder(photos, output):
+    output.mkdir()
+    with (
+        lock_folder(output),
+        pytest.raises(OSError, match=r"fits: process \d+ on .* writes into this folder; wait"),
+    ):
+        eg.fit_many(photos, output, **QUICK)
+    assert [row.status for row in eg.fit_many(photos, output, **QUICK)] == ["done"] * 3
+    assert not (output / ".lock").exists()
+
+
+def test_a_run_that_was_killed_holds_no_lock(photos, output):
+    output.mkdir()
+    code = (
+        "import os, sys, pathlib; from eigengs_dr.storage.lock import lock_folder\n"
+        "with lock_folder(pathlib.Path(sys.argv[1])): os.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-c", code, output], check=False, timeout=60)
+    assert (output / ".lock").exists()
+    assert [row.status for row in eg.fit_many(photos, output, **QUICK)] == ["done"] * 3
+
+
+def test_interrupted_runs_leave_one_row_an_image(photos, output):
+    def press(done, total, row):
+        raise KeyboardInterrupt
+
+    with pytest.raises(eg.RunInterrupted):
+        eg.fit_many(photos, output, progress=press, **QUICK)
+    # All were one group: the others are begun, and done again.
+    assert statuses(output) == {"00": "done", "01": "started", "02": "started"}
+    assert [row.status for row in eg.fit_many(photos, output, **QUICK)] == [
+        "skipped",
+        "done",
+        "done",
+    ]
+
+
+def test_encoded_images_have_rows_too(photos, output):
+    from _helpers.families import small_model
+
+    small_model("llvm").encode_many(photos, output)
+    rows, _ = read_manifest(output / NAME)
+    assert [row["status"] for row in rows.values()] == ["done"] * 3
+    assert rows["00"]["psnr_rgb"] is None and rows["00"]["gaussians"] == 100

@@ -1,0 +1,81 @@
+"""Images by folder, glob and URL."""
+
+import zipfile
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.clusters import QUICK, folder_of_photos
+from eigengs_dr.collection.remote import is_url, list_urls, load_url
+from eigengs_dr.collection.sources import list_sources
+
+
+@pytest.fixture
+def photos(tmp_path):
+    return folder_of_photos(tmp_path / "photos", 3)
+
+
+@pytest.fixture
+def bucket(photos):
+    """The photos in a store behind URLs, with a file that is no image."""
+    memory = pytest.importorskip("fsspec").filesystem("memory")
+    for path in photos.iterdir():
+        memory.pipe(f"/bucket/{path.name}", path.read_bytes())
+    memory.pipe("/bucket/notes.txt", b"hello")
+    yield memory
+    memory.rm("/bucket", recursive=True)
+
+
+def test_globs(photos, tmp_path):
+    (tmp_path / "photos" / "deep").mkdir()
+    (photos / "02.png").rename(photos / "deep" / "03.png")
+    names = [source.name for source in list_sources(str(tmp_path / "**" / "*.png"))]
+    assert names == ["00", "01", "03"]
+    with pytest.raises(ValueError, match=r"\*\.jpg: no file has such a name; check the pattern"):
+        list_sources(str(photos / "*.jpg"))
+
+
+def test_a_folder_whose_name_looks_like_a_glob(photos, tmp_path):
+    folder = photos.rename(tmp_path / "photos[1]")
+    assert len(list_sources(str(folder))) == 3
+
+
+def test_urls_of_folders_globs_and_files(bucket):
+    whole = ["memory:///bucket/00.png", "memory:///bucket/01.png", "memory:///bucket/02.png"]
+    assert list_urls("memory://bucket") == whole
+    assert list_urls("memory://bucket/0[01].png") == whole[:2]
+    assert list_urls("memory://bucket/07.png") == ["memory://bucket/07.png"]
+    with pytest.raises(eg.ImageError, match=r"memory://bucket/x\*: holds no images"):
+        list_urls("memory://bucket/x*")
+    with pytest.raises(eg.ImageError, match="nope://a: cannot be listed"):
+        list_urls("nope://a")
+
+
+def test_images_behind_urls_are_fitted(bucket, photos, tmp_path):
+    sources = ["memory://bucket/00.png", "memory://bucket/none.png", "memory://bucket/notes.txt"]
+    rows = eg.fit_many(sources, tmp_path / "fits", **QUICK)
+    assert [row.status for row in rows] == ["done", "failed", "failed"]
+    assert rows[0].name == "00" and rows[0].input == sources[0]
+    [alone] = eg.fit_many([photos / "00.png"], **QUICK)
+    np.testing.assert_array_equal(
+        eg.Gaussians.load(rows[0].output).to_arrays()["mean"],
+        alone.result.gaussians.to_arrays()["mean"],
+    )
+    assert rows[1].error.startswith("memory://bucket/none.png: cannot be read (")
+    assert rows[2].error.startswith("memory://bucket/notes.txt: not an image")
+
+
+def test_images_inside_of_an_archive(photos, tmp_path):
+    pytest.importorskip("fsspec")
+    with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
+        archive.write(photos / "00.png", "in/00.png")
+        archive.write(photos / "01.png", "in/01.png")
+    urls = list_urls(f"zip://in/*.png::{tmp_path}/all.zip")
+    assert [source.name for source in list_sources(urls)] == ["00", "01"]
+    np.testing.assert_array_equal(load_url(urls[1]), eg.load_image(photos / "01.png"))
+
+
+def test_what_is_a_url(tmp_path):
+    assert is_url("s3://bucket/a.png") and is_url("zip://a.png::b.zip")
+    assert not is_url("a.png") and not is_url(tmp_path) and not is_url(np.zeros(3))
