@@ -239,8 +239,7 @@ def _state_of_shards(files: list[Path], ranks: tuple[int, ...], run: Run) -> Eig
         run.checkpoint.folder,
         advance=None if run.client is not None else run.stop_if_pressed,
     )
-    sources = [path.absolute() for path in files]
-    return shard_states(sources, options, executor_for(run.client), report)
+    return shard_states(files, options, executor_for(run.client), report)
 
 
 def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS:

@@ -63,3 +63,11 @@ def test_training(client, tmp_path, images):
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     assert ("components", 54, 54) in stages
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "b.npz", "photos"]
+
+
+def test_relative_names_reach_workers_whole(client, tmp_path, images, monkeypatch):
+    (tmp_path / "photos").mkdir()
+    for i, image in enumerate(images[:20]):
+        save_image(tmp_path / "photos" / f"{i:03d}.png", image)
+    monkeypatch.chdir(tmp_path)
+    assert Eigenbasis.from_images("photos", SIZE, 4, client=client).count == 20

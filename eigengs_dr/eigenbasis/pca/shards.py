@@ -173,7 +173,7 @@ def shard_states(
 
     wanted = [node for node in levels[0] if needed(node)]
     done = len(source) - sum(_size(node, len(source)) for node in wanted)
-    tasks = (Shard(node, source[node[0] * SHARD : node[1] * SHARD]) for node in wanted)
+    tasks = (Shard(node, _absolute(source[node[0] * SHARD : node[1] * SHARD])) for node in wanted)
     with closing(executor.map(make_shard, tasks, options)) as ended:
         for index, made, lost in ended:
             _require(lost)
@@ -276,6 +276,14 @@ def _holds(node: Node, other: Node) -> bool:
 
 def _size(node: Node, images: int) -> int:
     return min(node[1] * SHARD, images) - node[0] * SHARD
+
+
+def _absolute(images: Images) -> Images:
+    """Name files from the root: a worker runs in another folder."""
+    if not isinstance(images, Sequence):
+        return images
+    is_file = (str, os.PathLike)
+    return [Path(item).absolute() if isinstance(item, is_file) else item for item in images]
 
 
 def _require(lost: str) -> None:
