@@ -41,8 +41,8 @@ REACH = 2
 HALF_RUNGS, MAX_HALF_RUNGS = 2, 8
 """Attempts on half rungs at the end: the first number, and up to the second while the best leaves
 room. On 16 sets of 40 to 3,000 Gaussians with budgets of 0.2, 0.5 and 2 dB, no file is larger than
-by 4 halvings of half an octave, in equal time. Files of up to 300 Gaussians are 0.9 % smaller,
-those of more 0.2 %."""
+by 4 halvings of half an octave, in equal time. Files of up to 300 Gaussians are 0.9 % smaller, and
+larger ones 0.2 %."""
 
 USED = 0.9
 """Part of the budget that leaves no room worth an attempt."""
