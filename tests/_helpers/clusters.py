@@ -90,6 +90,14 @@ def patch_write(replacement):
     run.write = lambda path, data: replacement(write, path, data)
 
 
+def mend_writes():
+    """Write results again, in this process."""
+    from eigengs_dr.collection import run
+    from eigengs_dr.gaussian.file import write
+
+    run.write = write
+
+
 def fill_disk():
     """Let every write of a result fail, in this process."""
 

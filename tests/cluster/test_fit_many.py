@@ -19,6 +19,7 @@ from _helpers.clusters import (
     files_of,
     fill_disk,
     folder_of_photos,
+    mend_writes,
     slow_writes,
 )
 from _helpers.families import small_model
@@ -102,7 +103,8 @@ def test_an_image_that_kills_its_worker(client, photos, output, expected):
     assert [row.name for row in rows if row.status == "failed"] == ["05"]
     assert "05.png: its worker ended 2 times" in rows[5].error
     client.unregister_worker_plugin("patch")
-    client.restart()
+    client.wait_for_workers(2, timeout=60)
+    client.run(mend_writes)
     rows = eg.fit_many(photos, output, client=client, **QUICK)
     assert [row.name for row in rows if row.status == "done"] == ["05"]
     left = [path for path in output.iterdir() if path.name.startswith(".")]
@@ -121,7 +123,7 @@ def test_a_full_disk_at_a_worker(client, photos, output, expected):
     more = eg.fit_many(photos, output, overwrite=True, client=client, **QUICK)
     assert {row.status for row in more} == {"failed"}
     assert more[0].error == f"{output / '00.npz'}: No space left on device"
-    client.restart()
+    client.run(mend_writes)
     eg.fit_many(photos, output, client=client, **QUICK)
     assert_complete(output, expected)
     assert {row.status for row in rows} <= {"done", "failed"}
