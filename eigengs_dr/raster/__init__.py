@@ -9,6 +9,7 @@
 - ``adjoint``: its gradient
 - ``rows``: images from tile layout to rows of pixels
 - ``render``: the differentiable operation and `render`
+- ``picture``: the picture of a set, by strips of rows
 - ``reference``: slow renderers to compare with
 - ``lookup``: the sum at scattered points, for textures
 """

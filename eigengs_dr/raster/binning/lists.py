@@ -186,9 +186,10 @@ def _images(types: ArrayTypes, count: int, grid: Grid) -> Any:
 
 
 def _padded(count: int) -> int:
-    """Round a size up by at most an eighth, to a multiple of 16.
+    """Round a size up by at most a quarter, and by at most 2^20, to a multiple of 16.
 
-    Frozen programs are traced again for another size, so that sizes should change seldom.
+    Frozen programs are traced again for another size, so that sizes should change seldom. For long
+    lists a trace costs less than the memory would.
     """
     step = max(16, 1 << max(0, min(count.bit_length() - 3, 20)))
     return (count // step + 1) * step

@@ -221,8 +221,8 @@ def for_each_tile(
 ) -> Any:
     """Call `visit` for every Gaussian and every tile that its ellipse touches, row by row.
 
-    One loop covers rows and columns: lanes of a packet then wait once for the longest walk, and not
-    in every row for the longest row.
+    Lanes of a packet wait in every row for the longest row. One loop over rows and columns would
+    not wait, but find the columns of a row for every tile: it took three times as long on llvm.
 
     Parameters
     ----------

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
+from eigengs_dr.raster.binning import granularity
 from eigengs_dr.raster.binning.granularity import GRANULARITY
 from eigengs_dr.raster.binning.lists import build_lists
 from eigengs_dr.raster.binning.tiles import TILE, Grid, for_each_tile
@@ -216,6 +217,21 @@ def pairs_by_tile(lists, count):
     for t, i, j in zip(order, lists.begin.numpy(), lists.end.numpy(), strict=True):
         np.add.at(found[t], splat[i:j], 1)
     return found
+
+
+def test_long_lists_have_longer_pieces(backend, monkeypatch):
+    """The same pairs in fewer pieces, where enough of them are left."""
+    scene = random_scene()
+    shape = upload(backend, scene.mean, scene.factor)
+    few = GRANULARITY[backend]._replace(visits=2, long_visits=5)
+    monkeypatch.setitem(GRANULARITY, backend, few)
+    short = build_lists(shape, RADIUS, GRID)
+    monkeypatch.setattr(granularity, "MIN_PIECES", 1)
+    long = build_lists(shape, RADIUS, GRID)
+    found, visits = pairs_by_splat(long)
+    before, most = pairs_by_splat(short)
+    np.testing.assert_array_equal(found, before)
+    assert most.max() == 2 and 2 < visits.max() <= 5
 
 
 @few
