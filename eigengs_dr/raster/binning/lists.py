@@ -270,7 +270,8 @@ def _cut(types: ArrayTypes, tile: Any, tiles: tuple, slots: tuple, capacity: int
     splat, begin, end = (dr.zeros(types.UInt, capacity) for _ in range(3))
     dr.make_opaque(splat, begin, end)
     owner = dr.arange(types.UInt, count)
-    length = types.UInt(dr.ceil(types.Float(last - start) / types.Float(dr.maximum(number, 1))))
+    # In integers: a quotient of floats on cuda may round up to one more.
+    length = (last - start + number - 1) // dr.maximum(number, 1)
 
     def write(i: Any, at: Any) -> tuple:
         active = i < stop
