@@ -19,12 +19,14 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import types_of
+from ..backend.arrays import types_of, upload
 from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
+from ..fitting.density_control import relocate
 from ..fitting.fit import Fit
 from ..fitting.initializers import PLACEMENTS, FitProblem, FitTarget, Placement, make_target
 from ..fitting.optimizers.descent import descend
+from ..fitting.optimizers.schedule import Schedule
 from ..fitting.options import FitOptions
 from ..fitting.placement.adaptive import place_adaptive
 from ..fitting.redistribute import density_for_error, squared_error
@@ -93,7 +95,8 @@ def fit_batch(
                     records, _pictures(reached, len(images)), images, strict=True
                 ):
                     if record.stopped != "plateau":
-                        record.judge(step, seconds, reached, shown, pixels, schedule)
+                        record.judge(step, seconds, reached, shown, pixels)
+                        record.end_at_plateau(schedule, options.iterations)
                 if all(record.stopped == "plateau" for record in records):
                     break
             if step % 10 == 0:
@@ -123,9 +126,8 @@ class _Record:
         reached: Gaussians,
         shown: Images,
         pixels: Images,
-        schedule: Any,
     ) -> None:
-        """Add a row to the trace, keep the best set, and notice a plateau."""
+        """Add a row to the trace, and keep the best set."""
         figures = {
             "iteration": step,
             "seconds": seconds,
@@ -135,7 +137,10 @@ class _Record:
         self.trace.append(figures)
         if figures["psnr_ycbcr"] > self.highest:
             self.best, self.highest, self.picture = reached, figures["psnr_ycbcr"], shown
-        if is_plateau(self.trace, schedule):
+
+    def end_at_plateau(self, schedule: Schedule, iterations: int) -> None:
+        """Notice a plateau of a run with some steps."""
+        if is_plateau(self.trace, schedule, iterations):
             self.stopped = "plateau"
 
 
@@ -152,8 +157,10 @@ def _start(images: Images, options: FitOptions) -> FitProblem:
     like = _stack(placed, values.shape, options)
     start = solve_batch(like, values, options.solve_steps).gaussians
     anew = partial(_redistribute, shown=shown, values=values, weight=weight, options=options)
-    again = anew if options.initializer == "adaptive" else None
-    return FitProblem(start, values, weight, redistribute=again)
+    moves = partial(_relocate, values=values, weight=weight)
+    if options.initializer != "adaptive":
+        return FitProblem(start, values, weight)
+    return FitProblem(start, values, weight, redistribute=anew, relocate=moves)
 
 
 def _shown(target: FitTarget, options: FitOptions) -> Images:
@@ -195,6 +202,49 @@ def _redistribute(
     return solve_batch(_stack(placed, values.shape, options), values, options.solve_steps).gaussians
 
 
+def _relocate(
+    gaussians: Gaussians, share: float, *, values: Images, weight: Images | None
+) -> Gaussians:
+    """Relocate the Gaussians of every image, as `eigengs_dr.fitting.density_control` does."""
+    weights = [None] * len(values) if weight is None else list(weight)
+    arrays = _arrays(gaussians)
+    moved = [
+        relocate(_cut(arrays, k, gaussians), share, values[k], weights[k]).to_arrays()
+        for k in range(len(values))
+    ]
+    mean, factor, color = (np.concatenate([m[name] for m in moved]) for name in _OWN)
+    stacked = Gaussians.from_arrays(mean, factor, color, **_like(gaussians))
+    types = types_of(gaussians.mean)
+    rows = np.stack([m["background"] for m in moved], axis=1)
+    return replace(stacked, background=types.FloatX([upload(types.Float, row) for row in rows]))
+
+
+_OWN = ("mean", "factor", "color")
+"""The arrays of a batch that hold the Gaussians of image after image."""
+
+
+def _arrays(gaussians: Gaussians) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a batch; the background has a row for each image."""
+    return {name: _numpy(getattr(gaussians, name)) for name in (*_OWN, "background")}
+
+
+def _cut(arrays: dict[str, NDArray[Any]], k: int, batch: Gaussians) -> Gaussians:
+    """Return the Gaussians of image k out of the `_arrays` of a batch."""
+    count = len(arrays["mean"]) // len(arrays["background"])
+    mean, factor, color = (arrays[name][k * count : (k + 1) * count] for name in _OWN)
+    return Gaussians.from_arrays(mean, factor, color, arrays["background"][k], **_like(batch))
+
+
+def _like(gaussians: Gaussians) -> dict[str, Any]:
+    """Return the arguments of `Gaussians.from_arrays` for the images of a batch."""
+    return {
+        "size": (gaussians.width, gaussians.height),
+        "space": gaussians.space,
+        "backend": types_of(gaussians.mean).backend,
+        "cutoff": gaussians.cutoff,
+    }
+
+
 def _pictures(gaussians: Gaussians, images: int) -> Images:
     """Render all images for display: as `eigengs_dr.raster.render.picture_of` does one."""
     shown = _sum(gaussians, images)
@@ -225,21 +275,8 @@ def _results(records: list[_Record], seconds: float, seconds_init: float) -> lis
         best, picture = record.best, record.picture
         assert best is not None and picture is not None
         if id(best) not in arrays:  # `records` keeps every set, so that an id stays its own
-            names = ("mean", "factor", "color", "background")
-            arrays[id(best)] = {name: _numpy(getattr(best, name)) for name in names}
-        found = arrays[id(best)]
-        count = len(found["mean"]) // len(records)
-        mine = slice(k * count, (k + 1) * count)
-        gaussians = Gaussians.from_arrays(
-            found["mean"][mine],
-            found["factor"][mine],
-            found["color"][mine],
-            found["background"][k],
-            size=(best.width, best.height),
-            space=best.space,
-            backend=types_of(best.mean).backend,
-            cutoff=best.cutoff,
-        )
+            arrays[id(best)] = _arrays(best)
+        gaussians = _cut(arrays[id(best)], k, best)
         results.append(
             Fit(
                 gaussians=gaussians,

@@ -10,12 +10,17 @@ from numpy.typing import NDArray
 from ..backend.arrays import types_of
 from ..gaussian.concatenate import concatenate
 from ..gaussian.gaussians import Gaussians
+from ..image.resize import resample
 from .placement.peaks import residual_peaks
 from .redistribute import residual
 from .solvers.conjugate_gradient import inner_products, solve
 
 Array = NDArray[np.floating]
 
+
+WORKING_SPACING = 3.0
+"""Pixels between Gaussians for `relocate`. Images with twice this spacing or more are shrunk first:
+wide filters take long, and the descent moves Gaussians by a pixel at once."""
 
 SOLVE_STEPS = 5
 """Steps of the colour solve after dropping Gaussians, so that their neighbours replace them."""
@@ -87,17 +92,83 @@ def densify(
     mean, size, color = residual_peaks(missed, count - len(gaussians), _spacing(gaussians), weight)
     if not len(mean):
         return gaussians
-    sharp = 1 / size
-    added = Gaussians.from_arrays(
+    return concatenate([gaussians, _like(gaussians, mean, _round(size), color)])
+
+
+def relocate(
+    gaussians: Gaussians,
+    share: float,
+    target: NDArray[np.float32],
+    weight: Array | None = None,
+) -> Gaussians:
+    """Move the Gaussians of least use to where they reduce the error most.
+
+    Without them, the colours of the others are solved for, see `prune`; then round Gaussians at the
+    peaks of the error take their places in the order. For the other parameters see `removal_cost`.
+
+    Parameters
+    ----------
+    share : float
+        Share of the Gaussians that move, in [0, 1].
+
+    Returns
+    -------
+    Gaussians
+        A set of as many Gaussians. Where `residual_peaks` finds too few places, Gaussians of least
+        use stay, with the colour 0.
+    """
+    value = removal_cost(gaussians, target, weight)
+    order, moves = np.argsort(value, kind="stable"), int(share * len(gaussians))
+    kept, moved = np.sort(order[moves:]), order[:moves]
+    rest = gaussians[kept]
+    if weight is None:
+        rest = solve(rest, target, SOLVE_STEPS, warm_start=True).gaussians
+    mean, size, color = _coarse_peaks(residual(rest, target), moves, _spacing(gaussians), weight)
+    arrays, found = gaussians.to_arrays(), rest.to_arrays()
+    arrays["background"] = found["background"]
+    rows = {"mean": mean, "factor": _round(size), "color": color}
+    for name, new in rows.items():
+        arrays[name] = np.array(arrays[name])
+        arrays[name][kept], arrays[name][moved[: len(new)]] = found[name], new
+    arrays["color"][moved[len(mean) :]] = 0
+    return _like(gaussians, **arrays)
+
+
+def _coarse_peaks(
+    missed: Array, count: int, spacing: float, weight: Array | None
+) -> tuple[Array, Array, Array]:
+    """Return the places of `residual_peaks`, on a smaller image where Gaussians are far apart."""
+    times = int(spacing / WORKING_SPACING)
+    if times < 2:
+        return residual_peaks(missed, count, spacing, weight)
+    height, width = missed.shape[:2]
+    size = -(-width // times), -(-height // times)
+    small = [None if v is None else resample(v, *size) for v in (missed, weight)]
+    x, y = width / size[0], height / size[1]
+    assert small[0] is not None
+    mean, deviation, color = residual_peaks(small[0], count, spacing / math.sqrt(x * y), small[1])
+    return mean * (x, y), deviation * math.sqrt(x * y), color
+
+
+def _round(size: Array) -> Array:
+    """Return the factors (n, 3) of round Gaussians with standard deviations (n,)."""
+    return np.stack([1 / size, 0 * size, 1 / size], axis=1)
+
+
+def _like(
+    gaussians: Gaussians, mean: Array, factor: Array, color: Array, background: Array | None = None
+) -> Gaussians:
+    """Return a set of other Gaussians, within their bounds, for the image of a set."""
+    return Gaussians.from_arrays(
         mean,
-        np.stack([sharp, 0 * sharp, sharp], axis=1),
+        factor,
         color,
+        background,
         size=(gaussians.width, gaussians.height),
         space=gaussians.space,
         backend=types_of(gaussians.mean).backend,
         cutoff=gaussians.cutoff,
-    )
-    return concatenate([gaussians, added.bounded()])
+    ).bounded()
 
 
 def _spacing(gaussians: Gaussians) -> float:

@@ -28,7 +28,7 @@ PLACEMENTS = {
 """Placements by name; each entry is a `Placement`, which uses the image alone."""
 
 INITIALIZERS = {
-    **dict.fromkeys(PLACEMENTS, "eigengs_dr.fitting.redistribute:start_from_placement"),
+    **dict.fromkeys(PLACEMENTS, "eigengs_dr.fitting.placement_initializer:start_from_placement"),
     "eigen": "eigengs_dr.eigenbasis.initializer:start_from_basis",
 }
 """Initialisers by the name that ``init`` takes; each entry is an `Initializer`."""
@@ -85,6 +85,9 @@ class FitProblem(NamedTuple):
     redistribute : callable, or None
         ``redistribute(gaussians, count)`` returns a new set with more Gaussians where the old set
         left more error. None for initialisers other than "adaptive".
+    relocate : callable, or None
+        ``relocate(gaussians, share)`` returns as many Gaussians, of which a share has moved to
+        where the old set left most error. None where Gaussians must keep their places.
     """
 
     gaussians: Gaussians
@@ -92,6 +95,7 @@ class FitProblem(NamedTuple):
     weight: NDArray[np.float32] | None = None
     base_image: NDArray[np.float32] | None = None
     redistribute: Callable[[Gaussians, int], Gaussians] | None = None
+    relocate: Callable[[Gaussians, float], Gaussians] | None = None
 
 
 class Initializer(Protocol):

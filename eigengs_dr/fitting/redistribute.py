@@ -16,8 +16,6 @@ on training images of ImageNet classes and of cats, by the error after 1,000 ste
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
-from pkgutil import resolve_name
 
 import drjit as dr
 import numpy as np
@@ -28,46 +26,11 @@ from ..gaussian.gaussians import Gaussians
 from ..image.resize import resample
 from ..image.strips import map_threads, strips
 from ..raster.render import render
-from .initializers import PLACEMENTS, FitProblem, FitTarget, Placement
-from .options import FitOptions
 from .placement.adaptive import Density, place_adaptive
 from .placement.density import target_density
 from .solvers.conjugate_gradient import solve
 
 Array = NDArray[np.floating]
-
-
-def start_from_placement(target: FitTarget, options: FitOptions) -> FitProblem:
-    """Place Gaussians by the image alone; see `eigengs_dr.fitting.initializers.Initializer`."""
-    name, method = options.initializer, options.method
-    place: Placement = resolve_name(PLACEMENTS[name])
-    # Linear light would put too few Gaussians into dark parts.
-    shown = target.pixels if options.color == "linear" else target.values
-    count = options.count_for(target.pixels)
-    generator = np.random.default_rng(options.seed)
-    mean, factor = place(shown, count, generator)
-    shape = (count, target.values.shape[2])
-    start = Gaussians.from_arrays(
-        mean,
-        factor,
-        np.zeros(shape, np.float32) if method.solves else generator.uniform(0, 1, shape),
-        size=(target.values.shape[1], target.values.shape[0]),
-        space=options.color,
-        backend=options.backend,
-        cutoff=options.cutoff,
-    ).bounded()
-    if not method.solves:
-        return FitProblem(start, target.values, target.weight)
-    solved = solve(start, target.values, options.solve_steps).gaussians
-    again = partial(
-        redistribute,
-        image=shown,
-        target=target.values,
-        weight=target.weight,
-        solve_steps=options.solve_steps,
-    )
-    anew = again if name == "adaptive" else None
-    return FitProblem(solved, target.values, target.weight, redistribute=anew)
 
 
 def redistribute(

@@ -105,7 +105,7 @@ def refine(
                     progress(step, iterations, trace[-1])
                 if interrupted():
                     break
-                if step in marks and is_plateau(trace, schedule):
+                if step in marks and is_plateau(trace, schedule, iterations):
                     stopped = "plateau"
                     break
         if interrupted():
@@ -134,12 +134,17 @@ def measure(
     return {"seconds": seconds, "psnr_ycbcr": ycbcr, "psnr_rgb": rgb}
 
 
-def is_plateau(trace: list[dict[str, Any]], schedule: Schedule) -> bool:
-    """Return whether the last `patience` steps gained less than `least_gain` decibels."""
+def is_plateau(trace: list[dict[str, Any]], schedule: Schedule, iterations: int) -> bool:
+    """Return whether the last `patience` steps gained less than `least_gain` decibels.
+
+    They must lie in the second half of the run. In the first half rates are high, and a run that
+    gains nothing there gains once they fall.
+    """
     last = trace[-1]
     if last["psnr_ycbcr"] > MAX_PSNR:
         return True
-    old = [row for row in trace if row["iteration"] <= last["iteration"] - schedule.patience]
+    begin = last["iteration"] - schedule.patience
+    old = [row for row in trace if iterations / 2 <= row["iteration"] <= begin]
     return bool(old) and not last["psnr_ycbcr"] - old[-1]["psnr_ycbcr"] >= schedule.least_gain
 
 

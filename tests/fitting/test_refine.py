@@ -7,7 +7,7 @@ from _helpers.sets import Scene
 from _helpers.waves import SIDE, SPLATS, default, figures, picture, presets, start
 from eigengs_dr.fitting.initializers import FitProblem
 from eigengs_dr.fitting.presets import PRESETS
-from eigengs_dr.fitting.refine import refine, trace_steps
+from eigengs_dr.fitting.refine import is_plateau, refine, trace_steps
 from eigengs_dr.image.color import rgb_to_ycbcr
 
 
@@ -55,12 +55,19 @@ def test_all_splats_on_one_pixel(backend, seed):
 
 
 def test_plateau(backend):
-    """Ten steps that gain less than a thousand decibels are one."""
+    """Ten steps that gain less than a thousand decibels are one, in the second half of a run."""
     gaussians, target = start(backend)
     schedule = default(patience=10, least_gain=1000.0)
-    result = refine(FitProblem(gaussians, target), picture(), schedule, 100)
-    assert (result.iterations, result.stopped) == (10, "plateau")
-    assert result.trace[-1]["iteration"] == 10
+    result = refine(FitProblem(gaussians, target), picture(), schedule, 400)
+    assert (result.iterations, result.stopped) == (300, "plateau")
+    assert result.trace[-1]["iteration"] == 300
+
+
+def test_no_plateau_while_rates_are_high():
+    """More steps asked for are more steps taken, also where the first half gains nothing."""
+    rows = [{"iteration": k, "psnr_ycbcr": 30.0} for k in range(0, 1001, 100)]
+    ends = [n for n in range(1, 12) if is_plateau(rows[:n], default(patience=300), 1000)]
+    assert [rows[n - 1]["iteration"] for n in ends] == [800, 900, 1000]
 
 
 @pytest.mark.parametrize("iterations", [0, 1, 10, 55, 100, 250])

@@ -24,7 +24,7 @@ from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ...raster.render import batch_to_tiles, bin_gaussians
 from ..initializers import FitProblem
 from .parameterization import Parameterization
-from .schedule import MIN_PHASE_RATIO, Schedule, lr_factor, next_build
+from .schedule import MIN_PHASE_RATIO, Schedule, lr_factor, next_build, relocation_steps
 
 MSE_EPSILON = 1e-10
 """Mean squared error added before the logarithm, which would diverge at an error of 0."""
@@ -40,7 +40,8 @@ def descend(
     problem : FitProblem
         The start and the target. If the problem can redistribute and the run is long enough, a
         first phase of `Schedule.redistribute_after` steps shows where error is left. The rest of
-        the steps then starts from redistributed Gaussians.
+        the steps then starts from redistributed Gaussians. If the problem can relocate, Gaussians
+        move between steps, see `eigengs_dr.fitting.optimizers.schedule.relocation_steps`.
     schedule : Schedule
     iterations : int
         Number of steps, with the first phase.
@@ -112,9 +113,12 @@ def _run_phase(
     weight = None if problem.weight is None else batch_to_tiles(types, problem.weight)
     factors = [lr_factor(schedule, step, iterations) for step in range(iterations)]
     rates = rate_table(types, schedule, factors)
-    stop = 0
+    stop, relocations = 0, relocation_steps(schedule, iterations) if problem.relocate else set()
     with freeze_program(step_program(schedule, fixed, levels)) as take_step:
         for step in range(iterations):
+            if step in relocations and problem.relocate:
+                fixed = problem.relocate(dr.detach(state.gaussians), schedule.relocate_share)
+                state, stop = start_descent(fixed, schedule), step
             if step == stop:
                 stop, moves = next_build(schedule, step, iterations)
                 pad, growth = variables.reach(fixed, moves)

@@ -60,8 +60,13 @@ class Schedule:
     redistribute_after : int
         Steps of the first phase, before redistribution; see
         `eigengs_dr.fitting.optimizers.descent.descend`.
+    relocate_every : int
+        Steps between two rounds of relocation, see `relocation_steps`; 0 for no relocation.
+    relocate_share : float
+        Share of the Gaussians that move in a round.
     patience : int
-        Number of steps. A refinement stops if this many steps gain less than `least_gain`.
+        Number of steps. A refinement stops if this many steps gain less than `least_gain`, all of
+        them in its second half, where rates are low.
     least_gain : float
         Gain in dB, see `patience`.
     """
@@ -74,6 +79,8 @@ class Schedule:
     decay: float = 0.03
     drift: float = 0.5
     redistribute_after: int = 20
+    relocate_every: int = 0
+    relocate_share: float = 0.1
     patience: int = 300
     least_gain: float = 0.01
 
@@ -93,6 +100,19 @@ def lr_factor(schedule: Schedule, step: int, iterations: int) -> float:
     along = 0.5 * (1 + math.cos(math.pi * step / iterations))
     left = schedule.decay + (1 - schedule.decay) * along
     return left * min(1.0, (step + 1) / max(1, schedule.warm_up))
+
+
+RELOCATE_UNTIL, MAX_RELOCATIONS = 0.5, 20
+"""The share of a descent that may relocate, and the largest number of rounds."""
+
+
+def relocation_steps(schedule: Schedule, iterations: int) -> set[int]:
+    """Return the steps before which Gaussians are relocated, evenly over the first half."""
+    if not schedule.relocate_every:
+        return set()
+    until = RELOCATE_UNTIL * iterations
+    rounds = min(MAX_RELOCATIONS, int(until / schedule.relocate_every))
+    return {round(until * (k + 1) / rounds) for k in range(rounds)}
 
 
 def next_build(schedule: Schedule, step: int, iterations: int) -> tuple[int, dict[str, float]]:

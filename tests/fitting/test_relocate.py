@@ -1,0 +1,85 @@
+"""Gaussians that move in the course of a descent."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.halves import SIDE, fitted, picture, squared_error
+from eigengs_dr.fitting.density_control import relocate, removal_cost
+from eigengs_dr.fitting.initializers import initialize
+from eigengs_dr.fitting.optimizers.descent import descend
+from eigengs_dr.fitting.optimizers.schedule import relocation_steps
+from eigengs_dr.fitting.options import FitOptions
+from eigengs_dr.fitting.presets import PRESETS
+
+SCHEDULE = PRESETS["default"].schedule
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_least_useful_move_and_the_others_stay(weighted):
+    start, target = fitted()
+    weight = np.full_like(target, 0.5) if weighted else None
+    least = np.argsort(removal_cost(start.gaussians, target, weight), kind="stable")[:12]
+    kept = np.setdiff1d(np.arange(60), least)
+    before = start.gaussians.to_arrays()
+    found = relocate(start.gaussians, 0.2, target, weight).to_arrays()
+    for name in ("mean", "factor"):
+        np.testing.assert_array_equal(found[name][kept], before[name][kept])
+    assert (found["mean"][least] != before["mean"][least]).any(axis=1).sum() >= 6
+    assert np.array_equal(found["color"][kept], before["color"][kept]) == weighted
+
+
+def test_a_gaussian_moves_to_the_error():
+    """One blob of the image has a Gaussian, the other has none; the others are of no use."""
+    y, x = np.indices((SIDE, SIDE)) + 0.5
+    at = [(8.5, 9.5), (22.5, 20.5)]
+    target = sum(np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 2.0**2)) for u, v in at)
+    target = target[..., None].astype(np.float32)
+    before = eg.Gaussians.from_arrays(
+        np.array([at[0]] + [(2.0, 30.0)] * 39),
+        np.tile([0.5, 0, 0.5], (40, 1)),
+        np.array([[1.0]] + [[0.0]] * 39),
+        size=(SIDE, SIDE),
+        space="data",
+        backend="llvm",
+    )
+    moved = relocate(before, 1 / 40, target)
+    away = np.linalg.norm(moved.to_arrays()["mean"] - at[1], axis=1)
+    assert away.min() < 1
+    assert squared_error(moved, target) < 0.2 * squared_error(before, target)
+
+
+def test_a_perfect_set_stays_perfect():
+    """Without places for them, Gaussians stay where they are, with the colour 0."""
+    flat = np.full((SIDE, SIDE, 3), 0.25, np.float32)
+    start = initialize(flat, FitOptions(gaussians=40, init="adaptive"))
+    moved = relocate(start.gaussians, 0.5, start.target)
+    assert len(moved) == 40
+    assert squared_error(moved, start.target) <= squared_error(start.gaussians, start.target) + 1e-6
+
+
+def test_rounds_are_spread_over_the_first_half():
+    schedule = replace(SCHEDULE, relocate_every=45)
+    assert relocation_steps(schedule, 80) == set()
+    assert relocation_steps(schedule, 100) == {50}
+    steps = sorted(relocation_steps(schedule, 980))
+    assert steps == [49 * k for k in range(1, 11)]
+    assert max(relocation_steps(schedule, 100_000)) == 50_000
+    assert relocation_steps(replace(schedule, relocate_every=0), 1000) == set()
+
+
+def test_a_descent_relocates_and_goes_on():
+    start = initialize(picture(), FitOptions(gaussians=60, init="adaptive"))
+    calls = []
+
+    def move(gaussians, share):
+        calls.append(share)
+        return start.relocate(gaussians, share)
+
+    problem = start._replace(redistribute=None, relocate=move)
+    sets = list(descend(problem, replace(SCHEDULE, relocate_every=10), 60))
+    assert (len(sets), calls) == (61, [SCHEDULE.relocate_share] * 3)
+    error = [squared_error(s, start.target) for s in (sets[0], sets[-1])]
+    assert error[1] < 0.7 * error[0]
