@@ -26,9 +26,10 @@ from .eigengs import EigenGS
 from .evaluation import evaluate, truncation_curve_on
 from .model_fit import fit_model
 from .options import TrainOptions
-from .pca.basis import Eigenbasis, check_components
-from .pca.incremental_pca import EigenState, block_length, empty_state, merge, rank_for
-from .pca.shards import ShardOptions, is_large, shard_block_length, shard_states
+from .pca.basis import Eigenbasis
+from .pca.component_counts import check_components
+from .pca.solvers.incremental_pca import EigenState, block_length, empty_state, merge, rank_for
+from .pca.solvers.shards import ShardOptions, is_large, shard_block_length, shard_states
 from .pca.truncation import TruncationCurve
 
 HELD_OUT = 10

@@ -8,8 +8,8 @@ import pytest
 from _helpers.low_rank import SIZE, assert_same, family
 from eigengs_dr.eigenbasis import training
 from eigengs_dr.eigenbasis.options import TrainOptions
-from eigengs_dr.eigenbasis.pca import shards
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
+from eigengs_dr.eigenbasis.pca.solvers import shards
 from eigengs_dr.image.io import save_image
 
 
