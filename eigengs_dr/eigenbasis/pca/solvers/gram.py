@@ -10,19 +10,17 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import closing
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ....backend.executor import Executor
+from ....backend.executor import Executor, completed
 from ....storage.checkpoint import read_arrays, write_arrays
 from .eigenpairs import FLOOR, largest_eigenpairs, orthonormalize
 from .incremental_pca import EigenState, draw_examples
-from .parts import require_done
 from .plane_store import PlaneStore, strips
 
 TILE_IMAGES = 1024
@@ -96,13 +94,13 @@ def gram_state(
         If the cluster is lost, or a task ends its worker again and again.
     """
     tiles = _tiles(len(store.counts), max(1, TILE_IMAGES // max(store.counts)))
-    for _ in _results(executor, compute_tile, tiles, store):
+    for _ in completed(executor, compute_tile, tiles, store):
         pass
     channels = [
         Channel(c, most, [tile for tile in tiles if tile.channel == c])
         for c, most in enumerate(components)
     ]
-    ended = dict(_results(executor, find_eigenpairs, channels, store))
+    ended = dict(completed(executor, find_eigenpairs, channels, store))
     found: list[Found] = [ended[c] for c in range(len(channels))]
     rows = _components(store, found, executor)
     parts = [orthonormalize(r, entry.values) for r, entry in zip(rows, found, strict=True)]
@@ -181,16 +179,6 @@ def _components(
     rows = [np.empty((len(entry.values), pixels), np.float32) for entry in found]
     tasks = [Strip(c, columns) for c in range(len(rows)) for columns in strips(pixels)]
     job = (store, [entry.weights for entry in found])
-    for index, part in _results(executor, combine_strip, tasks, job):
+    for index, part in completed(executor, combine_strip, tasks, job):
         rows[tasks[index].channel][:, tasks[index].columns] = part
     return rows
-
-
-def _results(
-    executor: Executor, function: Any, tasks: list[Any], shared: Any
-) -> Iterator[tuple[int, Any]]:
-    """Yield the number and the result of each task, as they end."""
-    with closing(executor.map(function, tasks, shared)) as ended:
-        for index, value, lost in ended:
-            require_done(lost)
-            yield index, value

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ....backend.executor import ClusterError
 from ....image.io import ImageError
 from ..lazy_images import LazyImages
 
@@ -74,9 +73,3 @@ def collect_notes(source: Any) -> Iterator[list[str]]:
                 raise
             notes.append(str(error))
     notes += [str(note.message) for note in caught]
-
-
-def require_done(lost: str) -> None:
-    """Raise ClusterError if a task was given up; see `eigengs_dr.backend.executor.Done`."""
-    if lost:
-        raise ClusterError(f"a part of the PCA cannot be done: {lost}")

@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....backend.executor import Executor
+from ....backend.executor import Executor, completed
 from ....image.folder import ReadProgress, read_blocks
 from ....image.io import ImageError
 from ....storage.checkpoint import read_arrays, write_arrays
 from .incremental_pca import EigenState, block_length, empty_state, merge, merge_states
-from .parts import Images, absolute, collect_notes, is_countable, readable, require_done
+from .parts import Images, absolute, collect_notes, is_countable, readable
 from .shard_tree import Node, holds, tree_levels
 
 SHARD = 2048
@@ -156,9 +156,8 @@ def shard_states(
     wanted = [node for node in levels[0] if needed(node)]
     done = len(source) - sum(_size(node, len(source)) for node in wanted)
     tasks = (Shard(node, absolute(source[node[0] * SHARD : node[1] * SHARD])) for node in wanted)
-    with closing(executor.map(make_shard, tasks, options)) as ended:
-        for index, made, lost in ended:
-            require_done(lost)
+    with closing(completed(executor, make_shard, tasks, options)) as ended:
+        for index, made in ended:
             for note in made.notes:
                 warnings.warn(note, stacklevel=3)
             states |= {(wanted[index], c): state for c, state in enumerate(made.states)}
@@ -215,9 +214,8 @@ def _merge_level(
         Merge(node, channel, states[children[0], channel], states[children[1], channel])
         for node, channel, children in wanted
     )
-    with closing(executor.map(merge_pair, tasks, options)) as ended:
-        for index, state, lost in ended:
-            require_done(lost)
+    with closing(completed(executor, merge_pair, tasks, options)) as ended:
+        for index, state in ended:
             node, channel, children = wanted[index]
             states[node, channel] = state
             if needed(node):  # its other channels may need them, if this run stops here

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ....backend.executor import Executor
+from ....backend.executor import Executor, completed
 from ....image.folder import ReadProgress, read_blocks
 from ....image.io import ImageError
-from .parts import Images, absolute, collect_notes, readable, require_done
+from .parts import Images, absolute, collect_notes, readable
 from .plane_store import PlaneStore, file_length, has_planes, write_planes
 
 MAX_IMAGES = 1 << 14
@@ -104,9 +104,8 @@ def store_images_by(
     check_count(total)
     starts = range(0, total, length)
     tasks = (Batch(k, absolute(images[i : i + length])) for k, i in enumerate(starts))
-    with closing(executor.map(store_batch, tasks, options)) as ended:
-        for index, notes, lost in ended:
-            require_done(lost)
+    with closing(completed(executor, store_batch, tasks, options)) as ended:
+        for index, notes in ended:
             for note in notes:
                 warnings.warn(note, stacklevel=3)
             done += min(length, total - starts[index])
