@@ -107,7 +107,8 @@ class EigenGS:
         progress : callable, optional
             ``progress(step, steps, {})`` after every round of training.
         client : distributed.Client, optional
-            Solve for the weights on the workers of this Dask cluster, with the same bits.
+            Solve for the weights on the workers of this Dask cluster; their number does not change
+            the result, see `eigengs_dr.eigenbasis.components.weights.find_weights`.
 
         Raises
         ------

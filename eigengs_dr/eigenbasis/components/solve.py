@@ -26,12 +26,11 @@ Planes = NDArray[np.float32]
 State = dict[str, NDArray[Any]]
 
 
-class Part(NamedTuple):
-    """Gaussians of a band or of all, with their weights in its components, and the errors."""
+class Band(NamedTuple):
+    """Gaussians of a band, with their weights in its components if the training found them."""
 
     gaussians: Gaussians
-    shapes: SharedShapes
-    weighted: Weighted
+    weights: tuple[Planes, ...] = ()
 
 
 class ComponentFit(NamedTuple):
@@ -108,22 +107,20 @@ def fit_components(
             states[i:] = [state]
             save(states)
     trained = time.perf_counter()
-    part = _assemble(basis, states, sides, result, backend, executor)
-    equations = part.shapes.equations
-    mean = equations.solve(equations.correlate(basis.mean))
+    gaussians, weighted = _assemble(basis, states, sides, result, backend, executor)
     figures = {
         "shape_seconds": trained - started,
         "weight_seconds": time.perf_counter() - trained,
-        "psnr_components": psnr_components(basis, part.weighted.errors),
+        "psnr_components": psnr_components(basis, weighted.errors),
     }
     if method == "default" and steps:
         size = (basis.width, basis.height)
         grids = [on_grid(size, side.splats) for side in sides]
-        untrained = _assemble(basis, grids, sides, result, backend, executor)
-        figures["psnr_untrained"] = psnr_components(basis, untrained.weighted.errors)
+        _, untrained = _assemble(basis, grids, sides, result, backend, executor)
+        figures["psnr_untrained"] = psnr_components(basis, untrained.errors)
     return ComponentFit(
-        gaussians=with_colors(part.gaussians, mean, basis.space),
-        weights=part.weighted.weights,
+        gaussians=with_colors(gaussians, weighted.weights[-1].T, basis.space),
+        weights=weighted.weights[:-1],
         low=sides[0].splats if split else 0,
         low_components=low_component_count(basis) if split else 0,
         figures=figures,
@@ -134,19 +131,26 @@ def _assemble(
     basis: Eigenbasis,
     states: list[State],
     sides: list[FrequencyBand],
-    result: Callable[..., Part],
+    result: Callable[..., Band],
     backend: str | None,
     executor: Executor,
-) -> Part:
-    """Return the Gaussians and weights of all bands."""
-    pairs = zip(states, sides, strict=True)
-    parts = [result(state, side, backend, executor) for state, side in pairs]
-    if len(parts) == 1:
-        return parts[0]
-    gaussians = concatenate([part.gaussians for part in parts])
-    shapes = SharedShapes.of(gaussians, sides[0].splats, backend)
-    weights = _join_weights(*(part.weighted.weights for part in parts))
-    return Part(gaussians, shapes, find_weights(shapes, basis.components, executor, weights))
+) -> tuple[Gaussians, Weighted]:
+    """Return the Gaussians of all bands, and their weights in the components and the mean."""
+    bands = [result(state, side, backend) for state, side in zip(states, sides, strict=True)]
+    gaussians, known = bands[0]
+    low = 0
+    if len(bands) > 1:
+        parts = [
+            band.weights
+            or find_weights(
+                SharedShapes.of(band.gaussians, 0, backend), side.components, executor
+            ).weights
+            for band, side in zip(bands, sides, strict=True)
+        ]
+        gaussians, known = concatenate([band.gaussians for band in bands]), _join_weights(*parts)
+        low = sides[0].splats
+    shapes = SharedShapes.of(gaussians, low, backend)
+    return gaussians, find_weights(shapes, (*basis.components, basis.mean), executor, known)
 
 
 def psnr_components(basis: Eigenbasis, errors: tuple[NDArray[np.float64], ...]) -> float:
@@ -155,10 +159,10 @@ def psnr_components(basis: Eigenbasis, errors: tuple[NDArray[np.float64], ...]) 
     Parameters
     ----------
     basis : Eigenbasis
-    errors : tuple of C ndarrays, shape (k_c,)
-        See `Weighted`.
+    errors : tuple of ndarrays, shape (k_c,)
+        See `Weighted`; those after the C channels of the basis are ignored.
     """
-    pairs = zip(basis.eigenvalues, errors, strict=True)
+    pairs = zip(basis.eigenvalues, errors, strict=False)
     return psnr_from_mse(float(sum(values @ error for values, error in pairs)) / basis.mean.size)
 
 
@@ -170,14 +174,10 @@ def _train_shapes(
     )
 
 
-def _solve_weights(
-    state: State, side: FrequencyBand, backend: str | None, executor: Executor
-) -> Part:
-    """Return the shapes of a state and their best weights."""
+def _shapes_alone(state: State, side: FrequencyBand, backend: str | None) -> Band:
+    """Return the shapes of a state, whose weights are solved for."""
     height, width = side.components[0].shape[1:]
-    gaussians = shapes_of(state, (width, height), len(side.components), backend)
-    shapes = SharedShapes.of(gaussians, backend=backend)
-    return Part(gaussians, shapes, find_weights(shapes, side.components, executor))
+    return Band(shapes_of(state, (width, height), len(side.components), backend))
 
 
 def _train_jointly(
@@ -190,21 +190,18 @@ def _train_jointly(
         yield current.arrays()
 
 
-def _weights_of(state: State, side: FrequencyBand, backend: str | None, executor: Executor) -> Part:
+def _weights_of(state: State, side: FrequencyBand, backend: str | None) -> Band:
     """Return the shapes and weights of a state; colours are 0, with all channels."""
     joint = JointState.from_arrays(state)
     blank = np.zeros((side.splats + 1, len(side.components)))
-    gaussians = with_colors(joint.gaussians(backend), blank, "data")
-    shapes = SharedShapes.of(gaussians, backend=backend)
-    weighted = find_weights(shapes, side.components, executor, joint.weights())
-    return Part(gaussians, shapes, weighted)
+    return Band(with_colors(joint.gaussians(backend), blank, "data"), joint.weights())
 
 
 METHODS_BY_PRESET = {
-    "default": (_train_shapes, _solve_weights),
+    "default": (_train_shapes, _shapes_alone),
     "eigengs": (_train_jointly, _weights_of),
 }
-"""Functions of each preset: one trains a band step by step, one turns its state into a `Part`."""
+"""Functions of each preset: one trains a band step by step, one turns its state into a `Band`."""
 
 
 def _join_weights(first: tuple[Planes, ...], second: tuple[Planes, ...]) -> tuple[Planes, ...]:
