@@ -6,7 +6,6 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
@@ -76,9 +75,8 @@ def encode_each(
     check_encoding(*options)
     basis = model if client is None else resolve_name(PACK_BASIS)(model)
     job = Job(partial(encode_work, basis, *options), _may_join)
-    folder = None if output is None else Path(output)
-    total, finished = run_images(images, folder, overwrite, job, client)
-    return collect(total, finished, folder is None, progress)
+    total, finished = run_images(images, output, overwrite, job, client)
+    return collect(total, finished, output is None, progress)
 
 
 def encode_work(
