@@ -137,18 +137,15 @@ def _assemble(
 ) -> tuple[Gaussians, Weighted]:
     """Return the Gaussians of all bands, and their weights in the components and the mean."""
     bands = [result(state, side, backend) for state, side in zip(states, sides, strict=True)]
-    gaussians, known = bands[0]
-    low = 0
+    (gaussians, known), low = bands[0], 0
     if len(bands) > 1:
-        parts = [
-            band.weights
-            or find_weights(
-                SharedShapes.of(band.gaussians, 0, backend), side.components, executor
-            ).weights
-            for band, side in zip(bands, sides, strict=True)
-        ]
-        gaussians, known = concatenate([band.gaussians for band in bands]), _join_weights(*parts)
-        low = sides[0].splats
+        weights = []
+        for band, side in zip(bands, sides, strict=True):
+            shapes = SharedShapes.of(band.gaussians, backend=backend)
+            alone = band.weights or find_weights(shapes, side.components, executor).weights
+            weights.append(alone)
+        known, low = _join_weights(*weights), sides[0].splats
+        gaussians = concatenate([band.gaussians for band in bands])
     shapes = SharedShapes.of(gaussians, low, backend)
     return gaussians, find_weights(shapes, (*basis.components, basis.mean), executor, known)
 

@@ -13,7 +13,7 @@ import numpy as np
 from ....backend.executor import Executor, completed
 from ....image.folder import ReadProgress, read_blocks
 from ....image.io import ImageError
-from .parts import Images, absolute, collect_notes, readable
+from .parts import Images, absolute, collect_notes, is_countable, readable
 from .plane_store import PlaneStore, file_length, has_planes, write_planes
 
 MAX_IMAGES = 1 << 14
@@ -62,6 +62,8 @@ def store_images(
     ValueError
         If there are more than `MAX_IMAGES` images.
     """
+    if is_countable(source):
+        check_count(len(source))
     length, files = file_length(options.size), 0
     blocks = read_blocks(readable(source), options.size, options.space, length, progress)
     with closing(blocks):
