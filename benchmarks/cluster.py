@@ -3,18 +3,22 @@
 - ``fits``: images a second one by one, in one process, and on two workers of one thread
 - ``overhead``: one worker of one thread against one process of one thread
 - ``tasks``: seconds of a task that does nothing, by the bytes that it takes and returns
-- ``pca``: the eigenbasis of crops on one worker and on two, with the memory of each
+- ``pca``: the eigenbasis of crops on one worker and on two, with the memory of each; of the images
+  in a folder with ``--images``, by the exact solver with ``--solver gram``
+- ``weights``: a model of 20,000 Gaussians, and that many components of 512x512, here and by workers
 
 Each part prints JSON. Compile the kernels by a first run, and take the median of several.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import resource
-import sys
+import shutil
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -110,26 +114,50 @@ def peak() -> float:
 
 def pca(folder: Path, count: int) -> dict[str, Any]:
     """Measure an eigenbasis of 300 components on one worker and on two."""
-    files = crops(folder, count)
-    found: dict[str, Any] = {}
+    files = sorted(ARGUMENTS.images.iterdir())[:count] if ARGUMENTS.images else crops(folder, count)
+    found: dict[str, Any] = {"images": len(files)}
     bases = []
     for workers in (1, 2):
         (states := folder / f"states{workers}").mkdir()
+        options = {"checkpoint": states, "solver": ARGUMENTS.solver}
         with connect(f"local:{workers}") as client:
             executor_for(client)
 
-            def run(client: Any = client, states: Path = states) -> None:
-                bases.append(eg.Eigenbasis.from_images(files, client=client, checkpoint=states))
+            def run(client: Any = client, options: dict[str, Any] = options) -> None:
+                bases.append(eg.Eigenbasis.from_images(files, client=client, **options))
 
             found[f"{workers} workers"] = timed(run)
             found[f"{workers} workers MB"] = list(client.run(peak).values())
+        shutil.rmtree(states)
     first, second = bases
     pairs = zip(first.components, second.components, strict=True)
     found["largest difference"] = max(float(np.abs(a - b).max()) for a, b in pairs)
     return found
 
 
+def weights(folder: Path, count: int) -> dict[str, float]:
+    """Measure the fit of a model here, on one worker and on two."""
+    random = np.random.default_rng(0)
+    images = random.random((count + 1, 64, 64, 3), np.float32).repeat(8, 1).repeat(8, 2)
+    basis = eg.Eigenbasis.from_images(images, (512, 512), count)
+    fit = partial(eg.EigenGS.fit, basis, gaussians=20_000, frequency_aware=False)
+    first = partial(eg.EigenGS.fit, basis.truncated(20), gaussians=20_000, frequency_aware=False)
+    first()
+    found = {"here": timed(fit)}
+    for workers in (1, 2):
+        with connect(f"local:{workers}") as client:
+            first(client=client)
+            found[f"{workers} workers"] = timed(partial(fit, client=client))
+    return found
+
+
 if __name__ == "__main__":
-    part, count = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 64
+    parser = argparse.ArgumentParser()
+    parser.add_argument("part")
+    parser.add_argument("count", type=int, nargs="?", default=64)
+    parser.add_argument("--images", type=Path)
+    parser.add_argument("--solver", default="incremental")
+    ARGUMENTS = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        print(json.dumps({part: globals()[part](Path(folder), count), "count": count}))
+        result = globals()[ARGUMENTS.part](Path(folder), ARGUMENTS.count)
+        print(json.dumps({ARGUMENTS.part: result, "count": ARGUMENTS.count}))

@@ -7,6 +7,7 @@ Functions that take ``client`` ask `executor_for` for an `Executor`. This module
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
+from contextlib import closing
 from pkgutil import resolve_name
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -104,6 +105,35 @@ class LocalExecutor:
         """Call ``function(task, shared)`` for every task; see `Executor.map`."""
         for index, task in enumerate(tasks):
             yield Done(index, function(task, shared))
+
+
+def completed(
+    executor: Executor, function: Function, tasks: Iterable[Any], shared: Any = None
+) -> Generator[tuple[int, Any], None, None]:
+    """Run tasks none of which may fail.
+
+    Parameters
+    ----------
+    executor : Executor
+    function, tasks, shared
+        See `Executor.map`, also for errors.
+
+    Yields
+    ------
+    index : int
+    value : Any
+        See `Done`.
+
+    Raises
+    ------
+    ClusterError
+        If a task was given up.
+    """
+    with closing(executor.map(function, tasks, shared)) as ended:
+        for index, value, lost in ended:
+            if lost:
+                raise ClusterError(f"a part of the work cannot be done: {lost}")
+            yield index, value
 
 
 def executor_for(client: Any = None) -> Executor:

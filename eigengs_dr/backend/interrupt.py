@@ -51,3 +51,31 @@ def defer_interrupts() -> Iterator[Callable[[], bool]]:
         yield lambda: bool(received)
     finally:
         restore()
+
+
+@contextmanager
+def terminate_as_interrupt() -> Iterator[None]:
+    """Turn SIGTERM into a `KeyboardInterrupt` during a block, so that the block cleans up.
+
+    A second SIGTERM ends the process. The block changes nothing in other threads than the main
+    thread, nor where something else handles SIGTERM, such as `defer_interrupts`.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        At SIGTERM.
+    """
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        yield
+        return
+
+    def interrupt(number: int, frame: Any) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from ..backend.executor import ClusterError
+from ..backend.interrupt import terminate_as_interrupt
 
 
 @contextmanager
@@ -38,5 +39,6 @@ def open_cluster(cluster: str | None) -> Iterator[Any]:
         raise ClusterError(
             f"--cluster needs {error.name}; type: pip install 'eigengs-dr[cluster]'"
         ) from None
-    with connect(cluster) as client:
+    # Schedulers of batch jobs send SIGTERM; the workers of ``local`` have to end too.
+    with terminate_as_interrupt(), connect(cluster) as client:
         yield client

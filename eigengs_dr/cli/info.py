@@ -12,7 +12,7 @@ from .outputs import check_outputs, name_outputs
 
 
 @click.command()
-@click.argument("file", type=ANY_PATH, metavar="NAME|FILE")
+@click.argument("file", type=click.Path(path_type=Path), metavar="NAME|FILE")
 @json_option
 @click.option("--preview", type=ANY_PATH, help="Picture of the contents.")
 def info(file: Path, as_json: bool, preview: Path | None) -> None:

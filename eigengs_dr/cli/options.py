@@ -10,11 +10,26 @@ import click
 
 from ..backend.selection import describe
 from ..collection.remote import is_url
+from ..storage.atomic import refuse_url
 from .console import NAME
 
 EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
-ANY_PATH = click.Path(path_type=Path)
+
+
+class OutputPath(click.Path):
+    """A file or a folder to write, which is no URL."""
+
+    def convert(self, value: Any, parameter: Any, context: Any) -> Any:
+        """Return a Path; a URL would become a strange folder of this one."""
+        try:
+            refuse_url(value)
+        except OSError as error:
+            self.fail(str(error), parameter, context)
+        return super().convert(value, parameter, context)
+
+
+ANY_PATH = OutputPath(path_type=Path)
 
 MAX_PIXELS = 1 << 29
 """Pixels of the largest picture to render, except into TIFF files; it takes 3 bytes a pixel."""

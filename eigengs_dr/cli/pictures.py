@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from ..eigenbasis.components.solve import with_colors
 from ..eigenbasis.eigengs import EigenGS
-from ..eigenbasis.pca.basis import CHANNELS, Eigenbasis
+from ..eigenbasis.pca.basis import Eigenbasis
+from ..eigenbasis.pca.component_counts import CHANNELS
 from ..gaussian.covariance import outline
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode

@@ -102,7 +102,7 @@ def train(
     in ten is held out and measured at the end. --energy counts the variance of each channel of
     the training images; --target-psnr measures PCA, in --color, of the images held out. After
     Ctrl-C or a crash, the same command resumes from the folder MODEL.npz.checkpoint. With --cluster
-    the processes of a Dask cluster find the components; all see FOLDER and MODEL.npz.
+    the processes of a Dask cluster find components and weights; all see FOLDER and MODEL.npz.
 
     \b
     Examples:

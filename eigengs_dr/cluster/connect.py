@@ -6,12 +6,13 @@ import logging
 import os
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from distributed import Client, LocalCluster
 
 from ..backend.executor import ClusterError
+from ..backend.interrupt import defer_interrupts
 
 CONNECT_SECONDS = 30.0
 """Time for the scheduler to answer."""
@@ -39,13 +40,19 @@ def connect(cluster: str) -> Iterator[Client]:
         If the scheduler does not answer.
     ValueError
         If the word is none of these.
+    KeyboardInterrupt
+        After Ctrl-C or SIGTERM while the workers start.
     """
     # The lines that Dask writes about lost connections come on top of ours.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     match = re.fullmatch(r"local(?::([1-9]\d*))?", cluster)
     if match:
-        count = int(match[1] or 0) or _cores()
-        with local_cluster(count) as processes, Client(processes) as client:
+        with ExitStack() as stack:
+            with defer_interrupts() as interrupted:  # Dask does not end what begins to start
+                count = int(match[1] or 0) or _cores()
+                client = stack.enter_context(Client(stack.enter_context(local_cluster(count))))
+            if interrupted():
+                raise KeyboardInterrupt
             yield client
         return
     try:

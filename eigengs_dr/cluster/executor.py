@@ -14,6 +14,7 @@ from distributed import Client, Future
 from distributed.scheduler import KilledWorker
 
 from ..backend.executor import ClusterError, Done, Function
+from ..backend.interrupt import terminate_as_interrupt
 from .worker import WorkerSetup, versions
 
 AHEAD = 2
@@ -82,15 +83,16 @@ class ClusterExecutor:
         constant = self._submit(_identity, shared)
         suspects = deque[Numbered]()
         most = at_once or AHEAD * self.workers
-        with closing(self._run(function, enumerate(tasks), constant, most)) as ended:
-            for numbered, done in ended:
-                if done.lost:  # perhaps by the fault of another task of that worker
-                    suspects.append(numbered)
-                else:
+        with terminate_as_interrupt():
+            with closing(self._run(function, enumerate(tasks), constant, most)) as ended:
+                for numbered, done in ended:
+                    if done.lost:  # perhaps by the fault of another task of that worker
+                        suspects.append(numbered)
+                    else:
+                        yield done
+            with closing(self._run(function, suspects, constant, 1)) as ended:
+                for _, done in ended:
                     yield done
-        with closing(self._run(function, suspects, constant, 1)) as ended:
-            for _, done in ended:
-                yield done
 
     def _run(
         self, function: Function, tasks: Iterable[Numbered], constant: Future, most: int

@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 
@@ -145,8 +144,7 @@ def fit_each(
         options = replace(options, basis=basis)
     make_work = partial(fit_work, options, levels, None if client is not None else step)
     job = Job(make_work, _may_join, keep_grey=options.color == "data")
-    folder = None if output is None else Path(output)
-    return run_images(images, folder, overwrite, job, client)
+    return run_images(images, output, overwrite, job, client)
 
 
 def fit_work(options: FitOptions, levels: int | None = None, step: Step | None = None) -> Work:

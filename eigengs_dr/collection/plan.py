@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
 from functools import partial
@@ -20,7 +21,11 @@ Loop = Callable[..., Generator[Finished, None, None]]
 
 
 def run_images(
-    images: Images, output: Path | None, overwrite: bool, job: Job, client: Any = None
+    images: Images,
+    output: str | os.PathLike[str] | None,
+    overwrite: bool,
+    job: Job,
+    client: Any = None,
 ) -> tuple[int | None, Generator[Finished, None, None]]:
     """Prepare a run; see `eigengs_dr.fit_many` for arguments and errors.
 
@@ -42,8 +47,7 @@ def run_images(
         )
     if output is None:
         return total, loop(sources, job, start=lambda names: None)
-    make_folder(output)
-    return total, _recorded(sources, job, output, overwrite, loop)
+    return total, _recorded(sources, job, make_folder(output), overwrite, loop)
 
 
 def _recorded(

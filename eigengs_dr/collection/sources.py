@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from ..gaussian.file import FORMAT
 from ..image.folder import image_files
 from ..storage import npz
-from ..storage.atomic import require_writable
+from ..storage.atomic import refuse_url, require_writable
 from .manifest import STARTED, Manifest
 from .remote import is_url, list_urls, stem_of
 
@@ -135,18 +135,21 @@ def _name_each(images: Iterable[Any]) -> Iterator[Source]:
         yield Source(name, item, place=number)
 
 
-def make_folder(output: Path) -> None:
+def make_folder(output: str | os.PathLike[str]) -> Path:
     """Create the folder of the results, and check that files can be written there.
 
     Raises
     ------
     OSError
-        If the folder cannot be created or written.
+        If the folder cannot be created or written, or is a URL.
     """
+    refuse_url(output)
+    output = Path(output)
     if output.exists() and not output.is_dir():
         raise OSError(f"{output}: is a file; many images need a folder")
     output.mkdir(parents=True, exist_ok=True)
     require_writable(output / "probe.npz")
+    return output
 
 
 def plan_output(source: Source, manifest: Manifest, overwrite: bool) -> Source:

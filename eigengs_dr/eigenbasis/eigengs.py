@@ -9,22 +9,19 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
-from functools import cached_property, partial
-from pkgutil import resolve_name
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.recording import exclusive
-from ..collection.fit_many import PACK_BASIS
 from ..collection.row import ImageRow, RowProgress
-from ..collection.run import Work
 from ..collection.sources import Images
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image
 from ..image.resize import resample
-from .encode_many import check_encoding, encode_each, group_work, packed_work
+from .encode_many import check_encoding, encode_each
 from .encoder import Encoder
 from .model_file import read_members, write_model
 from .model_fit import TrainProgress, fit_model
@@ -87,6 +84,7 @@ class EigenGS:
         steps: int | None = None,
         backend: str | None = None,
         progress: TrainProgress | None = None,
+        client: Any = None,
     ) -> EigenGS:
         """Fit one set of Gaussians to the mean image and all components of an eigenbasis.
 
@@ -108,6 +106,9 @@ class EigenGS:
         backend : {"llvm", "cuda"}, optional
         progress : callable, optional
             ``progress(step, steps, {})`` after every round of training.
+        client : distributed.Client, optional
+            Solve for the weights on the workers of this Dask cluster; their number does not change
+            the result, see `eigengs_dr.eigenbasis.components.weights.find_weights`.
 
         Raises
         ------
@@ -115,6 +116,8 @@ class EigenGS:
             If an argument is out of range.
         BackendError
             If the backend does not work.
+        ClusterError
+            If the cluster cannot be used, or is lost.
         """
         options = TrainOptions(
             size=(basis.width, basis.height),
@@ -124,7 +127,7 @@ class EigenGS:
             steps=steps,
             seed=seed,
         )
-        return cls(**fit_model(basis, options, backend, progress))
+        return cls(**fit_model(basis, options, backend, progress, client=client))
 
     @property
     def components(self) -> tuple[int, ...]:
@@ -265,37 +268,15 @@ class EigenGS:
         ValueError, OSError, RunInterrupted
             See `encode` and `eigengs_dr.fit_many`.
         """
-        check_encoding(colors, mean, target_psnr)
         options = (colors, mean, target_psnr)
-        if client is None:
-            work = partial(self.encode_work, *options)
-        else:
-            work = partial(packed_work, resolve_name(PACK_BASIS)(self), *options)
-        return encode_each(work, images, output, overwrite, progress, client)
-
-    def encode_work(self, colors: str, mean: str, target_psnr: float | None) -> Work:
-        """Return the work of `encode_many` on groups of images, with checked options of `encode`.
-
-        Parameters
-        ----------
-        colors, mean, target_psnr
-            See `encode`.
-        """
-        encode = exclusive()(self.encoder.encode)
-        return group_work(partial(encode, colors=colors, mean=mean, target_psnr=target_psnr))
+        return encode_each(self, options, images, output, overwrite, progress, client)
 
     def dense_mean(self, width: int, height: int) -> Planes:
         """Return the pixels of the mean image, shape (height, width, C), in the model's space."""
         return resample(np.moveaxis(self.mean_image, 0, 2), width, height)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write an ``.npz`` file, all or nothing; see `eigengs_dr.eigenbasis.model_file`.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written; an existing file is then unchanged.
-        """
+        """Write an ``.npz`` file, all or nothing; after OSError, an old file is unchanged."""
         write_model(path, self)
 
     @classmethod

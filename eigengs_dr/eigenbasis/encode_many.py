@@ -6,14 +6,14 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..collection.fit_many import LOAD_BASIS
+from ..backend.recording import exclusive
+from ..collection.fit_many import LOAD_BASIS, PACK_BASIS
 from ..collection.plan import run_images
 from ..collection.row import ImageRow, Outcome, RowProgress, collect
 from ..collection.run import FAILURES, Job, Work
@@ -21,6 +21,7 @@ from ..collection.sources import Images
 from ..gaussian.gaussians import Gaussians
 
 if TYPE_CHECKING:
+    from .eigengs import EigenGS
     from .registry import PackedModel
 
 MAX_GROUP = 32
@@ -52,35 +53,9 @@ def check_encoding(colors: str, mean: str, target_psnr: float | None) -> None:
         raise ValueError("target_psnr chooses components; use it with colors 'projected'")
 
 
-def group_work(encode: EncodeGroup) -> Work:
-    """Return the work on groups of images.
-
-    Parameters
-    ----------
-    encode : callable
-        ``encode(images)`` returns the Gaussians of every image of a group.
-    """
-    return partial(_encode_group, encode=encode)
-
-
-def packed_work(
-    packed: str | PackedModel, colors: str, mean: str, target_psnr: float | None
-) -> Work:
-    """Return the work on groups of images, on a worker of a cluster.
-
-    Parameters
-    ----------
-    packed : PackedModel or str
-        The result of `eigengs_dr.eigenbasis.registry.pack_basis`.
-    colors, mean, target_psnr
-        See `eigengs_dr.EigenGS.encode`.
-    """
-    work: Work = resolve_name(LOAD_BASIS)(packed).encode_work(colors, mean, target_psnr)
-    return work
-
-
 def encode_each(
-    make_work: Callable[[], Work],
+    model: EigenGS,
+    options: tuple[str, str, float | None],
     images: Images,
     output: str | os.PathLike[str] | None,
     overwrite: bool,
@@ -91,15 +66,34 @@ def encode_each(
 
     Parameters
     ----------
-    make_work : callable
-        Returns the work; on a cluster it travels.
+    model : EigenGS
+    options : tuple
+        The colors, mean and target_psnr of `eigengs_dr.EigenGS.encode_many`.
     images, output, overwrite, progress, client
-        See `eigengs_dr.EigenGS.encode_many`, also for results and errors.
+        See there, also for results and errors.
     """
-    job = Job(make_work, _may_join)
-    folder = None if output is None else Path(output)
-    total, finished = run_images(images, folder, overwrite, job, client)
-    return collect(total, finished, folder is None, progress)
+    check_encoding(*options)
+    basis = model if client is None else resolve_name(PACK_BASIS)(model)
+    job = Job(partial(encode_work, basis, *options), _may_join)
+    total, finished = run_images(images, output, overwrite, job, client)
+    return collect(total, finished, output is None, progress)
+
+
+def encode_work(
+    basis: EigenGS | str | PackedModel, colors: str, mean: str, target_psnr: float | None
+) -> Work:
+    """Return the work on groups of images, in this process or on a worker.
+
+    Parameters
+    ----------
+    basis : EigenGS, str or PackedModel
+        See `eigengs_dr.eigenbasis.registry.load_basis`.
+    colors, mean, target_psnr
+        See `eigengs_dr.EigenGS.encode`.
+    """
+    encode = exclusive()(resolve_name(LOAD_BASIS)(basis).encoder.encode)
+    encode = partial(encode, colors=colors, mean=mean, target_psnr=target_psnr)
+    return partial(_encode_group, encode=encode)
 
 
 def _may_join(group: list[Pixels], pixels: Pixels) -> bool:

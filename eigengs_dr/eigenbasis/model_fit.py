@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from ..backend.executor import executor_for
 from .components.solve import State, fit_components
 from .components.split import split_reason, wants_split
 from .options import TrainOptions
@@ -21,6 +22,7 @@ def fit_model(
     progress: TrainProgress | None = None,
     states: list[State] | None = None,
     save: Callable[[list[State]], None] = lambda states: None,
+    client: Any = None,
 ) -> dict[str, Any]:
     """Decide on the split, and fit Gaussians and weights to all components of a basis.
 
@@ -36,6 +38,8 @@ def fit_model(
         Resume from the last argument of `save`.
     save : callable, optional
         ``save(states)`` after `progress`; an error that it raises ends the work.
+    client : distributed.Client, optional
+        See `eigengs_dr.EigenGS.fit`.
 
     Returns
     -------
@@ -61,6 +65,7 @@ def fit_model(
         backend,
         states,
         report,
+        executor_for(client),
     )
     return {
         "gaussians": fitted.gaussians,

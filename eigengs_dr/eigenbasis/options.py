@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..image.folder import BASIS_SPACES, check_size
-from .pca.basis import check_components
+from .pca.component_counts import check_components
 from .pca.truncation import check_target
 
 STEPS = {"default": 0, "eigengs": 15_000}

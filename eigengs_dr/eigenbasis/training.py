@@ -26,9 +26,10 @@ from .eigengs import EigenGS
 from .evaluation import evaluate, truncation_curve_on
 from .model_fit import fit_model
 from .options import TrainOptions
-from .pca.basis import Eigenbasis, check_components
-from .pca.incremental_pca import EigenState, block_length, empty_state, merge, rank_for
-from .pca.shards import ShardOptions, is_large, shard_block_length, shard_states
+from .pca.basis import Eigenbasis
+from .pca.component_counts import check_components
+from .pca.solvers.incremental_pca import EigenState, block_length, empty_state, merge, rank_for
+from .pca.solvers.shards import ShardOptions, is_large, shard_block_length, shard_states
 from .pca.truncation import TruncationCurve
 
 HELD_OUT = 10
@@ -86,9 +87,9 @@ def train(
     progress : callable, optional
         ``progress(stage, done, total)``.
     client : distributed.Client, optional
-        Find the components on the workers of this Dask cluster, see
-        `eigengs_dr.Eigenbasis.from_images`. The images and the checkpoint must lie on a file system
-        that they share.
+        Find components and weights on the workers of this Dask cluster, see
+        `eigengs_dr.Eigenbasis.from_images` and `eigengs_dr.EigenGS.fit`. The images and the
+        checkpoint must lie on a file system that they share.
 
     Raises
     ------
@@ -263,7 +264,7 @@ def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS
         run.stop_if_pressed()
 
     states = _states(checkpoint.load("shapes") or {})
-    members = fit_model(basis, run.settings, run.backend, advance, states, save)
+    members = fit_model(basis, run.settings, run.backend, advance, states, save, run.client)
     return EigenGS(**members, held_out=np.zeros(0) if fall is None else fall.psnr)
 
 

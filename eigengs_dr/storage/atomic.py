@@ -37,8 +37,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises
     ------
     OSError
-        If the folder is missing or not writable, the target is a folder or a device, or the disk is
-        full. The message names the target.
+        If the folder is missing or not writable, the target is a folder, a device or a URL, or the
+        disk is full. The message names the target.
 
     Examples
     --------
@@ -107,8 +107,19 @@ def require_writable(path: str | os.PathLike[str]) -> None:
         raise OSError(f"{path}: {reason}; choose another path") from error
 
 
+def refuse_url(path: str | os.PathLike[str]) -> None:
+    """Raise OSError if a file or a folder to write is a URL.
+
+    Stores of objects rename no file in one step, and lock no folder; a result would not be written
+    whole or not at all.
+    """
+    if isinstance(path, str) and "://" in path:
+        raise OSError(f"{path}: results cannot be written to URLs; write to a folder, and copy it")
+
+
 def _target(path: str | os.PathLike[str]) -> Path:
     """Follow links, and refuse a target that must not be replaced, such as /dev/null."""
+    refuse_url(path)
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
         kind = "a folder" if target.is_dir() else "a device"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from eigengs_dr.backend.executor import Done, executor_for
+from eigengs_dr.backend.executor import ClusterError, Done, completed, executor_for
 
 
 def add(task, shared):
@@ -30,6 +30,18 @@ def test_errors_are_raised():
 def test_an_executor_is_taken_as_it_is():
     here = executor_for(None)
     assert executor_for(here) is here
+
+
+def test_completed_is_strict_about_lost_tasks():
+    class Losing:
+        def map(self, function, tasks, shared=None, at_once=None):
+            yield Done(1, 5)
+            yield Done(0, None, "its worker ended 2 times")
+
+    found = completed(Losing(), add, [1, 2], 3)
+    assert next(found) == (1, 5)
+    with pytest.raises(ClusterError, match="cannot be done: its worker ended 2 times"):
+        next(found)
 
 
 def test_other_clients_are_refused():

@@ -1,13 +1,16 @@
 """The option --cluster."""
 
 import json
+import subprocess
 import sys
+import time
 
 import pytest
 
 import eigengs_dr as eg
 from _helpers.clusters import files_of, folder_of_photos
 from _helpers.command import assert_refused, run, succeeded
+from _helpers.families import small_model
 from eigengs_dr.backend.executor import ClusterError
 from eigengs_dr.collection import fit_many as module
 
@@ -44,6 +47,64 @@ def test_urls(photos, tmp_path):
     pytest.importorskip("fsspec")
     succeeded(run("fit", f"file://{photos}/*.png", "-o", tmp_path / "fits", *QUICK))
     assert len(files_of(tmp_path / "fits")) == 4
+
+
+def test_results_are_not_written_to_urls(photos, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = "memory://fits: results cannot be written to URLs; write to a folder"
+    assert_refused(run("fit", photos, "-o", "memory://fits", *QUICK), said)
+    for write in (eg.fit_many, small_model("llvm").encode_many):
+        with pytest.raises(OSError, match="memory://fits: results cannot be written to URLs"):
+            write(photos, "memory://fits")
+    with pytest.raises(OSError, match=r"s3://bucket/x\.npz: results cannot be written to URLs"):
+        small_model("llvm").save("s3://bucket/x.npz")
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+@pytest.mark.slow
+def test_sigterm_ends_the_run_and_its_workers(tmp_path):
+    """As schedulers of batch jobs send it; the same command then does the rest."""
+    psutil = pytest.importorskip("psutil")
+    pytest.importorskip("distributed")
+    photos, output = folder_of_photos(tmp_path / "photos", 30, 96, 64), tmp_path / "fits"
+    command = [sys.executable, "-m", "eigengs_dr", "fit", str(photos), "-o", str(output)]
+    command += ["--gaussians", "300", "--iterations", "100", "--quiet", "--cluster", "local:2"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 120
+        while not list(output.glob("[!.]*.npz")) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        workers = psutil.Process(process.pid).children(recursive=True)
+        process.terminate()
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130 and len(workers) >= 2
+    assert said.count("\n") == 1 and "interrupted" in said and "fits the others" in said
+    assert not psutil.wait_procs(workers, timeout=10)[1]
+    partial = files_of(output)  # reads each: all are whole
+    assert 0 < len(partial) < 30
+    assert not [path for path in output.glob(".*") if path.suffix != ".npz"]
+    succeeded(run(*command[3:7], "--iterations", 100, "--gaussians", 300))
+    assert partial.items() <= files_of(output).items() and len(files_of(output)) == 30
+
+
+@pytest.mark.slow
+def test_sigterm_while_workers_start(tmp_path):
+    psutil = pytest.importorskip("psutil")
+    pytest.importorskip("distributed")
+    photos = folder_of_photos(tmp_path / "photos", 4)
+    command = [sys.executable, "-m", "eigengs_dr", "fit", str(photos), "-o", str(tmp_path / "fits")]
+    with subprocess.Popen(
+        [*command, "--cluster", "local:2"], stderr=subprocess.PIPE, text=True
+    ) as process:
+        deadline = time.monotonic() + 120
+        children = []
+        while not children and time.monotonic() < deadline:
+            children = psutil.Process(process.pid).children(recursive=True)
+            time.sleep(0.01)
+        process.terminate()
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert said.strip() == "eigengs-dr: interrupted"
+    assert not psutil.wait_procs(children, timeout=10)[1]
 
 
 def test_without_dask_one_line_says_what_to_install(photos, tmp_path, monkeypatch):

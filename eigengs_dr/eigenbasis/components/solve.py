@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.arrays import types_of, upload_rows
-from ...fitting.solvers.normal_equations import NormalEquations, squared_norms
+from ...backend.executor import Executor, executor_for
 from ...gaussian.concatenate import concatenate
 from ...gaussian.gaussians import Gaussians
 from ...image.metrics import psnr_from_mse
@@ -20,11 +20,17 @@ from .joint_state import JointState
 from .joint_training import train_jointly
 from .shape_training import on_grid, shapes_of, train_shapes
 from .split import FrequencyBand, frequency_bands, low_component_count
+from .weights import SharedShapes, Weighted, find_weights
 
 Planes = NDArray[np.float32]
 State = dict[str, NDArray[Any]]
-Part = tuple[NormalEquations, Gaussians, tuple[Planes, ...]]
-"""Normal equations, Gaussians, and their weights in the components of each channel."""
+
+
+class Band(NamedTuple):
+    """Gaussians of a band, with their weights in its components if the training found them."""
+
+    gaussians: Gaussians
+    weights: tuple[Planes, ...] = ()
 
 
 class ComponentFit(NamedTuple):
@@ -57,6 +63,7 @@ def fit_components(
     backend: str | None = None,
     states: list[State] | None = None,
     save: Callable[[list[State]], None] = lambda states: None,
+    executor: Executor | None = None,
 ) -> ComponentFit:
     """Place and train one set of Gaussians for all components, and find their weights.
 
@@ -79,15 +86,19 @@ def fit_components(
         Resume from the last argument of `save`.
     save : callable, optional
         ``save(states)`` after every round of training; an error that it raises ends the work.
+    executor : Executor, optional
+        Where the weights are solved for; this process by default.
 
     Raises
     ------
     ValueError
         If the method is "eigengs" and the basis has no components.
+    ClusterError
+        If the cluster is lost.
     """
     if method == "eigengs" and not any(map(len, basis.components)):
         raise ValueError("the images give no components to train on; use preset 'default'")
-    started = time.perf_counter()
+    started, executor = time.perf_counter(), executor or executor_for()
     sides, states = frequency_bands(basis, count, split), list(states or [])
     train, result = METHODS_BY_PRESET[method]
     for i, side in enumerate(sides):
@@ -96,21 +107,20 @@ def fit_components(
             states[i:] = [state]
             save(states)
     trained = time.perf_counter()
-    equations, gaussians, weights = _assemble(states, sides, result, backend)
-    mean = equations.solve(equations.correlate(basis.mean))
+    gaussians, weighted = _assemble(basis, states, sides, result, backend, executor)
     figures = {
         "shape_seconds": trained - started,
         "weight_seconds": time.perf_counter() - trained,
-        "psnr_components": psnr_components(equations, basis, weights),
+        "psnr_components": psnr_components(basis, weighted.errors),
     }
     if method == "default" and steps:
         size = (basis.width, basis.height)
         grids = [on_grid(size, side.splats) for side in sides]
-        equations, _, untrained = _assemble(grids, sides, result, backend)
-        figures["psnr_untrained"] = psnr_components(equations, basis, untrained)
+        _, untrained = _assemble(basis, grids, sides, result, backend, executor)
+        figures["psnr_untrained"] = psnr_components(basis, untrained.errors)
     return ComponentFit(
-        gaussians=with_colors(gaussians, mean, basis.space),
-        weights=weights,
+        gaussians=with_colors(gaussians, weighted.weights[-1].T, basis.space),
+        weights=weighted.weights[:-1],
         low=sides[0].splats if split else 0,
         low_components=low_component_count(basis) if split else 0,
         figures=figures,
@@ -118,28 +128,39 @@ def fit_components(
 
 
 def _assemble(
-    states: list[State], sides: list[FrequencyBand], result: Any, backend: str | None
-) -> Part:
-    """Return the equations, shapes and weights of the Gaussians of all bands."""
-    parts = [result(state, side, backend) for state, side in zip(states, sides, strict=True)]
-    equations, gaussians, weights = parts[0]
-    if len(parts) > 1:
-        gaussians = concatenate([part[1] for part in parts])
-        equations = NormalEquations(gaussians, sides[0].splats)
-        weights = _join_weights(weights, parts[1][2])
-    return equations, gaussians, weights
+    basis: Eigenbasis,
+    states: list[State],
+    sides: list[FrequencyBand],
+    result: Callable[..., Band],
+    backend: str | None,
+    executor: Executor,
+) -> tuple[Gaussians, Weighted]:
+    """Return the Gaussians of all bands, and their weights in the components and the mean."""
+    bands = [result(state, side, backend) for state, side in zip(states, sides, strict=True)]
+    (gaussians, known), low = bands[0], 0
+    if len(bands) > 1:
+        weights = []
+        for band, side in zip(bands, sides, strict=True):
+            shapes = SharedShapes.of(band.gaussians, backend=backend)
+            alone = band.weights or find_weights(shapes, side.components, executor).weights
+            weights.append(alone)
+        known, low = _join_weights(*weights), sides[0].splats
+        gaussians = concatenate([band.gaussians for band in bands])
+    shapes = SharedShapes.of(gaussians, low, backend)
+    return gaussians, find_weights(shapes, (*basis.components, basis.mean), executor, known)
 
 
-def psnr_components(
-    equations: NormalEquations, basis: Eigenbasis, weights: tuple[Planes, ...]
-) -> float:
-    """Return the PSNR of ``sum_j lambda_j |Psi~_j - Psi_j|^2`` per pixel and channel, in dB."""
-    total = 0.0
-    for planes, values, rows in zip(basis.components, basis.eigenvalues, weights, strict=True):
-        correlations = equations.correlate(planes)
-        error = equations.error(rows.T.astype(np.float64), correlations, squared_norms(planes))
-        total += float(values @ error)
-    return psnr_from_mse(total / basis.mean.size)
+def psnr_components(basis: Eigenbasis, errors: tuple[NDArray[np.float64], ...]) -> float:
+    """Return the PSNR of ``sum_j lambda_j |Psi~_j - Psi_j|^2`` per pixel and channel, in dB.
+
+    Parameters
+    ----------
+    basis : Eigenbasis
+    errors : tuple of ndarrays, shape (k_c,)
+        See `Weighted`; those after the C channels of the basis are ignored.
+    """
+    pairs = zip(basis.eigenvalues, errors, strict=False)
+    return psnr_from_mse(float(sum(values @ error for values, error in pairs)) / basis.mean.size)
 
 
 def _train_shapes(
@@ -150,13 +171,10 @@ def _train_shapes(
     )
 
 
-def _solve_weights(state: State, side: FrequencyBand, backend: str | None) -> Part:
-    """Return the shapes of a state and their best weights."""
+def _shapes_alone(state: State, side: FrequencyBand, backend: str | None) -> Band:
+    """Return the shapes of a state, whose weights are solved for."""
     height, width = side.components[0].shape[1:]
-    shapes = shapes_of(state, (width, height), len(side.components), backend)
-    equations = NormalEquations(shapes)
-    solutions = [equations.solve(equations.correlate(planes)) for planes in side.components]
-    return equations, shapes, tuple(weights.T.astype(np.float32) for weights in solutions)
+    return Band(shapes_of(state, (width, height), len(side.components), backend))
 
 
 def _train_jointly(
@@ -169,19 +187,18 @@ def _train_jointly(
         yield current.arrays()
 
 
-def _weights_of(state: State, side: FrequencyBand, backend: str | None) -> Part:
+def _weights_of(state: State, side: FrequencyBand, backend: str | None) -> Band:
     """Return the shapes and weights of a state; colours are 0, with all channels."""
     joint = JointState.from_arrays(state)
     blank = np.zeros((side.splats + 1, len(side.components)))
-    shapes = with_colors(joint.gaussians(backend), blank, "data")
-    return NormalEquations(shapes), shapes, joint.weights()
+    return Band(with_colors(joint.gaussians(backend), blank, "data"), joint.weights())
 
 
 METHODS_BY_PRESET = {
-    "default": (_train_shapes, _solve_weights),
+    "default": (_train_shapes, _shapes_alone),
     "eigengs": (_train_jointly, _weights_of),
 }
-"""Functions of each preset: one trains a band step by step, one turns its state into a `Part`."""
+"""Functions of each preset: one trains a band step by step, one turns its state into a `Band`."""
 
 
 def _join_weights(first: tuple[Planes, ...], second: tuple[Planes, ...]) -> tuple[Planes, ...]:

@@ -6,7 +6,6 @@ import os
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from operator import index
 from typing import Any
 
 import numpy as np
@@ -16,18 +15,17 @@ from ...image.color import ycbcr_to_rgb
 from ...image.folder import ReadProgress, Source, check_size, to_planes
 from ...image.io import check_image
 from ...image.resize import resample
-from .accumulate import accumulate
-from .basis_file import ENERGY_TOLERANCE, read_basis, write_basis
-from .incremental_pca import EigenState, rank_for
+from .accumulate import PCAOptions, accumulate
+from .basis_file import read_basis, write_basis
+from .component_counts import check_components, cumulative_share, ranks_for_energy
+from .solvers.eigenpairs import orient
+from .solvers.incremental_pca import EigenState
 from .truncation import (
     TruncationCurve,
     curve_from_eigenvalues,
     curve_from_residuals,
     residual_energy,
 )
-
-CHANNELS = {"ycbcr": ("Y", "Cb", "Cr"), "rgb": ("R", "G", "B")}
-"""Names of the channels of a space, for warnings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +39,8 @@ class Eigenbasis:
     mean : ndarray of float32, shape (C, H, W)
         Mean image, in [0, 1], in the space of the basis.
     components : tuple of C ndarrays of float32, shape (k_c, H, W)
-        Orthonormal components; the numbers k_c may differ and be 0.
+        Orthonormal components; the numbers k_c may differ and be 0. The entry of largest size of
+        a component is positive.
     eigenvalues : tuple of C ndarrays of float64, shape (k_c,)
         Variance along each component, descending; the covariance is ``1/m sum v v^T`` over the m
         training images (eq. 1 of the paper).
@@ -75,13 +74,11 @@ class Eigenbasis:
         progress: ReadProgress | None = None,
         client: Any = None,
         checkpoint: str | os.PathLike[str] | None = None,
+        solver: str = "incremental",
     ) -> Eigenbasis:
-        """Find the eigenbasis of a family of images in one pass, with memory for one block.
+        """Find the eigenbasis of a family of images in one pass.
 
-        The result is exact if all images fit in one block (1,024 of 256x256). With more blocks,
-        the last components lose some variance. From 2,049 images on, each 2,048 are a shard, and
-        the shards are merged in a fixed tree: see `eigengs_dr.eigenbasis.pca.shards`. The result
-        then has the same bits on any number of workers.
+        The number of workers does not change a bit of the result.
 
         Parameters
         ----------
@@ -105,9 +102,16 @@ class Eigenbasis:
             Work on the workers of this Dask cluster; None is this process. Workers read the files,
             so they need the same file system.
         checkpoint : path-like, optional
-            An existing folder that all workers see. It keeps the states of shards, so that the same
-            call continues after a break; the caller deletes it. Without it, the states travel
-            through this process: 295 MB a shard, for 300 components of 256x256.
+            An existing folder that all workers see, for this call alone. It keeps what tasks have
+            found, so that the same call continues after a break; the caller deletes it. Without
+            it, states travel through this process: 295 MB a shard, for 300 components of 256x256.
+        solver : {"incremental", "gram"}, optional
+            "incremental" merges blocks of up to 1,024 images. Its memory does not grow with their
+            number: a block (805 MB) and ``5 k d`` numbers for k components of d pixels in 3
+            channels. It is exact for one block; with more, the last components lose some variance.
+            "gram" is exact for up to 16,384 images. Of n images it holds ``n^2`` numbers of 8
+            bytes, and keeps all pixels, 12 bytes each, in `checkpoint` (needed with a client) or
+            in the folder of temporary files.
 
         Raises
         ------
@@ -122,9 +126,9 @@ class Eigenbasis:
         UserWarning
             If images are skipped, cropped or too few, or `components` is too low for the energy.
         """
-        size = check_size(size)
-        ranks = tuple(rank_for(k) for k in check_components(components, energy))
-        state = accumulate(source, size, color, ranks, seed, progress, client, checkpoint)
+        size, most = check_size(size), check_components(components, energy)
+        options = PCAOptions(size, color, most, seed, solver)
+        state = accumulate(source, options, progress, client, checkpoint)
         return cls.from_state(state, size, components, energy, color)
 
     @classmethod
@@ -146,8 +150,13 @@ class Eigenbasis:
         shape = (size[1], size[0])
         basis = cls(
             mean=state.mean.astype(np.float32).reshape(-1, *shape),
-            components=tuple(rows.reshape(-1, *shape) for rows in state.rows),
-            eigenvalues=tuple(scatter / state.count for scatter in state.scatter),
+            components=tuple(
+                orient(rows[:k]).reshape(-1, *shape)
+                for rows, k in zip(state.rows, most, strict=True)
+            ),
+            eigenvalues=tuple(
+                values[:k] / state.count for values, k in zip(state.scatter, most, strict=True)
+            ),
             variance=state.squares / state.count,
             count=state.count,
             space=color,
@@ -155,8 +164,10 @@ class Eigenbasis:
                 [_rgb(planes.reshape(-1, *shape), color) for planes in state.examples]
             ),
         )
-        basis = basis.truncated(most)
-        return basis if energy is None else _keep_energy(basis, most, energy)
+        if energy is None:
+            return basis
+        ranks = ranks_for_energy(basis.energy(), basis.variance, most, energy, color)
+        return basis.truncated(ranks)
 
     @property
     def width(self) -> int:
@@ -200,7 +211,7 @@ class Eigenbasis:
         The result is a tuple of C float64 arrays of shape (k_c,), ascending, at most 1.
         """
         pairs = zip(self.eigenvalues, self.variance, strict=True)
-        return tuple(_cumulative_share(values, total) for values, total in pairs)
+        return tuple(cumulative_share(values, total) for values, total in pairs)
 
     def truncation_curve(self, images: Iterable[ArrayLike] | None = None) -> TruncationCurve:
         """Return the mean PSNR of images over the number of components.
@@ -266,43 +277,6 @@ class Eigenbasis:
         lengths = np.einsum("cij,cij->c", planes, planes, dtype=np.float64)
         pairs = zip(lengths, self._coefficients(planes), strict=True)
         return [residual_energy(length, w.astype(np.float64) ** 2) for length, w in pairs]
-
-
-def check_components(
-    components: int | Sequence[int], energy: float | None = None
-) -> tuple[int, int, int]:
-    """Return the most components of each channel; raise ValueError for bad numbers or energy."""
-    if energy is not None and not 0 < energy <= 1:
-        raise ValueError(f"energy is {energy}; expected a share of the variance in (0, 1]")
-    try:
-        each = components if isinstance(components, Iterable) else (components,) * 3
-        y, cb, cr = map(index, each)
-    except (TypeError, ValueError):
-        raise ValueError(f"components is {components!r}; expected a number, or three") from None
-    if min(y, cb, cr) < 0:
-        raise ValueError(f"components is {components!r}; expected no negative number")
-    return y, cb, cr
-
-
-def _keep_energy(basis: Eigenbasis, most: Sequence[int], energy: float) -> Eigenbasis:
-    """Keep the fewest components that hold a share of the variance."""
-    ranks = []
-    for name, shares, cap in zip(CHANNELS[basis.space], basis.energy(), most, strict=True):
-        ranks.append(int(np.searchsorted(shares, energy)) + 1)
-        varies = basis.variance[len(ranks) - 1] > 0
-        share = shares[-1] if len(shares) else 0.0
-        if varies and len(shares) == cap and share < energy - ENERGY_TOLERANCE:
-            warnings.warn(
-                f"channel {name}: {cap} components hold {share:.2%} of the variance, "
-                f"less than {energy:.2%}; raise components",
-                stacklevel=3,
-            )
-    return basis.truncated(ranks)
-
-
-def _cumulative_share(eigenvalues: NDArray[np.float64], variance: float) -> NDArray[np.float64]:
-    """Return the cumulative share of the variance; empty if nothing varies."""
-    return np.minimum(np.cumsum(eigenvalues) / (variance or 1), 1)
 
 
 def _rgb(planes: NDArray[np.float32], space: str) -> NDArray[np.float32]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...image.folder import BASIS_SPACES
 from ...storage import npz
-from .incremental_pca import EXAMPLES
+from .solvers.incremental_pca import EXAMPLES
 
 FORMAT, VERSION = "eigengs_dr.eigenbasis", 1
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,10 @@ class LazyImages:
     Parameters
     ----------
     array : dask.array, shape (n, H, W, 3), (n, H, W) or (n, 3 H W)
-        Anything with ``shape``, slices of rows, and ``compute``. Rows of numbers are images of RGB,
-        pixel by pixel. The process that needs images computes them, so the array should be made of
-        readers (``from_zarr``, ``from_delayed``) and be chunked by rows.
+        Anything with ``shape``, ``chunks``, slices of rows, and ``compute``. Rows of numbers are
+        images of RGB, pixel by pixel. The process that needs images computes them, chunk by chunk,
+        so the array should be made of readers (``from_zarr``, ``from_delayed``) and be chunked by
+        rows, with some hundred images in a chunk.
     size : (int, int)
         Width and height of images that come as rows of numbers.
 
@@ -42,10 +44,13 @@ class LazyImages:
         """Return the images of some rows, still lazy."""
         return LazyImages(self.array[rows], self.size)
 
-    def blocks(self, length: int) -> Iterator[NDArray[Any]]:
-        """Compute and yield up to `length` images at a time."""
-        for first in range(0, len(self), length):
-            rows = self.array[first : first + length].compute(scheduler="synchronous")
+    def arrays(self) -> Iterator[NDArray[Any]]:
+        """Compute and yield one part of the array after the other, each once."""
+        ends = np.cumsum([0, *self.array.chunks[0]]).tolist()
+        for first, last in pairwise(ends):
+            if first == last:
+                continue
+            rows = self.array[first:last].compute(scheduler="synchronous")
             width, height = self.size
             yield np.asarray(rows).reshape(-1, height, width, 3) if rows.ndim == 2 else rows
 

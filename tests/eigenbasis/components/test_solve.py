@@ -5,7 +5,9 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, small_basis, small_model, splits
+from eigengs_dr.backend.executor import executor_for
 from eigengs_dr.eigenbasis.components.solve import fit_components, psnr_components
+from eigengs_dr.eigenbasis.components.weights import SharedShapes, find_weights
 from eigengs_dr.fitting.solvers.normal_equations import NormalEquations
 
 
@@ -58,7 +60,9 @@ def test_psnr_components_is_the_weighted_error(backend):
             )
             plane = eg.render(only).numpy()[..., 0]
             error += value * np.square(plane - basis.components[c][j]).sum()
-    found = psnr_components(NormalEquations(model.gaussians), basis, model.weights)
+    shapes = SharedShapes.of(model.gaussians, backend=backend)
+    weighted = find_weights(shapes, basis.components, executor_for(), model.weights)
+    found = psnr_components(basis, weighted.errors)
     assert found == pytest.approx(-10 * np.log10(error / basis.mean.size), abs=0.05)
 
 

@@ -12,8 +12,8 @@ from sklearn.decomposition import PCA
 from _helpers.errors import one_line
 from _helpers.low_rank import HEIGHT, SIZE, WIDTH, assert_same, basis_of, family, planes
 from eigengs_dr.eigenbasis.pca import accumulate
-from eigengs_dr.eigenbasis.pca import incremental_pca as incremental
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
+from eigengs_dr.eigenbasis.pca.solvers import incremental_pca as incremental
 from eigengs_dr.image.folder import image_files
 from eigengs_dr.image.io import ImageError, save_image
 from eigengs_dr.image.resize import resample

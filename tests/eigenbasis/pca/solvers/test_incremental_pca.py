@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from _helpers.low_rank import PIXELS, SIZE, assert_same, family, planes
-from eigengs_dr.eigenbasis.pca import incremental_pca as incremental
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
-from eigengs_dr.eigenbasis.pca.incremental_pca import EigenState, empty_state, merge
+from eigengs_dr.eigenbasis.pca.solvers import incremental_pca as incremental
+from eigengs_dr.eigenbasis.pca.solvers.incremental_pca import EigenState, empty_state, merge
 from eigengs_dr.image.folder import read_blocks
 
 
@@ -58,7 +58,7 @@ def test_merge_leaves_the_old_state_alone():
 def test_every_image_is_drawn_with_the_same_probability():
     block = np.zeros((64, 3, 1), np.float32) + np.arange(64, dtype=np.float32)[:, None, None]
     drawn = [
-        incremental._draw_examples(empty_state((1, 1), seed), block)[:, 0, 0] for seed in range(400)
+        np.stack(incremental.draw_examples([], block, 0, seed))[:, 0, 0] for seed in range(400)
     ]
     counts = np.bincount(np.concatenate(drawn).astype(int), minlength=64)
     # Expected 100 each, with a standard deviation of 8.7.

@@ -8,11 +8,16 @@ from sklearn.decomposition import PCA
 
 from _helpers.low_rank import SIZE, assert_same, family, planes
 from eigengs_dr.backend.executor import Done, executor_for
-from eigengs_dr.eigenbasis.pca import incremental_pca as incremental
-from eigengs_dr.eigenbasis.pca import shards
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
-from eigengs_dr.eigenbasis.pca.incremental_pca import EigenState, empty_state, merge, merge_states
-from eigengs_dr.eigenbasis.pca.shards import ShardOptions, shard_states
+from eigengs_dr.eigenbasis.pca.solvers import incremental_pca as incremental
+from eigengs_dr.eigenbasis.pca.solvers import shards
+from eigengs_dr.eigenbasis.pca.solvers.incremental_pca import (
+    EigenState,
+    empty_state,
+    merge,
+    merge_states,
+)
+from eigengs_dr.eigenbasis.pca.solvers.shards import ShardOptions, shard_states
 from eigengs_dr.image.io import ImageError, save_image
 
 

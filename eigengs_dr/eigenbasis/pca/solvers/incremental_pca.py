@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .eigenpairs import FLOOR, largest_eigenpairs, orthonormalize, product
 
 BLOCK_BYTES = 768 << 20
 """Bytes of a block of images."""
@@ -21,17 +23,7 @@ MARGIN = 0.25
 EXAMPLES = 16
 """Number of training images in a basis."""
 
-FLOOR = 1e-10
-"""Smallest variance of a component, per pixel (1 is white); below, it is rounding."""
-
-NOISE = 1e-8
-"""Smallest eigenvalue, as a share of all variance; below, it is rounding of the Gram matrix."""
-
-DRIFT = 1e-6
-"""Largest entry of ``V V^T - 1`` without a correction of the rows V."""
-
-COLUMNS = 4096
-"""Number of pixels to sum in single precision, before the sums are added in double."""
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +94,6 @@ class EigenState:
 
 def empty_state(size: tuple[int, int], seed: int = 0, channels: int = 3) -> EigenState:
     """Return the state of no images, with channels of a size (width, height)."""
-    if seed < 0:
-        raise ValueError(f"seed is {seed}; expected no negative number")
     pixels = size[0] * size[1]
     return EigenState(
         count=0,
@@ -154,7 +144,7 @@ def merge(state: EigenState, block: NDArray[np.float32], rank: Sequence[int]) ->
     n, b = state.count, len(block)
     if b == 0:
         return state
-    examples = _draw_examples(state, block)
+    examples = np.stack(draw_examples(state.examples, block, n, state.seed))
     mean = block.mean(axis=0, dtype=np.float64)
     # This shift towards the old mean gives the new images the scatter of both last terms.
     block -= (mean + np.sqrt(n / (n + b)) * (state.mean - mean)).astype(np.float32)
@@ -230,10 +220,10 @@ def _add_rows(
     """Add the rows of a block to a scatter matrix ``rows^T diag(scatter) rows``."""
     gram = _gram(rows, scatter, block)
     added = float(np.trace(gram[len(rows) :, len(rows) :]))
-    values, weights, dropped = _largest_eigenpairs(gram, most, floor)
+    values, weights, dropped = largest_eigenpairs(gram, most, floor)
     weights[: len(rows)] *= np.sqrt(scatter)[:, None]
     directions = _rotate(rows, block, weights.T.astype(np.float32))
-    return _Added(*_orthonormalize(directions, values), added, dropped)
+    return _Added(*orthonormalize(directions, values), added, dropped)
 
 
 def _gram(
@@ -243,28 +233,9 @@ def _gram(
     r = len(rows)
     gram = np.zeros((r + len(block),) * 2)
     gram[np.arange(r), np.arange(r)] = scatter
-    gram[r:, :r] = _product(block, rows) * np.sqrt(scatter)
-    gram[r:, r:] = _product(block, block)
+    gram[r:, :r] = product(block, rows) * np.sqrt(scatter)
+    gram[r:, r:] = product(block, block)
     return gram
-
-
-def _product(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return ``a b^T`` of long rows; pure single precision would lose small variances."""
-    result = np.zeros((len(a), len(b)))
-    for first in range(0, a.shape[1], COLUMNS):
-        result += a[:, first : first + COLUMNS] @ b[:, first : first + COLUMNS].T
-    return result
-
-
-def _largest_eigenpairs(
-    gram: NDArray[np.float64], most: int, floor: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return the largest eigenvalues, descending, the weights of rows, and the next eigenvalue."""
-    values, vectors = np.linalg.eigh(gram, UPLO="L")
-    values, vectors = values[::-1], vectors[:, ::-1]
-    kept = min(most, int((values > max(floor, NOISE * np.trace(gram))).sum()))
-    dropped = max(0.0, float(values[kept])) if kept < len(values) else 0.0
-    return values[:kept], vectors[:, :kept] / np.sqrt(values[:kept]), dropped
 
 
 def _rotate(
@@ -276,31 +247,33 @@ def _rotate(
     return result
 
 
-def _orthonormalize(
-    rows: NDArray[np.float32], scatter: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Drop spurious rows and make the others orthonormal again after rounding."""
-    overlap = _product(rows, rows)
-    # If the length of a row is far from 1, its eigenvalue is rounding and the row means nothing.
-    real = np.abs(np.diag(overlap) - 1) < 0.5
-    if not real.all():
-        rows, scatter, overlap = rows[real], scatter[real], overlap[real][:, real]
-    if np.abs(overlap - np.eye(len(rows))).max(initial=0) > DRIFT:
-        # Gram-Schmidt, largest scatter first, so that errors leave the rows of small scatter.
-        inverse = np.linalg.inv(np.linalg.cholesky(overlap))
-        rows = inverse.astype(np.float32) @ rows
-    return rows, scatter
+def draw_examples(
+    examples: Iterable[Item], items: Iterable[Item], first: int, seed: int
+) -> list[Item]:
+    """Sample examples by reservoir: image i draws one of i + 1 places; the first places count.
 
+    Parameters
+    ----------
+    examples : iterable
+        The examples of the images before.
+    items : iterable
+        The next images, or their numbers.
+    first : int
+        Number of the first of them.
+    seed : int
 
-def _draw_examples(state: EigenState, block: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Sample examples by reservoir: image i draws one of i + 1 places; the first places count."""
-    examples = list(state.examples)
-    for i, image in enumerate(block, state.count):
+    Returns
+    -------
+    list
+        At most `EXAMPLES` of `examples` and `items`.
+    """
+    drawn = list(examples)
+    for i, item in enumerate(items, first):
         # One generator for each image, so that no generator is part of the state.
-        place = i if i < EXAMPLES else np.random.default_rng((state.seed, i)).integers(i + 1)
+        place = i if i < EXAMPLES else np.random.default_rng((seed, i)).integers(i + 1)
         if place < EXAMPLES:
-            examples[place : place + 1] = [image.copy()]
-    return np.stack(examples)
+            drawn[place : place + 1] = [item]
+    return drawn
 
 
 def _join_examples(first: EigenState, second: EigenState) -> NDArray[np.float32]:

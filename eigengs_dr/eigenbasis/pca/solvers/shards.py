@@ -6,9 +6,8 @@ any number of workers. The channels of a shard are states of their own: a merge 
 
 from __future__ import annotations
 
-import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -18,12 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.executor import ClusterError, Executor
-from ...image.folder import ReadProgress, read_blocks
-from ...image.io import ImageError
-from ...storage.checkpoint import read_arrays, write_arrays
+from ....backend.executor import Executor, completed
+from ....image.folder import ReadProgress, read_blocks
+from ....image.io import ImageError
+from ....storage.checkpoint import read_arrays, write_arrays
 from .incremental_pca import EigenState, block_length, empty_state, merge, merge_states
-from .lazy_images import LazyImages
+from .parts import Images, absolute, collect_notes, is_countable, readable
+from .shard_tree import Node, holds, tree_levels
 
 SHARD = 2048
 """Images of a shard. Merging two states of 375 rows takes 0.2 of the time of a shard of so many
@@ -33,14 +33,8 @@ BLOCKS_OF_SHARD = 4
 """If there are several shards, a block has this fraction of the images of `block_length`: 256 of
 256x256. A worker then needs less than 1 GB."""
 
-Node = tuple[int, int]
-"""A range of shards, from the first to the last, without the last."""
-
 Stored = EigenState | Path
 """A state of one channel, or its file."""
-
-Images = Sequence[Any] | NDArray[Any] | LazyImages
-"""Files or single images, one array of images, or a lazy one."""
 
 Progress = Callable[[int, int], None]
 """``progress(done, total)``, in images."""
@@ -103,18 +97,6 @@ class Made(NamedTuple):
     notes: list[str]
 
 
-def is_countable(source: Any) -> bool:
-    """Whether a source is a sequence of files or of single images, which can be cut in shards."""
-    if isinstance(source, np.ndarray):
-        return source.ndim == 4 or (source.ndim == 3 and source.shape[2] not in (1, 3))
-    if isinstance(source, LazyImages):
-        return True
-    return isinstance(source, Sequence) and all(
-        isinstance(item, (str, os.PathLike)) or getattr(item, "shape", ())[2:] in ((1,), (3,))
-        for item in source
-    )
-
-
 def is_large(source: Any) -> bool:
     """Whether a source has so many images that their PCA is always done in shards."""
     return is_countable(source) and len(source) > SHARD
@@ -156,7 +138,7 @@ def shard_states(
         If the cluster is lost, or a task ends its worker again and again.
     """
     count = -(-len(source) // SHARD)
-    levels = _levels(count)
+    levels = tree_levels(count)
     channels = range(len(options.ranks))
     states: dict[tuple[Node, int], Stored] = {}
     for node in (node for level in levels for node in level):
@@ -169,14 +151,13 @@ def shard_states(
 
     def needed(node: Node) -> bool:
         """Whether a node has to be computed: neither it nor what it became is known."""
-        return not any(known(other) for level in levels for other in level if _holds(other, node))
+        return not any(known(other) for level in levels for other in level if holds(other, node))
 
     wanted = [node for node in levels[0] if needed(node)]
     done = len(source) - sum(_size(node, len(source)) for node in wanted)
-    tasks = (Shard(node, _absolute(source[node[0] * SHARD : node[1] * SHARD])) for node in wanted)
-    with closing(executor.map(make_shard, tasks, options)) as ended:
-        for index, made, lost in ended:
-            _require(lost)
+    tasks = (Shard(node, absolute(source[node[0] * SHARD : node[1] * SHARD])) for node in wanted)
+    with closing(completed(executor, make_shard, tasks, options)) as ended:
+        for index, made in ended:
             for note in made.notes:
                 warnings.warn(note, stacklevel=3)
             states |= {(wanted[index], c): state for c, state in enumerate(made.states)}
@@ -193,26 +174,14 @@ def make_shard(shard: Shard, options: ShardOptions) -> Made:
     """Find the state of each channel of a shard; this function runs on a worker."""
     seed = options.seed + shard.node[0]
     states = [empty_state(options.size, seed, channels=1) for _ in options.ranks]
-    source: Any = shard.source
-    if isinstance(source, LazyImages):
-        source = source.blocks(options.length)
-    notes: list[str] = []
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
-        try:
-            blocks = read_blocks(
-                source, options.size, options.space, options.length, options.advance
-            )
-            with closing(blocks):
-                for block in blocks:
-                    for c, rank in enumerate(options.ranks):
-                        states[c] = merge(states[c], block[:, c : c + 1], [rank])
-                    del block  # before the next is read
-        except ImageError as error:
-            if isinstance(source, np.ndarray):  # not a file, which may be bad
-                raise
-            notes.append(str(error))
-    notes += [str(note.message) for note in caught]
+    source = readable(shard.source)
+    with collect_notes(source) as notes:
+        blocks = read_blocks(source, options.size, options.space, options.length, options.advance)
+        with closing(blocks):
+            for block in blocks:
+                for c, rank in enumerate(options.ranks):
+                    states[c] = merge(states[c], block[:, c : c + 1], [rank])
+                del block  # before the next is read
     stored = [_store(state, options.path(shard.node, c)) for c, state in enumerate(states)]
     return Made(stored, notes)
 
@@ -232,7 +201,7 @@ def _merge_level(
     executor: Executor,
 ) -> None:
     """Compute the nodes of a level that are not known, and forget those below."""
-    pairs = [[child for child in below if _holds(node, child)] for node in level]
+    pairs = [[child for child in below if holds(node, child)] for node in level]
     channels = range(len(options.ranks))
     wanted = [
         (node, channel, children)
@@ -245,9 +214,8 @@ def _merge_level(
         Merge(node, channel, states[children[0], channel], states[children[1], channel])
         for node, channel, children in wanted
     )
-    with closing(executor.map(merge_pair, tasks, options)) as ended:
-        for index, state, lost in ended:
-            _require(lost)
+    with closing(completed(executor, merge_pair, tasks, options)) as ended:
+        for index, state in ended:
             node, channel, children = wanted[index]
             states[node, channel] = state
             if needed(node):  # its other channels may need them, if this run stops here
@@ -257,38 +225,8 @@ def _merge_level(
                     old.unlink(missing_ok=True)
 
 
-def _levels(count: int) -> list[list[Node]]:
-    """Return the tree over some shards: neighbours join; an odd last one goes up alone."""
-    level = [(k, k + 1) for k in range(count)]
-    levels = [level]
-    while len(level) > 1:
-        level = [
-            (pair[0][0], pair[-1][1])
-            for pair in (level[k : k + 2] for k in range(0, len(level), 2))
-        ]
-        levels.append(level)
-    return levels
-
-
-def _holds(node: Node, other: Node) -> bool:
-    return node[0] <= other[0] and other[1] <= node[1]
-
-
 def _size(node: Node, images: int) -> int:
     return min(node[1] * SHARD, images) - node[0] * SHARD
-
-
-def _absolute(images: Images) -> Images:
-    """Name files from the root: a worker runs in another folder."""
-    if not isinstance(images, Sequence):
-        return images
-    is_file = (str, os.PathLike)
-    return [Path(item).absolute() if isinstance(item, is_file) else item for item in images]
-
-
-def _require(lost: str) -> None:
-    if lost:
-        raise ClusterError(f"a part of the PCA cannot be done: {lost}")
 
 
 def _store(state: EigenState, path: Path | None) -> Stored:
