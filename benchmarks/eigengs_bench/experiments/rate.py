@@ -20,7 +20,7 @@ from PIL import Image as pillow
 from eigengs_bench.harness.datasets import images_of
 from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.timing import Image, decibels
-from eigengs_dr.codec.bit_allocation import pack
+from eigengs_dr.codec.packing import pack
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.image.io import to_8bit
 from eigengs_dr.image.metrics import ssim
