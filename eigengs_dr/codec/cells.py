@@ -2,9 +2,9 @@
 
 The order of N Gaussians is not stored, which saves ``log2(N!)`` bits. A square is halved until
 its parts are single cells, once across and once along in turn. The number of Gaussians in a half,
-of n in both, follows a beta-binomial distribution: Gaussians of a fit keep their distance, so halves
-have more equal numbers than by chance. The counts of large parts also tell where Gaussians are
-dense.
+of n in both, follows a beta-binomial distribution: Gaussians of a fit keep their distance, so
+halves have more equal numbers than by chance. The counts of large parts also tell where Gaussians
+are dense.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .range_coder import _Coder, categorical
+from .range_coder import Coder, categorical
 
 IntArray = NDArray[np.int64]
 
@@ -27,7 +27,7 @@ MAX_MODELLED = 15
 
 
 def code_cells(
-    coder: _Coder, count: int, levels: int, evenness: int, cells: IntArray | None = None
+    coder: Coder, count: int, levels: int, evenness: int, cells: IntArray | None = None
 ) -> IntArray:
     """Code the cells of Gaussians in any order; return them in the order of `morton_encode`.
 
@@ -60,9 +60,7 @@ def code_cells(
     return morton_decode(np.repeat(prefix, number), levels)
 
 
-def _code_halves(
-    coder: _Coder, number: IntArray, evenness: int, upper: IntArray | None
-) -> IntArray:
+def _code_halves(coder: Coder, number: IntArray, evenness: int, upper: IntArray | None) -> IntArray:
     """Code how many of each `number` of Gaussians lie in the second half."""
     result = np.zeros(len(number), np.int64)
     plain = (number == 1) | (number > MAX_MODELLED)
@@ -79,7 +77,7 @@ def _code_halves(
     return result
 
 
-def _any_number(coder: _Coder, number: IntArray, upper: IntArray | None) -> IntArray:
+def _any_number(coder: Coder, number: IntArray, upper: IntArray | None) -> IntArray:
     """Code integers from 0 to `number`, which may be large."""
     result, factor = np.zeros(len(number), np.int64), 1
     if number.max() < 1 << 20:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .exact_math import angle_in_turns, cos_turns, sin_turns
 from .neighbors import Pass
-from .range_coder import _Coder, categorical
+from .range_coder import Coder, categorical
 from .weights import CLASSES
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ class Directions:
         Numbers of directions.
     """
 
-    def __init__(self, coder: _Coder, passes: list[Pass], length: Array, turns: IntArray) -> None:
+    def __init__(self, coder: Coder, passes: list[Pass], length: Array, turns: IntArray) -> None:
         self.coder, self.passes, self.length, self.turns = coder, passes, length, turns
         self.u, self.v = np.zeros(len(turns)), np.zeros(len(turns))
 

@@ -49,7 +49,7 @@ _HEADER = struct.Struct("<4sBBBBHIIiiffd")
 and row of the first cell, the steps, and the cutoff."""
 
 _SECTION = struct.Struct("<III")
-"""Number of Gaussians, number of bytes that follow, and their CRC-32."""
+"""Number of Gaussians, number of bytes that follow, and the CRC-32 of that number and the bytes."""
 
 _CHECK = struct.Struct("<I")
 
@@ -116,7 +116,8 @@ def to_bytes(packed: EgsContent) -> bytes:
     parts = [head, _CHECK.pack(zlib.crc32(head))]
     for section in packed.sections:
         body = _body(section, packed.steps, corner, levels)
-        parts += [_SECTION.pack(len(section.cell), len(body), zlib.crc32(body)), body]
+        count = len(section.cell)
+        parts += [_SECTION.pack(count, len(body), section_check(count, body)), body]
     return b"".join(parts)
 
 
@@ -165,6 +166,11 @@ def read_set(path: Path, sections: int | None = None) -> SetData:
     """Read a packed set for `eigengs_dr.Gaussians.load`; for parameters and errors see `read`."""
     content = read(path, sections)
     return SetData(content.arrays(), content.size, content.space, content.cutoff)
+
+
+def section_check(count: int, body: bytes) -> int:
+    """Return the checksum of a section."""
+    return zlib.crc32(body, zlib.crc32(_CHECK.pack(count)))
 
 
 def _body(section: Symbols, steps: Steps, corner: IntArray, levels: int) -> bytes:
@@ -267,7 +273,7 @@ def _section(file: BinaryIO, size: int, number: int) -> tuple[bytes, int]:
             f"section {number} claims {splats} Gaussians in {length} bytes; copy the file again"
         )
     body = _exactly(file, length)
-    if zlib.crc32(body) != check:
+    if section_check(splats, body) != check:
         raise BadValue(f"section {number} is damaged; copy the file again")
     return body, splats
 

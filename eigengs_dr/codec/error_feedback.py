@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..backend.arrays import types_of
 from ..fitting.initializers import FitProblem
 from ..fitting.optimizers.descent import descend
+from ..fitting.optimizers.schedule import Schedule
 from ..fitting.presets import PRESETS
 from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.gaussians import Gaussians
@@ -37,9 +38,7 @@ RATE = 0.3
 """Learning rates of this descent, as a fraction of those of `fit`: the optimum is near."""
 
 
-def quantize_with_feedback(
-    gaussians: Gaussians, target: Array, steps: Steps, groups: int = GROUPS
-) -> EgsContent:
+def quantize_with_feedback(gaussians: Gaussians, target: Array, steps: Steps) -> EgsContent:
     """Round a set; let the Gaussians not yet rounded compensate.
 
     Parameters
@@ -49,8 +48,6 @@ def quantize_with_feedback(
     target : ndarray, shape (H, W, C)
         Target of the rendering, in the space of the set.
     steps : Steps
-    groups : int, optional
-        Largest number of groups.
 
     Returns
     -------
@@ -63,7 +60,7 @@ def quantize_with_feedback(
         If a number would be too large to store.
     """
     count = len(gaussians)
-    groups = min(groups, count)
+    groups = min(GROUPS, count)
     place = np.empty(count, np.int64)
     place[_along_curve(gaussians)] = np.arange(count)
     free, rest, done = np.arange(count), np.asarray(target, np.float32), list[Symbols]()
@@ -122,7 +119,7 @@ def _rendered(like: Gaussians, arrays: dict[str, Array]) -> NDArray[np.float32]:
     return np.asarray(render(found).numpy(), np.float32)
 
 
-def _slow_schedule():  # type: ignore[no-untyped-def]
+def _slow_schedule() -> Schedule:
     schedule = PRESETS["default"].schedule
     rates = {name: RATE * rate for name, rate in schedule.rates.items()}
     return replace(schedule, rates=rates, redistribute_after=0)

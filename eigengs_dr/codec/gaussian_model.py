@@ -27,7 +27,7 @@ from .quantization import (
     precision,
     turns_of,
 )
-from .range_coder import _Coder
+from .range_coder import Coder
 from .weights import MIN_WIDTH, Model, Weights, fit_weights, weighted
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ class GaussianCoder:
     """
 
     def __init__(
-        self, coder: _Coder, cells: IntArray, model: Model | None = None, rich: bool = True
+        self, coder: Coder, cells: IntArray, model: Model | None = None, rich: bool = True
     ) -> None:
         self.coder, self.cells, self.rich = coder, cells, rich
         self.known, self.model = iter(model.weights) if model else None, model or Model()

@@ -58,7 +58,8 @@ def passes_of(cells: IntArray) -> list[Pass]:
     passes = [Pass(index[:: 2 * STRIDES[0]], [], [])]
     for stride in STRIDES:
         rows = index[stride :: 2 * stride]
-        known, weight, total = [], [], np.zeros(len(rows))
+        known, weight = list[IntArray](), list[Array]()
+        total = np.zeros(len(rows))
         for place in PLACES:
             other = rows + place * stride
             inside = (other >= 0) & (other < len(cells))

@@ -39,8 +39,8 @@ MSE_WITHOUT_IMAGE = 1e-4
 MIN_MSE = 1e-9
 """Smallest mean squared error that counts: 90 dB."""
 
-FIRST_STEP, PLAIN_ATTEMPTS = 0.06, 6
-"""Step of the colours at which the search starts, and attempts without error feedback."""
+FIRST_STEP = 0.06
+"""Step of the colours at which the search starts."""
 
 CELLS = 4
 """Cells for the mean distance of Gaussians: some lie in one cell, and few bits tell the rest."""
@@ -161,7 +161,7 @@ def pack(
     def compensated(octaves: float) -> Attempt:
         return judge(quantize_with_feedback(gaussians, target, _steps(gaussians, octaves)))
 
-    found = largest_within(plain, attempts=PLAIN_ATTEMPTS)
+    found = largest_within(plain)
     if len(rows) == 1:  # compensation for the whole set would harm its prefixes
         start = MIN_OCTAVES if found is None else found[0] - 0.5 * np.log2(FEEDBACK)
         found = largest_within(compensated, start)

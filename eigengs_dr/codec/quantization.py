@@ -26,6 +26,7 @@ from ..gaussian.covariance import log_shapes
 from .exact_math import cos_turns, exp2, sin_turns
 
 Array = NDArray[np.floating]
+Double = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MAX_SYMBOL = 1 << 23
@@ -91,15 +92,15 @@ class Symbols(NamedTuple):
         return Symbols(*(part[chosen] for part in self))
 
 
-def precision(color: IntArray) -> NDArray[np.float64]:
+def precision(color: IntArray) -> Double:
     """Return Q, shape (N,), for colours (N, C) in steps."""
-    squares = np.zeros(len(color))
+    squares: Double = np.zeros(len(color))
     for channel in color.T.astype(np.float64):  # one after another: the same bits everywhere
         squares = squares + channel * channel
     return np.maximum(np.sqrt(squares), MIN_PRECISION)
 
 
-def turns_of(stretch: Array, fineness: Array) -> IntArray:
+def turns_of(stretch: Double, fineness: Double) -> IntArray:
     """Return the number of directions for stretches l and the Q of Gaussians, both (N,)."""
     with np.errstate(all="ignore"):
         wide = exp2(2 * LOG2E * stretch)
@@ -107,7 +108,7 @@ def turns_of(stretch: Array, fineness: Array) -> IntArray:
     return np.clip(turns, 1, MAX_TURNS).astype(np.int64)
 
 
-def factors_of(scale: Array, stretch: Array, turn: Array) -> NDArray[np.float64]:
+def factors_of(scale: Double, stretch: Double, turn: Double) -> Double:
     """Return the factors a, b, c, shape (N, 3), for s, l and t in turns, by exact arithmetic."""
     with np.errstate(all="ignore"):
         wide, size = exp2(2 * LOG2E * stretch), exp2(LOG2E * scale)
@@ -188,7 +189,7 @@ def dequantize(symbols: Symbols, steps: Steps) -> dict[str, Array]:
         }
 
 
-def _factors(scale: IntArray, stretch: IntArray, turn: IntArray, fineness: Array) -> Array:
+def _factors(scale: IntArray, stretch: IntArray, turn: IntArray, fineness: Double) -> Double:
     """Return the factors of integers."""
     length = stretch * (STRETCH_STEP / fineness)
     turns = turns_of(length, fineness)

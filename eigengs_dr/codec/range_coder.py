@@ -52,7 +52,7 @@ def categorical(probabilities: Array) -> Any:
     return constriction.stream.model.Categorical(np.asarray(probabilities, float), perfect=False)
 
 
-class _Coder:
+class Coder:
     """What both directions share: distributions made of `_uniform` and `_table`."""
 
     def uniform(self, sizes: IntArray, values: IntArray | None = None) -> IntArray:
@@ -129,7 +129,7 @@ class _Coder:
         raise NotImplementedError
 
 
-class Encoder(_Coder):
+class Encoder(Coder):
     """Integers to bytes."""
 
     def __init__(self) -> None:
@@ -148,7 +148,7 @@ class Encoder(_Coder):
         return bytes(self._coder.get_compressed().astype("<u4").tobytes())
 
 
-class Decoder(_Coder):
+class Decoder(Coder):
     """Bytes to integers; hostile bytes give some integers, or `BadValue`."""
 
     def __init__(self, data: bytes) -> None:
@@ -170,13 +170,13 @@ class Decoder(_Coder):
 
 @cache
 def _student(label: int, tails: int) -> Any:
-    """Return the model of the high parts of numbers of a class, see `_Coder.numbers`."""
+    """Return the model of the high parts of numbers of a class, see `Coder.numbers`."""
     kind, offset = divmod(label, OFFSETS)
     shift = max(0, -(-kind // PER_OCTAVE) - 3)
     width = float(exp2(np.array(kind / PER_OCTAVE)))
     edges = np.arange(-REACH, REACH + 1) * float(1 << shift) - 0.5
     edges = (edges - ((offset + 0.5) / OFFSETS - 0.5)) / width
-    below = _student_cdf(edges, tails)
+    below = _student_cdf(np.asarray(edges, np.float64), tails)
     below[0], below[-1] = 0.0, 1.0
     return categorical(np.maximum(np.diff(below), 1e-7))
 

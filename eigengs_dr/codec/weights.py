@@ -1,4 +1,4 @@
-"""The weights of a model of probabilities: how an encoder finds them, and how a file stores them."""
+"""The weights of a model of probabilities: how an encoder finds them, and how files store them."""
 
 from __future__ import annotations
 
