@@ -36,10 +36,10 @@ bound, which fits `eigengs_dr.codec.hilbert_index.MAX_LEVELS`."""
 SCALE_STEP, STRETCH_STEP, TURN_STEP, MEAN_STEP = 1.2, 1.0, 1.0, 1.4142135623730951
 """Steps of s, l, the angle and the mean, times Q."""
 
-MIN_PRECISION = 0.7
+MIN_PRECISION = 1.0
 """Smallest Q: the shape of a Gaussian with a colour of 0 steps."""
 
-DEAD_ZONE = 0.12
+DEAD_ZONE = 0.08
 """Part of a step by which colours are rounded towards 0, which saves bits for little error."""
 
 MAX_TURNS, MAX_PARTS = 1 << 20, 1 << 16
