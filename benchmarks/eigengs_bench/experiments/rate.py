@@ -58,7 +58,7 @@ class Codec(NamedTuple):
 CODECS = {
     "JPEG 4:2:0": Codec("JPEG", {"optimize": True, "subsampling": 2}),
     "JPEG 4:4:4": Codec("JPEG", {"optimize": True, "subsampling": 0}),
-    "JPEG 2000": Codec("JPEG2000", {"irreversible": True}, RATIOS),
+    "JPEG 2000": Codec("JPEG2000", {"irreversible": True, "mct": 1}, RATIOS),
     "WebP": Codec("WEBP", {"method": 6}),
     # Slower settings take up to 20 s a photo, for 1 % more bits at equal PSNR.
     "AVIF": Codec("AVIF", {"speed": 4, "max_threads": 1}),
