@@ -4,7 +4,7 @@ from .backend.executor import ClusterError
 from .backend.recording import exclusive
 from .backend.selection import BackendError
 from .blocks.fit_large import LargeFit, fit_large
-from .codec.bit_allocation import PackResult, pack
+from .codec.packing import PackResult, pack
 from .collection.fit_many import fit_many
 from .collection.row import ImageRow, RunInterrupted
 from .eigenbasis.eigengs import EigenGS

@@ -75,7 +75,7 @@ def pareto(task: Task, names: Names) -> Any:
 @measures_rows("rate.jsonl")
 @set_options(3)
 def rate(task: Task, names: Names) -> Any:
-    """Compare packed fits with JPEG and WebP at equal size.
+    """Compare packed fits with JPEG, JPEG 2000, WebP and AVIF at equal size.
 
     FOLDER gets a chart a set. An image of 256x256 pixels takes a minute.
     """

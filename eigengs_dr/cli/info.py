@@ -19,8 +19,8 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     """Show the contents of a fitted image or a model.
 
     NAME is a basis of the package, such as natural. For a fitted image, bpp is the size of the
-    file in bits per pixel. For a packed image, the command also shows the bits per value and the
-    quantisation step of each parameter.
+    file in bits per pixel. For a packed image, the command also shows the steps of the
+    quantisation.
 
     For a model, a table shows the first components of all channels in order of variance: their
     share of the variance, and the PSNR of PCA with them, for the training images and for the
@@ -98,10 +98,9 @@ def _describe_head(head: Any) -> dict[str, Any]:
 
 
 def _describe_packed(content: Any) -> dict[str, Any]:
-    """Return the bits per value and the quantisation step of each parameter."""
+    """Return the Gaussians of each section and the quantisation steps."""
     return {
-        "sections": [len(section.mean) for section in content.sections],
-        **{f"{name}_bits": bits for name, bits in content.widths().items()},
+        "sections": [len(section.cell) for section in content.sections],
         **{f"{name}_step": float(f"{step:.4g}") for name, step in content.steps._asdict().items()},
     }
 

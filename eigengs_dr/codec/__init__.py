@@ -1,10 +1,12 @@
 """Sets of Gaussians in few bytes.
 
-- ``quantization``: parameters as whole numbers
-- ``hilbert_index``: places along a Hilbert curve
-- ``entropy``: whole numbers as bytes
+- ``quantization``: Gaussians as integers
+- ``hilbert_index``, ``neighbors``: what is near
+- ``exact_math``: functions with the same bits on every machine
+- ``range_coder``: integers with probabilities as bits
+- ``cells``, ``gaussian_model``, ``directions``, ``weights``: the probabilities
 - ``egs``: the .egs file
-- ``bit_allocation``: `pack`: steps for a loss of PSNR
-- ``step_search``: a common factor of the steps, by attempts on a ladder
-- ``error_feedback``: rounding that later parameters compensate
+- ``packing``: `pack`: the largest steps within a loss of PSNR
+- ``step_search``: the search of a step by few attempts
+- ``error_feedback``: rounding that later Gaussians compensate
 """

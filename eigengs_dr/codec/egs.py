@@ -1,10 +1,10 @@
 """The ``.egs`` file format: Gaussians as integers, in sections that are read one by one.
 
-All numbers are little endian. The file starts with a header (`_HEADER`), the cutoff from version 2
-on, the background and a checksum. The sections follow. A section starts with its number of
-Gaussians, its length and its checksum (`_SECTION`). Its planes of integers follow, see
-`eigengs_dr.codec.entropy`: steps along a Hilbert curve through the means, s, u, v, and one plane
-per channel.
+All numbers are little endian. The file starts with a header (`_HEADER`), the background and a
+checksum. The sections follow. A section starts with its number of Gaussians, its length and its
+checksum (`_SECTION`). Its body holds a byte (`RICH` and an index in `EVENNESS`), the weights of a
+model (`eigengs_dr.codec.weights`), and the words of a range coder: the cells
+(`eigengs_dr.codec.cells`), then all other integers (`eigengs_dr.codec.gaussian_model`).
 """
 
 from __future__ import annotations
@@ -22,29 +22,34 @@ from ..gaussian.file import CUTOFF, SetData
 from ..image.color import MAX_CHANNELS, SPACES
 from ..storage.atomic import atomic_write
 from ..storage.npz import MAX_ENTRIES, BadValue
-from .entropy import decode, encode
-from .hilbert_index import MAX_LEVELS, hilbert_decode, hilbert_encode
+from . import weights
+from .cells import EVENNESS, code_cells
+from .gaussian_model import GaussianCoder
+from .hilbert_index import MAX_LEVELS, hilbert_encode
 from .quantization import Steps, Symbols, dequantize
+from .range_coder import Decoder, Encoder
+
+IntArray = NDArray[np.int64]
 
 SUFFIX = ".egs"
 
 MAGIC = b"\x89EGS"
 """First bytes of a file. The first byte is no ASCII character, so no text file starts with it."""
 
-VERSION = 2
-"""Newest version of the format. Version 2 adds a cutoff after the header; sets with the default
-cutoff are written as version 1."""
+VERSION = 3
+"""Version of the format. Versions 1 and 2, of packages before release, are not read."""
 
 MAX_SECTIONS = 1 << 12
 
-_HEADER = struct.Struct("<4sBBBBHIIii4f")
-"""Magic, version, space, channels, levels of the curve, sections, width, height, corner x and y
-(in steps from the centre of the first pixel), and the steps."""
+RICH = 0x80
+"""Flag of a section that stores all weights, not only the first ones."""
+
+_HEADER = struct.Struct("<4sBBBBHIIiiffd")
+"""Magic, version, space, channels, levels of the square of cells, sections, width, height, column
+and row of the first cell, the steps, and the cutoff."""
 
 _SECTION = struct.Struct("<III")
-"""Number of Gaussians, number of bytes that follow, and their CRC-32."""
-
-_CUTOFF = struct.Struct("<d")
+"""Number of Gaussians, number of bytes that follow, and the CRC-32 of that number and the bytes."""
 
 _CHECK = struct.Struct("<I")
 
@@ -79,23 +84,9 @@ class EgsContent(NamedTuple):
         with np.errstate(over="ignore"):
             return {name: value.astype(np.float32) for name, value in values.items()}
 
-    def widths(self) -> dict[str, list[int]]:
-        """Return the bits for the range of each parameter: x and y; s, u and v; the colours.
-
-        The codes of a file are shorter, because the values are not uniform.
-        """
-        return {
-            name: [int(span).bit_length() for span in np.ptp(part, axis=0)]
-            for name, part in self.whole()._asdict().items()
-        }
-
     def whole(self) -> Symbols:
         """Return the Gaussians of all sections."""
-        return Symbols(
-            np.concatenate([section.mean for section in self.sections]),
-            np.concatenate([section.shape for section in self.sections]),
-            np.concatenate([section.color for section in self.sections]),
-        )
+        return Symbols(*map(np.concatenate, zip(*self.sections, strict=True)))
 
 
 def is_egs(path: str | os.PathLike[str]) -> bool:
@@ -106,12 +97,12 @@ def is_egs(path: str | os.PathLike[str]) -> bool:
 
 def to_bytes(packed: EgsContent) -> bytes:
     """Return the bytes of a file; sort the Gaussians of each section in Hilbert-curve order."""
-    mean = packed.whole().mean
-    corner = mean.min(axis=0)
-    levels = int((mean - corner).max()).bit_length()
+    cells = packed.whole().cell
+    corner = cells.min(axis=0)
+    levels = int((cells - corner).max()).bit_length()
     head = _HEADER.pack(
         MAGIC,
-        1 if packed.cutoff == CUTOFF else VERSION,
+        VERSION,
         SPACES.index(packed.space),
         len(packed.background),
         levels,
@@ -119,14 +110,14 @@ def to_bytes(packed: EgsContent) -> bytes:
         *packed.size,
         *corner.tolist(),
         *packed.steps,
+        packed.cutoff,
     )
-    if packed.cutoff != CUTOFF:
-        head += _CUTOFF.pack(packed.cutoff)
     head += packed.background.astype("<f4").tobytes()
     parts = [head, _CHECK.pack(zlib.crc32(head))]
     for section in packed.sections:
-        body = _body(section, corner, levels)
-        parts += [_SECTION.pack(len(section.mean), len(body), zlib.crc32(body)), body]
+        body = _body(section, packed.steps, corner, levels)
+        count = len(section.cell)
+        parts += [_SECTION.pack(count, len(body), section_check(count, body)), body]
     return b"".join(parts)
 
 
@@ -177,47 +168,76 @@ def read_set(path: Path, sections: int | None = None) -> SetData:
     return SetData(content.arrays(), content.size, content.space, content.cutoff)
 
 
-def _body(section: Symbols, corner: NDArray[np.int64], levels: int) -> bytes:
-    """Return the bytes of the planes of a section."""
-    places = hilbert_encode(section.mean - corner, levels)
-    # Gaussians at one position are sorted too, so that equal sets in any order give equal files.
-    columns = [*section.color.T[::-1], *section.shape.T[::-1], places]
-    order = np.lexsort(columns)
-    ways = np.diff(places[order], prepend=0)
-    planes = [ways, *section.shape[order].T, *section.color[order].T]
-    return b"".join(map(encode, planes))
+def section_check(count: int, body: bytes) -> int:
+    """Return the checksum of a section."""
+    return zlib.crc32(body, zlib.crc32(_CHECK.pack(count)))
+
+
+def _body(section: Symbols, steps: Steps, corner: IntArray, levels: int) -> bytes:
+    """Return the bytes of a section: with all weights, or with the first ones if this is less."""
+    cells = section.cell - corner
+    # Gaussians in one cell are sorted too, so that equal sets in any order give equal files.
+    rest = np.column_stack(section[1:])
+    order = np.lexsort([*rest.T[::-1], hilbert_encode(cells, levels)])
+    given, evenness = section._replace(cell=cells).select(order), _evenness(cells, levels)
+    few = len(cells) < weights.SMALL
+    ways = [_code(given, steps, levels, evenness, rich) for rich in ((True, False)[: 1 + few])]
+    body = min(ways, key=len)
+    return body.ljust(len(cells), b"\0")  # a reader expects a byte for a Gaussian, or more
+
+
+def _code(given: Symbols, steps: Steps, levels: int, evenness: int, rich: bool) -> bytes:
+    coder = Encoder()
+    code_cells(coder, len(given.cell), levels, EVENNESS[evenness], given.cell)
+    walk = GaussianCoder(coder, given.cell, rich=rich)
+    walk.code(given.color.shape[1], steps, given)
+    head = bytes([evenness | RICH * rich]) + weights.to_bytes(walk.model, rich)
+    return head + coder.to_bytes()
+
+
+def _evenness(cells: IntArray, levels: int) -> int:
+    """Return the index in `EVENNESS` for which the cells take the fewest bytes."""
+
+    def size(index: int) -> int:
+        coder = Encoder()
+        code_cells(coder, len(cells), levels, EVENNESS[index], cells)
+        return len(coder.to_bytes())
+
+    return min(range(len(EVENNESS)), key=size)
 
 
 def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
-    head = _exactly(file, _HEADER.size)
-    magic, version, space, channels, levels, count, width, height, *rest = _HEADER.unpack(head)
-    if magic != MAGIC:
+    head = _exactly(file, 5)
+    if head[:4] != MAGIC:
         raise BadValue("not a packed set of Gaussians; it may be damaged or something else")
-    if not 1 <= version <= VERSION:
+    if head[4] != VERSION:
         raise BadValue(
-            f"version is {version}, but this package reads up to {VERSION}; upgrade eigengs-dr"
+            f"version is {head[4]}, but this package reads version {VERSION}; "
+            + ("upgrade eigengs-dr" if head[4] > VERSION else "pack the set again")
         )
-    more = _exactly(file, _CUTOFF.size) if version > 1 else b""
+    head += _exactly(file, _HEADER.size - len(head))
+    _, _, space, channels, levels, count, width, height, *rest = _HEADER.unpack(head)
     background = _exactly(file, 4 * channels)
     (check,) = _CHECK.unpack(_exactly(file, _CHECK.size))
-    if check != zlib.crc32(head + more + background):
+    if check != zlib.crc32(head + background):
         raise BadValue("the header is damaged; copy the file again")
-    corner, steps = np.array(rest[:2], np.int64), Steps(*rest[2:])
+    corner, steps = np.array(rest[:2], np.int64), Steps(*rest[2:4])
     _check_header(space, channels, levels, count, steps)
     if wanted is not None and not 1 <= wanted <= count:
         raise BadValue(f"the file has {count} sections, not {wanted}; ask for 1 to {count}")
     found: list[Symbols] = []
     for number in range(1, (wanted or count) + 1):
-        body, splats = _section(file, size, number, 4 + channels)
-        room = MAX_ENTRIES // max(3, channels) - sum(len(section.mean) for section in found)
+        body, splats = _section(file, size, number)
+        room = MAX_ENTRIES // max(3, channels) - sum(len(section.cell) for section in found)
         if splats > room:
             raise BadValue(
                 f"section {number} claims {splats} Gaussians, but at most {room} more can be read"
             )
         try:
-            found.append(_symbols(body, splats, channels, corner, levels))
+            symbols = _symbols(body, splats, channels, levels, steps)
         except BadValue as error:
             raise BadValue(f"section {number}: {error}; copy the file again") from None
+        found.append(symbols._replace(cell=symbols.cell + corner))
     if wanted is None and file.read(1):
         raise BadValue("data follow the last section; copy the file again")
     return EgsContent(
@@ -226,7 +246,7 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
         background=np.frombuffer(background, "<f4"),
         size=(width, height),
         space=SPACES[space],
-        cutoff=_CUTOFF.unpack(more)[0] if more else CUTOFF,
+        cutoff=rest[4],
     )
 
 
@@ -242,40 +262,33 @@ def _check_header(space: int, channels: int, levels: int, count: int, steps: Ste
         raise BadValue(f"the steps are {tuple(steps)}, expected numbers above 0")
 
 
-def _section(file: BinaryIO, size: int, number: int, planes: int) -> tuple[bytes, int]:
-    """Read the next section, check its checksum, and return its planes and number of Gaussians."""
+def _section(file: BinaryIO, size: int, number: int) -> tuple[bytes, int]:
+    """Read the next section, check its checksum, and return its body and number of Gaussians."""
     splats, length, check = _SECTION.unpack(_exactly(file, _SECTION.size))
     if length > size - file.tell():
         raise BadValue(f"section {number} is cut off; copy the file again")
-    # Every integer takes at least one bit, so the length of the file bounds the memory.
-    if not 1 <= splats <= 8 * length // planes:
+    # Every Gaussian takes at least one byte, so the length of the file bounds the memory.
+    if not 1 <= splats <= length:
         raise BadValue(
             f"section {number} claims {splats} Gaussians in {length} bytes; copy the file again"
         )
     body = _exactly(file, length)
-    if zlib.crc32(body) != check:
+    if section_check(splats, body) != check:
         raise BadValue(f"section {number} is damaged; copy the file again")
     return body, splats
 
 
-def _symbols(
-    body: bytes, splats: int, channels: int, corner: NDArray[np.int64], levels: int
-) -> Symbols:
-    """Decode the planes of a section; they may be hostile although the checksum is right."""
-    planes, rest = list[NDArray[np.int64]](), memoryview(body)
-    for _ in range(4 + channels):
-        plane, rest = decode(rest, splats)
-        planes.append(plane)
-    if len(rest):
-        raise BadValue("data follow the last plane")
-    ways, places = planes[0], np.cumsum(planes[0])
-    if (ways < 0).any() or (places < 0).any() or places[-1] >> 2 * levels:
-        raise BadValue("the curve leaves its square")
-    return Symbols(
-        hilbert_decode(places, levels) + corner,
-        np.stack(planes[1:4], axis=1),
-        np.stack(planes[4:], axis=1),
-    )
+def _symbols(body: bytes, splats: int, channels: int, levels: int, steps: Steps) -> Symbols:
+    """Decode the body of a section; it may be hostile although the checksum is right."""
+    rich, evenness = bool(body[0] & RICH), body[0] & ~RICH
+    if evenness >= len(EVENNESS):
+        raise BadValue("the first byte is unknown")
+    model, codes = weights.from_bytes(body[1:], channels, rich)
+    coder = Decoder(codes[: len(codes) // 4 * 4])  # a short body is filled up with bytes
+    with np.errstate(all="ignore"):  # the weights may be hostile
+        cells = code_cells(coder, splats, levels, EVENNESS[evenness])
+        cells = cells[np.argsort(hilbert_encode(cells, levels), kind="stable")]
+        return GaussianCoder(coder, cells, model).code(channels, steps)
 
 
 def _exactly(file: BinaryIO, count: int) -> bytes:

@@ -1,9 +1,9 @@
-"""Rounding with error feedback: later parameters compensate for the rounding of earlier ones.
+"""Rounding with error feedback: Gaussians that are not yet rounded compensate for those that are.
 
-Rounding takes three stages. Round the shapes, then descend on means and colours. Round the means,
-then solve for the colours. Round every other colour, then solve for the rest. At equal error, the
-descent makes files 4 % smaller, and the alternate rounding 1 to 2 %, than one solve for the
-colours. A set in several sections gets no compensation, because a reader may stop after any
+The Gaussians are divided into groups; neighbours along a Hilbert curve are in different groups. One
+group after another is rounded with all its parameters. After each group, the others descend on the
+error that is left. On training photos at equal error this saves 3 bits for each Gaussian, a tenth
+of the file. A set in several sections gets no compensation, because a reader may stop after any
 section.
 """
 
@@ -17,27 +17,29 @@ from numpy.typing import NDArray
 from ..backend.arrays import types_of
 from ..fitting.initializers import FitProblem
 from ..fitting.optimizers.descent import descend
+from ..fitting.optimizers.schedule import Schedule
 from ..fitting.presets import PRESETS
 from ..fitting.solvers.conjugate_gradient import solve
-from ..gaussian.covariance import log_shapes
 from ..gaussian.gaussians import Gaussians
 from ..raster.render import render
 from .egs import EgsContent
-from .quantization import Steps, dequantize, quantize
+from .hilbert_index import hilbert_encode
+from .quantization import DEAD_ZONE, Steps, Symbols, dequantize, quantize
 
 Array = NDArray[np.floating]
 
-COMPENSATION_STEPS = 20
-"""Steps of the descent on means and colours after the rounding of the shapes."""
+GROUPS = 16
+"""Groups of Gaussians, at most."""
 
-COMPENSATION_RATE = 0.4
+STEPS = 12
+"""Steps of descent after each group but the last one."""
+
+RATE = 0.3
 """Learning rates of this descent, as a fraction of those of `fit`: the optimum is near."""
 
 
-def quantize_with_feedback(
-    gaussians: Gaussians, target: Array, steps: Steps, rows: list[slice]
-) -> EgsContent:
-    """Round shapes, then means, then colours; let the parameters not yet rounded compensate.
+def quantize_with_feedback(gaussians: Gaussians, target: Array, steps: Steps) -> EgsContent:
+    """Round a set; let the Gaussians not yet rounded compensate.
 
     Parameters
     ----------
@@ -46,96 +48,92 @@ def quantize_with_feedback(
     target : ndarray, shape (H, W, C)
         Target of the rendering, in the space of the set.
     steps : Steps
-    rows : list of slice
-        Range of the Gaussians of each section.
 
     Returns
     -------
     EgsContent
+        One section.
 
     Raises
     ------
     ValueError
         If a number would be too large to store.
     """
+    count = len(gaussians)
+    groups = min(GROUPS, count)
+    place = np.empty(count, np.int64)
+    place[_along_curve(gaussians)] = np.arange(count)
+    free, rest, done = np.arange(count), np.asarray(target, np.float32), list[Symbols]()
+    current, inside = gaussians, _all_inside(gaussians)
+    for group in range(groups):
+        arrays, now = current.to_arrays(), place[free] % groups == group
+        chosen = {name: arrays[name][now] for name in ("mean", "factor", "color")}
+        done.append(quantize(chosen, steps, DEAD_ZONE))
+        free = free[~now]
+        if not len(free):
+            break
+        rest = rest - _rendered(gaussians, dequantize(done[-1], steps))
+        current = solve(current[np.flatnonzero(~now)], rest, 2, warm_start=True).gaussians
+        if inside:  # descent would move means outside the image into it
+            *_, current = descend(FitProblem(current, rest), _slow_schedule(), STEPS)
+    symbols = Symbols(*map(np.concatenate, zip(*done, strict=True)))
+    return content_of(gaussians, [symbols], steps, current.to_arrays()["background"])
+
+
+def quantize_sections(gaussians: Gaussians, steps: Steps, rows: list[slice]) -> EgsContent:
+    """Round a set without compensation, in sections of these ranges of Gaussians."""
     arrays = gaussians.to_arrays()
-    shape = log_shapes(arrays["factor"])
-    if len(rows) == 1:  # compensation for the whole set would harm its prefixes
-        arrays |= _compensate(gaussians, target, shape, steps)
-    symbols = quantize(arrays["mean"], shape, arrays["color"], steps)
-    background, size = arrays["background"], (gaussians.width, gaussians.height)
-    return EgsContent(
-        [symbols.select(r) for r in rows],
-        steps,
-        background,
-        size,
-        gaussians.space,
-        gaussians.cutoff,
-    )
+    symbols = quantize(arrays, steps, DEAD_ZONE)
+    parts = [symbols.select(r) for r in rows]
+    return content_of(gaussians, parts, steps, arrays["background"])
 
 
-def _compensate(
-    gaussians: Gaussians, target: Array, shape: Array, steps: Steps
-) -> dict[str, Array]:
-    """Return means, colours and background that compensate for the rounding."""
-    arrays, none = gaussians.to_arrays(), np.zeros((len(gaussians), gaussians.channels))
-    fixed = dequantize(quantize(arrays["mean"], shape, none, steps), steps)
-    current = _with(gaussians, factor=fixed["factor"])
-    if _all_inside(gaussians):  # descent would move means outside the image into it
-        current = solve(current, target, 5, warm_start=True).gaussians
-        schedule = PRESETS["default"].schedule
-        rates = {name: COMPENSATION_RATE * schedule.rates[name] for name in ("mean", "color")}
-        slow = replace(schedule, rates=rates)
-        problem = FitProblem(current, target.astype(np.float32))
-        *_, current = descend(problem, slow, COMPENSATION_STEPS)
-    mean = current.to_arrays()["mean"]
-    fixed = dequantize(quantize(mean, shape, none, steps), steps)
-    current = _with(current, mean=fixed["mean"])
-    solved = solve(current, target, 10, warm_start=True).gaussians
-    arrays = _round_alternately(solved, target, mean, shape, steps).to_arrays()
-    return {"mean": mean, "color": arrays["color"], "background": arrays["background"]}
-
-
-def _round_alternately(
-    solved: Gaussians, target: Array, mean: Array, shape: Array, steps: Steps
-) -> Gaussians:
-    """Round every other colour; solve for the colours between, which are near in space."""
-    if len(solved) == 1:
-        return solved
-    arrays, late = solved.to_arrays(), np.arange(len(solved)) % 2 == 1
-    rough = dequantize(quantize(mean, shape, arrays["color"], steps), steps)["color"]
-    kept = _with(solved, color=rough, background=0 * arrays["background"])[~late]
-    kept = replace(kept, space="data")
-    rest = target - render(kept).numpy()
-    found = solve(solved[late], rest, 5, warm_start=True).gaussians.to_arrays()
-    rough[late] = found["color"]
-    return _with(solved, color=rough, background=found["background"])
+def content_of(
+    gaussians: Gaussians, sections: list[Symbols], steps: Steps, background: Array
+) -> EgsContent:
+    """Return the content of a file for a set."""
+    size = (gaussians.width, gaussians.height)
+    return EgsContent(sections, steps, background, size, gaussians.space, gaussians.cutoff)
 
 
 def to_gaussians(packed: EgsContent, like: Gaussians) -> Gaussians:
     """Return the Gaussians of a content, on the backend of another set."""
-    backend = types_of(like.mean).backend
     return Gaussians.from_arrays(
         **packed.arrays(),
         size=packed.size,
         space=packed.space,
-        backend=backend,
+        backend=types_of(like.mean).backend,
         cutoff=packed.cutoff,
     )
 
 
-def _with(gaussians: Gaussians, **changed: Array) -> Gaussians:
-    """Return the set with some arrays replaced."""
-    return Gaussians.from_arrays(
-        **{**gaussians.to_arrays(), **changed},
-        size=(gaussians.width, gaussians.height),
-        space=gaussians.space,
-        backend=types_of(gaussians.mean).backend,
-        cutoff=gaussians.cutoff,
+def _rendered(like: Gaussians, arrays: dict[str, Array]) -> NDArray[np.float32]:
+    """Render Gaussians without background, in the space and size of a set."""
+    found = Gaussians.from_arrays(
+        **arrays,
+        size=(like.width, like.height),
+        space="data",
+        backend=types_of(like.mean).backend,
+        cutoff=like.cutoff,
     )
+    return np.asarray(render(found).numpy(), np.float32)
+
+
+def _slow_schedule() -> Schedule:
+    schedule = PRESETS["default"].schedule
+    rates = {name: RATE * rate for name, rate in schedule.rates.items()}
+    return replace(schedule, rates=rates, redistribute_after=0)
+
+
+def _along_curve(gaussians: Gaussians) -> NDArray[np.intp]:
+    """Return the order of the means along a Hilbert curve."""
+    mean = gaussians.to_arrays()["mean"]
+    low = mean.min(axis=0)
+    unit = 1023 / max(float((mean - low).max()), 1e-6)
+    return np.argsort(hilbert_encode(((mean - low) * unit).astype(np.int64), 10), kind="stable")
 
 
 def _all_inside(gaussians: Gaussians) -> bool:
-    """Return whether all means lie in the image."""
-    mean = gaussians.to_arrays()["mean"]
-    return bool(((mean >= 0) & (mean <= (gaussians.width, gaussians.height))).all())
+    """Return whether all means lie in the image, except for rounding."""
+    mean, size = gaussians.to_arrays()["mean"], np.array([gaussians.width, gaussians.height])
+    return bool((np.abs(mean - size / 2) <= size / 2 * (1 + 1e-4)).all())

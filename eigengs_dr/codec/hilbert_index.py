@@ -1,7 +1,6 @@
 """The Hilbert index of points with integer coordinates: neighbours on the curve are near in space.
 
-A file that stores points in Hilbert-curve order stores only the steps along the curve. It need not
-store the order of the N points, which saves ``log2(N!)`` bits.
+Gaussians near by are the context of each other in packed files.
 """
 
 from __future__ import annotations
@@ -42,18 +41,6 @@ def hilbert_encode(points: IntArray, levels: int) -> IntArray:
         place = place * 4 + (3 * right ^ low)
         x, y = _rotate(x, y, right, low, (1 << level) - 1)
     return place
-
-
-def hilbert_decode(places: IntArray, levels: int) -> IntArray:
-    """Return the points (N, 2) of Hilbert indices (N,): the inverse of `hilbert_encode`."""
-    x = y = np.zeros_like(places)
-    for level in range(levels):
-        quarter = places >> 2 * level & 3
-        right = quarter >> 1
-        low = quarter & 1 ^ right
-        x, y = _rotate(x, y, right, low, (1 << level) - 1)
-        x, y = x + (right << level), y + (low << level)
-    return np.stack([x, y], axis=1)
 
 
 def _rotate(

@@ -1,12 +1,18 @@
-"""Quantization: Gaussians as integers, in coordinates where equal steps have equal visible effects.
+"""Quantization: Gaussians as integers, with steps of equal visible effect.
 
-Shapes are rounded as the matrix logarithm ``L = 1/2 log(F^T F) = [[s + u, v], [v, s - u]]``: s is
-the logarithm of the inverse size, and (u, v) gives the amount and direction of the stretch, 0 for
-round Gaussians. A step changes every Gaussian by the same fraction of its size, whatever its size
-and angle. Colours are rounded in units of the inverse size, because the squared error of a colour
-grows with its area. On photos and at equal error, files are 2 to 3 % smaller than with the
-logarithms of a and c and b / a, or with axes and angle. The units of the colours save another 2 to
-5 % against one step for all colours.
+A change of a Gaussian changes the image. With the amplitude ``A = color size``, where the size is
+the geometric mean of the standard deviations, the squared change of the image is
+
+    pi (|dA|^2 + |A|^2 (ds^2 + dl^2 + (sinh(2 l) / 2)^2 dt^2 + 1/2 |F dm|^2))
+
+for a change of A, the logarithm s of the inverse size, the stretch l (half the logarithm of the
+ratio of the axes), twice the angle t of the axes, and the mean m. All products of different
+changes vanish. So one step for everything is best: a step of A is ``Steps.color``, and the steps of
+s, l, sinh(2 l) t / 2 and F m are ``1 / Q`` for a Gaussian whose colour has Q steps. A faint
+Gaussian has a rough shape and place, and a round Gaussian has no angle. The factors `SCALE_STEP`
+and others were tried on training photos.
+
+A mean lies in a square cell, see `Steps.cell`; a Gaussian divides its cell into a grid.
 """
 
 from __future__ import annotations
@@ -16,14 +22,30 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian.covariance import factors_from_log_shapes, sizes_from_log_shapes
+from ..gaussian.covariance import log_shapes
+from .exact_math import cos_turns, exp2, sin_turns
 
 Array = NDArray[np.floating]
+Double = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MAX_SYMBOL = 1 << 23
-"""Bound of the integers of parameters; finer steps are not worth storing. Two integers differ by
-less than twice the bound, which fits `eigengs_dr.codec.hilbert_index.MAX_LEVELS`."""
+"""Bound of the integers; finer steps are not worth storing. Two cells differ by less than twice the
+bound, which fits `eigengs_dr.codec.hilbert_index.MAX_LEVELS`."""
+
+SCALE_STEP, STRETCH_STEP, TURN_STEP, MEAN_STEP = 1.2, 1.0, 1.0, 1.4142135623730951
+"""Steps of s, l, the angle and the mean, times Q."""
+
+MIN_PRECISION = 1.0
+"""Smallest Q: the shape of a Gaussian with a colour of 0 steps."""
+
+DEAD_ZONE = 0.08
+"""Part of a step by which colours are rounded towards 0, which saves bits for little error."""
+
+MAX_TURNS, MAX_PARTS = 1 << 20, 1 << 16
+"""Largest numbers of directions, and of parts of a side of a cell."""
+
+LOG2E = 1.4426950408889634
 
 
 class Steps(NamedTuple):
@@ -31,18 +53,14 @@ class Steps(NamedTuple):
 
     Attributes
     ----------
-    mean : float
-        Step of the mean in pixels.
-    scale, stretch : float
-        Step of s, and step of u and v: 0.01 is 1 %.
     color : float
         Step of the colour, with 1 for white, times the size of the Gaussian in pixels.
+    cell : float
+        Side of a cell in pixels.
     """
 
-    mean: float
-    scale: float
-    stretch: float
     color: float
+    cell: float
 
 
 class Symbols(NamedTuple):
@@ -50,34 +68,74 @@ class Symbols(NamedTuple):
 
     Attributes
     ----------
-    mean : ndarray of int64, shape (N, 2)
-        Steps from the centre of the first pixel.
-    shape : ndarray of int64, shape (N, 3)
-        Steps of s, u and v.
+    cell : ndarray of int64, shape (N, 2)
+        Column and row of the cell of the mean.
+    part : ndarray of int64, shape (N, 2)
+        Column and row of the mean in the grid of its cell, see `Shapes.parts`.
     color : ndarray of int64, shape (N, C)
         Steps of the colours.
+    scale, stretch : ndarray of int64, shape (N,)
+        Steps of s and l.
+    turn : ndarray of int64, shape (N,)
+        Direction, from 0 to ``Shapes.turns - 1``.
     """
 
-    mean: IntArray
-    shape: IntArray
+    cell: IntArray
+    part: IntArray
     color: IntArray
+    scale: IntArray
+    stretch: IntArray
+    turn: IntArray
 
     def select(self, chosen: slice | NDArray[np.integer]) -> Symbols:
         """Return the Gaussians of a slice or of indices."""
         return Symbols(*(part[chosen] for part in self))
 
 
-def quantize(mean: Array, shape: Array, color: Array, steps: Steps) -> Symbols:
+def precision(color: IntArray) -> Double:
+    """Return Q, shape (N,), for colours (N, C) in steps."""
+    squares: Double = np.zeros(len(color))
+    for channel in color.T.astype(np.float64):  # one after another: the same bits everywhere
+        squares = squares + channel * channel
+    return np.maximum(np.sqrt(squares), MIN_PRECISION)
+
+
+def turns_of(stretch: Double, fineness: Double) -> IntArray:
+    """Return the number of directions for stretches l and the Q of Gaussians, both (N,)."""
+    with np.errstate(all="ignore"):
+        wide = exp2(2 * LOG2E * stretch)
+        turns = np.rint((wide - 1 / wide) * fineness * (1.5707963267948966 / TURN_STEP))
+    return np.clip(turns, 1, MAX_TURNS).astype(np.int64)
+
+
+def factors_of(scale: Double, stretch: Double, turn: Double) -> Double:
+    """Return the factors a, b, c, shape (N, 3), for s, l and t in turns, by exact arithmetic."""
+    with np.errstate(all="ignore"):
+        wide, size = exp2(2 * LOG2E * stretch), exp2(LOG2E * scale)
+        odd = 0.5 * (wide - 1 / wide)
+        half = cos_turns(0.5 * turn)
+        a = np.sqrt(1 / wide + 2 * odd * half * half)
+        return np.stack([a * size, odd * sin_turns(turn) / a * size, size / a], axis=1)
+
+
+def parts_of(factor: Array, fineness: Array, cell: float) -> IntArray:
+    """Return the parts of the sides of each cell, shape (N, 2)."""
+    with np.errstate(all="ignore"):
+        unit = fineness * (cell / MEAN_STEP)
+        parts = np.rint(np.stack([factor[:, 0] * unit, factor[:, 2] * unit], axis=1))
+    return np.clip(np.nan_to_num(parts, nan=1.0), 1, MAX_PARTS).astype(np.int64)
+
+
+def quantize(arrays: dict[str, Array], steps: Steps, dead_zone: float = 0.0) -> Symbols:
     """Round Gaussians to integers.
 
     Parameters
     ----------
-    mean : ndarray, shape (N, 2)
-        In pixels.
-    shape : ndarray, shape (N, 3)
-        s, u and v; their rounded values determine the units of the colours.
-    color : ndarray, shape (N, C)
+    arrays : dict of ndarray
+        mean (N, 2), factor (N, 3) and color (N, C), see `eigengs_dr.Gaussians`.
     steps : Steps
+    dead_zone : float, optional
+        Part of a step by which colours are rounded towards 0.
 
     Returns
     -------
@@ -88,15 +146,29 @@ def quantize(mean: Array, shape: Array, color: Array, steps: Steps) -> Symbols:
     ValueError
         If the absolute value of an integer would be `MAX_SYMBOL` or more.
     """
-    rounded = _round_to_steps("shape", shape, (steps.scale, steps.stretch, steps.stretch))
-    unit = steps.color / sizes_from_log_shapes(
-        rounded * (steps.scale, steps.stretch, steps.stretch)
-    )
+    s, u, v = log_shapes(arrays["factor"]).T
+    amplitude = np.asarray(arrays["color"], np.float64) / (steps.color * np.exp(s))[:, None]
+    rounded = np.copysign(np.floor(np.maximum(np.abs(amplitude) + 0.5 - dead_zone, 0)), amplitude)
+    color = _whole("color", rounded)
+    fineness = precision(color)
+    scale = _whole("shape", s * fineness / SCALE_STEP)
+    stretch = _whole("shape", np.hypot(u, v) * fineness / STRETCH_STEP)
+    turns = turns_of(stretch * (STRETCH_STEP / fineness), fineness)
+    turn = np.rint(np.arctan2(v, u) / (2 * np.pi) * turns).astype(np.int64) % turns
+    factor = _factors(scale, stretch, turn, fineness)
+    parts = parts_of(factor, fineness, steps.cell)
+    mean = np.asarray(arrays["mean"], np.float64) / steps.cell
+    cell_y, part_y = _place(mean[:, 1], parts[:, 1])
+    # The error across moves the mean along, so that F (m' - m) is small in both coordinates.
+    moved = cell_y + (part_y + 0.5) / parts[:, 1] - mean[:, 1]
+    cell_x, part_x = _place(mean[:, 0] - factor[:, 1] / factor[:, 0] * moved, parts[:, 0])
     return Symbols(
-        # Steps count from the centre of the first pixel.
-        _round_to_steps("mean", np.asarray(mean, np.float64) - 0.5, steps.mean),
-        rounded,
-        _round_to_steps("color", color, unit[:, None]),
+        np.stack([cell_x, cell_y], axis=1),
+        np.stack([part_x, part_y], axis=1),
+        color,
+        scale,
+        stretch,
+        turn,
     )
 
 
@@ -105,21 +177,36 @@ def dequantize(symbols: Symbols, steps: Steps) -> dict[str, Array]:
 
     Numbers of hostile files may overflow to infinity or zero.
     """
+    fineness = precision(symbols.color)
+    factor = _factors(symbols.scale, symbols.stretch, symbols.turn, fineness)
+    parts = parts_of(factor, fineness, steps.cell)
     with np.errstate(all="ignore"):
-        shape = symbols.shape * (steps.scale, steps.stretch, steps.stretch)
+        size = exp2(LOG2E * (symbols.scale * (SCALE_STEP / fineness)))
         return {
-            "mean": symbols.mean * steps.mean + 0.5,
-            "factor": factors_from_log_shapes(shape),
-            "color": symbols.color * (steps.color / sizes_from_log_shapes(shape))[:, None],
+            "mean": (symbols.cell + (symbols.part + 0.5) / parts) * steps.cell,
+            "factor": factor,
+            "color": symbols.color * (steps.color * size)[:, None],
         }
 
 
-def _round_to_steps(name: str, values: Array, step: object) -> IntArray:
-    """Round each value to the nearest step; for errors see `quantize`."""
-    counts = np.rint(np.asarray(values, np.float64) / np.asarray(step))
+def _factors(scale: IntArray, stretch: IntArray, turn: IntArray, fineness: Double) -> Double:
+    """Return the factors of integers."""
+    length = stretch * (STRETCH_STEP / fineness)
+    turns = turns_of(length, fineness)
+    return factors_of(scale * (SCALE_STEP / fineness), length, turn / turns)
+
+
+def _place(values: Array, parts: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the cells of coordinates, and the parts of the cells."""
+    cell = _whole("mean", np.floor(values))
+    return cell, np.clip((values - cell) * parts, 0, parts - 1).astype(np.int64)
+
+
+def _whole(name: str, counts: Array) -> IntArray:
+    """Round numbers of steps to integers; for errors see `quantize`."""
     if not (np.abs(counts) < MAX_SYMBOL).all():
         raise ValueError(
             f"pack: a {name} is {MAX_SYMBOL} steps or more from zero; call bounded() first, or "
             "allow a larger loss"
         )
-    return counts.astype(np.int64)
+    return np.rint(counts).astype(np.int64)

@@ -44,17 +44,17 @@ def test_codecs_are_told_what_they_are_named_for(tmp_path):
     image = one_image(6)
     jobs = {job["codec"]: work for job, work in rate._jobs(task_in(tmp_path), "m", [("1", image)])}
     assert list(jobs)[1:] == list(rate.CODECS)
-    for title, (kind, options) in rate.CODECS.items():
+    for title, codec in rate.CODECS.items():
         points = jobs[title]()["points"]
-        assert [point["setting"] for point in points] == list(rate.QUALITIES)
+        assert [point["setting"] for point in points] == list(codec.settings)
         file = io.BytesIO()
         coded = Image.fromarray((image * 255).round().astype(np.uint8))
-        coded.save(file, kind, quality=rate.QUALITIES[3], **options)
+        coded.save(file, codec.kind, **codec.set_to(codec.settings[3]))
         assert points[3]["bytes"] == len(file.getvalue())
-        shown = np.asarray(Image.open(file), np.float32) / 255
+        shown = np.asarray(Image.open(file).convert("RGB"), np.float32) / 255
         assert points[3]["psnr_rgb"] == pytest.approx(psnr(shown, image), abs=1e-9)
     grey = np.full((32, 32, 3), 128 / 255, np.float32)  # of which JPEG loses nothing
-    assert rate._coded(grey, *rate.CODECS["JPEG 4:4:4"])["points"][-1]["psnr_rgb"] == 100
+    assert rate._coded(grey, rate.CODECS["JPEG 4:4:4"])["points"][-1]["psnr_rgb"] == 100
 
 
 def rate_rows():
@@ -62,7 +62,10 @@ def rate_rows():
 
     def row(image, codec, *points):
         names = ("setting", "bits_per_pixel", "psnr_rgb", "seconds")
-        made = [{**dict(zip(names, point, strict=True)), "ssim": 0.9} for point in points]
+        made = [
+            {**dict(zip(names, point, strict=True)), "ms_ssim": 0.9, "decode_seconds": 0.1}
+            for point in points
+        ]
         job = {"set": "made", "image": image, "codec": codec}
         return {"job": job, "points": made, "run": RUN}
 
@@ -78,11 +81,13 @@ def test_rates_tell_ratios_and_where_they_are_missing():
     (table,) = rates.summarize(list(rate_rows())).tables
     cells = {row[0]: row[1:] for row in lines_of(table)}
     # 32 dB is half way: sqrt(1 * 4) and 3 times that; 2 * 4^(6 / 8) for WebP on the second.
-    assert cells[rate.OURS][1] == "4.00" and cells[rate.OURS][3].startswith("3.00")
-    assert cells["JPEG 4:2:0"][1] == "4.00 (1.00, 1)"
-    assert cells["WebP"][1] == f"{(4 + 2 * 4**0.75) / 2:.2f} ({(4 + 2 * 4**0.75) / 8:.2f}, 1)"
-    assert cells["images that all reach"] == ("2", "2", "1", "-")
-    assert cells[rate.OURS][2] == f"{4 ** (10 / 12):.2f}"
+    assert cells[rate.OURS][2] == "4.00" and cells[rate.OURS][6].startswith("3.00")
+    assert cells["JPEG 4:2:0"][2] == "4.00 (1.00, 1)"
+    assert cells["WebP"][2] == f"{(4 + 2 * 4**0.75) / 2:.2f} ({(4 + 2 * 4**0.75) / 8:.2f}, 1)"
+    assert cells["images that all reach"] == ("2", "2", "2", "2", "1", "-", "-", "-")
+    assert cells[rate.OURS][4] == f"{4 ** (10 / 12):.2f}"
+    # Twice the bits at 26 dB and at 38 dB on the first image, on the second 1.5 times fewer.
+    assert cells["JPEG 4:4:4"][5] == f"{100 * ((0.5 + 1.5) / 2 - 1):+.0f} %"
 
 
 def test_rate_charts_show_the_means_of_the_images():

@@ -1,4 +1,4 @@
-"""Splats as whole numbers."""
+"""Gaussians as integers."""
 
 import numpy as np
 import pytest
@@ -7,9 +7,13 @@ from hypothesis import given
 from _helpers.packed import STEPS
 from _helpers.sets import SIZE, few, scenes
 from eigengs_dr.codec import egs as packed
-from eigengs_dr.codec.hilbert_index import MAX_LEVELS
-from eigengs_dr.codec.quantization import MAX_SYMBOL, _round_to_steps, quantize
+from eigengs_dr.codec import quantization as qz
+from eigengs_dr.codec.quantization import MAX_SYMBOL, Steps, precision, quantize
 from eigengs_dr.gaussian.covariance import factors_from_log_shapes, log_shapes
+
+
+def arrays_of(scene):
+    return {"mean": scene.mean, "factor": scene.factor, "color": scene.color}
 
 
 @given(scenes())
@@ -32,24 +36,56 @@ def test_shapes_of_extreme_splats():
     )
 
 
+def test_both_ways_to_a_factor_agree():
+    s, length, turn = np.random.default_rng(0).uniform(-2, 2, (3, 500))
+    shape = [s, length * np.cos(2 * np.pi * turn), length * np.sin(2 * np.pi * turn)]
+    expected = factors_from_log_shapes(np.stack(shape, axis=1))
+    np.testing.assert_allclose(qz.factors_of(s, length, turn), expected, rtol=1e-6, atol=1e-6)
+
+
 @few
 @given(scenes())
 def test_rounding_moves_by_half_a_step(scene):
-    shape = log_shapes(scene.factor)
-    symbols = quantize(scene.mean, shape, scene.color, STEPS)
-    found = packed.EgsContent([symbols], STEPS, np.zeros(3, np.float32), SIZE, "data").arrays()
-    near = log_shapes(found["factor"])
-    assert np.abs(found["mean"] - scene.mean).max() <= STEPS.mean / 2 + 1e-5
-    assert np.abs(near - shape)[:, 0].max() <= STEPS.scale / 2 + 1e-5
-    assert np.abs(near - shape)[:, 1:].max() <= STEPS.stretch / 2 + 1e-5
-    unit = np.exp(near[:, :1]) * STEPS.color
-    assert (np.abs(found["color"] - scene.color) <= unit / 2 + 1e-5).all()
+    symbols = quantize(arrays_of(scene), STEPS)
+    content = packed.EgsContent([symbols], STEPS, np.zeros(3, np.float32), SIZE, "data")
+    found, q = content.arrays(), precision(symbols.color)
+    near, far = log_shapes(found["factor"]), log_shapes(scene.factor)
+    long = [np.hypot(shape[:, 1], shape[:, 2]) for shape in (near, far)]
+    assert (np.abs(near - far)[:, 0] * q <= 0.5 * qz.SCALE_STEP + 1e-4 * q).all()
+    assert (np.abs(long[0] - long[1]) * q <= 0.5 * qz.STRETCH_STEP + 1e-4 * q).all()
+    a, b, c = found["factor"].astype(np.float64).T
+    x, y = (found["mean"] - scene.mean).T
+    # A mean in a cell without a grid is half a cell off; otherwise half a step of F m.
+    grid = qz.parts_of(found["factor"], q, STEPS.cell)
+    for away, side, parts in ((a * x + b * y, a, grid[:, 0]), (c * y, c, grid[:, 1])):
+        assert (np.abs(away) <= 0.5 * STEPS.cell * side / parts * 1.01 + 1e-3 * side).all()
+    unit = STEPS.color * np.exp(far[:, :1])
+    amplitude = np.exp(-near[:, :1]) * found["color"] / STEPS.color
+    assert (np.abs(amplitude - scene.color / unit) <= 0.5 + 1e-3).all()
+
+
+def test_bright_gaussians_have_finer_shapes():
+    one = {"mean": [[5.3, 5.3]], "factor": [[0.31, 0.1, 0.53]], "color": [[1.0]]}
+    steps, errors = Steps(0.1, 2.0), []
+    for factor in (1, 10, 100):
+        arrays = {k: np.array(v) * (factor if k == "color" else 1) for k, v in one.items()}
+        found = qz.dequantize(quantize(arrays, steps), steps)
+        errors.append(np.abs(found["factor"] - arrays["factor"]).max())
+    assert errors[2] < 0.3 * errors[0]
+
+
+def test_colors_near_zero_vanish_in_the_dead_zone():
+    arrays = {"mean": np.ones((3, 2)), "factor": np.array([[1.0, 0, 1]] * 3)}
+    arrays["color"] = np.array([[0.55], [-0.55], [1.0]])
+    for zone, expected in ((0.0, [1, -1, 1]), (0.1, [0, 0, 1])):
+        found = quantize(arrays, Steps(1.0, 1.0), zone).color[:, 0]
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_numbers_beyond_the_largest_are_refused():
-    with pytest.raises(ValueError, match="a mean is 8388608 steps or more"):
-        quantize(np.full((1, 2), 1e9), np.zeros((1, 3)), np.zeros((1, 3)), STEPS)
-    ends = np.array([[-MAX_SYMBOL + 1.0], [MAX_SYMBOL - 1.0]])
-    assert int(np.ptp(_round_to_steps("mean", ends, 1.0))).bit_length() == MAX_LEVELS
-    with pytest.raises(ValueError, match="a mean is"):
-        _round_to_steps("mean", ends + 1, 1.0)
+    shape = {"factor": np.array([[1.0, 0, 1]]), "color": np.zeros((1, 1))}
+    for mean in (1e9, -1e9, np.nan):
+        with pytest.raises(ValueError, match="a mean is 8388608 steps or more"):
+            quantize({**shape, "mean": np.full((1, 2), mean)}, Steps(1.0, 1.0))
+    edge = quantize({**shape, "mean": np.full((1, 2), MAX_SYMBOL - 1.0)}, Steps(1.0, 1.0))
+    assert (edge.cell == MAX_SYMBOL - 1).all()

@@ -7,7 +7,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.photos import coffee
-from eigengs_dr.codec.bit_allocation import MSE_WITHOUT_IMAGE
+from eigengs_dr.codec.packing import MSE_WITHOUT_IMAGE
 from eigengs_dr.fitting.density_control import removal_cost
 from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.levels import fit_levels, level_counts

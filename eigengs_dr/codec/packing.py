@@ -1,16 +1,13 @@
 """The function `pack`, which writes a set to the smallest file within a given loss of PSNR.
 
-The error of rounding is ``D = sum_g k_g Delta_g^2`` with a step ``Delta_g`` for each kind g of
-parameter. One bit less for each of the ``n_g`` numbers of a kind doubles its step. The allocation
-is optimal if all ``k_g Delta_g^2 / n_g`` are equal (reverse water-filling; Cover and Thomas,
-Elements of Information Theory, section 10.3.3). `pack` measures the ``k_g`` and then searches one
-common factor of the steps, see `eigengs_dr.codec.step_search`.
+All steps follow from one, see `eigengs_dr.codec.quantization`. `pack` searches the largest one that
+the loss allows, first without error feedback, which is fast, then with it.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -21,16 +18,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import types_of
 from ..backend.recording import exclusive
-from ..gaussian.covariance import log_shapes, sizes_from_log_shapes
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rgb_to_ycbcr, to_coded
 from ..image.io import check_image
 from ..image.metrics import MAX_PSNR, psnr_from_mse
 from ..raster.render import render
 from .egs import MAX_SECTIONS, SUFFIX, EgsContent, to_bytes, write
-from .error_feedback import quantize_with_feedback, to_gaussians
+from .error_feedback import quantize_sections, quantize_with_feedback, to_gaussians
 from .quantization import Steps
-from .step_search import Attempt, largest_within
+from .step_search import MIN_OCTAVES, Attempt, largest_within
 
 Array = NDArray[np.floating]
 
@@ -43,21 +39,16 @@ MSE_WITHOUT_IMAGE = 1e-4
 MIN_MSE = 1e-9
 """Smallest mean squared error that counts: 90 dB."""
 
-PROBE_STEPS = Steps(mean=0.2, scale=0.25, stretch=0.18, color=0.125)
-"""Steps for the measurement of ``k_g``. The step of colours is relative to their root mean square,
-each colour times the size of its Gaussian. They are near the steps of a budget of 0.5 dB: with a
-third of them, the error of a small set drowns in noise, which costs up to 10 % of a file."""
+FIRST_STEP = 0.06
+"""Step of the colours at which the search starts."""
 
-MAX_STEPS = Steps(mean=4.0, scale=1.0, stretch=1.0, color=1.0)
-"""Upper bounds of the steps, in the units of `PROBE_STEPS`. Without a bound, a parameter with no
-visible effect would get an infinite step."""
+CELLS = 4
+"""Cells for the mean distance of Gaussians: some lie in one cell, and few bits tell the rest."""
 
-NEGLIGIBLE = 1 / 32
-"""Fraction of a step at which the error is a thousandth."""
+FEEDBACK = 0.6
+"""Error that rounding adds with error feedback, relative to that without, on training photos."""
 
 TOO_FINE = "pack: no rounding is fine enough for the budget; allow more dB"
-
-_Candidate = tuple[EgsContent, float]
 
 
 class PackResult(NamedTuple):
@@ -159,23 +150,25 @@ def pack(
     if min(limits) <= 0:
         raise ValueError(TOO_FINE)
 
-    def attempt(steps: Steps) -> _Candidate:
-        packed = quantize_with_feedback(gaussians, target, steps, rows)
-        after = zip(errors(to_gaussians(packed, gaussians)), limits, strict=True)
-        # The worst prefix counts, with its error on the scale of the whole set.
-        return packed, max(error * (limits[-1] / limit) for error, limit in after)
+    def judge(packed: EgsContent) -> Attempt:
+        after = zip(errors(to_gaussians(packed, gaussians)), limits, before, strict=True)
+        # The worst prefix counts.
+        return Attempt(max((e + unseen - b) / (m + unseen - b) for e, m, b in after), packed)
 
-    start = _water_fill(attempt, gaussians, limits[-1])
+    def plain(octaves: float) -> Attempt:
+        return judge(quantize_sections(gaussians, _steps(gaussians, octaves), rows))
 
-    def scaled(octaves: float) -> Attempt:
-        packed, error = attempt(_steps(np.array(start) * 2**octaves))
-        added = (error + unseen - before[-1]) / (limits[-1] + unseen - before[-1])
-        return Attempt(added, packed)
+    def compensated(octaves: float) -> Attempt:
+        return judge(quantize_with_feedback(gaussians, target, _steps(gaussians, octaves)))
 
-    found = largest_within(scaled)
+    found = largest_within(plain)
+    if len(rows) == 1:  # compensation for the whole set would harm its prefixes
+        start = MIN_OCTAVES if found is None else found[0] - 0.5 * np.log2(FEEDBACK)
+        found = largest_within(compensated, start)
     if found is None:
         raise ValueError(TOO_FINE)
-    packed, content = found.packed, to_bytes(found.packed)
+    packed = found[1].packed
+    content = to_bytes(packed)
     error = errors(to_gaussians(packed, gaussians))[-1]
     write(path, content)
     return PackResult(
@@ -188,27 +181,11 @@ def pack(
     )
 
 
-def _water_fill(
-    attempt: Callable[[Steps], _Candidate], gaussians: Gaussians, limit: float
-) -> Steps:
-    """Return steps of equal marginal cost that reach the limit if errors grow as their squares."""
-    arrays = gaussians.to_arrays()
-    size = sizes_from_log_shapes(log_shapes(arrays["factor"]))
-    spread = float(np.sqrt(np.mean(np.square(arrays["color"] * size[:, None]))))
-    unit = np.array([1, 1, 1, max(spread, 1e-6)])
-    probe, numbers = np.array(PROBE_STEPS) * unit, np.array([2, 1, 2, gaussians.channels])
-    fine = probe * NEGLIGIBLE
-    start = attempt(_steps(fine))[1]
-    errors = [attempt(_steps(np.where(np.arange(4) == k, probe, fine)))[1] for k in range(4)]
-    cost = np.maximum(np.array(errors) - start, 1e-6 * limit) / probe**2
-    room = max(limit - start, 0.1 * limit)
-    steps = np.sqrt(room / numbers.sum() * numbers / cost)
-    return _steps(np.minimum(steps, np.array(MAX_STEPS) * unit))
-
-
-def _steps(values: Array) -> Steps:
+def _steps(gaussians: Gaussians, octaves: float) -> Steps:
     """Return steps in single precision, as in the file."""
-    return Steps(*np.asarray(values, np.float32).tolist())
+    cell = (gaussians.width * gaussians.height / len(gaussians)) ** 0.5 / CELLS
+    values = np.array([FIRST_STEP * 2.0**octaves, cell], np.float32)
+    return Steps(*values.tolist())
 
 
 def _rows(count: int, sections: Sequence[int] | None) -> list[slice]:

@@ -1,0 +1,193 @@
+"""Integers as bits by a range coder (Martin, "Range encoding", 1979), of the library constriction.
+
+`Encoder` and `Decoder` have the same methods. Each codes an array of integers with a probability
+for each of them: the encoder takes the integers, the decoder returns them. So one function walks
+through a file in both directions, see `eigengs_dr.codec.gaussian_model`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import constriction
+import numpy as np
+from numpy.typing import NDArray
+
+from ..storage.npz import BadValue
+from .exact_math import exp2, log2
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+REACH = 64
+"""Half the number of symbols of a table; a number beyond them is escaped."""
+
+MAX_BITS = 50
+"""Bits of the largest number."""
+
+CHUNK = 16
+"""Low bits that are coded at once."""
+
+PER_OCTAVE = 3
+"""Classes of widths per octave."""
+
+MIN_CLASS, MAX_CLASS = -4 * PER_OCTAVE, 46 * PER_OCTAVE
+"""Classes of widths from 2^-4 to 2^46."""
+
+OFFSETS = 4
+"""Fractions of a whole number at which a distribution may lie."""
+
+TAILS = (2, 4, 8)
+"""Degrees of freedom of Student's distributions: their functions are algebraic for even ones."""
+
+
+@cache
+def _uniform() -> Any:
+    return constriction.stream.model.Uniform()
+
+
+def categorical(probabilities: Array) -> Any:
+    """Return a model of the integers from 0, with these probabilities up to a factor."""
+    return constriction.stream.model.Categorical(np.asarray(probabilities, float), perfect=False)
+
+
+class Coder:
+    """What both directions share: distributions made of `_uniform` and `_table`."""
+
+    def uniform(self, sizes: IntArray, values: IntArray | None = None) -> IntArray:
+        """Code integers from 0 to ``sizes - 1``, all equally likely; sizes up to 2^20."""
+        result = np.zeros(len(sizes), np.int64)
+        free = sizes > 1  # a range coder has no distribution of one value
+        if free.any():
+            given = None if values is None else values[free]
+            result[free] = self._code(_uniform(), given, len(sizes), sizes[free])
+        return result
+
+    def table(self, model: Any, count: int, values: IntArray | None = None) -> IntArray:
+        """Code `count` integers by one model from `categorical`."""
+        return self._code(model, values, count, None)
+
+    def numbers(
+        self, center: Array, width: Array, tails: int, values: IntArray | None = None
+    ) -> IntArray:
+        """Code integers with Student's distribution around centres.
+
+        Parameters
+        ----------
+        center, width : ndarray of float64, shape (N,)
+            Widths above 0.
+        tails : int
+            Degrees of freedom, one of `TAILS`.
+        values : ndarray of int64, shape (N,), optional
+        """
+        center = np.clip(np.nan_to_num(center), -(2.0**40), 2.0**40)
+        base = np.floor(center + 0.5)
+        offset = np.floor((center - base + 0.5) * OFFSETS).astype(np.int64)
+        octaves = log2(np.clip(np.nan_to_num(width), 2.0**-20, 2.0**45))
+        kind = np.clip(np.rint(PER_OCTAVE * octaves), MIN_CLASS, MAX_CLASS).astype(np.int64)
+        shift = np.maximum(0, -(-kind // PER_OCTAVE) - 3)
+        away = None if values is None else values - base.astype(np.int64)
+        high = np.zeros(len(center), np.int64)
+        label = kind * OFFSETS + np.clip(offset, 0, OFFSETS - 1)
+        order = np.argsort(label, kind="stable")
+        ends = np.flatnonzero(np.diff(label[order], append=np.iinfo(np.int64).max)) + 1
+        top = None if away is None else away >> shift
+        for rows in np.split(order, ends[:-1]):
+            model = _student(int(label[rows[0]]), tails)
+            given = None if top is None else np.clip(top[rows] + REACH, 0, 2 * REACH - 1)
+            high[rows] = self.table(model, len(rows), given) - REACH
+        for side, edge in ((-1, -REACH), (1, REACH - 1)):
+            rows = np.flatnonzero(high == edge)
+            if len(rows):
+                given = None if top is None else side * (top[rows] - edge)
+                high[rows] = edge + side * self._unbounded(len(rows), given)
+        low = self._low_bits(shift, None if away is None else away & (1 << shift) - 1)
+        return base.astype(np.int64) + (high << shift) + low
+
+    def _unbounded(self, count: int, values: IntArray | None) -> IntArray:
+        """Code integers from 0 on: the number of bits, then the bits."""
+        bits = None
+        if values is not None:
+            bits = np.frexp((values + 1).astype(np.float64))[1].astype(np.int64) - 1
+        bits = self.uniform(np.full(count, MAX_BITS), bits)
+        given = None if values is None else values + 1 - (1 << bits)
+        return (1 << bits) + self._low_bits(bits, given) - 1
+
+    def _low_bits(self, bits: IntArray, values: IntArray | None) -> IntArray:
+        """Code integers of known numbers of bits, all equally likely."""
+        result = np.zeros(len(bits), np.int64)
+        for first in range(0, int(bits.max(initial=0)), CHUNK):
+            length = np.clip(bits - first, 0, CHUNK)
+            given = None if values is None else values >> first & (1 << length) - 1
+            result += self.uniform(1 << length, given) << first
+        return result
+
+    def _code(
+        self, model: Any, values: IntArray | None, count: int, sizes: IntArray | None
+    ) -> IntArray:
+        raise NotImplementedError
+
+
+class Encoder(Coder):
+    """Integers to bytes."""
+
+    def __init__(self) -> None:
+        self._coder = constriction.stream.queue.RangeEncoder()
+
+    def _code(
+        self, model: Any, values: IntArray | None, count: int, sizes: IntArray | None
+    ) -> IntArray:
+        assert values is not None
+        more = [] if sizes is None else [sizes.astype(np.int32)]
+        self._coder.encode(values.astype(np.int32), model, *more)
+        return values
+
+    def to_bytes(self) -> bytes:
+        """Return all bytes."""
+        return bytes(self._coder.get_compressed().astype("<u4").tobytes())
+
+
+class Decoder(Coder):
+    """Bytes to integers; hostile bytes give some integers, or `BadValue`."""
+
+    def __init__(self, data: bytes) -> None:
+        if len(data) % 4:
+            raise BadValue("the codes are no whole number of words")
+        self._coder = constriction.stream.queue.RangeDecoder(
+            np.frombuffer(data, "<u4").astype(np.uint32)
+        )
+
+    def _code(
+        self, model: Any, values: IntArray | None, count: int, sizes: IntArray | None
+    ) -> IntArray:
+        more = count if sizes is None else sizes.astype(np.int32)
+        try:
+            return np.asarray(self._coder.decode(model, more), np.int64)
+        except (AssertionError, ValueError):
+            raise BadValue("the codes are damaged") from None
+
+
+@cache
+def _student(label: int, tails: int) -> Any:
+    """Return the model of the high parts of numbers of a class, see `Coder.numbers`."""
+    kind, offset = divmod(label, OFFSETS)
+    shift = max(0, -(-kind // PER_OCTAVE) - 3)
+    width = float(exp2(np.array(kind / PER_OCTAVE)))
+    edges = np.arange(-REACH, REACH + 1) * float(1 << shift) - 0.5
+    edges = (edges - ((offset + 0.5) / OFFSETS - 0.5)) / width
+    below = _student_cdf(np.asarray(edges, np.float64), tails)
+    below[0], below[-1] = 0.0, 1.0
+    return categorical(np.maximum(np.diff(below), 1e-7))
+
+
+def _student_cdf(t: Array, tails: int) -> Array:
+    """Return Student's distribution function for 2, 4 or 8 degrees of freedom."""
+    x = t / np.sqrt(tails + t * t)
+    square = x * x
+    if tails == 2:
+        return 0.5 + 0.5 * x
+    if tails == 4:
+        return 0.5 + 0.25 * x * (3 - square)
+    odd = x * (1 - square * (1 - square * (0.6 - square / 7)))
+    return 0.5 + 1.09375 * odd

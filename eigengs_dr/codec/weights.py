@@ -1,0 +1,167 @@
+"""The weights of a model of probabilities: how an encoder finds them, and how files store them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..storage.npz import BadValue
+from .range_coder import TAILS
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MIN_WIDTH = 0.1
+"""Smallest width of a distribution, in steps."""
+
+WIDTHS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2)
+"""Factors of the mean absolute error that are tried as width."""
+
+CLASSES = 15
+"""Classes of directions, see `eigengs_dr.codec.directions`."""
+
+SMALL = 1500
+"""Number of Gaussians below which the weights may take more bytes than they save."""
+
+
+class Weights(NamedTuple):
+    """How one kind of numbers is predicted.
+
+    Attributes
+    ----------
+    center, width : ndarray of float64
+        Weights of the features, see `eigengs_dr.codec.gaussian_model`.
+    tails : int
+        One of `eigengs_dr.codec.range_coder.TAILS`.
+    """
+
+    center: Array
+    width: Array
+    tails: int
+
+
+@dataclass
+class Model:
+    """All that a section stores beside the integers.
+
+    Attributes
+    ----------
+    weights : list of Weights
+        For each channel, for the scale, and for the stretch.
+    sharpness : ndarray of int64, shape (CLASSES,)
+        How near directions are to those of the neighbours, from 0 to 255.
+    """
+
+    weights: list[Weights] = field(default_factory=list)
+    sharpness: IntArray = field(default_factory=lambda: np.zeros(CLASSES, np.int64))
+
+
+def feature_counts(channels: int) -> list[tuple[int, int]]:
+    """Return the numbers of features of centre and width, for each `Weights` of a model."""
+    colors = [(1 + 2 * min(k, 2), 4 + 2 * min(k, 2)) for k in range(channels)]
+    return [*colors, (7, 2), (5, 2)]
+
+
+def fit_weights(
+    center: Array, width: Array, values: Array, step: Array, rich: bool = True
+) -> Weights:
+    """Return the weights for which numbers take few bits.
+
+    Parameters
+    ----------
+    center, width : ndarray, shape (N, F)
+        Features of the centre and of the width of each distribution.
+    values, step : ndarray, shape (N,)
+        The numbers, which are multiples of the steps.
+    rich : bool, optional
+        Whether all weights may differ from 0, or only the first ones.
+    """
+    parts, spread = np.zeros(width.shape[1]), np.maximum(step, 1e-9)
+    some = slice(None) if rich else slice(0, 1)
+    found = np.zeros(center.shape[1])
+    for _ in range(3):
+        scaled = center[:, some] / spread[:, None]
+        ridge = 1e-3 * len(values) ** 0.5 * np.eye(scaled.shape[1])
+        known = np.append(values / spread, np.zeros(len(ridge)))
+        solved = np.linalg.lstsq(np.vstack([scaled, ridge]), known, rcond=None)[0]
+        found[some] = stored_center(solved)
+        error = values - weighted(found, list(center.T))
+        parts[some] = _fit_width(width[:, some], np.abs(error) + 0.1 * step, spread)
+        spread = np.maximum(weighted(parts, list(width.T)), MIN_WIDTH * step)
+    trials = [(w, tails) for tails in TAILS for w in WIDTHS]
+    best = min(trials, key=lambda trial: _bits(error / step, trial[0] * spread / step, trial[1]))
+    return Weights(found, stored_width(parts * best[0]), best[1])
+
+
+def _fit_width(features: Array, error: Array, spread: Array) -> Array:
+    """Return weights above 0 of features above 0 whose sum is near the absolute errors."""
+    from scipy.optimize import nnls  # decoders need not wait for this import
+
+    return np.asarray(nnls(features / spread[:, None], error / spread)[0])
+
+
+def _bits(error: Array, width: Array, tails: int) -> float:
+    """Return about the bits that errors in steps take with a distribution."""
+    t = error / width
+    density = np.log2(width) + 0.5 * (tails + 1) * np.log2(1 + t * t / tails)
+    return float(density.sum()) + len(t) * {2: 1.5, 4: 1.415, 8: 1.369}[tails]
+
+
+def weighted(weights: Array, features: list[Array]) -> Array:
+    """Return the weighted sum of features, one after another: the same bits everywhere."""
+    total = np.zeros(len(features[0]))
+    for weight, values in zip(weights, features, strict=True):
+        total = total + weight * values
+    return total
+
+
+def stored_center(weights: Array) -> Array:
+    """Round weights to half precision, as in files."""
+    return np.clip(np.nan_to_num(weights), -6e4, 6e4).astype(np.float16).astype(np.float64)
+
+
+def stored_width(weights: Array) -> Array:
+    """Round weights above 0 to half precision with two bits after the first, as in files."""
+    half = np.clip(np.nan_to_num(weights), 0, 4e4).astype("<f2").view("<u2")
+    return ((half + 0x80) & 0xFF00).astype("<u2").view("<f2").astype(np.float64)
+
+
+def to_bytes(model: Model, rich: bool) -> bytes:
+    """Return the bytes of a model; if it is not rich, of the first weights only."""
+    some, parts = slice(None) if rich else slice(0, 1), list[bytes]()
+    for weights in model.weights:
+        high = weights.width[some].astype("<f2").view("<u2") >> 8
+        parts.append(bytes([TAILS.index(weights.tails)]))
+        parts += [weights.center[some].astype("<f2").tobytes(), high.astype(np.uint8).tobytes()]
+    if rich:
+        parts.append(model.sharpness.astype(np.uint8).tobytes())
+    return b"".join(parts)
+
+
+def from_bytes(data: bytes, channels: int, rich: bool) -> tuple[Model, bytes]:
+    """Return a model and the bytes after it; the bytes may be hostile."""
+    model = Model()
+
+    def take(count: int) -> bytes:
+        nonlocal data
+        if count > len(data):
+            raise BadValue("the weights are cut off")
+        taken, data = data[:count], data[count:]
+        return taken
+
+    for numbers in feature_counts(channels):
+        used = numbers if rich else (1, 1)
+        [tails] = take(1)
+        if tails >= len(TAILS):
+            raise BadValue("the weights name an unknown distribution")
+        center, width = np.zeros(numbers[0]), np.zeros(numbers[1])
+        center[: used[0]] = np.frombuffer(take(2 * used[0]), "<f2")
+        high = np.frombuffer(take(used[1]), np.uint8).astype("<u2") << 8
+        width[: used[1]] = high.view("<f2")
+        model.weights.append(Weights(center, width, TAILS[tails]))
+    if rich:
+        model.sharpness = np.frombuffer(take(CLASSES), np.uint8).astype(np.int64)
+    return model, data
