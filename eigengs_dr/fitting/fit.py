@@ -44,10 +44,9 @@ class Fit:
         the call of `fit`; they include placement, upload, the colour solve and the measurements.
         With color "data", psnr_rgb is the PSNR of the data after clamping and rounding to 8 bits,
         and psnr_ycbcr the PSNR of the unchanged data; for values above 1.5, the largest of them
-        is the peak. With color "radiance", psnr_ycbcr is the PSNR in PU21, see `eigengs_dr.psnr`.
+        is the peak. With color "radiance" or "log", psnr_ycbcr is in PU21, see `eigengs_dr.psnr`.
     image : ndarray of float32, shape (H, W, 3), or (H, W, 1) for data of one channel
-        The rendering of the set: RGB without clamping; for linear light, sRGB clamped at 0; or the
-        data.
+        The rendering of the set: RGB without clamping; for light, sRGB clamped at 0; or the data.
     seconds, seconds_init : float
         The whole time, and the time before refinement.
     iterations : int
@@ -134,11 +133,13 @@ def fit(
     solve_steps : int, optional
         Steps of conjugate gradients in the colour solve. "eigen" uses them only if the image and
         the basis differ in size.
-    color : {"ycbcr", "rgb", "linear", "radiance", "data"}, optional
+    color : {"ycbcr", "rgb", "linear", "radiance", "log", "data"}, optional
         Space of the colours and of the squared error. "linear" decodes sRGB: the Gaussians sum to
         linear light, as textures need it, and errors weigh more in the dark. "data" uses one or
         three channels unchanged (roughness, normals, heights). "radiance" is "linear" without an
-        upper bound; "linear" becomes "radiance" for an image of light above 1.
+        upper bound; "linear" becomes "radiance" for an image of light above 1. "log" suits such
+        images best: the Gaussians sum to logarithms of light, see
+        `eigengs_dr.image.radiance.to_log`.
     seed : int, optional
         Seed of the random numbers. Only the initialiser "random" and presets without a colour
         solve use random numbers; the preset "default" gives one result for all seeds.

@@ -13,7 +13,7 @@ from ..image.pixels import MAX_PIXEL, check_data, check_image, encoding_of
 from .options import FitOptions
 
 WHITE = 1.001
-"""Largest sRGB code of light that counts as bounded by white; renderings overshoot 1 by rounding."""
+"""Largest sRGB code of light that counts as bounded by white; renderings exceed 1 by rounding."""
 
 
 def read_pixels(image: Any, options: FitOptions) -> tuple[NDArray[np.float32], FitOptions]:

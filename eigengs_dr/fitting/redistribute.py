@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
 from ..gaussian.gaussians import Gaussians
+from ..image.color import LIGHT
 from ..image.resize import resample
 from ..image.strips import map_threads, strips
 from ..raster.render import render
@@ -42,7 +43,7 @@ def start_from_placement(target: FitTarget, options: FitOptions) -> FitProblem:
     name, method = options.initializer, options.method
     place: Placement = resolve_name(PLACEMENTS[name])
     # Linear light would put too few Gaussians into dark parts.
-    shown = target.pixels if options.color == "linear" else target.values
+    shown = target.pixels if options.color in LIGHT else target.values
     count = options.count_for(target.pixels)
     generator = np.random.default_rng(options.seed)
     mean, factor = place(shown, count, generator)

@@ -23,6 +23,7 @@ from .pixels import (
     check_light,
     check_range,
     encoding_of,
+    mark_image,
     to_floats,
 )
 from .strips import map_threads, strips
@@ -32,13 +33,18 @@ __all__ = [
     "SUFFIXES",
     "ImageError",
     "LinearImage",
+    "bits_of",
     "check_data",
     "check_image",
+    "dtype_of",
     "load_image",
+    "mark_image",
     "open_picture",
     "picture_pixels",
     "save_image",
     "to_8bit",
+    "to_file",
+    "write_pixels",
 ]
 
 SUFFIXES = (*SAVE_OPTIONS, *FLOAT_SUFFIXES)
@@ -175,16 +181,16 @@ def save_image(
     said = encoding_of(image, encoding)
     ready = isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.size
     if ready and bits == 8 and said != "linear" and image.shape[2:] in ((1,), (3,)):  # type: ignore[union-attr]
-        return _write(path, np.asarray(image), bits)  # large pictures need no copy
+        return write_pixels(path, np.asarray(image), bits)  # large pictures need no copy
     floats = to_floats(image, "image", keep_grey=True, copy=False)
-    kind = {8: np.uint8, 16: np.uint16, 32: np.float32}[32 if holds_floats(path, bits) else bits]
+    kind = dtype_of(path, bits)
     pixels = np.empty(floats.shape, kind)
 
     def fill(rows: slice) -> None:
         pixels[rows] = to_file(floats[rows], said, kind)
 
     map_threads(fill, strips(*floats.shape[:2]))
-    _write(path, pixels, bits)
+    write_pixels(path, pixels, bits)
 
 
 def bits_of(path: Path, bits: int | None = None) -> int:
@@ -206,9 +212,10 @@ def bits_of(path: Path, bits: int | None = None) -> int:
     return bits or known_bits[0]
 
 
-def holds_floats(path: Path, bits: int) -> bool:
-    """Return whether a file of these bits holds floats, which are linear light."""
-    return path.suffix.lower() in FLOAT_SUFFIXES or bits == 32
+def dtype_of(path: Path, bits: int) -> Any:
+    """Return the type of the values of a file: uint8, uint16, or float32 for linear light."""
+    floats = path.suffix.lower() in FLOAT_SUFFIXES or bits == 32
+    return np.float32 if floats else {8: np.uint8, 16: np.uint16}[bits]
 
 
 def to_file(pixels: NDArray[Any], encoding: str | None, kind: Any) -> NDArray[Any]:
@@ -233,8 +240,14 @@ def to_file(pixels: NDArray[Any], encoding: str | None, kind: Any) -> NDArray[An
     return np.rint(np.clip(coded, 0, 1) * np.iinfo(kind).max).astype(kind)
 
 
-def _write(path: Path, pixels: NDArray[Any], bits: int) -> None:
-    """Write pixels (H, W, C) as the suffix of the path and the bits say."""
+def write_pixels(path: Path, pixels: NDArray[Any], bits: int) -> None:
+    """Write pixels (H, W, C) of the type of `dtype_of`, completely or not at all.
+
+    Raises
+    ------
+    ImageError
+        If a package is missing, or the file cannot be written.
+    """
     from PIL import Image
 
     try:

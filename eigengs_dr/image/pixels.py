@@ -38,12 +38,19 @@ class LinearImage(np.ndarray):
     It is a `numpy.ndarray` in every other way. Parts of it, and results of arithmetic with it, are
     linear light too; `numpy.asarray` makes a plain array of it, whose pixels count as sRGB.
 
+    Attributes
+    ----------
+    encoding : str
+        "linear".
+
     Examples
     --------
     >>> light = np.full((2, 2, 3), 0.5).view(LinearImage)
     >>> type(2 * light[:1]).__name__, type(np.asarray(light)).__name__
     ('LinearImage', 'ndarray')
     """
+
+    encoding = "linear"
 
 
 def is_bitmap(image: Any) -> bool:
@@ -146,6 +153,21 @@ def check_image(
         light = check_light(to_floats(image, "image", keep_grey, copy=False), "image")
         return by_strips(to_coded, light)
     return check_range(to_floats(image, "image", keep_grey, copy), "image")
+
+
+def mark_image(image: ArrayLike, encoding: str | None = None) -> NDArray[np.float32]:
+    """Convert an array to float32 as `eigengs_dr.load_image` does a file: light stays light.
+
+    For parameters and errors see `check_image`.
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W, 3)
+        A `LinearImage` for light.
+    """
+    if encoding_of(image, encoding) == "linear":
+        return check_light(to_floats(image, "image"), "image").view(LinearImage)
+    return check_range(to_floats(image, "image"), "image")
 
 
 def check_data(image: ArrayLike, copy: bool = True) -> NDArray[np.float32]:

@@ -205,7 +205,9 @@ def test_check_image_codes_light():
     codes = check_image(LIGHT.view(LinearImage))
     assert type(codes) is np.ndarray and codes.max() > 10
     np.testing.assert_array_equal(codes, check_image(LIGHT, encoding="linear"))
-    np.testing.assert_allclose(check_image(np.full((1, 1, 3), 0.214041), encoding="linear"), 0.5, rtol=1e-6)
+    np.testing.assert_allclose(
+        check_image(np.full((1, 1, 3), 0.214041), encoding="linear"), 0.5, rtol=1e-6
+    )
     with pytest.raises(ImageError, match="say encoding='linear' for light") as error:
         check_image(LIGHT)
     one_line(error)

@@ -266,7 +266,10 @@ def test_check_image_keeps_rows_columns_and_channels():
         (np.full((4, 4), None), "pixels are object"),
         (np.full((4, 4), "a"), "pixels are <U1"),
         ([[1, 2], [3]], "not an array"),
-        (np.full((2, 2), 255.0), "from 255 to 255, not 0 to 1; divide by 255 first, or say encoding="),
+        (
+            np.full((2, 2), 255.0),
+            "from 255 to 255, not 0 to 1; divide by 255 first, or say encoding=",
+        ),
         (np.full((2, 2), 1e300), "scale it first"),
         (np.array([[-1.0, 1.0]]), "from -1 to 1, not 0 to 1; scale it"),
     ],

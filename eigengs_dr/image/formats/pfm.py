@@ -31,7 +31,7 @@ def read(path: Path) -> NDArray[np.float32]:
     content = path.read_bytes()
     header = _HEADER.match(content)
     if not header:
-        raise ValueError("damaged or unsupported (no header of a portable float map); export it again")
+        raise ValueError("damaged or unsupported (no header of a float map); export it again")
     width, height, channels = int(header[2]), int(header[3]), 3 if header[1] == b"PF" else 1
     if len(content) - header.end() != 4 * width * height * channels:
         raise ValueError("damaged (its size is not that of its header); copy or export it again")
