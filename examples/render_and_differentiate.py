@@ -99,6 +99,6 @@ for _ in range(300):
     losses.append(loss.item())
 
 found = replace(start, **optimizer)
-eg.save_image(folder / "found.png", eg.render(found))
+eg.save_image(folder / "found.png", eg.picture_of(found))
 print(f"the loss went from {losses[0]:.4f} to {losses[-1]:.1e} in {len(losses)} steps")
 print("means found:", found.to_arrays()["mean"].round(2).tolist())
