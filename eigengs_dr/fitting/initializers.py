@@ -40,7 +40,7 @@ errors in linear light. The weight is about the square root of the slope of the 
 errors of light, which neglect the dark, and errors of sRGB codes. With 5,000 Gaussians and 300
 steps it gains 0.7 dB of psnr_rgb over no weight, on 12 training images of ImageNet classes. It
 suits light above 1 too. Three made-up environments of 512x256 pixels, with a sun of 5,000, end at
-31.2 dB in PU21, at 29.6 dB without weights, at 31.5 dB with ``(I + 0.01)^-0.5``, at 29.9 and 25.5 dB
+31.2 dB in PU21, at 29.6 without weights, at 31.5 with ``(I + 0.01)^-0.5``, at 29.9 and 25.5 dB
 with relative errors (0.1 and 0.01 added to I), and at 27.0 dB with the slope of PU21. Steep weights
 let bright spots vanish, which costs at most 1 a pixel, rather than spill on dark pixels."""
 

@@ -199,7 +199,7 @@ def bits_of(path: Path, bits: int | None = None) -> int:
     Raises
     ------
     ImageError
-        If the suffix is unknown, or the format has no such bits.
+        If the suffix is unknown, the format has no such bits, or OpenImageIO is missing.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -209,6 +209,8 @@ def bits_of(path: Path, bits: int | None = None) -> int:
     if bits is not None and bits not in known_bits:
         shown = " or ".join(map(str, sorted(known_bits)))
         raise ImageError(f"{path}: bits is {bits}; a {suffix} file has {shown}")
+    if suffix in (".exr", ".hdr") and not is_installed():
+        raise ImageError(f"{path}: {ADVICE}")
     return bits or known_bits[0]
 
 

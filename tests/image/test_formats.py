@@ -55,6 +55,11 @@ def test_half_floats(tmp_path):
     np.testing.assert_array_equal(load_image(tmp_path / "a.exr"), LIGHT.astype(np.float16))
 
 
+def test_light_beyond_half_floats_is_clamped(tmp_path):
+    save_image(tmp_path / "a.exr", np.full((2, 3, 3), 1e6), bits=16)
+    np.testing.assert_array_equal(load_image(tmp_path / "a.exr"), 65504)
+
+
 def test_grey_floats_are_replicated(tmp_path):
     for suffix in (".pfm", ".tif"):
         save_image(tmp_path / f"a{suffix}", LIGHT[..., :1], bits=32)

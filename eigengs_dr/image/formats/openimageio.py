@@ -20,6 +20,9 @@ ADVICE = "needs OpenImageIO; type: pip install 'eigengs-dr[hdr]'"
 MAX_PIXELS = 1 << 29
 """Largest number of pixels of a file; a damaged header may claim more than memory holds."""
 
+MAX_HALF = 65_504.0
+"""Largest finite float of 16 bits."""
+
 GREY, RGB = ("Y",), ("R", "G", "B")
 
 
@@ -87,7 +90,7 @@ def write(path: Path, pixels: Pixels, bits: int) -> None:
     path : Path
     pixels : ndarray of float32 or uint16, shape (H, W, 3) or (H, W, 1)
     bits : {16, 32}
-        Bits of a value of an EXR file.
+        Bits of a value of an EXR file; with 16, values are clamped to +-65,504.
 
     Raises
     ------
@@ -99,6 +102,8 @@ def write(path: Path, pixels: Pixels, bits: int) -> None:
         pixels = np.broadcast_to(pixels, (*pixels.shape[:2], 3))
     height, width, channels = pixels.shape
     kind = "uint16" if pixels.dtype == np.uint16 else ("half" if bits == 16 else "float")
+    if kind == "half":
+        pixels = np.clip(pixels, -MAX_HALF, MAX_HALF)
     spec = oiio.ImageSpec(width, height, channels, kind)
     spec.channelnames = RGB if channels == 3 else GREY
     if path.suffix.lower() == ".exr":
