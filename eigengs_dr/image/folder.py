@@ -272,10 +272,11 @@ def _singles(source: Iterable[Any]) -> Iterator[Any]:
 
 def _prepare(item: Any, place: int, size: tuple[int, int], space: str) -> PreparedImage:
     """Read, crop and convert one image."""
+    loaded = isinstance(item, Path)
     try:
-        image = check_image(load_image(item) if isinstance(item, Path) else item)
+        image = check_image(load_image(item) if loaded else item, copy=not loaded)
     except ImageError as error:
-        if not isinstance(item, Path):
+        if not loaded:
             raise ImageError(f"image {place} of the source{str(error)[len('image') :]}") from None
         # A warning that lists several files has room for the name and the reason only.
         reason = str(error).removeprefix(f"{item}: ").split("; ")[0]
