@@ -55,7 +55,7 @@ def texture(show: Any, variant: str) -> Any:
 @click.command()
 @count_option("--gaussians", 20_000)
 @count_option("--iterations", 1000)
-@click.option("--picture", type=ANY_PATH, metavar="P.jpg", help="The fits at three exposures.")
+@click.option("--picture", type=ANY_PATH, metavar="P.jpg", help="The fits at two exposures.")
 @prints_figures
 def radiance(show: Any, picture: Path | None, **settings: Any) -> Any:
     """Fit a made-up environment map of 1,024x512 pixels: light above 1, and through 8 bits."""

@@ -18,7 +18,7 @@ from eigengs_dr.image.radiance import to_pu21
 
 Light = NDArray[np.float32]
 
-STOPS = (2, 0, -4)
+STOPS = (0, -4)
 """Exposures of the picture, in powers of 2."""
 
 CROP = slice(70, 290), slice(60, 480)
