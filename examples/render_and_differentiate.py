@@ -35,7 +35,7 @@ truth = eg.Gaussians.from_arrays(
     space="rgb",
 )
 target = eg.render(truth)  # a Dr.Jit tensor: 48 rows, 64 columns, 3 channels
-eg.save_image(folder / "target.png", target)
+eg.save_image(folder / "target.png", target, encoding="srgb")
 
 start = eg.Gaussians.from_arrays(
     mean=[[14, 24], [34, 20], [52, 30]],
@@ -72,7 +72,7 @@ still = dr.detach(start)
 image = eg.render(replace(still, mean=still.mean + Array2f(shift, 0)))
 dr.forward(shift)
 change = dr.grad(image)
-eg.save_image(folder / "change.png", 0.5 + 5 * change)
+eg.save_image(folder / "change.png", 0.5 + 5 * change, encoding="srgb")
 
 # %%
 # The chain rule gives the derivative of the loss, which the reverse mode gave above.
