@@ -14,8 +14,9 @@ from .fitting.levels import fit_levels, level_counts
 from .gaussian.concatenate import concatenate
 from .gaussian.gaussians import Gaussians
 from .gaussian.tensors import from_tensors, to_tensors
-from .image.io import ImageError, load_image, save_image
+from .image.io import load_image, save_image
 from .image.metrics import ms_ssim, psnr, ssim
+from .image.pixels import ImageError, LinearImage
 from .image.samples import sample
 from .plugins import register_plugins
 from .raster.render import picture_of, render
@@ -34,6 +35,7 @@ __all__ = [
     "ImageError",
     "ImageRow",
     "LargeFit",
+    "LinearImage",
     "PackResult",
     "RunInterrupted",
     "concatenate",

@@ -39,5 +39,5 @@ for row in result.trace[:: len(result.trace) // 4]:
 result.gaussians.save(folder / "cat.npz")
 cat = eg.Gaussians.load(folder / "cat.npz")
 large = eg.render(cat, width=4 * cat.width)
-eg.save_image(folder / "cat_4x.png", large)
+eg.save_image(folder / "cat_4x.png", large, encoding="srgb")
 print(f"wrote cat.npz, cat.png and cat_4x.png ({large.shape[1]} x {large.shape[0]} pixels)")

@@ -35,7 +35,7 @@ truth = eg.Gaussians.from_arrays(
     space="rgb",
 )
 target = eg.render(truth)  # a Dr.Jit tensor: 48 rows, 64 columns, 3 channels
-eg.save_image(folder / "target.png", target)
+eg.save_image(folder / "target.png", target, encoding="srgb")
 
 start = eg.Gaussians.from_arrays(
     mean=[[14, 24], [34, 20], [52, 30]],
@@ -72,7 +72,7 @@ still = dr.detach(start)
 image = eg.render(replace(still, mean=still.mean + Array2f(shift, 0)))
 dr.forward(shift)
 change = dr.grad(image)
-eg.save_image(folder / "change.png", 0.5 + 5 * change)
+eg.save_image(folder / "change.png", 0.5 + 5 * change, encoding="srgb")
 
 # %%
 # The chain rule gives the derivative of the loss, which the reverse mode gave above.
@@ -99,6 +99,6 @@ for _ in range(300):
     losses.append(loss.item())
 
 found = replace(start, **optimizer)
-eg.save_image(folder / "found.png", eg.render(found))
+eg.save_image(folder / "found.png", eg.picture_of(found))
 print(f"the loss went from {losses[0]:.4f} to {losses[-1]:.1e} in {len(losses)} steps")
 print("means found:", found.to_arrays()["mean"].round(2).tolist())

@@ -10,7 +10,15 @@ except ImportError as error:
     ) from error
 
 from .cone import pixel_angle
+from .environment import bake_environment
 from .parameters import gaussians_of, keep_in_bounds, texture_of
 from .registration import register_plugins
 
-__all__ = ["gaussians_of", "keep_in_bounds", "pixel_angle", "register_plugins", "texture_of"]
+__all__ = [
+    "bake_environment",
+    "gaussians_of",
+    "keep_in_bounds",
+    "pixel_angle",
+    "register_plugins",
+    "texture_of",
+]

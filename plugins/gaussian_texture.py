@@ -33,7 +33,7 @@ from eigengs_dr.raster.render import decode_parameters
 from .cone import metric
 from .properties import affine, angle, cutoff, raw, source_of, wrap_mode
 from .spectrum import upload_table, upsample
-from .values import keep_finite, luminance, show, slope_of
+from .values import is_shown, keep_finite, luminance, show, slope_of
 
 SURVEY = 128
 """Points along a side of the grid of brightness, for sampling of emission and for the mean."""
@@ -159,7 +159,7 @@ def gaussian_texture() -> type:
             count = 3 * self.channels
             sums = sum_at_points(self.cells, self.packed, number, x, y, active, terms, count)
             coded = [s + b for s, b in zip(sums[::3], self.background, strict=True)]
-            slope = [dr.select((c >= 0) & (c <= 1) | self.raw, slope_of(self, c), 0) for c in coded]
+            slope = [dr.select(is_shown(self, c), slope_of(self, c), 0) for c in coded]
             du = luminance([s * k for s, k in zip(slope, sums[1::3], strict=True)])
             dv = luminance([s * k for s, k in zip(slope, sums[2::3], strict=True)])
             du, dv = du * sx * self.width, dv * sy * self.height

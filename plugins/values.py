@@ -2,32 +2,46 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from eigengs_dr.image.color import to_linear
+from eigengs_dr.image.color import UNBOUNDED, to_linear
+from eigengs_dr.image.radiance import LOG_SLOPE, from_log
 
 
 def show(texture: Any, value: Any) -> Any:
     """Clamp and decode a channel, unless raw.
 
-    The clamp conserves energy. Gradients ignore it: else a colour that a step moved out of the
-    range would never come back.
+    The clamp conserves energy; light that may exceed 1 has no upper bound. Gradients ignore the
+    clamp: else a colour that a step moved out of the range would never come back.
     """
     if texture.raw:
         return value
+    if texture.space in UNBOUNDED:
+        value = from_log(value) if texture.space == "log" else value
+        return dr.replace_grad(dr.maximum(value, 0), value)
     value = dr.replace_grad(dr.clip(value, 0, 1), value)
     return to_linear(value) if texture.space in ("ycbcr", "rgb") else value
 
 
 def slope_of(texture: Any, value: Any) -> Any:
-    """Return the derivative of `show` for a channel in [0, 1]."""
+    """Return the derivative of `show` for a channel that it does not clamp."""
+    if texture.space == "log" and not texture.raw:
+        return (from_log(value) + 1 / LOG_SLOPE) * math.log1p(LOG_SLOPE)
     if texture.raw or texture.space not in ("ycbcr", "rgb"):
         return type(value)(1)
     curved = 2.4 / 1.055 * dr.power((dr.maximum(value, 0.04045) + 0.055) * (1 / 1.055), 1.4)
     return dr.select(value <= 0.04045, 1 / 12.92, curved)
+
+
+def is_shown(texture: Any, value: Any) -> Any:
+    """Return whether `show` does not clamp a channel."""
+    if texture.raw:
+        return type(value)(0) == 0
+    return (value >= 0) & ((value <= 1) | (texture.space in UNBOUNDED))
 
 
 def luminance(color: list) -> Any:

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from eigengs_bench.cli_single import eigen, inverse, kernels, levels, texture
+from eigengs_bench.cli_single import eigen, inverse, kernels, levels, radiance, texture
 from eigengs_bench.harness.store import Task
 from eigengs_bench.names import FIGURES, NATURAL, PAPER_SETS, PARTS, PRESETS, SETS, TABLES
 from eigengs_bench.options import (
@@ -204,5 +204,5 @@ def report(folder: Path, output: Path, quiet: bool) -> None:
         click.echo(f"wrote {output / 'index.html'} and {output / 'README.md'}")
 
 
-for command in (kernels, eigen, texture, inverse, levels):
+for command in (kernels, eigen, texture, inverse, levels, radiance):
     bench.add_command(command)

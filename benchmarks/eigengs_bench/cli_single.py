@@ -53,6 +53,23 @@ def texture(show: Any, variant: str) -> Any:
 
 
 @click.command()
+@count_option("--gaussians", 20_000)
+@count_option("--iterations", 1000)
+@click.option("--picture", type=ANY_PATH, metavar="P.jpg", help="The fits at two exposures.")
+@prints_figures
+def radiance(show: Any, picture: Path | None, **settings: Any) -> Any:
+    """Fit a made-up environment map of 1,024x512 pixels: light above 1, and through 8 bits."""
+    from eigengs_bench.experiments.radiance import comparison, run
+    from eigengs_dr.image.io import save_image
+
+    check_outputs([picture], [])
+    figures, results = run(progress=show, **settings)
+    if picture:
+        save_image(picture, comparison(results))
+    return figures, ""
+
+
+@click.command()
 @click.argument("image", type=EXISTING, metavar="IMAGE")
 @click.option("--basis", default="natural", show_default=True, metavar="NAME|FILE")
 @many_option("--condition", "conditions", CONDITIONS, "What photos are like, by default all")

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from ..gaussian.crop import crop
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
-from ..image.io import save_image, to_8bit
+from ..image.color import rendered_as
+from ..image.io import bits_of, dtype_of, to_file, write_pixels
 from ..image.metrics import float_space, squared_error
-from ..raster.render import picture_of
+from ..raster.render import picture_of, render
 from ..storage.atomic import atomic_write
 from .grid import Block
 from .source import Source, Window
@@ -28,8 +29,12 @@ Picture = NDArray[Any]
 
 def draw(data: SetData, backend: str | None = None) -> Picture:
     """Draw a set, which may be empty, at its own size, as `eigengs_dr.picture_of` does."""
+    return picture_of(_load(data, backend))
+
+
+def _load(data: SetData, backend: str | None) -> Gaussians:
+    """Return the set, or one Gaussian without colour for an empty one."""
     if len(data.arrays["mean"]) == 0:
-        # A Gaussian without colour: the background is converted as in other sets.
         channels = len(data.arrays["background"])
         data = data._replace(
             arrays=data.arrays
@@ -39,10 +44,9 @@ def draw(data: SetData, backend: str | None = None) -> Picture:
                 "color": np.zeros((1, channels), np.float32),
             }
         )
-    gaussians = Gaussians.from_arrays(
+    return Gaussians.from_arrays(
         **data.arrays, size=data.size, space=data.space, backend=backend, cutoff=data.cutoff
     )
-    return picture_of(gaussians)
 
 
 def draw_region(
@@ -50,6 +54,7 @@ def draw_region(
     region: tuple[int, int, int, int],
     size: tuple[int, int],
     backend: str | None = None,
+    kind: Any = np.uint8,
 ) -> Iterator[Picture]:
     """Draw a region of a set at any size, in bands of rows from top to bottom.
 
@@ -63,11 +68,13 @@ def draw_region(
     size : (int, int)
         Width and height of the picture in pixels.
     backend : {"llvm", "cuda"}, optional
+    kind : dtype, optional
+        uint8 or uint16 for clamped and rounded sRGB, float32 for light; data stay data.
 
     Yields
     ------
-    ndarray of uint8, shape (R, width, C)
-        Clamped and rounded; every band but the last has a multiple of 256 rows.
+    ndarray of the dtype `kind`, shape (R, width, C)
+        Every band but the last has a multiple of 256 rows.
     """
     left, top, native_width, native_height = region
     width, height = size
@@ -78,7 +85,7 @@ def draw_region(
     for first in range(0, height, rows):
         band = width, min(rows, height - first)
         part = crop(data, (0, first / scale[1]), band, scale)
-        yield to_8bit(draw(part, backend)).astype(np.uint8)
+        yield to_file(render(_load(part, backend)).numpy(), rendered_as(data.space), kind)
 
 
 def save_region(
@@ -88,31 +95,36 @@ def save_region(
     size: tuple[int, int],
     backend: str | None = None,
     progress: Callable[[int, int], None] | None = None,
+    bits: int | None = None,
 ) -> None:
-    """Draw a region of a set into a file with 8 bits per channel, completely or not at all.
+    """Draw a region of a set into a file, completely or not at all.
 
     Parameters
     ----------
     path : Path
         A .tif or .tiff file is written by tiles, in the memory of a band. Other files, see
-        `eigengs_dr.save_image`, need the whole picture: 3 bytes a pixel.
+        `eigengs_dr.save_image`, need the whole picture: 3 to 12 bytes a pixel.
     data, region, size, backend
         See `draw_region`.
     progress : callable, optional
         ``progress(done, total)`` with rows of the picture.
+    bits : int, optional
+        See `eigengs_dr.save_image`.
 
     Raises
     ------
     ImageError
-        If the suffix is unknown or the file cannot be written.
+        If the suffix is unknown, the format has no such bits, or the file cannot be written.
     OSError
         If the .tif file cannot be written.
     """
+    bits = bits_of(path, bits)
+    kind = dtype_of(path, bits)
     shape = size[1], size[0], len(data.arrays["background"])
 
     def bands() -> Iterator[Picture]:
         done = 0
-        for band in draw_region(data, region, size, backend):
+        for band in draw_region(data, region, size, backend, kind):
             yield band
             done += len(band)
             if progress:
@@ -120,13 +132,13 @@ def save_region(
 
     if path.suffix.lower() in TIFF_SUFFIXES:
         with atomic_write(path) as temporary:
-            write_tiles(temporary, shape, bands())
+            write_tiles(temporary, shape, bands(), kind)
         return
-    picture, first = np.empty(shape, np.uint8), 0
+    picture, first = np.empty(shape, kind), 0
     for band in bands():
         picture[first : first + len(band)] = band
         first += len(band)
-    save_image(path, picture)
+    write_pixels(path, picture, bits)
 
 
 class CompareTask(NamedTuple):

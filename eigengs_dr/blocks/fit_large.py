@@ -79,6 +79,7 @@ def fit_large(
     backend: str | None = None,
     progress: Progress | None = None,
     client: Any = None,
+    encoding: str | None = None,
 ) -> LargeFit:
     """Fit an image of any size block by block, in the memory of one block.
 
@@ -107,6 +108,9 @@ def fit_large(
         this order; the first pair with "density" for long fits alone), and blocks, their number.
     client : distributed.Client, optional
         Where blocks are fitted; by default in this process.
+    encoding : {"srgb", "linear"}, optional
+        What the pixels are, see `eigengs_dr.fit`. For light above 1, give the color "log" or
+        "radiance": nobody looks at all pixels first.
 
     Returns
     -------
@@ -145,8 +149,9 @@ def fit_large(
         solve_steps=solve_steps,
         cutoff=cutoff,
         backend=backend,
+        encoding=encoding,
     )
-    image = open_source(source, keep_grey=color == "data")
+    image = open_source(source, color == "data", encoding)
     blocks, options = plan(image, options, block)
     select(backend)
     keep: Any = nullcontext()
@@ -201,7 +206,7 @@ def plan(image: Source, options: FitOptions, side: int) -> tuple[list[Block], Fi
 
 def _decisive(options: FitOptions, side: int) -> dict[str, Any]:
     """Return the options on which the result depends."""
-    names = ("gaussians", "iterations", "color", "solve_steps", "cutoff")
+    names = ("gaussians", "iterations", "color", "solve_steps", "cutoff", "encoding")
     values = {name: getattr(options, name) for name in names} | {"block": side}
     # JSON has no numbers of NumPy.
     return {k: v.item() if isinstance(v, np.generic) else v for k, v in values.items()}

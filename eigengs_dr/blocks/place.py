@@ -21,6 +21,7 @@ from ..fitting.placement.adaptive import (
 )
 from ..fitting.placement.density import scale_by_owner
 from ..fitting.placement.nearest import nearest_center
+from ..image.color import LIGHT
 from .grid import Block
 
 Array = NDArray[np.floating]
@@ -43,7 +44,7 @@ class OldSet(NamedTuple):
 
 def placement_image(target: FitTarget, color: str) -> NDArray[np.float32]:
     """Return the image that shapes the Gaussians: linear light would neglect dark parts."""
-    return target.pixels if color == "linear" else target.values
+    return target.pixels if color in LIGHT else target.values
 
 
 def window_density(image: Array, spacing: float, old: OldSet | None = None) -> NDArray[np.float32]:

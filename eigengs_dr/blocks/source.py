@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..image.io import ImageError, check_image, open_picture, picture_pixels
-from .tiff import TIFF_SUFFIXES, read_window, window_shape
+from ..image.formats.registry import kind_of
+from ..image.io import ImageError, load_image, open_picture, picture_pixels
+from ..image.pixels import LinearImage, check_data, check_image, check_range, encoding_of
+from .tiff import TIFF_SUFFIXES, holds_floats, read_window, window_shape
 
 MAX_SIDE = 1 << 16
 """Longest side of a set of Gaussians, in pixels."""
@@ -34,17 +36,20 @@ class Window(NamedTuple):
     load : callable
         Returns the pixels in the dtype of the source. It holds a path, or the pixels.
     keep_grey : bool
-        Whether a grey image has one channel instead of three.
+        Whether the image is data, which keep one channel.
     name : str
         The image and the part, for errors.
+    encoding : {"srgb", "linear"}
+        What the pixels are.
     """
 
     load: Callable[[], Array]
     keep_grey: bool
     name: str
+    encoding: str = "srgb"
 
     def read(self) -> NDArray[np.float32]:
-        """Return the pixels: float32 of shape (h, w, 3), or (h, w, 1).
+        """Return the pixels: float32 of shape (h, w, 3), in sRGB, or data, perhaps (h, w, 1).
 
         Raises
         ------
@@ -53,7 +58,9 @@ class Window(NamedTuple):
         """
         pixels = self.load()
         try:
-            return check_image(pixels, keep_grey=self.keep_grey, copy=False)
+            if self.keep_grey:
+                return check_range(check_data(pixels, copy=False), "image")
+            return check_image(pixels, copy=False, encoding=self.encoding)
         except ImageError as error:
             raise ImageError(f"{self.name}: {str(error).removeprefix('image: ')}") from None
 
@@ -74,7 +81,7 @@ class Source:
         What tells this image from others, in numbers and texts.
     cut : callable
         ``cut(rows, columns)`` returns what `Window.load` holds.
-    keep_grey : bool
+    keep_grey, encoding
         See `Window`.
     """
 
@@ -85,26 +92,31 @@ class Source:
     identity: dict[str, Any]
     cut: Callable[[slice, slice], Callable[[], Array]]
     keep_grey: bool
+    encoding: str = "srgb"
 
     def window(self, rows: slice, columns: slice) -> Window:
         """Return a part of the image."""
         part = f"rows {rows.start} to {rows.stop}, columns {columns.start} to {columns.stop}"
-        return Window(self.cut(rows, columns), self.keep_grey, f"{self.name}, {part}")
+        name = f"{self.name}, {part}"
+        return Window(self.cut(rows, columns), self.keep_grey, name, self.encoding)
 
 
-def open_source(source: Any, keep_grey: bool = False) -> Source:
+def open_source(source: Any, keep_grey: bool = False, encoding: str | None = None) -> Source:
     """Open a large image without reading its pixels.
 
     Parameters
     ----------
     source : path-like or array
         A file: TIFF of grey or RGB by strips or tiles, and ``.npy``, are read by windows. Pillow
-        decodes other files (PNG, JPEG, TIFF of other kinds) whole, into 4 bytes a pixel.
+        decodes other files (PNG, JPEG, TIFF of other kinds) whole, into 4 bytes a pixel; files of
+        floats or 16 bits take 12.
         Or an array (H, W, 3), (H, W, 1) or (H, W) of a type that `eigengs_dr.load_image` knows, of
         which ``source[top:bottom, left:right]`` is a part: NumPy's, also memory-mapped, zarr's,
         Dask's.
     keep_grey : bool, optional
-        Whether a grey image has one channel instead of three.
+        Whether the image is data: a grey one has one channel instead of three.
+    encoding : {"srgb", "linear"}, optional
+        What the pixels are. By default what the image says: "linear" for files of floats.
 
     Returns
     -------
@@ -116,7 +128,7 @@ def open_source(source: Any, keep_grey: bool = False) -> Source:
         If there is no such file, it is no image, or the shape or the size is wrong.
     """
     if isinstance(source, (str, os.PathLike)):
-        return _open_file(Path(source), keep_grey)
+        return _open_file(Path(source), keep_grey, encoding)
     if not hasattr(source, "shape") or not hasattr(source, "dtype"):
         kind = type(source).__name__
         raise ImageError(f"image: is a {kind}; pass a file or an array of shape (H, W, 3)")
@@ -126,10 +138,11 @@ def open_source(source: Any, keep_grey: bool = False) -> Source:
     def cut(rows: slice, columns: slice) -> Callable[[], Array]:
         return partial(np.asarray, np.asarray(source[rows, columns]))
 
-    return _checked("image", shape, identity, cut, keep_grey)
+    said = encoding_of(source, encoding) or "srgb"
+    return _checked("image", shape, identity, cut, keep_grey, said)
 
 
-def _open_file(path: Path, keep_grey: bool) -> Source:
+def _open_file(path: Path, keep_grey: bool, encoding: str | None) -> Source:
     absolute = os.path.abspath(path)
     shape: tuple[int, ...] | None = None
     read: Read
@@ -139,8 +152,15 @@ def _open_file(path: Path, keep_grey: bool) -> Source:
         raise ImageError(f"{path}: {error.strerror or error}; check the path") from None
     if path.suffix.lower() in TIFF_SUFFIXES:
         shape = window_shape(absolute)
+    default = "srgb"
     if shape is not None:
         read = partial(read_window, absolute)
+        default = "linear" if holds_floats(absolute) else "srgb"
+    elif kind_of(path) is not None:
+        picture = _loaded(absolute, state.st_mtime_ns, keep_grey)
+        shape = picture.shape
+        read = partial(_read_loaded, absolute, state.st_mtime_ns, keep_grey)
+        default = "linear" if isinstance(picture, LinearImage) else "srgb"
     elif path.suffix.lower() == ".npy":
         shape = _array_shape(absolute)
         read = partial(_read_array, absolute)
@@ -153,7 +173,7 @@ def _open_file(path: Path, keep_grey: bool) -> Source:
     def cut(rows: slice, columns: slice) -> Callable[[], Array]:
         return partial(read, rows, columns)
 
-    return _checked(str(path), shape, identity, cut, keep_grey)
+    return _checked(str(path), shape, identity, cut, keep_grey, encoding or default)
 
 
 def _checked(
@@ -162,6 +182,7 @@ def _checked(
     identity: dict[str, Any],
     cut: Callable[[slice, slice], Callable[[], Array]],
     keep_grey: bool,
+    encoding: str,
 ) -> Source:
     """Return a source, or refuse what is no image or too large."""
     if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] not in (1, 3)):
@@ -170,7 +191,7 @@ def _checked(
         raise ImageError(f"{name}: {shape[1]}x{shape[0]} pixels; sides go from 1 to {MAX_SIDE:,}")
     grey = len(shape) == 2 or shape[2] == 1
     channels = 1 if grey and keep_grey else 3
-    return Source(shape[1], shape[0], channels, name, identity, cut, keep_grey)
+    return Source(shape[1], shape[0], channels, name, identity, cut, keep_grey, encoding)
 
 
 def _array_shape(path: str) -> tuple[int, ...]:
@@ -193,6 +214,17 @@ def _read_picture(path: str, modified: int, rows: slice, columns: slice) -> Arra
         return picture_pixels(picture.crop(box))[0]
 
 
+def _read_loaded(path: str, modified: int, keep_grey: bool, rows: slice, columns: slice) -> Array:
+    """Return a part of a file of floats or 16 bits."""
+    return np.asarray(_loaded(path, modified, keep_grey)[rows, columns])
+
+
+@lru_cache(maxsize=1)
+def _loaded(path: str, modified: int, keep_grey: bool) -> Array:
+    """Read a file of floats or 16 bits whole, and keep it; see `_decoded`."""
+    return load_image(path, keep_grey)
+
+
 @lru_cache(maxsize=1)
 def _decoded(path: str, modified: int) -> Any:
     """Decode a file, and keep it for the next window; `modified` tells its versions apart."""
@@ -204,6 +236,7 @@ def _decoded(path: str, modified: int) -> Any:
 def forget_pictures() -> None:
     """Free the memory of the file that Pillow decoded last."""
     _decoded.cache_clear()
+    _loaded.cache_clear()
 
 
 @contextmanager

@@ -51,6 +51,14 @@ def window_shape(path: str) -> tuple[int, int, int] | None:
     return height, width, channels
 
 
+def holds_floats(path: str) -> bool:
+    """Return whether a TIFF file, for which `window_shape` returns a shape, holds floats."""
+    import tifffile
+
+    with tifffile.TiffFile(path) as file:
+        return bool(file.pages[0].dtype.kind == "f")
+
+
 def read_window(path: str, rows: slice, columns: slice) -> Pixels:
     """Read a part of a TIFF file for which `window_shape` returns a shape.
 
@@ -123,7 +131,10 @@ def _decode(file: Any, page: Any, number: int) -> Pixels:
 
 
 def write_tiles(
-    path: str | os.PathLike[str], shape: tuple[int, int, int], bands: Iterator[Pixels]
+    path: str | os.PathLike[str],
+    shape: tuple[int, int, int],
+    bands: Iterator[Pixels],
+    dtype: Any = np.uint8,
 ) -> None:
     """Write a tiled TIFF file, a BigTIFF if it has more than 4 GB, from bands of rows.
 
@@ -132,8 +143,10 @@ def write_tiles(
     path : path-like
     shape : (int, int, int)
         Height, width and channels, 1 or 3.
-    bands : iterator of ndarray of uint8, shape (R, W, C)
+    bands : iterator of ndarray, shape (R, W, C)
         From top to bottom; every band but the last has a multiple of `TILE_SIDE` rows.
+    dtype : dtype, optional
+        Type of the bands: uint8, uint16 or float32.
 
     Raises
     ------
@@ -143,11 +156,12 @@ def write_tiles(
     import tifffile
 
     height, width, channels = shape
-    with tifffile.TiffWriter(path, bigtiff=height * width * channels > 4_000_000_000) as file:
+    large = height * width * channels * np.dtype(dtype).itemsize > 4_000_000_000
+    with tifffile.TiffWriter(path, bigtiff=large) as file:
         file.write(
             _tiles(bands, width),
             shape=shape if channels > 1 else shape[:2],
-            dtype=np.uint8,
+            dtype=dtype,
             photometric="rgb" if channels > 1 else "minisblack",
             tile=(TILE_SIDE, TILE_SIDE),
             compression="zlib",

@@ -25,6 +25,7 @@ from .options import (
     choice,
     cluster_option,
     describe_run,
+    encoding_option,
     quiet_option,
     report_option,
 )
@@ -79,7 +80,12 @@ FAILED = 2
     help=f"Basis for --init eigen, which it implies.  [default: {DEFAULT_BASIS}]",
 )
 @choice("--preset", list(PRESETS), "Our method, or that of a paper.")
-@choice("--color", list(SPACES), "Colour space; linear for textures, data for other values.")
+@choice(
+    "--color",
+    list(SPACES),
+    "Colour space; linear for textures, log for light above 1, data for other values.",
+)
+@encoding_option
 @click.option(
     "--seed",
     type=int,
@@ -135,6 +141,7 @@ def fit(
       eigengs-dr fit "photos/**/*.jpg" -o fits/ --cluster local:4
       eigengs-dr fit s3://bucket/photos/ -o /shared/fits/ --cluster tcp://node1:8786
       eigengs-dr fit roughness.png -o roughness.npz --color data
+      eigengs-dr fit sky.exr -o sky.npz --color log --gaussians 20000
       eigengs-dr fit huge.tif -o huge.npz --blocks 1024
     """
     from ..fitting.levels import check_options
@@ -233,7 +240,7 @@ def _fitter(options: FitOptions, levels: int | None) -> Callable[..., "Fit"]:
     from ..fitting.levels import fit_levels
 
     if levels is not None:
-        names = ("gaussians", "iterations", "color", "seed", "backend")
+        names = ("gaussians", "iterations", "color", "seed", "backend", "encoding")
         common = {name: getattr(options, name) for name in names}
         return lambda image, progress: fit_levels(image, levels=levels, progress=progress, **common)
     if options.initializer == "eigen":

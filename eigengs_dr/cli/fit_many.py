@@ -94,8 +94,7 @@ def _record(finished: Finished, preview: Path | None, color: str, measure: bool)
     """Return the figures of one image, and write its preview."""
     import eigengs_dr as eg
 
-    from ..image.metrics import float_space
-    from .pictures import comparison
+    from .pictures import comparison, displayed
 
     row, pixels = finished.row, finished.pixels
     record: Record = {"input": str(row.input), "output": str(row.output)}
@@ -106,7 +105,7 @@ def _record(finished: Finished, preview: Path | None, color: str, measure: bool)
     record |= {name: getattr(row, name) for name in (*names, "psnr_ycbcr", "psnr_rgb")}
     if pixels is None:  # it stays with the worker that fitted it
         return record
-    result = row.result
+    result, pixels = row.result, displayed(pixels, color)
     record["seconds_init"] = result.seconds_init
     if preview:
         try:
@@ -115,7 +114,9 @@ def _record(finished: Finished, preview: Path | None, color: str, measure: bool)
             return {**record, "stopped": "failed", "error": str(error)}
     if measure:
         record["ssim"] = eg.ssim(pixels, result.image)
-        record["ms_ssim"] = eg.ms_ssim(pixels, result.image, space=float_space(color))
+        record["ms_ssim"] = eg.ms_ssim(
+            pixels, result.image, space="data" if color == "data" else "ycbcr"
+        )
         record["trace"] = result.trace
     return record
 

@@ -29,12 +29,12 @@ def fit_one(
     import eigengs_dr as eg
 
     from ..fitting.fit import FitInterrupted
-    from .pictures import comparison
+    from .pictures import comparison, displayed
 
     started = time.perf_counter()
     with progress_bar(quiet) as show:
         show(f"{path.name}: load", 0, 1)
-        image = eg.load_image(path, keep_grey=options.color == "data")
+        image = eg.load_image(path, options.color == "data", options.encoding)
         loaded = time.perf_counter()
         try:
             result = run(image, progress=partial(show, path.name))
@@ -44,9 +44,11 @@ def fit_one(
             raise ValueError(f"{path}: {error}") from None
         result.gaussians.save(output)
         show(f"{path.name}: measure", 0, 1)
-        figures = _measure(image, result, options.color)
+        shown = displayed(image, options.color)
+        color = result.gaussians.space
+        figures = _measure(shown, result, color)
         if preview:
-            eg.save_image(preview, comparison(image, result.image, result.gaussians))
+            eg.save_image(preview, comparison(shown, result.image, result.gaussians))
     record = {
         "input": str(path),
         "output": str(output),
@@ -63,7 +65,7 @@ def fit_one(
         "trace": result.trace,
     }
     if not quiet:
-        click.echo(_summary(record, preview, options.color))
+        click.echo(_summary(record, preview, color))
     return record
 
 
@@ -77,7 +79,7 @@ def _measure(image: Any, result: Fit, color: str) -> dict[str, float]:
         "psnr_ycbcr": eg.psnr(image, result.image, space=float_space(color)),
         "psnr_rgb": eg.psnr(image, result.image, space="rgb"),
         "ssim": eg.ssim(image, result.image),
-        "ms_ssim": eg.ms_ssim(image, result.image, space=float_space(color)),
+        "ms_ssim": eg.ms_ssim(image, result.image, space="data" if color == "data" else "ycbcr"),
     }
 
 

@@ -10,6 +10,7 @@ import click
 
 from ..backend.selection import describe
 from ..collection.remote import is_url
+from ..image.pixels import ENCODINGS
 from ..storage.atomic import refuse_url
 from .console import NAME
 
@@ -59,6 +60,13 @@ cluster_option = click.option(
     "--cluster",
     metavar="local[:N]|tcp://HOST:PORT|FILE",
     help="Work on N processes here, or on a Dask cluster.",
+)
+
+
+encoding_option = click.option(
+    "--encoding",
+    type=click.Choice(ENCODINGS),
+    help="What the pixels are.  [default: linear in files of floats, else srgb]",
 )
 
 

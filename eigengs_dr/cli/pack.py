@@ -5,7 +5,15 @@ from pathlib import Path
 import click
 
 from ..backend.selection import select
-from .options import ANY_PATH, EXISTING, backend_option, describe_run, quiet_option, report_option
+from .options import (
+    ANY_PATH,
+    EXISTING,
+    backend_option,
+    describe_run,
+    encoding_option,
+    quiet_option,
+    report_option,
+)
 from .outputs import check_outputs, name_outputs
 from .report import write_report
 
@@ -20,6 +28,7 @@ Dr.Jit."""
     "-o", "--output", required=True, type=ANY_PATH, metavar="Y.egs", help="File to write."
 )
 @click.option("--image", type=EXISTING, help="The original image, to measure the loss with.")
+@encoding_option
 @click.option(
     "--budget",
     type=float,
@@ -45,6 +54,7 @@ def pack(
     file: Path,
     output: Path,
     image: Path | None,
+    encoding: str | None,
     budget: float,
     levels: int,
     backend: str | None,
@@ -69,7 +79,8 @@ def pack(
     import eigengs_dr as eg
 
     gaussians = eg.Gaussians.load(file, backend=backend)
-    pixels = eg.load_image(image, keep_grey=gaussians.channels == 1) if image else None
+    grey = gaussians.channels == 1
+    pixels = eg.load_image(image, grey, encoding) if image else None
     try:
         counts = eg.level_counts(len(gaussians), levels)
         sections = [n - before for before, n in zip([0, *counts], counts, strict=False)]
@@ -92,7 +103,8 @@ def pack(
         write_report(report, {**describe_run(context, backend), **figures})
     if not quiet:
         against = "the image" if image else "the rendering of the input"
-        space = "sRGB" if gaussians.space == "linear" else gaussians.space
+        spaces = {"linear": "sRGB", "radiance": "PU21"}
+        space = spaces.get(gaussians.space, gaussians.space)
         click.echo(
             f"{file}: {len(gaussians):,} Gaussians, {file.stat().st_size:,} bytes\n"
             f"  wrote {target}: {receipt.bytes:,} bytes, "

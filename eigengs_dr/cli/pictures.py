@@ -16,6 +16,7 @@ from ..gaussian.gaussians import Gaussians
 from ..image.color import decode
 from ..image.io import to_8bit
 from ..image.montage import join_pictures, text_line
+from ..image.pixels import check_image
 from ..image.resize import resample
 from ..raster.render import render
 
@@ -132,6 +133,11 @@ def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
     under = LIGHTER + (1 - LIGHTER) * np.clip(picture, 0, 1)
     subset = gaussians[picks]
     return _outlined(under, subset, [HIGH_COLOR] * len(subset))
+
+
+def displayed(image: Picture, color: str) -> Picture:
+    """Return an image from `eigengs_dr.load_image` as people look at it: sRGB, or data."""
+    return np.asarray(image) if color == "data" else check_image(image, copy=False)
 
 
 def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Picture:

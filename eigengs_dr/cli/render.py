@@ -34,6 +34,11 @@ from .outputs import check_outputs, name_outputs
     metavar="N",
     help="Draw the first N Gaussians alone; for fits with --levels.",
 )
+@click.option(
+    "--bits",
+    type=click.Choice(["8", "16", "32"]),
+    help="Bits of a value; 32 are floats.  [default: 32 in .exr, .hdr and .pfm, else 8]",
+)
 @backend_option
 @quiet_option
 def render(
@@ -43,28 +48,33 @@ def render(
     scale: float | None,
     size: tuple[int, int] | None,
     first: int | None,
+    bits: str | None,
     backend: str | None,
     quiet: bool,
 ) -> None:
     """Render a fitted image at any size, or a region of it.
 
-    Without --scale and --size, the picture has the native size of the image or of the region. A
-    fit in linear light is written as sRGB. A fit of data is written unchanged; one channel gives a
-    grey picture. Large pictures are drawn in bands; a .tif file takes no more memory than a band.
+    Without --scale and --size, the picture has the native size of the image or of the region.
+    Files of 8 and 16 bits hold sRGB, clamped; files of floats (.exr, .hdr, .pfm, and .tif with
+    --bits 32) hold linear light. A fit of data is written unchanged; one channel gives a grey
+    picture. Large pictures are drawn in bands; a .tif file takes no more memory than a band.
 
     \b
     Examples:
       eigengs-dr render photo.npz -o photo.png
       eigengs-dr render photo.npz -o large.tif --scale 4
+      eigengs-dr render sky.npz -o sky.exr
+      eigengs-dr render normals.npz -o normals.png --bits 16
       eigengs-dr render photo.npz -o icon.png --size 64x48 --first 500
       eigengs-dr render huge.npz -o part.png --region 4000,2500,800,600 --scale 2
     """
     if scale is not None and size is not None:
         raise click.UsageError("--scale and --size exclude each other; give one of them")
     from ..blocks.tiff import TIFF_SUFFIXES
-    from ..image.io import SAVE_OPTIONS
+    from ..image.io import SUFFIXES, bits_of
 
-    [output] = name_outputs([file], output, list(SAVE_OPTIONS))
+    [output] = name_outputs([file], output, SUFFIXES)
+    depth = bits_of(output, int(bits) if bits else None)
     check_outputs([output], [file])
     select(backend)
     from ..blocks.draw import save_region
@@ -94,6 +104,7 @@ def render(
             size,
             backend,
             lambda done, total: show(f"{output.name}: draw", done, total),
+            depth,
         )
     if not quiet:
         click.echo(f"{file}: {count:,} Gaussians\n  wrote {output} ({size[0]}x{size[1]})")

@@ -19,9 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from ..backend.arrays import types_of
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
-from ..image.color import rgb_to_ycbcr, to_coded
-from ..image.io import check_image
+from ..image.color import LIGHT, UNBOUNDED, rgb_to_ycbcr, to_coded, to_linear
 from ..image.metrics import MAX_PSNR, psnr_from_mse
+from ..image.pixels import check_data, check_image
+from ..image.radiance import to_log, to_pu21
 from ..raster.render import render
 from .egs import MAX_SECTIONS, SUFFIX, EgsContent, to_bytes, write
 from .error_feedback import quantize_sections, quantize_with_feedback, to_gaussians
@@ -87,6 +88,7 @@ def pack(
     budget: float = BUDGET,
     sections: Sequence[int] | None = None,
     cutoff: float | None = None,
+    encoding: str | None = None,
 ) -> PackResult:
     """Write a set to the smallest ``.egs`` file whose loss of PSNR stays within a budget.
 
@@ -99,7 +101,8 @@ def pack(
         The image of the fit, as `fit` takes it. By default the rendering of the set.
     budget : float, optional
         Largest loss of PSNR in dB, above 0 and at most 100: against the image, at the native size
-        and in the space of the set (psnr_ycbcr for YCbCr; `pack` compares linear light as sRGB).
+        and in the space of the set (psnr_ycbcr for YCbCr; `pack` compares linear light as sRGB, and
+        radiance in PU21).
         Without an image, the loss of a set of 40 dB if the errors add.
     sections : sequence of int, optional
         Number of Gaussians in each section of the file, in the order of the set. A reader may stop
@@ -107,6 +110,8 @@ def pack(
         Inside a section, Gaussians are stored in Hilbert-curve order.
     cutoff : float, optional
         Radius of a Gaussian in standard deviations; by default the cutoff of the set.
+    encoding : {"srgb", "linear"}, optional
+        What the pixels of the image are, see `eigengs_dr.fit`.
 
     Returns
     -------
@@ -134,10 +139,10 @@ def pack(
     gaussians = dr.detach(gaussians)
     if cutoff is not None:
         gaussians = replace(gaussians, cutoff=float(cutoff))
-    shown = _shown(gaussians) if image is None else _compared(gaussians, image)
+    shown = _shown(gaussians) if image is None else _compared(gaussians, image, encoding)
     # The best linear light is not the best sRGB picture. So compensation keeps a set in linear
     # light near its own rendering, not near the image.
-    keeps = image is None or gaussians.space == "linear"
+    keeps = image is None or gaussians.space in LIGHT
     target = _planes_of(gaussians) if keeps else shown
     unseen = MSE_WITHOUT_IMAGE if image is None else 0
 
@@ -200,18 +205,30 @@ def _rows(count: int, sections: Sequence[int] | None) -> list[slice]:
     return [slice(end - k, end) for end, k in zip(ends, counts, strict=True)]
 
 
-def _compared(gaussians: Gaussians, image: ArrayLike) -> Array:
-    """Return the image in the space of the comparison: the set's space, or sRGB for light."""
-    pixels = check_image(image, keep_grey=gaussians.channels == 1)
+def _compared(gaussians: Gaussians, image: ArrayLike, encoding: str | None) -> Array:
+    """Return the image in the space of the comparison.
+
+    It is the set's space; for linear light, sRGB, and for light above 1, PU21, which has bounds.
+    """
+    grey = gaussians.channels == 1
+    data = gaussians.space == "data"
+    pixels = check_data(image) if data else check_image(image, grey, encoding=encoding)
     expected = (gaussians.height, gaussians.width, gaussians.channels)
     if pixels.shape != expected:
         raise ValueError(f"pack: image has shape {pixels.shape}, the set needs {expected}")
-    return rgb_to_ycbcr(pixels) if gaussians.space == "ycbcr" else pixels
+    if gaussians.space == "ycbcr":
+        return rgb_to_ycbcr(pixels)
+    if gaussians.space in UNBOUNDED:
+        light = to_linear(pixels)
+        return to_log(light) if gaussians.space == "log" else to_pu21(light)
+    return pixels
 
 
 def _shown(gaussians: Gaussians) -> Array:
     """Render a set in the space of the comparison, see `_compared`."""
     planes = _planes_of(gaussians)
+    if gaussians.space == "radiance":
+        return to_pu21(planes)
     return to_coded(np.maximum(planes, 0)) if gaussians.space == "linear" else planes
 
 

@@ -33,8 +33,9 @@ from ..fitting.redistribute import density_for_error, squared_error
 from ..fitting.refine import is_plateau, trace_steps
 from ..fitting.solvers.conjugate_gradient import solve_batch
 from ..gaussian.gaussians import Gaussians
-from ..image.color import to_coded
+from ..image.color import LIGHT, to_picture
 from ..image.metrics import float_space, psnr
+from ..image.radiance import from_log
 from ..raster.kernels import forward
 from ..raster.layout import pack_parameters
 from ..raster.parameters import kernel_parameters, kernel_radius
@@ -165,7 +166,7 @@ def _start(images: Images, options: FitOptions) -> FitProblem:
 
 def _shown(target: FitTarget, options: FitOptions) -> Images:
     """Return the image that shapes the Gaussians; linear light would neglect dark parts."""
-    return target.pixels if options.color == "linear" else target.values
+    return target.pixels if options.color in LIGHT else target.values
 
 
 def _stack(placed: list, shape: tuple[int, ...], options: FitOptions) -> Gaussians:
@@ -248,7 +249,7 @@ def _like(gaussians: Gaussians) -> dict[str, Any]:
 def _pictures(gaussians: Gaussians, images: int) -> Images:
     """Render all images for display: as `eigengs_dr.raster.render.picture_of` does one."""
     shown = _sum(gaussians, images)
-    return to_coded(np.maximum(shown, 0)) if gaussians.space == "linear" else shown
+    return to_picture(gaussians.space, from_log(shown) if gaussians.space == "log" else shown)
 
 
 def _sum(gaussians: Gaussians, images: int) -> Images:

@@ -15,7 +15,9 @@ from ..backend.selection import select
 from ..fitting.fit import Fit, fit_image
 from ..fitting.levels import check_options, fit_levels
 from ..fitting.options import DEFAULT_BASIS, FitOptions
+from ..fitting.pixels import unit_of
 from ..image.metrics import float_space, psnr
+from ..image.pixels import LinearImage, check_image
 from .fit_batch import fit_batch, fits_in_batches
 from .plan import run_images
 from .row import Finished, ImageRow, Outcome, Pixels, RowProgress, collect
@@ -79,8 +81,8 @@ def fit_many(
         bits whatever the number of workers.
     options : Any
         Keyword arguments, the options of `eigengs_dr.fit`: gaussians, iterations, init, basis,
-        preset, solve_steps, color, seed, backend, target_psnr, target_space, max_gaussians and
-        cutoff. A basis is read once.
+        preset, solve_steps, color, seed, backend, target_psnr, target_space, max_gaussians,
+        cutoff and encoding. A basis is read once.
 
     Returns
     -------
@@ -143,7 +145,7 @@ def fit_each(
         basis = resolve_name(PACK_BASIS)(options.basis or DEFAULT_BASIS, options.backend)
         options = replace(options, basis=basis)
     make_work = partial(fit_work, options, levels, None if client is not None else step)
-    job = Job(make_work, _may_join, keep_grey=options.color == "data")
+    job = Job(make_work, _may_join, options.color == "data", options.encoding)
     return run_images(images, output, overwrite, job, client)
 
 
@@ -163,9 +165,10 @@ def fit_work(options: FitOptions, levels: int | None = None, step: Step | None =
 
 
 def _may_join(group: list[Pixels], pixels: Pixels) -> bool:
-    """Group small images of one size, up to `MAX_GROUP_PIXELS`."""
+    """Group small images of one size and encoding, up to `MAX_GROUP_PIXELS`."""
     enough = (len(group) + 1) * pixels.shape[0] * pixels.shape[1] > MAX_GROUP_PIXELS
-    return group[0].shape == pixels.shape and _is_small(pixels) and not enough
+    alike = type(group[0]) is type(pixels) and group[0].shape == pixels.shape
+    return alike and _is_small(pixels) and not enough
 
 
 def _is_small(pixels: Pixels) -> bool:
@@ -181,7 +184,9 @@ def _fit_group(
         if step:
             step(iteration / max(1, iterations))
 
-    if levels is None and _is_small(images[0]) and fits_in_batches(options):
+    plain = not isinstance(images[0], LinearImage)
+    plain &= all(unit_of(image, options.color) == 1 for image in images)
+    if levels is None and plain and _is_small(images[0]) and fits_in_batches(options):
         try:
             results = fit_batch(np.stack(images), options, step)
         except FAILURES:
@@ -204,16 +209,18 @@ def _fit_one(
 ) -> Fit:
     if levels is None:
         return fit_image(pixels, options, progress)
-    names = ("gaussians", "iterations", "color", "seed", "backend")
+    names = ("gaussians", "iterations", "color", "seed", "backend", "encoding")
     common = {name: getattr(options, name) for name in names}
     return fit_levels(pixels, levels=levels, progress=progress, **common)
 
 
 def _figures(pixels: Pixels, result: Fit, color: str) -> dict[str, Any]:
     """Return the figures of a fit for its row."""
+    shown = np.asarray(pixels) if color == "data" else check_image(pixels, copy=False)
+    space = float_space(result.gaussians.space)
     return {
-        "psnr_ycbcr": psnr(pixels, result.image, space=float_space(color)),
-        "psnr_rgb": psnr(pixels, result.image, space="rgb"),
+        "psnr_ycbcr": psnr(shown, result.image, space=space),
+        "psnr_rgb": psnr(shown, result.image, space="rgb"),
         "seconds": result.seconds,
         "iterations": result.iterations,
         "stopped": result.stopped,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -44,7 +45,9 @@ class Decoded(NamedTuple):
     may_pass: bool = False
 
 
-def read_ahead(sources: Iterable[Source], keep_grey: bool) -> Generator[Decoded, None, None]:
+def read_ahead(
+    sources: Iterable[Source], keep_grey: bool, encoding: str | None = None
+) -> Generator[Decoded, None, None]:
     """Decode images in threads while the caller works on earlier ones.
 
     Parameters
@@ -53,7 +56,9 @@ def read_ahead(sources: Iterable[Source], keep_grey: bool) -> Generator[Decoded,
         Files are read in threads. Arrays are copied at once: their owner may overwrite an array
         when the next one is requested.
     keep_grey : bool
-        See `eigengs_dr.image.io.load_image`.
+        Whether the images are data, which keep one channel.
+    encoding : {"srgb", "linear"}, optional
+        What the pixels are, see `eigengs_dr.image.io.load_image`.
 
     Yields
     ------
@@ -66,7 +71,7 @@ def read_ahead(sources: Iterable[Source], keep_grey: bool) -> Generator[Decoded,
     largest = 0
     try:
         for source in sources:
-            waiting.append(_submit(pool, source, keep_grey))
+            waiting.append(_submit(pool, source, keep_grey, encoding))
             while len(waiting) > _max_waiting(largest):
                 decoded = waiting.popleft().result()
                 largest = max(largest, 0 if decoded.pixels is None else decoded.pixels.nbytes)
@@ -85,23 +90,26 @@ def _max_waiting(largest: int) -> int:
     return min(max(1, MAX_WAITING_BYTES // largest), MAX_WAITING)
 
 
-def _submit(pool: ThreadPoolExecutor, source: Source, keep_grey: bool) -> Future[Decoded]:
+def _submit(
+    pool: ThreadPoolExecutor, source: Source, keep_grey: bool, encoding: str | None
+) -> Future[Decoded]:
     """Start to read a file; check an array, or pass a source without work on, at once."""
     if source.path is not None and not source.status:
-        return pool.submit(_decode, source, keep_grey)
+        return pool.submit(_decode, source, keep_grey, encoding)
     done: Future[Decoded] = Future()
-    done.set_result(Decoded(source) if source.status else _decode(source, keep_grey))
+    done.set_result(Decoded(source) if source.status else _decode(source, keep_grey, encoding))
     return done
 
 
-def _decode(source: Source, keep_grey: bool) -> Decoded:
+def _decode(source: Source, keep_grey: bool, encoding: str | None) -> Decoded:
     """Read one image, or note why it cannot be read."""
     try:
         if isinstance(source.image, str):
-            return Decoded(source, load_url(source.image, keep_grey))
+            return Decoded(source, load_url(source.image, keep_grey, encoding))
         if isinstance(source.image, Path):
-            return Decoded(source, io.load_image(source.image, keep_grey))
-        return Decoded(source, io.check_image(source.image, keep_grey))
+            return Decoded(source, io.load_image(source.image, keep_grey, encoding))
+        check = io.check_data if keep_grey else partial(io.mark_image, encoding=encoding)
+        return Decoded(source, check(source.image))
     except io.ImageError as error:
         text = str(error) if source.path else f"{source.name}: {str(error).removeprefix('image: ')}"
         return Decoded(source._replace(status="failed", error=text))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..image.io import SAVE_OPTIONS, ImageError, load_image
+from ..image.io import SUFFIXES, ImageError, load_image
 
 
 def is_url(name: Any) -> bool:
@@ -65,7 +65,7 @@ def list_urls(url: str) -> list[str]:
     return sorted(system.unstrip_protocol(name) + tail for name in names)
 
 
-def load_url(url: str, keep_grey: bool = False) -> NDArray[np.float32]:
+def load_url(url: str, keep_grey: bool = False, encoding: str | None = None) -> NDArray[np.float32]:
     """Read an image behind a URL; see `eigengs_dr.image.io.load_image`.
 
     Raises
@@ -85,7 +85,7 @@ def load_url(url: str, keep_grey: bool = False) -> NDArray[np.float32]:
         except Exception as error:  # each store raises its own types
             raise OSError(f"{url}: cannot be read ({_reason(error)})") from error
         try:
-            return load_image(file, keep_grey)
+            return load_image(file, keep_grey, encoding)
         except ImageError as error:
             raise ImageError(str(error).replace(str(file), url)) from None
 
@@ -103,7 +103,7 @@ def _fsspec() -> ModuleType:
 
 def _is_image(name: str) -> bool:
     path = PurePosixPath(name)
-    return path.suffix.lower() in SAVE_OPTIONS and not path.name.startswith(".")
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
 
 
 def _reason(error: Exception) -> str:

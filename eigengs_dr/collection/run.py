@@ -47,13 +47,14 @@ class Job:
         Returns the `Work`. It is called once in each process.
     may_join : callable
         See `MayJoin`.
-    keep_grey : bool
+    keep_grey, encoding
         See `eigengs_dr.image.io.load_image`.
     """
 
     make_work: Callable[[], Work]
     may_join: MayJoin
     keep_grey: bool = False
+    encoding: str | None = None
 
     @cached_property
     def work(self) -> Work:
@@ -90,7 +91,7 @@ def run_job(
     """
     work, writing = job.work, deque[Writing]()
     with (
-        closing(read_ahead(sources, job.keep_grey)) as decoded,
+        closing(read_ahead(sources, job.keep_grey, job.encoding)) as decoded,
         ThreadPoolExecutor(WRITERS, thread_name_prefix="write") as pool,
         defer_interrupts() as interrupted,
     ):

@@ -19,6 +19,7 @@ from ..collection.row import ImageRow, Outcome, RowProgress, collect
 from ..collection.run import FAILURES, Job, Work
 from ..collection.sources import Images
 from ..gaussian.gaussians import Gaussians
+from ..image.pixels import check_image
 
 if TYPE_CHECKING:
     from .eigengs import EigenGS
@@ -106,7 +107,7 @@ def _encode_group(images: list[Pixels], encode: EncodeGroup) -> Iterator[Outcome
     """Encode a group; if that fails, encode its images one by one to find the bad one."""
     started = time.perf_counter()
     try:
-        sets = encode(images)
+        sets = encode([check_image(image, copy=False) for image in images])
     except FAILURES as error:
         if len(images) > 1:
             for pixels in images:

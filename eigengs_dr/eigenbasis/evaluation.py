@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..image.io import ImageError, load_image
+from ..image.io import ImageError, check_image, load_image
 from ..image.metrics import psnr
 from ..image.resize import center_crop
 from ..raster.render import render
@@ -92,7 +92,9 @@ def _readable(
     for i, path in enumerate(files):
         watch(i)
         try:
-            image = center_crop(load_image(path), basis.width, basis.height)
+            image = center_crop(
+                check_image(load_image(path), copy=False), basis.width, basis.height
+            )
         except ImageError as error:
             bad.append(str(error))
         else:

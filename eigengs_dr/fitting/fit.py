@@ -16,10 +16,10 @@ from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
-from ..image.io import check_image
 from ..raster.render import picture_of
 from .initializers import FitProblem, initialize
 from .options import FitOptions, max_gaussians_for
+from .pixels import in_unit, read_pixels, unit_of
 from .refine import FitProgress, Refinement, measure, refine
 from .search import search_count
 
@@ -43,10 +43,10 @@ class Fit:
         Gaussians adds the key gaussians. Row 0 shows the set before refinement. Seconds count from
         the call of `fit`; they include placement, upload, the colour solve and the measurements.
         With color "data", psnr_rgb is the PSNR of the data after clamping and rounding to 8 bits,
-        and psnr_ycbcr the PSNR of the unchanged data.
+        and psnr_ycbcr the PSNR of the unchanged data; for values above 1.5, the largest of them
+        is the peak. With color "radiance" or "log", psnr_ycbcr is in PU21, see `eigengs_dr.psnr`.
     image : ndarray of float32, shape (H, W, 3), or (H, W, 1) for data of one channel
-        The rendering of the set: RGB without clamping; for linear light, sRGB clamped at 0; or the
-        data.
+        The rendering of the set: RGB without clamping; for light, sRGB clamped at 0; or the data.
     seconds, seconds_init : float
         The whole time, and the time before refinement.
     iterations : int
@@ -109,6 +109,7 @@ def fit(
     target_space: str = "ycbcr",
     max_gaussians: int | None = None,
     cutoff: float = CUTOFF,
+    encoding: str | None = None,
 ) -> Fit:
     """Fit an image by a given number of Gaussians, or by as few as a target PSNR needs.
 
@@ -132,10 +133,13 @@ def fit(
     solve_steps : int, optional
         Steps of conjugate gradients in the colour solve. "eigen" uses them only if the image and
         the basis differ in size.
-    color : {"ycbcr", "rgb", "linear", "data"}, optional
+    color : {"ycbcr", "rgb", "linear", "radiance", "log", "data"}, optional
         Space of the colours and of the squared error. "linear" decodes sRGB: the Gaussians sum to
         linear light, as textures need it, and errors weigh more in the dark. "data" uses one or
-        three channels unchanged (roughness, normals, heights).
+        three channels unchanged (roughness, normals, heights). "radiance" is "linear" without an
+        upper bound; "linear" becomes "radiance" for an image of light above 1. "log" suits such
+        images best: the Gaussians sum to logarithms of light, see
+        `eigengs_dr.image.radiance.to_log`.
     seed : int, optional
         Seed of the random numbers. Only the initialiser "random" and presets without a colour
         solve use random numbers; the preset "default" gives one result for all seeds.
@@ -154,6 +158,10 @@ def fit(
         many parameters as the image has numbers: 3 Gaussians for 8 pixels in colour.
     cutoff : float, optional
         Radius of a Gaussian in standard deviations, in (0, 12]; the set keeps it.
+    encoding : {"srgb", "linear"}, optional
+        What the pixels of the image are: sRGB codes, or light as in renderings. By default what the
+        image says (`eigengs_dr.load_image` marks light, a ``mitsuba.Bitmap`` has a flag), else
+        "srgb". Data are used as they are.
 
     Returns
     -------
@@ -193,6 +201,7 @@ def fit(
         target_psnr=target_psnr,
         target_space=target_space,
         max_gaussians=max_gaussians,
+        encoding=encoding,
     )
     return fit_image(image, options, progress)
 
@@ -201,8 +210,11 @@ def fit(
 def fit_image(image: ArrayLike, options: FitOptions, progress: FitProgress | None = None) -> Fit:
     """Fit an image with the options of one record; see `fit` for results and errors."""
     started = time.perf_counter()
-    pixels = check_image(image, keep_grey=options.color == "data", copy=False)
+    pixels, options = read_pixels(image, options)
     options.check_image(pixels)
+    unit = unit_of(pixels, options.color)
+    if unit != 1:
+        pixels = pixels / np.float32(unit)
     with defer_interrupts() as interrupted:
         start = initialize(pixels, _first_try(pixels, options))
         seconds_init = time.perf_counter() - started
@@ -218,7 +230,7 @@ def fit_image(image: ArrayLike, options: FitOptions, progress: FitProgress | Non
             )
         else:
             found = _search(start, pixels, options, started, progress, interrupted)
-    return finish(found, found.gaussians, start.base_image, started, seconds_init)
+    return finish(found, in_unit(found.gaussians, unit), start.base_image, started, seconds_init)
 
 
 def _first_try(pixels: NDArray[np.float32], options: FitOptions) -> FitOptions:

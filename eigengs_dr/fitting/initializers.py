@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..image.color import rgb_to_ycbcr, to_linear
+from ..image.color import LIGHT, rgb_to_ycbcr, to_linear
+from ..image.radiance import to_log
 from ..image.strips import by_strips
 
 if TYPE_CHECKING:
@@ -37,7 +38,11 @@ DARKNESS, BLACK = 0.3, 0.003
 """Exponent and smallest light I, with 1 for white, of the weight ``max(I, BLACK)^-DARKNESS`` of
 errors in linear light. The weight is about the square root of the slope of the sRGB curve, between
 errors of light, which neglect the dark, and errors of sRGB codes. With 5,000 Gaussians and 300
-steps it gains 0.7 dB of psnr_rgb over no weight, on 12 training images of ImageNet classes."""
+steps it gains 0.7 dB of psnr_rgb over no weight, on 12 training images of ImageNet classes. It
+suits light above 1 too. Three made-up environments of 512x256 pixels, with a sun of 5,000, end at
+31.2 dB in PU21, at 29.6 without weights, at 31.5 with ``(I + 0.01)^-0.5``, at 29.9 and 25.5 dB
+with relative errors (0.1 and 0.01 added to I), and at 27.0 dB with the slope of PU21. Steep weights
+let bright spots vanish, which costs at most 1 a pixel, rather than spill on dark pixels."""
 
 
 class Placement(Protocol):
@@ -131,7 +136,9 @@ def make_target(pixels: NDArray[np.float32], color: str) -> FitTarget:
     """Convert pixels (H, W, C) to the space of the colours, and weigh the errors there."""
     if color == "ycbcr":
         return FitTarget(pixels, by_strips(rgb_to_ycbcr, pixels))
-    if color == "linear":
+    if color == "log":
+        return FitTarget(pixels, by_strips(lambda part: to_log(to_linear(part)), pixels))
+    if color in LIGHT:
         light = by_strips(to_linear, pixels)
         return FitTarget(pixels, light, by_strips(dark_weight, light))
     return FitTarget(pixels, pixels)

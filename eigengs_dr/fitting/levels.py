@@ -21,13 +21,13 @@ from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
 from ..gaussian.concatenate import concatenate
 from ..gaussian.gaussians import Gaussians
-from ..image.io import check_image
 from .density_control import removal_cost
 from .fit import Fit, finish
 from .initializers import FitProblem, initialize
 from .optimizers.descent import descend
 from .optimizers.schedule import Schedule
 from .options import FitOptions
+from .pixels import in_unit, read_pixels, unit_of
 from .redistribute import place_like, residual
 from .refine import FitProgress, refine
 
@@ -91,6 +91,7 @@ def fit_levels(
     seed: int = 0,
     backend: str | None = None,
     progress: FitProgress | None = None,
+    encoding: str | None = None,
 ) -> Fit:
     """Fit nested sets: the first quarter of the Gaussians forms the image too, and so on.
 
@@ -105,13 +106,15 @@ def fit_levels(
         Gaussians with a larger removal cost come first, so that every prefix forms an image.
     iterations : int, optional
         Largest number of refinement steps of the whole set.
-    color : {"ycbcr", "rgb", "linear", "data"}, optional
+    color : {"ycbcr", "rgb", "linear", "radiance", "log", "data"}, optional
         See `eigengs_dr.fit`.
     seed : int, optional
         Not used: the placement draws no random numbers.
     backend : {"llvm", "cuda"}, optional
     progress : callable, optional
         ``progress(iteration, iterations, row)``, see `eigengs_dr.fit`.
+    encoding : {"srgb", "linear"}, optional
+        What the pixels are, see `eigengs_dr.fit`.
 
     Returns
     -------
@@ -130,10 +133,18 @@ def fit_levels(
     """
     started = time.perf_counter()
     options = FitOptions(
-        gaussians=gaussians, iterations=iterations, color=color, seed=seed, backend=backend
+        gaussians=gaussians,
+        iterations=iterations,
+        color=color,
+        seed=seed,
+        backend=backend,
+        encoding=encoding,
     )
-    pixels = check_image(image, keep_grey=color == "data", copy=False)
+    pixels, options = read_pixels(image, options)
     options.check_image(pixels)
+    unit = unit_of(pixels, options.color)
+    if unit != 1:
+        pixels = pixels / np.float32(unit)
     counts = level_counts(options.count_for(pixels), levels)
     schedule = options.method.schedule
     with defer_interrupts() as interrupted:
@@ -152,7 +163,7 @@ def fit_levels(
             interrupted=interrupted,
         )
         ordered = _sort_levels(refined.gaussians, start, counts)
-    return finish(refined, ordered, None, started, seconds_init)
+    return finish(refined, in_unit(ordered, unit), None, started, seconds_init)
 
 
 def _place_levels(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..gaussian.file import CUTOFF, MAX_CUTOFF
 from ..image.color import SPACES
 from ..image.metrics import MAX_PSNR
+from ..image.pixels import check_encoding
 from ..raster.limits import check_index_range
 from .initializers import INITIALIZERS
 from .presets import PRESETS, Preset
@@ -52,9 +53,11 @@ class FitOptions:
     target_psnr: float | None = None
     target_space: str = "ycbcr"
     max_gaussians: int | None = None
+    encoding: str | None = None
 
     def __post_init__(self) -> None:
         self._check_numbers()
+        check_encoding(self.encoding)
         for name, value, known in (
             ("init", self.init, ("auto", *INITIALIZERS)),
             ("preset", self.preset, tuple(PRESETS)),

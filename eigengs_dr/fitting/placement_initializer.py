@@ -8,6 +8,7 @@ from pkgutil import resolve_name
 import numpy as np
 
 from ..gaussian.gaussians import Gaussians
+from ..image.color import LIGHT
 from .density_control import relocate
 from .initializers import PLACEMENTS, FitProblem, FitTarget, Placement
 from .options import FitOptions
@@ -20,7 +21,7 @@ def start_from_placement(target: FitTarget, options: FitOptions) -> FitProblem:
     name, method = options.initializer, options.method
     place: Placement = resolve_name(PLACEMENTS[name])
     # Linear light would put too few Gaussians into dark parts.
-    shown = target.pixels if options.color == "linear" else target.values
+    shown = target.pixels if options.color in LIGHT else target.values
     count = options.count_for(target.pixels)
     generator = np.random.default_rng(options.seed)
     mean, factor = place(shown, count, generator)

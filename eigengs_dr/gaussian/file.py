@@ -181,7 +181,7 @@ def check(data: SetData) -> None:
         raise BadValue(f"cutoff is {cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}")
     if space not in SPACES:
         raise BadValue(f"space is {space!r}, expected one of {', '.join(SPACES)}")
-    if space in ("ycbcr", "rgb", "linear") and color.shape[1] not in (1, 3, 4):
+    if space != "data" and color.shape[1] not in (1, 3, 4):
         raise BadValue(f"color has {color.shape[1]} channels; space {space!r} has 1, 3 or 4")
     if space == "ycbcr" and color.shape[1] != 3:
         raise BadValue(f"color has {color.shape[1]} channels; space 'ycbcr' has 3")

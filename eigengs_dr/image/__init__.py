@@ -1,9 +1,11 @@
 """Pixels: no Gaussians here.
 
-- ``io``: image files
+- ``io``: image files; ``formats``: those that Pillow does not keep
+- ``pixels``: what pixels are, sRGB or light, and the checks of an image
 - ``samples``: photos of scikit-image
 - ``folder``: many images, in blocks
 - ``color``: YCbCr, linear light, sRGB
+- ``radiance``: codes of light above 1
 - ``resize``: other sizes
 - ``metrics``: PSNR, SSIM, MS-SSIM
 - ``montage``: pictures side by side

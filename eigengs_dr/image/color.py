@@ -6,12 +6,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-SPACES = ("ycbcr", "rgb", "linear", "data")
+SPACES = ("ycbcr", "rgb", "linear", "data", "radiance", "log")
 """Names of the colour spaces that the channels of a set of Gaussians may have.
 
-``"ycbcr"`` is studio-range YCbCr / 255, ``"rgb"`` is gamma-encoded RGB, ``"linear"`` is linear RGB
-and ``"data"`` is anything else (roughness, normals, ...), with any number of channels.
+``"ycbcr"`` is studio-range YCbCr / 255, ``"rgb"`` is gamma-encoded RGB, ``"linear"`` is linear RGB,
+``"radiance"`` is linear RGB that may exceed 1, ``"log"`` is logarithms of it (see
+`eigengs_dr.image.radiance`), and ``"data"`` is anything else (roughness, normals, ...), with any
+number of channels.
 """
+
+LIGHT = ("linear", "radiance")
+"""Spaces in which Gaussians sum to linear light."""
+
+UNBOUNDED = ("radiance", "log")
+"""Spaces of light that may exceed 1."""
 
 MAX_CHANNELS = 64
 """Largest number of channels: a program holds the sums of all channels of a tile in registers."""
@@ -152,13 +160,40 @@ def to_coded(linear: Any) -> Any:
     return select(linear <= 0.0031308, linear * 12.92, curved)
 
 
+def to_picture(space: str, rendered: NDArray[Any]) -> NDArray[Any]:
+    """Convert a rendering of a set to what people look at: light becomes sRGB.
+
+    Parameters
+    ----------
+    space : str
+        Space of the set.
+    rendered : ndarray of float, shape (..., C)
+        Rows of the result of `eigengs_dr.render`.
+
+    Returns
+    -------
+    ndarray, same shape and dtype
+        Negative light becomes 0; other values are not clamped.
+    """
+    if rendered_as(space) == "linear":
+        return np.asarray(to_coded(np.maximum(rendered, 0)))
+    return rendered
+
+
+def rendered_as(space: str) -> str | None:
+    """Return what renderings of a set of a space are: "srgb", "linear", or None for data."""
+    if space == "data":
+        return None
+    return "srgb" if space in ("ycbcr", "rgb") else "linear"
+
+
 def decode(space: str, channels: Sequence[Any]) -> list[Any]:
     """Convert YCbCr channels to RGB, and return the channels of other spaces unchanged.
 
     Parameters
     ----------
-    space : {"ycbcr", "rgb", "linear", "data"}
-        Colour space of the channels.
+    space : str
+        Colour space of the channels, one of `SPACES`.
     channels : sequence of NumPy or Dr.Jit arrays
         One array for each channel, all of one shape; exactly three for ``"ycbcr"``.
 

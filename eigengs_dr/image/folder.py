@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .color import RGB_TO_YCBCR, YCBCR_OFFSET
-from .io import SAVE_OPTIONS, ImageError, check_image, load_image
+from .io import SUFFIXES, ImageError, check_image, load_image
 from .resize import center_crop
 
 BASIS_SPACES = ("ycbcr", "rgb")
@@ -66,7 +66,7 @@ def image_files(folder: str | Path) -> list[Path]:
     Returns
     -------
     list of Path
-        Files with a suffix of `SAVE_OPTIONS` in upper or lower case, sorted by name.
+        Files with a suffix of `SUFFIXES` in upper or lower case, sorted by name.
 
     Raises
     ------
@@ -83,10 +83,10 @@ def image_files(folder: str | Path) -> list[Path]:
     files = [
         entry
         for entry in entries
-        if entry.suffix.lower() in SAVE_OPTIONS and entry.name[0] != "." and entry.is_file()
+        if entry.suffix.lower() in SUFFIXES and entry.name[0] != "." and entry.is_file()
     ]
     if not files:
-        known = " ".join(SAVE_OPTIONS)
+        known = " ".join(SUFFIXES)
         raise ImageError(f"{folder}: holds no images; expected files ending in {known}")
     return files
 
@@ -272,10 +272,11 @@ def _singles(source: Iterable[Any]) -> Iterator[Any]:
 
 def _prepare(item: Any, place: int, size: tuple[int, int], space: str) -> PreparedImage:
     """Read, crop and convert one image."""
+    loaded = isinstance(item, Path)
     try:
-        image = load_image(item) if isinstance(item, Path) else check_image(item)
+        image = check_image(load_image(item) if loaded else item, copy=not loaded)
     except ImageError as error:
-        if not isinstance(item, Path):
+        if not loaded:
             raise ImageError(f"image {place} of the source{str(error)[len('image') :]}") from None
         # A warning that lists several files has room for the name and the reason only.
         reason = str(error).removeprefix(f"{item}: ").split("; ")[0]

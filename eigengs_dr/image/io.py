@@ -1,196 +1,264 @@
-"""Image files and arrays: load, check, save."""
+"""Image files: load and save."""
+
+from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..storage.atomic import atomic_write
+from .color import to_coded, to_linear
+from .formats.openimageio import ADVICE, is_installed
+from .formats.pillow import SAVE_OPTIONS, image_errors, open_picture, picture_pixels
+from .formats.registry import BITS, FLOAT_SUFFIXES, kind_of, read_deep, turn, write_deep
+from .pixels import (
+    ImageError,
+    LinearImage,
+    check_data,
+    check_encoding,
+    check_image,
+    check_light,
+    check_range,
+    encoding_of,
+    mark_image,
+    to_floats,
+)
 from .strips import map_threads, strips
 
-if TYPE_CHECKING:
-    from PIL.Image import Image
+__all__ = [
+    "SAVE_OPTIONS",
+    "SUFFIXES",
+    "ImageError",
+    "LinearImage",
+    "bits_of",
+    "check_data",
+    "check_image",
+    "dtype_of",
+    "load_image",
+    "mark_image",
+    "open_picture",
+    "picture_pixels",
+    "save_image",
+    "to_8bit",
+    "to_file",
+    "write_pixels",
+]
 
-SAVE_OPTIONS: dict[str, dict[str, Any]] = {
-    ".png": {},
-    ".jpg": {"quality": 95},
-    ".jpeg": {"quality": 95},
-    ".webp": {"quality": 95},
-    ".tif": {},
-    ".tiff": {},
-    ".bmp": {},
-    ".ppm": {},
-}
-"""Suffixes of image files, with the options that Pillow receives when it writes a file."""
-
-MIN_PIXEL, MAX_PIXEL = -0.5, 1.5
-"""Range of accepted float pixels: resampled images overshoot [0, 1], but pixels in 0..255 are an
-error."""
+SUFFIXES = (*SAVE_OPTIONS, *FLOAT_SUFFIXES)
+"""Suffixes of image files."""
 
 
-class ImageError(ValueError):
-    """An image cannot be used; one line names the image, the reason and what to do."""
-
-
-def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]:
+def load_image(
+    path: str | Path, keep_grey: bool = False, encoding: str | None = None
+) -> NDArray[np.float32]:
     """Read an image file as RGB.
 
     The function replicates grey, converts palette, CMYK and YCbCr, and applies the orientation of
-    the EXIF header. It ignores colour profiles. An 8-bit value v becomes v/255 exactly. 16-bit grey
-    keeps its precision (v/65535). Pillow keeps only the upper 8 bits of 16-bit RGB, 16-bit RGBA and
-    16-bit grey with alpha.
+    the EXIF header. It ignores colour profiles. Values of 8 and 16 bits are divided by 255 and
+    65535. Values of floats stay as they are. EXR, Radiance HDR, and PNG of 16-bit colour need
+    OpenImageIO, from the extra ``hdr``; without it, the last has 8 bits and a warning.
 
     Parameters
     ----------
     path : str or Path
-        A file in any format that Pillow reads.
+        PNG, JPEG and other files that Pillow reads; TIFF; EXR; Radiance HDR; PFM.
     keep_grey : bool, optional
         Return one channel if the file is opaque grey.
+    encoding : {"srgb", "linear"}, optional
+        What the pixels of the file are. By default "linear" for files of floats, else "srgb".
 
     Returns
     -------
     ndarray of float32, shape (H, W, 3) or (H, W, 1)
-        RGB in [0, 1]; values of float files are not scaled.
+        RGB. sRGB lies in [0, 1]. Light is not bounded, and marked by the type `LinearImage`, so
+        that `fit` and `save_image` know it.
 
     Warns
     -----
     UserWarning
-        If the image has transparent pixels, which are shown over white. If the file holds several
-        frames, of which the first is used.
+        If the image has transparent pixels, which are shown over white, or over black in an EXR
+        file. If the file holds several frames, of which the first is used.
 
     Raises
     ------
     ImageError
-        If the file is missing, empty, damaged, too large or not an image.
+        If the file is missing, empty, damaged, too large or not an image; a pixel is not finite; or
+        an EXR file holds one channel without `keep_grey`, or several layers.
     """
+    check_encoding(encoding)
     path = Path(path)
-    with open_picture(path) as file:
-        frames = getattr(file, "n_frames", 1)
-        pixels, transparent = picture_pixels(file)
-    if transparent:
-        warnings.warn(f"{path}: transparent pixels are shown over white", stacklevel=2)
-    if frames > 1:
-        warnings.warn(f"{path}: holds {frames} frames, the first is used", stacklevel=2)
-    return _check_range(_rgb(pixels, str(path), keep_grey), str(path))
+    found = _load_deep(path, keep_grey)
+    if found is None:
+        with open_picture(path) as file:
+            frames = getattr(file, "n_frames", 1)
+            pixels, transparent = picture_pixels(file)
+        if transparent:
+            warnings.warn(f"{path}: transparent pixels are shown over white", stacklevel=2)
+        if frames > 1:
+            warnings.warn(f"{path}: holds {frames} frames, the first is used", stacklevel=2)
+        found = pixels, "srgb"
+    image = to_floats(found[0], str(path), keep_grey)
+    if (encoding or found[1]) == "linear":
+        return check_light(image, str(path)).view(LinearImage)
+    return check_range(image, str(path))
 
 
-@contextmanager
-def open_picture(path: Path) -> "Iterator[Image]":
-    """Open an image file with Pillow, turned as its EXIF header says; errors as `load_image`."""
-    from PIL import Image, ImageOps, UnidentifiedImageError  # 0.05 s
+def _load_deep(path: Path, keep_grey: bool) -> tuple[NDArray[Any], str] | None:
+    """Return the pixels of a file of floats or 16 bits, without alpha, and their encoding.
 
-    try:
-        if path.stat().st_size == 0:
-            raise ImageError(f"{path}: the file is empty (0 bytes); copy or export it again")
-        with Image.open(path) as file:
-            ImageOps.exif_transpose(file, in_place=True)  # a copy only if it turns the image
-            yield file
-    except ImageError:
-        raise
-    except FileNotFoundError:
-        raise ImageError(f"{path}: no such file; check the path") from None
-    except IsADirectoryError:
-        raise ImageError(f"{path}: is a folder; name an image file in it") from None
-    except PermissionError:
-        raise ImageError(f"{path}: may not be read; check its permissions") from None
-    except UnidentifiedImageError:
-        raise ImageError(
-            f"{path}: not an image that Pillow knows; save it as PNG or JPEG"
-        ) from None
-    except Image.DecompressionBombError:
-        limit = f"{2 * (Image.MAX_IMAGE_PIXELS or 0):,}"
-        raise ImageError(
-            f"{path}: has more than {limit} pixels; scale it down first, or fit it in blocks"
-        ) from None
-    except Exception as error:  # on damaged files Pillow's decoders raise many types
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ImageError(f"{path}: damaged or unsupported ({reason}); export it again") from error
-
-
-def check_image(
-    image: ArrayLike, keep_grey: bool = False, copy: bool = True
-) -> NDArray[np.float32]:
-    """Convert an array to a float32 image, and refuse an array that is not an image.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W), (H, W, 1) or (H, W, 3)
-        Grey or RGB: uint8 or uint16 (scaled to [0, 1]), bool, or floats with 1 as white. Floats may
-        overshoot [0, 1] by 0.5, as in resampled images; they are not clamped.
-    keep_grey : bool, optional
-        Return one channel if the image is grey.
-    copy : bool, optional
-        Without it, a C-contiguous image of float32 is returned as it is.
-
-    Returns
-    -------
-    ndarray of float32, shape (H, W, 3) or (H, W, 1)
-        RGB. The array is C-contiguous. It shares no memory with `image`, unless `copy` is False.
-
-    Raises
-    ------
-    ImageError
-        If the shape, the dtype or the range is wrong, the image has no pixels, or a pixel is not
-        finite.
-
-    Examples
-    --------
-    >>> check_image(np.array([[0, 51], [102, 255]], np.uint8))[..., 0]
-    array([[0. , 0.2],
-           [0.4, 1. ]], dtype=float32)
+    Returns None for a file that Pillow reads as well.
     """
-    return _check_range(_rgb(image, "image", keep_grey, copy), "image")
+    with image_errors(path):
+        if kind_of(path) == "png" and not is_installed():
+            warnings.warn(f"{path}: keeps 8 of its 16 bits; to keep all {ADVICE}", stacklevel=3)
+            return None
+        try:
+            found = read_deep(path)
+        except ValueError as error:
+            raise ImageError(f"{path}: {error}") from error
+    if found is None:
+        return None
+    if found.one_channel and not keep_grey:
+        raise ImageError(
+            f"{path}: holds one channel, not R, G and B; read it as data (keep_grey=True, "
+            "--color data), or export it as RGB"
+        )
+    pixels = turn(found.pixels, found.orientation)
+    encoding = "linear" if pixels.dtype.kind == "f" else "srgb"
+    if pixels.shape[2] in (1, 3):
+        return pixels, encoding
+    color, alpha = pixels[..., :-1], pixels[..., -1:]
+    peak = np.iinfo(pixels.dtype).max if encoding == "srgb" else 1
+    if (alpha >= peak).all():
+        return color, encoding
+    ground = "black" if found.associated else "white"
+    warnings.warn(f"{path}: transparent pixels are shown over {ground}", stacklevel=3)
+    if found.associated:
+        return color, encoding
+    share = np.divide(alpha, peak, dtype=np.float32)
+    return 1 - share * (1 - np.divide(color, peak, dtype=np.float32)), encoding
 
 
-def save_image(path: str | Path, image: ArrayLike) -> None:
-    """Write an image file with 8 bits per channel, completely or not at all.
+def save_image(
+    path: str | Path, image: ArrayLike, encoding: str | None = None, bits: int | None = None
+) -> None:
+    """Write an image file, completely or not at all.
 
     Parameters
     ----------
     path : str or Path
-        The suffix selects the format: .png, .tif, .tiff, .bmp and .ppm are lossless; .jpg, .jpeg
-        and .webp have quality 95. An existing file is replaced.
+        The suffix selects the format. Integers in sRGB: .png, .tif, .tiff, .bmp and .ppm are
+        lossless; .jpg, .jpeg and .webp have quality 95. Floats in linear light: .exr, .hdr and
+        .pfm. EXR, HDR, and PNG of 16-bit colour need OpenImageIO, from the extra ``hdr``. An
+        existing file is replaced.
     image : array_like, shape (H, W), (H, W, 1) or (H, W, 3)
-        RGB, or grey, which is written with one channel. Types as for `check_image`; finite floats
-        of any value are clamped to [0, 1].
+        RGB, or grey, which is written with one channel. Types as for `check_image`. Integers are
+        clamped to [0, 1]; floats are not.
+    encoding : {"srgb", "linear"}, optional
+        What the pixels are. They are converted where the file holds something else: light becomes
+        sRGB in a .png file, sRGB becomes light in an .exr file. By default what the image says,
+        see `check_image`; an array that says nothing is written as it is.
+    bits : {8, 16, 32}, optional
+        Bits of a value: 8 or 16 in .png; 8, 16 or 32 (floats) in .tif; 16 or 32, both floats, in
+        .exr. By default 32 in .exr, .hdr and .pfm, else 8.
+
+    Warns
+    -----
+    UserWarning
+        If the image is a Dr.Jit tensor and `encoding` is not given.
 
     Raises
     ------
     ImageError
-        If the array is not an image, the suffix is unknown or the file cannot be written. An
-        existing file does not change.
+        If the array is not an image, the suffix is unknown, the format has no such bits, a package
+        is missing or the file cannot be written. An existing file does not change.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in SAVE_OPTIONS:
-        known = " ".join(SAVE_OPTIONS)
-        raise ImageError(f"{path}: image suffix {suffix!r} is unknown; use one of {known}")
+    bits = bits_of(path, bits)
+    said = encoding_of(image, encoding)
     ready = isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.size
-    if ready and image.shape[2:] in ((1,), (3,)):  # type: ignore[union-attr]
-        return _write(path, np.asarray(image))  # large pictures need no copy
-    floats = _rgb(image, "image", keep_grey=True, copy=False)
-    height, width = floats.shape[:2]
-    pixels = np.empty(floats.shape, np.uint8)
+    if ready and bits == 8 and said != "linear" and image.shape[2:] in ((1,), (3,)):  # type: ignore[union-attr]
+        return write_pixels(path, np.asarray(image), bits)  # large pictures need no copy
+    floats = to_floats(image, "image", keep_grey=True, copy=False)
+    kind = dtype_of(path, bits)
+    pixels = np.empty(floats.shape, kind)
 
     def fill(rows: slice) -> None:
-        pixels[rows] = to_8bit(floats[rows])
+        pixels[rows] = to_file(floats[rows], said, kind)
 
-    map_threads(fill, strips(height, width))
-    _write(path, pixels)
+    map_threads(fill, strips(*floats.shape[:2]))
+    write_pixels(path, pixels, bits)
 
 
-def _write(path: Path, pixels: NDArray[np.uint8]) -> None:
-    """Write pixels (H, W, C) as the suffix of the path says."""
+def bits_of(path: Path, bits: int | None = None) -> int:
+    """Return the bits of a value in a file to be written, by its suffix if they are not given.
+
+    Raises
+    ------
+    ImageError
+        If the suffix is unknown, the format has no such bits, or OpenImageIO is missing.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        known = " ".join(SUFFIXES)
+        raise ImageError(f"{path}: image suffix {suffix!r} is unknown; use one of {known}")
+    known_bits = BITS.get(suffix, (8,))
+    if bits is not None and bits not in known_bits:
+        shown = " or ".join(map(str, sorted(known_bits)))
+        raise ImageError(f"{path}: bits is {bits}; a {suffix} file has {shown}")
+    if suffix in (".exr", ".hdr") and not is_installed():
+        raise ImageError(f"{path}: {ADVICE}")
+    return bits or known_bits[0]
+
+
+def dtype_of(path: Path, bits: int) -> Any:
+    """Return the type of the values of a file: uint8, uint16, or float32 for linear light."""
+    floats = path.suffix.lower() in FLOAT_SUFFIXES or bits == 32
+    return np.float32 if floats else {8: np.uint8, 16: np.uint16}[bits]
+
+
+def to_file(pixels: NDArray[Any], encoding: str | None, kind: Any) -> NDArray[Any]:
+    """Convert float pixels to the values of a file.
+
+    Parameters
+    ----------
+    pixels : ndarray of float
+    encoding : {"srgb", "linear"} or None
+        What the pixels are; None writes them as they are.
+    kind : dtype
+        uint8 and uint16 hold sRGB, clamped and rounded; float32 holds light.
+
+    Returns
+    -------
+    ndarray, same shape, of the dtype `kind`
+    """
+    if kind == np.float32:
+        light = to_linear(pixels) if encoding == "srgb" else pixels
+        return np.asarray(light, np.float32)
+    coded = to_coded(np.maximum(pixels, 0)) if encoding == "linear" else pixels
+    return np.rint(np.clip(coded, 0, 1) * np.iinfo(kind).max).astype(kind)
+
+
+def write_pixels(path: Path, pixels: NDArray[Any], bits: int) -> None:
+    """Write pixels (H, W, C) of the type of `dtype_of`, completely or not at all.
+
+    Raises
+    ------
+    ImageError
+        If a package is missing, or the file cannot be written.
+    """
     from PIL import Image
 
-    pixels = pixels[..., 0] if pixels.shape[2] == 1 else pixels
     try:
         with atomic_write(path) as temporary:
-            Image.fromarray(pixels).save(temporary, **SAVE_OPTIONS[path.suffix.lower()])
+            if bits > 8:
+                write_deep(temporary, pixels, bits)
+            else:
+                flat = pixels[..., 0] if pixels.shape[2] == 1 else pixels
+                Image.fromarray(flat).save(temporary, **SAVE_OPTIONS[path.suffix.lower()])
     except (OSError, ValueError) as error:
         message = str(error)
         if not message.startswith(f"{path}: "):  # errors of atomic_write are clear already
@@ -217,77 +285,3 @@ def to_8bit(image: NDArray[Any], out: NDArray[Any] | None = None) -> NDArray[Any
     clipped = np.clip(image, 0, 1, out=out)
     clipped *= 255
     return np.rint(clipped, out=clipped)
-
-
-def picture_pixels(image: "Image") -> tuple[NDArray[Any], bool]:
-    """Return the pixels of a Pillow image, and whether some of them are transparent."""
-    if image.mode == "I":  # 16-bit grey of PGM files comes as 32-bit integers
-        return np.asarray(image) / 65535, False
-    if image.mode == "F" or image.mode.startswith("I;16"):
-        return np.asarray(image), False
-    if not image.has_transparency_data:
-        # `convert` copies the image even if the mode stays.
-        return np.asarray(image if image.mode in ("1", "L", "RGB") else image.convert("RGB")), False
-    pixels = np.asarray(image.convert("RGBA"))
-    shown = np.empty((*pixels.shape[:2], 3), np.float32)
-
-    def show_over_white(rows: slice) -> None:
-        part = pixels[rows].astype(np.float32) / 255
-        color, alpha = part[..., :3], part[..., 3:]
-        shown[rows] = 1 - alpha * (1 - color)
-
-    map_threads(show_over_white, strips(*shown.shape[:2]))
-    return shown, bool(pixels[..., 3].min() < 255)
-
-
-def _rgb(
-    image: ArrayLike, name: str, keep_grey: bool = False, copy: bool = True
-) -> NDArray[np.float32]:
-    """Scale to float32 and replicate grey to RGB; errors call the image `name`."""
-    try:
-        array = np.asarray(image)
-    except ValueError:  # rows of unequal length
-        raise ImageError(f"{name}: not an array; expected shape (H, W, 3)") from None
-    if array.ndim == 2:
-        array = array[..., None]
-    if array.ndim != 3 or array.shape[2] not in (1, 3):
-        alpha = array.ndim == 3 and array.shape[2] == 4
-        hint = "drop alpha, as in image[..., :3]" if alpha else "pass one grey or RGB image"
-        raise ImageError(f"{name}: shape {array.shape}, expected (H, W) or (H, W, 3); {hint}")
-    if array.size == 0:
-        raise ImageError(f"{name}: shape {array.shape} has no pixels; check how it was cropped")
-
-    kind = array.dtype.kind
-    if kind not in "bf" and not (kind == "u" and array.itemsize <= 2):
-        expected = "expected uint8, uint16 or floats in [0, 1]"
-        raise ImageError(f"{name}: pixels are {array.dtype}; {expected}")
-    # The extremes are finite only if all pixels are; they need no array of flags.
-    if kind == "f" and not (np.isfinite(array.min()) and np.isfinite(array.max())):
-        bad = np.argwhere(~np.isfinite(array).all(axis=2))
-        row, column = bad[0].tolist()
-        raise ImageError(
-            f"{name}: {len(bad)} of {array.shape[0] * array.shape[1]} pixels are not finite, "
-            f"the first at [{row}, {column}]; replace them, as with np.nan_to_num"
-        )
-    channels = array.shape[2] if keep_grey else 3
-    as_it_is = array.dtype == np.float32 and array.shape[2] == channels
-    if as_it_is and not copy and array.flags.c_contiguous:
-        return array
-    peak = np.iinfo(array.dtype).max if kind == "u" else 1
-    pixels = np.empty((*array.shape[:2], channels), np.float32)
-
-    def fill(rows: slice) -> None:
-        with np.errstate(over="ignore"):  # callers clamp or refuse the infinities
-            pixels[rows] = np.divide(array[rows], peak, dtype=np.float32)
-
-    map_threads(fill, strips(*pixels.shape[:2]))
-    return pixels
-
-
-def _check_range(pixels: NDArray[np.float32], name: str) -> NDArray[np.float32]:
-    """Refuse pixels far outside [0, 1]."""
-    low, high = float(pixels.min()), float(pixels.max())
-    if low < MIN_PIXEL or high > MAX_PIXEL:
-        hint = "divide by 255" if 2 < high <= 255 and low >= 0 else "scale it"
-        raise ImageError(f"{name}: pixels run from {low:g} to {high:g}, not 0 to 1; {hint} first")
-    return pixels

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .blur import blur, gaussian_taps
-from .color import RGB_TO_YCBCR, rgb_to_ycbcr
+from .color import RGB_TO_YCBCR, UNBOUNDED, rgb_to_ycbcr, to_linear
 from .io import to_8bit
+from .pixels import LinearImage, check_image
+from .radiance import to_pu21
 from .strips import map_threads, strips
 
 WINDOW = 11
@@ -25,6 +27,9 @@ SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of MS-SSIM from the finest scale to the coarsest, Wang et al. 2003, section 3.2."""
 
 
+PSNR_SPACES = ("rgb", "ycbcr", "data", "pu21")
+"""Spaces in which `psnr` compares images."""
+
 Convert = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -36,12 +41,15 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     the official EigenGS code. The range of Y spans 219/255 of the peak. Therefore ``"ycbcr"`` gives
     higher numbers than ``"rgb"``: 4.94 dB more for white noise, 6.09 dB more for an error in grey.
     ``"data"`` compares the channels with peak 1 and neither clamps nor rounds.
+    ``"pu21"`` compares light, also above 1, as the eye does: it decodes sRGB and compares codes of
+    `eigengs_dr.image.radiance.to_pu21`, whose peak, 1, is white. Light above 100 counts as 100.
 
     Parameters
     ----------
     a, b : array_like of float, shape (H, W, 3) or (H, W, 1)
-        RGB or grey, 1 is white. Their order does not matter.
-    space : {"rgb", "ycbcr", "data"}
+        RGB or grey, 1 is white. Their order does not matter. Light from `eigengs_dr.load_image` is
+        encoded as sRGB first.
+    space : {"rgb", "ycbcr", "data", "pu21"}
         Space in which the mean squared error over all pixels and channels is computed.
 
     Returns
@@ -70,8 +78,8 @@ def squared_error(a: ArrayLike, b: ArrayLike, space: str) -> float:
     Sums of the parts of an image add up to that of the whole. Grey images count as three channels.
     For parameters and errors see `psnr`.
     """
-    if space not in ("rgb", "ycbcr", "data"):
-        raise ValueError(f"space {space!r} is unknown; use 'rgb', 'ycbcr' or 'data'")
+    if space not in PSNR_SPACES:
+        raise ValueError(f"space {space!r} is unknown; use one of {', '.join(PSNR_SPACES)}")
     x, y = _pair(a, b)
     return _sums_by_rows(x.__getitem__, y, [space])[0]
 
@@ -118,6 +126,8 @@ def _sum_squares(a: NDArray[np.float64], b: NDArray[np.float64], space: str) -> 
     if space == "rgb":
         for image in (a, b):
             to_8bit(image, out=image)
+    if space == "pu21":
+        a, b = to_pu21(to_linear(a)), to_pu21(to_linear(b))
     np.subtract(a, b, out=a)
     if space == "ycbcr":
         # |M d|^2 = trace(M d d^T M^T): the sums of the products of R, G and B are enough.
@@ -132,8 +142,11 @@ def _sum_squares(a: NDArray[np.float64], b: NDArray[np.float64], space: str) -> 
 def float_space(color: str) -> str:
     """Return the space in which psnr_ycbcr compares sets of the space `color`.
 
-    Sets in the space "data" have no YCbCr, so their channels are compared directly.
+    Sets in the space "data" have no YCbCr, so their channels are compared directly. Light above 1
+    is compared in PU21, which has bounds.
     """
+    if color in UNBOUNDED:
+        return "pu21"
     return "data" if color == "data" else "ycbcr"
 
 
@@ -238,7 +251,10 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
 
 def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return both images as RGB of one shape (H, W, 3) without a copy; grey is replicated."""
-    x, y = np.asarray(a), np.asarray(b)
+    x, y = (
+        check_image(image) if isinstance(image, LinearImage) else np.asarray(image)
+        for image in (a, b)
+    )
     if x.shape != y.shape:
         raise ValueError(f"images have shapes {x.shape} and {y.shape}; crop or scale one of them")
     if x.ndim != 3 or x.shape[2] not in (1, 3) or x.size == 0:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
-from ..image.color import to_coded
+from ..image.color import to_picture
+from ..image.radiance import from_log
 from .binning.tiles import TILE
 from .limits import check_index_range
 from .render import bin_gaussians, decode_parameters, rasterize
@@ -51,6 +52,6 @@ def picture_rows(gaussians: Gaussians) -> Callable[[slice], NDArray[np.floating]
         whole = tiles[first:last].transpose(0, 2, 1, 3)
         whole = whole.reshape((last - first) * side, -1, channels)
         part = whole[rows.start - first * side : rows.stop - first * side, : grid.width]
-        return to_coded(np.maximum(part, 0)) if gaussians.space == "linear" else part
+        return to_picture(gaussians.space, from_log(part) if gaussians.space == "log" else part)
 
     return read

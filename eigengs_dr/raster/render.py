@@ -14,7 +14,8 @@ from ..backend.arrays import ArrayTypes
 from ..backend.recording import exclusive
 from ..gaussian.file import MAX_CUTOFF
 from ..gaussian.gaussians import Gaussians
-from ..image.color import decode, to_coded
+from ..image.color import decode, to_picture
+from ..image.radiance import from_log
 from .adjoint import adjoint
 from .binning.lists import TileLists, build_lists
 from .binning.tiles import TILE, Grid
@@ -35,8 +36,9 @@ def render(
     """Render a set of Gaussians at any size.
 
     The result is differentiable with respect to mean, factor, color and background, in forward and
-    reverse mode. A set in YCbCr renders as RGB, a set in linear light renders in linear light
-    (`picture_of` encodes it as sRGB), and data stays as it is. Values are not clamped.
+    reverse mode. A set in YCbCr renders as RGB. Sets in the spaces "linear", "radiance" and "log"
+    render as linear light (`picture_of` encodes it as sRGB), and data stays as it is. Values are
+    not clamped.
 
     Parameters
     ----------
@@ -83,7 +85,8 @@ def render(
     parameters = decode_parameters(scaled)
     lists = bin_gaussians(scaled, adjoint=dr.grad_enabled(parameters))
     image = rasterize(parameters, lists, scaled.cutoff)
-    return to_tensor(image, lists.grid, len(parameters.background))
+    tensor = to_tensor(image, lists.grid, len(parameters.background))
+    return from_log(tensor) if gaussians.space == "log" else tensor
 
 
 @exclusive()
@@ -109,7 +112,7 @@ def picture_of(
         1 is white. Negative linear light becomes 0; other values are not clamped.
     """
     image = render(dr.detach(gaussians), width, height, cutoff).numpy()
-    return to_coded(np.maximum(image, 0)) if gaussians.space == "linear" else image
+    return to_picture(gaussians.space, image)
 
 
 def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[int, int]:

@@ -27,8 +27,8 @@ from ..gaussian.covariance import max_deviation
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.color import to_coded, to_linear
-from ..image.io import check_image
 from ..image.metrics import psnr as psnr_of
+from ..image.pixels import check_data, check_image
 from ..plugins.cone import PIXEL
 from ..raster.render import render
 from .back_projection import back_project, extrapolate
@@ -95,6 +95,7 @@ def fit_for_scene(
     most: int | None = None,
     iterations: int = 100,
     wrap_mode: str = "repeat",
+    encoding: str | None = None,
 ) -> SceneFit:
     """Find the fewest Gaussians with which all cameras of a scene see an image at a given PSNR.
 
@@ -120,6 +121,8 @@ def fit_for_scene(
         Steps of refinement for each number of Gaussians.
     wrap_mode : {"repeat", "mirror", "clamp"}, optional
         See `eigengs_dr.scene.visibility.visibility`.
+    encoding : {"srgb", "linear"}, optional
+        What the pixels are, see `eigengs_dr.fit`.
 
     Returns
     -------
@@ -147,7 +150,8 @@ def fit_for_scene(
         raise ValueError(
             f"iterations is {iterations} and most is {most}; they must be at least 0 and at least 1"
         )
-    pixels = check_image(image, keep_grey=color == "data").clip(0, 1)
+    checked = check_data(image) if color == "data" else check_image(image, encoding=encoding)
+    pixels = checked.clip(0, 1)
     height, width = pixels.shape[:2]
     values = to_linear(pixels) if color == "linear" else pixels
     found = visibility(scene, texture, width, height, wrap_mode)

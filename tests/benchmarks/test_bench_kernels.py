@@ -108,3 +108,12 @@ def test_textures_are_timed_against_a_bitmap(monkeypatch):
     assert all(value > 0 for value in figures.values())
     assert figures["difference"] <= 1e-4
     assert calls[-1] == ("texture", 3, 3)
+
+
+def test_an_environment_map_is_fitted_in_several_ways(tmp_path):
+    from eigengs_bench.experiments.radiance import run as fit_environment
+
+    figures, results = fit_environment(width=64, gaussians=200, iterations=30)
+    assert results["reference"].shape == (32, 64, 3)
+    assert results["reference"].max() > 10
+    assert figures["pu21_log"] > figures["pu21_8bit"]

@@ -8,7 +8,8 @@ from PIL import Image
 from _helpers.mosaics import Sliced, mosaic
 from eigengs_dr.blocks.source import forget_pictures, open_source
 from eigengs_dr.blocks.tiff import window_shape, write_tiles
-from eigengs_dr.image.io import ImageError, load_image
+from eigengs_dr.image.color import to_coded
+from eigengs_dr.image.io import ImageError, load_image, save_image
 
 PART = slice(37, 90), slice(50, 131)
 
@@ -49,8 +50,19 @@ def test_tiff_of_more_bits(tmp_path, pixels, dtype):
     scale = 257 if dtype == np.uint16 else 1 / 255
     values = (pixels * np.float64(scale)).astype(dtype)
     tifffile.imwrite(tmp_path / "a.tif", values, photometric="rgb", tile=(32, 32))
-    found = open_source(tmp_path / "a.tif").window(*PART).read()
+    found = open_source(tmp_path / "a.tif", encoding="srgb").window(*PART).read()
     np.testing.assert_allclose(found, pixels[PART] / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".pfm"])
+def test_floats_are_light(tmp_path, suffix):
+    light = np.random.default_rng(0).random((40, 50, 3)).astype(np.float32) * 20
+    save_image(tmp_path / f"a{suffix}", light, bits=32)
+    found = open_source(tmp_path / f"a{suffix}").window(slice(3, 30), slice(5, 45)).read()
+    np.testing.assert_array_equal(found, to_coded(light[3:30, 5:45]))
+    as_data = open_source(tmp_path / f"a{suffix}", keep_grey=True)
+    with pytest.raises(ImageError, match=r"rows 3 to 30.*not 0 to 1"):
+        as_data.window(slice(3, 30), slice(5, 45)).read()
 
 
 def test_grey_tiff(tmp_path, pixels):

@@ -186,7 +186,7 @@ def test_images_read_ahead_are_few(tmp_path, output, monkeypatch):
     class Pixels(np.ndarray):
         __hash__ = object.__hash__
 
-    def load(source, keep_grey=False):
+    def load(source, keep_grey=False, encoding=None):
         pixels = eg_load(path, keep_grey).view(Pixels)
         alive.add(pixels)
         most.append(len(alive))

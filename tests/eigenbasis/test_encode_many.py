@@ -34,6 +34,16 @@ def test_colours_are_those_of_encode(backend, options):
         assert row.gaussians == len(alone) and row.psnr_rgb is None and row.seconds > 0
 
 
+def test_light_is_encoded_as_srgb(backend, tmp_path):
+    model = small_model(backend)
+    image = family(1, seed=3)[0]
+    save_image(tmp_path / "a.pfm", image, encoding="srgb")
+    [row] = model.encode_many([tmp_path / "a.pfm"])
+    [alone] = model.encode_many([image])
+    a, b = (r.result.to_arrays()["color"] for r in (row, alone))
+    np.testing.assert_allclose(a, b, atol=1e-4)
+
+
 @splits
 def test_a_split_model(backend, split):
     model = small_model(backend, split)

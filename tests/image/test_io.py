@@ -2,6 +2,7 @@
 
 import io
 import struct
+import sys
 import zlib
 from pathlib import Path
 
@@ -88,14 +89,24 @@ def test_16_bit_grey_keeps_its_precision(tmp_path, suffix):
 
 
 @pytest.mark.parametrize(("kind", "channels"), [(2, 3), (4, 2), (6, 4)])
-def test_16_bit_colour_keeps_the_upper_8_bits(tmp_path, kind, channels):
+def test_16_bit_colour_keeps_its_precision(tmp_path, kind, channels):
     rows = (np.arange(2 * 3 * channels) * 3000 + 77).astype(">u2").reshape(2, 3, channels)
     alpha = channels % 2 == 0
     if alpha:
         rows[..., -1] = 65535
     (tmp_path / "a.png").write_bytes(png(3, 2, 16, kind, rows))
-    colors = np.broadcast_to(rows[..., : channels - alpha] >> 8, (2, 3, 3))
-    np.testing.assert_allclose(load_image(tmp_path / "a.png"), colors / 255, atol=1e-7)
+    colors = np.broadcast_to(rows[..., : channels - alpha], (2, 3, 3))
+    np.testing.assert_allclose(load_image(tmp_path / "a.png"), colors / 65535, atol=1e-7)
+
+
+def test_16_bit_colour_without_openimageio_has_8_bits_and_a_word(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "OpenImageIO", None)
+    rows = (np.arange(18) * 3000 + 77).astype(">u2").reshape(2, 3, 3)
+    (tmp_path / "a.png").write_bytes(png(3, 2, 16, 2, rows))
+    with pytest.warns(UserWarning, match="keeps 8 of its 16 bits.*eigengs-dr.hdr") as caught:
+        image = load_image(tmp_path / "a.png")
+    assert len(caught) == 1
+    np.testing.assert_allclose(image, (rows >> 8) / 255, atol=1e-7)
 
 
 @pytest.mark.parametrize("mode", ["RGBA", "LA"])
@@ -255,7 +266,10 @@ def test_check_image_keeps_rows_columns_and_channels():
         (np.full((4, 4), None), "pixels are object"),
         (np.full((4, 4), "a"), "pixels are <U1"),
         ([[1, 2], [3]], "not an array"),
-        (np.full((2, 2), 255.0), "from 255 to 255, not 0 to 1; divide by 255"),
+        (
+            np.full((2, 2), 255.0),
+            "from 255 to 255, not 0 to 1; divide by 255 first, or say encoding=",
+        ),
         (np.full((2, 2), 1e300), "scale it first"),
         (np.array([[-1.0, 1.0]]), "from -1 to 1, not 0 to 1; scale it"),
     ],
@@ -317,7 +331,7 @@ def test_saving_clamps_and_rounds(tmp_path):
     np.testing.assert_array_equal(to_8bit(values)[0], levels)
 
 
-@pytest.mark.parametrize("name", ["a.gif", "a.exr", "a", "a.npz", ".png"])
+@pytest.mark.parametrize("name", ["a.gif", "a.exrs", "a", "a.npz", ".png"])
 def test_unknown_suffix(tmp_path, name):
     with pytest.raises(ImageError, match=r"is unknown; use one of \.png") as error:
         save_image(tmp_path / name, BYTES)

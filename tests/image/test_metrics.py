@@ -152,7 +152,7 @@ def test_refuses_images_that_do_not_fit(metric):
 
 def test_refuses_an_unknown_space():
     pair = np.zeros((2, 1, 1, 3))
-    with pytest.raises(ValueError, match="use 'rgb', 'ycbcr' or 'data'"):
+    with pytest.raises(ValueError, match="use one of rgb, ycbcr, data, pu21"):
         psnr(*pair, space="lab")
     with pytest.raises(ValueError, match="use 'ycbcr' or 'data'"):
         ms_ssim(*pair, space="rgb")

@@ -54,6 +54,23 @@ class TestValues:
         found = picture(texture(g).eval(texel_centres()))
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
+    @pytest.mark.parametrize("space", ["radiance", "log"])
+    def test_light_above_1_is_not_clamped(self, space):
+        g = gaussians(space, quiet=False)
+        rendered = eg.render(g).numpy()
+        assert rendered.max() > 1.5 and rendered.min() < 0
+        found = picture(texture(g).eval(texel_centres()))
+        np.testing.assert_allclose(found, np.maximum(rendered, 0), rtol=1e-4, atol=1e-4)
+
+    @pytest.mark.parametrize("space", ["linear", "radiance", "log"])
+    def test_slopes_of_light(self, space):
+        g = gaussians(space)
+        t, step = texture(g), 1e-3
+        found = t.eval_1_grad(at(mi.Float(0.4), mi.Float(0.6)))
+        sides = [t.eval_1(at(mi.Float(0.4 + d), mi.Float(0.6))).numpy() for d in (-step, step)]
+        slope = (sides[1] - sides[0]) / (2 * step)
+        np.testing.assert_allclose(found[0].numpy(), slope, rtol=0.05, atol=0.02)
+
     def test_a_set_in_linear_light_shows_the_picture(self):
         g = gaussians("linear")
         found = picture(texture(g).eval(texel_centres()))

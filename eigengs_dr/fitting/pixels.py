@@ -1,0 +1,59 @@
+"""The pixels of a fit: sRGB, whatever the image holds, or data in [-1, 1]."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..gaussian.gaussians import Gaussians
+from ..image.pixels import MAX_PIXEL, check_data, check_image, encoding_of
+from .options import FitOptions
+
+WHITE = 1.001
+"""Largest sRGB code of light that counts as bounded by white; renderings exceed 1 by rounding."""
+
+
+def read_pixels(image: Any, options: FitOptions) -> tuple[NDArray[np.float32], FitOptions]:
+    """Check an image, and convert it to what `eigengs_dr.fitting` works on.
+
+    Parameters
+    ----------
+    image : array_like
+        See `eigengs_dr.fit`.
+    options : FitOptions
+
+    Returns
+    -------
+    pixels : ndarray of float32, shape (H, W, 3) or (H, W, 1)
+        sRGB, above 1 for light above 1; or the data. They may be the image itself.
+    options : FitOptions
+        With the color "radiance" instead of "linear" if the image is light above 1.
+
+    Raises
+    ------
+    ImageError
+        If the image is unusable.
+    """
+    if options.color == "data":
+        return check_data(image, copy=False), options
+    encoding = encoding_of(image, options.encoding) or "srgb"
+    pixels = check_image(image, copy=False, encoding=encoding)
+    if options.color == "linear" and encoding == "linear" and pixels.max() > WHITE:
+        options = replace(options, color="radiance")
+    return pixels, options
+
+
+def unit_of(pixels: NDArray[np.float32], color: str) -> float:
+    """Return the unit in which data are fitted: steps of colours are made for values up to 1."""
+    largest = float(np.abs(pixels).max()) if color == "data" else 0.0
+    return largest if largest > MAX_PIXEL else 1.0
+
+
+def in_unit(gaussians: Gaussians, unit: float) -> Gaussians:
+    """Multiply the colours and the background of a set."""
+    if unit == 1:
+        return gaussians
+    return replace(gaussians, color=gaussians.color * unit, background=gaussians.background * unit)

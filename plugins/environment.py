@@ -1,0 +1,58 @@
+"""Environment maps: emitters that take a bitmap, and no texture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.image.color import rendered_as, to_linear
+from eigengs_dr.raster.render import render
+
+
+def bake_environment(
+    gaussians: Gaussians, width: int | None = None, height: int | None = None, **properties: Any
+) -> dict[str, Any]:
+    """Render a set to the bitmap of an ``envmap``, for `mitsuba.load_dict`.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        A set of three channels, in equirectangular projection: twice as wide as high.
+    width, height : int, optional
+        Size of the bitmap in pixels, as for `eigengs_dr.render`; by default the native size.
+    **properties
+        Other properties of the emitter: ``scale``, ``to_world``.
+
+    Returns
+    -------
+    dict
+        The emitter with a bitmap of linear light; negative light is 0.
+
+    Raises
+    ------
+    ValueError
+        If the set has other channels, or holds data.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg, mitsuba as mi
+    >>> from eigengs_dr.plugins import bake_environment
+    >>> mi.set_variant("llvm_ad_rgb")
+    >>> sky = eg.Gaussians.from_arrays(
+    ...     [[8, 4]], [[0.2, 0, 0.2]], [[9, 9, 8]], size=(16, 8), space="radiance"
+    ... )
+    >>> scene = mi.load_dict({"type": "scene", "sky": bake_environment(sky)})
+    """
+    encoding = rendered_as(gaussians.space)
+    if gaussians.channels != 3 or encoding is None:
+        raise ValueError(
+            f"bake_environment: the set has {gaussians.channels} channels in the space "
+            f"{gaussians.space!r}; it needs three of light or colour"
+        )
+    shown = render(gaussians, width, height).numpy()
+    light = to_linear(shown) if encoding == "srgb" else shown
+    bitmap = mi.Bitmap(np.maximum(light, 0).astype(np.float32))
+    return {"type": "envmap", "bitmap": bitmap, **properties}

@@ -1,0 +1,253 @@
+"""Files of floats and of 16 bits: EXR, HDR, PFM, TIFF and PNG."""
+
+import sys
+import warnings
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import tifffile
+
+from _helpers.errors import one_line
+from eigengs_dr.image.io import ImageError, LinearImage, load_image, save_image
+from eigengs_dr.image.pixels import check_image
+
+LIGHT = (np.random.default_rng(0).random((5, 7, 3)) ** 8 * 5000).astype(np.float32)
+FLOATS = [".exr", ".hdr", ".pfm", ".tif"]
+
+
+def write_exr(path, names, pixels=None, **attributes):
+    """Write an EXR file of the given channels."""
+    pixels = np.full((2, 3, len(names)), 0.5, np.float32) if pixels is None else pixels
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], len(names), "float")
+    spec.channelnames = names
+    for name, value in attributes.items():
+        spec.attribute(name, value)
+    file = oiio.ImageOutput.create(str(path))
+    assert file.open(str(path), spec) and file.write_image(pixels) and file.close()
+
+
+@pytest.mark.parametrize("suffix", FLOATS)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_floats_come_back(tmp_path, suffix, channels):
+    path, light = tmp_path / f"a{suffix}", LIGHT[..., :channels]
+    save_image(path, light, bits=32)
+    found = load_image(path, keep_grey=True)
+    assert isinstance(found, LinearImage) and found.dtype == np.float32
+    if suffix == ".hdr":  # 8 bits, and one exponent for three channels
+        assert (np.abs(found - light) <= light.max(axis=2, keepdims=True) / 128).all()
+    else:
+        np.testing.assert_array_equal(found, light)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_16_bits_come_back(tmp_path, suffix, channels):
+    values = np.random.default_rng(1).integers(0, 65536, (5, 7, channels), np.uint16)
+    save_image(tmp_path / f"a{suffix}", values, bits=16)
+    found = load_image(tmp_path / f"a{suffix}", keep_grey=True)
+    assert not isinstance(found, LinearImage)
+    np.testing.assert_array_equal(np.rint(found * 65535), values)
+
+
+def test_half_floats(tmp_path):
+    save_image(tmp_path / "a.exr", LIGHT, bits=16)
+    np.testing.assert_array_equal(load_image(tmp_path / "a.exr"), LIGHT.astype(np.float16))
+
+
+def test_light_beyond_half_floats_is_clamped(tmp_path):
+    save_image(tmp_path / "a.exr", np.full((2, 3, 3), 1e6), bits=16)
+    np.testing.assert_array_equal(load_image(tmp_path / "a.exr"), 65504)
+
+
+def test_grey_floats_are_replicated(tmp_path):
+    for suffix in (".pfm", ".tif"):
+        save_image(tmp_path / f"a{suffix}", LIGHT[..., :1], bits=32)
+        np.testing.assert_array_equal(load_image(tmp_path / f"a{suffix}"), LIGHT[..., [0, 0, 0]])
+
+
+def test_big_endian_pfm(tmp_path):
+    (tmp_path / "a.pfm").write_bytes(b"PF\n7 5\n1.0\n" + LIGHT[::-1].astype(">f4").tobytes())
+    np.testing.assert_array_equal(load_image(tmp_path / "a.pfm"), LIGHT)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_deep_tiff_is_turned_as_pillow_turns(tmp_path, orientation):
+    values = (np.arange(5 * 7 * 3) % 256).reshape(5, 7, 3)
+    tags = [(274, "H", 1, orientation, True)]
+    tifffile.imwrite(tmp_path / "a.tif", values.astype(np.uint8), extratags=tags)
+    deep = (values * 257).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "b.tif", deep, extratags=tags, photometric="rgb")
+    np.testing.assert_allclose(load_image(tmp_path / "b.tif"), load_image(tmp_path / "a.tif"))
+
+
+# ---------------------------------------------------------------- what is refused
+
+
+def test_exr_of_one_channel(tmp_path):
+    write_exr(tmp_path / "a.exr", ("Z",))
+    with pytest.raises(ImageError, match="holds one channel, not R, G and B") as error:
+        load_image(tmp_path / "a.exr")
+    assert "a.exr" in one_line(error)
+    assert load_image(tmp_path / "a.exr", keep_grey=True).shape == (2, 3, 1)
+
+
+def test_exr_of_layers(tmp_path):
+    write_exr(tmp_path / "a.exr", ("R", "G", "B", "glow.R", "glow.G", "glow.B"))
+    with pytest.raises(ImageError, match=r"holds the channels R, G, B, glow\.R") as error:
+        load_image(tmp_path / "a.exr")
+    one_line(error)
+
+
+def test_exr_of_parts(tmp_path):
+    path = str(tmp_path / "a.exr")
+    specs = [oiio.ImageSpec(3, 2, 3, "float") for _ in range(2)]
+    for number, spec in enumerate(specs):
+        spec.attribute("oiio:subimagename", f"part{number}")
+    file = oiio.ImageOutput.create(path)
+    assert file.open(path, specs)
+    for number, spec in enumerate(specs):
+        assert number == 0 or file.open(path, spec, "AppendSubimage")
+        assert file.write_image(np.zeros((2, 3, 3), np.float32))
+    assert file.close()
+    with pytest.raises(ImageError, match="holds several parts") as error:
+        load_image(path)
+    one_line(error)
+
+
+def test_transparent_exr_is_over_black(tmp_path):
+    pixels = np.full((2, 3, 4), 0.5, np.float32)
+    write_exr(tmp_path / "a.exr", ("R", "G", "B", "A"), pixels)
+    with pytest.warns(UserWarning, match="over black"):
+        np.testing.assert_array_equal(load_image(tmp_path / "a.exr"), pixels[..., :3])
+    pixels[..., 3] = 1
+    write_exr(tmp_path / "a.exr", ("R", "G", "B", "A"), pixels)
+    np.testing.assert_array_equal(load_image(tmp_path / "a.exr"), pixels[..., :3])
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".pfm", ".tif"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_pixels_that_are_not_finite(tmp_path, suffix, bad):
+    light = LIGHT.copy()
+    path = tmp_path / f"a{suffix}"
+    save_image(path, light, bits=32)
+    light[2, 4, 1] = bad
+    if suffix == ".exr":
+        write_exr(path, ("R", "G", "B"), light)
+    elif suffix == ".tif":
+        tifffile.imwrite(path, light, photometric="rgb")
+    else:
+        path.write_bytes(b"PF\n7 5\n-1\n" + light[::-1].tobytes())
+    with pytest.raises(ImageError, match=r"1 of 35 pixels are not finite.*\[2, 4\]") as error:
+        load_image(path)
+    assert str(path) in one_line(error)
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".hdr", ".pfm", ".tif"])
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.9])
+def test_broken_files(tmp_path, suffix, share):
+    path = tmp_path / f"a{suffix}"
+    save_image(path, np.random.default_rng(0).random((64, 64, 3)), bits=32)
+    content = path.read_bytes()
+    path.write_bytes(content[: max(40, int(share * len(content)))])
+    with pytest.raises(ImageError) as error:
+        load_image(path)
+    assert str(path) in one_line(error)
+
+
+def test_without_openimageio(tmp_path, monkeypatch):
+    save_image(tmp_path / "a.exr", LIGHT)
+    monkeypatch.setitem(sys.modules, "OpenImageIO", None)
+    for act in (load_image, lambda path: save_image(path, LIGHT)):
+        with pytest.raises(ImageError, match=r"pip install 'eigengs-dr\[hdr\]'") as error:
+            act(tmp_path / "a.exr")
+        one_line(error)
+    save_image(tmp_path / "a.pfm", LIGHT)  # needs no package
+
+
+@pytest.mark.parametrize(("name", "bits"), [("a.jpg", 16), ("a.hdr", 16), ("a.png", 32)])
+def test_bits_that_a_format_has_not(tmp_path, name, bits):
+    with pytest.raises(ImageError, match=f"bits is {bits}; a") as error:
+        save_image(tmp_path / name, LIGHT, bits=bits)
+    one_line(error)
+    assert not list(tmp_path.iterdir())
+
+
+# ---------------------------------------------------------------- what pixels are
+
+
+def test_encoding_of_a_file_can_be_said(tmp_path):
+    codes = np.full((2, 3, 3), 0.5)
+    save_image(tmp_path / "a.exr", codes)
+    save_image(tmp_path / "a.png", codes)
+    assert not isinstance(load_image(tmp_path / "a.exr", encoding="srgb"), LinearImage)
+    assert isinstance(load_image(tmp_path / "a.png", encoding="linear"), LinearImage)
+    with pytest.raises(ValueError, match="encoding 'gamma' is unknown") as error:
+        load_image(tmp_path / "a.png", encoding="gamma")
+    one_line(error)
+
+
+def test_light_is_coded_in_files_of_integers(tmp_path):
+    light = np.full((2, 3, 3), 0.214041, np.float32)
+    for image, said in ((light, "linear"), (light.view(LinearImage), None)):
+        save_image(tmp_path / "a.png", image, encoding=said)
+        np.testing.assert_allclose(load_image(tmp_path / "a.png"), 0.5, atol=0.5 / 255)
+    save_image(tmp_path / "a.png", light)
+    np.testing.assert_allclose(load_image(tmp_path / "a.png"), light, atol=0.5 / 255)
+
+
+def test_codes_become_light_in_files_of_floats(tmp_path):
+    save_image(tmp_path / "a.exr", np.full((2, 3, 3), 0.5), encoding="srgb")
+    np.testing.assert_allclose(load_image(tmp_path / "a.exr"), 0.214041, rtol=1e-5)
+
+
+def test_light_above_1_is_clamped_in_files_of_integers(tmp_path):
+    save_image(tmp_path / "a.png", LIGHT, encoding="linear")
+    assert load_image(tmp_path / "a.png").max() == 1
+
+
+def test_check_image_codes_light():
+    codes = check_image(LIGHT.view(LinearImage))
+    assert type(codes) is np.ndarray and codes.max() > 10
+    np.testing.assert_array_equal(codes, check_image(LIGHT, encoding="linear"))
+    np.testing.assert_allclose(
+        check_image(np.full((1, 1, 3), 0.214041), encoding="linear"), 0.5, rtol=1e-6
+    )
+    with pytest.raises(ImageError, match="say encoding='linear' for light") as error:
+        check_image(LIGHT)
+    one_line(error)
+
+
+def test_light_beyond_single_precision():
+    with pytest.raises(ImageError, match="scale it first"):
+        check_image(np.full((2, 2), 1e10), encoding="linear")
+
+
+def test_linear_image_follows_arithmetic():
+    light = LIGHT.view(LinearImage)
+    assert isinstance((2 * light)[:2].copy(), LinearImage)
+    assert type(np.asarray(light)) is np.ndarray
+
+
+@pytest.mark.mitsuba
+@pytest.mark.parametrize("gamma", [False, True])
+def test_a_bitmap_tells_what_it_is(tmp_path, gamma):
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("llvm_ad_rgb")
+    bitmap = mi.Bitmap(np.full((2, 3, 3), 0.214041, np.float32))
+    if gamma:
+        bitmap = bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True)
+    np.testing.assert_allclose(check_image(bitmap), 0.5, atol=0.5 / 255)
+    save_image(tmp_path / "a.png", bitmap)
+    np.testing.assert_allclose(load_image(tmp_path / "a.png"), 0.5, atol=0.5 / 255)
+
+
+def test_a_tensor_of_colours_shall_say_what_it_is(tmp_path):
+    from drjit.llvm.ad import TensorXf
+
+    tensor = TensorXf(LIGHT[:2, :2] / 5000)
+    with pytest.warns(UserWarning, match="encoding='linear' for light"):
+        save_image(tmp_path / "a.png", tensor)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        save_image(tmp_path / "a.png", tensor, encoding="linear")
