@@ -10,7 +10,7 @@ from eigengs_dr.fitting.pixels import read_pixels
 from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.image.pixels import LinearImage
 
-SMALL = {"gaussians": 300, "iterations": 60}
+SMALL = {"gaussians": 300, "iterations": 100}
 
 
 @pytest.fixture(scope="module")
