@@ -70,7 +70,7 @@ class Settings:
     background: tuple[float, ...] = ()
 
 
-MEND_RATE = 0.3
+MEND_RATE = 0.15
 """Learning rates of `mend_seam`, as a fraction of those of a fit."""
 
 

@@ -168,8 +168,9 @@ def pack(
 
     found = largest_within(plain)
     if len(rows) == 1:  # compensation for the whole set would harm its prefixes
-        start = MIN_OCTAVES if found is None else found[0] - 0.5 * np.log2(FEEDBACK)
-        found = largest_within(compensated, start)
+        least = MIN_OCTAVES if found is None else found[0]
+        start = least if found is None else least - 0.5 * np.log2(FEEDBACK)
+        found = largest_within(compensated, start, least) or found
     if found is None:
         raise ValueError(TOO_FINE)
     packed = found[1].packed

@@ -47,7 +47,7 @@ class Attempt(NamedTuple):
 
 
 def largest_within(
-    attempt: Callable[[float], Attempt], start: float = 0.0
+    attempt: Callable[[float], Attempt], start: float = 0.0, least: float = MIN_OCTAVES
 ) -> tuple[float, Attempt] | None:
     """Search the largest step within the limit.
 
@@ -57,6 +57,8 @@ def largest_within(
         ``attempt(octaves)`` rounds with ``2**octaves`` times some first step.
     start : float, optional
         Octaves of the first attempt.
+    least : float, optional
+        Octaves of the smallest step to try.
 
     Returns
     -------
@@ -72,10 +74,10 @@ def largest_within(
             best = octaves, found
         goal = _crossing(tried) - MARGIN
         if best is None:
-            if octaves <= MIN_OCTAVES:
+            if octaves <= least:
                 return None
             lowest = min(place for place, _ in tried)
-            octaves = max(min(goal, lowest - MARGIN * len(tried)), MIN_OCTAVES)
+            octaves = max(min(goal, lowest - MARGIN * len(tried)), least)
             continue
         low = best[0] + MARGIN
         high = min((place for place, _ in tried if place > best[0]), default=MAX_OCTAVES + MARGIN)

@@ -149,11 +149,12 @@ def fit_levels(
     schedule = options.method.schedule
     with defer_interrupts() as interrupted:
         start = initialize(pixels, replace(options, gaussians=counts[0]))
+        start = start._replace(redistribute=None, relocate=None)  # the levels keep their Gaussians
         steps = min(STEPS_PER_LEVEL, iterations)
         placed = _place_levels(start, counts, schedule, steps, interrupted)
         seconds_init = time.perf_counter() - started
         refined = refine(
-            start._replace(gaussians=placed, redistribute=None),
+            start._replace(gaussians=placed),
             pixels,
             schedule,
             iterations,
@@ -177,7 +178,7 @@ def _place_levels(
     gaussians = start.gaussians
     for level, count in enumerate(counts[1:], 1):
         below = counts[: level - 1]
-        problem = start._replace(gaussians=gaussians, redistribute=None)
+        problem = start._replace(gaussians=gaussians)
         with closing(descend(problem, schedule, steps, levels=below)) as sets:
             for current in sets:
                 gaussians = current

@@ -125,6 +125,8 @@ class _Run:
         schedule = replace(self.schedule, rates=rates)
         self.planned = max(self.planned, self.step + steps)
         problem = self.start._replace(gaussians=gaussians, redistribute=None)
+        if share < 1:  # a polish moves Gaussians by itself
+            problem = problem._replace(relocate=None)
         with closing(descend(problem, schedule, steps)) as sets:
             current = next(sets)
             while not self.interrupted():
