@@ -34,7 +34,7 @@ GROUPS = 16
 STEPS = 12
 """Steps of descent after each group but the last one."""
 
-RATE = 0.15
+RATE = 0.2
 """Learning rates of this descent, as a fraction of those of `fit`: the optimum is near."""
 
 
