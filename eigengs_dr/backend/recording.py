@@ -64,6 +64,10 @@ def exclusive() -> Iterator[None]:
             _clear_retired()
 
 
+MANY_RECORDINGS = 1000
+"""Recordings of one program after which Dr.Jit warns; by default after 10."""
+
+
 @contextmanager
 def freeze_program(function: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
     """Freeze a function with `drjit.freeze` during a block, and free its program after the block.
@@ -87,7 +91,8 @@ def freeze_program(function: Callable[..., Any]) -> Iterator[Callable[..., Any]]
         The frozen function, with the arguments and the result of `function`. Its calls are
         `exclusive`.
     """
-    program = dr.freeze(function)
+    # Lists grow and shrink in a descent, and each other size is recorded, which takes 3 ms: no fault.
+    program = dr.freeze(function, warn_after=MANY_RECORDINGS)
 
     @wraps(function)
     def call(*arguments: Any, **settings: Any) -> Any:
