@@ -91,7 +91,7 @@ def freeze_program(function: Callable[..., Any]) -> Iterator[Callable[..., Any]]
         The frozen function, with the arguments and the result of `function`. Its calls are
         `exclusive`.
     """
-    # Lists grow and shrink in a descent, and each other size is recorded, which takes 3 ms: no fault.
+    # Lists grow and shrink in a descent. Each other size is recorded, in 3 ms: no fault.
     program = dr.freeze(function, warn_after=MANY_RECORDINGS)
 
     @wraps(function)
