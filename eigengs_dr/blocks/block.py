@@ -21,7 +21,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -29,7 +28,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.recording import exclusive
-from ..fitting.density_control import Part, relocate
 from ..fitting.initializers import FitProblem, FitTarget, make_target
 from ..fitting.optimizers.descent import descend
 from ..fitting.optimizers.schedule import Schedule
@@ -180,11 +178,7 @@ def fit_block(task: FitTask, settings: Settings, step_done: StepDone | None = No
     dict of str to ndarray
         Mean, factor and color of the own Gaussians, in pixels of the window.
     """
-    problem = _start(task, make_target(task.window.read(), settings.options.color), settings)
-    part = Part(task.own, task.block.core)
-    move = partial(relocate, target=problem.target, weight=problem.weight, part=part)
-    schedule = settings.options.method.schedule
-    return _fit(problem._replace(relocate=move), task, schedule, step_done)
+    return _fit(task, settings, settings.options.method.schedule, step_done)
 
 
 @exclusive()
@@ -192,13 +186,13 @@ def mend_seam(task: FitTask, settings: Settings, step_done: StepDone | None = No
     """Move the Gaussians along a border, those of both sides; results as those of `fit_block`."""
     schedule = settings.options.method.schedule
     rates = {name: MEND_RATE * rate for name, rate in schedule.rates.items()}
-    problem = _start(task, make_target(task.window.read(), settings.options.color), settings)
-    return _fit(problem, task, replace(schedule, rates=rates), step_done)
+    return _fit(task, settings, replace(schedule, rates=rates), step_done)
 
 
 def _fit(
-    problem: FitProblem, task: FitTask, schedule: Schedule, step_done: StepDone | None
+    task: FitTask, settings: Settings, schedule: Schedule, step_done: StepDone | None
 ) -> Arrays:
+    problem = _start(task, make_target(task.window.read(), settings.options.color), settings)
     found = _descend(problem, schedule, task.iterations, step_done)
     if _squared_error(found, problem).sum() > _squared_error(problem.gaussians, problem).sum():
         found = problem.gaussians  # as on an image that the colour solve fits without error
