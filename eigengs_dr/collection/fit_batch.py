@@ -70,7 +70,9 @@ def fit_batch(
     -------
     list of Fit
         The results of `eigengs_dr.fit`, on llvm bit for bit: sums run in the same order. A result
-        does not depend on the other images. The seconds are an equal share of the whole time.
+        depends on the other images only if a Gaussian gets narrower than about 0.2 pixels: all of
+        them are then evaluated by another formula, with weights that differ by 2e-6, see
+        `eigengs_dr.raster.evaluate.weights`. The seconds are an equal share of the whole time.
 
     Raises
     ------
