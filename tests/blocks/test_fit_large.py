@@ -1,6 +1,7 @@
 """Fits by blocks: no seams, the same bits in any order, and no work lost."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,10 @@ from _helpers.process import run_python
 from eigengs_dr.backend.executor import Done
 from eigengs_dr.blocks import draw
 from eigengs_dr.blocks import run as rounds
+from eigengs_dr.blocks.block import MAX_RATE
 from eigengs_dr.blocks.draw import save_region
 from eigengs_dr.fitting.memory import estimate_memory
+from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.gaussian.file import read
 
 FEW = {"gaussians": 700, "iterations": 10, "block": 64, "backend": "llvm"}
@@ -45,8 +48,12 @@ def psnr_in(mask, picture, pixels):
 
 
 @pytest.mark.parametrize("iterations", [40, pytest.param(300, marks=pytest.mark.slow)])
-def test_no_seam_is_left(iterations):
-    """Near borders and elsewhere, the error is that of a fit of the whole."""
+def test_no_seam_is_left(iterations, monkeypatch):
+    """Near borders and elsewhere, the error is that of a fit of the whole by the same steps."""
+    preset = PRESETS["default"]
+    rates = {name: min(rate, MAX_RATE) for name, rate in preset.schedule.rates.items()}
+    schedule = replace(preset.schedule, rates=rates, relocate_every=0)
+    monkeypatch.setitem(PRESETS, "default", replace(preset, schedule=schedule))
     pixels = mosaic(256)
     settings = {"gaussians": 3000, "iterations": iterations, "backend": "llvm"}
     blocks = eg.fit_large(pixels, block=96, **settings)
@@ -256,6 +263,7 @@ def test_memory_is_that_of_a_block(tmp_path):
 import resource
 import numpy as np
 import eigengs_dr as eg
+from eigengs_dr.blocks.block import MAX_RATE
 from eigengs_dr.blocks.draw import save_region
 from eigengs_dr.gaussian.file import read
 from pathlib import Path
