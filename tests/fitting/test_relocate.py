@@ -62,8 +62,8 @@ def test_a_perfect_set_stays_perfect():
 
 def test_rounds_are_spread_over_the_first_half():
     schedule = replace(SCHEDULE, relocate_every=45)
-    assert relocation_steps(schedule, 80) == set()
-    assert relocation_steps(schedule, 100) == {50}
+    assert relocation_steps(schedule, 100) == set()
+    assert relocation_steps(schedule, 180) == {45, 90}
     steps = sorted(relocation_steps(schedule, 980))
     assert steps == [49 * k for k in range(1, 11)]
     assert max(relocation_steps(schedule, 100_000)) == 50_000

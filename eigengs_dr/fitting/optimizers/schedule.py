@@ -102,8 +102,9 @@ def lr_factor(schedule: Schedule, step: int, iterations: int) -> float:
     return left * min(1.0, (step + 1) / max(1, schedule.warm_up))
 
 
-RELOCATE_UNTIL, MAX_RELOCATIONS = 0.5, 20
-"""The share of a descent that may relocate, and the largest number of rounds."""
+RELOCATE_UNTIL, MIN_RELOCATIONS, MAX_RELOCATIONS = 0.5, 2, 20
+"""The share of a descent that may relocate, and the numbers of rounds. On 64x64 pixels one round
+takes as long as 50 steps, so that a descent of 100 steps has none."""
 
 
 def relocation_steps(schedule: Schedule, iterations: int) -> set[int]:
@@ -112,6 +113,8 @@ def relocation_steps(schedule: Schedule, iterations: int) -> set[int]:
         return set()
     until = RELOCATE_UNTIL * iterations
     rounds = min(MAX_RELOCATIONS, int(until / schedule.relocate_every))
+    if rounds < MIN_RELOCATIONS:
+        return set()
     return {round(until * (k + 1) / rounds) for k in range(rounds)}
 
 
