@@ -71,7 +71,7 @@ class Settings:
 
 
 MAX_RATE = 0.12
-"""Largest learning rate of the fit of a block. With the rates of `eigengs_dr.fit` blocks lose 3 dB,
+"""Largest learning rate of the fit of a block. With the rates of `eigengs_dr.fit` blocks lose 5 dB,
 because stand-ins for neighbours move too far (1,024x1,024 pixels in blocks of 256, 1,000 steps)."""
 
 
