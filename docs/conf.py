@@ -1,4 +1,4 @@
-"""Settings of the manual: Sphinx, MyST, numpydoc, sphinx-click and sphinx-gallery."""
+"""Settings of the manual: Sphinx, MyST-NB, numpydoc, sphinx-click and sphinx-gallery."""
 
 import sys
 from pathlib import Path
@@ -20,7 +20,7 @@ copyright = f"2026, {author}"
 version = release = eg.__version__
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
@@ -32,11 +32,15 @@ extensions = [
     "sphinx_gallery.gen_gallery",
 ]
 templates_path = ["_templates"]
+exclude_patterns = ["tutorials/*.ipynb"]  # sphinx-gallery offers them, beside the pages
 
 # --- Pages ---------------------------------------------------------------------------------------
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from html import escape
 from pathlib import Path
@@ -31,7 +31,7 @@ FRAME_HEIGHT = 560
 """Height of a page inside a notebook, in pixels."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Page:
     """A page for the browser that shows a set or a model.
 
@@ -44,7 +44,10 @@ class Page:
         The whole page.
     """
 
-    html: str = field(repr=False)
+    html: str
+
+    def __repr__(self) -> str:
+        return f"Page({len(self.html):,} bytes)"
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the page as an ``.html`` file, completely or not at all.

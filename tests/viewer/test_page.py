@@ -7,6 +7,7 @@ import eigengs_dr as eg
 from _helpers.browser import PHONE
 from _helpers.families import SIDE, family, small_model
 from _helpers.sets import random_scene
+from eigengs_dr.viewer.page import Page
 
 SIZE = (120, 90)
 
@@ -48,7 +49,7 @@ def actual(show):
 
 @pytest.mark.parametrize(
     "space, channels",
-    [("ycbcr", 3), ("rgb", 3), ("linear", 3), ("radiance", 3), ("log", 3), ("data", 1)],
+    [("ycbcr", 3), ("linear", 3), ("log", 3), ("data", 1)],
 )
 def test_draws_as_the_renderer(actual, space, channels):
     gaussians = make_set(space, channels, cutoff=4.0)
@@ -97,7 +98,7 @@ def test_without_levels_the_largest_come_first(actual):
     assert differ(tab.image(), codes(gaussians[order[:count]])) < 0.05
 
 
-@pytest.mark.parametrize("scale", [7.3, 1e3, 1e8])
+@pytest.mark.parametrize("scale", [7.3, 1e8])
 def test_zoom_has_no_end(show, scale):
     """Pixels are compared with the sum in double precision at their places in the image."""
     gaussians = make_set()
@@ -146,7 +147,7 @@ def test_mouse_and_keyboard_move_the_picture(show):
     )
     assert x > SIZE[0] / 2 and y > SIZE[1] / 2 and scale == pytest.approx(1.25 * fit)
     canvas.press("1")
-    assert page.text_content("#zoom") == "100 %"
+    assert tab.run("byId('zoom').textContent") == "100 %"
 
 
 def test_two_fingers_zoom(show):
@@ -244,9 +245,8 @@ def scored(model, scores):
     return model.reconstruct([np.array(s) * np.sqrt(v[: len(s)]) for s, v in pairs])
 
 
-@pytest.mark.parametrize("color", ["ycbcr", "rgb"])
-def test_sliders_move_a_model(actual, color):
-    model = small_model("llvm", color=color)
+def test_sliders_move_a_model(actual):
+    model = small_model("llvm")
     tab = actual(eg.view(model))
     assert differ(tab.image(), codes(model.gaussians)) < 0.05
     assert tab.page.locator("#components fieldset").count() == 3
@@ -298,24 +298,44 @@ def test_text_is_escaped(show):
     assert tab.run("window.broken") is None
 
 
-@pytest.mark.parametrize("device", ["desktop", "phone"])
-def test_everything_is_in_reach(show, device):
-    """No control lies outside the window, and text does not run over it."""
-    page = eg.view(small_model("llvm"), family(count=1)[0])
-    tab = show(page, PHONE) if device == "phone" else show(page)
+def test_everything_is_in_reach_on_a_phone(show):
+    tab = show(eg.view(small_model("llvm"), family(count=1)[0]), PHONE)
     assert tab.run("document.documentElement.scrollWidth <= innerWidth")
     for name in ("#count", "#outlines", "#compare", "#random-image", "summary"):
         tab.page.locator(name).scroll_into_view_if_needed()
         assert tab.page.locator(name).is_visible()
 
 
-def test_shows_20_000_gaussians(show):
+def test_shows_20_000_gaussians(actual):
     gaussians = make_set(count=20_000)
     page = eg.view(gaussians)
     assert len(page.html.encode()) < 1_500_000
-    assert differ_at_native(show(page), gaussians) < 0.2
+    assert differ(actual(page).image(), codes(gaussians)) < 0.2
 
 
-def differ_at_native(tab, gaussians):
-    tab.page.click("#actual-size")
-    return differ(tab.image(), codes(gaussians))
+def test_16_bit_sums_are_close(actual):
+    """Where WebGL does not add 32-bit floats, as on some phones."""
+    gaussians = make_set()
+    without = """<script>
+        const get = WebGL2RenderingContext.prototype.getExtension;
+        WebGL2RenderingContext.prototype.getExtension = function (name) {
+            return name === "EXT_float_blend" ? null : get.call(this, name);
+        };
+    </script>"""
+    page = eg.view(gaussians)
+    tab = actual(Page(page.html.replace("<script>", without + "<script>", 1)))
+    assert tab.run("viewer.renderer.format === viewer.renderer.gl.RGBA16F")
+    assert differ(tab.image(), codes(gaussians)) < 0.2
+
+
+def test_draws_again_after_the_context_is_lost(actual):
+    gaussians = make_set()
+    tab = actual(eg.view(gaussians))
+    tab.page.evaluate("""() => new Promise((done) => {
+        viewer.canvas.addEventListener("webglcontextrestored", () => setTimeout(done, 50));
+        const loss = viewer.renderer.gl.getExtension("WEBGL_lose_context");
+        loss.loseContext();
+        setTimeout(() => loss.restoreContext(), 50);
+    })""")
+    tab.run("0")
+    assert differ(tab.image(), codes(gaussians)) < 0.05
