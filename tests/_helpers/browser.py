@@ -60,10 +60,15 @@ class Tab:
         self.wait("window.viewer?.ready")
 
     def run(self, code):
-        """Value of an expression of the page, after what it changed was drawn."""
+        """Value of an expression of the page, after all that changed before it was drawn."""
+        self.rest()
         value = self.page.evaluate(code)
-        self.wait("!(viewer.waiting || viewer.moving || viewer.stale)")
+        self.rest()
         return value
+
+    def rest(self):
+        """Wait until everything that changed is drawn."""
+        self.wait("!(viewer.waiting || viewer.moving || viewer.stale)")
 
     def wait(self, condition):
         """Wait until an expression of the page is true."""

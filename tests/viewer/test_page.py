@@ -129,7 +129,7 @@ def test_mouse_and_keyboard_move_the_picture(show):
     at = tab.run("viewer.camera.toImage(150, 200)")
     page.mouse.move(150, 200)
     page.mouse.wheel(0, -240)
-    assert tab.run("viewer.camera.scale > 1.5 * viewer.camera.fitScale")
+    tab.wait("viewer.camera.scale > 1.5 * viewer.camera.fitScale")  # the wheel answers later
     np.testing.assert_allclose(tab.run("viewer.camera.toImage(150, 200)"), at)  # stays under it
 
     page.mouse.down()
@@ -168,7 +168,7 @@ def test_two_fingers_zoom(show):
     np.testing.assert_allclose(tab.run("viewer.camera.toImage(2 * 180, 2 * 150)"), at, atol=0.1)
 
     tab.page.touchscreen.tap(180, 150)
-    assert tab.page.is_visible("#chosen")
+    tab.page.locator("#chosen").wait_for()
 
 
 def test_the_photo_is_right_of_the_divider(actual):
@@ -226,7 +226,7 @@ def test_points_at_a_gaussian(show):
     np.testing.assert_allclose([low, high], [[20, 25], [40, 35]], atol=1)
 
     tab.page.mouse.move(5, 5)
-    assert tab.page.is_hidden("#chosen")
+    tab.page.locator("#chosen").wait_for(state="hidden")
     np.testing.assert_array_equal(tab.pixels(), before)
 
 
