@@ -51,13 +51,23 @@ def chromium():
 class Tab:
     """A page of `eigengs_dr.view` in a browser, and what went wrong in it."""
 
-    def __init__(self, browser, path, device=DESKTOP):
-        self.page = browser.new_page(**device)
+    def __init__(self, page, path):
+        self.page = page
         self.errors, self.requests = [], []
-        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("request", lambda request: self.requests.append(request.url))
-        self.page.goto(path.as_uri())
+        self.listeners = {
+            "pageerror": lambda error: self.errors.append(str(error)),
+            "request": lambda request: self.requests.append(request.url),
+        }
+        for event, listener in self.listeners.items():
+            page.on(event, listener)
+        page.goto(path.as_uri())
         self.wait("window.viewer?.ready")
+
+    def close(self):
+        """Leave the page to the next test."""
+        for event, listener in self.listeners.items():
+            self.page.remove_listener(event, listener)
+        self.page.goto("about:blank")
 
     def run(self, code):
         """Value of an expression of the page, after all that changed before it was drawn."""

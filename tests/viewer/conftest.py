@@ -1,4 +1,4 @@
-"""One browser for all tests of pages."""
+"""One browser for all tests of pages, and one window a device: new ones take half a second."""
 
 import pytest
 
@@ -6,25 +6,34 @@ from _helpers.browser import DESKTOP, Tab, chromium
 
 
 @pytest.fixture(scope="package")
-def browser():
-    with chromium() as found:
-        yield found
+def window():
+    """Return the window of a device."""
+    windows = {}
+    with chromium() as browser:
+
+        def window(device):
+            key = repr(device)
+            if key not in windows:
+                windows[key] = browser.new_page(**device)
+            return windows[key]
+
+        yield window
 
 
 @pytest.fixture
-def show(browser, tmp_path):
-    """Open a page in the browser; at the end, check that nothing went wrong in it."""
+def show(window, tmp_path):
+    """Show a page in the browser; at the end, check that nothing went wrong in it."""
     tabs = []
 
     def show(page, device=DESKTOP):
         path = tmp_path / f"{len(tabs)}.html"
         page.save(path)
-        tabs.append(Tab(browser, path, device))
+        tabs.append(Tab(window(device), path))
         return tabs[-1]
 
     yield show
     for tab in tabs:
-        tab.page.close()
+        tab.close()
         assert tab.errors == []
         own = [url for url in tab.requests if not url.startswith(("file:", "data:", "blob:"))]
         assert own == [], "the page used the network"
