@@ -83,7 +83,8 @@ FAILED = 2
 @choice(
     "--color",
     list(SPACES),
-    "Colour space; linear for textures, log for light above 1, data for other values.",
+    "Colour space; linear for textures, log for light above 1, normal for normal maps, data for "
+    "other values.",
 )
 @encoding_option
 @click.option(

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..backend.arrays import types_of
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
-from ..image.color import LIGHT, UNBOUNDED, rgb_to_ycbcr, to_coded, to_linear
+from ..image.color import LIGHT, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_coded, to_linear
 from ..image.metrics import MAX_PSNR, psnr_from_mse
 from ..image.pixels import check_data, check_image
 from ..image.radiance import to_log, to_pu21
@@ -212,7 +212,7 @@ def _compared(gaussians: Gaussians, image: ArrayLike, encoding: str | None) -> A
     It is the set's space; for linear light, sRGB, and for light above 1, PU21, which has bounds.
     """
     grey = gaussians.channels == 1
-    data = gaussians.space == "data"
+    data = rendered_as(gaussians.space) is None
     pixels = check_data(image) if data else check_image(image, grey, encoding=encoding)
     expected = (gaussians.height, gaussians.width, gaussians.channels)
     if pixels.shape != expected:

@@ -183,5 +183,5 @@ def check(data: SetData) -> None:
         raise BadValue(f"space is {space!r}, expected one of {', '.join(SPACES)}")
     if space != "data" and color.shape[1] not in (1, 3, 4):
         raise BadValue(f"color has {color.shape[1]} channels; space {space!r} has 1, 3 or 4")
-    if space == "ycbcr" and color.shape[1] != 3:
-        raise BadValue(f"color has {color.shape[1]} channels; space 'ycbcr' has 3")
+    if space in ("ycbcr", "normal") and color.shape[1] != 3:
+        raise BadValue(f"color has {color.shape[1]} channels; space {space!r} has 3")
