@@ -60,7 +60,10 @@ def gaussian_texture() -> type:
         Properties
         ----------
         filename : str
-            Path of a set from ``eigengs-dr fit`` or `Gaussians.save`.
+            Path of a set from ``eigengs-dr fit`` or `Gaussians.save`, or of a material. Textures
+            of one file share the memory of means, shapes and lists until one of them changes.
+        map : str
+            With the `filename` of a material: the name of the map, such as "roughness".
         first : int
             With `filename`: number of Gaussians to use, from the first. Any number works for
             level-of-detail sets. By default all.
@@ -118,9 +121,13 @@ def gaussian_texture() -> type:
             size = (self.width, self.height)
             radius = kernel_radius(self.cutoff)
             side = cell_side(*size, dr.width(shape))
-            cells = list_cells(shape, *size, radius, side)
+            listed = self.source.listed
+            cells = listed(("cells", radius), lambda: list_cells(shape, *size, radius, side))
             if self.angle:
-                self.sizes = classify_by_size(shape, *size, self.cutoff, self.wrap)
+                self.sizes = listed(
+                    ("sizes", self.cutoff, self.wrap),
+                    lambda: classify_by_size(shape, *size, self.cutoff, self.wrap),
+                )
             self.cells = cells
 
         # --- Lookups -----------------------------------------------------------------------------

@@ -45,7 +45,8 @@ class Fit:
         the call of `fit`; they include placement, upload, the colour solve and the measurements.
         With color "data" or "normal", psnr_rgb is the PSNR of the data after clamping and rounding
         to 8 bits, and psnr_ycbcr the PSNR of the unchanged data; for values above 1.5, the largest
-        of them is the peak. With color "radiance" or "log", psnr_ycbcr is in PU21, see `eigengs_dr.psnr`.
+        of them is the peak. With color "radiance" or "log", psnr_ycbcr is in PU21, see
+        `eigengs_dr.psnr`.
     image : ndarray of float32, shape (H, W, 3), or (H, W, 1) for data of one channel
         The rendering of the set: RGB without clamping; for light, sRGB clamped at 0; or the data.
     seconds, seconds_init : float
@@ -87,11 +88,11 @@ class FitInterrupted(KeyboardInterrupt):
 
     Attributes
     ----------
-    result : Fit
+    result : Fit or MaterialFit
         The best set so far.
     """
 
-    def __init__(self, result: Fit) -> None:
+    def __init__(self, result: Any) -> None:
         super().__init__("the fit was interrupted; .result holds the best set so far")
         self.result = result
 
