@@ -23,6 +23,7 @@ from .material.fit_material import MaterialFit, fit_material
 from .material.material import Material
 from .plugins import register_plugins
 from .raster.render import picture_of, render
+from .scene.convert import ConvertedScene, convert_scene
 from .scene.fit_scene import fit_for_scene
 from .viewer.page import Page
 from .viewer.view import view
@@ -32,6 +33,7 @@ __version__: str
 __all__ = [
     "BackendError",
     "ClusterError",
+    "ConvertedScene",
     "EigenGS",
     "Eigenbasis",
     "Fit",
@@ -48,6 +50,7 @@ __all__ = [
     "Page",
     "RunInterrupted",
     "concatenate",
+    "convert_scene",
     "exclusive",
     "fit",
     "fit_for_scene",
