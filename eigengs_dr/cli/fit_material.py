@@ -214,7 +214,7 @@ def _preview(images: dict[str, Any], result: MaterialFit) -> Any:
     """Show a row of image, fit and outlines for each map."""
     import numpy as np
 
-    from .pictures import comparison, displayed
+    from ..viewer.pictures import comparison, displayed
 
     rows = []
     for m in result.material.maps:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ..gaussian.covariance import outline
 from ..gaussian.gaussians import Gaussians
-from ..image.io import to_8bit
 from ..image.color import rendered_as
+from ..image.io import to_8bit
 from ..image.pixels import check_image
 
 OUTLINES = 800

@@ -11,8 +11,7 @@ from ..backend.recording import exclusive
 from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.gaussians import Gaussians
-from ..image.color import UNBOUNDED
-from ..image.color import rendered_as
+from ..image.color import UNBOUNDED, rendered_as
 from ..image.pixels import check_data, check_image
 from .model_facts import describe_model, describe_share
 from .page import Page, build_page

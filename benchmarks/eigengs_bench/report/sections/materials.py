@@ -12,6 +12,8 @@ from eigengs_bench.experiments.materials import SEPARATE, SHARED
 from eigengs_bench.harness.store import Row, code_name
 from eigengs_bench.report import frames as fr
 
+SAME = 0.05  # dB that do not count as a difference
+
 LEVEL = 41.0  # dB, mean over the maps, at which GTC publishes its bits
 
 Curve = dict[int, dict[str, float]]
@@ -63,7 +65,7 @@ def ratio(rows: Sequence[Row], shared: Row, kind: str) -> float:
     """Return the bytes of shared shapes over those of separate sets of equal PSNR.
 
     The bytes of a separate set are interpolated over its PSNR, and extrapolated below its smallest
-    by the next two; NaN if a map is better than its largest set.
+    by one more step; NaN if a map is better than its largest set.
     """
     figure = {"bytes": "psnr", "npz_bytes": "npz_psnr"}[kind]
     total = 0.0
@@ -90,9 +92,9 @@ def bits_at(rows: Sequence[Row], kind: str, level: float = LEVEL) -> float:
 
 def _size_at(points: list[Any], level: float) -> float:
     """Interpolate the logarithm of sizes over PSNRs in rising order; see `ratio`."""
-    if len(points) < 2 or level > points[-1][0]:
+    if len(points) < 2 or level > points[-1][0] + SAME:
         return math.nan
-    above = next(k for k, (psnr, _) in enumerate(points) if k and psnr >= level)
+    above = next((k for k, (psnr, _) in enumerate(points) if k and psnr >= level), len(points) - 1)
     (low, few), (high, many) = points[above - 1 : above + 1]
-    share = (level - low) / (high - low) if high > low else 0.0
+    share = min(max((level - low) / (high - low), -1), 1) if high > low else 0.0
     return float(few * (many / few) ** share)
