@@ -39,7 +39,7 @@ def fitted(folder):
     """The file of a fit, with a preview and a report."""
     file = folder / "m.npz"
     files = ("-o", file, "--preview", folder / "p.png", "--report", folder / "r.json")
-    settings = ("--gaussians", 20, "--iterations", 5)
+    settings = ("--gaussians", 8, "--iterations", 5)
     result = run("fit", *maps(folder), *files, *settings)
     assert result.exit_code == 0, result.output
     assert "albedo: 3 channels in linear" in result.output
@@ -49,7 +49,7 @@ def fitted(folder):
 def test_fit(fitted, folder):
     report = json.loads((folder / "r.json").read_text())
     assert [m["name"] for m in report["maps"]] == ["albedo", "roughness", "normal"]
-    assert report["gaussians"] == 20 and report["trace"][0]["maps"]["normal"]["psnr_rgb"] > 10
+    assert report["gaussians"] == 8 and report["trace"][0]["maps"]["normal"]["psnr_rgb"] > 10
     material = eg.Material.load(fitted)
     for m in report["maps"]:
         psnr = eg.psnr(images(24)[m["name"]], material.pictures()[m["name"]])
@@ -67,7 +67,7 @@ def test_render(fitted, tmp_path):
 
 def test_info(fitted, tmp_path):
     facts = json.loads(run("info", fitted, "--json", "--preview", tmp_path / "p.png").output)
-    assert (facts["kind"], facts["gaussians"], facts["channels"]) == ("material", 20, 7)
+    assert (facts["kind"], facts["gaussians"], facts["channels"]) == ("material", 8, 7)
     assert [(m["name"], m["space"]) for m in facts["maps"]] == [
         ("albedo", "linear"),
         ("roughness", "data"),
@@ -84,7 +84,7 @@ def test_pack(fitted, folder, tmp_path):
     assert result.exit_code == 0, result.output
     assert "roughness" in result.output
     facts = json.loads(run("info", target, "--json").output)
-    assert (facts["kind"], facts["gaussians"], len(facts["maps"])) == ("material", 20, 3)
+    assert (facts["kind"], facts["gaussians"], len(facts["maps"])) == ("material", 8, 3)
     result = run("render", target, "-o", tmp_path / "n.png", "--map", "normal", "--quiet")
     assert result.exit_code == 0, result.output
 

@@ -65,12 +65,13 @@ def test_a_fit_has_unit_normals_and_its_file_too(tmp_path):
     result = eg.fit(bumps(), 60, iterations=10, color="normal")
     np.testing.assert_allclose(lengths(result.image), 1, atol=1e-5)
     assert result.trace[-1]["psnr_ycbcr"] > 30
-    result.gaussians.save(tmp_path / "n.npz")
-    eg.pack(result.gaussians, tmp_path / "n.egs", bumps())
+    few = result.gaussians[:8]
+    few.save(tmp_path / "n.npz")
+    eg.pack(few, tmp_path / "n.egs")
     for name, loss in (("n.npz", 1e-5), ("n.egs", 0.1)):
         loaded = eg.Gaussians.load(tmp_path / name)
         assert loaded.space == "normal"
-        np.testing.assert_allclose(eg.render(loaded).numpy(), result.image, atol=loss)
+        np.testing.assert_allclose(eg.render(loaded), eg.render(few), atol=loss)
 
 
 def test_what_is_no_normal_map():
