@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from eigengs_dr.backend.recording import without_collector
+from eigengs_dr.image.color import rendered_as
 from eigengs_dr.raster.layout import pack_parameters
 from eigengs_dr.raster.lookup.footprint import bound_covariance
 from eigengs_dr.raster.lookup.points import (
@@ -33,7 +34,7 @@ from eigengs_dr.raster.render import decode_parameters
 from .cone import metric
 from .properties import affine, angle, cutoff, raw, source_of, wrap_mode
 from .spectrum import upload_table, upsample
-from .values import is_shown, keep_finite, luminance, show, slope_of
+from .values import is_shown, keep_finite, luminance, show_all, slope_of
 
 SURVEY = 128
 """Points along a side of the grid of brightness, for sampling of emission and for the mean."""
@@ -59,7 +60,10 @@ def gaussian_texture() -> type:
         Properties
         ----------
         filename : str
-            Path of a set from ``eigengs-dr fit`` or `Gaussians.save`.
+            Path of a set from ``eigengs-dr fit`` or `Gaussians.save`, or of a material. Textures
+            of one file share the memory of means, shapes and lists until one of them changes.
+        map : str
+            With the `filename` of a material: the name of the map, such as "roughness".
         first : int
             With `filename`: number of Gaussians to use, from the first. Any number works for
             level-of-detail sets. By default all.
@@ -117,9 +121,13 @@ def gaussian_texture() -> type:
             size = (self.width, self.height)
             radius = kernel_radius(self.cutoff)
             side = cell_side(*size, dr.width(shape))
-            cells = list_cells(shape, *size, radius, side)
+            listed = self.source.listed
+            cells = listed(("cells", radius), lambda: list_cells(shape, *size, radius, side))
             if self.angle:
-                self.sizes = classify_by_size(shape, *size, self.cutoff, self.wrap)
+                self.sizes = listed(
+                    ("sizes", self.cutoff, self.wrap),
+                    lambda: classify_by_size(shape, *size, self.cutoff, self.wrap),
+                )
             self.cells = cells
 
         # --- Lookups -----------------------------------------------------------------------------
@@ -131,7 +139,7 @@ def gaussian_texture() -> type:
                 return mi.UnpolarizedSpectrum(luminance(color))
             if not mi.is_spectral:
                 return mi.Color3f(*color)
-            if self.raw or self.space == "data":
+            if self.raw or rendered_as(self.space) is None:
                 raise ValueError(
                     f"{_name(self)}: a spectral variant needs colours for a reflectance or "
                     "radiance, not raw data; use a set in a colour space, and raw = false"
@@ -178,7 +186,7 @@ def gaussian_texture() -> type:
                     self.cells, self.packed, number, x, y, active, terms, self.channels
                 )
             sums = [s + b for s, b in zip(sums, self.background, strict=True)]
-            return [dr.select(active, show(self, s), 0) for s in sums]
+            return [dr.select(active, s, 0) for s in show_all(self, sums)]
 
         def _filtered(self, si: Any, column: tuple, row: tuple, active: Any) -> list:
             """Average the texture over the footprint around a point, given as by `fold`."""

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.image.color import UNBOUNDED, to_linear
+from eigengs_dr.image.normals import unit_codes
 from eigengs_dr.image.radiance import LOG_SLOPE, from_log
 
 
@@ -25,6 +26,13 @@ def show(texture: Any, value: Any) -> Any:
         return dr.replace_grad(dr.maximum(value, 0), value)
     value = dr.replace_grad(dr.clip(value, 0, 1), value)
     return to_linear(value) if texture.space in ("ycbcr", "rgb") else value
+
+
+def show_all(texture: Any, values: list) -> list:
+    """Apply `show` to all channels; normals get the length 1 instead, unless raw."""
+    if texture.space == "normal" and not texture.raw:
+        return unit_codes(values)
+    return [show(texture, value) for value in values]
 
 
 def slope_of(texture: Any, value: Any) -> Any:
