@@ -230,7 +230,7 @@ def _summary(record: Record, preview: Path | None) -> str:
         "in {seconds:.1f} s ({seconds_total:.1f} s with loading)".format(**record)
     ]
     lines += [
-        "  {name}: {channels} channels in {space}, psnr_rgb {psnr_rgb:.2f} dB".format(**m)
+        "  {name} in {space} (channels: {channels}), psnr_rgb {psnr_rgb:.2f} dB".format(**m)
         for m in record["maps"]
     ]
     lines.append(f"  mean psnr_rgb {record['psnr_rgb']:.2f} dB\n  wrote {record['output']}")

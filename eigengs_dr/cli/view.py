@@ -21,6 +21,7 @@ SUFFIXES = (".html", ".htm")
     "--image", type=EXISTING, help="The photo, to compare with; a model encodes it and moves it."
 )
 @encoding_option
+@click.option("--map", "name", metavar="NAME", help="The map of a material to show.")
 @click.option(
     "--levels",
     type=click.IntRange(min=1),
@@ -35,6 +36,7 @@ def view(
     output: Path | None,
     image: Path | None,
     encoding: str | None,
+    name: str | None,
     levels: int | None,
     opens: bool,
     backend: str | None,
@@ -52,17 +54,19 @@ def view(
       eigengs-dr view photo.npz --open
       eigengs-dr view photo.npz --image photo.jpg -o photo.html
       eigengs-dr view levels.npz --levels 4
+      eigengs-dr view bark.npz --map roughness
       eigengs-dr view natural --image photo.jpg -o natural.html
     """
     [page] = name_outputs([file], output, SUFFIXES)
     check_outputs([page], [file, *([image] if image else [])])
     select(backend)
+    from ..image.color import rendered_as
     from ..image.io import load_image
     from ..viewer.view import view as make_page
 
-    source, counts = _load(file, levels, backend)
-    data = getattr(source, "space", None) == "data"
-    pixels = load_image(image, data, encoding) if image else None
+    source, counts = _load(file, name, levels, backend)
+    grey = rendered_as(getattr(source, "space", "rgb")) is None
+    pixels = load_image(image, grey, encoding) if image else None
     try:
         made = make_page(source, pixels, levels=counts, title=file.stem)
     except ValueError as error:
@@ -74,7 +78,9 @@ def view(
         click.launch(str(page))
 
 
-def _load(file: Path, levels: int | None, backend: str | None) -> tuple[Any, list[int]]:
+def _load(
+    file: Path, name: str | None, levels: int | None, backend: str | None
+) -> tuple[Any, list[int]]:
     """Return the set or the model of a file or a name, and the Gaussians up to each level."""
     from itertools import accumulate
 
@@ -83,25 +89,43 @@ def _load(file: Path, levels: int | None, backend: str | None) -> tuple[Any, lis
     from ..eigenbasis.eigengs import EigenGS
     from ..eigenbasis.registry import SHIPPED
     from ..fitting.levels import level_counts
-    from ..gaussian import file as set_file
-    from ..gaussian.gaussians import Gaussians
+    from ..material.file import holds_material
     from ..storage import npz
-    from ..viewer.set_facts import check_count
 
     file = SHIPPED.get(str(file), file)
     packed = egs.is_egs(file)
     if not packed and npz.format_of(file) == model_file.FORMAT:
-        if levels is not None:
-            raise ValueError(f"{file}: is a model, which has no levels; leave --levels out")
+        for option, value in (("--levels", levels), ("--map", name)):
+            if value is not None:
+                raise ValueError(f"{file}: is a model; leave {option} out")
         return EigenGS.load(file, backend), []
+    gaussians = _load_set(file, name, packed, backend)
     try:
-        if not packed:
-            check_count(set_file.read_head(file).gaussians)
-        gaussians = Gaussians.load(file, backend)
         if levels is not None:
             return gaussians, level_counts(len(gaussians), levels)
     except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+    if not packed or holds_material(file):
+        return gaussians, []
+    sections = [len(section.cell) for section in egs.read(file).sections]
+    return gaussians, list(accumulate(sections)) if len(sections) > 1 else []
+
+
+def _load_set(file: Path, name: str | None, packed: bool, backend: str | None) -> Any:
+    """Return the set of an image, or of one map of a material; the file may be hostile."""
+    from ..gaussian import file as set_file
+    from ..gaussian.gaussians import Gaussians
+    from ..material import file as material_file
+    from ..viewer.set_facts import check_count
+
+    try:
+        if not packed:
+            material = material_file.holds_material(file)
+            check_count((material_file if material else set_file).read_head(file).gaussians)
+        data = material_file.read_set(file, name, "--map")
+    except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(str(file)) else f"{file}: {error}") from None
-    sections = [len(section.cell) for section in egs.read(file).sections] if packed else []
-    return gaussians, list(accumulate(sections)) if len(sections) > 1 else []
+    return Gaussians.from_arrays(
+        **data.arrays, size=data.size, space=data.space, backend=backend, cutoff=data.cutoff
+    )

@@ -42,7 +42,7 @@ def fitted(folder):
     settings = ("--gaussians", 8, "--iterations", 5)
     result = run("fit", *maps(folder), *files, *settings)
     assert result.exit_code == 0, result.output
-    assert "albedo: 3 channels in linear" in result.output
+    assert "albedo in linear (channels: 3)" in result.output
     return file
 
 

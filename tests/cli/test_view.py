@@ -6,6 +6,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.command import assert_refused, run, said
 from _helpers.families import small_model
+from _helpers.materials import material
 from _helpers.sets import random_scene
 
 
@@ -48,7 +49,24 @@ def test_shows_a_model(photo, tmp_path):
     small_model("llvm").save("model.npz")
     said("view", "model.npz", "--image", "photo.png")
     assert "Random image" in (tmp_path / "model.html").read_text(encoding="utf-8")
-    assert_refused(run("view", "model.npz", "--levels", 2), "model.npz", "has no levels")
+    assert_refused(run("view", "model.npz", "--levels", 2), "model.npz", "leave --levels out")
+
+
+def test_shows_a_map_of_a_material(photo, tmp_path):
+    """As its own set would be shown: normals have the length 1 after the sum."""
+    bark = material(backend="llvm")
+    bark.save("bark.npz")
+    bark["normal"].save("normal.npz")
+    for name, options in (("bark", ("--map", "normal")), ("normal", ())):
+        said("view", f"{name}.npz", *options, "-o", f"{name}.html")
+    pages = [
+        (tmp_path / f"{name}.html").read_text(encoding="utf-8").replace("bark", "normal")
+        for name in ("bark", "normal")
+    ]
+    assert pages[0] == pages[1]
+    assert_refused(run("view", "bark.npz"), "bark.npz", "albedo, roughness, normal", "--map")
+    assert_refused(run("view", "bark.npz", "--map", "gloss"), "'gloss' is not in it")
+    assert_refused(run("view", photo, "--map", "normal"), "photo.npz", "no maps")
 
 
 def test_opens_the_page(photo, monkeypatch):
