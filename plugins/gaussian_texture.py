@@ -31,9 +31,11 @@ from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
 from eigengs_dr.raster.render import decode_parameters
 
 from .cone import metric
-from .properties import affine, angle, cutoff, raw, source_of, wrap_mode
+from .properties import angle, cutoff, raw, source_of, wrap_mode
 from .spectrum import upload_table, upsample
+from .transform import prepare, read_transform
 from .values import is_shown, keep_finite, luminance, show, slope_of
+from .versions import texture_class
 
 SURVEY = 128
 """Points along a side of the grid of brightness, for sampling of emission and for the mean."""
@@ -50,7 +52,7 @@ def gaussian_texture() -> type:
     if mi.variant().startswith("scalar"):
         return _Refusal
 
-    class GaussianTexture(mi.Texture):
+    class GaussianTexture(texture_class()):  # type: ignore[misc]
         """A sum of Gaussians over uv, ``(u, v) = (x / width, y / height)``, row 0 at v = 0.
 
         The Gaussians come from `filename`, from `model`, or from the arrays of a set, as
@@ -86,7 +88,7 @@ def gaussian_texture() -> type:
             self.cutoff = cutoff(props, self.source.start.cutoff)
             self.angle = angle(props)
             self.wrap = wrap_mode(props)
-            self.to_uv, self.from_uv = affine(props)
+            self.to_uv = read_transform(props)
             self.width, self.height = self.source.start.width, self.source.start.height
             self.space, self.channels = self.source.start.space, self.source.start.channels
             self.spectra = upload_table() if mi.is_spectral else None
@@ -94,8 +96,10 @@ def gaussian_texture() -> type:
 
         def traverse(self, callback: Any) -> None:
             self.source.put(callback)
+            callback.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
 
         def parameters_changed(self, keys: list[str]) -> None:
+            self.transform = prepare(self.to_uv)
             gaussians = self.source.gaussians()
             parameters = decode_parameters(gaussians)
             shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
@@ -163,8 +167,7 @@ def gaussian_texture() -> type:
             du = luminance([s * k for s, k in zip(slope, sums[1::3], strict=True)])
             dv = luminance([s * k for s, k in zip(slope, sums[2::3], strict=True)])
             du, dv = du * sx * self.width, dv * sy * self.height
-            (a, b, _), (c, d, _) = self.to_uv
-            return mi.Vector2f(a * du + c * dv, b * du + d * dv)
+            return mi.Vector2f(*self.transform.pull_back(du, dv))
 
         def _color(self, si: Any, active: Any) -> list:
             """Look up the channels, decoded and clamped unless `raw`."""
@@ -189,7 +192,7 @@ def gaussian_texture() -> type:
             if self.wrap == "clamp":  # a footprint without width would count half on a border
                 x = dr.clip(x, INSIDE, self.width - INSIDE)
                 y = dr.clip(y, INSIDE, self.height - INSIDE)
-            inverse, valid = metric(si, self.from_uv, self.angle)
+            inverse, valid = metric(si, self.transform.inverse, self.angle)
             unit, blind = bound_covariance(inverse)
             sizes = (sx * sx, sx * sy, sy * sy)
             footprint = [dr.select(valid, f * s, 0) for f, s in zip(unit, sizes, strict=True)]
@@ -211,9 +214,7 @@ def gaussian_texture() -> type:
 
         def _point(self, si: Any, active: Any) -> tuple:
             """Fold uv into the image: x, y in pixels with their slopes, active if uv is finite."""
-            (a, b, tu), (c, d, tv) = self.to_uv
-            u = a * si.uv.x + b * si.uv.y + tu
-            v = c * si.uv.x + d * si.uv.y + tv
+            u, v = self.transform.apply(si.uv)
             active = mi.Bool(active) & dr.isfinite(u) & dr.isfinite(v)
             x = fold(u * self.width, self.width, self.wrap)
             y = fold(v * self.height, self.height, self.wrap)

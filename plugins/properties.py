@@ -138,17 +138,3 @@ def wrap_mode(props: Any) -> str:
             f"gaussian_texture: wrap_mode {wrap!r} is unknown; use one of {', '.join(WRAPS)}"
         )
     return wrap
-
-
-def affine(props: Any) -> tuple[tuple, tuple]:
-    """Read ``to_uv``: return its rows (m00, m01, translation) and its linear part's inverse."""
-    transform = props["to_uv"] if "to_uv" in props else mi.ScalarTransform4f()
-    if not hasattr(transform, "matrix"):
-        raise ValueError(f"gaussian_texture: to_uv is {transform!r}; it must be a transform")
-    matrix = np.array(transform.matrix, np.float64)
-    linear = matrix[:2, :2]
-    area, size = abs(np.linalg.det(linear)), np.square(linear).sum()
-    if not (np.isfinite(matrix).all() and area > 1e-9 * size):
-        raise ValueError("gaussian_texture: to_uv maps the plane to a line; it must be invertible")
-    rows = [[*row[:2], row[-1]] for row in matrix[:2].tolist()]
-    return (tuple(rows[0]), tuple(rows[1])), tuple(np.linalg.inv(linear).ravel().tolist())
