@@ -11,7 +11,6 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from eigengs_dr.backend.recording import without_collector
 from eigengs_dr.raster.layout import pack_parameters
@@ -31,17 +30,13 @@ from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
 from eigengs_dr.raster.render import decode_parameters
 
 from .cone import metric
-from .properties import angle, cutoff, raw, source_of, wrap_mode
-from .spectrum import upload_table, upsample
+from .emission import emission_of
+from .properties import angle, cutoff, file_name, raw, source_of, wrap_mode
+from .spectrum import STEP, upload_table, upsample
+from .survey import make_survey, outside_of_recordings
 from .transform import prepare, read_transform
 from .values import is_shown, keep_finite, luminance, show, slope_of
 from .versions import texture_class
-
-SURVEY = 128
-"""Points along a side of the grid of brightness, for sampling of emission and for the mean."""
-
-DARKEST = 0.02
-"""Smallest density of sampled positions, relative to the mean."""
 
 INSIDE = 0.01
 """Distance in pixels of clamped points from the border."""
@@ -84,6 +79,7 @@ def gaussian_texture() -> type:
         def __init__(self, props: Any) -> None:
             super().__init__(props)
             self.source = source_of(props)
+            self.file = file_name(props)
             self.raw = raw(props)
             self.cutoff = cutoff(props, self.source.start.cutoff)
             self.angle = angle(props)
@@ -114,7 +110,7 @@ def gaussian_texture() -> type:
                 self.pyramid = build_pyramid(self.sizes, self.packed, number, self.cutoff)
                 self.average = pyramid_mean(self.pyramid)
                 dr.eval(self.average)
-            self._survey()
+            self.survey = self.emission = None
 
         def _list(self, shape: list) -> None:
             """List the Gaussians near every cell."""
@@ -224,15 +220,11 @@ def gaussian_texture() -> type:
 
         @without_collector
         def sample_position(self, sample: Any, active: Any = True) -> tuple:
-            cell, density, rest = self._sampled().sample(sample, active)
-            return mi.Point2f((mi.Point2f(cell) + rest) / SURVEY), density * SURVEY**2
+            return self._emission().sample(sample, active)
 
         @without_collector
         def pdf_position(self, p: Any, active: Any = True) -> Any:
-            inside = (p.x >= 0) & (p.x <= 1) & (p.y >= 0) & (p.y <= 1)
-            cell = dr.minimum(mi.Point2u(dr.select(inside, p, 0) * SURVEY), SURVEY - 1)
-            density = self._sampled().pdf(cell, active) * SURVEY**2
-            return dr.select(inside, density, 0)
+            return self._emission().density(p, active)
 
         @without_collector
         def sample_spectrum(self, si: Any, sample: Any, active: Any = True) -> tuple:
@@ -243,30 +235,32 @@ def gaussian_texture() -> type:
             si.wavelengths = mi.MI_CIE_MIN + width * sample
             return si.wavelengths, self.eval(si, active) * width
 
+        def pdf_spectrum(self, si: Any, active: Any = True) -> Any:
+            if not mi.is_spectral:
+                return mi.Color0f()
+            inside = (si.wavelengths >= mi.MI_CIE_MIN) & (si.wavelengths <= mi.MI_CIE_MAX)
+            return dr.select(inside & active, 1 / (mi.MI_CIE_MAX - mi.MI_CIE_MIN), 0)
+
+        def spectral_resolution(self) -> float:
+            return STEP
+
         def mean(self) -> Any:
-            return mi.Float(float(self.brightness.numpy().mean()))
+            return self._surveyed().mean
 
         def max(self) -> float:
-            return float(self.brightness.numpy().max())
+            return float(self._surveyed().largest[0])
 
-        def _survey(self) -> None:
-            """Evaluate brightness on a grid over uv now, since lookups during a render cannot."""
-            with dr.suspend_grad():
-                i = dr.arange(mi.UInt32, SURVEY**2)
-                si = dr.zeros(mi.SurfaceInteraction3f, SURVEY**2)
-                si.uv = (mi.Point2f(i % SURVEY, i // SURVEY) + 0.5) / SURVEY
-                self.brightness = luminance(self._color(si, mi.Bool(True)))
-                dr.eval(self.brightness)
-            self.distribution = None
+        def _surveyed(self) -> Any:
+            """Return the survey of the brightness; the first call after a change makes it."""
+            if self.survey is None:
+                self.survey = outside_of_recordings(lambda: make_survey(self))
+            return self.survey
 
-        def _sampled(self) -> Any:
-            """Return the distribution of emission over uv; the first call makes it."""
-            if self.distribution is None:
-                density = self.brightness.numpy().reshape(SURVEY, SURVEY)
-                density = np.maximum(density, 0)
-                floor = DARKEST * density.mean() or 1.0
-                self.distribution = mi.DiscreteDistribution2D(np.maximum(density, floor))
-            return self.distribution
+        def _emission(self) -> Any:
+            """Return the distribution of emission; the first call after a change makes it."""
+            if self.emission is None:
+                self.emission = emission_of(self._surveyed())
+            return self.emission
 
         # --- Description -------------------------------------------------------------------------
 
@@ -277,11 +271,15 @@ def gaussian_texture() -> type:
             return True
 
         def to_string(self) -> str:
+            transform = str(self.to_uv).replace("\n", "\n  ")
             return (
-                f"GaussianTexture[\n  gaussians = {len(self.source.start)},\n  resolution = "
-                f"[{self.width}, {self.height}],\n  space = {self.space},\n  raw = {self.raw},\n"
+                f'GaussianTexture[\n  name = "{self.file}",\n'
+                f"  gaussians = {len(self.source.start)},\n"
+                f"  resolution = [{self.width}, {self.height}],\n"
+                f"  space = {self.space},\n  raw = {int(self.raw)},\n"
                 f"  wrap_mode = {self.wrap},\n  prefilter = {self.angle:g},\n"
-                f"  cutoff = {self.cutoff:g}\n]"
+                f"  cutoff = {self.cutoff:g},\n  mean = {self.mean()},\n"
+                f"  transform = {transform}\n]"
             )
 
     return GaussianTexture

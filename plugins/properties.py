@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -92,6 +93,11 @@ def _from_arrays(props: Any, backend: str) -> Gaussians:
 def _path(props: Any, key: str) -> str:
     """Return the path of a file by Mitsuba's resolver, which also looks beside the scene."""
     return str(mi.file_resolver().resolve(props[key]))
+
+
+def file_name(props: Any) -> str:
+    """Return the name of the file of the Gaussians, without folders; "" if there is no file."""
+    return next((Path(props[key]).name for key in ("filename", "model") if key in props), "")
 
 
 def raw(props: Any) -> bool:

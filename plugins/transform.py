@@ -59,7 +59,9 @@ def read_transform(props: Any) -> Any:
     ValueError
         If it is no transform, or several at once.
     """
-    transform = props["to_uv"] if "to_uv" in props else mi.ScalarTransform3f()
+    if "to_uv" not in props:
+        return mi.ScalarTransform3f()
+    transform = props["to_uv"]
     if not hasattr(transform, "matrix"):
         raise ValueError(f"gaussian_texture: to_uv is {transform!r}; it must be a transform")
     matrix = np.array(transform.matrix, np.float64)

@@ -22,7 +22,7 @@ SIDE, SPP, SEED = 12, 32, 3
 
 def of_texture(scene):
     parameters = mi.traverse(scene)
-    parameters.keep([f"{TEXTURE}\\.{name}" for name in PARAMETERS])
+    parameters.keep(f"{TEXTURE}\\.(?!to_uv)")
     return parameters
 
 
