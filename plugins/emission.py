@@ -15,8 +15,9 @@ import numpy as np
 
 from .survey import Survey
 
-DARKEST = 0.02
-"""Smallest density of a cell, relative to the mean: light may lie beside its centre."""
+DARKEST = 0.005
+"""Smallest density of a cell, relative to the mean: light may lie beside its centre. With 0.02, the
+share of samples in the dark alone makes the noise of small lamps 14 %."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,7 @@ class Emission:
         """Return the density at positions; 0 outside of the unit square."""
         inside = (p.x >= 0) & (p.x <= 1) & (p.y >= 0) & (p.y <= 1)
         x, y = (
-            dr.select(inside, v, 0) * n - 0.5
-            for v, n in ((p.x, self.columns), (p.y, self.rows))
+            dr.select(inside, v, 0) * n - 0.5 for v, n in ((p.x, self.columns), (p.y, self.rows))
         )
         left, top = dr.floor(x), dr.floor(y)
         across, down = x - left, y - top

@@ -110,7 +110,10 @@ def gaussian_texture() -> type:
                 self.pyramid = build_pyramid(self.sizes, self.packed, number, self.cutoff)
                 self.average = pyramid_mean(self.pyramid)
                 dr.eval(self.average)
+            sampled = getattr(self, "emission", None) is not None
             self.survey = self.emission = None
+            if sampled:  # a frozen rendering cannot make it
+                self._emission()
 
         def _list(self, shape: list) -> None:
             """List the Gaussians near every cell."""

@@ -100,9 +100,7 @@ def make_survey(texture: Any) -> Survey:
             for c, side in ((u, texture.width), (v, texture.height))
         )
         terms = value_terms(radius)
-        sums = sum_at_points(
-            cells, packed, number, x, y, mi.Bool(True), terms, texture.channels
-        )
+        sums = sum_at_points(cells, packed, number, x, y, mi.Bool(True), terms, texture.channels)
         seen = [show(texture, s + b) for s, b in zip(sums, texture.background, strict=True)]
         light = brightness(texture, seen) + dr.zeros(mi.Float, columns * lines)
         dr.eval(light)
