@@ -14,7 +14,6 @@ import mitsuba as mi
 
 from eigengs_dr.backend.recording import without_collector
 from eigengs_dr.raster.layout import pack_parameters
-from eigengs_dr.raster.lookup.footprint import bound_covariance
 from eigengs_dr.raster.lookup.points import (
     cell_side,
     fold,
@@ -23,23 +22,19 @@ from eigengs_dr.raster.lookup.points import (
     sum_at_points,
     value_terms,
 )
-from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
-from eigengs_dr.raster.lookup.pyramid import build_pyramid, is_minified, pyramid_mean, sum_pyramid
+from eigengs_dr.raster.lookup.pyramid import build_pyramid, pyramid_mean
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
 from eigengs_dr.raster.render import decode_parameters
 
-from .cone import metric
 from .emission import emission_of
-from .properties import angle, cutoff, file_name, raw, source_of, wrap_mode
+from .filtered import sum_over_footprint
+from .properties import cutoff, file_name, prefilter, raw, source_of, wrap_mode
 from .spectrum import STEP, upload_table, upsample
 from .survey import make_survey, outside_of_recordings
 from .transform import prepare, read_transform
 from .values import is_shown, keep_finite, luminance, show, slope_of
 from .versions import texture_class
-
-INSIDE = 0.01
-"""Distance in pixels of clamped points from the border."""
 
 
 def gaussian_texture() -> type:
@@ -68,10 +63,11 @@ def gaussian_texture() -> type:
             Continuation of the texture outside of its borders; by default "repeat".
         raw : bool
             Return values without decoding and clamping; by default false.
-        prefilter : float
+        prefilter : float or bool
             Angle of a pixel in radians, at least 0 and below 1, see
             `eigengs_dr.plugins.pixel_angle`. Lookups average over the footprint of the pixel; 0,
-            the default, looks at points. Slopes of bump maps (`eval_1_grad`) ignore the footprint.
+            the default, looks at points. Footprints that rays carry (Mitsuba 3.10) go before the
+            angle, and true takes them alone. Slopes of bump maps (`eval_1_grad`) ignore footprints.
         cutoff : float
             Radius of a Gaussian in standard deviations; by default the cutoff of the set.
         """
@@ -82,7 +78,7 @@ def gaussian_texture() -> type:
             self.file = file_name(props)
             self.raw = raw(props)
             self.cutoff = cutoff(props, self.source.start.cutoff)
-            self.angle = angle(props)
+            self.angle, self.follows = prefilter(props)
             self.wrap = wrap_mode(props)
             self.to_uv = read_transform(props)
             self.width, self.height = self.source.start.width, self.source.start.height
@@ -105,13 +101,14 @@ def gaussian_texture() -> type:
             self.background = [keep_finite(b) for b in parameters.background]
             self.packed = pack_parameters([*shape, *color])
             dr.eval(self.packed, self.background)
-            if self.angle:
+            if self.filtered():
                 number = NUM_SHAPE_PARAMS + self.channels
                 self.pyramid = build_pyramid(self.sizes, self.packed, number, self.cutoff)
                 self.average = pyramid_mean(self.pyramid)
                 dr.eval(self.average)
             sampled = getattr(self, "emission", None) is not None
-            self.survey = self.emission = None
+            self.survey: Any = None
+            self.emission: Any = None
             if sampled:  # a frozen rendering cannot make it
                 self._emission()
 
@@ -121,7 +118,7 @@ def gaussian_texture() -> type:
             radius = kernel_radius(self.cutoff)
             side = cell_side(*size, dr.width(shape))
             cells = list_cells(shape, *size, radius, side)
-            if self.angle:
+            if self.filtered():
                 self.sizes = classify_by_size(shape, *size, self.cutoff, self.wrap)
             self.cells = cells
 
@@ -171,8 +168,8 @@ def gaussian_texture() -> type:
         def _color(self, si: Any, active: Any) -> list:
             """Look up the channels, decoded and clamped unless `raw`."""
             (x, sx), (y, sy), active = self._point(si, active)
-            if self.angle:
-                sums = self._filtered(si, (x, sx), (y, sy), active)
+            if self.filtered():
+                sums = sum_over_footprint(self, si, (x, sx), (y, sy), active)
             else:
                 number = NUM_SHAPE_PARAMS + self.channels
                 terms = value_terms(kernel_radius(self.cutoff))
@@ -181,35 +178,6 @@ def gaussian_texture() -> type:
                 )
             sums = [s + b for s, b in zip(sums, self.background, strict=True)]
             return [dr.select(active, show(self, s), 0) for s in sums]
-
-        def _filtered(self, si: Any, column: tuple, row: tuple, active: Any) -> list:
-            """Average the texture over the footprint around a point, given as by `fold`."""
-            # The slopes of `fold` turn a footprint in mirrored images. They also take away its
-            # width along an axis on which the point lies outside of a clamped image.
-            (x, sx), (y, sy) = column, row
-            sx, sy = sx * self.width, sy * self.height
-            if self.wrap == "clamp":  # a footprint without width would count half on a border
-                x = dr.clip(x, INSIDE, self.width - INSIDE)
-                y = dr.clip(y, INSIDE, self.height - INSIDE)
-            inverse, valid = metric(si, self.transform.inverse, self.angle)
-            unit, blind = bound_covariance(inverse)
-            sizes = (sx * sx, sx * sy, sy * sy)
-            footprint = [dr.select(valid, f * s, 0) for f, s in zip(unit, sizes, strict=True)]
-            blind &= valid & (sx * sy != 0)
-            distant = is_minified(self.pyramid, footprint)
-            near = sum_prefiltered(
-                self.sizes,
-                self.packed,
-                NUM_SHAPE_PARAMS + self.channels,
-                x,
-                y,
-                footprint,
-                active & ~distant,
-                self.cutoff,
-            )
-            far = sum_pyramid(self.pyramid, x, y, footprint, active & distant & ~blind)
-            seen = [dr.select(distant, f, n) for f, n in zip(far, near, strict=True)]
-            return [dr.select(blind, m, s) for m, s in zip(self.average, seen, strict=True)]
 
         def _point(self, si: Any, active: Any) -> tuple:
             """Fold uv into the image: x, y in pixels with their slopes, active if uv is finite."""
@@ -270,17 +238,22 @@ def gaussian_texture() -> type:
         def resolution(self) -> Any:
             return mi.ScalarVector2i(self.width, self.height)
 
+        def filtered(self) -> bool:
+            """Return whether lookups average over a footprint; Mitsuba 3.10 asks."""
+            return self.follows or self.angle > 0
+
         def is_spatially_varying(self) -> bool:
             return True
 
         def to_string(self) -> str:
+            angle = "true" if self.follows else f"{self.angle:g}"
             transform = str(self.to_uv).replace("\n", "\n  ")
             return (
                 f'GaussianTexture[\n  name = "{self.file}",\n'
                 f"  gaussians = {len(self.source.start)},\n"
                 f"  resolution = [{self.width}, {self.height}],\n"
                 f"  space = {self.space},\n  raw = {int(self.raw)},\n"
-                f"  wrap_mode = {self.wrap},\n  prefilter = {self.angle:g},\n"
+                f"  wrap_mode = {self.wrap},\n  prefilter = {angle},\n"
                 f"  cutoff = {self.cutoff:g},\n  mean = {self.mean()},\n"
                 f"  transform = {transform}\n]"
             )

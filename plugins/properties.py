@@ -15,6 +15,7 @@ from eigengs_dr.gaussian.tensors import FIELDS
 from eigengs_dr.image.color import SPACES
 
 from .parameters import FromModel, FromSet
+from .versions import has_footprints
 
 WRAPS = ("repeat", "mirror", "clamp")
 """Names of the ways to continue an image outside of its borders."""
@@ -125,15 +126,29 @@ def cutoff(props: Any, default: float) -> float:
     return value
 
 
-def angle(props: Any) -> float:
-    """Read ``prefilter``: the angle of a pixel in radians, or 0 for lookups at points."""
+def prefilter(props: Any) -> tuple[float, bool]:
+    """Read ``prefilter``: the angle of a pixel in radians, or 0 for lookups at points.
+
+    Returns
+    -------
+    angle : float
+    follows : bool
+        Whether the footprints of rays alone decide: ``true``.
+    """
+    if props.get("prefilter", 0.0) is True:
+        if not has_footprints():
+            raise ValueError(
+                "gaussian_texture: prefilter = true needs Mitsuba 3.10, and this is "
+                f"{mi.__version__}; give the angle of a pixel in radians, see pixel_angle"
+            )
+        return 0.0, True
     value = _number(props, "prefilter", 0.0)
     if not 0 <= value < 1:
         raise ValueError(
             f"gaussian_texture: prefilter is {value}; it is the angle of a pixel in radians, "
             "at least 0 and below 1"
         )
-    return value
+    return value, False
 
 
 def wrap_mode(props: Any) -> str:

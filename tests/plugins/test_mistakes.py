@@ -36,7 +36,8 @@ class TestMistakes:
             ({"space": "cmyk"}, "space 'cmyk'"),
             ({"raw": "false"}, "raw is 'false'; it must be a boolean"),
             ({"cutoff": "wide"}, "cutoff is 'wide'; it must be a number"),
-            ({"prefilter": True}, "prefilter is True; it must be a number"),
+            ({"prefilter": True}, "prefilter = true needs Mitsuba 3.10, and this is 3.9"),
+            ({"prefilter": False}, "prefilter is False; it must be a number"),
             ({"width": 31.5}, "width is 31.5; it must be an integer"),
         ],
     )
