@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from eigengs_dr.backend.arithmetic import rcp
 
-from .versions import footprint_of
+from .versions import footprint_of, has_footprints
 
 PIXEL = 0.4
 """Standard deviation of a footprint in pixels. The random positions of samples in a pixel already
@@ -49,6 +49,12 @@ def pixel_angle(sensor: Any) -> float:
         )
     fov = math.radians(float(dr.slice(parameters["x_fov"])))
     return 2 * math.tan(fov / 2) / sensor.film().size()[0]
+
+
+def footprint_inputs() -> tuple[str, ...]:
+    """Return the attributes of a surface interaction from which `seen_metric` finds a footprint."""
+    own = ("footprint",) if has_footprints() else ()
+    return ("t", "wi", "sh_frame", "dp_du", "dp_dv", *own)
 
 
 def seen_metric(si: Any, inverse: tuple, angle: float) -> tuple[list, Any]:

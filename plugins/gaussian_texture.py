@@ -14,22 +14,26 @@ import mitsuba as mi
 
 from eigengs_dr.backend.recording import without_collector
 from eigengs_dr.raster.layout import pack_parameters
+from eigengs_dr.raster.lookup.coarsen import build_pyramid
 from eigengs_dr.raster.lookup.points import (
     cell_side,
     fold,
     gradient_terms,
+    in_list_order,
     list_cells,
     sum_at_points,
-    value_terms,
 )
-from eigengs_dr.raster.lookup.pyramid import build_pyramid, pyramid_mean
+from eigengs_dr.raster.lookup.pyramid import pyramid_mean
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
+from eigengs_dr.raster.lookup.widened import arrange
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
 from eigengs_dr.raster.render import decode_parameters
 
+from .cone import footprint_inputs
 from .emission import emission_of
-from .filtered import sum_over_footprint
+from .lookup import sum_here, sum_over_footprint
 from .properties import cutoff, file_name, prefilter, raw, source_of, wrap_mode
+from .reuse import reused
 from .spectrum import STEP, upload_table, upsample
 from .survey import make_survey, outside_of_recordings
 from .transform import prepare, read_transform
@@ -79,6 +83,7 @@ def gaussian_texture() -> type:
             self.raw = raw(props)
             self.cutoff = cutoff(props, self.source.start.cutoff)
             self.angle, self.follows = prefilter(props)
+            self.inputs = ("uv", *(footprint_inputs() if self.filtered() else ()))
             self.wrap = wrap_mode(props)
             self.to_uv = read_transform(props)
             self.width, self.height = self.source.start.width, self.source.start.height
@@ -100,7 +105,11 @@ def gaussian_texture() -> type:
                 self._list([dr.detach(s) for s in shape])
             self.background = [keep_finite(b) for b in parameters.background]
             self.packed = pack_parameters([*shape, *color])
-            dr.eval(self.packed, self.background)
+            if self.filtered():
+                self.arranged = arrange(self.sizes.listed[0][1].splat, shape, color)
+            else:
+                self.arranged = in_list_order(self.cells.splat, [*shape, *color])
+            dr.eval(self.packed, self.background, self.arranged)
             if self.filtered():
                 number = NUM_SHAPE_PARAMS + self.channels
                 self.pyramid = build_pyramid(self.sizes, self.packed, number, self.cutoff)
@@ -167,17 +176,18 @@ def gaussian_texture() -> type:
 
         def _color(self, si: Any, active: Any) -> list:
             """Look up the channels, decoded and clamped unless `raw`."""
-            (x, sx), (y, sy), active = self._point(si, active)
+            color = reused(self, si, self.inputs, lambda: self._look_up(si))
+            return [dr.select(active, c, 0) for c in color]
+
+        def _look_up(self, si: Any) -> list:
+            """Look up the channels in all lanes; 0 where uv is not finite."""
+            (x, sx), (y, sy), valid = self._point(si, True)
             if self.filtered():
-                sums = sum_over_footprint(self, si, (x, sx), (y, sy), active)
+                sums = sum_over_footprint(self, si, (x, sx), (y, sy), valid)
             else:
-                number = NUM_SHAPE_PARAMS + self.channels
-                terms = value_terms(kernel_radius(self.cutoff))
-                sums = sum_at_points(
-                    self.cells, self.packed, number, x, y, active, terms, self.channels
-                )
+                sums = sum_here(self, x, y, valid)
             sums = [s + b for s, b in zip(sums, self.background, strict=True)]
-            return [dr.select(active, show(self, s), 0) for s in sums]
+            return [dr.select(valid, show(self, s), 0) for s in sums]
 
         def _point(self, si: Any, active: Any) -> tuple:
             """Fold uv into the image: x, y in pixels with their slopes, active if uv is finite."""

@@ -8,6 +8,7 @@ image, and the sum includes all copies of the image that the footprint reaches.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +20,9 @@ from ..evaluate import weights, widen
 from ..layout import gather_index, gather_run, unpack_parameters
 from ..parameters import NUM_SHAPE_PARAMS, kernel_covariance, kernel_radius
 from .footprint import inside_share
-from .points import sum_at_points
+from .points import cell_range, sum_range
 from .size_classes import SizeClasses
+from .widened import arranged_values, widened_values
 
 FOOTPRINT_REACH = 3.0
 """Half-width of a footprint, in standard deviations, in the search for copies of the image."""
@@ -35,6 +37,7 @@ def sum_prefiltered(
     footprint: list,
     active: Any,
     cutoff: float,
+    arranged: Any = None,
 ) -> list:
     """Sum the Gaussians under a footprint.
 
@@ -54,6 +57,8 @@ def sum_prefiltered(
     active : Bool
     cutoff : float
         Standard deviations.
+    arranged : Float, optional
+        From `arrange`, for lookups without gradients.
 
     Returns
     -------
@@ -69,30 +74,49 @@ def sum_prefiltered(
     inner = (x >= reach[0]) & (x + reach[0] <= sides[0])
     inner &= (y >= reach[1]) & (y + reach[1] <= sides[1])
     widest = dr.maximum(*reach) * (1 / FOOTPRINT_REACH)
-    terms = _widened_values(footprint, kernel_radius(cutoff))
-    total = [types.Float(0) for _ in range(number - NUM_SHAPE_PARAMS)]
+    channels = number - NUM_SHAPE_PARAMS
+    ends, others = (types.UInt(0), types.UInt(0)), active
     for spread, cells in sizes.listed:
-        small = active & inner & (widest <= spread)
-        part = sum_at_points(cells, packed, number, x, y, small, terms, len(total))
-        total = [t + p for t, p in zip(total, part, strict=True)]
-        active = active & ~small
+        small = others & inner & (widest <= spread)
+        found = cell_range(cells, x, y, small)
+        ends = tuple(dr.select(small, f, e) for f, e in zip(found, ends, strict=True))
+        others = others & ~small
+    radius = kernel_radius(cutoff)
+    terms = (widened_values if arranged is None else arranged_values)(footprint, radius)
+    splat = sizes.listed[0][1].splat
+    total = sum_range(splat, ends, packed, number, x, y, terms, channels, arranged)
     lookup = _Lookup(sizes, packed, number, cutoff, footprint)
     copies = [types.Int(dr.detach(v)) for v in (*first, *last)]
-    part = _sum_copies(lookup, x, y, copies, active)
+    part = where_any(others, lambda: _sum_copies(lookup, x, y, copies, others), channels, packed)
     return [t + p for t, p in zip(total, part, strict=True)]
 
 
-def _widened_values(footprint: list, radius: float) -> Any:
-    """Return the `terms` of `sum_at_points` for the filtered sum, without borders."""
-    scaled = kernel_covariance(footprint)
+def where_any(active: Any, compute: Callable[[], list], count: int, packed: Any) -> list:
+    """Return sums that few points need, and skip the work for packets of lanes without one.
 
-    def terms(splat: list, x: Any, y: Any) -> list:
-        shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], scaled)
-        (w,) = weights(shape, x, y, (1, 1), radius)
-        w = w * amplitude
-        return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
-
-    return terms
+    Parameters
+    ----------
+    active : Bool
+        The points that need the sums; the others get 0.
+    compute : callable
+        Returns the sums, a list of Float.
+    count : int
+        Length of this list.
+    packed : Float
+        Parameters. With gradients nothing is skipped: Dr.Jit cannot carry them out of the branch.
+    """
+    if dr.grad_enabled(packed):
+        return compute()
+    types = types_of(packed)
+    return list(
+        dr.if_stmt(
+            (),
+            active,
+            lambda: tuple(compute()),
+            lambda: tuple(types.Float(0) for _ in range(count)),
+            mode="symbolic",
+        )
+    )
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -22,7 +22,7 @@ CLASS_RATIO = 3.0
 """Ratio of the sizes of two classes. With a smaller ratio a lookup visits more rows of cells; with
 a larger ratio it visits more Gaussians that miss the footprint."""
 
-LISTED_FOOTPRINTS = (1.0, 4.0)
+LISTED_FOOTPRINTS = (0.4, 1.2, 4.0)
 """Standard deviations of the footprints for which cells list their Gaussians, in pixels; most
 lookups have such footprints."""
 
@@ -52,7 +52,8 @@ class SizeClasses:
         two zeros.
     listed : list of (float, Cells)
         Lists for footprints inside the image, of up to this standard deviation. They hold the
-        Gaussians widened by it, whose ellipses contain the ellipses for smaller footprints.
+        Gaussians widened by it, whose ellipses contain the ellipses for smaller footprints. All
+        have one array `splat`: lanes with footprints of several sizes then share a loop.
     """
 
     width: int
@@ -118,8 +119,21 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
         upload(types.UInt, splat.astype(np.uint32)),
         upload(types.UInt, np.asarray(starts, np.uint32)),
         upload(types.Float, np.asarray(table or np.zeros((1, 8)), np.float32).ravel()),
-        [(s, _cells_for(shape, width, height, cutoff, s)) for s in LISTED_FOOTPRINTS],
+        _listed([_cells_for(shape, width, height, cutoff, s) for s in LISTED_FOOTPRINTS]),
     )
+
+
+def _listed(levels: list[Cells]) -> list[tuple[float, Cells]]:
+    """Join the lists of several cells in one array."""
+    splat = dr.concat([cells.splat for cells in levels])
+    dr.eval(splat)
+    listed, first = [], 0
+    for spread, cells in zip(LISTED_FOOTPRINTS, levels, strict=True):
+        ends = cells.ends + dr.opaque(type(splat), first)
+        listed.append((spread, replace(cells, splat=splat, ends=ends)))
+        first += dr.width(cells.splat)
+    dr.eval(listed)
+    return listed
 
 
 def _cells_for(shape: list, width: int, height: int, cutoff: float, spread: float) -> Cells:

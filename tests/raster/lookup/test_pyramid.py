@@ -9,7 +9,8 @@ from _helpers.sets import SIZE, random_scene
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.raster.layout import pack_parameters
 from eigengs_dr.raster.lookup import pyramid as module
-from eigengs_dr.raster.lookup.pyramid import build_pyramid, is_minified, pyramid_mean, sum_pyramid
+from eigengs_dr.raster.lookup.coarsen import build_pyramid
+from eigengs_dr.raster.lookup.pyramid import is_minified, pyramid_mean, sum_pyramid
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS
 from eigengs_dr.raster.render import decode_parameters
