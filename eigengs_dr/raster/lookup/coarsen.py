@@ -18,8 +18,6 @@ from ..render import rasterize
 from ..rows import to_tensor
 from .prefilter import FOOTPRINT_REACH, sum_prefiltered
 from .pyramid import (
-    FEWEST,
-    FINEST,
     SAMPLE_DEVIATION,
     GaussianPyramid,
     Level,
@@ -27,6 +25,10 @@ from .pyramid import (
     sum_pyramid,
 )
 from .size_classes import SizeClasses
+
+FINEST, FEWEST = 1, 8
+"""Spacing of the points of the finest level, in pixels (the points are the pixels), and smallest
+number of points along the shorter side of the coarsest level."""
 
 
 def build_pyramid(sizes: SizeClasses, packed: Any, number: int, cutoff: float) -> GaussianPyramid:

@@ -31,10 +31,6 @@ from ..parameters import (
 SAMPLE_DEVIATION = 0.65
 """Standard deviation of the Gaussians of a level, in spacings of its points."""
 
-FINEST, FEWEST = 1, 8
-"""Spacing of the points of the finest level, in pixels (the points are the pixels), and smallest
-number of points along the shorter side of the coarsest level."""
-
 SAMPLE_REACH = 3.0
 """Standard deviations at which the Gaussians of a level end."""
 
