@@ -97,16 +97,25 @@ def gaussian_texture() -> type:
 
         def parameters_changed(self, keys: list[str]) -> None:
             self.transform = prepare(self.to_uv)
-            gaussians = self.source.gaussians()
-            parameters = decode_parameters(gaussians)
+            if set(keys) != {"to_uv"}:
+                self._take_over(not keys or any(key in self.source.shaping for key in keys))
+            sampled = getattr(self, "emission", None) is not None
+            self.survey: Any = None
+            self.emission: Any = None
+            if sampled:  # a frozen rendering cannot make it
+                self._emission()
+
+        def _take_over(self, moved: bool) -> None:
+            """Take over the Gaussians; with new lists if they have moved."""
+            parameters = decode_parameters(self.source.gaussians())
             shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
-            if not keys or any(key in self.source.shaping for key in keys):
+            if moved:
                 self._list([dr.detach(s) for s in shape])
             self.background = [keep_finite(b) for b in parameters.background]
             self.packed = pack_parameters([*shape, *color])
             if self.filtered():
-                self.arranged = arrange(self.sizes.listed[0][1].splat, shape, color)
+                self.arranged = arrange(self.cells.splat, shape, color)
             else:
                 self.arranged = in_list_order(self.cells.splat, [*shape, *color])
             dr.eval(self.packed, self.background, self.arranged)
@@ -115,21 +124,16 @@ def gaussian_texture() -> type:
                 self.pyramid = build_pyramid(self.sizes, self.packed, number, self.cutoff)
                 self.average = pyramid_mean(self.pyramid)
                 dr.eval(self.average)
-            sampled = getattr(self, "emission", None) is not None
-            self.survey: Any = None
-            self.emission: Any = None
-            if sampled:  # a frozen rendering cannot make it
-                self._emission()
 
         def _list(self, shape: list) -> None:
             """List the Gaussians near every cell."""
             size = (self.width, self.height)
-            radius = kernel_radius(self.cutoff)
-            side = cell_side(*size, dr.width(shape))
-            cells = list_cells(shape, *size, radius, side)
             if self.filtered():
                 self.sizes = classify_by_size(shape, *size, self.cutoff, self.wrap)
-            self.cells = cells
+                _, self.cells = self.sizes.listed[0]  # slopes and the survey look at points
+            else:
+                side = cell_side(*size, dr.width(shape))
+                self.cells = list_cells(shape, *size, kernel_radius(self.cutoff), side)
 
         # --- Lookups -----------------------------------------------------------------------------
 
