@@ -93,7 +93,7 @@ class TestSampling:
             np.array(tex.pdf_position(position)), np.array(density), rtol=1e-4
         )
 
-    @pytest.mark.parametrize("wrap", ["repeat", "mirror"])
+    @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
     def test_chi_square(self, wrap):
         """Mitsuba's own test, of positions against their density."""
         from mitsuba.chi2 import ChiSquareTest, PlanarDomain
