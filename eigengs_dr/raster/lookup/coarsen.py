@@ -16,7 +16,7 @@ from ..layout import unpack_parameters
 from ..parameters import NUM_SHAPE_PARAMS, KernelParameters, kernel_covariance, kernel_radius
 from ..render import rasterize
 from ..rows import to_tensor
-from .prefilter import FOOTPRINT_REACH, sum_prefiltered
+from .prefilter import sum_prefiltered
 from .pyramid import (
     SAMPLE_DEVIATION,
     GaussianPyramid,
@@ -24,7 +24,7 @@ from .pyramid import (
     count_points,
     sum_pyramid,
 )
-from .size_classes import SizeClasses
+from .size_classes import FOOTPRINT_REACH, SizeClasses
 
 FINEST, FEWEST = 1, 8
 """Spacing of the points of the finest level, in pixels (the points are the pixels), and smallest

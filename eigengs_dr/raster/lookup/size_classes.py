@@ -22,6 +22,9 @@ CLASS_RATIO = 3.0
 """Ratio of the sizes of two classes. With a smaller ratio a lookup visits more rows of cells; with
 a larger ratio it visits more Gaussians that miss the footprint."""
 
+FOOTPRINT_REACH = 3.0
+"""Half-width of a footprint, in standard deviations, in the search for copies of the image."""
+
 LISTED_FOOTPRINTS = (0.4, 1.2, 4.0)
 """Standard deviations of the footprints for which cells list their Gaussians, in pixels; most
 lookups have such footprints."""
@@ -51,7 +54,7 @@ class SizeClasses:
         For each class: s^2, first cell, columns, rows, 1 / side of a cell, origin of the cells, and
         two zeros.
     listed : list of (float, Cells)
-        Lists for footprints inside the image, of up to this standard deviation. They hold the
+        Lists for footprints of up to this standard deviation. They hold the
         Gaussians widened by it, whose ellipses contain the ellipses for smaller footprints. All
         have one array `splat`: lanes with footprints of several sizes then share a loop.
     """
@@ -141,4 +144,6 @@ def _cells_for(shape: list, width: int, height: int, cutoff: float, spread: floa
     variance = dr.opaque(types.Float, (spread / EXP2_SCALE) ** 2)
     widened, _ = widen(shape, [variance, types.Float(0), variance])
     side = max(4, cell_side(width, height, dr.width(shape)))
-    return list_cells(widened, width, height, kernel_radius(cutoff), side)
+    # Footprints at a border look at copies of the image from as far outside as they reach.
+    margin = math.ceil(FOOTPRINT_REACH * spread)
+    return list_cells(widened, width, height, kernel_radius(cutoff), side, margin)
