@@ -25,7 +25,7 @@ a larger ratio it visits more Gaussians that miss the footprint."""
 FOOTPRINT_REACH = 3.0
 """Half-width of a footprint, in standard deviations, in the search for copies of the image."""
 
-LISTED_FOOTPRINTS = (0.4, 1.2, 4.0)
+LISTED_FOOTPRINTS = (0.7, 4.0)
 """Standard deviations of the footprints for which cells list their Gaussians, in pixels; most
 lookups have such footprints."""
 
