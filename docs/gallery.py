@@ -13,6 +13,7 @@ ORDER = (
     "numpy_and_torch.py",
     "render_and_differentiate.py",
     "fit_for_scene.py",
+    "convert_scene.py",
 )
 """Scripts in the order of the manual; others follow."""
 

@@ -4,6 +4,7 @@ from .backend.executor import ClusterError
 from .backend.recording import exclusive
 from .backend.selection import BackendError
 from .blocks.fit_large import LargeFit, fit_large
+from .codec.material_packing import MaterialPackResult, pack_material
 from .codec.packing import PackResult, pack
 from .collection.fit_many import fit_many
 from .collection.row import ImageRow, RunInterrupted
@@ -18,8 +19,11 @@ from .image.io import load_image, save_image
 from .image.metrics import ms_ssim, psnr, ssim
 from .image.pixels import ImageError, LinearImage
 from .image.samples import sample
+from .material.fit_material import MaterialFit, fit_material
+from .material.material import Material
 from .plugins import register_plugins
 from .raster.render import picture_of, render
+from .scene.convert import ConvertedScene, convert_scene
 from .scene.fit_scene import fit_for_scene
 from .viewer.page import Page
 from .viewer.view import view
@@ -29,6 +33,7 @@ __version__: str
 __all__ = [
     "BackendError",
     "ClusterError",
+    "ConvertedScene",
     "EigenGS",
     "Eigenbasis",
     "Fit",
@@ -38,21 +43,27 @@ __all__ = [
     "ImageRow",
     "LargeFit",
     "LinearImage",
+    "Material",
+    "MaterialFit",
+    "MaterialPackResult",
     "PackResult",
     "Page",
     "RunInterrupted",
     "concatenate",
+    "convert_scene",
     "exclusive",
     "fit",
     "fit_for_scene",
     "fit_large",
     "fit_levels",
     "fit_many",
+    "fit_material",
     "from_tensors",
     "level_counts",
     "load_image",
     "ms_ssim",
     "pack",
+    "pack_material",
     "picture_of",
     "psnr",
     "register_plugins",

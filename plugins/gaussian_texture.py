@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.recording import without_collector
+from eigengs_dr.image.color import rendered_as
 from eigengs_dr.raster.layout import pack_parameters
 from eigengs_dr.raster.lookup.coarsen import build_pyramid
 from eigengs_dr.raster.lookup.points import (
@@ -37,7 +38,7 @@ from .reuse import reused
 from .spectrum import STEP, upload_table, upsample
 from .survey import make_survey, outside_of_recordings
 from .transform import prepare, read_transform
-from .values import is_shown, keep_finite, luminance, show, slope_of
+from .values import is_shown, keep_finite, luminance, show_all, slope_of
 from .versions import texture_class
 
 
@@ -55,7 +56,10 @@ def gaussian_texture() -> type:
         Properties
         ----------
         filename : str
-            Path of a set from ``eigengs-dr fit`` or `Gaussians.save`.
+            Path of a set from ``eigengs-dr fit`` or `Gaussians.save`, or of a material. Textures
+            of one file share the memory of means, shapes and lists until one of them changes.
+        map : str
+            With the `filename` of a material: the name of the map, such as "roughness".
         first : int
             With `filename`: number of Gaussians to use, from the first. Any number works for
             level-of-detail sets. By default all.
@@ -128,12 +132,18 @@ def gaussian_texture() -> type:
         def _list(self, shape: list) -> None:
             """List the Gaussians near every cell."""
             size = (self.width, self.height)
+            listed = self.source.listed
             if self.filtered():
-                self.sizes = classify_by_size(shape, *size, self.cutoff, self.wrap)
+                self.sizes = listed(
+                    ("sizes", self.cutoff, self.wrap),
+                    lambda: classify_by_size(shape, *size, self.cutoff, self.wrap),
+                )
                 _, self.cells = self.sizes.listed[0]  # slopes and the survey look at points
             else:
-                side = cell_side(*size, dr.width(shape))
-                self.cells = list_cells(shape, *size, kernel_radius(self.cutoff), side)
+                side, radius = cell_side(*size, dr.width(shape)), kernel_radius(self.cutoff)
+                self.cells = listed(
+                    ("cells", radius), lambda: list_cells(shape, *size, radius, side)
+                )
 
         # --- Lookups -----------------------------------------------------------------------------
 
@@ -144,7 +154,7 @@ def gaussian_texture() -> type:
                 return mi.UnpolarizedSpectrum(luminance(color))
             if not mi.is_spectral:
                 return mi.Color3f(*color)
-            if self.raw or self.space == "data":
+            if self.raw or rendered_as(self.space) is None:
                 raise ValueError(
                     f"{_name(self)}: a spectral variant needs colours for a reflectance or "
                     "radiance, not raw data; use a set in a colour space, and raw = false"
@@ -191,7 +201,7 @@ def gaussian_texture() -> type:
             else:
                 sums = sum_here(self, x, y, valid)
             sums = [s + b for s, b in zip(sums, self.background, strict=True)]
-            return [dr.select(valid, show(self, s), 0) for s in sums]
+            return [dr.select(valid, s, 0) for s in show_all(self, sums)]
 
         def _point(self, si: Any, active: Any) -> tuple:
             """Fold uv into the image: x, y in pixels with their slopes, active if uv is finite."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +14,8 @@ from eigengs_dr.backend.arrays import types_of, upload_tensor
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.gaussian.tensors import FIELDS, from_tensors, to_tensors
+
+from .shared import SharedFile
 
 
 def texture_of(gaussians: Gaussians, **properties: Any) -> dict[str, Any]:
@@ -111,9 +114,11 @@ class FromSet:
     shaping = ("mean", "factor")
     """Parameters whose change requires new lists of the Gaussians."""
 
-    def __init__(self, gaussians: Gaussians) -> None:
-        self.start = gaussians
+    def __init__(self, gaussians: Gaussians, shared: SharedFile | None = None) -> None:
+        self.start, self.shared = gaussians, shared
         self.tensors = to_tensors(gaussians)
+        if shared is not None:  # own objects, so that each has its own gradient, of one memory
+            self.tensors |= {name: type(t)(t) for name, t in shared.tensors.items()}
 
     def put(self, callback: Any) -> None:
         """Show the parameters to `mitsuba.traverse`."""
@@ -133,6 +138,15 @@ class FromSet:
         except ValueError as error:
             raise ValueError(f"gaussian_texture: {error}") from error
 
+    def listed(self, key: Any, build: Callable[[], Any]) -> Any:
+        """Return lists of the Gaussians: those of the file while means and shapes are the file's.
+
+        `key` tells lists of one file apart, and `build` makes them.
+        """
+        if self.shared is not None and self.shared.holds(self.tensors):
+            return self.shared.listed(key, build)
+        return build()
+
 
 @dataclass(init=False)
 class FromModel:
@@ -147,6 +161,10 @@ class FromModel:
     coefficients: Any
 
     shaping = ()
+
+    def listed(self, key: Any, build: Callable[[], Any]) -> Any:
+        """Make lists of the Gaussians; see `FromSet.listed`."""
+        return build()
 
     def __init__(self, model: EigenGS, coefficients: Any = None) -> None:
         self.start = model.gaussians

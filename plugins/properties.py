@@ -15,6 +15,7 @@ from eigengs_dr.gaussian.tensors import FIELDS
 from eigengs_dr.image.color import SPACES
 
 from .parameters import FromModel, FromSet
+from .shared import shared_file
 from .versions import has_footprints
 
 WRAPS = ("repeat", "mirror", "clamp")
@@ -40,15 +41,17 @@ def source_of(props: Any) -> FromSet | FromModel:
     if given[0] == "model":
         model = EigenGS.load(_path(props, "model"), backend)
         return FromModel(model, _coefficients(props))
+    shared = None
     if given[0] == "filename":
-        gaussians = Gaussians.load(_path(props, "filename"), backend)[: _first(props)]
+        shared = shared_file(_path(props, "filename"), backend, _first(props))
+        gaussians = shared.map(_map(props))
     else:
         gaussians = _from_arrays(props, backend)
     if gaussians.channels not in (1, 3):
         raise ValueError(
             f"gaussian_texture: the set has {gaussians.channels} channels; use a set of 1 or 3"
         )
-    return FromSet(gaussians)
+    return FromSet(gaussians, shared)
 
 
 def _first(props: Any) -> int | None:
@@ -57,6 +60,14 @@ def _first(props: Any) -> int | None:
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise ValueError(f"gaussian_texture: first is {value!r}; it must be a number of Gaussians")
     return value or None
+
+
+def _map(props: Any) -> str | None:
+    """Read ``map``, the name of a map of a material; None without this property."""
+    value = props.get("map", None)
+    if value is not None and not isinstance(value, str):
+        raise ValueError(f"gaussian_texture: map is {value!r}; it must be the name of a map")
+    return value
 
 
 def _coefficients(props: Any) -> Any:

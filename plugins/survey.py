@@ -35,7 +35,7 @@ from eigengs_dr.raster.parameters import (
     kernel_radius,
 )
 
-from .values import brightness, show
+from .values import brightness, show_all
 
 RESOLVED = 0.65
 """Standard deviation of a Gaussian, in spacings of the points, that the points resolve."""
@@ -101,7 +101,8 @@ def make_survey(texture: Any) -> Survey:
         )
         terms = value_terms(radius)
         sums = sum_at_points(cells, packed, number, x, y, mi.Bool(True), terms, texture.channels)
-        seen = [show(texture, s + b) for s, b in zip(sums, texture.background, strict=True)]
+        coded = [s + b for s, b in zip(sums, texture.background, strict=True)]
+        seen = show_all(texture, coded)
         light = brightness(texture, seen) + dr.zeros(mi.Float, columns * lines)
         dr.eval(light)
         survey = Survey(columns, lines, light, dr.mean(light), dr.max(light))

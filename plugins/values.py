@@ -8,7 +8,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from eigengs_dr.image.color import UNBOUNDED, to_linear
+from eigengs_dr.image.color import UNBOUNDED, rendered_as, to_linear
+from eigengs_dr.image.normals import unit_codes
 from eigengs_dr.image.radiance import LOG_SLOPE, from_log
 
 from .spectrum import mean_weights
@@ -27,6 +28,13 @@ def show(texture: Any, value: Any) -> Any:
         return dr.replace_grad(dr.maximum(value, 0), value)
     value = dr.replace_grad(dr.clip(value, 0, 1), value)
     return to_linear(value) if texture.space in ("ycbcr", "rgb") else value
+
+
+def show_all(texture: Any, values: list) -> list:
+    """Apply `show` to all channels; normals get the length 1 instead, unless raw."""
+    if texture.space == "normal" and not texture.raw:
+        return unit_codes(values)
+    return [show(texture, value) for value in values]
 
 
 def slope_of(texture: Any, value: Any) -> Any:
@@ -66,7 +74,7 @@ def brightness(texture: Any, color: list) -> Any:
         In spectral variants the mean of the spectrum of `upsample`, as of a ``bitmap``; else the
         luminance.
     """
-    if mi.is_spectral and len(color) == 3 and not texture.raw and texture.space != "data":
+    if mi.is_spectral and len(color) == 3 and not texture.raw and rendered_as(texture.space):
         return sum(w * c for w, c in zip(mean_weights(), color, strict=True))
     return luminance(color)
 

@@ -52,6 +52,31 @@ def fitted(folder, name, image, gaussians, color):
     return path
 
 
+def fitted_material(folder, name, maps, gaussians):
+    """Fit the maps of a material and save it, unless the file exists.
+
+    Parameters
+    ----------
+    folder, name
+        As for `fitted`.
+    maps : dict of str to ndarray
+        As for `eigengs_dr.fit_material`.
+    gaussians : int
+        Number of Gaussians.
+
+    Returns
+    -------
+    Path
+        The file.
+    """
+    path = folder / f"{name}.npz"
+    if not path.exists():
+        started = time.perf_counter()
+        eg.fit_material(maps, gaussians=gaussians, iterations=300).material.save(path)
+        print(f"wrote {path} in {time.perf_counter() - started:.1f} s")
+    return path
+
+
 def floor():
     """Return the photo of the floor, a square of 400 pixels."""
     return eg.sample("coffee")[:, 100:500]
@@ -114,9 +139,8 @@ def main(folder=FOLDER):
     fitted(folder, "floor", floor(), 4000, "linear")
     fitted(folder, "picture", portrait, 5000, "linear")
     fitted(folder, "poster", cat, 5000, "ycbcr")
-    fitted(folder, "tiles-color", color, 3000, "linear")
-    fitted(folder, "tiles-roughness", roughness, 3000, "data")
-    fitted(folder, "tiles-normals", normals, 4000, "data")
+    maps = {"albedo": color, "roughness": roughness, "normal": normals}
+    fitted_material(folder, "tiles", maps, 4000)
 
 
 if __name__ == "__main__":

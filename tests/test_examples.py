@@ -116,6 +116,16 @@ def test_fit_for_scene(run, tmp_path):
     check_pictures(tmp_path, "budget", "budget_photo")
 
 
+@pytest.mark.slow
+def test_convert_scene(run, tmp_path):
+    pytest.importorskip("mitsuba")
+    out = run("convert_scene.py", tmp_path)
+    share, psnr = numbers(out, "NUM of the memory; NUM dB between the renderings")
+    assert share < 0.5 and psnr > 30
+    assert out.count("texels") == 4 and "left alone: sky.png (environment)" in out
+    check_pictures(tmp_path, "converted")
+
+
 def test_all_are_listed_and_tested():
     scripts = {path.name for path in FOLDER.glob("*.py")}
     listed = re.findall(r"^\| \[`(\w+\.py)`\]\(\1\) \|", (FOLDER / "README.md").read_text(), re.M)

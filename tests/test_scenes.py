@@ -95,18 +95,23 @@ def test_assets_are_what_scenes_name(monkeypatch, tmp_path):
     monkeypatch.setattr(
         assets, "fitted", lambda folder, name, image, *rest: made.update({name: image})
     )
+    materials = {}
+    monkeypatch.setattr(
+        assets, "fitted_material", lambda folder, name, maps, *rest: materials.update({name: maps})
+    )
     assets.main(tmp_path)
     named = {
         name
         for path in SCENES.glob("*.xml")
         for name in re.findall(r"\$folder/([\w-]+)\.npz", path.read_text())
     }
-    assert set(made) == named
+    assert {*made, *materials} == named
+    made |= materials["tiles"]
     for image in made.values():
         assert 0 <= np.min(image) < np.max(image) <= 1
-    normals = 2 * made["tiles-normals"] - 1
+    normals = 2 * made["normal"] - 1
     assert np.allclose(np.linalg.norm(normals, axis=2), 1)
-    assert made["tiles-roughness"].ndim == 2
+    assert made["roughness"].ndim == 2
 
 
 def test_assets_keep_what_is_there(tmp_path):

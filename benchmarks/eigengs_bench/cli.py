@@ -86,6 +86,31 @@ def rate(task: Task, names: Names) -> Any:
 
 
 @bench.command()
+@click.argument("folders", nargs=-1, required=True, type=FOLDER, metavar="FOLDER...")
+@click.option(
+    "--gaussians",
+    "counts",
+    multiple=True,
+    type=click.IntRange(min=1),
+    default=(2000, 8000, 32000),
+    show_default=True,
+    help="Of a set; may be repeated.",
+)
+@measures_rows("materials.jsonl", iterations=300)
+def materials(task: Task, folders: tuple[Path, ...], counts: tuple[int, ...]) -> Any:
+    """Compare maps on shared shapes with a set for each map, PNG, ASTC and BC7.
+
+    A FOLDER holds the images of one material; their names are those of the maps: albedo.jpg,
+    roughness.jpg, normal.jpg. ASTC needs astc-encoder-py, BC7 needs etcpak and texture2ddecoder;
+    without them they are left out.
+    """
+    from eigengs_bench.experiments.materials import run
+    from eigengs_bench.report.sections.materials import summarize
+
+    return summarize(run(task, folders, tuple(dict.fromkeys(counts))))
+
+
+@bench.command()
 @click.option(
     "--target",
     "targets",

@@ -16,6 +16,7 @@ from ..backend.selection import select
 from ..fitting.options import FitOptions
 from ..gaussian.file import CUTOFF, write
 from ..gaussian.gaussians import Gaussians
+from ..image.color import rendered_as
 from ..image.metrics import psnr_from_mse
 from ..storage.atomic import require_writable
 from ..storage.checkpoint import Checkpoint
@@ -151,7 +152,7 @@ def fit_large(
         backend=backend,
         encoding=encoding,
     )
-    image = open_source(source, color == "data", encoding)
+    image = open_source(source, rendered_as(color) is None, encoding)
     blocks, options = plan(image, options, block)
     select(backend)
     keep: Any = nullcontext()

@@ -16,6 +16,7 @@ from .cluster import open_cluster
 from .console import INTERRUPTED, say
 from .fit_large import block_side, check_large, fit_by_blocks
 from .fit_many import fit_several
+from .fit_material import MapFile, MapOption, run_maps
 from .fit_one import fit_one
 from .memory import announce_memory
 from .options import (
@@ -43,9 +44,16 @@ FAILED = 2
 
 
 @click.command()
-@click.argument("images", nargs=-1, required=True, type=ImageSource(), metavar="IMAGE...")
+@click.argument("images", nargs=-1, type=ImageSource(), metavar="IMAGE...")
 @click.option(
     "-o", "--output", type=ANY_PATH, help=".npz file or folder.  [default: the current folder]"
+)
+@click.option(
+    "--map",
+    "maps",
+    multiple=True,
+    type=MapOption(),
+    help="A map of a material by name, instead of IMAGE; repeat for more.",
 )
 @click.option("--gaussians", type=int, metavar="N", help="Number of Gaussians.  [default: 5000]")
 @click.option("--target-psnr", type=float, metavar="DB", help="Find the fewest for this PSNR.")
@@ -83,7 +91,8 @@ FAILED = 2
 @choice(
     "--color",
     list(SPACES),
-    "Colour space; linear for textures, log for light above 1, data for other values.",
+    "Colour space; linear for textures, log for light above 1, normal for normal maps, data for "
+    "other values.",
 )
 @encoding_option
 @click.option(
@@ -106,6 +115,7 @@ def fit(
     /,
     images: tuple[Path | str, ...],
     output: Path | None,
+    maps: tuple[MapFile, ...],
     blocks: int | None,
     levels: int | None,
     preview: Path | None,
@@ -130,6 +140,11 @@ def fit(
     An image that is too large for this machine is fitted by blocks, with one Gaussian for 20 pixels
     by default. Ctrl-C then keeps the blocks that are done, and the same command goes on.
 
+    With --map, several maps of one size, such as albedo, roughness and normal, share one set of
+    shapes; -o names the file. Maps named albedo, color and the like are fitted in linear light,
+    normal as normals, and others as data; --map height:data=FILE says the space. --target-psnr then
+    holds for each map.
+
     \b
     Examples:
       eigengs-dr fit photo.jpg
@@ -143,6 +158,7 @@ def fit(
       eigengs-dr fit roughness.png -o roughness.npz --color data
       eigengs-dr fit sky.exr -o sky.npz --color log --gaussians 20000
       eigengs-dr fit huge.tif -o huge.npz --blocks 1024
+      eigengs-dr fit --map albedo=a.jpg --map roughness=r.jpg --map normal=n.jpg -o bark.npz
     """
     from ..fitting.levels import check_options
     from ..image.io import SAVE_OPTIONS
@@ -150,6 +166,11 @@ def fit(
     options = FitOptions(**settings)
     if levels is not None:
         check_options(options)
+    if maps:
+        files = (output, preview, report)
+        context.exit(run_maps(context, images, maps, files, options, levels, quiet))
+    if not images:
+        raise click.UsageError("no image is given; name image files, or maps with --map")
     paths = [file for source in images for file in _expand(source)]
     several = len(paths) > 1 or paths != list(images)
     if cluster and (preview or not (several or blocks)):

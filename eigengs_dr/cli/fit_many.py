@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..image.color import rendered_as
 from .console import images_bar, say
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ def _record(finished: Finished, preview: Path | None, color: str, measure: bool)
     if measure:
         record["ssim"] = eg.ssim(pixels, result.image)
         record["ms_ssim"] = eg.ms_ssim(
-            pixels, result.image, space="data" if color == "data" else "ycbcr"
+            pixels, result.image, space="ycbcr" if rendered_as(color) else "data"
         )
         record["trace"] = result.trace
     return record

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..image.color import rendered_as
 from .console import progress_bar
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def fit_one(
     started = time.perf_counter()
     with progress_bar(quiet) as show:
         show(f"{path.name}: load", 0, 1)
-        image = eg.load_image(path, options.color == "data", options.encoding)
+        image = eg.load_image(path, rendered_as(options.color) is None, options.encoding)
         loaded = time.perf_counter()
         try:
             result = run(image, progress=partial(show, path.name))
@@ -79,7 +80,7 @@ def _measure(image: Any, result: Fit, color: str) -> dict[str, float]:
         "psnr_ycbcr": eg.psnr(image, result.image, space=float_space(color)),
         "psnr_rgb": eg.psnr(image, result.image, space="rgb"),
         "ssim": eg.ssim(image, result.image),
-        "ms_ssim": eg.ms_ssim(image, result.image, space="data" if color == "data" else "ycbcr"),
+        "ms_ssim": eg.ms_ssim(image, result.image, space="ycbcr" if rendered_as(color) else "data"),
     }
 
 

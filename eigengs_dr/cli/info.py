@@ -16,11 +16,13 @@ from .outputs import check_outputs, name_outputs
 @json_option
 @click.option("--preview", type=ANY_PATH, help="Picture of the contents.")
 def info(file: Path, as_json: bool, preview: Path | None) -> None:
-    """Show the contents of a fitted image or a model.
+    """Show the contents of a fitted image, a material or a model.
 
     NAME is a basis of the package, such as natural. For a fitted image, bpp is the size of the
     file in bits per pixel. For a packed image, the command also shows the steps of the
     quantisation.
+
+    For a material, a table shows its maps; bpp is for all of them together.
 
     For a model, a table shows the first components of all channels in order of variance: their
     share of the variance, and the PSNR of PCA with them, for the training images and for the
@@ -47,14 +49,20 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     from ..eigenbasis.registry import SHIPPED
     from ..gaussian import file as setfile
     from ..gaussian.gaussians import Gaussians
+    from ..material import file as materialfile
     from ..storage import npz
 
     kinds: dict[str, tuple[str, Any, Any, Any]] = {
         setfile.FORMAT: ("image", Gaussians.load, _describe_image, _draw_image),
+        materialfile.FORMAT: ("material", materialfile.read, _describe_material, _draw_material),
         modelfile.FORMAT: ("model", EigenGS.load, _describe_model, _draw_model),
     }
     file = SHIPPED.get(str(file), file)
-    file_format = setfile.FORMAT if packed.is_egs(file) else npz.format_of(file)
+    if packed.is_egs(file):
+        maps = materialfile.holds_material(file)
+        file_format = materialfile.FORMAT if maps else setfile.FORMAT
+    else:
+        file_format = npz.format_of(file)
     if file_format not in kinds:
         raise ValueError(
             f"{file}: format is {file_format[:40]!r}, expected one of {', '.join(kinds)}"
@@ -63,9 +71,11 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     facts: dict[str, Any] = {"file": str(file), "kind": kind, "bytes": file.stat().st_size}
     if kind == "image" and not packed.is_egs(file):
         facts |= _describe_head(setfile.read_head(file))
+    elif kind == "material" and not packed.is_egs(file):
+        facts |= _describe_material(materialfile.read_head(file))
     else:
         facts |= describe(load(file))
-    if kind == "image":
+    if kind != "model":
         facts["bpp"] = round(8 * facts["bytes"] / (facts["width"] * facts["height"]), 4)
     if packed.is_egs(file):
         facts |= _describe_packed(packed.read(file))
@@ -94,6 +104,19 @@ def _describe_head(head: Any) -> dict[str, Any]:
         "channels": head.channels,
         "space": head.space,
         "cutoff": head.cutoff,
+    }
+
+
+def _describe_material(found: Any) -> dict[str, Any]:
+    """Describe a material by the head of its file, or by its content."""
+    count = len(found.arrays["mean"]) if hasattr(found, "arrays") else found.gaussians
+    return {
+        "gaussians": count,
+        "width": found.size[0],
+        "height": found.size[1],
+        "channels": sum(m.channels for m in found.maps),
+        "cutoff": found.cutoff,
+        "maps": [m._asdict() for m in found.maps],
     }
 
 
@@ -138,10 +161,15 @@ def _rows(fall: Any, held_out: Any) -> list[dict[str, Any]]:
     return rows
 
 
-def _text(fall: Any = (), **facts: Any) -> str:
-    """Format facts as lines, and the truncation curve as a table below."""
+def _text(fall: Any = (), maps: Any = (), **facts: Any) -> str:
+    """Format facts as lines, and maps and the truncation curve as tables below."""
     width = max(map(len, facts)) + 1
     lines = [f"{key:{width}} {value}" for key, value in facts.items()]
+    if maps:
+        lines += ["", f"{'map':16} {'channels':>8} {'space':>9} {'weight':>8}"]
+    for m in maps:
+        row = "{name:16} {channels:8} {space:>9} {weight:8.3g}"
+        lines.append(row.format(**m))
     if fall:
         lines += ["", f"components{'':16} {'variance':>8} {'training':>9} {'held out':>9}"]
     for row in fall:
@@ -161,6 +189,19 @@ def _draw_image(file: Path, picture: Path) -> None:
     data = read(file)
     check_pixels(*data.size)
     save_region(picture, data, (0, 0, *data.size), data.size)
+
+
+def _draw_material(file: Path, picture: Path) -> None:
+    from ..image.io import save_image
+    from ..image.montage import join_pictures
+    from ..material.material import Material
+
+    shown = Material.load(file).pictures().values()
+    save_image(picture, join_pictures([_as_rgb(image) for image in shown], 1))
+
+
+def _as_rgb(image: Any) -> Any:
+    return image.repeat(3 // image.shape[2], axis=2)
 
 
 def _draw_model(file: Path, picture: Path) -> None:

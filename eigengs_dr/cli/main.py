@@ -7,6 +7,7 @@ import click
 
 from .bench import bench
 from .console import Program
+from .convert import convert
 from .doctor import doctor
 from .fit import fit
 from .info import info
@@ -35,5 +36,5 @@ def main() -> None:
     """
 
 
-for command in (fit, render, train, info, pack, view, scene, doctor, bench):
+for command in (fit, render, train, info, pack, view, scene, convert, doctor, bench):
     main.add_command(command)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ..fitting.memory import check_memory, estimate_memory, installed_memory
 from ..fitting.options import FitOptions, default_count
+from ..image.color import rendered_as
 from .console import say
 
 NOTABLE = 1_000_000_000
@@ -69,7 +70,7 @@ def _problem(path: Path, options: FitOptions) -> tuple[int, int, int, int] | Non
     count = options.gaussians or default_count(width * height)
     if options.target_psnr is not None:
         count = max(1, width * height // PIXELS_PER_FIRST_GAUSSIAN)
-    return width, height, 1 if grey and options.color == "data" else 3, count
+    return width, height, 1 if grey and rendered_as(options.color) is None else 3, count
 
 
 def _image_size(path: Path) -> tuple[int, int, bool] | None:

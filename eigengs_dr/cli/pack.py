@@ -5,6 +5,7 @@ from pathlib import Path
 import click
 
 from ..backend.selection import select
+from .fit_material import MapFile, MapOption
 from .options import (
     ANY_PATH,
     EXISTING,
@@ -15,6 +16,7 @@ from .options import (
     report_option,
 )
 from .outputs import check_outputs, name_outputs
+from .pack_material import pack_maps
 from .report import write_report
 
 SUFFIX, BUDGET = ".egs", 0.5
@@ -28,6 +30,13 @@ Dr.Jit."""
     "-o", "--output", required=True, type=ANY_PATH, metavar="Y.egs", help="File to write."
 )
 @click.option("--image", type=EXISTING, help="The original image, to measure the loss with.")
+@click.option(
+    "--map",
+    "maps",
+    multiple=True,
+    type=MapOption(),
+    help="The image of a map of a material; repeat for all of them.",
+)
 @encoding_option
 @click.option(
     "--budget",
@@ -54,6 +63,7 @@ def pack(
     file: Path,
     output: Path,
     image: Path | None,
+    maps: tuple[MapFile, ...],
     encoding: str | None,
     budget: float,
     levels: int,
@@ -65,18 +75,30 @@ def pack(
 
     The command quantises the parameters as coarsely as the allowed loss of PSNR permits, and
     codes them. Every command that reads the .npz file of an image reads .egs files too. Without
-    --image, the command assumes that the fit has 40 dB.
+    --image, the command assumes that the fit has 40 dB. A material takes --map instead.
 
     \b
     Examples:
       eigengs-dr pack photo.npz -o photo.egs --image photo.jpg
       eigengs-dr pack photo.npz -o photo.egs --budget 0.1
       eigengs-dr pack levels.npz -o levels.egs --levels 4
+      eigengs-dr pack bark.npz -o bark.egs --map albedo=a.jpg --map normal=n.jpg
     """
     [target] = name_outputs([file], output, [SUFFIX])
-    check_outputs([target, report], [file, *([image] if image else [])])
+    inputs = [file, *([image] if image else []), *(item.path for item in maps)]
+    check_outputs([target, report], inputs)
     select(backend)
     import eigengs_dr as eg
+
+    from ..material.file import holds_material
+
+    if holds_material(file):
+        figures = pack_maps(file, target, image, maps, encoding, budget, levels, backend, quiet)
+        if report:
+            write_report(report, {**describe_run(context, backend), **figures})
+        return
+    if maps:
+        raise ValueError(f"{file}: holds one image and no maps; give --image instead of --map")
 
     gaussians = eg.Gaussians.load(file, backend=backend)
     grey = gaussians.channels == 1

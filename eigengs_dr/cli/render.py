@@ -25,6 +25,7 @@ from .outputs import check_outputs, name_outputs
 @click.option(
     "-o", "--output", required=True, type=ANY_PATH, metavar="Y.png", help="Picture to write."
 )
+@click.option("--map", "name", metavar="NAME", help="The map of a material to draw.")
 @click.option("--region", type=Region(), help="Left, top, width, height: a part of the image.")
 @click.option("--scale", type=float, metavar="S", help="Factor on the native size, such as 0.5.")
 @click.option("--size", type=Size(), help="Width and height in pixels, such as 1024x768.")
@@ -44,6 +45,7 @@ from .outputs import check_outputs, name_outputs
 def render(
     file: Path,
     output: Path,
+    name: str | None,
     region: tuple[int, int, int, int] | None,
     scale: float | None,
     size: tuple[int, int] | None,
@@ -66,6 +68,7 @@ def render(
       eigengs-dr render sky.npz -o sky.exr
       eigengs-dr render normals.npz -o normals.png --bits 16
       eigengs-dr render photo.npz -o icon.png --size 64x48 --first 500
+      eigengs-dr render bark.npz -o roughness.png --map roughness
       eigengs-dr render huge.npz -o part.png --region 4000,2500,800,600 --scale 2
     """
     if scale is not None and size is not None:
@@ -78,9 +81,9 @@ def render(
     check_outputs([output], [file])
     select(backend)
     from ..blocks.draw import save_region
-    from ..gaussian.file import read
+    from ..material.file import read_set
 
-    data = read(file)
+    data = read_set(file, name, "--map")
     count = len(data.arrays["mean"])
     if first is not None:
         if first > count:

@@ -91,7 +91,7 @@ def scene(
     """
     outputs = name_outputs(scenes, output, SUFFIXES)
     check_outputs(outputs, scenes)
-    mi = _mitsuba(variant, quiet)
+    mi = load_mitsuba(variant, quiet)
     for path, target in zip(scenes, outputs, strict=True):
         started = time.perf_counter()
         try:
@@ -101,7 +101,7 @@ def scene(
                 )
         # Mitsuba raises many types for mistakes in a scene; only the message says what is wrong.
         except Exception as error:
-            raise _refusal(path, error) from error
+            raise explain(path, error) from error
         _write(mi, target, pixels)
         if not quiet:
             height, width = pixels.shape[:2]
@@ -111,7 +111,7 @@ def scene(
             )
 
 
-def _mitsuba(variant: str | None, quiet: bool) -> Any:
+def load_mitsuba(variant: str | None, quiet: bool) -> Any:
     """Import Mitsuba, set a variant and register the plugins."""
     backend = variant.partition("_")[0] if variant else None
     module = select(backend if backend in ("llvm", "cuda") else None)
@@ -169,7 +169,7 @@ def _write(mi: Any, path: Path, pixels: Any) -> None:
         bitmap.write(str(temporary))
 
 
-def _refusal(path: Path, error: BaseException) -> Exception:
+def explain(path: Path, error: BaseException) -> Exception:
     """Reduce an error of Mitsuba to one line that says what is wrong."""
     while error.__cause__:  # the outer error of Dr.Jit only says "see above"
         error = error.__cause__

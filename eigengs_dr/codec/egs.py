@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -20,10 +21,12 @@ from numpy.typing import NDArray
 
 from ..gaussian.file import CUTOFF, SetData
 from ..image.color import MAX_CHANNELS, SPACES
+from ..material.maps import TextureMap, check_maps
 from ..storage.atomic import atomic_write
 from ..storage.npz import MAX_ENTRIES, BadValue
 from . import weights
 from .cells import EVENNESS, code_cells
+from .egs_maps import maps_to_bytes, read_maps
 from .gaussian_model import GaussianCoder
 from .hilbert_index import MAX_LEVELS, hilbert_encode
 from .quantization import Steps, Symbols, dequantize
@@ -36,8 +39,9 @@ SUFFIX = ".egs"
 MAGIC = b"\x89EGS"
 """First bytes of a file. The first byte is no ASCII character, so no text file starts with it."""
 
-VERSION = 3
-"""Version of the format. Versions 1 and 2, of packages before release, are not read."""
+VERSION, MAPS_VERSION = 3, 4
+"""Versions of the format, for an image and for a material, which has a table of maps. Versions 1
+and 2, of packages before release, are not read."""
 
 MAX_SECTIONS = 1 << 12
 
@@ -69,6 +73,9 @@ class EgsContent(NamedTuple):
         One of `eigengs_dr.image.color.SPACES`.
     cutoff : float
         Radius of a Gaussian in standard deviations.
+    maps : tuple of TextureMap
+        The maps of a material, whose colours and background are multiplied by their weights; empty
+        for an image.
     """
 
     sections: list[Symbols]
@@ -77,6 +84,7 @@ class EgsContent(NamedTuple):
     size: tuple[int, int]
     space: str
     cutoff: float = CUTOFF
+    maps: tuple[TextureMap, ...] = ()
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return mean (N, 2), factor (N, 3), color (N, C) and background (C,), all of float32."""
@@ -102,7 +110,7 @@ def to_bytes(packed: EgsContent) -> bytes:
     levels = int((cells - corner).max()).bit_length()
     head = _HEADER.pack(
         MAGIC,
-        VERSION,
+        MAPS_VERSION if packed.maps else VERSION,
         SPACES.index(packed.space),
         len(packed.background),
         levels,
@@ -112,7 +120,7 @@ def to_bytes(packed: EgsContent) -> bytes:
         *packed.steps,
         packed.cutoff,
     )
-    head += packed.background.astype("<f4").tobytes()
+    head += packed.background.astype("<f4").tobytes() + maps_to_bytes(packed.maps)
     parts = [head, _CHECK.pack(zlib.crc32(head))]
     for section in packed.sections:
         body = _body(section, packed.steps, corner, levels)
@@ -165,6 +173,9 @@ def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsConten
 def read_set(path: Path, sections: int | None = None) -> SetData:
     """Read a packed set for `eigengs_dr.Gaussians.load`; for parameters and errors see `read`."""
     content = read(path, sections)
+    if content.maps:
+        names = ", ".join(m.name for m in content.maps)
+        raise ValueError(f"{path}: holds the maps {names}; load it by Material.load, take one")
     return SetData(content.arrays(), content.size, content.space, content.cutoff)
 
 
@@ -210,17 +221,22 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
     head = _exactly(file, 5)
     if head[:4] != MAGIC:
         raise BadValue("not a packed set of Gaussians; it may be damaged or something else")
-    if head[4] != VERSION:
+    if head[4] not in (VERSION, MAPS_VERSION):
         raise BadValue(
-            f"version is {head[4]}, but this package reads version {VERSION}; "
+            f"version is {head[4]}, but this package reads versions {VERSION} and {MAPS_VERSION}; "
             + ("upgrade eigengs-dr" if head[4] > VERSION else "pack the set again")
         )
     head += _exactly(file, _HEADER.size - len(head))
     _, _, space, channels, levels, count, width, height, *rest = _HEADER.unpack(head)
     background = _exactly(file, 4 * channels)
+    table, maps = b"", tuple[TextureMap, ...]()
+    if head[4] == MAPS_VERSION:
+        table, maps = read_maps(partial(_exactly, file))
     (check,) = _CHECK.unpack(_exactly(file, _CHECK.size))
-    if check != zlib.crc32(head + background):
+    if check != zlib.crc32(head + background + table):
         raise BadValue("the header is damaged; copy the file again")
+    if maps:
+        check_maps(maps, channels)
     corner, steps = np.array(rest[:2], np.int64), Steps(*rest[2:4])
     _check_header(space, channels, levels, count, steps)
     if wanted is not None and not 1 <= wanted <= count:
@@ -247,6 +263,7 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
         size=(width, height),
         space=SPACES[space],
         cutoff=rest[4],
+        maps=maps,
     )
 
 

@@ -7,7 +7,7 @@ the loss allows, first without error feedback, which is fast, then with it.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..backend.arrays import types_of
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
-from ..image.color import LIGHT, UNBOUNDED, rgb_to_ycbcr, to_coded, to_linear
+from ..image.color import LIGHT, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_coded, to_linear
 from ..image.metrics import MAX_PSNR, psnr_from_mse
 from ..image.pixels import check_data, check_image
 from ..image.radiance import to_log, to_pu21
@@ -129,13 +129,8 @@ def pack(
     -----
     On one machine and backend, the same arguments give the same file bit for bit.
     """
-    if Path(path).suffix.lower() != SUFFIX:
-        raise ValueError(f"{path}: pack writes {SUFFIX} files; use this suffix, or save()")
-    rows = _rows(len(gaussians), sections)
-    if not 0 < budget <= MAX_PSNR:
-        raise ValueError(
-            f"pack: budget is {budget}; it must be above 0 and at most {MAX_PSNR:g} dB, such as 0.5"
-        )
+    check_request(path, budget)
+    rows = section_rows(len(gaussians), sections)
     gaussians = dr.detach(gaussians)
     if cutoff is not None:
         gaussians = replace(gaussians, cutoff=float(cutoff))
@@ -150,6 +145,55 @@ def pack(
         parts = [*(found[: r.stop] for r in rows[:-1]), found]
         return [_error(part, shown) for part in parts]
 
+    packed, drop = compress(gaussians, target, errors, budget, rows, unseen)
+    content = to_bytes(packed)
+    write(path, content)
+    return PackResult(
+        gaussians=Gaussians.load(path, types_of(gaussians.mean).backend),
+        bytes=len(content),
+        bits_per_pixel=8 * len(content) / (gaussians.width * gaussians.height),
+        psnr=psnr_from_mse(errors(to_gaussians(packed, gaussians))[-1]),
+        psnr_drop=drop,
+        steps=packed.steps,
+    )
+
+
+def compress(
+    gaussians: Gaussians,
+    target: Array,
+    errors: Callable[[Gaussians], list[float]],
+    budget: float,
+    rows: list[slice],
+    unseen: float = 0.0,
+) -> tuple[EgsContent, float]:
+    """Round a set as coarsely as a budget allows.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Set without gradients.
+    target : ndarray, shape (H, W, C)
+        What compensation for the rounding aims at, in the space of the set.
+    errors : callable
+        ``errors(gaussians)`` returns the mean squared error of each prefix that `rows` end at.
+    budget : float
+        Allowed loss of each prefix in dB.
+    rows : list of slice
+        The sections.
+    unseen : float, optional
+        Mean squared error that `errors` does not see, and that adds to it.
+
+    Returns
+    -------
+    EgsContent
+    float
+        The loss of the whole set in dB.
+
+    Raises
+    ------
+    ValueError
+        If no rounding meets the budget.
+    """
     before = [max(error + unseen, MIN_MSE) for error in errors(gaussians)]
     limits = [error * 10 ** (budget / 10) - unseen for error in before]
     if min(limits) <= 0:
@@ -174,17 +218,8 @@ def pack(
     if found is None:
         raise ValueError(TOO_FINE)
     packed = found[1].packed
-    content = to_bytes(packed)
-    error = errors(to_gaussians(packed, gaussians))[-1]
-    write(path, content)
-    return PackResult(
-        gaussians=Gaussians.load(path, types_of(gaussians.mean).backend),
-        bytes=len(content),
-        bits_per_pixel=8 * len(content) / (gaussians.width * gaussians.height),
-        psnr=psnr_from_mse(error),
-        psnr_drop=psnr_from_mse(before[-1]) - psnr_from_mse(error + unseen),
-        steps=packed.steps,
-    )
+    after = errors(to_gaussians(packed, gaussians))[-1] + unseen
+    return packed, psnr_from_mse(before[-1]) - psnr_from_mse(after)
 
 
 def _steps(gaussians: Gaussians, octaves: float) -> Steps:
@@ -194,7 +229,17 @@ def _steps(gaussians: Gaussians, octaves: float) -> Steps:
     return Steps(*values.tolist())
 
 
-def _rows(count: int, sections: Sequence[int] | None) -> list[slice]:
+def check_request(path: str | os.PathLike[str], budget: float) -> None:
+    """Raise ValueError for another suffix than ``.egs``, or a budget out of range."""
+    if Path(path).suffix.lower() != SUFFIX:
+        raise ValueError(f"{path}: pack writes {SUFFIX} files; use this suffix, or save()")
+    if not 0 < budget <= MAX_PSNR:
+        raise ValueError(
+            f"pack: budget is {budget}; it must be above 0 and at most {MAX_PSNR:g} dB, such as 0.5"
+        )
+
+
+def section_rows(count: int, sections: Sequence[int] | None) -> list[slice]:
     """Return the range of the Gaussians of each section."""
     counts = [count] if sections is None else [int(k) for k in sections]
     if not counts or min(counts) < 1 or sum(counts) != count or len(counts) > MAX_SECTIONS:
@@ -212,7 +257,7 @@ def _compared(gaussians: Gaussians, image: ArrayLike, encoding: str | None) -> A
     It is the set's space; for linear light, sRGB, and for light above 1, PU21, which has bounds.
     """
     grey = gaussians.channels == 1
-    data = gaussians.space == "data"
+    data = rendered_as(gaussians.space) is None
     pixels = check_data(image) if data else check_image(image, grey, encoding=encoding)
     expected = (gaussians.height, gaussians.width, gaussians.channels)
     if pixels.shape != expected:

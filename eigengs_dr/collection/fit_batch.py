@@ -33,9 +33,8 @@ from ..fitting.redistribute import density_for_error, squared_error
 from ..fitting.refine import is_plateau, trace_steps
 from ..fitting.solvers.conjugate_gradient import solve_batch
 from ..gaussian.gaussians import Gaussians
-from ..image.color import LIGHT, to_picture
+from ..image.color import LIGHT, from_sum, to_picture
 from ..image.metrics import float_space, psnr
-from ..image.radiance import from_log
 from ..raster.kernels import forward
 from ..raster.layout import pack_parameters
 from ..raster.parameters import kernel_parameters, kernel_radius
@@ -251,7 +250,7 @@ def _like(gaussians: Gaussians) -> dict[str, Any]:
 def _pictures(gaussians: Gaussians, images: int) -> Images:
     """Render all images for display: as `eigengs_dr.raster.render.picture_of` does one."""
     shown = _sum(gaussians, images)
-    return to_picture(gaussians.space, from_log(shown) if gaussians.space == "log" else shown)
+    return to_picture(gaussians.space, from_sum(gaussians.space, shown))
 
 
 def _sum(gaussians: Gaussians, images: int) -> Images:

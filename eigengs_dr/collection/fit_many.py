@@ -16,6 +16,7 @@ from ..fitting.fit import Fit, fit_image
 from ..fitting.levels import check_options, fit_levels
 from ..fitting.options import DEFAULT_BASIS, FitOptions
 from ..fitting.pixels import unit_of
+from ..image.color import rendered_as
 from ..image.metrics import float_space, psnr
 from ..image.pixels import LinearImage, check_image
 from .fit_batch import fit_batch, fits_in_batches
@@ -145,7 +146,7 @@ def fit_each(
         basis = resolve_name(PACK_BASIS)(options.basis or DEFAULT_BASIS, options.backend)
         options = replace(options, basis=basis)
     make_work = partial(fit_work, options, levels, None if client is not None else step)
-    job = Job(make_work, _may_join, options.color == "data", options.encoding)
+    job = Job(make_work, _may_join, rendered_as(options.color) is None, options.encoding)
     return run_images(images, output, overwrite, job, client)
 
 
@@ -216,7 +217,8 @@ def _fit_one(
 
 def _figures(pixels: Pixels, result: Fit, color: str) -> dict[str, Any]:
     """Return the figures of a fit for its row."""
-    shown = np.asarray(pixels) if color == "data" else check_image(pixels, copy=False)
+    data = rendered_as(color) is None
+    shown = np.asarray(pixels) if data else check_image(pixels, copy=False)
     space = float_space(result.gaussians.space)
     return {
         "psnr_ycbcr": psnr(shown, result.image, space=space),

@@ -43,9 +43,10 @@ class Fit:
         Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb. A search for the number of
         Gaussians adds the key gaussians. Row 0 shows the set before refinement. Seconds count from
         the call of `fit`; they include placement, upload, the colour solve and the measurements.
-        With color "data", psnr_rgb is the PSNR of the data after clamping and rounding to 8 bits,
-        and psnr_ycbcr the PSNR of the unchanged data; for values above 1.5, the largest of them
-        is the peak. With color "radiance" or "log", psnr_ycbcr is in PU21, see `eigengs_dr.psnr`.
+        With color "data" or "normal", psnr_rgb is the PSNR of the data after clamping and rounding
+        to 8 bits, and psnr_ycbcr the PSNR of the unchanged data; for values above 1.5, the largest
+        of them is the peak. With color "radiance" or "log", psnr_ycbcr is in PU21, see
+        `eigengs_dr.psnr`.
     image : ndarray of float32, shape (H, W, 3), or (H, W, 1) for data of one channel
         The rendering of the set: RGB without clamping; for light, sRGB clamped at 0; or the data.
     seconds, seconds_init : float
@@ -87,11 +88,11 @@ class FitInterrupted(KeyboardInterrupt):
 
     Attributes
     ----------
-    result : Fit
+    result : Fit or MaterialFit
         The best set so far.
     """
 
-    def __init__(self, result: Fit) -> None:
+    def __init__(self, result: Any) -> None:
         super().__init__("the fit was interrupted; .result holds the best set so far")
         self.result = result
 
@@ -136,10 +137,11 @@ def fit(
     solve_steps : int, optional
         Steps of conjugate gradients in the colour solve. "eigen" uses them only if the image and
         the basis differ in size.
-    color : {"ycbcr", "rgb", "linear", "radiance", "log", "data"}, optional
+    color : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, optional
         Space of the colours and of the squared error. "linear" decodes sRGB: the Gaussians sum to
         linear light, as textures need it, and errors weigh more in the dark. "data" uses one or
-        three channels unchanged (roughness, normals, heights). "radiance" is "linear" without an
+        three channels unchanged (roughness, heights). "normal" uses the codes ``(n + 1) / 2`` of a
+        normal map; renderings have normals of length 1. "radiance" is "linear" without an
         upper bound; "linear" becomes "radiance" for an image of light above 1. "log" suits such
         images best: the Gaussians sum to logarithms of light, see
         `eigengs_dr.image.radiance.to_log`.

@@ -65,11 +65,15 @@ class FitTarget(NamedTuple):
         The image in the space of the colours.
     weight : ndarray of float32, shape (H, W, C), or None
         Factor of the errors before squaring.
+    shown : ndarray of float32, shape (H, W, C), or None
+        The image that places Gaussians, by default the values. Linear light would put too few
+        Gaussians into dark parts.
     """
 
     pixels: NDArray[np.float32]
     values: NDArray[np.float32]
     weight: NDArray[np.float32] | None = None
+    shown: NDArray[np.float32] | None = None
 
 
 class FitProblem(NamedTuple):
@@ -140,7 +144,7 @@ def make_target(pixels: NDArray[np.float32], color: str) -> FitTarget:
         return FitTarget(pixels, by_strips(lambda part: to_log(to_linear(part)), pixels))
     if color in LIGHT:
         light = by_strips(to_linear, pixels)
-        return FitTarget(pixels, light, by_strips(dark_weight, light))
+        return FitTarget(pixels, light, by_strips(dark_weight, light), shown=pixels)
     return FitTarget(pixels, pixels)
 
 

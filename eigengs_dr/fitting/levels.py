@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 
 import drjit as dr
 import numpy as np
@@ -23,13 +24,14 @@ from ..gaussian.concatenate import concatenate
 from ..gaussian.gaussians import Gaussians
 from .density_control import removal_cost
 from .fit import Fit, finish
-from .initializers import FitProblem, initialize
+from .initializers import FitProblem, FitTarget, make_target
 from .optimizers.descent import descend
 from .optimizers.schedule import Schedule
 from .options import FitOptions
 from .pixels import in_unit, read_pixels, unit_of
+from .placement_initializer import start_from_placement
 from .redistribute import place_like, residual
-from .refine import FitProgress, refine
+from .refine import FitProgress, Refinement, Score, measure, refine
 
 LEVEL_RATIO = 4
 """Ratio of the numbers of Gaussians up to a level and up to the level before it; 4 halves their
@@ -106,7 +108,7 @@ def fit_levels(
         Gaussians with a larger removal cost come first, so that every prefix forms an image.
     iterations : int, optional
         Largest number of refinement steps of the whole set.
-    color : {"ycbcr", "rgb", "linear", "radiance", "log", "data"}, optional
+    color : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, optional
         See `eigengs_dr.fit`.
     seed : int, optional
         Not used: the placement draws no random numbers.
@@ -145,26 +147,59 @@ def fit_levels(
     unit = unit_of(pixels, options.color)
     if unit != 1:
         pixels = pixels / np.float32(unit)
-    counts = level_counts(options.count_for(pixels), levels)
-    schedule = options.method.schedule
+    score = partial(measure, image=pixels, started=started)
     with defer_interrupts() as interrupted:
-        start = initialize(pixels, replace(options, gaussians=counts[0]))
-        start = start._replace(redistribute=None, relocate=None)  # the levels keep their Gaussians
-        steps = min(STEPS_PER_LEVEL, iterations)
-        placed = _place_levels(start, counts, schedule, steps, interrupted)
-        seconds_init = time.perf_counter() - started
-        refined = refine(
-            start._replace(gaussians=placed),
-            pixels,
-            schedule,
-            iterations,
-            started=started,
-            levels=counts[:-1],
-            progress=progress,
-            interrupted=interrupted,
-        )
-        ordered = _sort_levels(refined.gaussians, start, counts)
-    return finish(refined, in_unit(ordered, unit), None, started, seconds_init)
+        target = make_target(pixels, options.color)
+        found, seconds_init = refine_levels(target, options, levels, score, progress, interrupted)
+    return finish(found, in_unit(found.gaussians, unit), None, started, seconds_init)
+
+
+def refine_levels(
+    target: FitTarget,
+    options: FitOptions,
+    levels: int,
+    score: Score,
+    progress: FitProgress | None = None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> tuple[Refinement, float]:
+    """Place and refine nested sets for a target.
+
+    Parameters
+    ----------
+    target : FitTarget
+    options : FitOptions
+        Options that `check_options` accepts.
+    levels : int
+        See `fit_levels`.
+    score, progress, interrupted : callable
+        See `eigengs_dr.fitting.refine.refine`.
+
+    Returns
+    -------
+    Refinement
+        Its set is sorted by levels.
+    float
+        Seconds before refinement.
+    """
+    started = time.perf_counter()
+    counts = level_counts(options.count_for(target.values), levels)
+    schedule = options.method.schedule
+    start = start_from_placement(target, replace(options, gaussians=counts[0]))
+    start = start._replace(redistribute=None, relocate=None)  # the levels keep their Gaussians
+    steps = min(STEPS_PER_LEVEL, options.iterations)
+    placed = _place_levels(start, counts, schedule, steps, interrupted)
+    seconds_init = time.perf_counter() - started
+    refined = refine(
+        start._replace(gaussians=placed),
+        target.pixels,
+        schedule,
+        options.iterations,
+        levels=counts[:-1],
+        progress=progress,
+        interrupted=interrupted,
+        score=score,
+    )
+    return refined._replace(gaussians=_sort_levels(refined.gaussians, start, counts)), seconds_init
 
 
 def _place_levels(

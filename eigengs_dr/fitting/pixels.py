@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian.gaussians import Gaussians
-from ..image.pixels import MAX_PIXEL, check_data, check_image, encoding_of
+from ..image.color import rendered_as
+from ..image.pixels import (
+    MAX_PIXEL,
+    MIN_PIXEL,
+    ImageError,
+    check_data,
+    check_image,
+    encoding_of,
+)
 from .options import FitOptions
 
 WHITE = 1.001
@@ -37,13 +45,36 @@ def read_pixels(image: Any, options: FitOptions) -> tuple[NDArray[np.float32], F
     ImageError
         If the image is unusable.
     """
-    if options.color == "data":
-        return check_data(image, copy=False), options
+    if rendered_as(options.color) is None:
+        return read_data(image, options.color), options
     encoding = encoding_of(image, options.encoding) or "srgb"
     pixels = check_image(image, copy=False, encoding=encoding)
     if options.color == "linear" and encoding == "linear" and pixels.max() > WHITE:
         options = replace(options, color="radiance")
     return pixels, options
+
+
+def read_data(image: Any, space: str) -> NDArray[np.float32]:
+    """Check an image of data, shape (H, W, 1) or (H, W, 3), or of normals, shape (H, W, 3).
+
+    Raises
+    ------
+    ImageError
+        If the image is unusable, or no normal map.
+    """
+    pixels = check_data(image, copy=False)
+    if space != "normal":
+        return pixels
+    if pixels.shape[2] != 3:
+        raise ImageError(
+            f"image: shape {pixels.shape}; a normal map has three channels; use color 'data'"
+        )
+    if pixels.min() < MIN_PIXEL or pixels.max() > MAX_PIXEL:
+        raise ImageError(
+            f"image: normals run from {pixels.min():g} to {pixels.max():g}, not 0 to 1; pass "
+            "(n + 1) / 2"
+        )
+    return pixels
 
 
 def unit_of(pixels: NDArray[np.float32], color: str) -> float:

@@ -8,7 +8,6 @@ from pkgutil import resolve_name
 import numpy as np
 
 from ..gaussian.gaussians import Gaussians
-from ..image.color import LIGHT
 from .density_control import relocate
 from .initializers import PLACEMENTS, FitProblem, FitTarget, Placement
 from .options import FitOptions
@@ -20,9 +19,8 @@ def start_from_placement(target: FitTarget, options: FitOptions) -> FitProblem:
     """Place Gaussians by the image alone; see `eigengs_dr.fitting.initializers.Initializer`."""
     name, method = options.initializer, options.method
     place: Placement = resolve_name(PLACEMENTS[name])
-    # Linear light would put too few Gaussians into dark parts.
-    shown = target.pixels if options.color in LIGHT else target.values
-    count = options.count_for(target.pixels)
+    shown = target.values if target.shown is None else target.shown
+    count = options.count_for(target.values)
     generator = np.random.default_rng(options.seed)
     mean, factor = place(shown, count, generator)
     shape = (count, target.values.shape[2])

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from functools import partial
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -20,6 +21,7 @@ from .optimizers.descent import descend
 from .optimizers.schedule import Schedule
 
 FitProgress = Callable[[int, int, dict[str, Any]], None]
+Score = Callable[[Gaussians], dict[str, Any]]
 
 
 class Refinement(NamedTuple):
@@ -53,6 +55,7 @@ def refine(
     levels: Sequence[int] = (),
     progress: FitProgress | None = None,
     interrupted: Callable[[], bool] = lambda: False,
+    score: Score | None = None,
 ) -> Refinement:
     """Minimise the squared error over all parameters.
 
@@ -75,6 +78,9 @@ def refine(
     interrupted : callable, optional
         Called before every step; True ends the refinement. See
         `eigengs_dr.backend.interrupt.defer_interrupts`.
+    score : callable, optional
+        ``score(gaussians)`` returns a row of the trace without its iteration, by default that of
+        `measure`. Its psnr_ycbcr decides which set is the best.
 
     Returns
     -------
@@ -83,14 +89,15 @@ def refine(
         the last step.
     """
     started = time.perf_counter() if started is None else started
+    if score is None:
+        score = partial(measure, image=image, started=started, base_image=problem.base_image)
     marks, trace = trace_steps(iterations), list[dict[str, Any]]()
     best, current, highest = problem.gaussians, problem.gaussians, -math.inf
     stopped, step = "iterations", 0
 
     def judge() -> None:
         nonlocal best, highest
-        figures = measure(current, image, started, problem.base_image)
-        trace.append({"iteration": step, **figures})
+        trace.append({"iteration": step, **score(current)})
         if trace[-1]["psnr_ycbcr"] > highest:
             best, highest = current, trace[-1]["psnr_ycbcr"]
 

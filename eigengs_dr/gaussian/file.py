@@ -15,6 +15,9 @@ from ..storage import npz
 from ..storage.npz import BadValue, Field
 
 FORMAT = "eigengs_dr.gaussians"
+MATERIAL = "eigengs_dr.material"
+"""Format of files of several maps, which `eigengs_dr.material.file` reads."""
+
 VERSION = 2
 """Version of the format; version 2 added the cutoff."""
 
@@ -142,6 +145,8 @@ def _read(path: Path, sections: int | None) -> SetData:
             return data
     if sections is not None:
         raise ValueError(f"{path}: has no sections; pass sections only for .egs files")
+    if npz.format_of(path) == MATERIAL:
+        raise ValueError(f"{path}: holds a material; load it by Material.load, and take one map")
     version = npz.read_version(path, FORMAT, VERSION)
     layout = LAYOUT if version < 2 else LAYOUT | {"cutoff": CUTOFF_FIELD}
     arrays = npz.read(path, FORMAT, VERSION, layout)
@@ -183,5 +188,5 @@ def check(data: SetData) -> None:
         raise BadValue(f"space is {space!r}, expected one of {', '.join(SPACES)}")
     if space != "data" and color.shape[1] not in (1, 3, 4):
         raise BadValue(f"color has {color.shape[1]} channels; space {space!r} has 1, 3 or 4")
-    if space == "ycbcr" and color.shape[1] != 3:
-        raise BadValue(f"color has {color.shape[1]} channels; space 'ycbcr' has 3")
+    if space in ("ycbcr", "normal") and color.shape[1] != 3:
+        raise BadValue(f"color has {color.shape[1]} channels; space {space!r} has 3")

@@ -6,13 +6,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-SPACES = ("ycbcr", "rgb", "linear", "data", "radiance", "log")
+from .normals import renormalize
+from .radiance import from_log
+
+SPACES = ("ycbcr", "rgb", "linear", "data", "radiance", "log", "normal")
 """Names of the colour spaces that the channels of a set of Gaussians may have.
 
 ``"ycbcr"`` is studio-range YCbCr / 255, ``"rgb"`` is gamma-encoded RGB, ``"linear"`` is linear RGB,
 ``"radiance"`` is linear RGB that may exceed 1, ``"log"`` is logarithms of it (see
-`eigengs_dr.image.radiance`), and ``"data"`` is anything else (roughness, normals, ...), with any
-number of channels.
+`eigengs_dr.image.radiance`), ``"normal"`` is a normal map (see `eigengs_dr.image.normals`), and
+``"data"`` is anything else (roughness, heights, ...), with any number of channels.
 """
 
 LIGHT = ("linear", "radiance")
@@ -180,9 +183,29 @@ def to_picture(space: str, rendered: NDArray[Any]) -> NDArray[Any]:
     return rendered
 
 
+def from_sum(space: str, summed: Any) -> Any:
+    """Convert the sums of Gaussians to what a rendering holds, where decoding colours cannot.
+
+    Parameters
+    ----------
+    space : str
+        Space of the set.
+    summed : ndarray of float, shape (..., C), or Dr.Jit tensor, shape (H, W, C)
+
+    Returns
+    -------
+    array, same shape and type
+        Light for logarithms, normals of length 1 for normals; else `summed`. Dr.Jit tensors carry
+        derivatives.
+    """
+    if space == "log":
+        return from_log(summed)
+    return renormalize(summed) if space == "normal" else summed
+
+
 def rendered_as(space: str) -> str | None:
     """Return what renderings of a set of a space are: "srgb", "linear", or None for data."""
-    if space == "data":
+    if space in ("data", "normal"):
         return None
     return "srgb" if space in ("ycbcr", "rgb") else "linear"
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .blur import blur, gaussian_taps
-from .color import RGB_TO_YCBCR, UNBOUNDED, rgb_to_ycbcr, to_linear
+from .color import RGB_TO_YCBCR, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_linear
 from .io import to_8bit
 from .pixels import LinearImage, check_image
 from .radiance import to_pu21
@@ -142,12 +142,12 @@ def _sum_squares(a: NDArray[np.float64], b: NDArray[np.float64], space: str) -> 
 def float_space(color: str) -> str:
     """Return the space in which psnr_ycbcr compares sets of the space `color`.
 
-    Sets in the space "data" have no YCbCr, so their channels are compared directly. Light above 1
+    Data and normals have no YCbCr, so their channels are compared directly. Light above 1
     is compared in PU21, which has bounds.
     """
     if color in UNBOUNDED:
         return "pu21"
-    return "data" if color == "data" else "ycbcr"
+    return "ycbcr" if rendered_as(color) else "data"
 
 
 def psnr_from_mse(mse: float) -> float:

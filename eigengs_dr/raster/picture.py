@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
-from ..image.color import to_picture
-from ..image.radiance import from_log
+from ..image.color import from_sum, to_picture
 from .binning.tiles import TILE
 from .limits import check_index_range
 from .render import bin_gaussians, decode_parameters, rasterize
@@ -52,6 +51,6 @@ def picture_rows(gaussians: Gaussians) -> Callable[[slice], NDArray[np.floating]
         whole = tiles[first:last].transpose(0, 2, 1, 3)
         whole = whole.reshape((last - first) * side, -1, channels)
         part = whole[rows.start - first * side : rows.stop - first * side, : grid.width]
-        return to_picture(gaussians.space, from_log(part) if gaussians.space == "log" else part)
+        return to_picture(gaussians.space, from_sum(gaussians.space, part))
 
     return read

@@ -14,8 +14,7 @@ from ..backend.arrays import ArrayTypes
 from ..backend.recording import exclusive
 from ..gaussian.file import MAX_CUTOFF
 from ..gaussian.gaussians import Gaussians
-from ..image.color import decode, to_picture
-from ..image.radiance import from_log
+from ..image.color import decode, from_sum, to_picture
 from .adjoint import adjoint
 from .binning.lists import TileLists, build_lists
 from .binning.tiles import TILE, Grid
@@ -86,7 +85,7 @@ def render(
     lists = bin_gaussians(scaled, adjoint=dr.grad_enabled(parameters))
     image = rasterize(parameters, lists, scaled.cutoff)
     tensor = to_tensor(image, lists.grid, len(parameters.background))
-    return from_log(tensor) if gaussians.space == "log" else tensor
+    return from_sum(gaussians.space, tensor)
 
 
 @exclusive()

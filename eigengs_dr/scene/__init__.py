@@ -3,6 +3,8 @@
 - ``visibility``: pixels to texels
 - ``back_projection``: the smoothest texture that looks alike
 - ``fit_scene``: the fewest Gaussians for a scene
+- ``bitmaps``: the bitmaps of a scene, and which of them must stay
+- ``convert``: a scene with Gaussians in the place of its bitmaps
 """
 
 from .. import plugins  # noqa: F401  without Mitsuba, its error says what to install

@@ -8,7 +8,7 @@ which every camera sees the texture at a given PSNR.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -88,13 +88,13 @@ class SceneFit(NamedTuple):
 @exclusive()
 def fit_for_scene(
     scene: Any,
-    texture: str,
+    texture: Any,
     image: ArrayLike,
     psnr: float = 40.0,
     color: str = "linear",
     most: int | None = None,
     iterations: int = 100,
-    wrap_mode: str = "repeat",
+    wrap_mode: str | Sequence[str] = "repeat",
     encoding: str | None = None,
 ) -> SceneFit:
     """Find the fewest Gaussians with which all cameras of a scene see an image at a given PSNR.
@@ -104,9 +104,9 @@ def fit_for_scene(
     scene : mitsuba.Scene
         Scene with all its cameras, and any bitmap or ``gaussian_texture`` in the place of the
         texture; only its position is used.
-    texture : str
+    texture : str, mitsuba.Texture, or a sequence of them
         Name of the texture among the parameters of the scene, such as
-        ``"poster.bsdf.reflectance"``.
+        ``"poster.bsdf.reflectance"``. Several are uses of the image.
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
         Image for the texture, float in [0, 1] or unsigned integers; row 0 at v = 0.
     psnr : float, optional
@@ -119,7 +119,7 @@ def fit_for_scene(
         Largest number of Gaussians; by default the number of seen texels.
     iterations : int, optional
         Steps of refinement for each number of Gaussians.
-    wrap_mode : {"repeat", "mirror", "clamp"}, optional
+    wrap_mode : {"repeat", "mirror", "clamp"}, or a sequence of them, optional
         See `eigengs_dr.scene.visibility.visibility`.
     encoding : {"srgb", "linear"}, optional
         What the pixels are, see `eigengs_dr.fit`.

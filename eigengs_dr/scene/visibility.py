@@ -9,6 +9,8 @@ footprint of a texel counts. Rays do not follow mirrors or glass, and the lens i
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,9 +61,9 @@ class Visibility(NamedTuple):
         Smallest standard deviation, in texels, of a pixel's footprint at each texel; infinite at
         unseen texels. The shorter axis counts, so that no detail visible along one axis is lost.
     pixel_to_texel : list of scipy.sparse.csr_array of float32, shape (pixels, H * W)
-        One matrix for each camera that sees the texture, with one row for each pixel that sees it:
-        the shares of the texels in the pixel, with the sum 1. ``pixel_to_texel[k] @ texels`` is the
-        view of camera k in even light.
+        One matrix for each camera that sees the texture, and for each use of it, with one row for
+        each pixel that sees it: the shares of the texels in the pixel, with the sum 1.
+        ``pixel_to_texel[k] @ texels`` is the view of camera k in even light.
     """
 
     footprint: NDArray[np.float32]
@@ -80,7 +82,11 @@ class Visibility(NamedTuple):
 
 
 def visibility(
-    scene: Any, texture: str, width: int, height: int, wrap_mode: str = "repeat"
+    scene: Any,
+    texture: Any,
+    width: int,
+    height: int,
+    wrap_mode: str | Sequence[str] = "repeat",
 ) -> Visibility:
     """Measure what the cameras of a scene resolve of a texture.
 
@@ -88,13 +94,14 @@ def visibility(
     ----------
     scene : mitsuba.Scene
         All its sensors count, with the size and crop of their films.
-    texture : str
+    texture : str, mitsuba.Texture, or a sequence of them
         Name of the texture among the parameters of the scene (`mitsuba.traverse`), such as
-        ``"poster.bsdf.reflectance"``: a bitmap or a ``gaussian_texture`` of any content.
+        ``"poster.bsdf.reflectance"``: a bitmap or a ``gaussian_texture`` of any content. Several
+        textures count as uses of one image.
     width, height : int
         Size in texels: that of the image for the texture.
-    wrap_mode : {"repeat", "mirror", "clamp"}, optional
-        Wrap mode of a bitmap, which Mitsuba does not tell; a ``gaussian_texture`` uses its own.
+    wrap_mode : {"repeat", "mirror", "clamp"}, or a sequence of them, optional
+        Wrap mode of each bitmap, which Mitsuba does not tell; a ``gaussian_texture`` uses its own.
 
     Returns
     -------
@@ -106,13 +113,18 @@ def visibility(
         If the scene has no such texture, no shape uses it, no pixel sees it, or the wrap mode is
         unknown.
     """
-    if wrap_mode not in WRAPS:
-        raise ValueError(f"wrap_mode {wrap_mode!r} is unknown; use one of {', '.join(WRAPS)}")
-    node, shapes = _find(scene, texture)
-    to_uv, wrap = _mapping(node, wrap_mode)
+    textures = list(texture) if isinstance(texture, list | tuple) else [texture]
+    wraps = [wrap_mode] * len(textures) if isinstance(wrap_mode, str) else list(wrap_mode)
+    for mode in wraps:
+        if mode not in WRAPS:
+            raise ValueError(f"wrap_mode {mode!r} is unknown; use one of {', '.join(WRAPS)}")
+    found = [_find(scene, name) for name in textures]
+    uses = [
+        (shapes, *_mapping(node, mode)) for (node, shapes), mode in zip(found, wraps, strict=True)
+    ]
     footprint = np.full(height * width, np.inf, np.float32)
     lookups = []
-    for sensor in scene.sensors():
+    for sensor, (shapes, to_uv, wrap) in product(scene.sensors(), uses):
         hits = _samples_of(_View(scene, sensor, shapes, to_uv, wrap, width, height))
         if hits is None:
             continue
@@ -120,8 +132,8 @@ def visibility(
         lookups.append(_rows(hits, width, height))
     if not lookups:
         raise ValueError(
-            f"no pixel of the scene's {len(scene.sensors())} cameras sees {texture!r}; check where "
-            "the cameras look, and what hides the texture"
+            f"no pixel of the scene's {len(scene.sensors())} cameras sees {_name(texture)}; check "
+            "where the cameras look, and what hides the texture"
         )
     return Visibility(footprint.reshape(height, width), lookups)
 
@@ -129,7 +141,11 @@ def visibility(
 # --- The texture in its scene --------------------------------------------------------------------
 
 
-def _find(scene: Any, texture: str) -> tuple[Any, list]:
+def _name(texture: Any) -> str:
+    return repr(texture) if isinstance(texture, str) else "the texture"
+
+
+def _find(scene: Any, texture: Any) -> tuple[Any, list]:
     """Find the texture of a name, and the shapes that use it.
 
     Raises
@@ -143,13 +159,16 @@ def _find(scene: Any, texture: str) -> tuple[Any, list]:
         for key, entry in entries.items()
         if isinstance(entry[2], mi.Texture)
     }
-    if texture not in textures:
+    if not isinstance(texture, str):
+        node = texture
+    elif texture not in textures:
         known = ", ".join(name for name, t in textures.items() if t.is_spatially_varying())
         raise ValueError(f"texture {texture!r} is not in the scene; it has {known or 'none'}")
-    node = textures[texture]
+    else:
+        node = textures[texture]
     shapes = [shape for shape in scene.shapes() if node in mi.traverse(shape).hierarchy]
     if not shapes:
-        raise ValueError(f"texture {texture!r} belongs to no shape; name the texture of a shape")
+        raise ValueError(f"{_name(texture)} belongs to no shape; name the texture of a shape")
     return node, shapes
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..gaussian.covariance import outline
 from ..gaussian.gaussians import Gaussians
+from ..image.color import rendered_as
 from ..image.io import to_8bit
 from ..image.pixels import check_image
 
@@ -81,7 +82,7 @@ def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
 
 def displayed(image: Picture, color: str) -> Picture:
     """Return an image from `eigengs_dr.load_image` as people look at it: sRGB, or data."""
-    return np.asarray(image) if color == "data" else check_image(image, copy=False)
+    return np.asarray(image) if rendered_as(color) is None else check_image(image, copy=False)
 
 
 def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Picture:

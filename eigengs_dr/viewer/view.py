@@ -11,7 +11,7 @@ from ..backend.recording import exclusive
 from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.gaussians import Gaussians
-from ..image.color import UNBOUNDED
+from ..image.color import UNBOUNDED, rendered_as
 from ..image.pixels import check_data, check_image
 from .model_facts import describe_model, describe_share
 from .page import Page, build_page
@@ -102,10 +102,11 @@ def view(
         levels=bool(levels),
         views=views if len(views) > 1 else [],
         bright=gaussians.space in UNBOUNDED,
-        color_name="Values" if gaussians.space == "data" else "Colour",
+        color_name="Colour" if rendered_as(gaussians.space) else "Values",
     )
 
 
 def _photo(image: ArrayLike, space: str, encoding: str | None) -> NDArray[np.float32]:
     """Return a photo as people look at it: sRGB, or data."""
-    return check_data(image) if space == "data" else check_image(image, encoding=encoding)
+    data = rendered_as(space) is None
+    return check_data(image) if data else check_image(image, encoding=encoding)

@@ -113,7 +113,7 @@ def test_mistake_that_shows_while_rendering(scene, folder, tmp_path):
     path = scene(
         '<shape type="sphere"><bsdf type="normalmap"><bsdf type="diffuse"/>'
         '<texture type="gaussian_texture" name="normalmap"><boolean name="raw" value="true"/>'
-        f'<string name="filename" value="{folder / "tiles-roughness.npz"}"/></texture>'
+        f'<string name="filename" value="{folder / "roughness.npz"}"/></texture>'
         "</bsdf></shape>"
     )
     result = run(path, "-o", tmp_path / "x.png", "--variant", "llvm_ad_rgb")

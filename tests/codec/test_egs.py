@@ -168,8 +168,14 @@ PLAIN = b"\0\0\0\0" * 5
 HOSTILE = {
     "nothing": (b"", "not a readable"),
     "another magic": (header(magic=b"\x89EGT") + body(), "not a readable"),
-    "newer": (header(version=4) + body(), "version is 4, but this package reads version 3; upg"),
-    "older": (header(version=2) + body(), "version is 2, but this package reads version 3; pack"),
+    "newer": (
+        header(version=5) + body(),
+        "version is 5, but this package reads versions 3 and 4",
+    ),
+    "older": (
+        header(version=2) + body(),
+        "reads versions 3 and 4; pack the set",
+    ),
     "version 0": (header(version=0) + body(), "version is 0"),
     "another space": (header(space=9) + body(), "unknown values"),
     "no channels": (header(channels=0) + body(), "claims 0 channels"),

@@ -1,5 +1,7 @@
 """Lookups of the texture: values, colour, wrapping, slopes."""
 
+from dataclasses import replace
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -63,6 +65,15 @@ class TestValues:
         sides = [t.eval_1(at(mi.Float(0.4 + d), mi.Float(0.6))).numpy() for d in (-step, step)]
         slope = (sides[1] - sides[0]) / (2 * step)
         np.testing.assert_allclose(found[0].numpy(), slope, rtol=0.05, atol=0.02)
+
+    def test_normals_get_the_length_1_unless_raw(self):
+        g = gaussians("normal", quiet=False)
+        found = picture(texture(g).eval_3(texel_centres()))
+        np.testing.assert_allclose(np.linalg.norm(2 * found - 1, axis=2), 1, atol=1e-5)
+        np.testing.assert_allclose(found, eg.render(g).numpy(), atol=1e-4)
+        raw = picture(texture(g, raw=True).eval_3(texel_centres()))
+        plain = eg.render(replace(g, space="data")).numpy()
+        np.testing.assert_allclose(raw, plain, atol=1e-5)
 
     def test_a_set_in_linear_light_shows_the_picture(self):
         g = gaussians("linear")

@@ -1,0 +1,63 @@
+"""The command ``eigengs-dr pack`` for a material."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .fit_material import MapFile, by_name, load_map
+
+
+def pack_maps(
+    file: Path,
+    target: Path,
+    image: Path | None,
+    maps: tuple[MapFile, ...],
+    encoding: str | None,
+    budget: float,
+    levels: int,
+    backend: str | None,
+    quiet: bool,
+) -> dict[str, Any]:
+    """Pack a material, and return its figures."""
+    import eigengs_dr as eg
+
+    if image:
+        raise ValueError(f"{file}: holds a material; give its images by --map NAME=FILE")
+    if levels > 1:
+        raise ValueError(f"{file}: a material has no levels in .egs files; leave --levels out")
+    material = eg.Material.load(file, backend)
+    spaces = {m.name: m.space for m in material.maps}
+    named = {
+        name: item._replace(space=item.space or spaces.get(name))
+        for name, item in by_name(maps).items()
+    }
+    images = {name: load_map(item, encoding) for name, item in named.items()} or None
+    try:
+        packed = eg.pack_material(material, target, images, budget, encoding)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+    before = file.stat().st_size
+    if not quiet:
+        shown = ", ".join(f"{name} {psnr:.2f} dB" for name, psnr in packed.psnr.items())
+        against = "the images" if images else "the renderings of the input"
+        click.echo(
+            f"{file}: {len(material.gaussians):,} Gaussians, {before:,} bytes\n"
+            f"  wrote {target}: {packed.bytes:,} bytes, "
+            f"{packed.bits_per_pixel:.3f} bits per pixel for all maps\n"
+            f"  lost {packed.psnr_drop:.2f} dB; psnr_rgb against {against}: {shown}"
+        )
+    return {
+        "input": str(file),
+        "output": str(target),
+        "gaussians": len(material.gaussians),
+        "budget": budget,
+        "bytes_before": before,
+        "bytes": packed.bytes,
+        "bits_per_pixel": packed.bits_per_pixel,
+        "psnr_rgb": packed.psnr,
+        "lost": packed.psnr_drop,
+        "steps": packed.steps._asdict(),
+    }

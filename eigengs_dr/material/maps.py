@@ -1,0 +1,136 @@
+"""The maps of a material: their names, spaces and channels."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..image.color import SPACES, decode, from_sum, to_picture
+from ..storage.npz import BadValue
+
+MAX_CHANNELS = 16
+"""Largest number of channels of all maps together: a program holds the sums of all channels of a
+block of pixels in registers."""
+
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
+"""Valid names of maps."""
+
+COLORS = ("albedo", "base_color", "basecolor", "color", "diffuse", "reflectance", "emission")
+"""Names of maps that hold colours, unless the caller says something else."""
+
+NORMALS = ("normal", "normals", "normalmap")
+"""Names of maps that hold normals, unless the caller says something else."""
+
+
+class TextureMap(NamedTuple):
+    """One map of a material.
+
+    Attributes
+    ----------
+    name : str
+        Letters, digits, "_" and "-"; at most 32.
+    space : str
+        Space of its channels, one of `eigengs_dr.image.color.SPACES`.
+    channels : int
+        Number of its channels.
+    weight : float
+        Factor of its errors in the fit; packing uses it again.
+    """
+
+    name: str
+    space: str
+    channels: int
+    weight: float = 1.0
+
+
+def usual_space(name: str) -> str:
+    """Return the space of a map by its name: linear light, normals, or data.
+
+    Examples
+    --------
+    >>> [usual_space(name) for name in ("albedo", "normal", "roughness")]
+    ['linear', 'normal', 'data']
+    """
+    lower = name.lower()
+    if lower in COLORS:
+        return "linear"
+    return "normal" if lower in NORMALS else "data"
+
+
+def check_name(name: str) -> None:
+    """Raise `BadValue` if no map can have a name."""
+    if not isinstance(name, str) or not NAME.fullmatch(name):
+        shown = repr(name)[:40]
+        raise BadValue(
+            f"map {shown}: a name starts with a letter and has at most 32 letters, digits, _ or -"
+        )
+
+
+def check_maps(maps: Sequence[TextureMap], channels: int) -> None:
+    """Raise `BadValue` if maps are invalid, or do not have this number of channels together."""
+    names = [m.name for m in maps]
+    for m in maps:
+        check_name(m.name)
+        if m.space not in SPACES:
+            raise BadValue(f"map {m.name!r}: space {m.space[:20]!r} is not in {', '.join(SPACES)}")
+        fitting = {"ycbcr": (3,), "normal": (3,)}.get(m.space, (1, 3))
+        if m.channels not in fitting:
+            wanted = " or ".join(map(str, fitting))
+            raise BadValue(
+                f"map {m.name!r} has {m.channels} channels; space {m.space!r} has {wanted}"
+            )
+        if not (math.isfinite(m.weight) and m.weight > 0):
+            raise BadValue(f"map {m.name!r}: weight is {m.weight}; it must be above 0")
+    if not maps or len(set(names)) < len(names):
+        raise BadValue(f"maps are {', '.join(names) or 'none'}; give each name once")
+    total = sum(m.channels for m in maps)
+    if total > MAX_CHANNELS:
+        raise BadValue(
+            f"the maps have {total} channels, at most {MAX_CHANNELS} share shapes; make two "
+            "materials"
+        )
+    if total != channels:
+        raise BadValue(f"the maps have {total} channels, but the Gaussians have {channels}")
+
+
+def slices(maps: Sequence[TextureMap]) -> list[slice]:
+    """Return the channels of each map among those of all."""
+    ends = np.cumsum([m.channels for m in maps]).tolist()
+    return [slice(end - m.channels, end) for end, m in zip(ends, maps, strict=True)]
+
+
+def find_map(maps: Sequence[TextureMap], name: str) -> int:
+    """Return the index of a map.
+
+    Raises
+    ------
+    BadValue
+        If there is none; the message lists the names.
+    """
+    names = [m.name for m in maps]
+    if name not in names:
+        raise BadValue(f"map {name!r} is not in it; it has {', '.join(names)}")
+    return names.index(name)
+
+
+def show_sums(space: str, sums: NDArray[Any]) -> NDArray[Any]:
+    """Convert sums of Gaussians of a space to what people look at.
+
+    Parameters
+    ----------
+    space : str
+    sums : ndarray of float, shape (..., C)
+
+    Returns
+    -------
+    ndarray, same shape
+        As `eigengs_dr.picture_of` of a set of this space: RGB for colours, else data or normals.
+    """
+    if space == "ycbcr":
+        sums = np.stack(decode(space, list(np.moveaxis(sums, -1, 0))), axis=-1)
+    return to_picture(space, from_sum(space, sums))

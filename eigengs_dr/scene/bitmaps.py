@@ -1,0 +1,181 @@
+"""The bitmaps of a scene: where they are, what they hold, and which ones must stay bitmaps."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..image.io import load_image
+from ..image.pixels import ImageError, LinearImage
+from ..plugins import register_plugins  # first: its error says what to install
+
+# isort: split
+import mitsuba as mi
+
+TWO_VALUES = 0.95
+"""Share of pixels that are black or white from which on an image counts as a mask."""
+
+MASKS = {("mask", "opacity")}
+"""Slots that cut out parts of a surface: type of the parent and name of the property."""
+
+KEPT = ("to_uv", "wrap_mode")
+"""Properties of a bitmap that a ``gaussian_texture`` has too."""
+
+
+class Use(NamedTuple):
+    """A bitmap in a scene.
+
+    Attributes
+    ----------
+    node : int
+        Its index among the nodes of the parsed scene.
+    parent : int
+        Index of the node that uses it.
+    slot : str
+        Property of that node.
+    file : str
+        Absolute path of the image; empty if it is in memory.
+    raw : bool
+        Whether the values are data.
+    wrap : str
+        Wrap mode.
+    name : str
+        How a report calls it.
+    """
+
+    node: int
+    parent: int
+    slot: str
+    file: str
+    raw: bool
+    wrap: str
+    name: str
+
+
+class Parsed(NamedTuple):
+    """A scene that is parsed but not instantiated: all nodes, and the folder of its files."""
+
+    config: Any
+    state: Any
+    folder: Path
+
+
+def parse(scene: Any, parameters: Mapping[str, str] | None = None) -> Parsed:
+    """Parse a scene, and make the names of its files absolute.
+
+    Parameters
+    ----------
+    scene : path-like or dict
+        An XML file, or a dictionary as for `mitsuba.load_dict`.
+    parameters : mapping of str to str, optional
+        Values for the defaults of an XML file.
+
+    Raises
+    ------
+    ValueError
+        If the root is no scene.
+    RuntimeError
+        Mitsuba's error, if the scene does not parse.
+    """
+    register_plugins()
+    config = mi.parser.ParserConfig(mi.variant())
+    config.merge_equivalent = config.merge_meshes = config.parallel = False
+    if isinstance(scene, Mapping):
+        folder, state = Path.cwd(), mi.parser.parse_dict(config, dict(scene))
+    else:
+        folder = Path(scene).resolve().parent
+        state = mi.parser.parse_file(config, str(scene), **dict(parameters or {}))
+    mi.parser.transform_all(config, state)
+    if state.root.props.plugin_name() != "scene":
+        raise ValueError("holds no scene; its root must be <scene version='3.0.0'>")
+    for node in state.nodes:
+        for key in node.props.keys():  # noqa: SIM118  it is no mapping
+            if key == "filename" or key.endswith("_filename"):
+                path = folder / node.props[key]
+                if path.exists():
+                    node.props[key] = str(path)
+    return Parsed(config, state, folder)
+
+
+def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
+    """Find the bitmaps of a scene that may become Gaussians.
+
+    Returns
+    -------
+    list of Use
+    list of (str, str)
+        The name of what stays as it is, and why.
+    """
+    nodes = parsed.state.nodes
+    parents: dict[int, list[tuple[int, str]]] = {}
+    for index, node in enumerate(nodes):
+        for slot in node.props.keys():  # noqa: SIM118  it is no mapping
+            if node.props.type(slot) == mi.Properties.Type.ResolvedReference:
+                parents.setdefault(node.props[slot].index(), []).append((index, slot))
+    uses, left = [], list[tuple[str, str]]()
+    for index, node in enumerate(nodes):
+        props = node.props
+        if props.plugin_name() == "envmap":
+            left.append((_label(props, None, ""), "an environment map takes no texture"))
+        if node.type != mi.ObjectType.Texture or props.plugin_name() != "bitmap":
+            continue
+        # A texture with an id is a child of the scene too, where it has no use.
+        above = [(p, s) for p, s in parents.get(index, []) if nodes[p].type != mi.ObjectType.Scene]
+        parent, slot = above[0] if above else (0, "")
+        name = _label(props, nodes[parent].props, slot)
+        if reason := _reason(props, [(nodes[p].props.plugin_name(), s) for p, s in above]):
+            left.append((name, reason))
+            continue
+        file = os.path.realpath(props["filename"])
+        raw, wrap = bool(props.get("raw", False)), str(props.get("wrap_mode", "repeat"))
+        uses.append(Use(index, parent, slot, file, raw, wrap, name))
+    return uses, left
+
+
+def _label(props: Any, parent: Any, slot: str) -> str:
+    """Name a bitmap by its file and where it is."""
+    file = Path(str(props["filename"])).name if "filename" in props else "a bitmap in memory"
+    if parent is None:
+        return f"{file} (environment)"
+    return f"{file} ({parent.id() or parent.plugin_name()}.{slot})"
+
+
+def _reason(props: Any, slots: list[tuple[str, str]]) -> str:
+    """Say why a bitmap stays a bitmap by its properties, or nothing."""
+    if not slots:
+        return "nothing uses it"
+    if "filename" not in props:
+        return "its pixels are in memory; give a file"
+    if not Path(str(props["filename"])).is_file():
+        return "its file is missing"
+    if any(slot in MASKS for slot in slots):
+        return "an alpha mask: Gaussians would soften its edges"
+    if str(props.get("filter_type", "bilinear")) != "bilinear":
+        return "its filter shows single texels"
+    return ""
+
+
+def read_pixels(use: Use) -> NDArray[np.float32] | str:
+    """Return the pixels of a bitmap, or say why it stays a bitmap."""
+    try:
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            image = load_image(use.file, keep_grey=use.raw)
+    except ImageError as error:
+        return str(error).removeprefix(f"{use.file}: ")
+    if any("transparent" in str(warning.message) for warning in said):
+        return "its pixels are transparent"
+    if image.max() > 1.001 or image.min() < -0.001:
+        return f"values from {image.min():g} to {image.max():g}, beyond 0 and 1"
+    if use.raw and isinstance(image, LinearImage):
+        image = np.asarray(image)
+    extreme = float(((image <= 0.02) | (image >= 0.98)).all(axis=2).mean())
+    if extreme >= TWO_VALUES and np.ptp(image) > 0.5:
+        return "a mask of two values: Gaussians would soften its edges"
+    return image

@@ -1,0 +1,327 @@
+"""The function `convert_scene`, which replaces the bitmaps of a scene by Gaussians."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..backend.recording import exclusive
+from ..gaussian.gaussians import Gaussians
+from ..image.color import to_coded
+from ..image.io import save_image
+from ..image.metrics import psnr as psnr_of
+from ..storage.atomic import refuse_url
+from .bitmaps import KEPT, Parsed, Use, parse, read_pixels, uses_of
+from .fit_scene import fit_for_scene
+
+# isort: split
+import mitsuba as mi
+
+SCENE = "scene.xml"
+"""Name of the new scene in its folder."""
+
+LOUDER = 8.0
+"""Factor of the differences in their pictures."""
+
+SAMPLES_PER_PASS = 1 << 24
+"""Most samples of a rendering in one pass."""
+
+Progress = Callable[[str, int, int], None]
+
+
+class ConvertedTexture(NamedTuple):
+    """A bitmap that became Gaussians.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Its uses: the file, and in brackets what uses it.
+    file : str
+        The new file, relative to the folder.
+    width, height, channels : int
+    bytes : int
+        Memory of the bitmap with 8 bits a value.
+    gaussians : int
+    gaussian_bytes : int
+        Memory of means, shapes and colours in single precision.
+    psnr : float
+        Lowest PSNR in dB with which a camera sees it, see `eigengs_dr.fit_for_scene`.
+    """
+
+    names: tuple[str, ...]
+    file: str
+    width: int
+    height: int
+    channels: int
+    bytes: int
+    gaussians: int
+    gaussian_bytes: int
+    psnr: float
+
+
+@dataclass(frozen=True)
+class ConvertedScene:
+    """Result of `convert_scene`.
+
+    Attributes
+    ----------
+    scene : Path
+        The new XML file. Beside it are the sets of Gaussians, and for each camera the pictures
+        before-1.png, after-1.png and difference-1.png, 8 times louder.
+    textures : list of ConvertedTexture
+    left : list of (str, str)
+        What stayed as it was, and why.
+    psnr : list of float
+        psnr_rgb in dB between the renderings of each camera; both have the same random numbers.
+    """
+
+    scene: Path
+    textures: list[ConvertedTexture]
+    left: list[tuple[str, str]]
+    psnr: list[float] = field(default_factory=list)
+
+
+@exclusive()
+def convert_scene(
+    scene: str | os.PathLike[str] | dict[str, Any],
+    folder: str | os.PathLike[str],
+    psnr: float = 40.0,
+    iterations: int = 100,
+    spp: int | None = None,
+    parameters: Mapping[str, str] | None = None,
+    progress: Progress = lambda *_: None,
+) -> ConvertedScene:
+    """Replace every bitmap of a scene by as many Gaussians as its cameras resolve.
+
+    Uses of one image share a set. The function leaves alone what Gaussians would spoil or cannot
+    replace: environment maps, alpha masks, images of two values, values above 1, images that no
+    camera sees, and those that would take more Gaussians than texels.
+
+    Parameters
+    ----------
+    scene : path-like or dict
+        XML file, or dictionary as for `mitsuba.load_dict`, with images in files.
+    folder : path-like
+        Folder to write; it must not exist, or be empty. It is written as a whole, or not at all.
+    psnr : float, optional
+        Lowest PSNR in dB with which a camera sees a texture, see `eigengs_dr.fit_for_scene`.
+    iterations : int, optional
+        Steps of refinement for each number of Gaussians.
+    spp : int, optional
+        Samples per pixel of the renderings, by default those of the scene; 0 renders nothing.
+    parameters : mapping of str to str, optional
+        Values for the defaults of an XML file.
+    progress : callable, optional
+        ``progress(label, done, total)``.
+
+    Returns
+    -------
+    ConvertedScene
+
+    Raises
+    ------
+    ValueError
+        If no variant of Mitsuba is set, an argument is out of range, the folder has files in it, or
+        the scene cannot be written as XML.
+    RuntimeError
+        Mitsuba's error, if the scene does not parse.
+    OSError
+        If the folder cannot be written.
+
+    Examples
+    --------
+    After ``mi.set_variant("llvm_ad_rgb")``::
+
+        result = eg.convert_scene("room.xml", "room-gaussians/", psnr=40)
+        image = mi.render(mi.load_file(str(result.scene)))
+    """
+    if not mi.variant():
+        raise ValueError("no variant is set; call mi.set_variant('llvm_ad_rgb') first")
+    if not 0 < psnr < 60:
+        raise ValueError(f"psnr is {psnr:g}; it must be above 0 and below 60 dB")
+    refuse_url(folder)
+    target = Path(folder)
+    work = _workplace(target)
+    try:
+        parsed, again = parse(scene, parameters), parse(scene, parameters)
+        uses, left = uses_of(parsed)
+        before = mi.parser.instantiate(parsed.config, parsed.state)
+        sets, textures = _convert(before, parsed, uses, left, psnr, iterations, progress)
+        for file, gaussians in sets.items():
+            gaussians.save(work / file)
+        _rewrite(again, textures, uses, target)
+        (work / SCENE).write_text(_to_xml(again), encoding="utf-8")
+        found = [] if spp == 0 else _compare(before, work, spp, progress)
+        if target.exists():
+            target.rmdir()  # it is empty
+        os.replace(work, target)
+    except BaseException:
+        shutil.rmtree(work, ignore_errors=True)
+        raise
+    return ConvertedScene(target / SCENE, textures, left, found)
+
+
+def _workplace(target: Path) -> Path:
+    """Make a folder beside the target, which becomes the target at the end."""
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise ValueError(f"{target}: exists and is not empty; choose another folder")
+    parent = target.resolve().parent
+    work = parent / f".{secrets.token_hex(8)}"
+    try:
+        work.mkdir()
+        return work
+    except OSError as error:
+        raise OSError(
+            f"{target}: cannot create a folder in {parent} ({error.strerror}); choose another path"
+        ) from error
+
+
+# --- The textures --------------------------------------------------------------------------------
+
+
+def _convert(
+    scene: Any,
+    parsed: Parsed,
+    uses: list[Use],
+    left: list[tuple[str, str]],
+    psnr: float,
+    iterations: int,
+    progress: Progress,
+) -> tuple[dict[str, Gaussians], list[ConvertedTexture]]:
+    """Fit the image of each bitmap; note in `left` what must stay."""
+    groups: dict[tuple[str, bool], list[Use]] = {}
+    for use in uses:
+        groups.setdefault((use.file, use.raw), []).append(use)
+    sets, textures = dict[str, Gaussians](), list[ConvertedTexture]()
+    for number, ((_, raw), group) in enumerate(groups.items()):
+        progress("textures", number, len(groups))
+        nodes = parsed.state.nodes
+        seen = [nodes[use.parent].props[use.slot] for use in group]
+        pixels = read_pixels(group[0])
+        if isinstance(pixels, str):
+            left += [(use.name, pixels) for use in group]
+            continue
+        try:
+            found = fit_for_scene(
+                scene,
+                seen,
+                pixels,
+                psnr,
+                "data" if raw else "linear",
+                iterations=iterations,
+                wrap_mode=[use.wrap for use in group],
+            )
+        except ValueError as error:
+            left += [(use.name, str(error)) for use in group]
+            continue
+        g = found.gaussians
+        height, width, channels = pixels.shape
+        size = 4 * (len(g) * (5 + g.channels) + g.channels)
+        if size >= pixels.size:
+            reason = f"{len(g):,} Gaussians take more memory than its texels"
+            left += [(use.name, reason) for use in group]
+            continue
+        file = _file_name(group[0].file, raw, sets)
+        sets[file] = g
+        names = tuple(use.name for use in group)
+        textures.append(
+            ConvertedTexture(
+                names,
+                file,
+                width,
+                height,
+                channels,
+                pixels.size,
+                len(g),
+                size,
+                min(found.psnr),
+            )
+        )
+    progress("textures", len(groups), len(groups))
+    return sets, textures
+
+
+def _file_name(image: str, raw: bool, taken: dict[str, Gaussians]) -> str:
+    """Name the file of a set by its image."""
+    stem = Path(image).stem
+    names = [f"{stem}.npz", f"{stem}-data.npz", *(f"{stem}-{k}.npz" for k in range(2, 1000))]
+    return next(name for name in names[raw and f"{stem}.npz" in taken :] if name not in taken)
+
+
+# --- The scene -----------------------------------------------------------------------------------
+
+
+def _rewrite(
+    parsed: Parsed, textures: list[ConvertedTexture], uses: list[Use], target: Path
+) -> None:
+    """Put the sets in the place of the bitmaps, and name other files relative to the folder."""
+    files = {name: texture.file for texture in textures for name in texture.names}
+    made = {use.node: files[use.name] for use in uses if use.name in files}
+    for index, node in enumerate(parsed.state.nodes):
+        props = node.props
+        if index in made:
+            for key in list(props.keys()):
+                if key not in KEPT:
+                    del props[key]
+            props.set_plugin_name("gaussian_texture")
+            props["filename"] = made[index]
+            continue
+        for key in list(props.keys()):
+            if key == "filename" or key.endswith("_filename"):
+                path = Path(props[key])
+                if path.is_absolute() and path.exists():
+                    props[key] = os.path.relpath(path, target.resolve())
+
+
+def _to_xml(parsed: Parsed) -> str:
+    try:
+        return str(mi.parser.write_string(parsed.state))
+    except RuntimeError as error:
+        reason = str(error).partition("] ")[2] or str(error)
+        raise ValueError(
+            f"the scene cannot be written as XML ({reason}); give images and meshes by files"
+        ) from None
+
+
+# --- The renderings ------------------------------------------------------------------------------
+
+
+def _compare(before: Any, folder: Path, spp: int | None, progress: Progress) -> list[float]:
+    """Render both scenes by each camera, write the pictures, and return their PSNR."""
+    # Threads of Mitsuba would wait for the lock of this thread to read the sets.
+    after = mi.load_file(str(folder / SCENE), parallel=False)
+    found, cameras = [], len(before.sensors())
+    for number in range(cameras):
+        progress("renderings", number, cameras)
+        pair = [_picture(scene, number, spp) for scene in (before, after)]
+        loud = np.clip(LOUDER * np.abs(pair[0] - pair[1]), 0, 1)
+        for name, picture in zip(("before", "after", "difference"), [*pair, loud], strict=True):
+            save_image(folder / f"{name}-{number + 1}.png", picture)
+        found.append(psnr_of(pair[0], pair[1]))
+    progress("renderings", cameras, cameras)
+    return found
+
+
+def _picture(scene: Any, camera: int, spp: int | None) -> NDArray[np.float32]:
+    """Render a scene in sRGB, shape (H, W, 3) or (H, W, 1)."""
+    sensor = scene.sensors()[camera]
+    width, height = sensor.film().crop_size()
+    total = spp or sensor.sampler().sample_count()
+    most = max(1, SAMPLES_PER_PASS // (width * height))
+    light: Any = 0
+    done = 0
+    while done < total:
+        count = min(most, total - done)
+        light = light + count * np.array(mi.render(scene, sensor=camera, spp=count, seed=done))
+        done += count
+    channels = 3 if light.shape[2] >= 3 else 1
+    shown = to_coded(np.maximum(light[..., :channels] / total, 0))
+    return np.clip(shown, 0, 1).astype(np.float32)

@@ -1,0 +1,143 @@
+"""Materials: the set of a map, pictures, files, and hostile files."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.materials import MAPS, material
+from eigengs_dr.material.file import read_head, read_set
+from eigengs_dr.material.maps import TextureMap, check_maps, slices, usual_space
+from eigengs_dr.raster.reference import render_exact
+from eigengs_dr.storage import npz
+from eigengs_dr.storage.npz import BadValue
+
+
+def test_the_set_of_a_map_renders_its_channels(backend):
+    """The oracle renders each map alone, in double precision."""
+    m = material(backend=backend)
+    arrays, pictures = m.gaussians.to_arrays(), m.pictures()
+    for own, part in zip(m.maps, slices(m.maps), strict=True):
+        view = m[own.name]
+        assert (view.space, view.channels) == (own.space, own.channels)
+        exact = render_exact(
+            arrays["mean"],
+            arrays["factor"],
+            arrays["color"][:, part],
+            arrays["background"][part],
+            22,
+            17,
+            m.gaussians.cutoff,
+        )
+        summed = eg.render(replace(view, space="data")).numpy()
+        np.testing.assert_allclose(summed, exact, atol=2e-3)  # a Gaussian ends at its cutoff
+        np.testing.assert_allclose(pictures[own.name], eg.picture_of(view), atol=2e-6)
+        assert view.mean[0].index == m.gaussians.mean[0].index  # one memory
+
+
+def test_derivatives_of_a_map_are_those_of_its_channels(backend):
+    dr = pytest.importorskip("drjit")
+    m = material(backend=backend)
+    g = m.gaussians
+    gradients = []
+    for view in (m["roughness"], replace(m["roughness"], space="data")):
+        view = dr.detach(view)
+        dr.enable_grad(view.mean, view.color)
+        dr.backward(dr.sum(dr.square(eg.render(view).array)))
+        gradients.append([dr.grad(view.mean).numpy(), dr.grad(view.color).numpy()])
+    whole = dr.detach(g)
+    dr.enable_grad(whole.mean, whole.color)
+    image = eg.render(whole)
+    dr.backward(dr.sum(dr.square(image[..., 3].array)))
+    gradients.append([dr.grad(whole.mean).numpy(), dr.grad(whole.color[3]).numpy()[None]])
+    for mean, color in gradients[1:]:
+        np.testing.assert_allclose(mean, gradients[0][0], atol=1e-5)
+        np.testing.assert_allclose(color, gradients[0][1], rtol=1e-4, atol=1e-5)
+
+
+def test_names():
+    m = material()
+    assert (list(m), len(m)) == (["albedo", "roughness", "normal"], 3)
+    with pytest.raises(KeyError, match="'height' is not in it; it has albedo, roughness, normal"):
+        m["height"]
+    assert [usual_space(n) for n in ("Base_Color", "NORMAL", "ao")] == ["linear", "normal", "data"]
+    assert len(m.first(7).gaussians) == 7
+
+
+@pytest.mark.parametrize(
+    ("maps", "words"),
+    [
+        ([TextureMap("1a", "data", 1)], "map '1a': a name starts with a letter"),
+        ([TextureMap("a", "data", 1), TextureMap("a", "data", 1)], "give each name once"),
+        ([TextureMap("a", "hsv", 3)], "space 'hsv' is not in"),
+        ([TextureMap("a", "normal", 1)], "has 1 channels; space 'normal' has 3"),
+        ([TextureMap("a", "data", 2)], "has 2 channels; space 'data' has 1 or 3"),
+        ([TextureMap("a", "data", 1, np.nan)], "weight is nan"),
+        ([TextureMap("a", "data", 3)], "but the Gaussians have 1"),
+        ([TextureMap(f"m{k}", "data", 3) for k in range(6)], "have 18 channels, at most 16"),
+        ([], "maps are none"),
+    ],
+)
+def test_invalid_maps(maps, words):
+    with pytest.raises(BadValue, match=words):
+        check_maps(maps, 1)
+
+
+def test_a_file_holds_it_all(tmp_path):
+    m = material()
+    m.save(tmp_path / "m.npz")
+    again = eg.Material.load(tmp_path / "m.npz")
+    assert again.maps == m.maps
+    for name, values in m.gaussians.to_arrays().items():
+        np.testing.assert_array_equal(again.gaussians.to_arrays()[name], values)
+    head = read_head(tmp_path / "m.npz")
+    assert (head.gaussians, head.size, head.maps) == (24, (22, 17), MAPS)
+    data = read_set(tmp_path / "m.npz", "normal")
+    assert (data.space, data.arrays["color"].shape) == ("normal", (24, 3))
+
+
+def test_the_wrong_kind_of_file(tmp_path):
+    m = material()
+    m.save(tmp_path / "m.npz")
+    m["albedo"].save(tmp_path / "g.npz")
+    with pytest.raises(ValueError, match=r"holds a material; load it by Material\.load"):
+        eg.Gaussians.load(tmp_path / "m.npz")
+    with pytest.raises(ValueError, match=r"expected 'eigengs_dr\.material'"):
+        eg.Material.load(tmp_path / "g.npz")
+    with pytest.raises(ValueError, match="maps albedo, roughness, normal; choose one with map"):
+        read_set(tmp_path / "m.npz", None)
+    with pytest.raises(ValueError, match="holds one image and no maps; leave map out"):
+        read_set(tmp_path / "g.npz", "albedo")
+    with pytest.raises(ValueError, match=r"only eigengs_dr\.pack_material writes \.egs"):
+        m.save(tmp_path / "m.egs")
+
+
+HOSTILE = {
+    "a name": ({"names": np.array(["albedo", "../x", "normal"])}, "a name starts with a letter"),
+    "twice": ({"names": np.array(["a", "a", "normal"])}, "give each name once"),
+    "a space": ({"spaces": np.array(["linear", "cmyk", "normal"])}, "space 'cmyk'"),
+    "channels": ({"channels": np.array([3, 1, 1])}, "space 'normal' has 3"),
+    "negative": ({"channels": np.array([3, -1, 3])}, "has -1 channels"),
+    "lengths": ({"weights": np.ones(2)}, "differ in length"),
+    "weights": ({"weights": np.array([1, np.inf, 1])}, "weight is inf"),
+    "too many": ({"names": np.array(["a"] * 99)}, "claims shape"),
+    "long": ({"names": np.array(["a" * 70, "b", "c"])}, "over 64 characters"),
+    "missing": ({"names": None}, "key 'names' is missing"),
+    "values": ({"color": np.full((24, 7), np.nan, np.float32)}, "color holds values that are not"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_files(tmp_path, case):
+    changes, words = HOSTILE[case]
+    path = tmp_path / "m.npz"
+    material().save(path)
+    with np.load(path, allow_pickle=False) as file:
+        members = {k: v for k, v in dict(file).items() if k not in ("format", "version")}
+    members |= changes
+    members = {k: v for k, v in members.items() if v is not None}
+    npz.write(path, "eigengs_dr.material", 1, members)
+    with pytest.raises(ValueError, match=words) as error:
+        eg.Material.load(path)
+    assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)

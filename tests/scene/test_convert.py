@@ -1,0 +1,106 @@
+"""A scene whose bitmaps become Gaussians: what is converted, what stays, and mistakes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
+
+import eigengs_dr as eg  # noqa: E402
+from _helpers.bitmap_scenes import room, save_images, sky, wall  # noqa: E402
+from eigengs_dr.image.io import load_image  # noqa: E402
+
+pytestmark = pytest.mark.mitsuba
+
+QUICK = {"psnr": 30, "iterations": 20}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The images of the scenes."""
+    return save_images(tmp_path_factory.mktemp("images"))
+
+
+def bitmaps_in(path):
+    """Number of bitmaps in an XML file."""
+    return Path(path).read_text().count('type="bitmap"')
+
+
+def test_nested_maps_and_several_uses(folder, tmp_path):
+    found = eg.convert_scene(wall(folder), tmp_path / "new", **QUICK)
+    assert found.left == [] and bitmaps_in(found.scene) == 0
+    names = {t.file: t.names for t in found.textures}
+    assert names == {
+        "photo.npz": ("photo.png (paint.reflectance)", "photo.png (principled.base_color)"),
+        "normals.npz": ("normals.png (normalmap.normalmap)",),
+        "rough.npz": ("rough.png (principled.roughness)",),
+    }
+    for texture in found.textures:
+        assert texture.psnr >= 30 and texture.gaussian_bytes < texture.bytes
+        saved = eg.Gaussians.load(tmp_path / "new" / texture.file)
+        assert len(saved) == texture.gaussians
+        assert saved.space == ("linear" if texture.file == "photo.npz" else "data")
+    assert len(found.psnr) == 2 and min(found.psnr) > 25
+    text = found.scene.read_text()
+    assert text.count("photo.npz") == 2 and 'value="mirror"' in text and "<scale" in text
+    pictures = {p.name for p in (tmp_path / "new").glob("*.png")}
+    assert pictures == {f"{k}-{n}.png" for k in ("before", "after", "difference") for n in (1, 2)}
+    before, after = (load_image(tmp_path / "new" / f"{k}-1.png") for k in ("before", "after"))
+    assert eg.psnr(before, after) == pytest.approx(found.psnr[0], abs=0.1)
+
+
+def test_what_stays_and_why(folder, tmp_path):
+    found = eg.convert_scene(sky(folder), tmp_path / "new", **QUICK)
+    reasons = dict(found.left)
+    assert "environment map" in reasons["photo.png (environment)"]
+    assert "alpha mask" in reasons["leaf.png (mask.opacity)"]
+    assert "two values" in reasons["leaf.png (blendbsdf.weight)"]
+    assert "no pixel" in reasons["hidden.png (diffuse.reflectance)"]
+    [photo] = found.textures
+    assert photo.names == ("photo.png (diffuse.reflectance)", "photo.png (area.radiance)")
+    assert bitmaps_in(found.scene) == 3
+    assert min(found.psnr) > 25
+    assert str(folder) not in found.scene.read_text()  # other files are named relative to it
+
+
+def test_a_dictionary_with_a_mesh(folder, tmp_path):
+    found = eg.convert_scene(room(mi, folder), tmp_path / "new", spp=2, **QUICK)
+    assert {t.file for t in found.textures} == {"photo.npz", "rough.npz"}
+    scene = mi.load_file(str(found.scene))
+    assert np.isfinite(np.array(mi.render(scene, spp=1))).all()
+    assert "quad.ply" in found.scene.read_text()
+
+
+def test_nothing_is_rendered_on_request(folder, tmp_path):
+    found = eg.convert_scene(wall(folder), tmp_path / "new", spp=0, psnr=20, iterations=1)
+    assert found.psnr == [] and not list((tmp_path / "new").glob("*.png"))
+
+
+def test_mistakes(folder, tmp_path):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "x").write_text("")
+    (tmp_path / "bad.xml").write_text("<scene version='3.0.0'><shape type='cube'></scene>")
+    (tmp_path / "shape.xml").write_text("<shape version='3.0.0' type='cube'/>")
+    before = sorted(tmp_path.rglob("*"))
+    good = wall(folder)
+    for scene, target, settings, error, words in (
+        (good, tmp_path / "full", {}, ValueError, "exists and is not empty"),
+        (good, tmp_path / "a" / "b", {}, OSError, "cannot create a folder in"),
+        (good, tmp_path / "new", {"psnr": 70}, ValueError, "psnr is 70"),
+        (tmp_path / "bad.xml", tmp_path / "new", {}, RuntimeError, "pars"),
+        (tmp_path / "shape.xml", tmp_path / "new", {}, ValueError, "holds no scene"),
+        (good, "s3://x/y", {}, OSError, "cannot be written to URLs"),
+    ):
+        with pytest.raises(error, match=words):
+            eg.convert_scene(scene, target, **settings)
+        assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_objects_in_memory_are_refused(folder, tmp_path):
+    pixels = mi.Bitmap(np.full((4, 4, 3), 0.5, np.float32))
+    scene = room(mi, folder)
+    scene["quad"]["bsdf"]["bsdf"]["reflectance"]["color0"] = {"type": "bitmap", "bitmap": pixels}
+    with pytest.raises(ValueError, match=r"cannot be written as XML .*; give images and meshes by"):
+        eg.convert_scene(scene, tmp_path / "new", spp=0, **QUICK)
+    assert not list(tmp_path.iterdir())
