@@ -1,4 +1,7 @@
-"""The footprint of a pixel on a texture: the cone of the pixel, cut by the surface."""
+"""The footprint of a pixel on a texture: the cone of the pixel, cut by the surface.
+
+Mitsuba 3.10 finds the footprints of what the camera sees directly; else the angle of a pixel does.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,8 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.arithmetic import rcp
+
+from .versions import footprint_of, has_footprints
 
 PIXEL = 0.4
 """Standard deviation of a footprint in pixels. The random positions of samples in a pixel already
@@ -44,6 +49,65 @@ def pixel_angle(sensor: Any) -> float:
         )
     fov = math.radians(float(dr.slice(parameters["x_fov"])))
     return 2 * math.tan(fov / 2) / sensor.film().size()[0]
+
+
+def footprint_inputs() -> tuple[str, ...]:
+    """Return the attributes of a surface interaction from which `seen_metric` finds a footprint."""
+    own = ("footprint",) if has_footprints() else ()
+    return ("t", "wi", "sh_frame", "dp_du", "dp_dv", *own)
+
+
+def seen_metric(si: Any, inverse: tuple, angle: float) -> tuple[list, Any]:
+    """Return the metric of the renderer's footprint, or where there is none, of the cone's.
+
+    Parameters
+    ----------
+    si, inverse, angle
+        As for `metric`. With an angle of 0, surfaces without a footprint have no metric.
+
+    Returns
+    -------
+    metric : list of 3 Float
+    valid : Bool
+    """
+    found = footprint_of(si)
+    if found is None:
+        return metric(si, inverse, angle)
+    entries, present = footprint_metric(found, inverse)
+    if not angle:
+        return entries, present
+    others, valid = metric(si, inverse, angle)
+    return [dr.select(present, e, o) for e, o in zip(entries, others, strict=True)], present | valid
+
+
+def footprint_metric(footprint: tuple, inverse: tuple) -> tuple[list, Any]:
+    """Return the metric in which the footprint of a renderer is the unit circle.
+
+    With the footprint M, whose columns span a pixel in uv, and the inverse B of ``to_uv``, the
+    covariance is ``PIXEL^2 B^-1 M M^T B^-T``.
+
+    Parameters
+    ----------
+    footprint : tuple of 4 Float
+        Entries m00, m01, m10, m11.
+    inverse : tuple of 4 Float
+        Rows of B.
+
+    Returns
+    -------
+    metric : list of 3 Float
+        Entries xx, xy, yy.
+    present : Bool
+        False if the footprint has no area.
+    """
+    m00, m01, m10, m11 = footprint
+    b00, b01, b10, b11 = inverse
+    area = dr.fma(m00, m11, -m01 * m10)
+    present = (area != 0) & dr.isfinite(area)
+    scale = rcp(PIXEL * dr.select(present, area, 1))
+    n00, n01 = (m11 * b00 - m01 * b10) * scale, (m11 * b01 - m01 * b11) * scale
+    n10, n11 = (m00 * b10 - m10 * b00) * scale, (m00 * b11 - m10 * b01) * scale
+    return [n00 * n00 + n10 * n10, n00 * n01 + n10 * n11, n01 * n01 + n11 * n11], present
 
 
 def metric(si: Any, inverse: tuple, angle: float) -> tuple[list, Any]:

@@ -11,39 +11,35 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from eigengs_dr.backend.recording import without_collector
 from eigengs_dr.image.color import rendered_as
 from eigengs_dr.raster.layout import pack_parameters
-from eigengs_dr.raster.lookup.footprint import bound_covariance
+from eigengs_dr.raster.lookup.coarsen import build_pyramid
 from eigengs_dr.raster.lookup.points import (
     cell_side,
     fold,
     gradient_terms,
+    in_list_order,
     list_cells,
     sum_at_points,
-    value_terms,
 )
-from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
-from eigengs_dr.raster.lookup.pyramid import build_pyramid, is_minified, pyramid_mean, sum_pyramid
+from eigengs_dr.raster.lookup.pyramid import pyramid_mean
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
+from eigengs_dr.raster.lookup.widened import arrange
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
 from eigengs_dr.raster.render import decode_parameters
 
-from .cone import metric
-from .properties import affine, angle, cutoff, raw, source_of, wrap_mode
-from .spectrum import upload_table, upsample
+from .cone import footprint_inputs
+from .emission import emission_of
+from .lookup import sum_here, sum_over_footprint
+from .properties import cutoff, file_name, prefilter, raw, source_of, wrap_mode
+from .reuse import reused
+from .spectrum import STEP, upload_table, upsample
+from .survey import make_survey, outside_of_recordings
+from .transform import prepare, read_transform
 from .values import is_shown, keep_finite, luminance, show_all, slope_of
-
-SURVEY = 128
-"""Points along a side of the grid of brightness, for sampling of emission and for the mean."""
-
-DARKEST = 0.02
-"""Smallest density of sampled positions, relative to the mean."""
-
-INSIDE = 0.01
-"""Distance in pixels of clamped points from the border."""
+from .versions import texture_class
 
 
 def gaussian_texture() -> type:
@@ -51,7 +47,7 @@ def gaussian_texture() -> type:
     if mi.variant().startswith("scalar"):
         return _Refusal
 
-    class GaussianTexture(mi.Texture):
+    class GaussianTexture(texture_class()):  # type: ignore[misc]
         """A sum of Gaussians over uv, ``(u, v) = (x / width, y / height)``, row 0 at v = 0.
 
         The Gaussians come from `filename`, from `model`, or from the arrays of a set, as
@@ -75,10 +71,11 @@ def gaussian_texture() -> type:
             Continuation of the texture outside of its borders; by default "repeat".
         raw : bool
             Return values without decoding and clamping; by default false.
-        prefilter : float
+        prefilter : float or bool
             Angle of a pixel in radians, at least 0 and below 1, see
             `eigengs_dr.plugins.pixel_angle`. Lookups average over the footprint of the pixel; 0,
-            the default, looks at points. Slopes of bump maps (`eval_1_grad`) ignore the footprint.
+            the default, looks at points. Footprints that rays carry (Mitsuba 3.10) go before the
+            angle, and true takes them alone. Slopes of bump maps (`eval_1_grad`) ignore footprints.
         cutoff : float
             Radius of a Gaussian in standard deviations; by default the cutoff of the set.
         """
@@ -86,11 +83,13 @@ def gaussian_texture() -> type:
         def __init__(self, props: Any) -> None:
             super().__init__(props)
             self.source = source_of(props)
+            self.file = file_name(props)
             self.raw = raw(props)
             self.cutoff = cutoff(props, self.source.start.cutoff)
-            self.angle = angle(props)
+            self.angle, self.follows = prefilter(props)
+            self.inputs = ("uv", *(footprint_inputs() if self.filtered() else ()))
             self.wrap = wrap_mode(props)
-            self.to_uv, self.from_uv = affine(props)
+            self.to_uv = read_transform(props)
             self.width, self.height = self.source.start.width, self.source.start.height
             self.space, self.channels = self.source.start.space, self.source.start.channels
             self.spectra = upload_table() if mi.is_spectral else None
@@ -98,37 +97,53 @@ def gaussian_texture() -> type:
 
         def traverse(self, callback: Any) -> None:
             self.source.put(callback)
+            callback.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
 
         def parameters_changed(self, keys: list[str]) -> None:
-            gaussians = self.source.gaussians()
-            parameters = decode_parameters(gaussians)
+            self.transform = prepare(self.to_uv)
+            if set(keys) != {"to_uv"}:
+                self._take_over(not keys or any(key in self.source.shaping for key in keys))
+            sampled = getattr(self, "emission", None) is not None
+            self.survey: Any = None
+            self.emission: Any = None
+            if sampled:  # a frozen rendering cannot make it
+                self._emission()
+
+        def _take_over(self, moved: bool) -> None:
+            """Take over the Gaussians; with new lists if they have moved."""
+            parameters = decode_parameters(self.source.gaussians())
             shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
-            if not keys or any(key in self.source.shaping for key in keys):
+            if moved:
                 self._list([dr.detach(s) for s in shape])
             self.background = [keep_finite(b) for b in parameters.background]
             self.packed = pack_parameters([*shape, *color])
-            dr.eval(self.packed, self.background)
-            if self.angle:
+            if self.filtered():
+                self.arranged = arrange(self.cells.splat, shape, color)
+            else:
+                self.arranged = in_list_order(self.cells.splat, [*shape, *color])
+            dr.eval(self.packed, self.background, self.arranged)
+            if self.filtered():
                 number = NUM_SHAPE_PARAMS + self.channels
                 self.pyramid = build_pyramid(self.sizes, self.packed, number, self.cutoff)
                 self.average = pyramid_mean(self.pyramid)
                 dr.eval(self.average)
-            self._survey()
 
         def _list(self, shape: list) -> None:
             """List the Gaussians near every cell."""
             size = (self.width, self.height)
-            radius = kernel_radius(self.cutoff)
-            side = cell_side(*size, dr.width(shape))
             listed = self.source.listed
-            cells = listed(("cells", radius), lambda: list_cells(shape, *size, radius, side))
-            if self.angle:
+            if self.filtered():
                 self.sizes = listed(
                     ("sizes", self.cutoff, self.wrap),
                     lambda: classify_by_size(shape, *size, self.cutoff, self.wrap),
                 )
-            self.cells = cells
+                _, self.cells = self.sizes.listed[0]  # slopes and the survey look at points
+            else:
+                side, radius = cell_side(*size, dr.width(shape)), kernel_radius(self.cutoff)
+                self.cells = listed(
+                    ("cells", radius), lambda: list_cells(shape, *size, radius, side)
+                )
 
         # --- Lookups -----------------------------------------------------------------------------
 
@@ -171,57 +186,26 @@ def gaussian_texture() -> type:
             du = luminance([s * k for s, k in zip(slope, sums[1::3], strict=True)])
             dv = luminance([s * k for s, k in zip(slope, sums[2::3], strict=True)])
             du, dv = du * sx * self.width, dv * sy * self.height
-            (a, b, _), (c, d, _) = self.to_uv
-            return mi.Vector2f(a * du + c * dv, b * du + d * dv)
+            return mi.Vector2f(*self.transform.pull_back(du, dv))
 
         def _color(self, si: Any, active: Any) -> list:
             """Look up the channels, decoded and clamped unless `raw`."""
-            (x, sx), (y, sy), active = self._point(si, active)
-            if self.angle:
-                sums = self._filtered(si, (x, sx), (y, sy), active)
-            else:
-                number = NUM_SHAPE_PARAMS + self.channels
-                terms = value_terms(kernel_radius(self.cutoff))
-                sums = sum_at_points(
-                    self.cells, self.packed, number, x, y, active, terms, self.channels
-                )
-            sums = [s + b for s, b in zip(sums, self.background, strict=True)]
-            return [dr.select(active, s, 0) for s in show_all(self, sums)]
+            color = reused(self, si, self.inputs, lambda: self._look_up(si))
+            return [dr.select(active, c, 0) for c in color]
 
-        def _filtered(self, si: Any, column: tuple, row: tuple, active: Any) -> list:
-            """Average the texture over the footprint around a point, given as by `fold`."""
-            # The slopes of `fold` turn a footprint in mirrored images. They also take away its
-            # width along an axis on which the point lies outside of a clamped image.
-            (x, sx), (y, sy) = column, row
-            sx, sy = sx * self.width, sy * self.height
-            if self.wrap == "clamp":  # a footprint without width would count half on a border
-                x = dr.clip(x, INSIDE, self.width - INSIDE)
-                y = dr.clip(y, INSIDE, self.height - INSIDE)
-            inverse, valid = metric(si, self.from_uv, self.angle)
-            unit, blind = bound_covariance(inverse)
-            sizes = (sx * sx, sx * sy, sy * sy)
-            footprint = [dr.select(valid, f * s, 0) for f, s in zip(unit, sizes, strict=True)]
-            blind &= valid & (sx * sy != 0)
-            distant = is_minified(self.pyramid, footprint)
-            near = sum_prefiltered(
-                self.sizes,
-                self.packed,
-                NUM_SHAPE_PARAMS + self.channels,
-                x,
-                y,
-                footprint,
-                active & ~distant,
-                self.cutoff,
-            )
-            far = sum_pyramid(self.pyramid, x, y, footprint, active & distant & ~blind)
-            seen = [dr.select(distant, f, n) for f, n in zip(far, near, strict=True)]
-            return [dr.select(blind, m, s) for m, s in zip(self.average, seen, strict=True)]
+        def _look_up(self, si: Any) -> list:
+            """Look up the channels in all lanes; 0 where uv is not finite."""
+            (x, sx), (y, sy), valid = self._point(si, True)
+            if self.filtered():
+                sums = sum_over_footprint(self, si, (x, sx), (y, sy), valid)
+            else:
+                sums = sum_here(self, x, y, valid)
+            sums = [s + b for s, b in zip(sums, self.background, strict=True)]
+            return [dr.select(valid, s, 0) for s in show_all(self, sums)]
 
         def _point(self, si: Any, active: Any) -> tuple:
             """Fold uv into the image: x, y in pixels with their slopes, active if uv is finite."""
-            (a, b, tu), (c, d, tv) = self.to_uv
-            u = a * si.uv.x + b * si.uv.y + tu
-            v = c * si.uv.x + d * si.uv.y + tv
+            u, v = self.transform.apply(si.uv)
             active = mi.Bool(active) & dr.isfinite(u) & dr.isfinite(v)
             x = fold(u * self.width, self.width, self.wrap)
             y = fold(v * self.height, self.height, self.wrap)
@@ -231,15 +215,11 @@ def gaussian_texture() -> type:
 
         @without_collector
         def sample_position(self, sample: Any, active: Any = True) -> tuple:
-            cell, density, rest = self._sampled().sample(sample, active)
-            return mi.Point2f((mi.Point2f(cell) + rest) / SURVEY), density * SURVEY**2
+            return self._emission().sample(sample, active)
 
         @without_collector
         def pdf_position(self, p: Any, active: Any = True) -> Any:
-            inside = (p.x >= 0) & (p.x <= 1) & (p.y >= 0) & (p.y <= 1)
-            cell = dr.minimum(mi.Point2u(dr.select(inside, p, 0) * SURVEY), SURVEY - 1)
-            density = self._sampled().pdf(cell, active) * SURVEY**2
-            return dr.select(inside, density, 0)
+            return self._emission().density(p, active)
 
         @without_collector
         def sample_spectrum(self, si: Any, sample: Any, active: Any = True) -> tuple:
@@ -250,45 +230,56 @@ def gaussian_texture() -> type:
             si.wavelengths = mi.MI_CIE_MIN + width * sample
             return si.wavelengths, self.eval(si, active) * width
 
+        def pdf_spectrum(self, si: Any, active: Any = True) -> Any:
+            if not mi.is_spectral:
+                return mi.Color0f()
+            inside = (si.wavelengths >= mi.MI_CIE_MIN) & (si.wavelengths <= mi.MI_CIE_MAX)
+            return dr.select(inside & active, 1 / (mi.MI_CIE_MAX - mi.MI_CIE_MIN), 0)
+
+        def spectral_resolution(self) -> float:
+            return STEP
+
         def mean(self) -> Any:
-            return mi.Float(float(self.brightness.numpy().mean()))
+            return self._surveyed().mean
 
         def max(self) -> float:
-            return float(self.brightness.numpy().max())
+            return float(self._surveyed().largest[0])
 
-        def _survey(self) -> None:
-            """Evaluate brightness on a grid over uv now, since lookups during a render cannot."""
-            with dr.suspend_grad():
-                i = dr.arange(mi.UInt32, SURVEY**2)
-                si = dr.zeros(mi.SurfaceInteraction3f, SURVEY**2)
-                si.uv = (mi.Point2f(i % SURVEY, i // SURVEY) + 0.5) / SURVEY
-                self.brightness = luminance(self._color(si, mi.Bool(True)))
-                dr.eval(self.brightness)
-            self.distribution = None
+        def _surveyed(self) -> Any:
+            """Return the survey of the brightness; the first call after a change makes it."""
+            if self.survey is None:
+                self.survey = outside_of_recordings(lambda: make_survey(self))
+            return self.survey
 
-        def _sampled(self) -> Any:
-            """Return the distribution of emission over uv; the first call makes it."""
-            if self.distribution is None:
-                density = self.brightness.numpy().reshape(SURVEY, SURVEY)
-                density = np.maximum(density, 0)
-                floor = DARKEST * density.mean() or 1.0
-                self.distribution = mi.DiscreteDistribution2D(np.maximum(density, floor))
-            return self.distribution
+        def _emission(self) -> Any:
+            """Return the distribution of emission; the first call after a change makes it."""
+            if self.emission is None:
+                self.emission = emission_of(self._surveyed())
+            return self.emission
 
         # --- Description -------------------------------------------------------------------------
 
         def resolution(self) -> Any:
             return mi.ScalarVector2i(self.width, self.height)
 
+        def filtered(self) -> bool:
+            """Return whether lookups average over a footprint; Mitsuba 3.10 asks."""
+            return self.follows or self.angle > 0
+
         def is_spatially_varying(self) -> bool:
             return True
 
         def to_string(self) -> str:
+            angle = "true" if self.follows else f"{self.angle:g}"
+            transform = str(self.to_uv).replace("\n", "\n  ")
             return (
-                f"GaussianTexture[\n  gaussians = {len(self.source.start)},\n  resolution = "
-                f"[{self.width}, {self.height}],\n  space = {self.space},\n  raw = {self.raw},\n"
-                f"  wrap_mode = {self.wrap},\n  prefilter = {self.angle:g},\n"
-                f"  cutoff = {self.cutoff:g}\n]"
+                f'GaussianTexture[\n  name = "{self.file}",\n'
+                f"  gaussians = {len(self.source.start)},\n"
+                f"  resolution = [{self.width}, {self.height}],\n"
+                f"  space = {self.space},\n  raw = {int(self.raw)},\n"
+                f"  wrap_mode = {self.wrap},\n  prefilter = {angle},\n"
+                f"  cutoff = {self.cutoff:g},\n  mean = {self.mean()},\n"
+                f"  transform = {transform}\n]"
             )
 
     return GaussianTexture

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -101,11 +101,15 @@ def _found(parameters: Any, texture: str) -> dict[str, Any]:
     return {name: parameters[key] for name, key in keys.items() if key in parameters}
 
 
+@dataclass(init=False)
 class FromSet:
     """The parameters mean (N, 2), factor (N, 3), color (N, C) and background (C,) of a set.
 
     Units are native pixels and the space of the set, as in `eigengs_dr.Gaussians`.
     """
+
+    start: Gaussians
+    tensors: dict[str, Any]
 
     shaping = ("mean", "factor")
     """Parameters whose change requires new lists of the Gaussians."""
@@ -144,12 +148,17 @@ class FromSet:
         return build()
 
 
+@dataclass(init=False)
 class FromModel:
     """The parameter coefficients (C, k) of an `eigengs_dr.EigenGS` model.
 
     ``colors = mean colors + coefficients x weights`` for every channel; shapes do not change. A
     channel with fewer components than others ignores the rest of its row.
     """
+
+    start: Gaussians
+    weights: list[Any]
+    coefficients: Any
 
     shaping = ()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -15,6 +16,7 @@ from eigengs_dr.image.color import SPACES
 
 from .parameters import FromModel, FromSet
 from .shared import shared_file
+from .versions import has_footprints
 
 WRAPS = ("repeat", "mirror", "clamp")
 """Names of the ways to continue an image outside of its borders."""
@@ -105,6 +107,11 @@ def _path(props: Any, key: str) -> str:
     return str(mi.file_resolver().resolve(props[key]))
 
 
+def file_name(props: Any) -> str:
+    """Return the name of the file of the Gaussians, without folders; "" if there is no file."""
+    return next((Path(props[key]).name for key in ("filename", "model") if key in props), "")
+
+
 def raw(props: Any) -> bool:
     """Read ``raw``: whether lookups skip decoding and clamping."""
     value = props.get("raw", False)
@@ -130,15 +137,29 @@ def cutoff(props: Any, default: float) -> float:
     return value
 
 
-def angle(props: Any) -> float:
-    """Read ``prefilter``: the angle of a pixel in radians, or 0 for lookups at points."""
+def prefilter(props: Any) -> tuple[float, bool]:
+    """Read ``prefilter``: the angle of a pixel in radians, or 0 for lookups at points.
+
+    Returns
+    -------
+    angle : float
+    follows : bool
+        Whether the footprints of rays alone decide: ``true``.
+    """
+    if props.get("prefilter", 0.0) is True:
+        if not has_footprints():
+            raise ValueError(
+                "gaussian_texture: prefilter = true needs Mitsuba 3.10, and this is "
+                f"{mi.__version__}; give the angle of a pixel in radians, see pixel_angle"
+            )
+        return 0.0, True
     value = _number(props, "prefilter", 0.0)
     if not 0 <= value < 1:
         raise ValueError(
             f"gaussian_texture: prefilter is {value}; it is the angle of a pixel in radians, "
             "at least 0 and below 1"
         )
-    return value
+    return value, False
 
 
 def wrap_mode(props: Any) -> str:
@@ -149,17 +170,3 @@ def wrap_mode(props: Any) -> str:
             f"gaussian_texture: wrap_mode {wrap!r} is unknown; use one of {', '.join(WRAPS)}"
         )
     return wrap
-
-
-def affine(props: Any) -> tuple[tuple, tuple]:
-    """Read ``to_uv``: return its rows (m00, m01, translation) and its linear part's inverse."""
-    transform = props["to_uv"] if "to_uv" in props else mi.ScalarTransform4f()
-    if not hasattr(transform, "matrix"):
-        raise ValueError(f"gaussian_texture: to_uv is {transform!r}; it must be a transform")
-    matrix = np.array(transform.matrix, np.float64)
-    linear = matrix[:2, :2]
-    area, size = abs(np.linalg.det(linear)), np.square(linear).sum()
-    if not (np.isfinite(matrix).all() and area > 1e-9 * size):
-        raise ValueError("gaussian_texture: to_uv maps the plane to a line; it must be invertible")
-    rows = [[*row[:2], row[-1]] for row in matrix[:2].tolist()]
-    return (tuple(rows[0]), tuple(rows[1])), tuple(np.linalg.inv(linear).ravel().tolist())

@@ -7,6 +7,7 @@ from functools import cache
 import mitsuba as mi
 
 from .gaussian_texture import gaussian_texture
+from .versions import register_texture
 
 
 def register_plugins() -> None:
@@ -37,4 +38,4 @@ def _follow() -> None:
 
 @cache
 def _register(variant: str) -> None:
-    mi.register_texture("gaussian_texture", gaussian_texture())
+    register_texture("gaussian_texture", gaussian_texture())

@@ -93,6 +93,15 @@ def _hat_colors() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return half[::2], colors
 
 
+@cache
+def mean_weights() -> tuple[float, float, float]:
+    """Return the means of R, G and B over the wavelengths, exactly: they are linear in pieces."""
+    _, spectra = basis()
+    inner = spectra.sum(axis=1) - 0.5 * (spectra[:, 0] + spectra[:, -1])
+    red, green, blue = (inner / (spectra.shape[1] - 1)).tolist()
+    return red, green, blue
+
+
 def upload_table() -> Any:
     """Upload the basis for `upsample`, in the current variant (LLVM or CUDA).
 

@@ -8,9 +8,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from eigengs_dr.image.color import UNBOUNDED, to_linear
+from eigengs_dr.image.color import UNBOUNDED, rendered_as, to_linear
 from eigengs_dr.image.normals import unit_codes
 from eigengs_dr.image.radiance import LOG_SLOPE, from_log
+
+from .spectrum import mean_weights
 
 
 def show(texture: Any, value: Any) -> Any:
@@ -55,6 +57,26 @@ def is_shown(texture: Any, value: Any) -> Any:
 def luminance(color: list) -> Any:
     """Return the luminance of three channels, or the one channel there is."""
     return color[0] if len(color) == 1 else mi.luminance(mi.Color3f(*color))
+
+
+def brightness(texture: Any, color: list) -> Any:
+    """Return what the texture reflects or emits in the mean: of wavelengths, where it has spectra.
+
+    Parameters
+    ----------
+    texture : mitsuba.Texture
+    color : list of Float
+        Channels from `show`.
+
+    Returns
+    -------
+    Float
+        In spectral variants the mean of the spectrum of `upsample`, as of a ``bitmap``; else the
+        luminance.
+    """
+    if mi.is_spectral and len(color) == 3 and not texture.raw and rendered_as(texture.space):
+        return sum(w * c for w, c in zip(mean_weights(), color, strict=True))
+    return luminance(color)
 
 
 def keep_finite(x: Any) -> Any:

@@ -174,8 +174,7 @@ def _find(scene: Any, texture: Any) -> tuple[Any, list]:
 
 def _mapping(node: Any, wrap_mode: str) -> tuple[NDArray[np.float64], str]:
     """Return the rows of ``to_uv``, shape (2, 3), and the wrap mode of a texture."""
-    if hasattr(node, "wrap"):
-        return np.array(node.to_uv), node.wrap
+    wrap_mode = getattr(node, "wrap", wrap_mode)
     parameters = mi.traverse(node)
     if "to_uv" not in parameters:
         return np.eye(2, 3), wrap_mode

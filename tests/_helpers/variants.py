@@ -10,3 +10,8 @@ def on_both(kind):
 
 BOTH_RGB = on_both("rgb")
 """The variants of tests that name none."""
+
+
+def in_variants(names):
+    """Run a test in these variants instead."""
+    return pytest.mark.parametrize("variant", names, indirect=True)

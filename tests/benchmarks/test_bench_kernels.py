@@ -98,13 +98,16 @@ def test_textures_are_timed_against_a_bitmap(monkeypatch):
     from eigengs_bench.experiments import texture
 
     small = {"SIDE": 16, "TEXELS": 32, "SPP": 1, "COUNTS": (50, 100), "SETTLED": 100}
+    small["CHANGED"] = (100, 150)
     for name, value in {**small, "STEPS": 2, "ROUNDS": 1}.items():
         monkeypatch.setattr(texture, name, value)
     before, calls = mi.variant(), []
     figures = texture.run(progress=lambda *step: calls.append(step))
     if before:
         mi.set_variant(before)
-    assert {"ratio_50", "ratio_100", "ratio_prefiltered", "ratio_step", "change_ms"} <= set(figures)
+    expected = {"ratio_50", "ratio_100", "ratio_prefiltered", "ratio_step"}
+    expected |= {"change_100_ms", "change_filtered_150_ms"}
+    assert expected <= set(figures)
     assert all(value > 0 for value in figures.values())
     assert figures["difference"] <= 1e-4
     assert calls[-1] == ("texture", 3, 3)

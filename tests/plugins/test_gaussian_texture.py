@@ -1,4 +1,4 @@
-"""The texture in Mitsuba: values, wrapping, colour, slots of scenes, sampling, mistakes."""
+"""Lookups of the texture: values, colour, wrapping, slopes."""
 
 from dataclasses import replace
 
@@ -10,8 +10,8 @@ from _helpers.sets import COUNT, SIZE
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 import eigengs_dr as eg  # noqa: E402
-from _helpers.texture import at, gaussians, picture, small_scene, texel_centres, texture  # noqa: E402
-from _helpers.variants import BOTH_RGB, on_both  # noqa: E402
+from _helpers.texture import at, gaussians, picture, texel_centres, texture  # noqa: E402
+from _helpers.variants import BOTH_RGB, in_variants, on_both  # noqa: E402
 from eigengs_dr.image.color import to_linear  # noqa: E402
 from eigengs_dr.plugins import texture_of  # noqa: E402
 from eigengs_dr.raster.render import picture_of  # noqa: E402
@@ -21,13 +21,6 @@ pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 MONO, SPECTRAL = on_both("mono"), on_both("spectral")
 
 
-def in_variants(names):
-    return pytest.mark.parametrize("variant", names, indirect=True)
-
-
-others = [
-    pytest.param(name, marks=pytest.mark.slow) for name in ("llvm_ad_mono", "llvm_ad_spectral")
-]
 in_all = in_variants([*BOTH_RGB, *MONO, *SPECTRAL])
 
 
@@ -172,16 +165,6 @@ class TestWhere:
         expected = np.array(tex.eval(at(mi.Float(inside[0]), mi.Float(inside[1]))))
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
-    @pytest.mark.parametrize("dimensions", [3, 4])
-    def test_to_uv_comes_first(self, dimensions):
-        kind = mi.ScalarTransform3f if dimensions == 3 else mi.ScalarTransform4f
-        shift = [0.1, 0.2] if dimensions == 3 else [0.1, 0.2, 0]
-        scale = [0.5, 0.25] if dimensions == 3 else [0.5, 0.25, 1]
-        tex = texture(gaussians(), to_uv=kind().translate(shift) @ kind().scale(scale))
-        found = np.array(tex.eval(at(0.4, 0.8)))
-        expected = np.array(texture(gaussians()).eval(at(0.3, 0.4)))
-        np.testing.assert_allclose(found, expected, atol=1e-5)
-
     @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
     @pytest.mark.parametrize("prefilter", [0.0, 0.001])
     def test_no_uv_makes_a_nan(self, wrap, prefilter):
@@ -225,245 +208,3 @@ class TestSlope:
         value = np.array(tex.eval_1(texel_centres()))
         slope = np.array(tex.eval_1_grad(texel_centres()))
         assert (slope[:, value == 0] == 0).all()
-
-
-SLOTS = ["diffuse", "principled", "roughconductor", "roughdielectric", "plastic", "roughplastic"]
-SLOTS += ["blend", "mask", "normalmap", "bumpmap"]
-
-
-def slots(g):
-    """BSDFs with a texture in every kind of place that Mitsuba has for one, by name."""
-    colour, number = texture_of(g), texture_of(gaussians("data", channels=1))
-    diffuse = {"type": "diffuse"}
-    return {
-        "diffuse": {"type": "diffuse", "reflectance": colour},
-        "principled": {"type": "principled", "base_color": colour, "roughness": number},
-        "roughconductor": {"type": "roughconductor", "alpha": number},
-        "roughdielectric": {"type": "roughdielectric", "alpha": number},
-        "plastic": {"type": "plastic", "diffuse_reflectance": colour},
-        "roughplastic": {"type": "roughplastic", "diffuse_reflectance": colour},
-        "blend": {
-            "type": "blendbsdf",
-            "weight": number,
-            "a": diffuse,
-            "b": {"type": "diffuse", "reflectance": 0.1},
-        },
-        "mask": {"type": "mask", "opacity": number, "inner": diffuse},
-        "normalmap": {
-            "type": "normalmap",
-            "normalmap": texture_of(gaussians("data")),
-            "inner": diffuse,
-        },
-        "bumpmap": {"type": "bumpmap", "bump": number, "scale": 3.0, "inner": diffuse},
-    }
-
-
-class TestSlots:
-    @in_variants([*BOTH_RGB, *others])
-    @pytest.mark.parametrize("name", SLOTS)
-    def test_renders_and_differentiates(self, variant, name):
-        """In every slot the picture is finite, changes with the texture, and has a gradient."""
-        scene = small_scene(slots(gaussians())[name], "direct")
-        parameters = mi.traverse(scene)
-        keys = [k for k, _ in parameters if k.endswith((".color", ".mean"))]
-        assert keys
-        for key in keys:
-            dr.enable_grad(parameters[key])
-        parameters.update()
-        image = mi.render(scene, params=parameters, spp=4)
-        assert np.isfinite(np.array(image)).all()
-        dr.backward(dr.mean(dr.square(image)))
-        for key in keys:
-            gradient = np.array(dr.grad(parameters[key]))
-            assert np.isfinite(gradient).all()
-            assert np.abs(gradient).max() > 0, key
-
-    @in_all
-    def test_lights(self, variant):
-        radiance = texture_of(gaussians("linear"))
-        if mi.is_spectral:
-            radiance = {"type": "d65", "of": radiance}  # else it glows at equal energy
-        emitter = {"type": "area", "radiance": radiance}
-        scene = small_scene(None, "path", emitter=emitter)
-        parameters = mi.traverse(scene)
-        key = next(k for k, _ in parameters if k.endswith(".color"))
-        dr.enable_grad(parameters[key])
-        parameters.update()
-        image = mi.render(scene, params=parameters, spp=4)
-        assert np.isfinite(np.array(image)).all()
-        dr.backward(dr.mean(image))
-        assert np.abs(np.array(dr.grad(parameters[key]))).max() > 0
-
-    @in_all
-    def test_particles_leave_it_as_paths_find_it(self, variant):
-        """Light traced from the emitter, which samples positions and wavelengths of the texture."""
-        emitter = {"type": "area", "radiance": texture_of(gaussians("linear", quiet=False))}
-        scene = small_scene(None, emitter=emitter)
-        means = [
-            np.array(mi.render(scene, integrator=mi.load_dict({"type": t, "max_depth": 3}), spp=64))
-            for t in ("path", "ptracer")
-        ]
-        np.testing.assert_allclose(*(m.mean(axis=(0, 1)) for m in means), rtol=0.05)
-
-    def test_a_lamp_lights_as_a_bitmap_of_the_same_picture_does(self):
-        g = gaussians("linear", quiet=False)
-        data = mi.TensorXf(np.clip(eg.render(g, SIZE[0] * 8).numpy(), 0, 1))
-        means = []
-        for radiance in (
-            texture_of(g),
-            {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"},
-        ):
-            scene = small_scene(None, emitter={"type": "area", "radiance": radiance})
-            means.append(np.array(mi.render(scene, spp=256, seed=1)).mean(axis=(0, 1)))
-        np.testing.assert_allclose(means[0], means[1], rtol=0.02)
-
-
-class TestSampling:
-    @pytest.mark.parametrize("wrap", ["repeat", "mirror"])
-    def test_chi_square(self, wrap):
-        """Mitsuba's own test, of positions against their density."""
-        from mitsuba.chi2 import ChiSquareTest, PlanarDomain
-
-        turn = mi.ScalarTransform4f().rotate([0, 0, 1], 20) @ mi.ScalarTransform4f().scale(1.3)
-        tex = texture(gaussians("linear", quiet=False), wrap_mode=wrap, to_uv=turn)
-        test = ChiSquareTest(
-            domain=PlanarDomain(mi.ScalarBoundingBox2f([0, 0], [1, 1])),
-            sample_func=lambda sample: tex.sample_position(sample)[0],
-            pdf_func=tex.pdf_position,
-            sample_dim=2,
-            sample_count=200_000,
-            res=64,
-            ires=16,
-        )
-        assert test.run(), test.messages
-
-    def test_density_is_what_sampling_says(self):
-        tex = texture(gaussians("linear", quiet=False))
-        sample = mi.Point2f(
-            *(mi.Float(k) for k in np.float32(np.random.default_rng(0).random((2, 1000))))
-        )
-        position, density = tex.sample_position(sample)
-        found = np.array(tex.pdf_position(position))
-        agree = np.isclose(found, np.array(density), rtol=1e-4)
-        assert agree.mean() > 0.99  # some samples round to the edge of a cell
-        assert (np.array(density) > 0).all()
-
-    def test_follows_the_parameters(self):
-        tex = texture(gaussians("linear"))
-        point = mi.Point2f(0.2, 0.2)
-        assert np.array(tex.pdf_position(point)) == pytest.approx(1, abs=0.3)
-        parameters = mi.traverse(tex)
-        bright = np.array(parameters["color"])
-        near = np.argsort(np.hypot(*(np.array(parameters["mean"]) - 0.8 * np.array(SIZE)).T))[:4]
-        bright[near] = 1
-        parameters["color"] = mi.TensorXf(bright)
-        parameters["background"] = mi.TensorXf(np.zeros(3, np.float32))
-        parameters.update()
-        assert np.array(tex.pdf_position(point)) < 0.5
-
-    def test_what_is_below_zero_is_not_sampled(self):
-        """Of a raw texture, whose values are not clamped."""
-        g = gaussians("linear")
-        g.color *= 0
-        g.background *= -1
-        density = np.array(texture(g, raw=True).pdf_position(mi.Point2f(0.3, 0.7)))
-        assert density == pytest.approx(1)
-        g = gaussians("linear", quiet=False)
-        g.background *= 0
-        g.color *= 5
-        tex = texture(g, raw=True)
-        dark = np.array(tex.eval_1(texel_centres())) < -1
-        density = np.array(tex.pdf_position(texel_centres().uv))
-        assert dark.any()
-        assert density[dark].max() < 0.1 * density.max()
-
-    def test_outside_there_is_no_density(self):
-        tex = texture(gaussians("linear"))
-        assert np.array(tex.pdf_position(mi.Point2f(1.5, 0.5))) == 0
-
-    def test_a_black_picture_is_sampled_evenly(self):
-        g = gaussians("linear")
-        g.color *= 0
-        g.background *= 0
-        assert np.array(texture(g).pdf_position(mi.Point2f(0.3, 0.7))) == pytest.approx(1)
-
-
-class TestMistakes:
-    @pytest.mark.parametrize(
-        ("properties", "message"),
-        [
-            ({"filename": "nowhere.npz"}, "nowhere.npz"),
-            ({}, "give one of filename"),
-            ({"filename": "a.npz", "model": "b.npz"}, "give one of filename"),
-        ],
-    )
-    def test_of_where_from(self, properties, message):
-        with pytest.raises(RuntimeError, match=message):
-            mi.load_dict({"type": "gaussian_texture", **properties})
-
-    @pytest.mark.parametrize(
-        ("properties", "message"),
-        [
-            ({"wrap_mode": "bounce"}, "wrap_mode 'bounce' is unknown; use one of repeat, mirror"),
-            ({"cutoff": 0.0}, "cutoff is 0.0; it must be above 0 and at most 12"),
-            ({"prefilter": -1.0}, "prefilter is -1.0; it is the angle of a pixel"),
-            ({"prefiltre": 1.0}, "prefiltre"),
-            ({"space": "cmyk"}, "space 'cmyk'"),
-            ({"raw": "false"}, "raw is 'false'; it must be a boolean"),
-            ({"cutoff": "wide"}, "cutoff is 'wide'; it must be a number"),
-            ({"prefilter": True}, "prefilter is True; it must be a number"),
-            ({"width": 31.5}, "width is 31.5; it must be an integer"),
-            ({"to_uv": 2.0}, "to_uv is 2.0; it must be a transform"),
-        ],
-    )
-    def test_of_properties(self, properties, message):
-        with pytest.raises(RuntimeError, match=message):
-            texture(gaussians(), **properties)
-
-    def test_a_transform_that_is_flat(self):
-        with pytest.raises(RuntimeError, match="to_uv maps the plane to a line"):
-            texture(gaussians(), to_uv=mi.ScalarTransform4f(np.diag([1.0, 0, 1, 1])))
-
-    def test_a_small_transform_is_not_flat(self):
-        tiny = mi.ScalarTransform4f().scale([1e-7, 1e-7, 1])
-        found = texture(gaussians(), to_uv=tiny).eval(at(0.5, 0.5))
-        np.testing.assert_allclose(found, texture(gaussians()).eval(at(5e-8, 5e-8)), atol=1e-5)
-
-    @pytest.mark.parametrize("channels", [2, 4])
-    def test_a_set_of_other_channels(self, channels):
-        with pytest.raises(RuntimeError, match=f"has {channels} channels; use a set of 1 or 3"):
-            texture(gaussians("data", channels=channels))
-
-    def test_an_array_that_is_missing(self):
-        properties = texture_of(gaussians())
-        del properties["color"]
-        with pytest.raises(RuntimeError, match="color is missing"):
-            mi.load_dict(properties)
-
-    def test_a_file_that_is_no_set(self, tmp_path):
-        (tmp_path / "x.npz").write_bytes(b"nothing")
-        with pytest.raises(RuntimeError, match=r"x\.npz"):
-            mi.load_dict({"type": "gaussian_texture", "filename": str(tmp_path / "x.npz")})
-
-    def test_normals_from_one_channel(self):
-        with pytest.raises(ValueError, match="a lookup of three channels"):
-            texture(gaussians("data", channels=1)).eval_3(at(0.5, 0.5))
-
-    @in_variants(SPECTRAL)
-    @pytest.mark.parametrize("raw", [True, False])
-    def test_a_spectrum_from_data(self, variant, raw):
-        tex = texture(gaussians("rgb" if raw else "data"), raw=raw)
-        with pytest.raises(ValueError, match="not raw data"):
-            tex.eval(at(0.5, 0.5))
-
-    @in_variants(["scalar_rgb"])
-    def test_scalar_variants(self, variant):
-        with pytest.raises(RuntimeError, match="does not support the variant scalar_rgb; use"):
-            mi.load_dict({"type": "gaussian_texture", "filename": "x.npz"})
-
-    def test_parameters_of_another_shape(self):
-        tex = texture(gaussians())
-        parameters = mi.traverse(tex)
-        parameters["color"] = mi.TensorXf(np.zeros((3, 3), np.float32))
-        with pytest.raises(Exception, match=r"color has shape \(3, 3\), expected \(24, 3\)"):
-            parameters.update()

@@ -16,7 +16,8 @@ from eigengs_dr.raster.render import picture_of, render
 
 SIDE, TEXELS, SPP = 512, 1024, 16  # of the picture, of the bitmap, and samples a pixel
 COUNTS = (500, 5_000, 20_000)  # Gaussians of the textures
-SETTLED = 5_000  # Gaussians of the texture that is also prefiltered, differentiated and changed
+SETTLED = 5_000  # Gaussians of the texture that is also prefiltered and differentiated
+CHANGED = (5_000, 50_000)  # Gaussians of the textures whose parameters change
 STEPS, WARM_UP, ROUNDS = 100, 2, 9  # of the fits; rounds that compile, and that are measured
 
 
@@ -24,9 +25,9 @@ def run(variant: str = "llvm_ad_rgb", progress: Progress = lambda *_: None) -> d
     """Time a material ball with each texture in turn, in one run; every figure is a median.
 
     `ratio_N` is rendering with N Gaussians over rendering with a bitmap, `ratio_prefiltered` with
-    5,000 and the prefilter, `ratio_step` picture and gradient of all parameters by `prb`. `change`
-    takes over changed parameters; `difference` is the largest between texture and
-    `eigengs_dr.render` at texel centres.
+    5,000 and the prefilter, `ratio_step` picture and gradient of all parameters by `prb`.
+    `change_N` and `change_filtered_N` take over N changed shapes, without and with prefilter;
+    `difference` is the largest between texture and `eigengs_dr.render` at texel centres.
     """
     import mitsuba as mi
 
@@ -35,13 +36,14 @@ def run(variant: str = "llvm_ad_rgb", progress: Progress = lambda *_: None) -> d
     mi.set_variant(variant)
     register_plugins()
     picture, sets = sample("coffee")[:400, 100:500], {}
-    for count in COUNTS:
+    counts = sorted({*COUNTS, *CHANGED})
+    for count in counts:
         sets[count] = fit(picture, count, STEPS).gaussians
-        progress("fits", len(sets), len(COUNTS))
+        progress("fits", len(sets), len(counts))
     coded = np.clip(picture_of(sets[SETTLED], TEXELS, TEXELS), 0, 1)
     data = mi.TensorXf(to_linear(coded).astype(np.float32))
     plain = ball(mi, {"type": "bitmap", "data": data, "raw": True})
-    scenes = {f"gaussians_{count}": ball(mi, texture_of(g)) for count, g in sets.items()}
+    scenes = {f"gaussians_{n}": ball(mi, texture_of(sets[n])) for n in COUNTS}
     angle = pixel_angle(plain.sensors()[0])
     filtered = ball(mi, texture_of(sets[SETTLED], prefilter=angle))
     settled = scenes[f"gaussians_{SETTLED}"]
@@ -51,8 +53,11 @@ def run(variant: str = "llvm_ad_rgb", progress: Progress = lambda *_: None) -> d
         "prefiltered": partial(mi.render, filtered),
         "step_bitmap": _step(mi, plain),
         "step_gaussians": _step(mi, settled),
-        "change": partial(_change, mi, settled),
     }
+    for count in CHANGED:
+        for name, given in (("change", 0.0), ("change_filtered", angle)):
+            texture = mi.load_dict(texture_of(sets[count], prefilter=given))
+            programs[f"{name}_{count}"] = partial(_change, mi, texture)
     total = WARM_UP + ROUNDS
     timed = interleaved(programs, WARM_UP, ROUNDS, lambda done: progress("texture", done, total))
     return {
@@ -102,13 +107,13 @@ def _step(mi: Any, scene: Any) -> Callable[[], Any]:
     return step
 
 
-def _change(mi: Any, scene: Any) -> Any:
-    parameters = mi.traverse(scene)
-    parameters.keep(r".*base_color\.factor")
-    ((key, factor),) = parameters
-    parameters[key] = dr.detach(factor) + 0
+def _change(mi: Any, texture: Any) -> Any:
+    """Change all shapes by a millionth; equal values would be no change for Mitsuba."""
+    parameters = mi.traverse(texture)
+    factor = dr.detach(parameters["factor"])
+    parameters["factor"] = factor * dr.opaque(mi.Float, 1 + 1e-6)
     parameters.update()
-    return parameters[key]
+    return texture.packed
 
 
 def _difference(mi: Any, gaussians: Any, texture: dict[str, Any]) -> float:

@@ -19,7 +19,7 @@ from ...backend.arrays import types_of
 from ..binning.lists import build_lists
 from ..binning.tiles import Grid
 from ..evaluate import LN2, weights
-from ..layout import gather_index, unpack_parameters
+from ..layout import gather_index, pack_parameters, unpack_parameters
 from ..parameters import NUM_SHAPE_PARAMS
 
 
@@ -88,6 +88,35 @@ def list_cells(
     return Cells(grid, margin, lists.splat, ends)
 
 
+MAX_ARRANGED = 1 << 20
+"""Largest number of entries of lists whose parameters are copied; the copies take 32 MiB."""
+
+
+def in_list_order(splat: Any, rows: list) -> Any:
+    """Copy parameters to the order of the lists, for lookups without gradients.
+
+    A lookup then reads neighbours in memory and needs no index. The adjoint would be slower, since
+    it would add to the copies first.
+
+    Parameters
+    ----------
+    splat : UInt32
+        Entries of `Cells.splat`.
+    rows : list of Float, shape (N,)
+        One array for each parameter.
+
+    Returns
+    -------
+    Float, or None
+        As from `eigengs_dr.raster.layout.pack_parameters`, an entry for each of the lists. None if
+        there are more than `MAX_ARRANGED`.
+    """
+    if dr.width(splat) > MAX_ARRANGED:
+        return None
+    packed = pack_parameters([dr.detach(row) for row in rows])
+    return pack_parameters(unpack_parameters(packed, splat, len(rows)))
+
+
 def fold(x: Any, side: int, wrap: str) -> tuple[Any, Any]:
     """Move a coordinate into the image.
 
@@ -143,6 +172,7 @@ def sum_at_points(
     active: Any,
     terms: Callable[[list, Any, Any], list],
     count: int,
+    arranged: Any = None,
 ) -> list:
     """Sum the contributions of the Gaussians near a point.
 
@@ -163,22 +193,52 @@ def sum_at_points(
         ``terms(parameters, x, y)`` returns the contributions of a Gaussian as a list of Float.
     count : int
         Length of this list.
+    arranged : Float, optional
+        Parameters from `in_list_order`, which take the place of `packed`.
 
     Returns
     -------
     list of `count` Float
     """
+    ends = cell_range(cells, x, y, active)
+    return sum_range(cells.splat, ends, packed, number, x, y, terms, count, arranged)
+
+
+def sum_range(
+    splat: Any,
+    ends: tuple[Any, Any],
+    packed: Any,
+    number: int,
+    x: Any,
+    y: Any,
+    terms: Callable[[list, Any, Any], list],
+    count: int,
+    arranged: Any = None,
+) -> list:
+    """Sum the contributions of the Gaussians ``splat[begin:end]``, as `sum_at_points` does.
+
+    Parameters
+    ----------
+    splat : UInt32
+    ends : tuple of 2 UInt32
+        Begin and end of the range of each point.
+    packed, number, x, y, terms, count, arranged
+        As for `sum_at_points`.
+    """
     types = types_of(packed)
-    begin, end = cell_range(cells, x, y, active)
 
     def add(i: Any, end: Any, x: Any, y: Any, sums: list) -> tuple:
         here = i < end
-        splat = unpack_parameters(packed, gather_index(types, cells.splat, i, here), number, here)
-        return i + 1, end, x, y, [s + t for s, t in zip(sums, terms(splat, x, y), strict=True)]
+        if arranged is None:
+            source, index = packed, gather_index(types, splat, i, here)
+        else:
+            source, index = arranged, i
+        gaussian = unpack_parameters(source, index, number, here)
+        return i + 1, end, x, y, [s + t for s, t in zip(sums, terms(gaussian, x, y), strict=True)]
 
     # max_iterations=-1 tells Dr.Jit that the loop is a pure sum: its gradient needs no storage.
     return dr.while_loop(
-        (begin, end, x, y, [types.Float(0) for _ in range(count)]),
+        (*ends, x, y, [types.Float(0) for _ in range(count)]),
         lambda i, end, *rest: i < end,
         add,
         label="sum at points",

@@ -8,6 +8,7 @@ image, and the sum includes all copies of the image that the footprint reaches.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,11 +20,9 @@ from ..evaluate import weights, widen
 from ..layout import gather_index, gather_run, unpack_parameters
 from ..parameters import NUM_SHAPE_PARAMS, kernel_covariance, kernel_radius
 from .footprint import inside_share
-from .points import sum_at_points
-from .size_classes import SizeClasses
-
-FOOTPRINT_REACH = 3.0
-"""Half-width of a footprint, in standard deviations, in the search for copies of the image."""
+from .points import cell_range, sum_range
+from .size_classes import FOOTPRINT_REACH, SizeClasses
+from .widened import arranged_values, widened_values
 
 
 def sum_prefiltered(
@@ -35,6 +34,7 @@ def sum_prefiltered(
     footprint: list,
     active: Any,
     cutoff: float,
+    arranged: Any = None,
 ) -> list:
     """Sum the Gaussians under a footprint.
 
@@ -54,6 +54,8 @@ def sum_prefiltered(
     active : Bool
     cutoff : float
         Standard deviations.
+    arranged : Float, optional
+        From `arrange`, for lookups without gradients.
 
     Returns
     -------
@@ -69,30 +71,65 @@ def sum_prefiltered(
     inner = (x >= reach[0]) & (x + reach[0] <= sides[0])
     inner &= (y >= reach[1]) & (y + reach[1] <= sides[1])
     widest = dr.maximum(*reach) * (1 / FOOTPRINT_REACH)
-    terms = _widened_values(footprint, kernel_radius(cutoff))
-    total = [types.Float(0) for _ in range(number - NUM_SHAPE_PARAMS)]
-    for spread, cells in sizes.listed:
-        small = active & inner & (widest <= spread)
-        part = sum_at_points(cells, packed, number, x, y, small, terms, len(total))
-        total = [t + p for t, p in zip(total, part, strict=True)]
-        active = active & ~small
+    channels = number - NUM_SHAPE_PARAMS
+    listed = active & (widest <= sizes.listed[-1][0])
+    radius = kernel_radius(cutoff)
+    terms = (widened_values if arranged is None else arranged_values)(footprint, radius)
+    splat, ends = sizes.listed[0][1].splat, _ends(sizes, x, y, widest, listed & inner)
+    total = sum_range(splat, ends, packed, number, x, y, terms, channels, arranged)
+    # Two copies in each direction: more only show in small images.
+    listed &= (last[0] - first[0] <= 1) & (last[1] - first[1] <= 1)
     lookup = _Lookup(sizes, packed, number, cutoff, footprint)
     copies = [types.Int(dr.detach(v)) for v in (*first, *last)]
-    part = _sum_copies(lookup, x, y, copies, active)
-    return [t + p for t, p in zip(total, part, strict=True)]
+    border = listed & ~inner
+    others = active & ~border & ~(inner & (widest <= sizes.listed[-1][0]))
+    for few, compute in (
+        (border, lambda: _sum_border(lookup, x, y, copies, widest, border)),
+        (others, lambda: _sum_copies(lookup, x, y, copies, others)),
+    ):
+        part = where_any(few, compute, channels, packed)
+        total = [t + p for t, p in zip(total, part, strict=True)]
+    return total
 
 
-def _widened_values(footprint: list, radius: float) -> Any:
-    """Return the `terms` of `sum_at_points` for the filtered sum, without borders."""
-    scaled = kernel_covariance(footprint)
+def _ends(sizes: SizeClasses, x: Any, y: Any, widest: Any, active: Any) -> tuple[Any, Any]:
+    """Return begin and end of the shortest list that serves a footprint."""
+    types = types_of(x)
+    begin, end = types.UInt(0), types.UInt(0)
+    for spread, cells in sizes.listed:
+        small = active & (widest <= spread)
+        found = cell_range(cells, x, y, small)
+        begin, end = dr.select(small, found[0], begin), dr.select(small, found[1], end)
+        active = active & ~small
+    return begin, end
 
-    def terms(splat: list, x: Any, y: Any) -> list:
-        shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], scaled)
-        (w,) = weights(shape, x, y, (1, 1), radius)
-        w = w * amplitude
-        return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
 
-    return terms
+def where_any(active: Any, compute: Callable[[], list], count: int, packed: Any) -> list:
+    """Return sums that few points need, and skip the work for packets of lanes without one.
+
+    Parameters
+    ----------
+    active : Bool
+        The points that need the sums; the others get 0.
+    compute : callable
+        Returns the sums, a list of Float.
+    count : int
+        Length of this list.
+    packed : Float
+        Parameters. With gradients nothing is skipped: Dr.Jit cannot carry them out of the branch.
+    """
+    if dr.grad_enabled(packed):
+        return compute()
+    types = types_of(packed)
+    return list(
+        dr.if_stmt(
+            (),
+            active,
+            lambda: tuple(compute()),
+            lambda: tuple(types.Float(0) for _ in range(count)),
+            mode="symbolic",
+        )
+    )
 
 
 @dataclass(frozen=True)
@@ -104,6 +141,46 @@ class _Lookup:
     number: int
     cutoff: float
     footprint: list
+
+
+def _local(sizes: SizeClasses, i: Any, j: Any, x: Any, y: Any) -> tuple:
+    """Return the point in the copy (i, j), and the sign of the footprint's xy in this copy."""
+    types = types_of(x)
+    x, y = x - types.Float(i) * sizes.width, y - types.Float(j) * sizes.height
+    if sizes.wrap == "repeat":
+        return x, y, types.Float(1)
+    odd_x, odd_y = (i & 1) == 1, (j & 1) == 1
+    x, y = dr.select(odd_x, sizes.width - x, x), dr.select(odd_y, sizes.height - y, y)
+    return x, y, dr.select(odd_x == odd_y, types.Float(1), -1)
+
+
+def _sum_border(lookup: _Lookup, x: Any, y: Any, copies: list, widest: Any, active: Any) -> list:
+    """Sum over the lists of up to 2 x 2 copies of the image, for small footprints."""
+    sizes, packed = lookup.sizes, lookup.packed
+    types, channels = types_of(packed), lookup.number - NUM_SHAPE_PARAMS
+    radius, scaled = kernel_radius(lookup.cutoff), kernel_covariance(lookup.footprint)
+    left, top, right, bottom = copies
+    total = [types.Float(0) for _ in range(channels)]
+    for i, j, shown in (
+        (left, top, active),
+        (right, top, active & (right != left)),
+        (left, bottom, active & (bottom != top)),
+        (right, bottom, active & (right != left) & (bottom != top)),
+    ):
+        px, py, sign = _local(sizes, i, j, x, y)
+        seen = [scaled[0], scaled[1] * sign, scaled[2]]
+
+        def terms(splat: list, x: Any, y: Any, seen: list = seen) -> list:
+            shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], seen)
+            (w,) = weights(shape, x, y, (1, 1), radius)
+            w = w * amplitude * inside_share(shape, seen, x, y, sizes.width, sizes.height)
+            return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
+
+        ends = _ends(sizes, dr.detach(px), dr.detach(py), widest, shown)
+        splat = sizes.listed[0][1].splat
+        part = sum_range(splat, ends, packed, lookup.number, px, py, terms, channels)
+        total = [t + p for t, p in zip(total, part, strict=True)]
+    return total
 
 
 def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> list:
@@ -119,19 +196,10 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
     left, top, right, bottom = copies
     bottom = dr.select(active, bottom, top - 1)
 
-    def local(i: Any, j: Any, x: Any, y: Any) -> tuple:
-        """Return the point in the copy (i, j), and the sign of the footprint's xy in this copy."""
-        x, y = x - types.Float(i) * sizes.width, y - types.Float(j) * sizes.height
-        if sizes.wrap == "repeat":
-            return x, y, types.Float(1)
-        odd_x, odd_y = (i & 1) == 1, (j & 1) == 1
-        x, y = dr.select(odd_x, sizes.width - x, x), dr.select(odd_y, sizes.height - y, y)
-        return x, y, dr.select(odd_x == odd_y, types.Float(1), -1)
-
     def rows(i: Any, j: Any, k: Any) -> tuple:
         """Return the rows of cells [first, last] of the size class k under the footprint."""
         square, _, _, ny, inverse, origin = _row_of(types, sizes, k)
-        _, y0, _ = local(i, j, dr.detach(x), dr.detach(y))
+        _, y0, _ = _local(sizes, i, j, dr.detach(x), dr.detach(y))
         reach = lookup.cutoff * dr.sqrt(footprint[2] + square)
         first = dr.maximum(dr.floor((y0 - reach - origin) * inverse), 0)
         last = dr.minimum(dr.floor((y0 + reach - origin) * inverse), ny - 1)
@@ -140,7 +208,7 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
     def run(i: Any, j: Any, k: Any, row: Any, valid: Any) -> tuple:
         """Return the range [begin, end) in `splat` of a row of cells in the widened ellipse."""
         square, first, nx, _, inverse, origin = _row_of(types, sizes, k)
-        x0, y0, sign = local(i, j, dr.detach(x), dr.detach(y))
+        x0, y0, sign = _local(sizes, i, j, dr.detach(x), dr.detach(y))
         xx, xy, yy = footprint[0] + square, footprint[1] * sign, footprint[2] + square
         side = rcp(inverse)
         low = dr.fma(types.Float(row), side, origin) - y0
@@ -172,7 +240,7 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
         here = (n < end) & (j <= bottom)
         index = gather_index(types, sizes.splat, n, here)
         splat = unpack_parameters(packed, index, lookup.number, here)
-        px, py, sign = local(i, j, x, y)
+        px, py, sign = _local(sizes, i, j, x, y)
         seen = [scaled[0], scaled[1] * sign, scaled[2]]
         shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], seen)
         (w,) = weights(shape, px, py, (1, 1), radius)

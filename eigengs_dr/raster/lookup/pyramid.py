@@ -14,7 +14,7 @@ the variance of its footprint. The ripple of the grid is below
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -23,16 +23,13 @@ from ...backend.arithmetic import rcp, rsqrt
 from ...backend.arrays import ArrayTypes, types_of
 from ..evaluate import falloff
 from ..layout import gather_run
-from ..parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_radius
-from .prefilter import sum_prefiltered
-from .size_classes import SizeClasses
+from ..parameters import (
+    EXP2_SCALE,
+    kernel_radius,
+)
 
 SAMPLE_DEVIATION = 0.65
 """Standard deviation of the Gaussians of a level, in spacings of its points."""
-
-FINEST, FEWEST = 1, 8
-"""Spacing of the points of the finest level, in pixels, and smallest number of points along the
-shorter side of the coarsest level."""
 
 SAMPLE_REACH = 3.0
 """Standard deviations at which the Gaussians of a level end."""
@@ -85,58 +82,9 @@ class GaussianPyramid:
     values: Any
 
 
-def build_pyramid(sizes: SizeClasses, packed: Any, number: int, cutoff: float) -> GaussianPyramid:
-    """Evaluate a sum of Gaussians at the points of all levels; differentiable.
-
-    Cost: one `eigengs_dr.raster.lookup.prefilter.sum_prefiltered` for each of the
-    ``width height / FINEST^2`` points of the finest level. Each other level samples the previous
-    level.
-
-    Parameters
-    ----------
-    sizes, packed, number, cutoff
-        As for `eigengs_dr.raster.lookup.prefilter.sum_prefiltered`.
-
-    Returns
-    -------
-    GaussianPyramid
-    """
-    types = types_of(packed)
-    width, height = sizes.width, sizes.height
-    pyramid = GaussianPyramid(width, height, sizes.wrap, number - NUM_SHAPE_PARAMS, (), None)
-    parts: list = []
-    spacing = FINEST
-    while not parts or min(width, height) >= FEWEST * spacing:
-        nx, ny = math.ceil(width / spacing), math.ceil(height / spacing)
-        level = Level(sum(map(_points, pyramid.levels)), nx, ny, width / nx, height / ny)
-        index = dr.arange(types.UInt, nx * ny)
-        x = (types.Float(index % nx) + 0.5) * level.dx
-        y = (types.Float(index // nx) + 0.5) * level.dy
-        blur = [types.Float((SAMPLE_DEVIATION * level.dx) ** 2), types.Float(0)]
-        blur.append(types.Float((SAMPLE_DEVIATION * level.dy) ** 2))
-        if parts:
-            finer = replace(pyramid, levels=(replace(pyramid.levels[-1], first=0),))
-            seen = sum_pyramid(replace(finer, values=parts[-1]), x, y, blur, types.Bool(True))
-        else:
-            seen = sum_prefiltered(sizes, packed, number, x, y, blur, types.Bool(True), cutoff)
-        parts.append(_interleaved(types, seen, nx * ny))
-        pyramid = replace(pyramid, levels=(*pyramid.levels, level))
-        spacing *= 2
-    values = dr.concat(parts)
-    dr.eval(values)
-    return replace(pyramid, values=values)
-
-
-def _points(level: Level) -> int:
+def count_points(level: Level) -> int:
+    """Return the number of points of a level."""
     return level.nx * level.ny
-
-
-def _interleaved(types: ArrayTypes, rows: list, count: int) -> Any:
-    """Store the values of all channels point after point, 4 numbers per point."""
-    padded = [*rows, *[types.Float(0)] * (4 - len(rows))]
-    flat = dr.ravel(types.FloatX([row + dr.zeros(types.Float, count) for row in padded]), order="F")
-    dr.eval(flat)
-    return flat
 
 
 def pyramid_mean(lattice: GaussianPyramid) -> list:
@@ -144,7 +92,11 @@ def pyramid_mean(lattice: GaussianPyramid) -> list:
     types = types_of(lattice.values)
     level = lattice.levels[-1]
     rows = gather_run(
-        types, lattice.values, dr.arange(types.UInt, _points(level)) + level.first, 4, True
+        types,
+        lattice.values,
+        dr.arange(types.UInt, count_points(level)) + level.first,
+        4,
+        True,
     )
     return [dr.mean(row) for row in rows[: lattice.channels]]
 

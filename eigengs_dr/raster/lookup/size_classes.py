@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -22,7 +22,10 @@ CLASS_RATIO = 3.0
 """Ratio of the sizes of two classes. With a smaller ratio a lookup visits more rows of cells; with
 a larger ratio it visits more Gaussians that miss the footprint."""
 
-LISTED_FOOTPRINTS = (1.0, 4.0)
+FOOTPRINT_REACH = 3.0
+"""Half-width of a footprint, in standard deviations, in the search for copies of the image."""
+
+LISTED_FOOTPRINTS = (0.7, 4.0)
 """Standard deviations of the footprints for which cells list their Gaussians, in pixels; most
 lookups have such footprints."""
 
@@ -51,8 +54,9 @@ class SizeClasses:
         For each class: s^2, first cell, columns, rows, 1 / side of a cell, origin of the cells, and
         two zeros.
     listed : list of (float, Cells)
-        Lists for footprints inside the image, of up to this standard deviation. They hold the
-        Gaussians widened by it, whose ellipses contain the ellipses for smaller footprints.
+        Lists for footprints of up to this standard deviation. They hold the
+        Gaussians widened by it, whose ellipses contain the ellipses for smaller footprints. All
+        have one array `splat`: lanes with footprints of several sizes then share a loop.
     """
 
     width: int
@@ -118,8 +122,21 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
         upload(types.UInt, splat.astype(np.uint32)),
         upload(types.UInt, np.asarray(starts, np.uint32)),
         upload(types.Float, np.asarray(table or np.zeros((1, 8)), np.float32).ravel()),
-        [(s, _cells_for(shape, width, height, cutoff, s)) for s in LISTED_FOOTPRINTS],
+        _listed([_cells_for(shape, width, height, cutoff, s) for s in LISTED_FOOTPRINTS]),
     )
+
+
+def _listed(levels: list[Cells]) -> list[tuple[float, Cells]]:
+    """Join the lists of several cells in one array."""
+    splat = dr.concat([cells.splat for cells in levels])
+    dr.eval(splat)
+    listed, first = [], 0
+    for spread, cells in zip(LISTED_FOOTPRINTS, levels, strict=True):
+        ends = cells.ends + dr.opaque(type(splat), first)
+        listed.append((spread, replace(cells, splat=splat, ends=ends)))
+        first += dr.width(cells.splat)
+    dr.eval(listed)
+    return listed
 
 
 def _cells_for(shape: list, width: int, height: int, cutoff: float, spread: float) -> Cells:
@@ -127,4 +144,6 @@ def _cells_for(shape: list, width: int, height: int, cutoff: float, spread: floa
     variance = dr.opaque(types.Float, (spread / EXP2_SCALE) ** 2)
     widened, _ = widen(shape, [variance, types.Float(0), variance])
     side = max(4, cell_side(width, height, dr.width(shape)))
-    return list_cells(widened, width, height, kernel_radius(cutoff), side)
+    # Footprints at a border look at copies of the image from as far outside as they reach.
+    margin = math.ceil(FOOTPRINT_REACH * spread)
+    return list_cells(widened, width, height, kernel_radius(cutoff), side, margin)

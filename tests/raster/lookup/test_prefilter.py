@@ -13,6 +13,7 @@ from eigengs_dr.raster.layout import pack_parameters
 from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
+from eigengs_dr.raster.lookup.widened import arrange
 from eigengs_dr.raster.parameters import EXP2_SCALE, NUM_SHAPE_PARAMS
 from eigengs_dr.raster.render import decode_parameters
 
@@ -193,3 +194,20 @@ class TestSumFiltered:
         scene = scene._replace(mean=scene.mean + 1e6)
         rows = stacked(filtered(scene.on(backend), "repeat", some_points(), FOOTPRINTS[1]))
         np.testing.assert_array_equal(rows, 0)
+
+
+@pytest.mark.parametrize("variance", [0.0, 0.1, 1.0, 9.0])
+def test_lists_in_order_give_the_same(backend, variance):
+    """Copies of the parameters in the order of the lists, with the inverse factor."""
+    gaussians = random_scene(4).on(backend)
+    p = decode_parameters(gaussians)
+    rows = [*p.shape, *p.color]
+    sizes = classify_by_size([dr.detach(r) for r in p.shape], *SIZE, CUTOFF, "repeat")
+    arranged = arrange(sizes.listed[0][1].splat, p.shape, p.color)
+    types = types_of(p.shape[0])
+    points = np.float32(np.random.default_rng(0).uniform(0, SIZE, (300, 2)))
+    x, y = (types.Float(np.ascontiguousarray(c)) for c in points.T)
+    blur = [types.Float(v) for v in (variance, 0.5 * variance, 0.7 * variance)]
+    arguments = sizes, pack_parameters(rows), len(rows), x, y, blur, types.Bool(True), CUTOFF
+    found, expected = sum_prefiltered(*arguments, arranged), sum_prefiltered(*arguments)
+    np.testing.assert_allclose(np.array(found), np.array(expected), atol=2e-5)

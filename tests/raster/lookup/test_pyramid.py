@@ -1,5 +1,7 @@
 """Distant views: lattices against brute force and against exact lookups; their gradients."""
 
+from dataclasses import replace
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -8,8 +10,9 @@ from _helpers.footprints import CUTOFF, brute_force, some_points, stacked, tiled
 from _helpers.sets import SIZE, random_scene
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.raster.layout import pack_parameters
-from eigengs_dr.raster.lookup import pyramid as module
-from eigengs_dr.raster.lookup.pyramid import build_pyramid, is_minified, pyramid_mean, sum_pyramid
+from eigengs_dr.raster.lookup import coarsen
+from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
+from eigengs_dr.raster.lookup.pyramid import is_minified, pyramid_mean, sum_pyramid
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS
 from eigengs_dr.raster.render import decode_parameters
@@ -30,7 +33,7 @@ def lattice_of(gaussians, wrap, cutoff=CUTOFF):
     rows = [*p.shape, *p.color]
     shape = [dr.detach(r) for r in rows[:NUM_SHAPE_PARAMS]]
     sizes = classify_by_size(shape, gaussians.width, gaussians.height, cutoff, wrap)
-    return build_pyramid(
+    return coarsen.build_pyramid(
         sizes, pack_parameters(rows), NUM_SHAPE_PARAMS + gaussians.channels, cutoff
     )
 
@@ -62,13 +65,13 @@ class TestLookup:
 
     def test_coarser_lattices_agree_with_finer_ones(self, backend, monkeypatch):
         """One splat a lattice point, seen from afar: every level gives the same."""
-        monkeypatch.setattr(module, "FEWEST", 2)
+        monkeypatch.setattr(coarsen, "FEWEST", 2)
         lattice = lattice_of(inner_scene().on(backend), "repeat")
         assert len(lattice.levels) >= 4
         covariance, points = np.diag([36.0, 30.0]), some_points()
         whole = stacked(looked_up(lattice, points, covariance))
         for number in range(1, 3):
-            part = module.replace(lattice, levels=lattice.levels[:number])
+            part = replace(lattice, levels=lattice.levels[:number])
             found = stacked(looked_up(part, points, covariance))
             np.testing.assert_allclose(found, whole, atol=0.02)
 
@@ -142,3 +145,21 @@ def test_levels_end_where_points_are_few(backend, size, levels):
         assert level.nx * level.dx == pytest.approx(size[0])
         assert level.ny * level.dy == pytest.approx(size[1])
     assert dr.width(lattice.values) == 4 * sum(level.nx * level.ny for level in lattice.levels)
+
+
+@pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
+def test_the_finest_level_is_the_filtered_sum(backend, wrap):
+    """At every pixel, although most are rendered and only the border is looked up."""
+    gaussians = random_scene(3).on(backend)
+    p = decode_parameters(gaussians)
+    rows = [*p.shape, *p.color]
+    sizes = classify_by_size([dr.detach(r) for r in p.shape], *SIZE, CUTOFF, wrap)
+    number, packed = len(rows), pack_parameters(rows)
+    types = types_of(packed)
+    index = dr.arange(types.UInt, SIZE[0] * SIZE[1])
+    x, y = types.Float(index % SIZE[0]) + 0.5, types.Float(index // SIZE[0]) + 0.5
+    blur = [types.Float(coarsen.SAMPLE_DEVIATION**2 * k) for k in (1, 0, 1)]
+    expected = sum_prefiltered(sizes, packed, number, x, y, blur, types.Bool(True), CUTOFF)
+    lattice = coarsen.build_pyramid(sizes, packed, number, CUTOFF)
+    found = np.array(lattice.values)[: 4 * SIZE[0] * SIZE[1]].reshape(-1, 4)[:, : len(p.color)]
+    np.testing.assert_allclose(found, np.stack([np.array(e) for e in expected], 1), atol=1e-5)

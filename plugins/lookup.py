@@ -1,0 +1,109 @@
+"""Lookups of ``gaussian_texture``: the sum of Gaussians at a point, or over a footprint.
+
+Values come from parameters in the order of the lists, and derivatives from the parameters
+themselves: reading copies is faster, but adding to copies is slower. Dr.Jit leaves the values of
+the second sum out, because nobody needs them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from eigengs_dr.raster.lookup.footprint import bound_covariance
+from eigengs_dr.raster.lookup.points import sum_at_points, value_terms
+from eigengs_dr.raster.lookup.prefilter import sum_prefiltered, where_any
+from eigengs_dr.raster.lookup.pyramid import is_minified, sum_pyramid
+from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
+
+from .cone import seen_metric
+
+INSIDE = 0.01
+"""Distance in pixels of clamped points from the border."""
+
+
+def sum_here(texture: Any, x: Any, y: Any, active: Any) -> list:
+    """Sum the Gaussians at a point.
+
+    Parameters
+    ----------
+    texture : mitsuba.Texture
+        A ``gaussian_texture`` without a prefilter.
+    x, y : Float
+        In pixels, inside the image.
+    active : Bool
+
+    Returns
+    -------
+    list of Float
+        One sum for each channel, without the background.
+    """
+    count, terms = texture.channels, value_terms(kernel_radius(texture.cutoff))
+    number = NUM_SHAPE_PARAMS + count
+
+    def look_up(packed: Any, x: Any, y: Any, arranged: Any) -> list:
+        return sum_at_points(texture.cells, packed, number, x, y, active, terms, count, arranged)
+
+    if not dr.grad_enabled(texture.packed):
+        return look_up(texture.packed, x, y, texture.arranged)
+    packed, px, py = dr.detach((texture.packed, x, y))
+    value = look_up(packed, px, py, texture.arranged)
+    return _with_gradient(value, look_up(texture.packed, x, y, None))
+
+
+def sum_over_footprint(texture: Any, si: Any, column: tuple, row: tuple, active: Any) -> list:
+    """Average the sum of Gaussians over the footprint around a point.
+
+    Parameters
+    ----------
+    texture : mitsuba.Texture
+        A ``gaussian_texture`` with a prefilter.
+    si : mitsuba.SurfaceInteraction3f
+    column, row : tuple of 2 Float
+        x and y in pixels, with their slopes, from `eigengs_dr.raster.lookup.points.fold`.
+    active : Bool
+
+    Returns
+    -------
+    list of Float
+        One sum for each channel, without the background.
+    """
+    # The slopes of `fold` turn a footprint in mirrored images. They also take away its width along
+    # an axis on which the point lies outside of a clamped image.
+    (x, sx), (y, sy) = column, row
+    sx, sy = sx * texture.width, sy * texture.height
+    if texture.wrap == "clamp":  # a footprint without width would count half on a border
+        x = dr.clip(x, INSIDE, texture.width - INSIDE)
+        y = dr.clip(y, INSIDE, texture.height - INSIDE)
+    inverse, valid = seen_metric(si, texture.transform.inverse, texture.angle)
+    unit, blind = bound_covariance(inverse)
+    sizes = (sx * sx, sx * sy, sy * sy)
+    footprint = [dr.select(valid, f * s, 0) for f, s in zip(unit, sizes, strict=True)]
+    blind &= valid & (sx * sy != 0)
+    distant = is_minified(texture.pyramid, footprint)
+    near, wide = active & ~distant, active & distant & ~blind
+    count, cutoff = texture.channels, texture.cutoff
+    number = NUM_SHAPE_PARAMS + count
+
+    def look_up(source: tuple, x: Any, y: Any, arranged: Any) -> list:
+        packed, pyramid, average = source
+        sharp = sum_prefiltered(
+            texture.sizes, packed, number, x, y, footprint, near, cutoff, arranged
+        )
+        far = where_any(
+            wide, lambda: sum_pyramid(pyramid, x, y, footprint, wide), count, pyramid.values
+        )
+        seen = [dr.select(distant, f, n) for f, n in zip(far, sharp, strict=True)]
+        return [dr.select(blind, m, s) for m, s in zip(average, seen, strict=True)]
+
+    source = (texture.packed, texture.pyramid, texture.average)
+    if not dr.grad_enabled(texture.packed):
+        return look_up(source, x, y, texture.arranged)
+    fixed, px, py = dr.detach((source, x, y))
+    value = look_up(fixed, px, py, texture.arranged)
+    return _with_gradient(value, look_up(source, x, y, None))
+
+
+def _with_gradient(values: list, carriers: list) -> list:
+    return [dr.replace_grad(v, c) for v, c in zip(values, carriers, strict=True)]

@@ -1,0 +1,85 @@
+"""Mistakes in the properties and parameters of the texture: one line says what to do."""
+
+import numpy as np
+import pytest
+
+mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
+from _helpers.texture import at, gaussians, texture  # noqa: E402
+from _helpers.variants import in_variants, on_both  # noqa: E402
+from eigengs_dr.plugins import texture_of  # noqa: E402
+
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
+
+SPECTRAL = on_both("spectral")
+
+
+class TestMistakes:
+    @pytest.mark.parametrize(
+        ("properties", "message"),
+        [
+            ({"filename": "nowhere.npz"}, "nowhere.npz"),
+            ({}, "give one of filename"),
+            ({"filename": "a.npz", "model": "b.npz"}, "give one of filename"),
+        ],
+    )
+    def test_of_where_from(self, properties, message):
+        with pytest.raises(RuntimeError, match=message):
+            mi.load_dict({"type": "gaussian_texture", **properties})
+
+    @pytest.mark.parametrize(
+        ("properties", "message"),
+        [
+            ({"wrap_mode": "bounce"}, "wrap_mode 'bounce' is unknown; use one of repeat, mirror"),
+            ({"cutoff": 0.0}, "cutoff is 0.0; it must be above 0 and at most 12"),
+            ({"prefilter": -1.0}, "prefilter is -1.0; it is the angle of a pixel"),
+            ({"prefiltre": 1.0}, "prefiltre"),
+            ({"space": "cmyk"}, "space 'cmyk'"),
+            ({"raw": "false"}, "raw is 'false'; it must be a boolean"),
+            ({"cutoff": "wide"}, "cutoff is 'wide'; it must be a number"),
+            ({"prefilter": True}, "prefilter = true needs Mitsuba 3.10, and this is 3.9"),
+            ({"prefilter": False}, "prefilter is False; it must be a number"),
+            ({"width": 31.5}, "width is 31.5; it must be an integer"),
+        ],
+    )
+    def test_of_properties(self, properties, message):
+        with pytest.raises(RuntimeError, match=message):
+            texture(gaussians(), **properties)
+
+    @pytest.mark.parametrize("channels", [2, 4])
+    def test_a_set_of_other_channels(self, channels):
+        with pytest.raises(RuntimeError, match=f"has {channels} channels; use a set of 1 or 3"):
+            texture(gaussians("data", channels=channels))
+
+    def test_an_array_that_is_missing(self):
+        properties = texture_of(gaussians())
+        del properties["color"]
+        with pytest.raises(RuntimeError, match="color is missing"):
+            mi.load_dict(properties)
+
+    def test_a_file_that_is_no_set(self, tmp_path):
+        (tmp_path / "x.npz").write_bytes(b"nothing")
+        with pytest.raises(RuntimeError, match=r"x\.npz"):
+            mi.load_dict({"type": "gaussian_texture", "filename": str(tmp_path / "x.npz")})
+
+    def test_normals_from_one_channel(self):
+        with pytest.raises(ValueError, match="a lookup of three channels"):
+            texture(gaussians("data", channels=1)).eval_3(at(0.5, 0.5))
+
+    @in_variants(SPECTRAL)
+    @pytest.mark.parametrize("raw", [True, False])
+    def test_a_spectrum_from_data(self, variant, raw):
+        tex = texture(gaussians("rgb" if raw else "data"), raw=raw)
+        with pytest.raises(ValueError, match="not raw data"):
+            tex.eval(at(0.5, 0.5))
+
+    @in_variants(["scalar_rgb"])
+    def test_scalar_variants(self, variant):
+        with pytest.raises(RuntimeError, match="does not support the variant scalar_rgb; use"):
+            mi.load_dict({"type": "gaussian_texture", "filename": "x.npz"})
+
+    def test_parameters_of_another_shape(self):
+        tex = texture(gaussians())
+        parameters = mi.traverse(tex)
+        parameters["color"] = mi.TensorXf(np.zeros((3, 3), np.float32))
+        with pytest.raises(Exception, match=r"color has shape \(3, 3\), expected \(24, 3\)"):
+            parameters.update()

@@ -1,0 +1,162 @@
+"""Sampled emission of the texture, its mean and its maximum."""
+
+import numpy as np
+import pytest
+
+from _helpers.sets import SIZE
+
+mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
+import eigengs_dr as eg  # noqa: E402
+from _helpers.texture import at, backend, gaussians, texel_centres, texture  # noqa: E402
+from _helpers.variants import in_variants, on_both  # noqa: E402
+from eigengs_dr.gaussian.gaussians import Gaussians  # noqa: E402
+from eigengs_dr.image.color import to_linear  # noqa: E402
+
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
+
+
+def lamps(deviation, count=40, side=256, space="linear"):
+    """Small round lights on black, some across the border, and their mean in closed form."""
+    rng = np.random.default_rng(0)
+    mean = rng.uniform(8, side - 8, (count, 2)).astype(np.float32)
+    factor = np.tile(np.float32([1 / deviation, 0, 1 / deviation]), (count, 1))
+    color = np.repeat(rng.uniform(0.5, 0.9, (count, 1)), 3, axis=1).astype(np.float32)
+    g = Gaussians.from_arrays(
+        mean, factor, color, size=(side, side), space=space, backend=backend()
+    )
+    mass = 2 * np.pi * deviation**2 * -np.expm1(-0.5 * g.cutoff**2)
+    return g, color[:, 0].sum(dtype=np.float64) * mass / side**2
+
+
+class TestMean:
+    @pytest.mark.parametrize("deviation", [0.03, 0.1, 0.3, 0.7, 2.0])
+    def test_is_the_integral_however_small_the_gaussians_are(self, deviation):
+        g, expected = lamps(deviation)
+        assert np.array(texture(g).mean()).item() == pytest.approx(expected, rel=2e-3)
+
+    @pytest.mark.parametrize("most", [1 << 10, 1 << 13])
+    def test_of_few_points_is_still_the_integral(self, monkeypatch, most):
+        monkeypatch.setattr("eigengs_dr.plugins.survey.MOST", most)
+        g, expected = lamps(2.0)
+        assert np.array(texture(g).mean()).item() == pytest.approx(expected, rel=0.02)
+
+    @pytest.mark.parametrize("scale", [0.37, 3.0])
+    def test_over_what_to_uv_shows(self, scale):
+        """Repeats count as often as they show; a part of the texture has its own mean."""
+        g = gaussians("linear")
+        tex = texture(g, to_uv=mi.ScalarTransform4f().scale(scale))
+        line = np.float32((np.arange(300) + 0.5) / 300)
+        u, v = np.meshgrid(line, line)
+        seen = tex.eval_1(at(mi.Float(u.ravel()), mi.Float(v.ravel())))
+        assert np.array(tex.mean()).item() == pytest.approx(np.array(seen).mean(), rel=3e-3)
+
+    def test_of_clamped_and_decoded_values(self):
+        g = gaussians("ycbcr", quiet=False)
+        dense = np.clip(eg.render(g, SIZE[0] * 10).numpy(), 0, 1)
+        light = to_linear(dense) @ np.float32([0.212671, 0.715160, 0.072169])
+        assert np.array(texture(g).mean()).item() == pytest.approx(light.mean(), rel=0.01)
+
+    @in_variants(on_both("spectral"))
+    def test_of_spectra_is_over_wavelengths(self, variant):
+        tex = texture(gaussians("rgb"))
+        si = texel_centres()
+        total = 0
+        lengths = np.linspace(mi.MI_CIE_MIN, mi.MI_CIE_MAX, 95)
+        for first in range(0, 92, 4):
+            si.wavelengths = type(si.wavelengths)(*lengths[first : first + 4].tolist())
+            total += np.array(tex.eval(si), np.float64).mean() / 23
+        assert np.array(tex.mean()).item() == pytest.approx(total, rel=0.01)
+
+    def test_follows_the_parameters(self):
+        tex = texture(gaussians("linear"))
+        before = np.array(tex.mean()).item(), tex.max()
+        parameters = mi.traverse(tex)
+        parameters["background"] = parameters["background"] + 0.1
+        parameters.update()
+        after = np.array(tex.mean()).item(), tex.max()
+        np.testing.assert_allclose(np.subtract(after, before), 0.1, rtol=0.01)
+
+
+class TestSampling:
+    @pytest.mark.parametrize("deviation", [0.3, 1.2, 3.0])
+    def test_small_lamps_are_found(self, deviation):
+        """One sample estimates their light to 40 %; evenly spread samples to 1,000 % or more."""
+        g, expected = lamps(deviation)
+        tex = texture(g)
+        rng = np.random.default_rng(1)
+        sample = mi.Point2f(*(mi.Float(rng.random(50_000, np.float32)) for _ in "uv"))
+        position, density = tex.sample_position(sample)
+        found = np.array(tex.eval_1(at(position.x, position.y)) / density)
+        assert found.mean() == pytest.approx(expected, rel=0.02)
+        assert found.std() < 0.4 * expected
+        np.testing.assert_allclose(
+            np.array(tex.pdf_position(position)), np.array(density), rtol=1e-4
+        )
+
+    @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
+    def test_chi_square(self, wrap):
+        """Mitsuba's own test, of positions against their density."""
+        from mitsuba.chi2 import ChiSquareTest, PlanarDomain
+
+        turn = mi.ScalarTransform4f().rotate([0, 0, 1], 20) @ mi.ScalarTransform4f().scale(1.3)
+        tex = texture(gaussians("linear", quiet=False), wrap_mode=wrap, to_uv=turn)
+        test = ChiSquareTest(
+            domain=PlanarDomain(mi.ScalarBoundingBox2f([0, 0], [1, 1])),
+            sample_func=lambda sample: tex.sample_position(sample)[0],
+            pdf_func=tex.pdf_position,
+            sample_dim=2,
+            sample_count=200_000,
+            res=64,
+            ires=16,
+        )
+        assert test.run(), test.messages
+
+    def test_density_is_what_sampling_says(self):
+        tex = texture(gaussians("linear", quiet=False))
+        sample = mi.Point2f(
+            *(mi.Float(k) for k in np.float32(np.random.default_rng(0).random((2, 1000))))
+        )
+        position, density = tex.sample_position(sample)
+        found = np.array(tex.pdf_position(position))
+        agree = np.isclose(found, np.array(density), rtol=1e-4)
+        assert agree.mean() > 0.99  # some samples round to the edge of a cell
+        assert (np.array(density) > 0).all()
+
+    def test_follows_the_parameters(self):
+        tex = texture(gaussians("linear"))
+        point = mi.Point2f(0.2, 0.2)
+        assert np.array(tex.pdf_position(point)) == pytest.approx(1, abs=0.3)
+        parameters = mi.traverse(tex)
+        bright = np.array(parameters["color"])
+        near = np.argsort(np.hypot(*(np.array(parameters["mean"]) - 0.8 * np.array(SIZE)).T))[:4]
+        bright[near] = 1
+        parameters["color"] = mi.TensorXf(bright)
+        parameters["background"] = mi.TensorXf(np.zeros(3, np.float32))
+        parameters.update()
+        assert np.array(tex.pdf_position(point)) < 0.5
+
+    def test_what_is_below_zero_is_not_sampled(self):
+        """Of a raw texture, whose values are not clamped."""
+        g = gaussians("linear")
+        g.color *= 0
+        g.background *= -1
+        density = np.array(texture(g, raw=True).pdf_position(mi.Point2f(0.3, 0.7)))
+        assert density == pytest.approx(1)
+        g = gaussians("linear", quiet=False)
+        g.background *= 0
+        g.color *= 5
+        tex = texture(g, raw=True)
+        dark = np.array(tex.eval_1(texel_centres())) < -1
+        density = np.array(tex.pdf_position(texel_centres().uv))
+        assert dark.any()
+        assert density[dark].max() < 0.1 * density.max()
+
+    def test_outside_there_is_no_density(self):
+        tex = texture(gaussians("linear"))
+        assert np.array(tex.pdf_position(mi.Point2f(1.5, 0.5))) == 0
+
+    def test_a_black_picture_is_sampled_evenly(self):
+        g = gaussians("linear")
+        g.color *= 0
+        g.background *= 0
+        assert np.array(texture(g).pdf_position(mi.Point2f(0.3, 0.7))) == pytest.approx(1)

@@ -1,0 +1,110 @@
+"""The texture in every slot of scenes, and as a light."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from _helpers.sets import SIZE
+
+mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
+import eigengs_dr as eg  # noqa: E402
+from _helpers.texture import gaussians, small_scene  # noqa: E402
+from _helpers.variants import BOTH_RGB, in_variants, on_both  # noqa: E402
+from eigengs_dr.plugins import texture_of  # noqa: E402
+
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
+
+others = [
+    pytest.param(name, marks=pytest.mark.slow) for name in ("llvm_ad_mono", "llvm_ad_spectral")
+]
+in_all = in_variants([*BOTH_RGB, *on_both("mono"), *on_both("spectral")])
+
+SLOTS = ["diffuse", "principled", "roughconductor", "roughdielectric", "plastic", "roughplastic"]
+SLOTS += ["blend", "mask", "normalmap", "bumpmap"]
+
+
+def slots(g):
+    """BSDFs with a texture in every kind of place that Mitsuba has for one, by name."""
+    colour, number = texture_of(g), texture_of(gaussians("data", channels=1))
+    diffuse = {"type": "diffuse"}
+    return {
+        "diffuse": {"type": "diffuse", "reflectance": colour},
+        "principled": {"type": "principled", "base_color": colour, "roughness": number},
+        "roughconductor": {"type": "roughconductor", "alpha": number},
+        "roughdielectric": {"type": "roughdielectric", "alpha": number},
+        "plastic": {"type": "plastic", "diffuse_reflectance": colour},
+        "roughplastic": {"type": "roughplastic", "diffuse_reflectance": colour},
+        "blend": {
+            "type": "blendbsdf",
+            "weight": number,
+            "a": diffuse,
+            "b": {"type": "diffuse", "reflectance": 0.1},
+        },
+        "mask": {"type": "mask", "opacity": number, "inner": diffuse},
+        "normalmap": {
+            "type": "normalmap",
+            "normalmap": texture_of(gaussians("data")),
+            "inner": diffuse,
+        },
+        "bumpmap": {"type": "bumpmap", "bump": number, "scale": 3.0, "inner": diffuse},
+    }
+
+
+class TestSlots:
+    @in_variants([*BOTH_RGB, *others])
+    @pytest.mark.parametrize("name", SLOTS)
+    def test_renders_and_differentiates(self, variant, name):
+        """In every slot the picture is finite, changes with the texture, and has a gradient."""
+        scene = small_scene(slots(gaussians())[name], "direct")
+        parameters = mi.traverse(scene)
+        keys = [k for k, _ in parameters if k.endswith((".color", ".mean"))]
+        assert keys
+        for key in keys:
+            dr.enable_grad(parameters[key])
+        parameters.update()
+        image = mi.render(scene, params=parameters, spp=4)
+        assert np.isfinite(np.array(image)).all()
+        dr.backward(dr.mean(dr.square(image)))
+        for key in keys:
+            gradient = np.array(dr.grad(parameters[key]))
+            assert np.isfinite(gradient).all()
+            assert np.abs(gradient).max() > 0, key
+
+    @in_all
+    def test_lights(self, variant):
+        radiance = texture_of(gaussians("linear"))
+        if mi.is_spectral:
+            radiance = {"type": "d65", "of": radiance}  # else it glows at equal energy
+        emitter = {"type": "area", "radiance": radiance}
+        scene = small_scene(None, "path", emitter=emitter)
+        parameters = mi.traverse(scene)
+        key = next(k for k, _ in parameters if k.endswith(".color"))
+        dr.enable_grad(parameters[key])
+        parameters.update()
+        image = mi.render(scene, params=parameters, spp=4)
+        assert np.isfinite(np.array(image)).all()
+        dr.backward(dr.mean(image))
+        assert np.abs(np.array(dr.grad(parameters[key]))).max() > 0
+
+    @in_all
+    def test_particles_leave_it_as_paths_find_it(self, variant):
+        """Light traced from the emitter, which samples positions and wavelengths of the texture."""
+        emitter = {"type": "area", "radiance": texture_of(gaussians("linear", quiet=False))}
+        scene = small_scene(None, emitter=emitter)
+        means = [
+            np.array(mi.render(scene, integrator=mi.load_dict({"type": t, "max_depth": 3}), spp=64))
+            for t in ("path", "ptracer")
+        ]
+        np.testing.assert_allclose(*(m.mean(axis=(0, 1)) for m in means), rtol=0.05)
+
+    def test_a_lamp_lights_as_a_bitmap_of_the_same_picture_does(self):
+        g = gaussians("linear", quiet=False)
+        data = mi.TensorXf(np.clip(eg.render(g, SIZE[0] * 8).numpy(), 0, 1))
+        means = []
+        for radiance in (
+            texture_of(g),
+            {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"},
+        ):
+            scene = small_scene(None, emitter={"type": "area", "radiance": radiance})
+            means.append(np.array(mi.render(scene, spp=256, seed=1)).mean(axis=(0, 1)))
+        np.testing.assert_allclose(means[0], means[1], rtol=0.02)
