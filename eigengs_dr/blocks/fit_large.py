@@ -104,7 +104,7 @@ def fit_large(
         See `eigengs_dr.fit`.
     progress : callable, optional
         ``progress(done, total, row)``: what is done of a stage, in blocks or steps of blocks. The
-        row has the key stage ("survey", "place", "density", "place", "fit", "mend", "measure", in
+        row has the key stage ("survey", "place", "density", "place", "fit", "measure", in
         this order; the first pair with "density" for long fits alone), and blocks, their number.
     client : distributed.Client, optional
         Where blocks are fitted; by default in this process.

@@ -8,9 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-PHASES = 4
-"""Number of phases, see `Block`."""
-
 HALO_SPACINGS = 5.0
 """Width of a halo, in mean distances of the Gaussians. On 1,024x1,024 pixels in blocks of 256, 60
 steps, the 16 pixels around borders have 32.18, 32.20 and 32.22 dB with 4, 5 and 8."""
@@ -31,8 +28,6 @@ class Block(NamedTuple):
     window_rows, window_columns : slice
         The core with its halo. All windows of an image have one size, so that all fits have one
         program; at the edges of the image the halo of the other sides is larger.
-    phase : int
-        From 0 to 3: blocks of one phase do not touch each other, not even at a corner.
     """
 
     number: int
@@ -40,7 +35,6 @@ class Block(NamedTuple):
     columns: slice
     window_rows: slice
     window_columns: slice
-    phase: int
 
     @property
     def core(self) -> tuple[slice, slice]:
@@ -101,10 +95,9 @@ def divide(width: int, height: int, side: int, halo: int) -> list[Block]:
     """
     rows, columns = _parts(height, side, halo), _parts(width, side, halo)
     blocks = list[Block]()
-    for i, (core_rows, window_rows) in enumerate(rows):
-        for j, (core_columns, window_columns) in enumerate(columns):
-            phase = 2 * (i % 2) + j % 2
-            block = Block(len(blocks), core_rows, core_columns, window_rows, window_columns, phase)
+    for core_rows, window_rows in rows:
+        for core_columns, window_columns in columns:
+            block = Block(len(blocks), core_rows, core_columns, window_rows, window_columns)
             blocks.append(block)
     return blocks
 

@@ -16,19 +16,15 @@ from ..fitting.optimizers.schedule import MIN_PHASE_RATIO
 from ..fitting.options import FitOptions
 from ..gaussian.file import SetData
 from ..storage.checkpoint import Checkpoint
-from .block import FitTask, PlaceTask, Settings, find_density, fit_block, mend_seam, place, survey
+from .block import FitTask, PlaceTask, Settings, find_density, fit_block, place, survey
 from .draw import compare, compare_tasks
-from .grid import PHASES, Block, choose_halo, deal
+from .grid import Block, deal
 from .place import OldSet
-from .seams import seams
+from .rounds import rounds
 from .sets import Arrays, BlockSets
 from .source import Source, Window
 
 Progress = Callable[[int, int, dict[str, Any]], None]
-
-
-MEND_SHARE = 0.15
-"""Steps of `_mend`, as a fraction of those of a fit."""
 
 
 class Run:
@@ -80,7 +76,6 @@ class Run:
             old, mass = self._find_density(self._place(mass), first)
             steps -= first
         sets = self._fit_blocks(self._place(mass, old), steps)
-        self._mend(sets, round(MEND_SHARE * steps))
         background = np.array(self.settings.background, np.float32)
         return SetData(
             sets.arrays | {"background": background},
@@ -135,10 +130,7 @@ class Run:
         mass = np.empty(len(self.blocks))
 
         def make_task(block: Block) -> FitTask:
-            # Errors hardly differ between both sides of a border, so that blocks need no phases.
-            arrays, own = placed.in_window(block)
-            mean, factor = arrays["mean"], arrays["factor"]
-            return FitTask(self._window(block), block, mean, factor, None, own, None, steps)
+            return self._fit_task(block, placed, steps, range(steps))
 
         self._begin("density", len(self.blocks) * steps)
         for block, found in self._fitted("density", find_density, self.blocks, make_task, steps):
@@ -146,45 +138,41 @@ class Run:
             old.put(block, found)
         return old, mass
 
-    def _fit_blocks(self, placed: BlockSets, steps: int) -> BlockSets:
-        """Fit all blocks, phase by phase."""
-        names, options = ("mean", "factor", "color"), self.options
-        sets = BlockSets(self.blocks, placed.counts(), names, self.image.channels, options.cutoff)
-
-        def make_task(block: Block) -> FitTask:
-            earlier = [other for other in self.blocks if other.phase < block.phase]
-            arrays, own = placed.in_window(block, without=earlier)
-            mean, factor, fixed = arrays["mean"], arrays["factor"], sets.touching(block, earlier)
-            return FitTask(self._window(block), block, mean, factor, None, own, fixed, steps)
-
+    def _fit_blocks(self, sets: BlockSets, steps: int) -> BlockSets:
+        """Fit all blocks, round by round, from sets without colours."""
+        parts = rounds(self.options.method.schedule, steps)
+        names, counts = ("mean", "factor", "color"), sets.counts()
         self._begin("fit", len(self.blocks) * steps)
-        for phase in range(PHASES):
-            blocks = [block for block in self.blocks if block.phase == phase]
-            for block, found in self._fitted("fit", fit_block, blocks, make_task, steps):
-                sets.put(block, found)
+        first = self._kept_round(len(parts))
+        self.resumed += first * len(self.blocks)
+        self._advance(len(self.blocks) * parts[first].start)
+        for number, part in enumerate(parts[first:], start=first):
+            task = partial(self._fit_task, sets=sets, steps=steps, part=part)
+            found = BlockSets(self.blocks, counts, names, self.image.channels, self.options.cutoff)
+            done = self._fitted(f"fit{number}-", fit_block, self.blocks, task, len(part))
+            for block, arrays in done:
+                found.put(block, arrays)
+            sets = found
+            if self.checkpoint is not None:
+                self.checkpoint.remove(f"fit{number - 1}-*")
         return sets
 
-    def _mend(self, sets: BlockSets, steps: int) -> None:
-        """Move the Gaussians along all borders of blocks, phase by phase."""
-        size, halo = (self.image.width, self.image.height), choose_halo(self.settings.spacing)
-        strips = seams(self.blocks, *size, self.settings.spacing, halo)
-        near = dict[int, tuple[NDArray[np.intp], NDArray[np.intp]]]()
+    def _kept_round(self, number: int) -> int:
+        """Return the last of some rounds of which an earlier call has fitted all blocks, or 0."""
+        kept = self.checkpoint
+        whole = [
+            k
+            for k in range(number)
+            if kept and all(kept.holds(f"fit{k}-{block.number}") for block in self.blocks)
+        ]
+        return max(whole, default=0)
 
-        def make_task(strip: Block) -> FitTask:
-            own, fixed = (sets.take(rows, strip) for rows in near[strip.number])
-            return FitTask(
-                self._window(strip), strip, **own, own=slice(None), fixed=fixed, iterations=steps
-            )
-
-        self._begin("mend", len(strips) * steps)
-        for phase in range(PHASES):
-            own = [strip for strip in strips if strip.phase == phase]
-            near |= {strip.number: sets.around(strip) for strip in own}
-            own = [strip for strip in own if len(near[strip.number][0])]
-            # Strips of one phase may see each other by large Gaussians, so that all wait for all.
-            found = list(self._fitted("seam", mend_seam, own, make_task, steps))
-            for strip, arrays in found:
-                sets.replace(near[strip.number][0], arrays, strip)
+    def _fit_task(self, block: Block, sets: BlockSets, steps: int, part: range) -> FitTask:
+        """Return the task of a block: its window, all Gaussians in it, and others that touch it."""
+        arrays, own = sets.in_window(block)
+        mean, factor, color = arrays["mean"], arrays["factor"], arrays.get("color")
+        fixed = None if color is None else sets.around(block)
+        return FitTask(self._window(block), block, mean, factor, color, own, fixed, steps, part)
 
     def _fitted(
         self,

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian.crop import crop, reaches, touches
+from ..gaussian.crop import crop, reaches
 from ..gaussian.file import CUTOFF, SetData
 from .grid import Block, neighbors
 
@@ -69,100 +68,50 @@ class BlockSets:
         if "factor" in self.arrays:
             self._measure(block)
 
-    def in_window(self, block: Block, without: Sequence[Block] = ()) -> tuple[Arrays, slice]:
+    def in_window(self, block: Block) -> tuple[Arrays, slice]:
         """Return the Gaussians whose means lie in the window of a block, in the window's pixels.
-
-        Parameters
-        ----------
-        block : Block
-        without : sequence of Block, optional
-            Blocks whose Gaussians are left out.
 
         Returns
         -------
         arrays : dict of str to ndarray
         own : slice
-            Those of the block itself: all of them lie in its window.
+            Those of the block itself: all of them, wherever they lie.
         """
-        low, high = block.corner, block.corner + block.window_size
         found: dict[str, list[NDArray[Any]]] = {name: [] for name in self.arrays}
         before, own = 0, slice(0, 0)
-        out = {other.number for other in without}
         for other in neighbors(block, self.blocks):
-            if other.number in out:
-                continue
             part = self.parts[other.number]
-            mean = self.arrays["mean"][part]
-            inside = np.all((mean >= low) & (mean <= high), axis=1)
+            inside = _in_window(self.arrays["mean"][part], block)
             if other.number == block.number:
-                inside = np.ones(len(mean), bool)  # rounding may move one across the edge
-                own = slice(before, before + len(mean))
+                inside[:] = True  # rounding may move one across the edge
+                own = slice(before, before + len(inside))
             before += int(inside.sum())
             for name, rows in found.items():
                 rows.append(self.arrays[name][part][inside])
         arrays = {name: np.concatenate(rows) for name, rows in found.items()}
-        arrays["mean"] = (arrays["mean"] - low).astype(np.float32)
+        arrays["mean"] = (arrays["mean"] - block.corner).astype(np.float32)
         return arrays, own
 
-    def touching(self, block: Block, others: list[Block]) -> Arrays:
-        """Return the Gaussians of other blocks that touch the window of a block, in its pixels.
-
-        Parameters
-        ----------
-        block : Block
-        others : list of Block
-            Blocks whose rows are set.
+    def around(self, block: Block) -> Arrays:
+        """Return the other Gaussians that touch the window of a block, in the window's pixels.
 
         Returns
         -------
         dict of str to ndarray
-            Mean, factor and color.
+            Mean, factor and color of those that `in_window` leaves out.
         """
+        near = {other.number for other in neighbors(block, self.blocks)}
         found = [{name: rows[:0] for name, rows in self.arrays.items()}]
-        for other in others:
-            if self._reaches(other, block):
-                found.append(crop(self._data(other), *_window(block)).arrays)
+        for other in self.blocks:
+            if other.number == block.number or not self._reaches(other, block):
+                continue
+            data = self._data(other)
+            if other.number in near:
+                outside = ~_in_window(data.arrays["mean"], block)
+                rows = {name: data.arrays[name][outside] for name in self.arrays}
+                data = data._replace(arrays=data.arrays | rows)
+            found.append(crop(data, *_window(block)).arrays)
         return {name: np.concatenate([part[name] for part in found]) for name in self.arrays}
-
-    def around(self, strip: Block) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the rows whose means lie in the core of a part, and others that touch its window.
-
-        Gaussians that reach beyond the window are others: a fit of it would not see all they do.
-
-        Returns
-        -------
-        inside, around : ndarray of int, shape (n,)
-        """
-        core = np.array([[strip.columns.start, strip.rows.start]])
-        end = np.array([[strip.columns.stop, strip.rows.stop]])
-        low, high = strip.corner, strip.corner + strip.window_size
-        low, high = np.where(low > 0, low, -np.inf), np.where(high < self.size, high, np.inf)
-        inside, around = [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
-        for block in self.blocks:
-            if self._reaches(block, strip):
-                first, data = self.parts[block.number].start, self._data(block)
-                mean, reach = data.arrays["mean"], np.stack(reaches(data), axis=1)
-                own = np.all((mean >= core) & (mean < end), axis=1)
-                own &= np.all((mean - reach >= low) & (mean + reach <= high), axis=1)
-                seen = touches(data, *_window(strip)) & ~own
-                inside.append(np.flatnonzero(own) + first)
-                around.append(np.flatnonzero(seen) + first)
-        return np.concatenate(inside), np.concatenate(around)
-
-    def take(self, rows: NDArray[np.intp], part: Block) -> Arrays:
-        """Return some rows, with means in pixels of the window of a part."""
-        arrays = {name: values[rows] for name, values in self.arrays.items()}
-        arrays["mean"] = (arrays["mean"] - part.corner).astype(np.float32)
-        return arrays
-
-    def replace(self, rows: NDArray[np.intp], found: Arrays, part: Block) -> None:
-        """Set some rows; their means are in pixels of the window of a part."""
-        for name, values in self.arrays.items():
-            values[rows] = found[name] + part.corner if name == "mean" else found[name]
-        for block in self.blocks:
-            own = self.parts[block.number]
-            if ((rows >= own.start) & (rows < own.stop)).any():
-                self._measure(block)
 
     def _measure(self, block: Block) -> None:
         """Note the box that the Gaussians of a block touch: left, top, right, bottom."""
@@ -185,6 +134,13 @@ class BlockSets:
         arrays = {name: rows[part] for name, rows in self.arrays.items()}
         arrays["background"] = np.zeros(1, np.float32)
         return SetData(arrays, (1, 1), "data", self.cutoff)
+
+
+def _in_window(mean: NDArray[Any], block: Block) -> NDArray[np.bool_]:
+    """Return which of some means (n, 2), in pixels of the image, lie in the window of a block."""
+    low, high = block.corner, block.corner + block.window_size
+    inside: NDArray[np.bool_] = np.all((mean >= low) & (mean <= high), axis=1)
+    return inside
 
 
 def _window(part: Block) -> tuple[tuple[float, float], tuple[int, int]]:

@@ -20,7 +20,6 @@ WORDS = {
     "place": "place",
     "density": "find where error is left",
     "fit": "fit",
-    "mend": "join blocks",
     "measure": "measure",
 }
 """What the bar says in each stage."""

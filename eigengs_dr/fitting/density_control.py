@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,11 +97,27 @@ def densify(
     return concatenate([gaussians, _like(gaussians, mean, _round(size), color)])
 
 
+class Part(NamedTuple):
+    """A part of a picture, for `relocate`.
+
+    Attributes
+    ----------
+    own : slice
+        The Gaussians that may move.
+    core : (slice, slice)
+        The rows and columns to which they may move.
+    """
+
+    own: slice
+    core: tuple[slice, slice]
+
+
 def relocate(
     gaussians: Gaussians,
     share: float,
     target: NDArray[np.float32],
     weight: Array | None = None,
+    part: Part | None = None,
 ) -> Gaussians:
     """Move the Gaussians of least use to where they reduce the error most.
 
@@ -110,6 +128,8 @@ def relocate(
     ----------
     share : float
         Share of the Gaussians that move, in [0, 1].
+    part : Part, optional
+        The Gaussians that may move, and where. The background then stays.
 
     Returns
     -------
@@ -117,21 +137,32 @@ def relocate(
         A set of as many Gaussians. Where `residual_peaks` finds too few places, Gaussians of least
         use stay, with the colour 0.
     """
-    value = removal_cost(gaussians, target, weight)
-    order, moves = np.argsort(value, kind="stable"), int(share * len(gaussians))
-    kept, moved = np.sort(order[moves:]), order[:moves]
-    rest = gaussians[kept]
+    index, arrays = np.arange(len(gaussians)), gaussians.to_arrays()
+    own = index if part is None else index[part.own]
+    value = removal_cost(gaussians, target, weight)[own]
+    moved = own[np.argsort(value, kind="stable")[: int(share * len(own))]]
+    kept = np.setdiff1d(index, moved)
+    rest = _like(gaussians, **{k: v if k == "background" else v[kept] for k, v in arrays.items()})
     if weight is None:
-        rest = solve(rest, target, SOLVE_STEPS, warm_start=True).gaussians
-    mean, size, color = _coarse_peaks(residual(rest, target), moves, _spacing(gaussians), weight)
-    arrays, found = gaussians.to_arrays(), rest.to_arrays()
-    arrays["background"] = found["background"]
+        held = None if part is None else arrays["background"]
+        rest = solve(rest, target, SOLVE_STEPS, warm_start=True, background=held).gaussians
+    missed = residual(rest, target)
+    if part is not None:
+        inside = np.zeros_like(missed)
+        inside[part.core] = missed[part.core]
+        missed = inside
+    mean, size, color = _coarse_peaks(missed, len(moved), _spacing(gaussians), weight)
+    found = rest.to_arrays()
     rows = {"mean": mean, "factor": _round(size), "color": color}
-    for name, new in rows.items():
-        arrays[name] = np.array(arrays[name])
-        arrays[name][kept], arrays[name][moved[: len(new)]] = found[name], new
-    arrays["color"][moved[len(mean) :]] = 0
-    return _like(gaussians, **arrays)
+    new = {"background": found["background"]}
+    for name, peaks in rows.items():
+        new[name] = np.array(arrays[name])
+        new[name][kept], new[name][moved[: len(peaks)]] = found[name], peaks
+    new["color"][moved[len(mean) :]] = 0
+    there = _like(gaussians, **new)
+    # The set may be of a class with other bounds.
+    values = {name: getattr(there, name) for name in new}
+    return replace(gaussians, **values).bounded()
 
 
 def _coarse_peaks(

@@ -101,6 +101,10 @@ class Checkpoint:
         """
         write_arrays(self.folder / f"{name}.npz", arrays)
 
+    def holds(self, name: str) -> bool:
+        """Return whether arrays were saved under a name."""
+        return (self.folder / f"{name}.npz").exists()
+
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
         """Return the arrays that were saved under a name, or None.
 
@@ -109,10 +113,7 @@ class Checkpoint:
         ValueError
             If the file is damaged.
         """
-        path = self.folder / f"{name}.npz"
-        if not path.exists():
-            return None
-        return read_arrays(path)
+        return read_arrays(self.folder / f"{name}.npz") if self.holds(name) else None
 
     def remove(self, pattern: str) -> None:
         """Delete the arrays that were saved under a name, or under all names of a pattern."""

@@ -1,7 +1,6 @@
 """Fits by blocks: no seams, the same bits in any order, and no work lost."""
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +13,8 @@ from _helpers.mosaics import Backwards, Sliced, mosaic
 from _helpers.process import run_python
 from eigengs_dr.backend.executor import Done
 from eigengs_dr.blocks import draw
-from eigengs_dr.blocks import run as rounds
-from eigengs_dr.blocks.block import MAX_RATE
 from eigengs_dr.blocks.draw import save_region
 from eigengs_dr.fitting.memory import estimate_memory
-from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.gaussian.file import read
 
 FEW = {"gaussians": 700, "iterations": 10, "block": 64, "backend": "llvm"}
@@ -48,12 +44,8 @@ def psnr_in(mask, picture, pixels):
 
 
 @pytest.mark.parametrize("iterations", [40, pytest.param(300, marks=pytest.mark.slow)])
-def test_no_seam_is_left(iterations, monkeypatch):
-    """Near borders and elsewhere, the error is that of a fit of the whole by the same steps."""
-    preset = PRESETS["default"]
-    rates = {name: min(rate, MAX_RATE) for name, rate in preset.schedule.rates.items()}
-    schedule = replace(preset.schedule, rates=rates, relocate_every=0)
-    monkeypatch.setitem(PRESETS, "default", replace(preset, schedule=schedule))
+def test_no_seam_is_left(iterations):
+    """Near borders and elsewhere, the error is that of a fit of the whole."""
     pixels = mosaic(256)
     settings = {"gaussians": 3000, "iterations": iterations, "backend": "llvm"}
     blocks = eg.fit_large(pixels, block=96, **settings)
@@ -131,7 +123,7 @@ class Stop(Exception):
     """The end of a run from outside."""
 
 
-@pytest.mark.parametrize("stage", ["fit", "mend", "density"])
+@pytest.mark.parametrize("stage", ["fit", "density"])
 def test_interrupted_run_goes_on(tmp_path, stage):
     pixels, output = mosaic(128), tmp_path / "a.npz"
     settings = FEW | {"iterations": 200 if stage == "density" else 20}
@@ -151,6 +143,18 @@ def test_interrupted_run_goes_on(tmp_path, stage):
     assert not folder.exists()
     saved = eg.Gaussians.load(output, backend="llvm").to_arrays()
     np.testing.assert_array_equal(saved["mean"], arrays_of(whole)["mean"])
+
+
+def test_a_folder_keeps_the_last_rounds_alone(tmp_path):
+    """The Gaussians of an image would else lie on the disk once for every round."""
+    kept = []
+
+    def look(done, total, row):
+        if row["stage"] == "measure":
+            kept.extend(path.name for path in (tmp_path / "a.npz.checkpoint").glob("fit*"))
+
+    eg.fit_large(mosaic(128), tmp_path / "a.npz", progress=look, **FEW)
+    assert set(kept) == {f"fit2-{number}.npz" for number in range(4)}
 
 
 def test_ctrl_c_keeps_finished_blocks(tmp_path):
@@ -182,7 +186,7 @@ def test_folder_of_another_run_is_refused(tmp_path):
     pixels, output = mosaic(128), tmp_path / "a.npz"
 
     def stop(done, total, row):
-        if row["stage"] == "mend":
+        if row["stage"] == "measure":
             raise Stop
 
     with pytest.raises(Stop):
@@ -191,7 +195,7 @@ def test_folder_of_another_run_is_refused(tmp_path):
         eg.fit_large(pixels, output, **FEW | {"gaussians": 701})
     with pytest.raises(ValueError, match="interrupted run of another image"):
         eg.fit_large(pixels[::-1], output, **FEW)
-    assert eg.fit_large(pixels, output, **FEW).resumed == 4
+    assert eg.fit_large(pixels, output, **FEW).resumed == 3 * 4  # three rounds of four blocks
 
 
 def test_progress():
@@ -202,7 +206,7 @@ def test_progress():
         progress=lambda done, total, row: rows.append((row["stage"], done, total)),
     )
     stages = list(dict.fromkeys(stage for stage, _, _ in rows))
-    assert stages == ["survey", "place", "fit", "mend", "measure"]
+    assert stages == ["survey", "place", "fit", "measure"]
     for stage in stages:
         done = [(d, t) for s, d, t in rows if s == stage]
         assert done[0][0] == 0 and done[-1][0] == done[-1][1]
@@ -249,8 +253,7 @@ def test_lost_task_is_one_line():
         eg.fit_large(mosaic(128), **FEW, client=Losing())
 
 
-def test_steps_never_make_a_block_worse(monkeypatch):
-    monkeypatch.setattr(rounds, "MEND_SHARE", 0)
+def test_steps_never_make_a_block_worse():
     solved = eg.fit_large(mosaic(128), **FEW | {"iterations": 0})
     fitted = eg.fit_large(mosaic(128), **FEW)
     assert fitted.psnr_ycbcr > solved.psnr_ycbcr
@@ -263,7 +266,6 @@ def test_memory_is_that_of_a_block(tmp_path):
 import resource
 import numpy as np
 import eigengs_dr as eg
-from eigengs_dr.blocks.block import MAX_RATE
 from eigengs_dr.blocks.draw import save_region
 from eigengs_dr.gaussian.file import read
 from pathlib import Path

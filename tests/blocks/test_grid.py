@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eigengs_dr.blocks.grid import choose_halo, deal, divide, neighbors
-from eigengs_dr.blocks.seams import seams
 
 
 @given(st.integers(1, 300), st.integers(1, 300), st.integers(20, 120), st.integers(0, 40))
@@ -30,12 +29,17 @@ def test_cores_tile_the_image_inside_their_windows(width, height, side, halo):
     assert len({tuple(block.window_size) for block in blocks}) == 1
 
 
-def test_blocks_of_one_phase_do_not_touch():
+def test_neighbors_of_a_window():
     blocks = divide(400, 300, 100, 16)
     for block in blocks:
-        near = neighbors(block, blocks)
-        assert block in near
-        assert [other for other in near if other.phase == block.phase] == [block]
+        rows, columns = block.window_rows, block.window_columns
+        seen = [
+            other
+            for other in blocks
+            if max(other.rows.start, rows.start) < min(other.rows.stop, rows.stop)
+            and max(other.columns.start, columns.start) < min(other.columns.stop, columns.stop)
+        ]
+        assert block in seen and neighbors(block, blocks) == seen
 
 
 def test_window_knows_where_the_image_goes_on():
@@ -62,23 +66,6 @@ def test_gaussians_follow_the_picture():
     assert dealt.tolist() == [100, 200, 500]
     # A full block leaves the rest to the others.
     assert deal(np.array([1.0, 8.0, 1.0]), np.array([100, 100, 100]), 200).tolist() == [50, 100, 50]
-
-
-def test_strips_lie_along_all_borders():
-    blocks = divide(300, 200, 100, 20)
-    strips = seams(blocks, 300, 200, 4.0, 20)
-    assert len(strips) == 2 * 2 + 3  # two vertical borders of two blocks, one border of three
-    seen = np.zeros((200, 300), int)
-    for strip in strips:
-        seen[strip.rows, strip.columns] += 1
-    assert (seen[:, 84:116] >= 1).all() and (seen[84:116] >= 1).all()
-    assert not seen[:84, :84].any()
-    for phase in range(4):
-        once = np.zeros((200, 300), int)
-        for strip in strips:
-            if strip.phase == phase:
-                once[strip.rows, strip.columns] += 1
-        assert once.max() == 1
 
 
 @pytest.mark.parametrize("spacing", [1.0, 4.5, 16.0])

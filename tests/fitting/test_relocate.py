@@ -7,7 +7,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.halves import SIDE, fitted, picture, squared_error
-from eigengs_dr.fitting.density_control import relocate, removal_cost
+from eigengs_dr.fitting.density_control import Part, relocate, removal_cost
 from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.optimizers.descent import descend
 from eigengs_dr.fitting.optimizers.schedule import relocation_steps
@@ -49,6 +49,19 @@ def test_a_gaussian_moves_to_the_error():
     away = np.linalg.norm(moved.to_arrays()["mean"] - at[1], axis=1)
     assert away.min() < 1
     assert squared_error(moved, target) < 0.2 * squared_error(before, target)
+
+
+def test_a_part_moves_inside_itself():
+    """Only its own Gaussians, only to its own pixels, before the same background."""
+    start, target = fitted()
+    before, part = start.gaussians.to_arrays(), Part(slice(20, 50), (slice(0, 16), slice(8, 32)))
+    found = relocate(start.gaussians, 0.5, target, part=part).to_arrays()
+    moved = np.flatnonzero((found["mean"] != before["mean"]).any(axis=1))
+    assert 0 < len(moved) <= 15
+    assert moved.min() >= 20 and moved.max() < 50
+    x, y = found["mean"][moved].T
+    assert (x > 7).all() and (y < 17).all()
+    np.testing.assert_array_equal(found["background"], before["background"])
 
 
 def test_a_perfect_set_stays_perfect():

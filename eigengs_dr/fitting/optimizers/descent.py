@@ -57,11 +57,11 @@ def descend(
         yield problem.gaussians
         first = schedule.redistribute_after
         if problem.redistribute and first > 0 and iterations >= MIN_PHASE_RATIO * first:
-            for current in _run_phase(problem, schedule, first):
+            for current in run_phase(problem, schedule, first):
                 yield current
             anew = problem.redistribute(dr.detach(current), len(current))
             problem, iterations = problem._replace(gaussians=anew), iterations - first
-        yield from _run_phase(problem, schedule, iterations, levels)
+        yield from run_phase(problem, schedule, iterations, levels)
 
 
 @dataclass(frozen=True)
@@ -101,21 +101,41 @@ def pack(gaussians: Gaussians) -> Any:
     return pack_parameters([*kernel_shape(gaussians), *gaussians.color])
 
 
-def _run_phase(
-    problem: FitProblem, schedule: Schedule, iterations: int, levels: Sequence[int] = ()
+def run_phase(
+    problem: FitProblem,
+    schedule: Schedule,
+    iterations: int,
+    levels: Sequence[int] = (),
+    part: range | None = None,
 ) -> Generator[Gaussians, None, None]:
-    """Yield the set after every step of one phase."""
+    """Yield the set after every step of one phase of `descend`, or of a part of its steps.
+
+    A part starts without the moments of the optimiser. It starts with a warm-up, unless Gaussians
+    relocate before its first step: without one, a stop in the middle of 100 steps costs 0.55 dB,
+    with one 0.16 dB (1,024x1,024 pixels, one Gaussian for 20 pixels).
+
+    Parameters
+    ----------
+    problem, schedule, levels
+        See `descend`.
+    iterations : int
+        Number of steps of the phase.
+    part : range, optional
+        The steps to take, some of ``range(iterations)``; by default all.
+    """
+    part = range(iterations) if part is None else part
     fixed = problem.gaussians
     types = types_of(fixed.mean)
     images = len(problem.target) if problem.target.ndim == 4 else 1
     state, variables = start_descent(fixed, schedule), schedule.variables()
     target = batch_to_tiles(types, problem.target)
     weight = None if problem.weight is None else batch_to_tiles(types, problem.weight)
-    factors = [lr_factor(schedule, step, iterations) for step in range(iterations)]
-    rates = rate_table(types, schedule, factors)
-    stop, relocations = 0, relocation_steps(schedule, iterations) if problem.relocate else set()
+    relocations = relocation_steps(schedule, iterations) if problem.relocate else set()
+    start = 0 if part.start in relocations else part.start
+    factors = [lr_factor(schedule, step, iterations, start) for step in range(iterations)]
+    rates, stop = rate_table(types, schedule, factors), part.start
     with freeze_program(step_program(schedule, fixed, levels)) as take_step:
-        for step in range(iterations):
+        for step in part:
             if step in relocations and problem.relocate:
                 fixed = problem.relocate(dr.detach(state.gaussians), schedule.relocate_share)
                 state, stop = start_descent(fixed, schedule), step

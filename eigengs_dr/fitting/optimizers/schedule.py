@@ -77,7 +77,7 @@ class Schedule:
     parameterization: str = "scale_relative"
     warm_up: int = 5
     decay: float = 0.03
-    drift: float = 0.5
+    drift: float = 1.0
     redistribute_after: int = 20
     relocate_every: int = 0
     relocate_share: float = 0.1
@@ -95,11 +95,14 @@ class Schedule:
         return found
 
 
-def lr_factor(schedule: Schedule, step: int, iterations: int) -> float:
-    """Return the factor of the learning rates at a step: a linear rise times half a cosine."""
+def lr_factor(schedule: Schedule, step: int, iterations: int, start: int = 0) -> float:
+    """Return the factor of the learning rates at a step: a linear rise times half a cosine.
+
+    The rise begins at the step `start`; earlier steps have the factor 0.
+    """
     along = 0.5 * (1 + math.cos(math.pi * step / iterations))
     left = schedule.decay + (1 - schedule.decay) * along
-    return left * min(1.0, (step + 1) / max(1, schedule.warm_up))
+    return left * min(1.0, max(0, step - start + 1) / max(1, schedule.warm_up))
 
 
 RELOCATE_UNTIL, MIN_RELOCATIONS, MAX_RELOCATIONS = 0.5, 2, 20
