@@ -1,4 +1,4 @@
-"""Settings of the manual: Sphinx, MyST, numpydoc, sphinx-click and sphinx-gallery."""
+"""Settings of the manual: Sphinx, MyST-NB, numpydoc, sphinx-click and sphinx-gallery."""
 
 import sys
 from pathlib import Path
@@ -8,7 +8,8 @@ from sphinx.util import logging
 
 import eigengs_dr as eg
 
-sys.path.insert(0, str(Path(__file__).parent))  # for check_names.py and gallery.py
+sys.path.insert(0, str(Path(__file__).parent))  # for check_names.py, gallery.py and pages.py
+import pages
 from check_names import missing
 
 LOGGER = logging.getLogger(__name__)
@@ -19,7 +20,7 @@ copyright = f"2026, {author}"
 version = release = eg.__version__
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
@@ -31,11 +32,15 @@ extensions = [
     "sphinx_gallery.gen_gallery",
 ]
 templates_path = ["_templates"]
+exclude_patterns = ["tutorials/*.ipynb"]  # sphinx-gallery offers them, beside the pages
 
 # --- Pages ---------------------------------------------------------------------------------------
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
 
@@ -43,6 +48,8 @@ html_theme = "furo"
 html_title = f"eigengs_dr {release}"
 html_static_path = ["_static"]
 html_css_files = ["custom.css"]
+pages.FOLDER.mkdir(parents=True, exist_ok=True)  # Sphinx wants it before it is filled
+html_extra_path = [str(pages.FOLDER)]
 
 # --- Reference -----------------------------------------------------------------------------------
 
@@ -76,6 +83,11 @@ def check_names(app: Any) -> None:
         LOGGER.warning("%s does not exist", line)
 
 
+def write_pages(app: Any) -> None:
+    """Write the pages that how-to/view.md embeds."""
+    pages.write_pages()
+
+
 def show_examples_as_code(app: Any, context: Any, lines: list[str]) -> None:
     """Turn the lines of a help text that keep their breaks into a block of code."""
     result: list[str] = []
@@ -93,6 +105,7 @@ def show_examples_as_code(app: Any, context: Any, lines: list[str]) -> None:
 def setup(app: Any) -> None:
     """Connect the functions above."""
     app.connect("builder-inited", check_names)
+    app.connect("builder-inited", write_pages)
     app.connect("autodoc-skip-member", skip_tuple_fields)
     app.connect("sphinx-click-process-description", show_examples_as_code)
 

@@ -4,6 +4,9 @@
 package neither loads Dr.Jit nor sets a Mitsuba variant.
 """
 
+from pkgutil import resolve_name
+from typing import Any
+
 import lazy_loader
 
 from .backend.libllvm import select_libllvm
@@ -15,3 +18,8 @@ __version__ = "0.1.0"
 select_libllvm()
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def load_ipython_extension(shell: Any) -> None:
+    """Shorten errors in a notebook: what ``%load_ext eigengs_dr`` calls."""
+    resolve_name("eigengs_dr.viewer.short_errors:install")(shell)

@@ -21,6 +21,8 @@ from .image.samples import sample
 from .plugins import register_plugins
 from .raster.render import picture_of, render
 from .scene.fit_scene import fit_for_scene
+from .viewer.page import Page
+from .viewer.view import view
 
 __version__: str
 
@@ -37,6 +39,7 @@ __all__ = [
     "LargeFit",
     "LinearImage",
     "PackResult",
+    "Page",
     "RunInterrupted",
     "concatenate",
     "exclusive",
@@ -58,4 +61,5 @@ __all__ = [
     "save_image",
     "ssim",
     "to_tensors",
+    "view",
 ]

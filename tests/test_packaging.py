@@ -53,6 +53,8 @@ def test_wheel(tmp_path):
     assert modules | plugins <= set(names)
     for name in ("eigenbasis/data/natural.npz", "__init__.pyi", "py.typed"):
         assert f"eigengs_dr/{name}" in names
+    page = {path.relative_to(ROOT).as_posix() for path in ROOT.glob("eigengs_dr/viewer/web/*")}
+    assert page and page <= set(names)
     installed = tmp_path / "installed"
     where = str(installed / "eigengs_dr/plugins/__init__.py")
     assert find_plugins(tmp_path, installed) == [where, "None"]

@@ -94,7 +94,7 @@ def _record(finished: Finished, preview: Path | None, color: str, measure: bool)
     """Return the figures of one image, and write its preview."""
     import eigengs_dr as eg
 
-    from .pictures import comparison, displayed
+    from ..viewer.pictures import comparison, displayed
 
     row, pixels = finished.row, finished.pixels
     record: Record = {"input": str(row.input), "output": str(row.output)}

@@ -29,7 +29,7 @@ def fit_one(
     import eigengs_dr as eg
 
     from ..fitting.fit import FitInterrupted
-    from .pictures import comparison, displayed
+    from ..viewer.pictures import comparison, displayed
 
     started = time.perf_counter()
     with progress_bar(quiet) as show:

@@ -166,6 +166,6 @@ def _draw_image(file: Path, picture: Path) -> None:
 def _draw_model(file: Path, picture: Path) -> None:
     from ..eigenbasis.eigengs import EigenGS
     from ..image.io import save_image
-    from .pictures import component_sheet
+    from ..viewer.sheets import component_sheet
 
     save_image(picture, component_sheet(EigenGS.load(file)))

@@ -14,6 +14,7 @@ from .pack import pack
 from .render import render
 from .scene import scene
 from .train import train
+from .view import view
 
 
 @click.group(cls=Program)
@@ -28,10 +29,11 @@ def main() -> None:
       eigengs-dr info photo.npz                             Show what it holds.
       eigengs-dr render photo.npz -o large.png --scale 2    Render it larger.
       eigengs-dr pack photo.npz -o photo.egs                Make it small.
+      eigengs-dr view photo.npz --open                      Look at it in the browser.
 
     "eigengs-dr COMMAND --help" describes a command.
     """
 
 
-for command in (fit, render, train, info, pack, scene, doctor, bench):
+for command in (fit, render, train, info, pack, view, scene, doctor, bench):
     main.add_command(command)

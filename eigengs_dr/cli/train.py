@@ -158,7 +158,7 @@ def _figures(figures: dict[str, Any]) -> dict[str, Any]:
 
 def _save_sheet(path: Path, trained: Any) -> None:
     from ..image.io import save_image
-    from .pictures import component_sheet
+    from ..viewer.sheets import component_sheet
 
     save_image(path, component_sheet(trained.model, trained.basis))
 

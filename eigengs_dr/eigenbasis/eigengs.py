@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.display import to_html
 from ..backend.recording import exclusive
 from ..collection.row import ImageRow, RowProgress
 from ..collection.sources import Images
@@ -27,12 +28,13 @@ from .model_file import read_members, write_model
 from .model_fit import TrainProgress, fit_model
 from .options import TrainOptions
 from .pca.basis import Eigenbasis
+from .pca.component_counts import name_components
 from .pca.truncation import TruncationCurve, curve_from_eigenvalues
 
 Planes = NDArray[np.float32]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class EigenGS:
     """Gaussians that render the mean image and all principal components of a family of images.
 
@@ -128,6 +130,12 @@ class EigenGS:
             seed=seed,
         )
         return cls(**fit_model(basis, options, backend, progress, client=client))
+
+    def __repr__(self) -> str:
+        size = f"{len(self.gaussians)} Gaussians, {self.gaussians.width}x{self.gaussians.height}"
+        return f"EigenGS({size} pixels, {name_components(self.gaussians.space, self.components)})"
+
+    _repr_html_ = to_html  # what a notebook shows
 
     @property
     def components(self) -> tuple[int, ...]:

@@ -15,7 +15,8 @@ from ..gaussian.gaussians import Gaussians
 from ..image.resize import resample
 from .placement.peaks import residual_peaks
 from .redistribute import residual
-from .solvers.conjugate_gradient import inner_products, solve
+from .solvers.conjugate_gradient import solve
+from .solvers.matrix_products import inner_products
 
 Array = NDArray[np.floating]
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.display import to_html
 from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
 from ..gaussian.file import CUTOFF
@@ -77,6 +78,8 @@ class Fit:
             f"psnr_rgb={last.get('psnr_rgb', np.nan):.2f}, "
             f"seconds={self.seconds:.2f}, stopped={self.stopped!r})"
         )
+
+    _repr_html_ = to_html  # what a notebook shows
 
 
 class FitInterrupted(KeyboardInterrupt):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import types_in, types_of, upload, upload_rows
+from ..backend.display import to_html
 from ..backend.recording import exclusive
 from ..backend.selection import select
 from ..storage.npz import BadValue
@@ -23,7 +24,7 @@ MIN_DEVIATION = 0.25
 between pixel centres, where it has no gradient."""
 
 
-@dataclass
+@dataclass(repr=False)
 class Gaussians:
     """N two-dimensional Gaussians and a constant background: an image of any size.
 
@@ -136,6 +137,12 @@ class Gaussians:
             "color": _rows(self.color, n),
             "background": _rows(self.background, 1)[0],
         }
+
+    def __repr__(self) -> str:
+        size = f"{len(self)}, {self.width}x{self.height} pixels, {self.channels} channels"
+        return f"Gaussians({size}, {self.space!r}, cutoff={self.cutoff:g})"
+
+    _repr_html_ = to_html  # what a notebook shows
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""

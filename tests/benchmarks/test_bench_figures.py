@@ -14,13 +14,13 @@ from eigengs_bench.harness.datasets import images_of
 from eigengs_bench.harness.store import read
 from eigengs_bench.names import FIGURES, SETS
 from eigengs_bench.report import charts as strips
-from eigengs_dr.cli.pictures import overlay
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.io import save_image
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import picture_of
+from eigengs_dr.viewer.pictures import overlay
 
 CREDIT = "AFHQ, NAVER Corp., CC BY-NC 4.0"
 

@@ -15,7 +15,6 @@ from eigengs_bench.harness.store import Task
 from eigengs_bench.harness.timing import Image, Moment, descent
 from eigengs_bench.names import CATS, NATURAL, SETS
 from eigengs_bench.report.charts import CELL, Cell, save_strip, strip
-from eigengs_dr.cli.pictures import overlay
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.eigenbasis.registry import load_basis
 from eigengs_dr.gaussian.gaussians import Gaussians
@@ -23,6 +22,7 @@ from eigengs_dr.image.metrics import psnr
 from eigengs_dr.image.resize import center_crop
 from eigengs_dr.image.samples import sample
 from eigengs_dr.raster.render import picture_of
+from eigengs_dr.viewer.pictures import overlay
 
 CREDIT = "AFHQ, NAVER Corp., CC BY-NC 4.0"  # of all pictures of cats
 COMPONENTS = 300  # a channel of the models that are trained, as in the paper's comparisons

@@ -11,13 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...backend.display import to_html
 from ...image.color import ycbcr_to_rgb
 from ...image.folder import ReadProgress, Source, check_size, to_planes
 from ...image.io import check_image
 from ...image.resize import resample
 from .accumulate import PCAOptions, accumulate
 from .basis_file import read_basis, write_basis
-from .component_counts import check_components, cumulative_share, ranks_for_energy
+from .component_counts import (
+    check_components,
+    cumulative_share,
+    name_components,
+    ranks_for_energy,
+)
 from .solvers.eigenpairs import orient
 from .solvers.incremental_pca import EigenState
 from .truncation import (
@@ -28,7 +34,7 @@ from .truncation import (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Eigenbasis:
     """The mean image and the principal components of a family of images.
 
@@ -168,6 +174,12 @@ class Eigenbasis:
             return basis
         ranks = ranks_for_energy(basis.energy(), basis.variance, most, energy, color)
         return basis.truncated(ranks)
+
+    def __repr__(self) -> str:
+        components = name_components(self.space, map(len, self.components))
+        return f"Eigenbasis({self.count} images, {self.width}x{self.height} pixels, {components})"
+
+    _repr_html_ = to_html  # what a notebook shows
 
     @property
     def width(self) -> int:

@@ -15,6 +15,11 @@ CHANNELS = {"ycbcr": ("Y", "Cb", "Cr"), "rgb": ("R", "G", "B")}
 """Names of the channels of a space, for warnings."""
 
 
+def name_components(space: str, counts: Iterable[int]) -> str:
+    """Return how many components each channel has, as in "230 Y, 60 Cb, 60 Cr"."""
+    return ", ".join(f"{n} {name}" for n, name in zip(counts, CHANNELS[space], strict=True))
+
+
 def check_components(
     components: int | Sequence[int], energy: float | None = None
 ) -> tuple[int, int, int]:

@@ -8,7 +8,6 @@ stored.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -16,17 +15,15 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.arithmetic import rcp
 from ...backend.arrays import release_memory, types_of, upload
 from ...backend.recording import freeze_program
-from ...gaussian.file import MAX_CUTOFF
 from ...gaussian.gaussians import Gaussians
-from ...raster.adjoint import adjoint
 from ...raster.binning.lists import TileLists
-from ...raster.kernels import channel_moments, channel_sums, residual, sum_lanes
-from ...raster.layout import gather_run, pack_parameters
-from ...raster.parameters import NUM_SHAPE_PARAMS, detached_shape, kernel_radius
-from ...raster.render import batch_to_tiles, bin_gaussians, to_tiles
+from ...raster.kernels import channel_moments, sum_lanes
+from ...raster.layout import gather_run
+from ...raster.parameters import detached_shape
+from ...raster.render import batch_to_tiles, bin_gaussians
+from .matrix_products import apply, apply_transposed, correlate, inverse_diagonal
 from .unknowns import Unknowns, add_multiple, dots, multiply, negate, spread
 
 RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}
@@ -127,35 +124,6 @@ def solve_batch(gaussians: Gaussians, images: NDArray[Any], steps: int = 10) -> 
         return _solve(gaussians, lists, images, _start(gaussians, images, False), steps)
 
 
-def inner_products(
-    gaussians: Gaussians, image: NDArray[Any], squared: bool = False
-) -> NDArray[Any]:
-    """Return the inner products of the weights of every Gaussian with an image.
-
-    Parameters
-    ----------
-    gaussians : Gaussians
-        The function ignores the colours.
-    image : ndarray, shape (H, W, C)
-        Image of the native size.
-    squared : bool, optional
-        Square the weights first.
-
-    Returns
-    -------
-    ndarray, shape (N, C)
-        ``sum_x w_n(x) image(x)``. Cost: one adjoint with respect to colours.
-    """
-    with dr.suspend_grad():
-        types = types_of(gaussians.mean)
-        lists = bin_gaussians(gaussians)
-        delta = to_tiles(types, np.asarray(image, np.float32), lists.grid)
-        shape = detached_shape(gaussians)
-        product = _apply_squared if squared else _apply_transposed
-        rows = product(shape, delta, image.shape[2], lists, gaussians.cutoff)
-        return np.stack([row.numpy() for row in rows[0]], axis=1)
-
-
 def _start(gaussians: Gaussians, images: NDArray[Any], warm: bool) -> Unknowns:
     """Return the first unknowns: those of the set, or zero and the mean of each image."""
     types, n = types_of(gaussians.mean), len(gaussians)
@@ -186,12 +154,12 @@ def _solve(
     dr.eval(shape, x)
 
     target = batch_to_tiles(types, np.asarray(image, np.float32))
-    error, lanes = _apply(shape, x, lists, cutoff, target)
+    error, lanes = apply(shape, x, lists, cutoff, target)
     squares = [sum_lanes(lanes, lists)]
     dr.eval(error, squares)
     del target
-    r = negate(_apply_transposed(shape, error, channels, lists, cutoff))
-    inverse = _inverse_diagonal(shape, channels, lists, cutoff)
+    r = negate(apply_transposed(shape, error, channels, lists, cutoff))
+    inverse = inverse_diagonal(shape, channels, lists, cutoff)
     if hold_background:  # a direction of 0 never moves it
         inverse = inverse[0], [dr.opaque(types.Float, 0)] * channels
     p = multiply(r, inverse)
@@ -221,7 +189,7 @@ def _advance(
     shape: list, x: Unknowns, p: Unknowns, rz: list, lists: TileLists, cutoff: float
 ) -> tuple[Unknowns, Any, list]:
     """Move x along p to the least error; return x, ``q = A p``, and ``alpha = rz / |q|^2``."""
-    q, lanes = _apply(shape, p, lists, cutoff)
+    q, lanes = apply(shape, p, lists, cutoff)
     curvature = sum_lanes(lanes, lists)
     # A channel that is solved except for rounding stops: its directions would grow without bound.
     alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, curvature, strict=True)]
@@ -242,7 +210,7 @@ def _turn(
 ) -> tuple[Unknowns, list, list]:
     """Return the next direction p, its rz, and the sums of the squares of the error."""
     Float, grid, channels = type(error), lists.grid, len(rz)
-    color = _correlate(shape, error, channels, lists, cutoff)
+    color = correlate(shape, error, channels, lists, cutoff)
     sums, squares = channel_moments(error, channels, grid)
     r = negate((color, sums))
     z = multiply(r, inverse)
@@ -277,46 +245,3 @@ def _add_in_place(image: Any, step: Any, factors: list, lists: TileLists) -> Non
     add, alone = dr.ReduceOp.Add, dr.ReduceMode.NoConflicts
     dr.scatter_reduce(add, image, types.FloatX(added), tile, mode=alone)
     dr.eval(image)
-
-
-def _apply(
-    shape: list, x: Unknowns, lists: TileLists, cutoff: float, target: Any = None
-) -> tuple[Any, list]:
-    """Return ``A x - D``, and for each lane the sums of its squares."""
-    packed = pack_parameters([*shape, *x[0]])
-    return residual(packed, x[1], lists, kernel_radius(cutoff), target)
-
-
-def _apply_transposed(
-    shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float
-) -> Unknowns:
-    """Return ``A^T d``: correlations with every Gaussian, and the sum of every channel."""
-    color = _correlate(shape, delta, channels, lists, cutoff)
-    return color, channel_sums(delta, channels, lists.grid)
-
-
-def _correlate(shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float) -> list:
-    """Return for each channel the correlations of an image with every Gaussian."""
-    packed = pack_parameters([*shape, *[type(delta)(0)] * channels])
-    return adjoint(packed, delta, channels, lists, kernel_radius(cutoff), color_only=True)
-
-
-def _inverse_diagonal(shape: list, channels: int, lists: TileLists, cutoff: float) -> Unknowns:
-    """Return one over the diagonal of ``A^T A``: all channels have the same."""
-    types = types_of(shape[0])
-    packed = pack_parameters([*shape, types.Float(0)])
-    ones = dr.full(types.Float, 1, lists.grid.images)
-    inside, _ = residual(packed, [ones], lists, kernel_radius(cutoff), None)
-    diagonal = _apply_squared(shape, inside, 1, lists, cutoff)
-    color, background = ([dr.select(d > 1e-8, rcp(d), 0) for d in part] for part in diagonal)
-    return color * channels, background * channels
-
-
-def _apply_squared(
-    shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float
-) -> Unknowns:
-    """Apply `_apply_transposed` with ``w^2``, the weight of a Gaussian narrower by sqrt 2."""
-    root = math.sqrt(2)
-    narrow = [*shape[:2], *[f * root for f in shape[2:NUM_SHAPE_PARAMS]]]
-    reach = min(cutoff * root, MAX_CUTOFF)  # beyond, the squares are 0 in any precision
-    return _apply_transposed(narrow, delta, channels, replace(lists, steep=True), reach)

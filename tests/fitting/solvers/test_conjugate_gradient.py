@@ -11,7 +11,8 @@ from hypothesis import given
 
 from _helpers.halves import SIDE, fitted
 from _helpers.sets import COUNT, SIZE, Scene, few, random_scene, scene_of, scenes
-from eigengs_dr.fitting.solvers.conjugate_gradient import inner_products, solve
+from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.solvers.matrix_products import inner_products
 from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.raster.render import render
 

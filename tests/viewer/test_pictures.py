@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 
 from _helpers.photos import SMALL, random_fields
-from eigengs_dr.cli import pictures
-from eigengs_dr.cli.pictures import CELL, LIGHTER, comparison, component_sheet, ellipses, overlay
 from eigengs_dr.eigenbasis.options import TrainOptions
 from eigengs_dr.eigenbasis.training import train
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.montage import GAP
 from eigengs_dr.image.resize import resample
 from eigengs_dr.raster.render import render
+from eigengs_dr.viewer import pictures
+from eigengs_dr.viewer.pictures import LIGHTER, comparison, ellipses, overlay
+from eigengs_dr.viewer.sheets import CELL, component_sheet
 
 CAPTION = 12
 """Height of the line above a picture."""

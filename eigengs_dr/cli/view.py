@@ -1,0 +1,107 @@
+"""The command ``eigengs-dr view``: a page for the browser."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..backend.selection import select
+from .options import ANY_PATH, EXISTING, backend_option, encoding_option, quiet_option
+from .outputs import check_outputs, name_outputs
+
+SUFFIXES = (".html", ".htm")
+
+
+@click.command()
+@click.argument("file", type=click.Path(path_type=Path), metavar="NAME|FILE")
+@click.option(
+    "-o", "--output", type=ANY_PATH, metavar="PAGE.html", help="Page.  [default: in this folder]"
+)
+@click.option(
+    "--image", type=EXISTING, help="The photo, to compare with; a model encodes it and moves it."
+)
+@encoding_option
+@click.option(
+    "--levels",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Levels of the fit.  [default: the sections of an .egs file]",
+)
+@click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
+@backend_option
+@quiet_option
+def view(
+    file: Path,
+    output: Path | None,
+    image: Path | None,
+    encoding: str | None,
+    levels: int | None,
+    opens: bool,
+    backend: str | None,
+    quiet: bool,
+) -> None:
+    """Make a page for the browser that draws a fitted image or a model.
+
+    NAME is a basis of the package, such as natural. The page is one file and needs no network. It
+    draws as "render" does, at any zoom. It shows outlines, the first Gaussians alone, and the
+    parameters of the one under the pointer. With --image, a divider wipes between the Gaussians
+    and the photo. For a model, it has sliders for the first components, and draws random images.
+
+    \b
+    Examples:
+      eigengs-dr view photo.npz --open
+      eigengs-dr view photo.npz --image photo.jpg -o photo.html
+      eigengs-dr view levels.npz --levels 4
+      eigengs-dr view natural --image photo.jpg -o natural.html
+    """
+    [page] = name_outputs([file], output, SUFFIXES)
+    check_outputs([page], [file, *([image] if image else [])])
+    select(backend)
+    from ..image.io import load_image
+    from ..viewer.view import view as make_page
+
+    source, counts = _load(file, levels, backend)
+    data = getattr(source, "space", None) == "data"
+    pixels = load_image(image, data, encoding) if image else None
+    try:
+        made = make_page(source, pixels, levels=counts, title=file.stem)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+    made.save(page)
+    if not quiet:
+        click.echo(f"{file}: wrote {page} ({len(made.html):,} bytes)")
+    if opens:
+        click.launch(str(page))
+
+
+def _load(file: Path, levels: int | None, backend: str | None) -> tuple[Any, list[int]]:
+    """Return the set or the model of a file or a name, and the Gaussians up to each level."""
+    from itertools import accumulate
+
+    from ..codec import egs
+    from ..eigenbasis import model_file
+    from ..eigenbasis.eigengs import EigenGS
+    from ..eigenbasis.registry import SHIPPED
+    from ..fitting.levels import level_counts
+    from ..gaussian import file as set_file
+    from ..gaussian.gaussians import Gaussians
+    from ..storage import npz
+    from ..viewer.set_facts import check_count
+
+    file = SHIPPED.get(str(file), file)
+    packed = egs.is_egs(file)
+    if not packed and npz.format_of(file) == model_file.FORMAT:
+        if levels is not None:
+            raise ValueError(f"{file}: is a model, which has no levels; leave --levels out")
+        return EigenGS.load(file, backend), []
+    try:
+        if not packed:
+            check_count(set_file.read_head(file).gaussians)
+        gaussians = Gaussians.load(file, backend)
+        if levels is not None:
+            return gaussians, level_counts(len(gaussians), levels)
+    except ValueError as error:
+        text = str(error)
+        raise ValueError(text if text.startswith(str(file)) else f"{file}: {error}") from None
+    sections = [len(section.cell) for section in egs.read(file).sections] if packed else []
+    return gaussians, list(accumulate(sections)) if len(sections) > 1 else []

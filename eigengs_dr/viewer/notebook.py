@@ -1,0 +1,80 @@
+"""What Jupyter shows of sets, fits, bases and models: a picture, and a line of figures."""
+
+from __future__ import annotations
+
+from functools import singledispatch
+from html import escape
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..eigenbasis.eigengs import EigenGS
+from ..eigenbasis.pca.basis import Eigenbasis
+from ..fitting.fit import Fit
+from ..gaussian.gaussians import Gaussians
+from ..raster.render import picture_of
+from .curve import draw_curve
+from .photo import photo_uri
+from .set_facts import MAX_GAUSSIANS
+from .sheets import first_components
+
+MAX_SIDE = 480
+"""Longest side of the picture of a set, in pixels. Smaller sets are shown at their size."""
+
+THUMBNAIL = 120
+"""Width of a component, in pixels."""
+
+
+@singledispatch
+def to_html(value: Any) -> str:
+    """Return HTML of a set, a fit, a basis or a model."""
+    return f"<pre>{escape(repr(value))}</pre>"
+
+
+@to_html.register
+def _show_set(gaussians: Gaussians) -> str:
+    if len(gaussians) > MAX_GAUSSIANS:  # drawing them takes seconds
+        return _block(repr(gaussians))
+    scale = min(1.0, MAX_SIDE / max(gaussians.width, gaussians.height))
+    width, height = (max(1, round(scale * s)) for s in (gaussians.width, gaussians.height))
+    return _block(repr(gaussians), _image(picture_of(gaussians, width, height)))
+
+
+@to_html.register
+def _show_fit(fit: Fit) -> str:
+    scale = -(-max(fit.image.shape[:2]) // MAX_SIDE)
+    curve = [(row["seconds"], row["psnr_rgb"]) for row in fit.trace]
+    picture = _image(fit.image[::scale, ::scale])
+    return _block(repr(fit), picture, draw_curve(curve, "seconds", "PSNR in RGB, dB"))
+
+
+@to_html.register
+def _show_basis(basis: Eigenbasis) -> str:
+    return _block(repr(basis), *_figures(basis))
+
+
+@to_html.register
+def _show_model(model: EigenGS) -> str:
+    return _block(repr(model), *_figures(model))
+
+
+def _figures(source: EigenGS | Eigenbasis) -> list[str]:
+    style = f"margin: 0; width: {THUMBNAIL}px; text-align: center"
+    return [
+        f'<figure style="{style}">{_image(picture, THUMBNAIL)}'
+        f"<figcaption>{escape(name)}</figcaption></figure>"
+        for name, picture in first_components(source)
+    ]
+
+
+def _image(picture: NDArray[Any], most: int = MAX_SIDE) -> str:
+    """Return a picture as HTML; of data with 2 or more than 3 channels, the first is shown."""
+    shown = picture if picture.shape[2] in (1, 3) else picture[..., :1]
+    style = f"max-width: min(100%, {most}px)"
+    return f'<img src="{photo_uri(np.asarray(shown, np.float32))}" style="{style}" alt="">'
+
+
+def _block(text: str, *parts: str) -> str:
+    style = "display: flex; flex-wrap: wrap; gap: 16px; align-items: flex-end"
+    return f'<div><code>{escape(text)}</code><div style="{style}">{"".join(parts)}</div></div>'

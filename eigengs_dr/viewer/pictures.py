@@ -1,0 +1,142 @@
+"""Pictures of sets: outlines of the Gaussians, alone or over the picture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..gaussian.covariance import outline
+from ..gaussian.gaussians import Gaussians
+from ..image.io import to_8bit
+from ..image.pixels import check_image
+
+OUTLINES = 800
+"""Longer side of a picture of ellipses, in pixels."""
+
+MAX_OUTLINES = 2000
+"""Most outlines over a picture; more of them hide each other."""
+
+MIN_SIDE = 512
+"""Shortest longer side of a picture under outlines, in pixels; smaller pictures are enlarged."""
+
+LIGHTER = 0.6
+"""Share of white that lightens a picture under outlines."""
+
+MAX_REACH = 100
+"""Farthest reach of an outline to draw, in longer sides of the picture. A longer outline would
+look straight, and Pillow takes no larger coordinates."""
+
+LOW_COLOR, HIGH_COLOR = (214, 96, 20), (30, 90, 160)
+"""Colours of outlines: orange for the Gaussians of low frequencies, blue for all others."""
+
+Picture = NDArray[Any]
+Color = tuple[int, int, int]
+
+
+def ellipses(gaussians: Gaussians, low: int = 0) -> Picture:
+    """Draw the outline of every Gaussian at one standard deviation.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    low : int, optional
+        Number of Gaussians of low frequencies. These first Gaussians are orange and on top, all
+        others are blue.
+
+    Returns
+    -------
+    ndarray of float, shape (H, W, 3)
+        RGB on white; the longer side has 800 pixels.
+    """
+    width, height = within(OUTLINES, gaussians.width, gaussians.height)
+    colors = [LOW_COLOR] * low + [HIGH_COLOR] * (len(gaussians) - low)
+    return _outlined(np.ones((height, width, 3)), gaussians, colors)
+
+
+def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
+    """Draw the outlines of Gaussians at one standard deviation over a lightened picture.
+
+    The function draws at most 2,000 Gaussians. It picks them at random, with a fixed seed.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Of any space and native size.
+    picture : ndarray of float, shape (H, W, 3) or (H, W, 1)
+        RGB or grey; clamped.
+
+    Returns
+    -------
+    ndarray of float, shape (H, W, 3)
+        RGB.
+    """
+    # Regular picks would draw stripes if the Gaussians lie on a grid.
+    picks = np.random.default_rng(0).permutation(len(gaussians))[:MAX_OUTLINES]
+    under = LIGHTER + (1 - LIGHTER) * np.clip(picture, 0, 1)
+    subset = gaussians[picks]
+    return _outlined(under, subset, [HIGH_COLOR] * len(subset))
+
+
+def displayed(image: Picture, color: str) -> Picture:
+    """Return an image from `eigengs_dr.load_image` as people look at it: sRGB, or data."""
+    return np.asarray(image) if color == "data" else check_image(image, copy=False)
+
+
+def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Picture:
+    """Put an image, its fit, and the fit under outlines of its Gaussians side by side.
+
+    Parameters
+    ----------
+    image, picture : ndarray of float, shape (H, W, 3) or (H, W, 1)
+        The image and its fit, RGB or grey, of one size.
+    gaussians : Gaussians
+        The Gaussians of the fit.
+
+    Returns
+    -------
+    ndarray of float, shape (k * H, 3 * k * W, 3)
+        RGB. Every pixel is repeated k times along both axes; k is the smallest number that gives
+        each part a longer side of at least 512 pixels.
+    """
+    times = -(-MIN_SIDE // max(image.shape[:2]))
+    shape = (*image.shape[:2], 3)
+    parts = [np.broadcast_to(part, shape) for part in (image, picture)]
+    large = [part.repeat(times, axis=0).repeat(times, axis=1) for part in parts]
+    return np.concatenate([*large, overlay(gaussians, large[1])], axis=1)
+
+
+def _outlined(picture: Picture, gaussians: Gaussians, colors: list[Color]) -> Picture:
+    """Draw outlines at one standard deviation, the first Gaussian on top."""
+    from PIL import Image, ImageDraw
+
+    height, width = picture.shape[:2]
+    # Lines of Pillow have jagged edges; at twice the size, averaging smooths them.
+    under = np.broadcast_to(to_8bit(picture), (height, width, 3)).astype(np.uint8)
+    image = Image.fromarray(under.repeat(2, axis=0).repeat(2, axis=1))
+    draw = ImageDraw.Draw(image)
+    points = _outlines(gaussians.scaled(2 * width, 2 * height))
+    for n in reversed(np.flatnonzero(_in_sight(points, image.size))):
+        draw.line(points[n].ravel().tolist(), fill=colors[n], width=2)
+    return np.asarray(image.resize((width, height), Image.Resampling.BOX), np.float32) / 255
+
+
+def _outlines(gaussians: Gaussians) -> Picture:
+    """Return closed outlines at one standard deviation, shape (N, 25, 2)."""
+    arrays = gaussians.to_arrays()
+    return outline(arrays["factor"]) + arrays["mean"].astype(np.float64)[:, None]
+
+
+def _in_sight(points: Picture, size: tuple[int, int]) -> Picture:
+    """Tell which outlines may cross a picture and are small enough for Pillow."""
+    low, high = points.min(axis=1), points.max(axis=1)
+    longest = MAX_REACH * max(size)
+    near = (low > -longest) & (high < longest)
+    return (near & (high >= 0) & (low <= size)).all(axis=1)
+
+
+def within(longest: int, width: int, height: int) -> tuple[int, int]:
+    """Scale width and height to a given longer side."""
+    scale = longest / max(width, height)
+    return max(1, round(width * scale)), max(1, round(height * scale))

@@ -1,0 +1,111 @@
+"""The function `view`, which makes a page of a set, a fit or a model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..backend.recording import exclusive
+from ..eigenbasis.eigengs import EigenGS
+from ..fitting.fit import Fit
+from ..gaussian.gaussians import Gaussians
+from ..image.color import UNBOUNDED
+from ..image.pixels import check_data, check_image
+from .model_facts import describe_model, describe_share
+from .page import Page, build_page
+from .photo import check_aspect, photo_uri
+from .set_facts import channel_views, describe_set, light_of
+
+
+@exclusive()
+def view(
+    source: Gaussians | Fit | EigenGS,
+    image: ArrayLike | None = None,
+    *,
+    levels: Sequence[int] = (),
+    title: str = "Gaussians",
+    encoding: str | None = None,
+) -> Page:
+    """Make a page for the browser that draws a set or a model as `render` does.
+
+    The page pans and zooms without end, and shows outlines, the first Gaussians alone, and the
+    parameters of the one under the pointer. For a model it has sliders for the first components of
+    each channel, and draws random images.
+
+    Parameters
+    ----------
+    source : Gaussians, Fit or EigenGS
+    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W), optional
+        The photo, to compare with. A model encodes it, so that the sliders move it.
+    levels : sequence of int, optional
+        Numbers of first Gaussians that make a whole image each, as from `level_counts`.
+    title : str, optional
+        Title of the page.
+    encoding : {"srgb", "linear"}, optional
+        What the pixels of the image are, see `fit`.
+
+    Returns
+    -------
+    Page
+        Save it by ``page.save("page.html")``; a notebook shows it.
+
+    Raises
+    ------
+    ValueError
+        If the set has more than a million Gaussians, a value is not finite, the image has another
+        aspect ratio than the set, or a fit has a mean image of pixels.
+    TypeError
+        If the source is something else.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg
+    >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
+    >>> page = eg.view(g, title="One Gaussian")
+    >>> "One Gaussian" in page.html
+    True
+    """
+    if isinstance(source, Fit):
+        if source.mean_image is not None:
+            raise ValueError("the fit has a mean image of pixels, which a page cannot draw")
+        source = source.gaussians
+    if not isinstance(source, Gaussians | EigenGS):
+        raise TypeError(
+            f"{type(source).__name__} cannot be shown; expected Gaussians, Fit or EigenGS"
+        )
+    gaussians = source if isinstance(source, Gaussians) else source.gaussians
+    pixels = None if image is None else _photo(image, gaussians.space, encoding)
+    model = None
+    if isinstance(source, EigenGS):
+        model = describe_model(source, pixels)
+        if pixels is not None:
+            gaussians = gaussians.scaled(pixels.shape[1], pixels.shape[0])
+    elif pixels is not None:
+        check_aspect(pixels, (gaussians.width, gaussians.height))
+    views = channel_views(gaussians.channels)
+    facts = {
+        "set": describe_set(gaussians, levels),
+        "light": light_of(gaussians.space),
+        "channels": views[0][1],
+        "photo": None if pixels is None else photo_uri(pixels),
+        "model": model,
+    }
+    return build_page(
+        title=title,
+        summary=f"{len(gaussians):,} Gaussians, {gaussians.width} x {gaussians.height} pixels",
+        facts=facts,
+        photo=pixels is not None,
+        model=model is not None,
+        model_note=describe_share(source) if isinstance(source, EigenGS) else "",
+        levels=bool(levels),
+        views=views if len(views) > 1 else [],
+        bright=gaussians.space in UNBOUNDED,
+        color_name="Values" if gaussians.space == "data" else "Colour",
+    )
+
+
+def _photo(image: ArrayLike, space: str, encoding: str | None) -> NDArray[np.float32]:
+    """Return a photo as people look at it: sRGB, or data."""
+    return check_data(image) if space == "data" else check_image(image, encoding=encoding)

@@ -1,0 +1,31 @@
+"use strict";
+
+/** Start the page: window.viewer and window.model are for tests and for the curious. */
+function start() {
+  const facts = JSON.parse(byId("facts").textContent);
+  const set = new GaussianSet(facts.set);
+  const viewer = new Viewer(byId("view"), set, facts.light, facts.channels);
+  window.viewer = viewer;
+  connectView(viewer);
+  connectCount(viewer, facts.set.levels);
+  if (facts.photo) connectPhoto(viewer, facts.photo);
+  if (facts.model) {
+    window.model = new Model(facts.model, set);
+    connectModel(viewer, window.model);
+  }
+  listen(viewer.canvas, viewer.camera, {
+    moved: () => viewer.redraw(true),
+    pointed: (x, y) => showChosen(viewer, viewer.choose(x, y)),
+  });
+  viewer.draw();
+  viewer.renderer.finish();
+  viewer.ready = performance.now();
+}
+
+try {
+  start();
+} catch (error) {
+  byId("failure").hidden = false;
+  byId("failure").textContent = `The picture cannot be drawn: ${error.message}. Try a recent Firefox, Chrome, Edge or Safari.`;
+  throw error;
+}

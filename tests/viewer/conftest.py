@@ -1,0 +1,39 @@
+"""One browser for all tests of pages, and one window a device: new ones take half a second."""
+
+import pytest
+
+from _helpers.browser import DESKTOP, Tab, chromium
+
+
+@pytest.fixture(scope="package")
+def window():
+    """Return the window of a device."""
+    windows = {}
+    with chromium() as browser:
+
+        def window(device):
+            key = repr(device)
+            if key not in windows:
+                windows[key] = browser.new_page(**device)
+            return windows[key]
+
+        yield window
+
+
+@pytest.fixture
+def show(window, tmp_path):
+    """Show a page in the browser; at the end, check that nothing went wrong in it."""
+    tabs = []
+
+    def show(page, device=DESKTOP):
+        path = tmp_path / f"{len(tabs)}.html"
+        page.save(path)
+        tabs.append(Tab(window(device), path))
+        return tabs[-1]
+
+    yield show
+    for tab in tabs:
+        tab.close()
+        assert tab.errors == []
+        own = [url for url in tab.requests if not url.startswith(("file:", "data:", "blob:"))]
+        assert own == [], "the page used the network"

@@ -1,0 +1,142 @@
+"""What notebooks show; the notebook of the manual runs."""
+
+import re
+from base64 import b64decode
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import eigengs_dr as eg
+from _helpers.families import small_basis, small_model
+from _helpers.sets import random_scene
+from eigengs_dr.viewer import notebook
+from eigengs_dr.viewer.curve import draw_curve
+
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "notebook.ipynb"
+
+
+def pictures(html):
+    """The pictures in HTML, as 8-bit arrays."""
+    codes = re.findall(r'src="data:image/\w+;base64,([^"]+)"', html)
+    return [np.asarray(Image.open(BytesIO(b64decode(code)))).astype(float) for code in codes]
+
+
+def test_a_set_is_its_picture():
+    gaussians = random_scene(0, 60, (48, 32)).on("llvm", space="rgb")
+    assert repr(gaussians) == "Gaussians(60, 48x32 pixels, 3 channels, 'rgb', cutoff=3)"
+    html = gaussians._repr_html_()
+    assert "60, 48x32 pixels, 3 channels" in html
+    [shown] = pictures(html)
+    expected = np.rint(255 * np.clip(eg.picture_of(gaussians), 0, 1))
+    assert np.abs(shown - expected).mean() < 4  # JPEG
+
+
+def test_a_large_set_is_scaled_down():
+    gaussians = random_scene(0, 60, (48, 32)).on("llvm").scaled(4800, 3200)
+    [shown] = pictures(gaussians._repr_html_())
+    assert shown.shape[:2] == (320, 480)
+
+
+def test_a_set_that_takes_long_has_no_picture(monkeypatch):
+    monkeypatch.setattr(notebook, "MAX_GAUSSIANS", 10)
+    html = random_scene(0, 60).on("llvm")._repr_html_()
+    assert "Gaussians(60" in html and pictures(html) == []
+
+
+def test_of_many_channels_the_first_is_shown():
+    gaussians = random_scene(0, 60, (48, 32), channels=5).on("llvm")
+    [shown] = pictures(gaussians._repr_html_())
+    assert shown.shape == (32, 48)
+
+
+def test_a_fit_has_its_curve():
+    fit = eg.fit(eg.sample("coffee")[:32, :48], 60, iterations=20)
+    html = fit._repr_html_()
+    assert len(pictures(html)) == 1
+    [points] = re.findall(r'points="([^"]+)"', html)
+    assert len(points.split()) == len(fit.trace) >= 2
+    values = [row["psnr_rgb"] for row in fit.trace]
+    for value in (min(values), max(values)):
+        assert f">{value:.4g}</text>" in html
+
+
+def test_a_curve_without_points_is_empty():
+    assert draw_curve([(0, 1), (1, float("inf"))], "x", "y") == ""
+    flat = draw_curve([(0, 5), (1, 5)], "x", "y")
+    assert "nan" not in flat and flat.count("5</text>") == 2
+
+
+def test_bases_and_models_show_components():
+    names = ["mean", *(f"Y {n}" for n in (1, 2, 3, 5, 10)), "Cb 1", "Cb 2", "Cr 1", "Cr 2"]
+    basis, model = small_basis(), small_model("llvm")
+    assert repr(basis) == "Eigenbasis(40 images, 32x32 pixels, 12 Y, 6 Cb, 6 Cr)"
+    assert repr(model) == "EigenGS(100 Gaussians, 32x32 pixels, 12 Y, 6 Cb, 6 Cr)"
+    shown = []
+    for source in (basis, model):
+        html = source._repr_html_()
+        assert repr(source) in html
+        assert re.findall("<figcaption>(.*?)</figcaption>", html) == names
+        shown.append(np.stack(pictures(html)))
+    # The Gaussians render the components, so both look alike.
+    for a, b in zip(*shown, strict=True):
+        assert np.corrcoef(a.ravel(), b.ravel())[0, 1] > 0.9
+
+
+@pytest.fixture
+def shell():
+    """An IPython shell without colours that has loaded the extension."""
+    interactive = pytest.importorskip("IPython.core.interactiveshell", reason="no IPython")
+    found = interactive.InteractiveShell()
+    found.run_line_magic("colors", "nocolor")
+    found.run_cell("%load_ext eigengs_dr\nimport eigengs_dr as eg\nimport numpy as np")
+    yield found
+    interactive.InteractiveShell.clear_instance()
+
+
+def said(shell, capsys, code):
+    """What a cell that fails prints."""
+    capsys.readouterr()
+    assert not shell.run_cell(code).success
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "code, message",
+    [
+        ("eg.fit(np.full((8, 8, 3), 200.0))", "ImageError: image: pixels run from 200 to 200"),
+        ("eg.fit(np.zeros((8, 8, 3)), 500)", "ValueError: gaussians is 500"),
+        ("eg.Gaussians.load('missing.npz')", "FileNotFoundError"),
+        ("eg.view(3)", "TypeError: int cannot be shown"),
+    ],
+)
+def test_mistakes_are_short(shell, capsys, code, message):
+    out = said(shell, capsys, f"x = 1\n{code}")
+    assert f"----> 2 {code}" in out
+    assert out.strip().splitlines()[-1].startswith(message)
+    assert ".py" not in out and len(out.splitlines()) <= 8
+    shell.run_line_magic("tb", "")
+    assert ".py" in capsys.readouterr().out
+
+
+def test_other_errors_stay_whole(shell, capsys):
+    assert "ZeroDivisionError" in said(shell, capsys, "1 / 0")
+    out = said(shell, capsys, "np.linalg.inv(np.zeros((2, 2)))")
+    assert ".py" in out and "LinAlgError" in out
+
+
+def test_the_notebook_runs():
+    nbformat = pytest.importorskip("nbformat", reason="no nbformat")
+    client = pytest.importorskip("nbclient", reason="no nbclient")
+    pytest.importorskip("ipykernel", reason="no kernel for notebooks")
+    book = nbformat.read(NOTEBOOK, 4)
+    assert not any(cell.get("outputs") for cell in book.cells), "outputs are not stored"
+    client.NotebookClient(book, timeout=200, kernel_name="python3").execute()
+    outputs = [output for cell in book.cells for output in cell.get("outputs", [])]
+    shown = [output for output in outputs if "text/html" in output.get("data", {})]
+    assert len(shown) == 7
+    [error] = [output for output in outputs if output.output_type == "error"]
+    assert error.ename == "ImageError" and "divide by 255" in error.evalue
+    assert all(len(line) < 600 for line in error.traceback)
