@@ -7,9 +7,19 @@ import click
 
 from eigengs_bench.cli_single import eigen, inverse, kernels, levels, radiance, texture
 from eigengs_bench.harness.store import Task
-from eigengs_bench.names import FIGURES, NATURAL, PAPER_SETS, PARTS, PRESETS, SETS, TABLES
+from eigengs_bench.names import (
+    FIGURES,
+    KODAK_COUNTS,
+    NATURAL,
+    PAPER_SETS,
+    PARTS,
+    PRESETS,
+    SETS,
+    TABLES,
+)
 from eigengs_bench.options import (
     count_option,
+    counts_option,
     data_argument,
     many_option,
     measures_rows,
@@ -162,6 +172,35 @@ def stability(task: Task, cases: Names, presets: Names) -> Any:
     for smooth in (case for case in chosen if case.name == "smooth"):
         save_figure(task.folder / TILES, tiles_chart(smooth.image(), tiles_of(task, smooth)))
     return summarize(rows)
+
+
+@bench.command()
+@click.argument("data", type=FOLDER, metavar="DATA")
+@counts_option("--counts", KODAK_COUNTS, "Gaussians; may be repeated.")
+@counts_option("--steps", (1000,), "Steps of a fit; may be repeated.")
+@count_option("--photos", 24, "The first ones.")
+@click.option("--timed", is_flag=True, help="Nothing else runs: the seconds count.")
+@measures_rows("kodak.jsonl", iterations=None)
+def kodak(
+    task: Task, photos: int, counts: tuple[int, ...], steps: tuple[int, ...], timed: bool
+) -> Any:
+    """Fit the Kodak photos by numbers of Gaussians, beside what other methods published.
+
+    \b
+    All photos, 1,000 steps, then the numbers 5,000 and 10,000 with more steps:
+      eigengs-dr bench kodak data -o F
+      eigengs-dr bench kodak data -o F --counts 5000 --counts 10000 --steps 5000
+    Seconds, on a quiet machine:
+      eigengs-dr bench kodak data -o F --photos 4 --timed
+
+    DATA has the photos in kodak/. A photo takes about two minutes: 15 to 25 s a number. Ctrl-C
+    keeps the fits that are done. FOLDER gets charts of PSNR over Gaussians, and over the seconds of
+    timed fits.
+    """
+    from eigengs_bench.experiments.kodak import run
+    from eigengs_bench.report.sections.kodak import summarize
+
+    return summarize(run(task._replace(images=photos), counts, steps, timed))
 
 
 @bench.command()

@@ -32,13 +32,19 @@ def count_option(name: str, default: int, text: str = "", least: int = 1) -> Any
     return click.option(name, type=kind, default=default, show_default=True, help=text)
 
 
+def counts_option(name: str, default: tuple[int, ...], text: str) -> Any:
+    """Make an option that takes several numbers, each from 1 on."""
+    kind: Any = {"type": click.IntRange(min=1), "default": default, "show_default": True}
+    return click.option(name, multiple=True, callback=_each_once, help=text, **kind)
+
+
 def many_option(name: str, to: str, values: Any, text: str) -> Any:
     """Make an option that takes some of several words and may be repeated."""
     text, kind = f"{text}; may be repeated.", click.Choice(list(values))
     return click.option(name, to, multiple=True, type=kind, callback=_each_once, help=text)
 
 
-def _each_once(context: Any, option: Any, values: tuple[str, ...]) -> tuple[str, ...]:
+def _each_once(context: Any, option: Any, values: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(dict.fromkeys(values))
 
 
@@ -62,16 +68,20 @@ def about(context: click.Context, backend: str | None) -> Row:
     return {**options.describe_run(context, backend), **code_state()}
 
 
-def measures_rows(file: str, iterations: int = 1000, least: int = 1) -> Any:
+def measures_rows(file: str, iterations: int | None = 1000, least: int = 1) -> Any:
     """Make a function of a task into a command that keeps rows in a file of a folder.
 
     The command prints the tables of the `Section` that the function returns, and writes its charts
-    to the folder. It prints a note if the file holds rows of other code.
+    to the folder. It prints a note if the file holds rows of other code. With `iterations` None it
+    has no option of that name.
     """
 
     def decorate(command: Callable[..., Any]) -> Any:
+        if iterations is not None:
+            text = "Steps of every fit, or the most."
+            command = count_option("--iterations", iterations, text, least)(command)
+
         @output_option
-        @count_option("--iterations", iterations, "Steps of every fit, or the most.", least)
         @options.seed_option
         @options.backend_option
         @options.quiet_option

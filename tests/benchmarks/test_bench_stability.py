@@ -27,7 +27,7 @@ def small(name="small", gaussians=20, iterations=3, **rest):
 
 
 def test_cases_are_what_they_are_called():
-    assert len(CASES) == 20
+    assert len(CASES) == 21
     made = {name: case.image() for name, case in CASES.items() if name != "large"}
     for name, image in made.items():
         assert image.dtype == np.float32 and image.shape[2] == 3
@@ -74,6 +74,21 @@ def test_a_cell_tells_what_the_moments_say(backend):
     highest = max(condition_number(m.gaussians.to_arrays()["factor"]).max() for m in moments)
     assert found["condition"] == pytest.approx(highest)
     assert found["finite"] and found["gaussians"] == 20 and "peak_gib" not in found
+
+
+def test_a_case_is_compared_with_a_shorter_run(backend, monkeypatch):
+    case = small(iterations=30, shorter=10)
+    found = stability.measure_cell(case, "default", 0, backend)
+    shorter = stability.moments(small(iterations=10), case.image(), "default", 0, backend)
+    expected = psnr(shorter[-1].picture, case.image(), "ycbcr")
+    assert found["shorter_ycbcr"] == pytest.approx(expected, abs=1e-6)
+    monkeypatch.setattr(stability, "is_plateau", lambda trace, *_: trace[-1]["iteration"] == 20)
+    ended = stability.moments(case, case.image(), "default", 0, backend)
+    assert ended[-1].iteration == 20
+    whole = stability.moments(case._replace(shorter=0), case.image(), "default", 0, backend)
+    assert whole[-1].iteration == 30
+    [clamped] = cases.chosen_cases(["plateau"], 40)
+    assert (clamped.iterations, clamped.shorter) == (40, 40)
 
 
 def test_exact_pictures_do_not_drop(backend):
@@ -146,10 +161,16 @@ def test_defects_are_named():
         cell_row("rounding", end_ycbcr=29.995),
         cell_row("worse", end_ycbcr=29.5),
         cell_row("lost", finite=False, start_ycbcr=None, end_ycbcr=None),
+        cell_row("plateau", shorter_ycbcr=40.3),
+        cell_row("longer", shorter_ycbcr=39.0),
         cell_row("other", "eigengs", end_ycbcr=10.0),
         cell_row("thin", needs="more"),
     ]
-    assert defects(rows) == ["worse: ends 0.50 dB below its start", "lost: not finite"]
+    assert defects(rows) == [
+        "worse: ends 0.50 dB below its start",
+        "lost: not finite",
+        "plateau: ends 0.30 dB below a run of fewer steps",
+    ]
     assert lines_of(summarize(rows).tables[-1]) == [(line,) for line in defects(rows)]
 
 

@@ -55,19 +55,35 @@ def test_all_splats_on_one_pixel(backend, seed):
 
 
 def test_plateau(backend):
-    """Ten steps that gain less than a thousand decibels are one, in the second half of a run."""
+    """Ten steps that gain less than a thousand decibels are one, in the last quarter of a run."""
     gaussians, target = start(backend)
     schedule = default(patience=10, least_gain=1000.0)
-    result = refine(FitProblem(gaussians, target), picture(), schedule, 400)
-    assert (result.iterations, result.stopped) == (300, "plateau")
-    assert result.trace[-1]["iteration"] == 300
+    result = refine(FitProblem(gaussians, target), picture(), schedule, 900)
+    assert (result.iterations, result.stopped) == (800, "plateau")
+    assert result.trace[-1]["iteration"] == 800
+
+
+def rows_of(decibels, every=100):
+    return [{"iteration": every * k, "psnr_ycbcr": d} for k, d in enumerate(decibels)]
+
+
+def ends_of(rows, iterations):
+    """The steps at which a run with such a trace could end."""
+    known = [rows[: n + 1] for n in range(len(rows))]
+    schedule = default(patience=300)
+    return [t[-1]["iteration"] for t in known if is_plateau(t, schedule, iterations)]
 
 
 def test_no_plateau_while_rates_are_high():
-    """More steps asked for are more steps taken, also where the first half gains nothing."""
-    rows = [{"iteration": k, "psnr_ycbcr": 30.0} for k in range(0, 1001, 100)]
-    ends = [n for n in range(1, 12) if is_plateau(rows[:n], default(patience=300), 1000)]
-    assert [rows[n - 1]["iteration"] for n in ends] == [800, 900, 1000]
+    """More steps asked for are more steps taken, also where three quarters gain nothing."""
+    assert ends_of(rows_of([30.0] * 11), 1000) == []
+    assert ends_of(rows_of([30.0] * 21), 2000) == [1800, 1900, 2000]
+
+
+def test_no_plateau_where_the_psnr_jumps():
+    """The best row of each time counts, not that at its end."""
+    assert ends_of(rows_of([30.0] * 15 + [31, 30, 32, 31, 33, 32]), 2000) == []
+    assert ends_of(rows_of([30.0] * 15 + [33, 30, 32, 31, 33, 32]), 2000) == [1800, 1900, 2000]
 
 
 @pytest.mark.parametrize("iterations", [0, 1, 10, 55, 100, 250])

@@ -1,4 +1,4 @@
-"""Hard cases times presets: which stay finite, and which end no worse than they started."""
+"""Hard cases times presets: which stay finite, and end no worse than they or shorter runs were."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -18,11 +18,12 @@ from eigengs_dr.eigenbasis.registry import load_basis
 from eigengs_dr.fitting.initializers import FitProblem, initialize
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.presets import PRESETS
-from eigengs_dr.fitting.refine import trace_steps
+from eigengs_dr.fitting.refine import is_plateau, trace_steps
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.gaussian.covariance import condition_number
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import picture_of
 
 FILE = "stability.jsonl"
@@ -63,7 +64,8 @@ def measure_cell(case: Case, preset: str, seed: int, backend: str | None) -> Row
     "needs", alone, says what a preset lacks. Else "finite" is true if all parameters and pixels are
     finite at all marks of `trace_steps`; start, end and half are PSNRs of the first and of the last
     moment and of the last set in half precision, drop is the loss from the best moment to the last;
-    "condition" is the highest of a covariance, "peak_gib" the memory of a case in its own process.
+    "condition" is the highest of a covariance, "peak_gib" the memory of a case in its own process,
+    "shorter_ycbcr" the PSNR at the end of a run of the shorter number of steps of the case.
     """
     image = case.image()
     most = image.shape[0] * image.shape[1]
@@ -72,18 +74,32 @@ def measure_cell(case: Case, preset: str, seed: int, backend: str | None) -> Row
         return {"needs": f"a basis with at most {most} Gaussians"}
     followed = moments(case, image, preset, seed, backend)
     memory = {"peak_gib": peak_gib()} if case.alone else {}  # before the judgement takes its own
-    return {**_score(followed, image), **memory}
+    row = {**_score(followed, image), **memory}
+    if case.shorter:
+        shorter = moments(case._replace(iterations=case.shorter), image, preset, seed, backend)
+        row["shorter_ycbcr"] = decibels(shorter[-1].picture, image, "ycbcr")
+    return row
 
 
 def moments(
     case: Case, image: Image, preset: str, seed: int, backend: str | None = None
 ) -> list[Moment]:
-    """Follow the descent of a preset on the image of a case, at the marks of `trace_steps`."""
+    """Follow the descent of a preset on the image of a case, at the marks of `trace_steps`.
+
+    A case that is compared with a shorter run ends at a plateau.
+    """
     method = PRESETS[preset]
     rates = {name: case.rates * rate for name, rate in method.schedule.rates.items()}
     schedule = replace(method.schedule, rates=rates)
     start = partial(_start, case, image, preset, seed, backend)
-    return list(follow(start, schedule, case.iterations, trace_steps(case.iterations)))
+    followed, trace = list[Moment](), list[Row]()
+    for moment in follow(start, schedule, case.iterations, trace_steps(case.iterations)):
+        followed.append(moment)
+        reached = psnr(moment.picture, image, "ycbcr")
+        trace.append({"iteration": moment.iteration, "psnr_ycbcr": reached})
+        if case.shorter and is_plateau(trace, schedule, case.iterations):
+            break
+    return followed
 
 
 def _start(case: Case, image: Image, preset: str, seed: int, backend: str | None) -> FitProblem:

@@ -27,7 +27,8 @@ class Case(NamedTuple):
 
     ``image()`` makes the image. `place`, a `Placement`, returns means and factors to start from;
     None for the start of the preset. `rates` multiplies the rates of the preset. A case `alone`
-    runs in a process of its own, for its memory.
+    runs in a process of its own, for its memory. With `shorter`, the run may end at a plateau, as
+    in `fit`, and is compared with a run that was asked for as many steps.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Case(NamedTuple):
     place: Callable[..., Shapes] | None = None
     rates: float = 1.0
     alone: bool = False
+    shorter: int = 0
 
 
 def photo(width: int = SIDE, height: int = SIDE) -> Image:
@@ -154,6 +156,8 @@ _ALL = (
     *(Case(place.__name__, photo, place=place) for place in (needles, subpixel, heap, outside)),
     Case("fast", photo, rates=10.0),
     Case("long", photo, iterations=10_000),
+    # Few Gaussians gain little early, while rates are high.
+    Case("plateau", photo, 800, 5000, shorter=1000),
 )
 
 CASES = {case.name: case for case in _ALL}
@@ -164,4 +168,9 @@ def chosen_cases(names: Sequence[str], iterations: int) -> list[Case]:
     if unknown := [name for name in names if name not in CASES]:
         raise ValueError(f"case {unknown[0]!r} is unknown; use one of {', '.join(CASES)}")
     chosen = [CASES[name] for name in dict.fromkeys(names or CASES)]
-    return [case._replace(iterations=min(case.iterations, iterations)) for case in chosen]
+    return [
+        case._replace(
+            iterations=min(case.iterations, iterations), shorter=min(case.shorter, iterations)
+        )
+        for case in chosen
+    ]

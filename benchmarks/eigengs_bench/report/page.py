@@ -14,7 +14,7 @@ from eigengs_bench.experiments.figures import LIST, read_list
 from eigengs_bench.harness.store import Row, code_name, count_codes, read
 from eigengs_bench.report.charts import draw
 from eigengs_bench.report.frames import Section, as_text, remark
-from eigengs_bench.report.sections import budget, methods, pareto, rate, scaling, stability
+from eigengs_bench.report.sections import budget, kodak, methods, pareto, rate, scaling, stability
 from eigengs_bench.report.sections.losses import where_default_loses
 from eigengs_dr.storage.atomic import atomic_write
 
@@ -26,6 +26,7 @@ SECTIONS: tuple[tuple[str, tuple[str, ...], Callable[..., Section]], ...] = (
     ("Speed against accuracy", ("pareto.jsonl",), pareto.summarize),
     ("Where methods fail", ("stability.jsonl",), stability.summarize),
     ("Where default loses", ("tables.jsonl", "stability.jsonl"), where_default_loses),
+    ("The Kodak photos, beside published figures", ("kodak.jsonl",), kodak.summarize),
     ("Gaussians that a PSNR takes", ("budget.jsonl",), budget.summarize),
     ("Bytes that a PSNR takes", ("rate.jsonl",), rate.summarize),
     ("What size costs", ("scaling.jsonl",), scaling.summarize),
@@ -85,7 +86,8 @@ def write_page(folder: Path, output: Path) -> None:
 
 def rows_of(path: Path) -> list[Row]:
     """Read rows; `ValueError` if two differ in the seed (or steps) alone, and would be counted."""
-    free = ("seed",) if path.name == "tables.jsonl" else ("seed", "iterations")
+    several = path.name in ("tables.jsonl", "kodak.jsonl")  # numbers of steps, side by side
+    free = ("seed",) if several else ("seed", "iterations")
     rows, known = read(path), dict[str, Row]()
     for job in (row["job"] for row in rows):
         what = json.dumps({k: v for k, v in job.items() if k not in free}, sort_keys=True)

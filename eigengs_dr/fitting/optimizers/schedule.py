@@ -66,7 +66,7 @@ class Schedule:
         Share of the Gaussians that move in a round.
     patience : int
         Number of steps. A refinement stops if this many steps gain less than `least_gain`, all of
-        them in its second half, where rates are low.
+        them in its last quarter, where rates are low; see `eigengs_dr.fitting.refine.is_plateau`.
     least_gain : float
         Gain in dB, see `patience`.
     """

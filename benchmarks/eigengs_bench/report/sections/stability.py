@@ -1,5 +1,6 @@
 """The rows of `stability` as tables: cases down, presets across, one table a figure."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 
 import pandas as pd
@@ -12,22 +13,27 @@ TOLERANCE = 0.01  # decibels that an end may lie below its start
 
 
 def summarize(rows: Sequence[Row]) -> Section:
-    """Lay the matrix out, and list what is wrong with default."""
+    """Lay the matrix out, and list what is wrong with default; see `defects`."""
     steps = " or ".join(f"{n:,}" for n in sorted({row["job"]["iterations"] for row in rows}))
     matrix = [_matrix(f"{caption}; {steps} steps", cell, rows) for caption, cell in FIGURES]
     found = [(line,) for line in defects(rows)]
-    caption = "Cells of default that are not finite, or end below their start"
+    caption = "Cells of default that are not finite, or end below their start or a shorter run"
     return Section([*matrix, table(caption, ("cell",), found, _codes(rows))])
 
 
 def defects(rows: Iterable[Row]) -> list[str]:
-    """Name the cells of default that are not finite, or end below their start: one line each."""
+    """Name the cells of default that are not finite, or end too low: one line each.
+
+    Too low is below their start, or below the end of a run that was asked for fewer steps.
+    """
     found = []
     for row in (row for row in rows if row["job"]["preset"] == "default" and "needs" not in row):
         if not row["finite"]:
             found.append(f"{row['job']['case']}: not finite")
         elif (lost := row["start_ycbcr"] - row["end_ycbcr"]) > TOLERANCE:
             found.append(f"{row['job']['case']}: ends {lost:.2f} dB below its start")
+        elif (lost := row.get("shorter_ycbcr", -math.inf) - row["end_ycbcr"]) > TOLERANCE:
+            found.append(f"{row['job']['case']}: ends {lost:.2f} dB below a run of fewer steps")
     return found
 
 
