@@ -19,6 +19,7 @@ import eigengs_dr as eg
 from eigengs_bench.experiments.scaling import CELL, mosaic
 from eigengs_bench.harness.alone import peak_gib
 from eigengs_dr.blocks.draw import draw_region
+from eigengs_dr.blocks.grid import divide
 from eigengs_dr.gaussian.file import SetData
 from eigengs_dr.image.color import rgb_to_ycbcr, to_coded
 from eigengs_dr.image.metrics import psnr_from_mse
@@ -60,18 +61,23 @@ def psnr_by_borders(found: eg.Gaussians, image: np.ndarray, block: int) -> list[
     """Return the PSNR in YCbCr near the borders of blocks, elsewhere, and of all pixels."""
     height, width = image.shape[:2]
     data = SetData(found.to_arrays(), (width, height), found.space, found.cutoff)
-    inside = np.abs((np.arange(max(width, height)) + block // 2) % block - block // 2) < NEAR
-    inside[:NEAR] = False  # an edge of the image is no border
+    near_rows, near_columns = near_borders(height, block), near_borders(width, block)
     sums, counts, top = np.zeros(2), np.zeros(2), 0
     for band in draw_region(data, (0, 0, width, height), (width, height), kind=np.float32):
         rows = slice(top, top + len(band))
         shown = rgb_to_ycbcr(to_coded(band)) - rgb_to_ycbcr(image[rows] / np.float32(255))
         errors = np.square(shown).mean(axis=2)
-        near = inside[rows, None] | inside[None, :width]
+        near = near_rows[rows, None] | near_columns
         sums += errors[near].sum(dtype=float), errors[~near].sum(dtype=float)
         counts += near.sum(), (~near).sum()
         top = rows.stop
     return [psnr_from_mse(mse) for mse in (*(sums / counts), sums.sum() / counts.sum())]
+
+
+def near_borders(length: int, block: int) -> np.ndarray:
+    """Return which pixels of an axis lie near a border of blocks; an edge of the image is none."""
+    borders = np.array([part.rows.start for part in divide(1, length, block, 0)[1:]])
+    return (np.abs(np.arange(length)[:, None] + 0.5 - borders) < NEAR).any(axis=1)
 
 
 def write_mosaic(path: Path, side: int) -> None:

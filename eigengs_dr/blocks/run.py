@@ -1,4 +1,4 @@
-"""The rounds of a fit by blocks: survey, placement, fit, and the error that is left."""
+"""The stages of a fit by blocks: survey, placement, fit, and the error that is left."""
 
 from __future__ import annotations
 
@@ -69,13 +69,10 @@ class Run:
 
     def fit(self) -> SetData:
         """Place and fit all Gaussians; a long fit places them again where error was left."""
-        mass = self._survey()
         steps, first = self.options.iterations, self.options.method.schedule.redistribute_after
-        old = None
-        if steps >= MIN_PHASE_RATIO * first:
-            old, mass = self._find_density(self._place(mass), first)
-            steps -= first
-        sets = self._fit_blocks(self._place(mass, old), steps)
+        if steps < MIN_PHASE_RATIO * first:
+            first = 0
+        sets = self._fit_blocks(self._place_all(first), steps - first)
         background = np.array(self.settings.background, np.float32)
         return SetData(
             sets.arrays | {"background": background},
@@ -91,6 +88,13 @@ class Run:
         sums = {b.number: value for b, value in self._map(compare, tasks, self.blocks)}
         ycbcr, rgb = np.sum([value for _, value in sorted(sums.items())], axis=0).tolist()
         return ycbcr, rgb
+
+    def _place_all(self, first: int) -> BlockSets:
+        """Place all Gaussians; if there are first steps, again where these leave error."""
+        mass, old = self._survey(), None
+        if first:
+            old, mass = self._find_density(self._place(mass), first)
+        return self._place(mass, old)
 
     def _survey(self) -> NDArray[np.float64]:
         """Return the masses of all blocks, and set the background: the mean of the image."""
@@ -133,7 +137,7 @@ class Run:
             return self._fit_task(block, placed, steps, range(steps))
 
         self._begin("density", len(self.blocks) * steps)
-        for block, found in self._fitted("density", find_density, self.blocks, make_task, steps):
+        for block, found in self._fitted("density-", find_density, self.blocks, make_task, steps):
             mass[block.number] = found["mass"][0]
             old.put(block, found)
         return old, mass

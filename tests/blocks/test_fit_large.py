@@ -157,6 +157,50 @@ def test_a_folder_keeps_the_last_rounds_alone(tmp_path):
     assert set(kept) == {f"fit2-{number}.npz" for number in range(4)}
 
 
+def test_blocks_of_an_older_version_are_not_used(tmp_path):
+    """Its blocks were fitted in one go, by other rates, so that their errors are others too."""
+    settings = FEW | {"gaussians": 200, "block": 32, "iterations": 200}
+    output = tmp_path / "a.npz"
+
+    def stop(done, total, row):
+        if row["stage"] == "fit":
+            raise Stop
+
+    with pytest.raises(Stop):
+        eg.fit_large(mosaic(64), output, progress=stop, **settings)
+    folder = tmp_path / "a.npz.checkpoint"
+    for number in range(4):
+        (folder / f"density-{number}.npz").unlink()
+    for name in ("density0", "density3", "fit0", "fit3", "seam3"):
+        (folder / f"{name}.npz").write_bytes(b"an older version")
+    again = eg.fit_large(mosaic(64), output, **settings)
+    assert again.resumed == 0 and not folder.exists()
+
+
+@pytest.mark.parametrize("part", [0.3, 0.6, 0.95])
+def test_a_round_with_a_hole_is_taken_again(tmp_path, part):
+    """In any round, a run goes on from the last one that is complete, with the same bits."""
+    settings = FEW | {"gaussians": 200, "block": 32, "iterations": 32}
+    whole = eg.fit_large(mosaic(64), **settings)
+    output, rows = tmp_path / "a.npz", []
+
+    def stop(done, total, row):
+        if row["stage"] == "fit" and done >= part * total:
+            raise Stop
+
+    with pytest.raises(Stop):
+        eg.fit_large(mosaic(64), output, progress=stop, **settings)
+    for path in (tmp_path / "a.npz.checkpoint").glob("fit?-2.npz"):
+        path.unlink()
+
+    def note(done, total, row):
+        if row["stage"] == "fit":
+            rows.append(done)
+
+    assert_same_bits(whole, eg.fit_large(mosaic(64), output, progress=note, **settings))
+    assert rows == sorted(rows) and rows[-1] == 4 * 32
+
+
 def test_ctrl_c_keeps_finished_blocks(tmp_path):
     code = f"""
 import os, signal
@@ -253,7 +297,7 @@ def test_lost_task_is_one_line():
         eg.fit_large(mosaic(128), **FEW, client=Losing())
 
 
-def test_steps_never_make_a_block_worse():
+def test_steps_improve_what_the_solve_found():
     solved = eg.fit_large(mosaic(128), **FEW | {"iterations": 0})
     fitted = eg.fit_large(mosaic(128), **FEW)
     assert fitted.psnr_ycbcr > solved.psnr_ycbcr
