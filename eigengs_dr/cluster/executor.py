@@ -110,6 +110,9 @@ class ClusterExecutor:
                 if not under_way:
                     return
                 future = self._next(ended)
+                if future.status == "lost":  # its worker ended with the result: it runs again
+                    future.add_done_callback(ended.put)
+                    continue
                 numbered = under_way.pop(future)
                 yield numbered, self._done(numbered[0], future)
                 future.release()
@@ -143,7 +146,7 @@ class ClusterExecutor:
         """Return what became of a task."""
         if future.status == "finished":
             return Done(index, future.result())
-        if future.status in ("cancelled", "lost"):
+        if future.status == "cancelled":
             raise ClusterError(self._gone)
         error = future.exception()
         if isinstance(error, KilledWorker):

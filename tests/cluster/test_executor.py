@@ -1,6 +1,8 @@
 """Tasks on two real processes: order, errors, what is drawn when, and workers that end."""
 
 import os
+import signal
+import time
 
 import numpy as np
 import pytest
@@ -53,6 +55,25 @@ def test_few_tasks_are_drawn_ahead(executor):
 def test_errors_are_raised(executor):
     with pytest.raises(ValueError, match="task 0"):
         list(executor.map(clusters.fail, range(1)))
+
+
+def test_a_result_that_ends_with_its_worker_is_made_again(executor, client, monkeypatch):
+    """The worker ends after the task, before the client has read what the task returned."""
+    fetch, ended = module.ClusterExecutor._next, []
+
+    def end_worker_first(self, queue):
+        future = fetch(self, queue)
+        if not ended and future.status == "finished":
+            holder = client.who_has([future])[future.key][0]
+            ended.append(client.run(os.getpid, workers=[holder])[holder])
+            os.kill(ended[0], signal.SIGKILL)
+            while future.status == "finished":
+                time.sleep(0.001)
+        return future
+
+    monkeypatch.setattr(module.ClusterExecutor, "_next", end_worker_first)
+    found = done(executor, clusters.slow_process_of, range(4))
+    assert len(found) == 4 and ended[0] not in [entry.value for entry in found]
 
 
 def test_a_worker_that_ends_is_replaced(executor, tmp_path):
