@@ -28,12 +28,12 @@ def decibels(gaussians, image):
 def receipts(tmp_path_factory):
     """Receipts and files of two budgets."""
     folder = tmp_path_factory.mktemp("packed")
-    files = {budget: folder / f"{budget}.egs" for budget in (0.5, 2.0)}
+    files = {budget: folder / f"{budget}.egs" for budget in (0.5, 3.0)}
     gaussians, image = small_fit()
     return {b: (eg.pack(gaussians, file, image, b), file) for b, file in files.items()}
 
 
-@pytest.mark.parametrize("budget", [0.5, 2.0])
+@pytest.mark.parametrize("budget", [0.5, 3.0])
 def test_the_budget_holds_and_is_used(fitted, receipts, budget):
     gaussians, image = fitted
     receipt, file = receipts[budget]
