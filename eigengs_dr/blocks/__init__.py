@@ -4,7 +4,6 @@
 - ``grid``: blocks, their windows, and their shares of the Gaussians
 - ``place``: where the Gaussians of a block start
 - ``sets``: the Gaussians of all blocks
-- ``window_gaussians``: Gaussians that stay in a window
 - ``block``: the fit of one block
 - ``rounds``: the steps between which blocks exchange their Gaussians
 - ``run``: the stages of a fit of all blocks

@@ -41,10 +41,9 @@ from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
 from .draw import draw
-from .grid import Block, choose_halo
+from .grid import Block
 from .place import OldSet, place_block, placement_image, window_density
 from .source import Window
-from .window_gaussians import WindowGaussians
 
 Array = NDArray[np.floating]
 Arrays = dict[str, NDArray[Any]]
@@ -210,8 +209,6 @@ def _start(task: FitTask, target: FitTarget, settings: Settings) -> FitProblem:
         backend=options.backend,
         cutoff=options.cutoff,
     ).bounded()
-    sides = task.block.open_sides(*settings.size)
-    placed = WindowGaussians.in_window(placed, choose_halo(settings.spacing), sides)
     if task.color is None:
         placed = solve(placed, values, options.solve_steps, background=background).gaussians
     return FitProblem(placed, values, target.weight)

@@ -56,11 +56,6 @@ class Block(NamedTuple):
         rows, columns = self.window_rows, self.window_columns
         return np.array([columns.stop - columns.start, rows.stop - rows.start], np.float64)
 
-    def open_sides(self, width: int, height: int) -> tuple[bool, bool, bool, bool]:
-        """Return whether an image goes on left of the window, above, right of it and below."""
-        rows, columns = self.window_rows, self.window_columns
-        return columns.start > 0, rows.start > 0, columns.stop < width, rows.stop < height
-
     @property
     def pixels(self) -> int:
         """Number of pixels of the core."""

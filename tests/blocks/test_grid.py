@@ -42,12 +42,6 @@ def test_neighbors_of_a_window():
         assert block in seen and neighbors(block, blocks) == seen
 
 
-def test_window_knows_where_the_image_goes_on():
-    first, last = divide(200, 100, 100, 8)
-    assert first.open_sides(200, 100) == (False, False, True, False)
-    assert last.open_sides(200, 100) == (True, False, False, False)
-
-
 @given(
     st.lists(st.floats(0, 1e3), min_size=1, max_size=20),
     st.integers(0, 2**31),
