@@ -8,7 +8,7 @@ around borders and elsewhere (1,024x1,024 pixels in blocks of 256, one Gaussian 
 
 | method | 200 steps | 1,000 steps |
 |---|---|---|
-| rounds | 46.15, 45.63 | 48.53, 47.69 |
+| rounds | 46.18, 45.61 | 48.53, 47.69 |
 | a fit of the whole | 46.34, 45.94 | 48.64, 48.17 |
 
 In one round, with stand-ins to the end, 100 steps reach 38 dB in the 4 pixels along borders, and
