@@ -21,10 +21,6 @@ SUFFIXES = (".png", ".exr")
 MADE = "build/scenes/"
 """Folder of the sets that the scenes of the repository use."""
 
-SAMPLES_PER_PASS = 1 << 24
-"""Most samples in one pass. The state of a sample takes some 20 bytes; progress and Ctrl-C wait
-for the end of a pass."""
-
 RESERVED = ("path", "parallel", "optimize")
 """Names of arguments of `mitsuba.load_file`, which no scene parameter can have."""
 
@@ -137,24 +133,14 @@ def _render(
     mi: Any, path: Path, spp: int | None, parameters: dict[str, str], show: Callable[..., None]
 ) -> tuple[Any, int]:
     """Render a scene in passes; return its pixels, shape (H, W, C), and the samples per pixel."""
-    import numpy as np
+    from ..scene.passes import render_in_passes
 
     scene = mi.load_file(str(path), **parameters)
     if not isinstance(scene, mi.Scene):
         raise ValueError("the file holds no scene; its root must be <scene version='3.0.0'>")
     if not scene.sensors():
         raise ValueError("the scene has no sensor; add one")
-    sensor = scene.sensors()[0]
-    width, height = sensor.film().crop_size()
-    total = spp or sensor.sampler().sample_count()
-    most = max(1, SAMPLES_PER_PASS // (width * height))
-    pixels, done = np.zeros(()), 0
-    while done < total:
-        count = min(most, total - done)
-        pixels = pixels + count * np.array(mi.render(scene, spp=count, seed=done), np.float64)
-        done += count
-        show(done, total)
-    return (pixels / total).astype(np.float32), total
+    return render_in_passes(scene, 0, spp, show)
 
 
 def _write(mi: Any, path: Path, pixels: Any) -> None:

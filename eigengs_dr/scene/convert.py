@@ -5,36 +5,23 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
-from ..image.color import to_coded
-from ..image.io import save_image
-from ..image.metrics import psnr as psnr_of
 from ..storage.atomic import refuse_url
 from .bitmaps import KEPT, Parsed, Use, parse, read_pixels, uses_of
-from .fit_scene import fit_for_scene
+from .compare_renderings import Progress, compare_renderings
+from .fit_scene import SceneFit, fit_for_scene
 
 # isort: split
 import mitsuba as mi
 
 SCENE = "scene.xml"
 """Name of the new scene in its folder."""
-
-LOUDER = 8.0
-"""Factor of the differences in their pictures."""
-
-SAMPLES_PER_PASS = 1 << 24
-"""Most samples of a rendering in one pass."""
-
-Progress = Callable[[str, int, int], None]
 
 
 class ConvertedTexture(NamedTuple):
@@ -154,19 +141,31 @@ def convert_scene(
         parsed, again = parse(scene, parameters), parse(scene, parameters)
         uses, left = uses_of(parsed)
         before = mi.parser.instantiate(parsed.config, parsed.state)
-        sets, textures = _convert(before, parsed, uses, left, psnr, iterations, progress)
-        for file, gaussians in sets.items():
-            gaussians.save(work / file)
-        _rewrite(again, textures, uses, target)
+        made = dict[int, str]()
+        textures = list[ConvertedTexture]()
+        for group in _by_image(uses, progress):
+            file = _file_name(group[0], {texture.file for texture in textures})
+            found = _convert(before, parsed, group, psnr, iterations)
+            if isinstance(found, str):
+                left += [(use.name, found) for use in group]
+                continue
+            found.gaussians.save(work / file)
+            made |= {use.node: file for use in group}
+            textures.append(_describe(group, file, found))
+        _rewrite(again, made, target)
         (work / SCENE).write_text(_to_xml(again), encoding="utf-8")
-        found = [] if spp == 0 else _compare(before, work, spp, progress)
+        seen = list[float]()
+        if spp != 0:
+            # Threads of Mitsuba would wait for the lock of this thread to read the sets.
+            after = mi.load_file(str(work / SCENE), parallel=False)
+            seen = compare_renderings(before, after, work, spp, progress)
         if target.exists():
             target.rmdir()  # it is empty
         os.replace(work, target)
     except BaseException:
         shutil.rmtree(work, ignore_errors=True)
         raise
-    return ConvertedScene(target / SCENE, textures, left, found)
+    return ConvertedScene(target / SCENE, textures, left, seen)
 
 
 def _workplace(target: Path) -> Path:
@@ -187,84 +186,70 @@ def _workplace(target: Path) -> Path:
 # --- The textures --------------------------------------------------------------------------------
 
 
-def _convert(
-    scene: Any,
-    parsed: Parsed,
-    uses: list[Use],
-    left: list[tuple[str, str]],
-    psnr: float,
-    iterations: int,
-    progress: Progress,
-) -> tuple[dict[str, Gaussians], list[ConvertedTexture]]:
-    """Fit the image of each bitmap; note in `left` what must stay."""
+def _by_image(uses: list[Use], progress: Progress) -> Iterator[list[Use]]:
+    """Yield the uses of each image, and show progress."""
     groups: dict[tuple[str, bool], list[Use]] = {}
     for use in uses:
         groups.setdefault((use.file, use.raw), []).append(use)
-    sets, textures = dict[str, Gaussians](), list[ConvertedTexture]()
-    for number, ((_, raw), group) in enumerate(groups.items()):
+    for number, group in enumerate(groups.values()):
         progress("textures", number, len(groups))
-        nodes = parsed.state.nodes
-        seen = [nodes[use.parent].props[use.slot] for use in group]
-        pixels = read_pixels(group[0])
-        if isinstance(pixels, str):
-            left += [(use.name, pixels) for use in group]
-            continue
-        try:
-            found = fit_for_scene(
-                scene,
-                seen,
-                pixels,
-                psnr,
-                "data" if raw else "linear",
-                iterations=iterations,
-                wrap_mode=[use.wrap for use in group],
-            )
-        except ValueError as error:
-            left += [(use.name, str(error)) for use in group]
-            continue
-        g = found.gaussians
-        height, width, channels = pixels.shape
-        size = 4 * (len(g) * (5 + g.channels) + g.channels)
-        if size >= pixels.size:
-            reason = f"{len(g):,} Gaussians take more memory than its texels"
-            left += [(use.name, reason) for use in group]
-            continue
-        file = _file_name(group[0].file, raw, sets)
-        sets[file] = g
-        names = tuple(use.name for use in group)
-        textures.append(
-            ConvertedTexture(
-                names,
-                file,
-                width,
-                height,
-                channels,
-                pixels.size,
-                len(g),
-                size,
-                min(found.psnr),
-            )
-        )
+        yield group
     progress("textures", len(groups), len(groups))
-    return sets, textures
 
 
-def _file_name(image: str, raw: bool, taken: dict[str, Gaussians]) -> str:
+def _convert(
+    scene: Any, parsed: Parsed, group: list[Use], psnr: float, iterations: int
+) -> SceneFit | str:
+    """Fit the image of some uses, or return why it must stay."""
+    nodes, pixels = parsed.state.nodes, read_pixels(group[0])
+    if isinstance(pixels, str):
+        return pixels
+    try:
+        found = fit_for_scene(
+            scene,
+            [nodes[use.parent].props[use.slot] for use in group],
+            pixels,
+            psnr,
+            "data" if group[0].raw else "linear",
+            iterations=iterations,
+            wrap_mode=[use.wrap for use in group],
+        )
+    except ValueError as error:
+        return str(error)
+    if _memory(found.gaussians) >= pixels.size:
+        return f"{len(found.gaussians):,} Gaussians take more memory than its texels"
+    return found
+
+
+def _memory(gaussians: Gaussians) -> int:
+    """Return the bytes of means, shapes and colours in single precision."""
+    channels = gaussians.channels
+    return 4 * (len(gaussians) * (5 + channels) + channels)
+
+
+def _describe(group: list[Use], file: str, found: SceneFit) -> ConvertedTexture:
+    g = found.gaussians
+    names = tuple(use.name for use in group)
+    size = g.width, g.height, g.channels
+    memory = g.width * g.height * g.channels, len(g), _memory(g)
+    return ConvertedTexture(names, file, *size, *memory, min(found.psnr))
+
+
+def _file_name(use: Use, taken: set[str]) -> str:
     """Name the file of a set by its image."""
-    stem = Path(image).stem
+    stem = Path(use.file).stem
     names = [f"{stem}.npz", f"{stem}-data.npz", *(f"{stem}-{k}.npz" for k in range(2, 1000))]
-    return next(name for name in names[raw and f"{stem}.npz" in taken :] if name not in taken)
+    return next(name for name in names[use.raw and f"{stem}.npz" in taken :] if name not in taken)
 
 
 # --- The scene -----------------------------------------------------------------------------------
 
 
-def _rewrite(
-    parsed: Parsed, textures: list[ConvertedTexture], uses: list[Use], target: Path
-) -> None:
-    """Put the sets in the place of the bitmaps, and name other files relative to the folder."""
-    files = {name: texture.file for texture in textures for name in texture.names}
-    made = {use.node: files[use.name] for use in uses if use.name in files}
+def _rewrite(parsed: Parsed, made: dict[int, str], target: Path) -> None:
+    """Put the sets in the place of the bitmaps, and name other files relative to the folder.
+
+    `made` holds the new file for the index of each node that was a bitmap.
+    """
     for index, node in enumerate(parsed.state.nodes):
         props = node.props
         if index in made:
@@ -289,39 +274,3 @@ def _to_xml(parsed: Parsed) -> str:
         raise ValueError(
             f"the scene cannot be written as XML ({reason}); give images and meshes by files"
         ) from None
-
-
-# --- The renderings ------------------------------------------------------------------------------
-
-
-def _compare(before: Any, folder: Path, spp: int | None, progress: Progress) -> list[float]:
-    """Render both scenes by each camera, write the pictures, and return their PSNR."""
-    # Threads of Mitsuba would wait for the lock of this thread to read the sets.
-    after = mi.load_file(str(folder / SCENE), parallel=False)
-    found, cameras = [], len(before.sensors())
-    for number in range(cameras):
-        progress("renderings", number, cameras)
-        pair = [_picture(scene, number, spp) for scene in (before, after)]
-        loud = np.clip(LOUDER * np.abs(pair[0] - pair[1]), 0, 1)
-        for name, picture in zip(("before", "after", "difference"), [*pair, loud], strict=True):
-            save_image(folder / f"{name}-{number + 1}.png", picture)
-        found.append(psnr_of(pair[0], pair[1]))
-    progress("renderings", cameras, cameras)
-    return found
-
-
-def _picture(scene: Any, camera: int, spp: int | None) -> NDArray[np.float32]:
-    """Render a scene in sRGB, shape (H, W, 3) or (H, W, 1)."""
-    sensor = scene.sensors()[camera]
-    width, height = sensor.film().crop_size()
-    total = spp or sensor.sampler().sample_count()
-    most = max(1, SAMPLES_PER_PASS // (width * height))
-    light: Any = 0
-    done = 0
-    while done < total:
-        count = min(most, total - done)
-        light = light + count * np.array(mi.render(scene, sensor=camera, spp=count, seed=done))
-        done += count
-    channels = 3 if light.shape[2] >= 3 else 1
-    shown = to_coded(np.maximum(light[..., :channels] / total, 0))
-    return np.clip(shown, 0, 1).astype(np.float32)
