@@ -187,14 +187,12 @@ def kodak(
     """Fit the Kodak photos by numbers of Gaussians, beside what other methods published.
 
     \b
-    All photos, 1,000 steps, then the numbers 5,000 and 10,000 with more steps:
+    Examples:
       eigengs-dr bench kodak data -o F
       eigengs-dr bench kodak data -o F --counts 5000 --counts 10000 --steps 5000
-    Seconds, on a quiet machine:
       eigengs-dr bench kodak data -o F --photos 4 --timed
 
-    DATA has the photos in kodak/. A photo takes about two minutes: 15 to 25 s a number. Ctrl-C
-    keeps the fits that are done. FOLDER gets charts of PSNR over Gaussians, and over the seconds of
+    DATA has the photos in kodak/. Ctrl-C keeps the fits that are done. FOLDER gets charts of PSNR over Gaussians, and over the seconds of
     timed fits.
     """
     from eigengs_bench.experiments.kodak import run
