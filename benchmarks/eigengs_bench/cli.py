@@ -192,8 +192,8 @@ def kodak(
       eigengs-dr bench kodak data -o F --counts 5000 --counts 10000 --steps 5000
       eigengs-dr bench kodak data -o F --photos 4 --timed
 
-    DATA has the photos in kodak/. Ctrl-C keeps the fits that are done. FOLDER gets charts of PSNR over Gaussians, and over the seconds of
-    timed fits.
+    DATA has the photos in kodak/. Ctrl-C keeps the fits that are done. FOLDER gets charts of PSNR
+    over Gaussians, and over the seconds of timed fits.
     """
     from eigengs_bench.experiments.kodak import run
     from eigengs_bench.report.sections.kodak import summarize
