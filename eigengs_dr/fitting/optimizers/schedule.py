@@ -77,7 +77,7 @@ class Schedule:
     parameterization: str = "scale_relative"
     warm_up: int = 5
     decay: float = 0.03
-    drift: float = 0.5
+    drift: float = 1.0
     redistribute_after: int = 20
     relocate_every: int = 0
     relocate_share: float = 0.1
