@@ -89,10 +89,17 @@ def write(path: str | os.PathLike[str], data: SetData) -> None:
     """
     if Path(path).suffix.lower() == ".egs":
         raise ValueError(f"{path}: only eigengs_dr.pack writes .egs files; save as .npz")
-    members = {name: np.asarray(array, np.float32) for name, array in data.arrays.items()}
-    members |= {"size": np.array(data.size, np.int64), "space": np.array(data.space)}
-    members["cutoff"] = np.array(data.cutoff, np.float64)
+    members = to_members(data.arrays, data.size, data.cutoff) | {"space": np.array(data.space)}
     npz.write(path, FORMAT, VERSION, members, compressed=len(members["mean"]) < PLAIN_COUNT)
+
+
+def to_members(arrays: Arrays, size: tuple[int, int], cutoff: float) -> Arrays:
+    """Return what files of sets and of materials store alike, in the types of `LAYOUT`."""
+    members: Arrays = {name: np.asarray(array, np.float32) for name, array in arrays.items()}
+    return members | {
+        "size": np.array(size, np.int64),
+        "cutoff": np.array(cutoff, np.float64),
+    }
 
 
 class SetHead(NamedTuple):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..gaussian.file import LAYOUT as SET_LAYOUT
-from ..gaussian.file import MATERIAL, PLAIN_COUNT, Arrays, SetData, check
+from ..gaussian.file import MATERIAL, PLAIN_COUNT, Arrays, SetData, check, to_members
 from ..gaussian.file import read as read_image
 from ..storage import npz
 from ..storage.npz import BadValue, Field
@@ -93,10 +93,7 @@ def write(path: str | os.PathLike[str], data: MaterialData) -> None:
     if Path(path).suffix.lower() == ".egs":
         raise ValueError(f"{path}: only eigengs_dr.pack_material writes .egs files; save as .npz")
     names, spaces, channels, weights = zip(*data.maps, strict=True)
-    members = {name: np.asarray(array, np.float32) for name, array in data.arrays.items()}
-    members |= {
-        "size": np.array(data.size, np.int64),
-        "cutoff": np.array(data.cutoff, np.float64),
+    members = to_members(data.arrays, data.size, data.cutoff) | {
         "names": np.array(names),
         "spaces": np.array(spaces),
         "channels": np.array(channels, np.int64),
