@@ -44,12 +44,11 @@ def fitted(folder, name, image, gaussians, color):
     Path
         The file.
     """
-    path = folder / f"{name}.npz"
-    if not path.exists():
-        started = time.perf_counter()
-        eg.fit(image, gaussians=gaussians, iterations=300, color=color).gaussians.save(path)
-        print(f"wrote {path} in {time.perf_counter() - started:.1f} s")
-    return path
+
+    def fit():
+        return eg.fit(image, gaussians=gaussians, iterations=300, color=color).gaussians
+
+    return _kept(folder / f"{name}.npz", fit)
 
 
 def fitted_material(folder, name, maps, gaussians):
@@ -69,10 +68,18 @@ def fitted_material(folder, name, maps, gaussians):
     Path
         The file.
     """
-    path = folder / f"{name}.npz"
+
+    def fit():
+        return eg.fit_material(maps, gaussians=gaussians, iterations=300).material
+
+    return _kept(folder / f"{name}.npz", fit)
+
+
+def _kept(path, fit):
+    """Save what a fit returns, unless the file exists; return the file."""
     if not path.exists():
         started = time.perf_counter()
-        eg.fit_material(maps, gaussians=gaussians, iterations=300).material.save(path)
+        fit().save(path)
         print(f"wrote {path} in {time.perf_counter() - started:.1f} s")
     return path
 
