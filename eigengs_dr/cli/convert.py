@@ -12,7 +12,7 @@ from .console import progress_bar
 from .options import ANY_PATH, EXISTING, describe_run, quiet_option, report_option
 from .outputs import check_outputs
 from .report import write_report
-from .scene import Definition, explain, load_mitsuba
+from .scene import definitions_option, explain, load_mitsuba
 
 if TYPE_CHECKING:
     from ..scene.convert import ConvertedScene
@@ -46,13 +46,7 @@ if TYPE_CHECKING:
     help="Samples per pixel of the renderings; 0 renders nothing.  [default: from the scene]",
 )
 @click.option("--variant", metavar="NAME", help="Mitsuba variant, as for eigengs-dr scene.")
-@click.option(
-    "-D",
-    "definitions",
-    multiple=True,
-    type=Definition(),
-    help="Set a <default> of the scene; repeat for more.",
-)
+@definitions_option
 @report_option
 @quiet_option
 @click.pass_context

@@ -40,6 +40,15 @@ class Definition(click.ParamType):
         return key, text
 
 
+definitions_option = click.option(
+    "-D",
+    "definitions",
+    multiple=True,
+    type=Definition(),
+    help="Set a <default> of the scene; repeat for more.",
+)
+
+
 @click.command()
 @click.argument("scenes", nargs=-1, required=True, type=EXISTING, metavar="SCENE.xml...")
 @click.option(
@@ -56,13 +65,7 @@ class Definition(click.ParamType):
     metavar="N",
     help="Samples per pixel.  [default: from the scene]",
 )
-@click.option(
-    "-D",
-    "definitions",
-    multiple=True,
-    type=Definition(),
-    help="Set a <default> of the scene; repeat for more.",
-)
+@definitions_option
 @quiet_option
 def scene(
     scenes: tuple[Path, ...],
