@@ -11,6 +11,7 @@ import click
 
 from ..backend.selection import select
 from .console import INTERRUPTED, progress_bar, say
+from .fit_one import course_of
 from .options import describe_run
 from .outputs import check_outputs, name_outputs
 from .report import write_report
@@ -170,12 +171,7 @@ def fit_maps(
         "width": width,
         "height": height,
         "gaussians": len(result.material.gaussians),
-        "iterations": result.iterations,
-        "stopped": result.stopped,
-        "seconds": result.seconds,
-        "seconds_init": result.seconds_init,
-        "seconds_load": loaded - started,
-        "seconds_total": time.perf_counter() - started,
+        **course_of(result, started, loaded),
         "psnr_ycbcr": figures["psnr_ycbcr"],
         "psnr_rgb": figures["psnr_rgb"],
         "maps": [

@@ -16,6 +16,7 @@ from .console import progress_bar
 if TYPE_CHECKING:
     from ..fitting.fit import Fit
     from ..fitting.options import FitOptions
+    from ..material.fit_material import MaterialFit
 
 
 def fit_one(
@@ -56,18 +57,25 @@ def fit_one(
         "width": image.shape[1],
         "height": image.shape[0],
         "gaussians": len(result.gaussians),
-        "iterations": result.iterations,
-        "stopped": result.stopped,
-        "seconds": result.seconds,
-        "seconds_init": result.seconds_init,
-        "seconds_load": loaded - started,
-        "seconds_total": time.perf_counter() - started,
+        **course_of(result, started, loaded),
         **figures,
         "trace": result.trace,
     }
     if not quiet:
         click.echo(_summary(record, preview, color))
     return record
+
+
+def course_of(result: Fit | MaterialFit, started: float, loaded: float) -> dict[str, Any]:
+    """Return how a fit went, for a report; `loaded` is the time when the images were there."""
+    return {
+        "iterations": result.iterations,
+        "stopped": result.stopped,
+        "seconds": result.seconds,
+        "seconds_init": result.seconds_init,
+        "seconds_load": loaded - started,
+        "seconds_total": time.perf_counter() - started,
+    }
 
 
 def _measure(image: Any, result: Fit, color: str) -> dict[str, float]:

@@ -16,7 +16,7 @@ from .options import (
     report_option,
 )
 from .outputs import check_outputs, name_outputs
-from .pack_material import pack_maps
+from .pack_material import pack_maps, packing_figures
 from .report import write_report
 
 SUFFIX, BUDGET = ".egs", 0.5
@@ -109,19 +109,8 @@ def pack(
         receipt = eg.pack(gaussians, target, pixels, budget, sections)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
-    figures = {
-        "input": str(file),
-        "output": str(target),
-        "gaussians": len(gaussians),
-        "budget": budget,
-        "bytes_before": file.stat().st_size,
-        "bytes": receipt.bytes,
-        "bits_per_pixel": receipt.bits_per_pixel,
-        "psnr": receipt.psnr,
-        "lost": receipt.psnr_drop,
-        "steps": receipt.steps._asdict(),
-    }
     if report:
+        figures = packing_figures(file, target, receipt.gaussians, budget, receipt, "psnr")
         write_report(report, {**describe_run(context, backend), **figures})
     if not quiet:
         against = "the image" if image else "the rendering of the input"

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from .fit_material import MapFile, by_name, load_map
+
+if TYPE_CHECKING:
+    from ..codec.material_packing import MaterialPackResult
+    from ..codec.packing import PackResult
+    from ..gaussian.gaussians import Gaussians
 
 
 def pack_maps(
@@ -49,15 +54,27 @@ def pack_maps(
             f"{packed.bits_per_pixel:.3f} bits per pixel for all maps\n"
             f"  lost {packed.psnr_drop:.2f} dB; psnr_rgb against {against}: {shown}"
         )
+    return packing_figures(file, target, material.gaussians, budget, packed, "psnr_rgb")
+
+
+def packing_figures(
+    file: Path,
+    target: Path,
+    gaussians: Gaussians,
+    budget: float,
+    packed: PackResult | MaterialPackResult,
+    psnr: str,
+) -> dict[str, Any]:
+    """Return the figures of a report, with the PSNR under a key of its kind."""
     return {
         "input": str(file),
         "output": str(target),
-        "gaussians": len(material.gaussians),
+        "gaussians": len(gaussians),
         "budget": budget,
-        "bytes_before": before,
+        "bytes_before": file.stat().st_size,
         "bytes": packed.bytes,
         "bits_per_pixel": packed.bits_per_pixel,
-        "psnr_rgb": packed.psnr,
+        psnr: packed.psnr,
         "lost": packed.psnr_drop,
         "steps": packed.steps._asdict(),
     }
