@@ -20,7 +20,6 @@ from eigengs_bench.experiments.scaling import CELL, mosaic
 from eigengs_bench.harness.alone import peak_gib
 from eigengs_dr.blocks.draw import draw_region
 from eigengs_dr.blocks.grid import divide
-from eigengs_dr.gaussian.file import SetData
 from eigengs_dr.image.color import rgb_to_ycbcr, to_coded
 from eigengs_dr.image.metrics import psnr_from_mse
 
@@ -60,10 +59,9 @@ def main(side: int, block: int, iterations: int, whole: bool) -> None:
 def psnr_by_borders(found: eg.Gaussians, image: np.ndarray, block: int) -> list[float]:
     """Return the PSNR in YCbCr near the borders of blocks, elsewhere, and of all pixels."""
     height, width = image.shape[:2]
-    data = SetData(found.to_arrays(), (width, height), found.space, found.cutoff)
     near_rows, near_columns = near_borders(height, block), near_borders(width, block)
     sums, counts, top = np.zeros(2), np.zeros(2), 0
-    for band in draw_region(data, (0, 0, width, height), (width, height), kind=np.float32):
+    for band in draw_region(found.data(), (0, 0, width, height), (width, height), kind=np.float32):
         rows = slice(top, top + len(band))
         shown = rgb_to_ycbcr(to_coded(band)) - rgb_to_ycbcr(image[rows] / np.float32(255))
         errors = np.square(shown).mean(axis=2)

@@ -44,9 +44,7 @@ def _load(data: SetData, backend: str | None) -> Gaussians:
                 "color": np.zeros((1, channels), np.float32),
             }
         )
-    return Gaussians.from_arrays(
-        **data.arrays, size=data.size, space=data.space, backend=backend, cutoff=data.cutoff
-    )
+    return Gaussians.from_data(data, backend)
 
 
 def draw_region(

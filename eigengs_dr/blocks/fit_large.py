@@ -169,9 +169,7 @@ def fit_large(
     finally:
         forget_pictures()
     ycbcr, rgb = (psnr_from_mse(e / (3 * image.width * image.height)) for e in errors)
-    result = Gaussians.from_arrays(
-        **data.arrays, size=data.size, space=data.space, backend=backend, cutoff=data.cutoff
-    )
+    result = Gaussians.from_data(data, backend)
     seconds = time.perf_counter() - started
     return LargeFit(result, ycbcr, rgb, len(blocks), run.resumed, iterations, seconds)
 

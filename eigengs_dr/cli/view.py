@@ -126,6 +126,4 @@ def _load_set(file: Path, name: str | None, packed: bool, backend: str | None) -
     except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(str(file)) else f"{file}: {error}") from None
-    return Gaussians.from_arrays(
-        **data.arrays, size=data.size, space=data.space, backend=backend, cutoff=data.cutoff
-    )
+    return Gaussians.from_data(data, backend)

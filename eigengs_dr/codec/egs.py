@@ -92,6 +92,10 @@ class EgsContent(NamedTuple):
         with np.errstate(over="ignore"):
             return {name: value.astype(np.float32) for name, value in values.items()}
 
+    def set_data(self) -> SetData:
+        """Return the set; a material has the channels of all maps."""
+        return SetData(self.arrays(), self.size, self.space, self.cutoff)
+
     def whole(self) -> Symbols:
         """Return the Gaussians of all sections."""
         return Symbols(*map(np.concatenate, zip(*self.sections, strict=True)))
@@ -176,7 +180,7 @@ def read_set(path: Path, sections: int | None = None) -> SetData:
     if content.maps:
         names = ", ".join(m.name for m in content.maps)
         raise ValueError(f"{path}: holds the maps {names}; load it by Material.load, take one")
-    return SetData(content.arrays(), content.size, content.space, content.cutoff)
+    return content.set_data()
 
 
 def section_check(count: int, body: bytes) -> int:

@@ -98,13 +98,7 @@ def content_of(
 
 def to_gaussians(packed: EgsContent, like: Gaussians) -> Gaussians:
     """Return the Gaussians of a content, on the backend of another set."""
-    return Gaussians.from_arrays(
-        **packed.arrays(),
-        size=packed.size,
-        space=packed.space,
-        backend=types_of(like.mean).backend,
-        cutoff=packed.cutoff,
-    )
+    return Gaussians.from_data(packed.set_data(), types_of(like.mean).backend)
 
 
 def _rendered(like: Gaussians, arrays: dict[str, Array]) -> NDArray[np.float32]:

@@ -251,8 +251,7 @@ def _to_arrays(result: Any) -> Any:
     if isinstance(result, Fit):
         return replace(result, gaussians=_to_arrays(result.gaussians))
     if isinstance(result, Gaussians):
-        size = (result.width, result.height)
-        return SetData(result.to_arrays(), size, result.space, result.cutoff)
+        return result.data()
     return result
 
 
@@ -262,8 +261,5 @@ def _from_arrays(result: Any) -> Any:
     if isinstance(result, Fit):
         return replace(result, gaussians=_from_arrays(result.gaussians))
     if isinstance(result, SetData):
-        arrays: dict[str, Any] = result.arrays
-        return Gaussians.from_arrays(
-            **arrays, size=result.size, space=result.space, cutoff=result.cutoff
-        )
+        return Gaussians.from_data(result)
     return result

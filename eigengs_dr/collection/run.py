@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..backend.interrupt import defer_interrupts
-from ..gaussian.file import SetData, write
+from ..gaussian.file import write
 from ..gaussian.gaussians import Gaussians
 from .read_ahead import Decoded, read_ahead
 from .row import Finished, ImageRow, Outcome, Pixels
@@ -170,9 +170,7 @@ def _write(
     """Start to write a set; the thread that calls this owns all work of Dr.Jit."""
     if output is None or gaussians is None:
         return None
-    size = (gaussians.width, gaussians.height)
-    data = SetData(gaussians.to_arrays(), size, gaussians.space, gaussians.cutoff)
-    return pool.submit(write, output, data)
+    return pool.submit(write, output, gaussians.data())
 
 
 def _are_many(writing: deque[Writing]) -> bool:

@@ -38,11 +38,7 @@ class PackedModel:
     @cached_property
     def model(self) -> EigenGS:
         """The model, with the bits of the first; it is built once in a process."""
-        arrays, size, space, cutoff = self.shapes
-        gaussians = Gaussians.from_arrays(
-            **arrays, size=size, space=space, cutoff=cutoff, backend=self.backend
-        )
-        return EigenGS(gaussians, **self.members)
+        return EigenGS(Gaussians.from_data(self.shapes, self.backend), **self.members)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the model here: arrays of Dr.Jit do not travel."""
@@ -64,10 +60,9 @@ def pack_basis(
     if basis in SHIPPED:
         return str(basis)
     model = load_basis(basis)
-    gaussians, size = model.gaussians, (model.gaussians.width, model.gaussians.height)
-    shapes = SetData(gaussians.to_arrays(), size, gaussians.space, gaussians.cutoff)
     names = [field.name for field in fields(EigenGS) if field.name != "gaussians"]
-    return PackedModel(shapes, {name: getattr(model, name) for name in names}, backend)
+    members = {name: getattr(model, name) for name in names}
+    return PackedModel(model.gaussians.data(), members, backend)
 
 
 def load_basis(

@@ -17,11 +17,8 @@ from ..backend.display import to_html
 from ..backend.recording import exclusive
 from ..backend.selection import select
 from ..storage.npz import BadValue
+from .bounds import clip_parameters
 from .file import CUTOFF, SetData, check, read, write
-
-MIN_DEVIATION = 0.25
-"""Smallest standard deviation along an axis of the factor, in pixels. A narrower Gaussian can fall
-between pixel centres, where it has no gradient."""
 
 
 @dataclass(repr=False)
@@ -127,6 +124,18 @@ class Gaussians:
             cutoff=float(cutoff),  # a NumPy scalar would promote Dr.Jit arrays to float64
         )
 
+    @classmethod
+    def from_data(cls, data: SetData, backend: str | None = None) -> Gaussians:
+        """Create a set from the content of a file; for the backend and errors see `from_arrays`."""
+        arrays: dict[str, Any] = data.arrays
+        return cls.from_arrays(
+            **arrays, size=data.size, space=data.space, backend=backend, cutoff=data.cutoff
+        )
+
+    def data(self) -> SetData:
+        """Return the content for a file."""
+        return SetData(self.to_arrays(), (self.width, self.height), self.space, self.cutoff)
+
     @exclusive()
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Return mean (N, 2), factor (N, 3), color (N, C) and background (C,) as NumPy arrays."""
@@ -213,11 +222,7 @@ class Gaussians:
 
     @exclusive()
     def bounded(self, size: tuple[Any, Any] | None = None) -> Gaussians:
-        """Clip every parameter to its bounds.
-
-        A mean lies in the image. a and c lie between 1 / (twice the longer side) and
-        1 / `MIN_DEVIATION`, and b within +-1 / `MIN_DEVIATION`. A mean that is not finite becomes
-        the centre of the image, a and c become 1 / `MIN_DEVIATION`, b and colours become 0.
+        """Clip every parameter to its bounds, see `eigengs_dr.gaussian.bounds.clip_parameters`.
 
         Parameters
         ----------
@@ -227,27 +232,9 @@ class Gaussians:
         types = types_of(self.mean)
         if size is None:
             size = dr.opaque(types.Float, self.width), dr.opaque(types.Float, self.height)
-        width, height = size
-        # In double precision, because cuda divides approximately in single.
-        longer = dr.float64_array_t(types.Float)(dr.maximum(width, height))
-        low, high = types.Float(0.5 / longer), 1 / MIN_DEVIATION
-
-        def inside(x: Any, low: Any, high: Any, otherwise: Any) -> Any:
-            return dr.select(dr.isfinite(x), dr.clip(x, low, high), otherwise)
-
-        a, b, c = self.factor
-        return replace(
-            self,
-            mean=types.Float2(
-                inside(self.mean[0], 0.0, width, 0.5 * width),
-                inside(self.mean[1], 0.0, height, 0.5 * height),
-            ),
-            factor=types.Float3(
-                inside(a, low, high, high), inside(b, -high, high, 0.0), inside(c, low, high, high)
-            ),
-            color=dr.select(dr.isfinite(self.color), self.color, 0),
-            background=dr.select(dr.isfinite(self.background), self.background, 0),
-        )
+        parameters = self.mean, self.factor, self.color, self.background
+        mean, factor, color, background = clip_parameters(*parameters, *size)
+        return replace(self, mean=mean, factor=factor, color=color, background=background)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the set as an ``.npz`` file in single precision, completely or not at all.
@@ -259,8 +246,7 @@ class Gaussians:
         OSError
             If the file cannot be written; an existing file does not change.
         """
-        size = (self.width, self.height)
-        write(path, SetData(self.to_arrays(), size, self.space, self.cutoff))
+        write(path, self.data())
 
     @classmethod
     def load(
@@ -288,8 +274,7 @@ class Gaussians:
         OSError
             If the file cannot be opened.
         """
-        arrays, size, space, cutoff = read(Path(path), sections)
-        return cls.from_arrays(**arrays, size=size, space=space, backend=backend, cutoff=cutoff)
+        return cls.from_data(read(Path(path), sections), backend)
 
 
 def broadcast(row: Any, count: int) -> Any:

@@ -56,6 +56,10 @@ class MaterialData(NamedTuple):
     cutoff: float
     maps: tuple[TextureMap, ...]
 
+    def set_data(self) -> SetData:
+        """Return the channels of all maps as one set, in the space "data"."""
+        return SetData(self.arrays, self.size, "data", self.cutoff)
+
     def map_data(self, name: str) -> SetData:
         """Return the set of one map; it shares mean and factor.
 
@@ -115,7 +119,7 @@ def read(path: Path) -> MaterialData:
     """
     data = _read(path)
     try:
-        check(SetData(data.arrays, data.size, "data", data.cutoff))
+        check(data.set_data())
         check_maps(data.maps, data.arrays["color"].shape[1])
     except BadValue as error:
         raise ValueError(f"{path}: {error}") from None

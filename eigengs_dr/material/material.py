@@ -154,8 +154,5 @@ class Material:
         OSError
             If the file cannot be opened.
         """
-        arrays, size, cutoff, maps = read(Path(path))
-        gaussians = Gaussians.from_arrays(
-            **arrays, size=size, space="data", backend=backend, cutoff=cutoff
-        )
-        return cls(gaussians, maps)
+        data = read(Path(path))
+        return cls(Gaussians.from_data(data.set_data(), backend), data.maps)

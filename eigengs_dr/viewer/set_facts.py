@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..gaussian.file import SetData, check
+from ..gaussian.file import check
 from ..gaussian.gaussians import Gaussians
 from ..image.color import LIGHT, decode
 
@@ -40,8 +40,8 @@ def describe_set(gaussians: Gaussians, levels: Sequence[int] = ()) -> dict[str, 
         If the set has too many Gaussians or values that are not valid, or a level is out of range.
     """
     check_count(len(gaussians))
-    arrays, size = gaussians.to_arrays(), (gaussians.width, gaussians.height)
-    check(SetData(arrays, size, gaussians.space, gaussians.cutoff))
+    data = gaussians.data()
+    check(data)
     marks = [int(n) for n in levels]
     if marks != sorted(set(marks)) or (marks and not 1 <= marks[0] <= marks[-1] <= len(gaussians)):
         raise ValueError(f"levels are {marks}; expected ascending numbers up to {len(gaussians)}")
@@ -51,8 +51,8 @@ def describe_set(gaussians: Gaussians, levels: Sequence[int] = ()) -> dict[str, 
         "height": gaussians.height,
         "cutoff": gaussians.cutoff,
         "levels": marks,
-        "mean": to_text(arrays["mean"], "<f4"),
-        "factor": to_text(arrays["factor"], "<f4"),
+        "mean": to_text(data.arrays["mean"], "<f4"),
+        "factor": to_text(data.arrays["factor"], "<f4"),
         "color": to_text(color, "<f4"),
         "background": background.tolist(),
     }

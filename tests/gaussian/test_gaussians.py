@@ -11,8 +11,9 @@ from hypothesis.extra import numpy as hnp
 
 from _helpers.sets import COUNT, NAMES, SIZE, arrays_of, check_equal, few, random_scene
 from eigengs_dr.backend.selection import select
+from eigengs_dr.gaussian.bounds import MIN_DEVIATION
 from eigengs_dr.gaussian.concatenate import concatenate
-from eigengs_dr.gaussian.gaussians import MIN_DEVIATION, Gaussians
+from eigengs_dr.gaussian.gaussians import Gaussians
 
 LOW, HIGH = 1 / (2 * max(SIZE)), 1 / MIN_DEVIATION
 """Bounds of the diagonal of a factor."""

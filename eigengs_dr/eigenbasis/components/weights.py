@@ -39,18 +39,12 @@ class SharedShapes:
     @classmethod
     def of(cls, gaussians: Gaussians, low: int = 0, backend: str | None = None) -> SharedShapes:
         """Take the shapes of Gaussians."""
-        size = (gaussians.width, gaussians.height)
-        data = SetData(gaussians.to_arrays(), size, gaussians.space, gaussians.cutoff)
-        return cls(data, low, backend)
+        return cls(gaussians.data(), low, backend)
 
     @cached_property
     def equations(self) -> NormalEquations:
         """The factorised equations; they are built once in a process."""
-        arrays, size, space, cutoff = self.data
-        gaussians = Gaussians.from_arrays(
-            **arrays, size=size, space=space, cutoff=cutoff, backend=self.backend
-        )
-        return NormalEquations(gaussians, self.low)
+        return NormalEquations(Gaussians.from_data(self.data, self.backend), self.low)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the equations here: arrays of Dr.Jit do not travel."""

@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.optimizers.parameterization import CHOLESKY, CHOLESKY_BOUND, SCALE_RELATIVE
-from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
+from eigengs_dr.gaussian.bounds import MIN_DEVIATION
 
 
 @few
