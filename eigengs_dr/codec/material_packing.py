@@ -17,9 +17,8 @@ from ..gaussian.gaussians import Gaussians
 from ..image.color import LIGHT
 from ..image.metrics import psnrs_by_rows
 from ..material.file import MaterialData
-from ..material.fit_material import scale_channels
 from ..material.maps import TextureMap, show_sums, slices
-from ..material.material import Material
+from ..material.material import Material, scale_channels
 from ..material.target import combine, read_maps
 from ..raster.render import render
 from .egs import MAPS_VERSION, EgsContent, read, to_bytes, write

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.arrays import types_of
 from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
 from ..fitting.fit import PIXELS_PER_FIRST_GAUSSIAN, FitInterrupted
@@ -23,9 +22,8 @@ from ..fitting.redistribute import residual
 from ..fitting.refine import FitProgress, Refinement, Score, refine
 from ..fitting.search import search_count
 from ..gaussian.file import CUTOFF
-from ..gaussian.gaussians import Gaussians
 from .maps import TextureMap
-from .material import Material
+from .material import Material, scale_channels
 from .target import MapImage, combine, maps_of, read_maps, score_maps
 
 MIN_MSE = (1 / 255) ** 2 / 12
@@ -276,7 +274,8 @@ def _finish(
     found: Refinement, maps: tuple[TextureMap, ...], started: float, seconds_init: float
 ) -> MaterialFit:
     """Return the result in the units of the maps; raise `FitInterrupted` after Ctrl-C."""
-    material = Material(unweighted(found.gaussians, maps), maps)
+    factors = [1 / m.weight for m in maps for _ in range(m.channels)]
+    material = Material(scale_channels(found.gaussians, factors), maps)
     result = MaterialFit(
         material=material,
         trace=found.trace,
@@ -289,19 +288,3 @@ def _finish(
     if found.stopped == "interrupted":
         raise FitInterrupted(result)
     return result
-
-
-def unweighted(gaussians: Gaussians, maps: Sequence[TextureMap]) -> Gaussians:
-    """Divide the channels of each map by its weight."""
-    factors = [1 / m.weight for m in maps for _ in range(m.channels)]
-    return scale_channels(gaussians, factors)
-
-
-def scale_channels(gaussians: Gaussians, factors: Sequence[float]) -> Gaussians:
-    """Multiply colours and background by a factor for each channel."""
-    FloatX = types_of(gaussians.mean).FloatX
-
-    def scale(rows: Any) -> Any:
-        return FloatX([row * float(f) for row, f in zip(rows, factors, strict=True)])
-
-    return replace(gaussians, color=scale(gaussians.color), background=scale(gaussians.background))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import drjit as dr
 from numpy.typing import NDArray
 
+from ..backend.arrays import types_of
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
 from ..raster.render import render
@@ -156,3 +157,13 @@ class Material:
         """
         data = read(Path(path))
         return cls(Gaussians.from_data(data.set_data(), backend), data.maps)
+
+
+def scale_channels(gaussians: Gaussians, factors: Sequence[float]) -> Gaussians:
+    """Multiply colours and background by a factor for each channel."""
+    FloatX = types_of(gaussians.mean).FloatX
+
+    def scale(rows: Any) -> Any:
+        return FloatX([row * float(f) for row, f in zip(rows, factors, strict=True)])
+
+    return replace(gaussians, color=scale(gaussians.color), background=scale(gaussians.background))
