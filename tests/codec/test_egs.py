@@ -15,7 +15,7 @@ import eigengs_dr as eg
 from _helpers.packed import SPACES, STEPS, peak
 from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
 from eigengs_dr.codec import egs as packed
-from eigengs_dr.codec import weights
+from eigengs_dr.codec import egs_section, weights
 from eigengs_dr.codec.quantization import Steps, Symbols, quantize
 
 # --- Files -------------------------------------------------------------------------------------
@@ -151,9 +151,9 @@ def header(**changed):
 
 def body(splats=COUNT, data=None, length=None):
     whole = packed.to_bytes(content())
-    data = whole[len(header()) + packed._SECTION.size :] if data is None else data
-    check = packed.section_check(splats, data)
-    return packed._SECTION.pack(splats, len(data) if length is None else length, check) + data
+    data = whole[len(header()) + egs_section.HEAD.size :] if data is None else data
+    check = egs_section.section_check(splats, data)
+    return egs_section.HEAD.pack(splats, len(data) if length is None else length, check) + data
 
 
 def hostile(first=0, model=b"", codes=b""):
@@ -216,7 +216,7 @@ def test_codes_of_any_bytes(tmp_path_factory, data, rich):
     """They give a set or an error, and no warning."""
     path = tmp_path_factory.mktemp("any") / "x.egs"
     for content in (data, PLAIN + data):
-        path.write_bytes(header() + hostile(packed.RICH * rich, content))
+        path.write_bytes(header() + hostile(egs_section.RICH * rich, content))
         try:
             found = packed.read(path)
         except ValueError:
