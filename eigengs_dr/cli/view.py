@@ -93,35 +93,38 @@ def _load(
     from ..storage import npz
 
     file = SHIPPED.get(str(file), file)
-    packed = egs.is_egs(file)
-    if not packed and npz.format_of(file) == model_file.FORMAT:
+    sections = egs.section_counts(file) if egs.is_egs(file) else []
+    if not sections and npz.format_of(file) == model_file.FORMAT:
         for option, value in (("--levels", levels), ("--map", name)):
             if value is not None:
                 raise ValueError(f"{file}: is a model; leave {option} out")
         return EigenGS.load(file, backend), []
-    gaussians = _load_set(file, name, packed, backend)
+    gaussians = _load_set(file, name, sum(sections), backend)
     try:
         if levels is not None:
             return gaussians, level_counts(len(gaussians), levels)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
-    if not packed or holds_material(file):
+    if len(sections) < 2 or holds_material(file):
         return gaussians, []
-    sections = [len(section.cell) for section in egs.read(file).sections]
-    return gaussians, list(accumulate(sections)) if len(sections) > 1 else []
+    return gaussians, list(accumulate(sections))
 
 
-def _load_set(file: Path, name: str | None, packed: bool, backend: str | None) -> Any:
-    """Return the set of an image, or of one map of a material; the file may be hostile."""
+def _load_set(file: Path, name: str | None, count: int, backend: str | None) -> Any:
+    """Return the set of an image, or of one map of a material; the file may be hostile.
+
+    A count of 0 is not known yet: the head of an ``.npz`` file tells it.
+    """
     from ..gaussian import file as set_file
     from ..gaussian.gaussians import Gaussians
     from ..material import file as material_file
     from ..viewer.set_facts import check_count
 
     try:
-        if not packed:
+        if not count:
             material = material_file.holds_material(file)
-            check_count((material_file if material else set_file).read_head(file).gaussians)
+            count = (material_file if material else set_file).read_head(file).gaussians
+        check_count(count)
         data = material_file.read_set(file, name, "--map")
     except ValueError as error:
         text = str(error)
