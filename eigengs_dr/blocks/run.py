@@ -211,8 +211,8 @@ class Run:
             for done in ended:
                 if done.lost:
                     raise RuntimeError(f"{self.image.name}: {done.lost}")
-                self._advance(steps)
                 yield parts[done.index], done.value
+                self._advance(steps)  # the caller has kept the result: `progress` may raise
                 self._stop_if_pressed()
 
     def _window(self, block: Block) -> Window:

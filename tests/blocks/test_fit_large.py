@@ -145,6 +145,18 @@ def test_interrupted_run_goes_on(tmp_path, stage):
     np.testing.assert_array_equal(saved["mean"], arrays_of(whole)["mean"])
 
 
+def test_a_block_is_kept_before_its_end_is_told(tmp_path):
+    """A callable that raises does not lose the block that has just ended."""
+
+    def stop(done, total, row):
+        if row["stage"] == "fit" and done:
+            raise Stop
+
+    with pytest.raises(Stop):
+        eg.fit_large(mosaic(128), tmp_path / "a.npz", progress=stop, **FEW)
+    assert eg.fit_large(mosaic(128), tmp_path / "a.npz", **FEW).resumed == 1
+
+
 def test_a_folder_keeps_the_last_rounds_alone(tmp_path):
     """The Gaussians of an image would else lie on the disk once for every round."""
     kept = []
