@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..fitting.solvers.normal_equations import NormalEquations, squared_norms
 from ..gaussian.gaussians import Gaussians
 from ..image.color import RGB_TO_YCBCR, YCBCR_OFFSET
-from ..image.folder import to_planes
+from ..image.planes import to_planes
 from ..image.resize import resample
 from .components.solve import with_colors
 from .projection import Coefficients, ComponentProjector

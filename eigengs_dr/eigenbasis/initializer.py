@@ -12,7 +12,7 @@ from ..fitting.options import DEFAULT_BASIS, FitOptions
 from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode
-from ..image.folder import BASIS_SPACES
+from ..image.planes import BASIS_SPACES
 from .eigengs import EigenGS
 from .registry import load_basis
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..image.folder import BASIS_SPACES, check_size
+from ..image.planes import BASIS_SPACES, check_size
 from .pca.component_counts import check_components
 from .pca.truncation import check_target
 

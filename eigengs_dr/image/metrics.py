@@ -7,18 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .blur import blur, gaussian_taps
 from .color import RGB_TO_YCBCR, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_linear
 from .io import to_8bit
 from .pixels import LinearImage, check_image
 from .radiance import to_pu21
 from .strips import map_threads, strips
-
-WINDOW = 11
-"""Side of the Gaussian window of SSIM and MS-SSIM, in pixels."""
-
-SIGMA = 1.5
-"""Standard deviation of that window, in pixels."""
+from .structure import WINDOW, Convert, halve, similarity, window_radius
 
 MAX_PSNR = 100.0
 """Upper bound of reported PSNRs, in dB: above it, only rounding errors differ."""
@@ -26,11 +20,8 @@ MAX_PSNR = 100.0
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of MS-SSIM from the finest scale to the coarsest, Wang et al. 2003, section 3.2."""
 
-
 PSNR_SPACES = ("rgb", "ycbcr", "data", "pu21")
 """Spaces in which `psnr` compares images."""
-
-Convert = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
@@ -184,11 +175,11 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
     of `skimage.metrics.structural_similarity`.
     """
     x, y = _pair(a, b)
-    mirrored = WINDOW // 2 - _radius(x.shape[:2])
+    mirrored = WINDOW // 2 - window_radius(x.shape[:2])
     if mirrored:
         border = [(mirrored, mirrored), (mirrored, mirrored), (0, 0)]
         x, y = (np.pad(image, border, "symmetric") for image in (x, y))
-    whole, _ = _similarity(x, y, lambda rows: np.clip(rows, 0, 1, out=rows))
+    whole, _ = similarity(x, y, lambda rows: np.clip(rows, 0, 1, out=rows))
     return float(whole.mean())
 
 
@@ -243,9 +234,9 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
 
     product = np.ones(3)
     for weight in weights[:-1]:
-        product *= np.maximum(_similarity(x, y, convert)[1], 0) ** weight
-        x, y = _halved(x), _halved(y)
-    product *= np.maximum(_similarity(x, y, convert)[0], 0) ** weights[-1]
+        product *= np.maximum(similarity(x, y, convert)[1], 0) ** weight
+        x, y = halve(x), halve(y)
+    product *= np.maximum(similarity(x, y, convert)[0], 0) ** weights[-1]
     return float(product.mean())
 
 
@@ -263,57 +254,3 @@ def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
         )
     shape = (*x.shape[:2], 3)
     return np.broadcast_to(x, shape), np.broadcast_to(y, shape)
-
-
-def _radius(sides: tuple[int, ...]) -> int:
-    """Return the radius of the window: that of `WINDOW`, or the largest that fits the image."""
-    return min(WINDOW // 2, (min(sides) - 1) // 2)
-
-
-def _similarity(
-    x: NDArray[Any], y: NDArray[Any], convert: Convert
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return mean SSIM and mean contrast-structure term per channel of two (H, W, 3) images.
-
-    The images are converted and compared strip by strip: large ones need no copy in double
-    precision. Only pixels whose window lies inside the image count.
-    """
-    height, width = x.shape[:2]
-    radius = _radius((height, width))
-    taps = gaussian_taps(SIGMA, radius / SIGMA)
-    rows, columns = height - 2 * radius, width - 2 * radius
-
-    def sums(strip: slice) -> NDArray[np.float64]:
-        inside = slice(strip.start, strip.stop + 2 * radius)
-        p, q = (convert(image[inside].astype(np.float64)) for image in (x, y))
-        return np.array([_similarity_sums(p[..., k], q[..., k], taps) for k in range(3)])
-
-    whole, structure = (sum(map_threads(sums, strips(rows, width))) / (rows * columns)).T
-    return whole, structure
-
-
-def _similarity_sums(
-    x: NDArray[np.float64], y: NDArray[np.float64], taps: NDArray[np.float64]
-) -> tuple[float, float]:
-    """Return the sums of SSIM and of its contrast-structure term over two planes (H, W)."""
-    c1, c2 = 0.01**2, 0.03**2
-    x, y = np.ascontiguousarray(x), np.ascontiguousarray(y)
-    mean_x, mean_y = blur(x, taps), blur(y, taps)
-    product, squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
-    covariance, variances = blur(x * y, taps) - product, blur(x * x + y * y, taps) - squares
-    structure = (2 * covariance + c2) / (variances + c2)
-    luminance = (2 * product + c1) / (squares + c1)
-    return float((luminance * structure).sum()), float(structure.sum())
-
-
-def _halved(image: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the means of the 2x2 blocks of an image (H, W, 3); drop an odd last row or column."""
-    height, width = image.shape[0] // 2, image.shape[1] // 2
-    result = np.empty((height, width, 3))
-
-    def fill(rows: slice) -> None:
-        part = image[2 * rows.start : 2 * rows.stop, : 2 * width].astype(np.float64)
-        np.mean(part.reshape(-1, 2, width, 2, 3), axis=(1, 3), out=result[rows])
-
-    map_threads(fill, strips(height, 2 * width))
-    return result

@@ -8,7 +8,7 @@ from _helpers.families import SIDE, SPLATS, family, small_model
 from _helpers.halves import picture
 from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.image.folder import to_planes
+from eigengs_dr.image.planes import to_planes
 from eigengs_dr.image.resize import resample
 
 

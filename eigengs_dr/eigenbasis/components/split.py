@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ...fitting.solvers.normal_equations import NormalEquations, squared_norms
 from ...gaussian.concatenate import concatenate
-from ...image.folder import to_planes
 from ...image.metrics import psnr_from_mse
+from ...image.planes import to_planes
 from ..pca.basis import Eigenbasis
 from .shape_training import on_grid, shapes_of
 

@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...backend.display import to_html
 from ...image.color import ycbcr_to_rgb
-from ...image.folder import ReadProgress, Source, check_size, to_planes
+from ...image.folder import ReadProgress, Source
 from ...image.io import check_image
+from ...image.planes import check_size, to_planes
 from ...image.resize import resample
 from .accumulate import PCAOptions, accumulate
 from .basis_file import read_basis, write_basis

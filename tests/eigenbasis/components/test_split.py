@@ -6,7 +6,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, rendered, small_basis, small_model, splits
 from eigengs_dr.eigenbasis.components.split import SPLIT_COST, split_reason, wants_split
-from eigengs_dr.image.folder import to_planes
+from eigengs_dr.image.planes import to_planes
 
 
 @splits
