@@ -1,6 +1,6 @@
 """What the cameras of a Mitsuba scene see of a texture.
 
-- ``visibility``: pixels to texels
+- ``visibility``: pixels to texels; ``rays``: from the cameras to the texture
 - ``back_projection``: the smoothest texture that looks alike
 - ``fit_scene``: the fewest Gaussians for a scene
 - ``bitmaps``: the bitmaps of a scene, and which of them must stay
