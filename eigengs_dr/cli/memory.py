@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..fitting.memory import check_memory, estimate_memory, installed_memory
-from ..fitting.options import FitOptions, default_count
+from ..fitting.options import PIXELS_PER_FIRST_GAUSSIAN, FitOptions, default_count
 from ..image.color import rendered_as
 from .console import say
 
@@ -61,8 +61,6 @@ def needs_blocks(path: Path, options: FitOptions) -> bool:
 
 def _problem(path: Path, options: FitOptions) -> tuple[int, int, int, int] | None:
     """Return width, height, channels and Gaussians of a fit, or None if they are not known."""
-    from ..fitting.fit import PIXELS_PER_FIRST_GAUSSIAN
-
     size = _image_size(path)
     if size is None:
         return None

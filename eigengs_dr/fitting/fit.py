@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -19,16 +19,13 @@ from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..raster.render import picture_of
 from .initializers import FitProblem, initialize
-from .options import FitOptions, max_gaussians_for
+from .options import FitOptions
 from .pixels import in_unit, read_pixels, unit_of
 from .refine import FitProgress, Refinement, measure, refine
 from .search import search_count
 
 if TYPE_CHECKING:
     from ..eigenbasis.eigengs import EigenGS
-
-PIXELS_PER_FIRST_GAUSSIAN = 64
-"""Pixels per Gaussian in the first try of a search for the number of Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -221,7 +218,7 @@ def fit_image(image: ArrayLike, options: FitOptions, progress: FitProgress | Non
     if unit != 1:
         pixels = pixels / np.float32(unit)
     with defer_interrupts() as interrupted:
-        start = initialize(pixels, _first_try(pixels, options))
+        start = initialize(pixels, options.first_try(pixels))
         seconds_init = time.perf_counter() - started
         if options.target_psnr is None:
             found = refine(
@@ -236,18 +233,6 @@ def fit_image(image: ArrayLike, options: FitOptions, progress: FitProgress | Non
         else:
             found = _search(start, pixels, options, started, progress, interrupted)
     return finish(found, in_unit(found.gaussians, unit), start.base_image, started, seconds_init)
-
-
-def _first_try(pixels: NDArray[np.float32], options: FitOptions) -> FitOptions:
-    """Return the options of the initialiser; a search starts with few Gaussians."""
-    if options.target_psnr is None:
-        return options
-    most = options.max_gaussians or max_gaussians_for(pixels)
-    area = pixels.shape[0] * pixels.shape[1]
-    count = min(most, max(1, area // PIXELS_PER_FIRST_GAUSSIAN))
-    return replace(
-        options, gaussians=count, target_psnr=None, max_gaussians=None, target_space="ycbcr"
-    )
 
 
 def _search(
@@ -265,7 +250,7 @@ def _search(
         partial(measure, image=pixels, started=started),
         f"psnr_{options.target_space}",
         options.target_psnr,
-        options.max_gaussians or max_gaussians_for(pixels),
+        options.most_for(pixels),
         options.method.schedule,
         options.iterations,
         progress=progress,

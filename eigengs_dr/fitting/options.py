@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +25,9 @@ DEFAULT_COUNT = 5000
 
 DEFAULT_BASIS = "natural"
 """Name of the basis by default: the basis that ships with the package."""
+
+PIXELS_PER_FIRST_GAUSSIAN = 64
+"""Pixels per Gaussian in the first try of a search for the number of Gaussians."""
 
 COLOR_PARAMETERS = 5
 """Parameters of a Gaussian without its colour: two of the mean and three of the factor."""
@@ -107,6 +110,23 @@ class FitOptions:
     def count_for(self, pixels: NDArray[np.float32]) -> int:
         """Return the number of Gaussians for an image (H, W, C), if the fit does not search it."""
         return self.gaussians or default_count(pixels.shape[0] * pixels.shape[1])
+
+    def most_for(self, pixels: NDArray[np.float32]) -> int:
+        """Return the largest number of Gaussians that a search tries for an image (H, W, C)."""
+        return self.max_gaussians or max_gaussians_for(pixels)
+
+    def first_try(self, pixels: NDArray[np.float32]) -> FitOptions:
+        """Return the options of the start for an image (H, W, C): a search starts with few."""
+        if self.target_psnr is None:
+            return self
+        few = max(1, pixels.shape[0] * pixels.shape[1] // PIXELS_PER_FIRST_GAUSSIAN)
+        return replace(
+            self,
+            gaussians=min(self.most_for(pixels), few),
+            target_psnr=None,
+            target_space="ycbcr",
+            max_gaussians=None,
+        )
 
     def _check_numbers(self) -> None:
         counts = {name: getattr(self, name) for name in ("iterations", "solve_steps", "seed")}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
-from ..fitting.fit import PIXELS_PER_FIRST_GAUSSIAN, FitInterrupted
+from ..fitting.fit import FitInterrupted
 from ..fitting.initializers import FitTarget
 from ..fitting.levels import check_options, refine_levels
-from ..fitting.options import FitOptions, max_gaussians_for
+from ..fitting.options import FitOptions
 from ..fitting.placement_initializer import start_from_placement
 from ..fitting.redistribute import residual
 from ..fitting.refine import FitProgress, Refinement, Score, refine
@@ -182,27 +182,17 @@ def _run(
     if levels is not None:
         return refine_levels(target, options, levels, score, progress, interrupted)
     schedule, iterations = options.method.schedule, options.iterations
+    start = start_from_placement(target, options.first_try(target.values))
+    seconds_init = time.perf_counter() - started
     if options.target_psnr is None:
-        start = start_from_placement(target, options)
-        seconds_init = time.perf_counter() - started
         kwargs: dict[str, Any] = {"progress": progress, "interrupted": interrupted}
         refined = refine(start, target.pixels, schedule, iterations, score=score, **kwargs)
         return refined, seconds_init
-    most = options.max_gaussians or max_gaussians_for(target.values)
-    start = start_from_placement(target, _first_try(options, target.values, most))
-    seconds_init = time.perf_counter() - started
+    most = options.most_for(target.values)
     found = search_count(
         start, score, "spare", 0.0, most, schedule, iterations, progress, interrupted
     )
     return found, seconds_init
-
-
-def _first_try(options: FitOptions, values: NDArray[np.float32], most: int) -> FitOptions:
-    """Return the options of the start of a search, or of the first solve."""
-    count = min(most, max(1, values.shape[0] * values.shape[1] // PIXELS_PER_FIRST_GAUSSIAN))
-    return replace(
-        options, gaussians=count, target_psnr=None, target_space="ycbcr", max_gaussians=None
-    )
 
 
 def _balance(
