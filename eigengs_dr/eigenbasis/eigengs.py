@@ -231,13 +231,7 @@ class EigenGS:
         Raises
         ------
         ValueError
-            If the image cannot be used, an option is unknown, or the target is not a positive
-            number or comes with exact colours.
-
-        Warns
-        -----
-        UserWarning
-            If all components miss the target; the result then uses all of them.
+            As `project`; also if an option is unknown, or a target comes with exact colours.
         """
         check_encoding(colors, mean, target_psnr)
         pixels = check_image(image, copy=False)
@@ -293,11 +287,8 @@ class EigenGS:
 
         Raises
         ------
-        ValueError
-            If the file is no model, is damaged, is newer than this package, or holds values that
-            are not finite or do not fit together; the message names the file and the key.
-        OSError
-            If the file cannot be opened.
+        ValueError, OSError
+            As `eigengs_dr.Gaussians.load`, for a model.
         """
         return cls(**read_members(path, backend))
 
