@@ -1,9 +1,12 @@
-"""Pictures with unlike parts, and executors that run tasks in other ways."""
+"""Pictures with unlike parts, settings to fit them by blocks, and executors of other ways."""
 
 import numpy as np
 
 import eigengs_dr as eg
 from eigengs_dr.backend.executor import Done
+
+FEW = {"gaussians": 700, "iterations": 10, "block": 64, "backend": "llvm"}
+"""Settings of a fit of 128x128 pixels in four blocks."""
 
 
 def mosaic(side=256):
@@ -45,3 +48,12 @@ class Sliced:
 
     def __array__(self, *arguments, **options):
         raise AssertionError("the whole array was read")
+
+
+def arrays_of(result):
+    return result.gaussians.to_arrays()
+
+
+def assert_same_bits(one, other):
+    for name, values in arrays_of(one).items():
+        np.testing.assert_array_equal(values, arrays_of(other)[name], err_msg=name)

@@ -3,6 +3,9 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
+
+import eigengs_dr
 
 SELECT = """
 import eigengs_dr
@@ -28,3 +31,9 @@ def run_python(code, **environment):
         check=False,
         timeout=250,  # a library that is read for the first time may take minutes
     )
+
+
+def python_path():
+    """Return where such programs find the package and the helpers of the tests."""
+    root = Path(eigengs_dr.__file__).parents[1]
+    return os.pathsep.join([str(root), str(root / "tests")])

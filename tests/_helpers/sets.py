@@ -20,6 +20,9 @@ compiled once."""
 COUNT = 24
 """Number of splats, for the same reason."""
 
+SMOOTH = 6.0
+"""A cutoff whose edge, exp(-18), is below rounding: invariants hold at every pixel."""
+
 few = settings(
     max_examples=10,
     deadline=None,  # the first example compiles kernels
@@ -142,3 +145,9 @@ def check_equal(gaussians, arrays):
 def upload(types, *arrays):
     """Arrays of a backend that hold the values of NumPy arrays."""
     return [types.Float(np.ascontiguousarray(v)) for v in arrays]
+
+
+def bound(scene, rounding):
+    """What rounding may do at a pixel: relative to the sum of what is added there, (H, W, C)."""
+    magnitudes = scene._replace(color=np.abs(scene.color), background=np.abs(scene.background))
+    return rounding * (1e-3 + magnitudes.exact())

@@ -8,6 +8,8 @@ import pytest
 from _helpers.sets import random_scene
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.image.metrics import psnr
+from eigengs_dr.raster.render import picture_of
 
 SIDE, SPLATS = 32, 100
 """Size of the pictures that are fitted, and splats in a fit: one set of kernels."""
@@ -40,3 +42,15 @@ def start(backend, count=SPLATS, seed=0):
 def default(**changed):
     """The schedule of the default preset, changed."""
     return replace(PRESETS["default"].schedule, **changed)
+
+
+def check_sound(result, image):
+    """All numbers are finite, and the result is the best row and not worse than the start."""
+    assert np.isfinite(result.image).all()
+    assert all(np.isfinite(v).all() for v in result.gaussians.to_arrays().values())
+    rendered = picture_of(result.gaussians)
+    added = 0 if result.mean_image is None else result.mean_image
+    np.testing.assert_array_equal(result.image, rendered + added)
+    reached = psnr(image, result.image, space="ycbcr")
+    assert reached == max(figures(result))
+    assert reached >= result.trace[0]["psnr_ycbcr"]

@@ -12,13 +12,7 @@ import eigengs_dr as eg
 from _helpers.command import assert_refused, previewed, run, smooth_pixels, succeeded
 from _helpers.halves import picture
 from eigengs_dr.backend.selection import BackendError, select
-from eigengs_dr.cli.main import main
-from eigengs_dr.eigenbasis import registry as bases
-from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting import fit as fit_module
-from eigengs_dr.fitting.initializers import INITIALIZERS
-from eigengs_dr.fitting.options import DEFAULT_BASIS
-from eigengs_dr.image.color import SPACES, YCBCR_TO_RGB
 
 
 def test_fit_says_what_it_did(fitted):
@@ -88,74 +82,6 @@ def test_fit_several_images_into_folders(photo, tmp_path):
     assert "versions" in report
 
 
-SMALL_IMAGES = {
-    "one-pixel": lambda: Image.fromarray(smooth_pixels(1, 1)),
-    "one-row": lambda: Image.fromarray(smooth_pixels(17, 1)),
-    "one-column": lambda: Image.fromarray(smooth_pixels(1, 17)),
-    "grey": lambda: Image.fromarray(smooth_pixels(20, 12, 1)[..., 0]),
-    "16-bit": lambda: Image.fromarray(smooth_pixels(20, 12, 1)[..., 0].astype(np.uint16) * 257),
-    "palette": lambda: Image.fromarray(smooth_pixels(20, 12)).quantize(16),
-    "constant": lambda: Image.new("RGB", (20, 12), (10, 200, 90)),
-    "black": lambda: Image.new("RGB", (20, 12)),
-}
-
-
-@pytest.mark.parametrize("kind", SMALL_IMAGES)
-def test_unusual_images_fit(kind, tmp_path):
-    SMALL_IMAGES[kind]().save(tmp_path / "x.png")
-    fits_without_nan(tmp_path / "x.png", notes=0)
-
-
-def test_cmyk_fits(tmp_path):
-    Image.fromarray(smooth_pixels(20, 12)).convert("CMYK").save(tmp_path / "x.jpg")
-    fits_without_nan(tmp_path / "x.jpg", notes=0)
-
-
-def test_alpha_fits_with_a_note(tmp_path):
-    Image.fromarray(smooth_pixels(20, 12, 4), "RGBA").save(tmp_path / "x.png")
-    assert "white" in fits_without_nan(tmp_path / "x.png", notes=1)
-
-
-def test_animated_fits_with_a_note(tmp_path):
-    first, second = (Image.fromarray(smooth_pixels(20, n)) for n in (12, 12))
-    second.putpixel((0, 0), (0, 0, 0))
-    first.save(tmp_path / "x.gif", save_all=True, append_images=[second])
-    assert "2 frames" in fits_without_nan(tmp_path / "x.gif", notes=1)
-
-
-def fits_without_nan(path, notes):
-    """Fit an image in a few iterations; return what was said on standard error."""
-    output, report = path.parent / "out.npz", path.parent / "out.json"
-    result = succeeded(run("fit", path, "-o", output, "--iterations", 3, "--report", report))
-    assert result.stderr.count("\n") == result.stderr.count("eigengs-dr: note: ") == notes
-    figures = json.loads(report.read_text())
-    # Null stands for infinity, which equal images have.
-    assert figures["psnr_rgb"] is None or figures["psnr_rgb"] > 5
-    with np.load(output, allow_pickle=False) as file:
-        arrays = [file[key] for key in file.files]
-    assert all(np.isfinite(array).all() for array in arrays if array.dtype.kind == "f")
-    return result.stderr
-
-
-def test_missing_image(tmp_path, existing):
-    assert_refused(run("fit", tmp_path / "gone.png", "-o", existing), "gone.png")
-
-
-def test_folder_as_image(tmp_path, existing):
-    assert_refused(run("fit", tmp_path, "-o", existing), tmp_path)
-
-
-@pytest.mark.parametrize("content", [b"", b"this is text, not a picture\n"])
-def test_file_that_is_no_image(tmp_path, existing, content):
-    (tmp_path / "x.png").write_bytes(content)
-    assert_refused(run("fit", tmp_path / "x.png", "-o", existing), "x.png")
-
-
-def test_truncated_image(photo, existing):
-    photo.write_bytes(photo.read_bytes()[:300])
-    assert_refused(run("fit", photo, "-o", existing), photo)
-
-
 @pytest.mark.parametrize(
     ("option", "value", "word"),
     [
@@ -206,67 +132,6 @@ def test_interrupted_before_there_is_a_fit(photo, existing, monkeypatch):
     result = run("fit", photo, "-o", existing)
     assert result.exit_code == 130
     assert result.stderr.strip() == "eigengs-dr: interrupted"
-
-
-def test_fit_from_an_eigenbasis(trained, photo, tmp_path):
-    folder, _ = trained
-    start = ["--init", "eigen", "--basis", folder / "m.npz", "--report", tmp_path / "r.json"]
-    succeeded(run("fit", photo, "-o", tmp_path / "x.npz", *start, "--iterations", 30))
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert report["gaussians"] == 60
-    assert report["basis"] == str(folder / "m.npz")
-    model = EigenGS.load(folder / "m.npz")
-    image = eg.load_image(photo)
-    encoded = eg.psnr(image, eg.render(model.encode(image)).numpy(), space="ycbcr")
-    assert report["trace"][0]["psnr_ycbcr"] == pytest.approx(encoded, abs=0.1)
-    assert report["psnr_ycbcr"] > encoded
-
-
-def test_the_basis_is_read_once(trained, photo, tmp_path, monkeypatch):
-    folder, _ = trained
-    loaded = []
-    load = EigenGS.load
-    monkeypatch.setattr(EigenGS, "load", lambda *given: loaded.append(given) or load(*given))
-    start = ["--init", "eigen", "--basis", folder / "m.npz", "--iterations", 0]
-    shutil.copy(photo, tmp_path / "other.png")
-    succeeded(run("fit", photo, tmp_path / "other.png", "-o", tmp_path / "fits", *start))
-    assert len(loaded) == 1
-
-
-def test_the_papers_form_lacks_the_mean_image(trained, photo, tmp_path):
-    folder, _ = trained
-    options = ["--preset", "eigengs", "--basis", folder / "m.npz", "--iterations", 2]
-    outputs = ["-o", tmp_path / "x.npz", "--preview", tmp_path / "both.png"]
-    result = succeeded(run("fit", photo, *outputs, *options))
-    assert result.stderr.count("\n") == 1
-    assert "note: " in result.stderr
-    assert "mean image stays in the basis" in result.stderr
-    _, fit, _ = previewed(tmp_path / "both.png")
-    model = EigenGS.load(folder / "m.npz")
-    added = model.dense_mean(32, 32) @ YCBCR_TO_RGB.T
-    saved = eg.render(eg.Gaussians.load(tmp_path / "x.npz")).numpy()
-    shown = np.clip(saved + added, 0, 1) * 255
-    assert np.abs(shown - fit).max() < 1.5
-
-
-def test_bases_that_do_not_fit(trained, fitted, photo, existing, tmp_path):
-    folder, _ = trained
-    eigen = ["fit", photo, "-o", existing, "--init", "eigen"]
-    model = folder / "m.npz"
-    assert_refused(run(*eigen, "--basis", "nowhere"), "'nowhere'", "natural")
-    assert_refused(run(*eigen, "--basis", fitted[0] / "fit.npz"), "eigengs_dr.gaussians")
-    assert_refused(run(*eigen, "--basis", tmp_path), "basis")
-    assert_refused(run(*eigen, "--basis", model, "--gaussians", 50), photo, "50", "60")
-    assert_refused(run(*eigen, "--basis", model, "--color", "rgb"), photo, "'rgb'", "'ycbcr'")
-
-
-def test_the_names_of_inits_and_bases():
-    [option] = [p for p in main.commands["fit"].params if p.name == "init"]
-    assert tuple(option.type.choices) == ("auto", *INITIALIZERS)
-    [option] = [p for p in main.commands["fit"].params if p.name == "color"]
-    assert tuple(option.type.choices) == SPACES
-    [option] = [p for p in main.commands["fit"].params if p.name == "basis"]
-    assert DEFAULT_BASIS in bases.SHIPPED and DEFAULT_BASIS in option.help
 
 
 def test_command_finds_few_or_says_that_it_cannot(tmp_path):
@@ -336,17 +201,6 @@ def test_several_images_are_not_written_to_a_file(photo, tmp_path):
     shutil.copy(photo, other)
     assert_refused(run("fit", photo, other, "-o", tmp_path / "out.npz", *QUICK), "need a folder")
     assert not (tmp_path / "out.npz").exists()
-
-
-def test_a_basis_implies_its_start(trained, photo, tmp_path):
-    """It is read, or the command says that it cannot be."""
-    model, report = trained[0] / "m.npz", tmp_path / "r.json"
-    output = ["-o", tmp_path / "x.npz", "--iterations", 0, "--report", report]
-    succeeded(run("fit", photo, *output, "--basis", model))
-    told = json.loads(report.read_text())
-    assert (told["gaussians"], told["basis"]) == (60, str(model))
-    assert_refused(run("fit", photo, *output, "--basis", "nowhere.npz"), "nowhere.npz")
-    assert_refused(run("fit", photo, *output, "--basis", model, "--init", "grid"), "basis")
 
 
 def test_the_report_has_all_of_the_time(fitted):

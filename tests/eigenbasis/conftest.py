@@ -13,3 +13,13 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("trained")
     random_fields(folder / "photos", 30)
     return folder, train(folder / "photos", folder / "model.npz", TrainOptions(**SMALL))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return random_fields(tmp_path / "photos", 24)
+
+
+@pytest.fixture
+def output(tmp_path):
+    return tmp_path / "model.npz"

@@ -1,22 +1,14 @@
-"""Sets of splats: arrays in and out, bounds, selection."""
+"""Sets of splats: arrays in and out, selection, sizes."""
 
 from dataclasses import replace
 
 import drjit as dr
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
-from _helpers.sets import COUNT, NAMES, SIZE, arrays_of, check_equal, few, random_scene
+from _helpers.sets import COUNT, NAMES, SIZE, arrays_of, check_equal, random_scene
 from eigengs_dr.backend.selection import select
-from eigengs_dr.gaussian.bounds import MIN_DEVIATION
-from eigengs_dr.gaussian.concatenate import concatenate
 from eigengs_dr.gaussian.gaussians import Gaussians
-
-LOW, HIGH = 1 / (2 * max(SIZE)), 1 / MIN_DEVIATION
-"""Bounds of the diagonal of a factor."""
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 7])
@@ -120,7 +112,7 @@ def test_a_size_that_is_no_integer():
         Gaussians.from_arrays([[1, 1]], [[1, 0, 1]], [[1]], size=(8.75, 9), space="data")
 
 
-# --- Selection and concatenation ---------------------------------------------------------------
+# --- Selection --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -163,53 +155,7 @@ def test_selection_of_nothing(backend, index):
         random_scene().on(backend)[index]
 
 
-def test_concatenation(backend):
-    """Splats one after the other, backgrounds added."""
-    parts = [random_scene(seed, count) for seed, count in ((0, COUNT), (1, 3), (2, 1))]
-    joined = concatenate([p.on(backend) for p in parts])
-    expected = {name: np.concatenate([getattr(p, name) for p in parts]) for name in NAMES[:3]}
-    background = 3 * parts[0].background.astype(np.float32)
-    assert len(joined) == COUNT + 4
-    found = joined.to_arrays()
-    np.testing.assert_allclose(found.pop("background"), background, rtol=1e-6)
-    for name, value in found.items():
-        np.testing.assert_array_equal(value, expected[name])
-
-
-def test_concatenation_of_one(backend):
-    gaussians = random_scene().on(backend)
-    check_equal(concatenate([gaussians]), gaussians.to_arrays())
-
-
-def test_concatenation_of_values_that_all_splats_share(backend):
-    scene = random_scene()
-    gaussians = replace(scene.on(backend), factor=select(backend).Array3f(0.5, 0.25, 0.75))
-    joined = concatenate([gaussians, gaussians])
-    np.testing.assert_array_equal(
-        joined.to_arrays()["factor"], np.tile([0.5, 0.25, 0.75], (2 * COUNT, 1))
-    )
-
-
-def test_concatenation_of_nothing():
-    with pytest.raises(ValueError, match="no sets"):
-        concatenate([])
-
-
-def test_concatenation_of_what_differs(backend):
-    first = random_scene().on(backend)
-    others = [
-        random_scene(size=(9, 9)).on(backend),
-        random_scene(channels=1).on(backend),
-        replace(first, space="rgb"),
-        random_scene().on(backend, 64),
-    ]
-    for other in others:
-        with pytest.raises(ValueError, match="sets differ") as error:
-            concatenate([first, other])
-        assert "\n" not in str(error.value)
-
-
-# --- Size and bounds ---------------------------------------------------------------------------
+# --- Size -------------------------------------------------------------------------------------
 
 
 def test_scaled(backend):
@@ -233,62 +179,6 @@ def test_scaled_there_and_back(backend):
 def test_scaled_to_nothing(backend, size):
     with pytest.raises(ValueError, match="at least 1 pixel"):
         random_scene().on(backend).scaled(*size)
-
-
-any_floats = st.floats(width=32, allow_nan=True, allow_infinity=True)
-
-
-def unbounded(backend, values):
-    """A set with any numbers: values has shape (COUNT, 8)."""
-    scene = random_scene()._replace(mean=values[:, :2], factor=values[:, 2:5], color=values[:, 5:])
-    return scene.on(backend)
-
-
-def check_bounds(arrays):
-    mean, factor = arrays["mean"], arrays["factor"].astype(np.float64)
-    assert ((mean >= 0) & (mean <= SIZE)).all()
-    a, b, c = factor.T
-    for diagonal in (a, c):
-        assert ((diagonal >= LOW * (1 - 1e-6)) & (diagonal <= HIGH)).all()
-    assert (np.abs(b) <= HIGH).all()
-    assert np.isfinite(arrays["color"]).all()
-    inverse = np.array([[a * a, a * b], [a * b, b * b + c * c]]).transpose(2, 0, 1)
-    assert (np.linalg.det(inverse) > 0).all()
-
-
-@few
-@given(values=hnp.arrays(np.float32, (COUNT, 8), elements=any_floats))
-def test_bounds_hold_after_any_step(backend, values):
-    bounded = unbounded(backend, values).bounded()
-    check_bounds(bounded.to_arrays())
-    check_equal(bounded.bounded(), bounded.to_arrays())
-
-
-def test_bounds_leave_alone_what_is_inside(backend):
-    scene = random_scene()
-    scene = scene._replace(mean=np.clip(scene.mean, 0, SIZE))
-    check_equal(scene.on(backend).bounded(), arrays_of(scene))
-
-
-def test_what_replaces_numbers_that_are_not_finite(backend):
-    """A mean by the middle, a factor by its bound, a colour by 0."""
-    for value in (np.nan, np.inf, -np.inf):
-        found = unbounded(backend, np.full((COUNT, 8), value)).bounded().to_arrays()
-        np.testing.assert_array_equal(found["mean"][0], [SIZE[0] / 2, SIZE[1] / 2])
-        np.testing.assert_array_equal(found["factor"][0], [HIGH, 0, HIGH])
-        assert not found["color"].any()
-
-
-def test_bounded_background_is_finite(backend):
-    scene = random_scene()._replace(background=np.array([np.nan, 0, np.inf]))
-    assert np.isfinite(scene.on(backend).bounded().to_arrays()["background"]).all()
-
-
-def test_bounds_of_the_smallest_image(backend):
-    scene = random_scene(size=(1, 1))
-    found = scene.on(backend).bounded().to_arrays()
-    assert ((found["mean"] >= 0) & (found["mean"] <= 1)).all()
-    assert found["factor"][:, [0, 2]].min() >= 0.5
 
 
 def test_sets_are_trees_of_arrays(backend):

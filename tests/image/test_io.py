@@ -1,40 +1,23 @@
-"""Reading, checking and writing images: every kind of file, every kind of damage."""
+"""Reading images: every kind of file, every kind of damage."""
 
 import io
 import struct
 import sys
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from _helpers.errors import one_line
+from _helpers.files import BYTES, property_of
 from eigengs_dr.image.io import (
-    SAVE_OPTIONS,
     ImageError,
-    check_image,
     load_image,
     save_image,
-    to_8bit,
 )
-
-BYTES = np.array([[[0, 51, 102], [255, 204, 153]]], np.uint8)
-LOSSLESS = [".png", ".tif", ".tiff", ".bmp", ".ppm", ".PNG"]
-
-byte_images = hnp.arrays(
-    np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.sampled_from([1, 3]))
-)
-
-
-def property_of(path, name):
-    """Open a file with Pillow itself and ask it for its mode or format."""
-    with Image.open(path) as file:
-        return getattr(file, name)
 
 
 def png(width, height, depth, kind, rows):
@@ -48,9 +31,6 @@ def png(width, height, depth, kind, rows):
     pixels = zlib.compress(b"".join(b"\0" + row.tobytes() for row in rows))
     chunks = chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
     return b"\x89PNG\r\n\x1a\n" + chunks
-
-
-# ---------------------------------------------------------------- reading
 
 
 def test_8_bit_values_are_exact(tmp_path):
@@ -218,156 +198,3 @@ def test_damaged_files_load_or_say_so(tmp_path_factory, data):
         assert "\n" not in str(error)
     else:
         assert image.dtype == np.float32 and image.shape[2] == 3
-
-
-# ---------------------------------------------------------------- checking
-
-
-@pytest.mark.parametrize(
-    ("pixel", "expected"),
-    [
-        (np.uint8(51), 0.2),
-        (np.uint16(13107), 0.2),
-        (np.dtype(">u2").type(13107), 0.2),
-        (np.bool_(True), 1),
-        (np.float16(0.5), 0.5),
-        (np.float32(0.2), 0.2),
-        (np.float64(-0.4), -0.4),
-    ],
-)
-@pytest.mark.parametrize("shape", [(2, 5), (2, 5, 1), (2, 5, 3), (1, 1), (1, 9)])
-def test_check_image_scales_and_replicates(pixel, expected, shape):
-    image = np.full(shape, pixel)
-    result = check_image(image)
-    assert result.dtype == np.float32 and result.flags.c_contiguous
-    assert result.shape == (*shape[:2], 3)
-    np.testing.assert_allclose(result, expected, rtol=1e-6)
-    assert not np.shares_memory(result, image)
-
-
-def test_check_image_keeps_rows_columns_and_channels():
-    image = np.random.default_rng(0).random((3, 4, 3)).astype(np.float32)
-    for view in (image, np.asfortranarray(image), image[::-1][::-1], image.tolist()):
-        np.testing.assert_array_equal(check_image(view), image)
-
-
-@pytest.mark.parametrize(
-    ("image", "complaint"),
-    [
-        (np.zeros(5), r"shape \(5,\), expected"),
-        (np.float32(1), r"shape \(\), expected"),
-        (np.zeros((4, 4, 2)), r"shape \(4, 4, 2\), expected"),
-        (np.zeros((4, 4, 4)), r"drop alpha"),
-        (np.zeros((1, 4, 4, 3)), r"shape \(1, 4, 4, 3\), expected"),
-        (np.zeros((0, 4, 3)), "no pixels"),
-        (np.zeros((4, 0)), "no pixels"),
-        (np.zeros((4, 4), np.int64), "pixels are int64"),
-        (np.zeros((4, 4), complex), "pixels are complex128"),
-        (np.full((4, 4), None), "pixels are object"),
-        (np.full((4, 4), "a"), "pixels are <U1"),
-        ([[1, 2], [3]], "not an array"),
-        (
-            np.full((2, 2), 255.0),
-            "from 255 to 255, not 0 to 1; divide by 255 first, or say encoding=",
-        ),
-        (np.full((2, 2), 1e300), "scale it first"),
-        (np.array([[-1.0, 1.0]]), "from -1 to 1, not 0 to 1; scale it"),
-    ],
-)
-def test_check_image_refuses(image, complaint):
-    with pytest.raises(ImageError, match=complaint) as error:
-        check_image(image)
-    one_line(error)
-
-
-def test_non_finite_pixels_are_counted_and_placed():
-    image = np.zeros((3, 4, 3))
-    image[1, 2] = np.nan
-    image[2, 0, 1] = np.inf
-    with pytest.raises(ImageError, match=r"2 of 12 pixels .* first at \[1, 2\]") as error:
-        check_image(image)
-    one_line(error)
-
-
-# ---------------------------------------------------------------- writing
-
-
-@pytest.mark.parametrize("suffix", LOSSLESS)
-@settings(max_examples=10, deadline=None)
-@given(image=byte_images)
-def test_lossless_round_trip(tmp_path_factory, suffix, image):
-    path = tmp_path_factory.mktemp("round") / f"a{suffix}"
-    save_image(path, image)
-    np.testing.assert_array_equal(load_image(path), check_image(image))
-    save_image(path, load_image(path))
-    np.testing.assert_array_equal(load_image(path), check_image(image))
-
-
-@pytest.mark.parametrize("suffix", SAVE_OPTIONS)
-def test_every_suffix_is_written_in_its_format(tmp_path, suffix):
-    path = tmp_path / f"a{suffix}"
-    image = np.full((8, 8, 3), (0.2, 0.4, 0.6))
-    save_image(path, image)
-    np.testing.assert_allclose(load_image(path), image, atol=0.02)
-    kind = {".jpg": "JPEG", ".tif": "TIFF"}.get(suffix, suffix[1:].upper())
-    assert property_of(path, "format") == kind
-
-
-@pytest.mark.parametrize(("channels", "mode"), [(1, "L"), (3, "RGB")])
-def test_grey_stays_grey(tmp_path, channels, mode):
-    image = np.random.default_rng(0).integers(0, 256, (5, 4, channels), np.uint8)
-    save_image(tmp_path / "a.png", image)
-    assert property_of(tmp_path / "a.png", "mode") == mode
-    kept = load_image(tmp_path / "a.png", keep_grey=True)
-    np.testing.assert_array_equal(kept, check_image(image, keep_grey=True))
-    assert kept.shape == image.shape and kept.flags.c_contiguous
-
-
-def test_saving_clamps_and_rounds(tmp_path):
-    values = np.array([[-3, 0.49 / 255, 0.51 / 255, 0.9999, 7, 1e300]])
-    save_image(tmp_path / "a.png", values)
-    levels = np.rint(load_image(tmp_path / "a.png") * 255)[0, :, 0]
-    np.testing.assert_array_equal(levels, [0, 0, 1, 255, 255, 255])
-    np.testing.assert_array_equal(to_8bit(values)[0], levels)
-
-
-@pytest.mark.parametrize("name", ["a.gif", "a.exrs", "a", "a.npz", ".png"])
-def test_unknown_suffix(tmp_path, name):
-    with pytest.raises(ImageError, match=r"is unknown; use one of \.png") as error:
-        save_image(tmp_path / name, BYTES)
-    one_line(error)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_failed_write_leaves_everything_as_it_was(tmp_path, monkeypatch):
-    path = tmp_path / "a.png"
-    save_image(path, BYTES)
-    before = path.read_bytes()
-
-    def disk_full(self, target, **options):
-        Path(target).write_bytes(b"half of")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Image.Image, "save", disk_full)
-    with pytest.raises(ImageError, match="No space left") as error:
-        save_image(path, 1 - BYTES / 255)
-    one_line(error)
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_unwritable_targets(tmp_path):
-    (tmp_path / "folder.png").mkdir()
-    (tmp_path / "file").write_bytes(b"")
-    for target in ("folder.png", "nowhere/a.png", "file/a.png"):
-        with pytest.raises(ImageError, match=r"cannot be written|is a folder") as error:
-            save_image(tmp_path / target, BYTES)
-        assert one_line(error).count("choose another path") == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
-
-
-def test_bad_pixels_touch_no_file(tmp_path):
-    for image in (np.full((2, 2), np.nan), np.zeros((2, 2, 5)), np.zeros((0, 0, 3))):
-        with pytest.raises(ImageError):
-            save_image(tmp_path / "a.png", image)
-    assert not list(tmp_path.iterdir())

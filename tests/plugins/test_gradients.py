@@ -16,7 +16,9 @@ from eigengs_dr.plugins import gaussians_of, keep_in_bounds, texture_of  # noqa:
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
 PARAMETERS = ["mean", "factor", "color", "background"]
+
 TEXTURE = "wall.bsdf.reflectance"
+
 SIDE, SPP, SEED = 12, 32, 3
 
 
@@ -110,34 +112,6 @@ class TestIntegrators:
         image = scene.integrator().render_forward(scene, parameters, seed=SEED, spp=SPP)
         found = (np.array(image) * upstream()).sum()
         assert found == pytest.approx((expected * direction).sum(), rel=1e-3)
-
-
-class TestClamp:
-    @pytest.mark.parametrize("space", ["linear", "rgb"])
-    @pytest.mark.parametrize(("outside", "sign"), [(1.7, 1), (-0.4, -1)])
-    def test_colours_out_of_range_feel_the_way_back(self, space, outside, sign):
-        g = gaussians(space)
-        g.background = dr.full(type(g.background), outside, (3, 1))
-        tex = texture(g)
-        parameters = mi.traverse(tex)
-        dr.enable_grad(parameters["background"])
-        parameters.update()
-        value = tex.eval_1(at(0.5, 0.5))
-        assert np.array(value) == pytest.approx(1 if sign > 0 else 0, abs=1e-6)
-        dr.backward(dr.square(value - 0.5))
-        assert (np.sign(np.array(dr.grad(parameters["background"]))) == sign).all()
-
-    def test_a_descent_comes_back(self):
-        g = gaussians("linear")
-        g.background = dr.full(type(g.background), 3.0, (3, 1))
-        tex = texture(g)
-        parameters = mi.traverse(tex)
-        optimizer = mi.ad.Adam(lr=0.2, params={"background": parameters["background"]})
-        for _ in range(40):
-            parameters.update(optimizer)
-            dr.backward(dr.mean(dr.square(tex.eval_1(texel_centres()) - 0.5)))
-            optimizer.step()
-        assert np.array(optimizer["background"]) == pytest.approx(0.5, abs=0.1)
 
 
 class TestBroken:

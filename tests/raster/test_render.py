@@ -1,4 +1,4 @@
-"""Rendering: against a float64 sum over all pairs, and what must not change the picture."""
+"""Rendering: against a float64 sum over all pairs, of good and of bad numbers."""
 
 import math
 from dataclasses import replace
@@ -13,7 +13,9 @@ from scipy.ndimage import maximum_filter
 from _helpers.sets import (
     COUNT,
     SIZE,
+    SMOOTH,
     Scene,
+    bound,
     covariances,
     distances,
     factors_of,
@@ -24,8 +26,7 @@ from _helpers.sets import (
 from _helpers.waves import SIDE, SPLATS
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.gaussian.concatenate import concatenate
-from eigengs_dr.gaussian.file import CUTOFF, MAX_CUTOFF
+from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.image.color import rgb_to_ycbcr, ycbcr_to_rgb
 from eigengs_dr.raster.binning.tiles import TILE, Grid
 from eigengs_dr.raster.reference import render_plain
@@ -39,15 +40,6 @@ from eigengs_dr.raster.render import (
     to_tiles,
 )
 from eigengs_dr.raster.rows import to_tensor
-
-SMOOTH = 6.0
-"""A cutoff whose edge, exp(-18), is below rounding: invariants hold at every pixel."""
-
-
-def bound(scene, rounding):
-    """What rounding may do at a pixel: relative to the sum of what is added there, (H, W, C)."""
-    magnitudes = scene._replace(color=np.abs(scene.color), background=np.abs(scene.background))
-    return rounding * (1e-3 + magnitudes.exact())
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
@@ -142,74 +134,6 @@ def test_stretched_splats(backend):
     np.testing.assert_allclose(image[clear], scene.exact(CUTOFF)[clear], rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("asked", "size"),
-    [
-        ({}, SIZE),
-        ({"width": 44}, (44, 34)),
-        ({"height": 34}, (44, 34)),
-        ({"width": 44, "height": 34}, (44, 34)),
-        ({"width": 10, "height": 30}, (10, 30)),
-        ({"width": 1}, (1, 1)),
-        ({"height": 1}, (1, 1)),
-    ],
-)
-def test_size_arguments(backend, asked, size):
-    """Positions and lengths scale with each side: means by s, factors by 1 / s."""
-    scene = random_scene(4)
-    image = render(scene.on(backend), **asked).numpy()
-    assert image.shape == (size[1], size[0], 3)
-    sx, sy = size[0] / SIZE[0], size[1] / SIZE[1]
-    larger = scene._replace(
-        mean=scene.mean * [sx, sy], factor=scene.factor / [sx, sy, sy], size=size
-    )
-    clear = larger.off_edge(CUTOFF, 1e-3)
-    np.testing.assert_allclose(image[clear], larger.exact(CUTOFF)[clear], rtol=0, atol=2e-5)
-
-
-@pytest.mark.parametrize("cutoff", [0, -1.0, math.nan, math.inf, np.nextafter(12.0, 13)])
-def test_bad_cutoff(backend, cutoff):
-    with pytest.raises(ValueError, match="cutoff") as error:
-        render(random_scene().on(backend), cutoff=cutoff)
-    assert "\n" not in str(error.value)
-
-
-def test_cutoff_that_is_an_integer(backend):
-    gaussians = random_scene().on(backend)
-    np.testing.assert_array_equal(render(gaussians, cutoff=3), render(gaussians, cutoff=3.0))
-
-
-def test_widest_cutoff(backend):
-    scene = random_scene(5)
-    image = render(scene.on(backend), cutoff=MAX_CUTOFF).numpy()
-    assert (np.abs(image - scene.exact()) <= bound(scene, 1e-5)).all()
-
-
-@pytest.mark.parametrize("asked", [{"width": 0}, {"height": 0}, {"width": -3, "height": 5}])
-def test_bad_size(backend, asked):
-    with pytest.raises(ValueError, match="at least 1") as error:
-        render(random_scene().on(backend), **asked)
-    assert "\n" not in str(error.value)
-
-
-def test_size_beyond_32_bits_is_refused_before_it_is_allocated(backend):
-    with pytest.raises(ValueError, match="37838x37838 pixels and 3 channels has") as error:
-        render(random_scene().on(backend), width=37838, height=37838)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("kind", [np.float64, np.float32])
-def test_cutoff_of_numpy(backend, kind):
-    gaussians = random_scene().on(backend)
-    np.testing.assert_array_equal(render(gaussians, cutoff=kind(3)), render(gaussians, cutoff=3.0))
-
-
-def test_size_of_numpy(backend):
-    gaussians = random_scene().on(backend)
-    image = render(gaussians, width=np.int64(10), height=np.int64(8))
-    np.testing.assert_array_equal(image, render(gaussians, width=10, height=8))
-
-
 def test_one_splat(backend):
     scene = random_scene(6, count=1)._replace(mean=np.array([[8.5, 9.5]]))
     image = render(scene.on(backend)).numpy()
@@ -300,105 +224,6 @@ def test_other_spaces_come_out_as_they_are(backend, space):
     scene = random_scene(13)
     image = render(scene.on(backend, space=space))
     np.testing.assert_array_equal(image, render(scene.on(backend)))
-
-
-def test_renderings_are_bit_equal(backend):
-    gaussians = random_scene(14).on(backend)
-    np.testing.assert_array_equal(render(gaussians), render(gaussians))
-
-
-def test_rendering_leaves_the_set_as_it_was(backend):
-    scene = random_scene(15)
-    gaussians = scene.on(backend)
-    render(gaussians, width=10, height=8).numpy()
-    for name, value in gaussians.to_arrays().items():
-        np.testing.assert_array_equal(value, getattr(scene, name))
-    assert (gaussians.width, gaussians.height) == SIZE
-
-
-@few
-@given(scene=scenes(), order=st.permutations(range(COUNT)))
-def test_splats_permuted(backend, scene, order):
-    image = render(scene.on(backend)).numpy()
-    permuted = render(scene.permuted(list(order)).on(backend)).numpy()
-    assert (np.abs(image - permuted) <= bound(scene, 1e-5)).all()
-
-
-def transposed(scene):
-    """Swap x and y: the covariances are transposed, and their inverses factored again."""
-    a, b, c = scene.factor.T
-    inverse = np.stack([np.stack([b * b + c * c, a * b], -1), np.stack([a * b, a * a], -1)], -2)
-    lower = np.linalg.cholesky(inverse)
-    return scene._replace(
-        mean=scene.mean[:, ::-1],
-        factor=np.stack([lower[:, 0, 0], lower[:, 1, 0], lower[:, 1, 1]], axis=1),
-        size=scene.size[::-1],
-    )
-
-
-@few
-@given(scene=scenes())
-def test_image_transposed(backend, scene):
-    image = render(scene.on(backend), cutoff=SMOOTH).numpy()
-    swapped = render(transposed(scene).on(backend), cutoff=SMOOTH).numpy()
-    assert (np.abs(image - swapped.transpose(1, 0, 2)) <= bound(scene, 3e-5)).all()
-
-
-@few
-@given(scene=scenes())
-def test_set_split_in_two_and_summed(backend, scene):
-    gaussians = scene.on(backend)
-    first, second = gaussians[: COUNT // 2], gaussians[COUNT // 2 :]
-    together = render(gaussians, cutoff=SMOOTH).numpy()
-    parts = [render(g, cutoff=SMOOTH).numpy() for g in (first, second)]
-    limit = bound(scene, 1e-5)
-    assert (np.abs(sum(parts) - scene.background - together) <= limit).all()
-    joined = render(concatenate([first, second]), cutoff=SMOOTH).numpy()
-    assert (np.abs(joined - sum(parts)) <= limit).all()
-
-
-@few
-@given(scene=scenes())
-def test_size_tripled(backend, scene):
-    """The middle of 3x3 pixels of the large picture is the centre of the small one's pixel."""
-    gaussians = scene.on(backend)
-    small = render(gaussians, cutoff=SMOOTH).numpy()
-    large = render(gaussians, width=3 * SIZE[0], cutoff=SMOOTH).numpy()
-    assert (np.abs(large[1::3, 1::3] - small) <= bound(scene, 3e-5)).all()
-
-
-@few
-@given(scene=scenes())
-def test_size_doubled(backend, scene):
-    """A pixel of the large picture is the small one sampled at quarters of a pixel."""
-    large = render(scene.on(backend), width=2 * SIZE[0], cutoff=SMOOTH).numpy()
-    for i, j in ((0, 0), (1, 1)):
-        shift = np.array([i, j]) / 2 - 0.25
-        sampled = scene._replace(mean=scene.mean - shift).exact(SMOOTH)
-        assert (np.abs(large[j::2, i::2] - sampled) <= bound(scene, 3e-5)).all()
-
-
-@few
-@given(scene=scenes())
-def test_moved_by_whole_pixels(backend, scene):
-    image = render(scene.on(backend), cutoff=SMOOTH).numpy()
-    moved = scene._replace(mean=scene.mean + np.array([3, 2])).on(backend)
-    moved = render(moved, cutoff=SMOOTH).numpy()
-    assert (np.abs(moved[2:, 3:] - image[:-2, :-3]) <= bound(scene, 3e-5)[:-2, :-3]).all()
-
-
-@few
-@given(scene=scenes(), other=scenes(), scale=st.floats(-2, 2, width=32))
-def test_linear_in_colour(backend, scene, other, scale):
-    """The shapes are those of the first scene."""
-    second = scene._replace(color=other.color, background=2 * other.background)
-    both = scene._replace(
-        color=scene.color + scale * second.color,
-        background=scene.background + scale * second.background,
-    )
-    images = [render(s.on(backend)).numpy() for s in (scene, second, both)]
-    limit = bound(scene, 1e-5) + abs(scale) * bound(second, 1e-5)
-    assert (np.abs(images[0] + scale * images[1] - images[2]) <= limit).all()
 
 
 def test_operation_behind_render(backend):

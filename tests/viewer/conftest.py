@@ -37,3 +37,15 @@ def show(window, tmp_path):
         assert tab.errors == []
         own = [url for url in tab.requests if not url.startswith(("file:", "data:", "blob:"))]
         assert own == [], "the page used the network"
+
+
+@pytest.fixture
+def actual(show):
+    """Open a page at one pixel of the screen for one of the image."""
+
+    def actual(page):
+        tab = show(page)
+        tab.page.click("#actual-size")
+        return tab
+
+    return actual

@@ -1,0 +1,138 @@
+"""Fits by blocks that were stopped: no work is lost, and the bits are the same."""
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.mosaics import FEW, arrays_of, assert_same_bits, mosaic
+from _helpers.process import python_path, run_python
+
+
+class Stop(Exception):
+    """The end of a run from outside."""
+
+
+@pytest.mark.parametrize("stage", ["fit", "density"])
+def test_interrupted_run_goes_on(tmp_path, stage):
+    pixels, output = mosaic(128), tmp_path / "a.npz"
+    settings = FEW | {"iterations": 200 if stage == "density" else 20}
+    whole = eg.fit_large(pixels, **settings)
+
+    def stop(done, total, row):
+        if row["stage"] == stage and done >= total / 2:
+            raise Stop
+
+    with pytest.raises(Stop):
+        eg.fit_large(pixels, output, progress=stop, **settings)
+    folder = tmp_path / "a.npz.checkpoint"
+    assert folder.is_dir() and not output.exists()
+    again = eg.fit_large(pixels, output, **settings)
+    assert again.resumed >= 1
+    assert_same_bits(whole, again)
+    assert not folder.exists()
+    saved = eg.Gaussians.load(output, backend="llvm").to_arrays()
+    np.testing.assert_array_equal(saved["mean"], arrays_of(whole)["mean"])
+
+
+def test_a_block_is_kept_before_its_end_is_told(tmp_path):
+    """A callable that raises does not lose the block that has just ended."""
+
+    def stop(done, total, row):
+        if row["stage"] == "fit" and done:
+            raise Stop
+
+    with pytest.raises(Stop):
+        eg.fit_large(mosaic(128), tmp_path / "a.npz", progress=stop, **FEW)
+    assert eg.fit_large(mosaic(128), tmp_path / "a.npz", **FEW).resumed == 1
+
+
+def test_a_folder_keeps_the_last_rounds_alone(tmp_path):
+    """The Gaussians of an image would else lie on the disk once for every round."""
+    kept = []
+
+    def look(done, total, row):
+        if row["stage"] == "measure":
+            kept.extend(path.name for path in (tmp_path / "a.npz.checkpoint").glob("fit*"))
+
+    eg.fit_large(mosaic(128), tmp_path / "a.npz", progress=look, **FEW)
+    assert set(kept) == {f"fit2-{number}.npz" for number in range(4)}
+
+
+def test_blocks_of_an_older_version_are_not_used(tmp_path):
+    """Its blocks were fitted in one go, by other rates, so that their errors are others too."""
+    settings = FEW | {"gaussians": 200, "block": 32, "iterations": 200}
+    output = tmp_path / "a.npz"
+
+    def stop(done, total, row):
+        if row["stage"] == "fit":
+            raise Stop
+
+    with pytest.raises(Stop):
+        eg.fit_large(mosaic(64), output, progress=stop, **settings)
+    folder = tmp_path / "a.npz.checkpoint"
+    for number in range(4):
+        (folder / f"density-{number}.npz").unlink()
+    for name in ("density0", "density3", "fit0", "fit3", "seam3"):
+        (folder / f"{name}.npz").write_bytes(b"an older version")
+    again = eg.fit_large(mosaic(64), output, **settings)
+    assert again.resumed == 0 and not folder.exists()
+
+
+@pytest.mark.parametrize("part", [0.3, 0.6, 0.95])
+def test_a_round_with_a_hole_is_taken_again(tmp_path, part):
+    """In any round, a run goes on from the last one that is complete, with the same bits."""
+    settings = FEW | {"gaussians": 200, "block": 32, "iterations": 32}
+    whole = eg.fit_large(mosaic(64), **settings)
+    output, rows = tmp_path / "a.npz", []
+
+    def stop(done, total, row):
+        if row["stage"] == "fit" and done >= part * total:
+            raise Stop
+
+    with pytest.raises(Stop):
+        eg.fit_large(mosaic(64), output, progress=stop, **settings)
+    for path in (tmp_path / "a.npz.checkpoint").glob("fit?-2.npz"):
+        path.unlink()
+
+    def note(done, total, row):
+        if row["stage"] == "fit":
+            rows.append(done)
+
+    assert_same_bits(whole, eg.fit_large(mosaic(64), output, progress=note, **settings))
+    assert rows == sorted(rows) and rows[-1] == 4 * 32
+
+
+def test_ctrl_c_keeps_finished_blocks(tmp_path):
+    code = f"""
+import os, signal
+import eigengs_dr as eg
+from _helpers.mosaics import mosaic
+def stop(done, total, row):
+    if row["stage"] == "fit" and done >= total / 2:
+        os.kill(os.getpid(), signal.SIGINT)
+try:
+    eg.fit_large(mosaic(128), {str(tmp_path / "a.npz")!r}, progress=stop, **{FEW!r})
+except KeyboardInterrupt:
+    print("stopped")
+"""
+    process = run_python(code, PYTHONPATH=python_path())
+    assert process.stdout == "stopped\n", process.stderr
+    result = eg.fit_large(mosaic(128), tmp_path / "a.npz", **FEW)
+    assert result.resumed >= 1
+    assert_same_bits(result, eg.fit_large(mosaic(128), **FEW))
+
+
+def test_folder_of_another_run_is_refused(tmp_path):
+    pixels, output = mosaic(128), tmp_path / "a.npz"
+
+    def stop(done, total, row):
+        if row["stage"] == "measure":
+            raise Stop
+
+    with pytest.raises(Stop):
+        eg.fit_large(pixels, output, progress=stop, **FEW)
+    with pytest.raises(ValueError, match="with gaussians 700 instead of 701"):
+        eg.fit_large(pixels, output, **FEW | {"gaussians": 701})
+    with pytest.raises(ValueError, match="interrupted run of another image"):
+        eg.fit_large(pixels[::-1], output, **FEW)
+    assert eg.fit_large(pixels, output, **FEW).resumed == 3 * 4  # three rounds of four blocks

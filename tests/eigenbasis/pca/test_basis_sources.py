@@ -1,0 +1,108 @@
+"""The images of an eigenbasis: sources of every kind, bad ones, and interruptions."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from _helpers.errors import one_line
+from _helpers.low_rank import HEIGHT, SIZE, WIDTH, assert_same, family
+from eigengs_dr.eigenbasis.pca import accumulate
+from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
+from eigengs_dr.image.folder import image_files
+from eigengs_dr.image.io import ImageError, save_image
+from eigengs_dr.image.resize import resample
+
+
+def test_every_source_gives_the_same_bits(tmp_path, blocks_of):
+    images = np.rint(family(30).clip(0, 1) * 255).astype(np.uint8)
+    for i, image in enumerate(images):
+        save_image(tmp_path / f"{i:03}.png", image)
+    blocks_of(8)
+    first = Eigenbasis.from_images(images, SIZE, 5)
+    for source in (images, tmp_path, image_files(tmp_path), iter(np.split(images, 10))):
+        assert_same(Eigenbasis.from_images(source, SIZE, 5), first)
+
+
+def test_examples_are_training_images_drawn_with_the_seed(blocks_of):
+    images = family(100)
+    first = Eigenbasis.from_images(images, SIZE, 2, seed=5)
+    assert first.examples.shape == (16, HEIGHT, WIDTH, 3) and first.examples.dtype == np.float32
+    distances = np.abs(first.examples[:, None] - images).max(axis=(2, 3, 4))
+    assert (distances.min(axis=1) < 1e-6).all()
+    assert len(set(distances.argmin(axis=1))) == 16
+    blocks_of(9)
+    np.testing.assert_array_equal(
+        Eigenbasis.from_images(images, SIZE, 2, seed=5).examples, first.examples
+    )
+    assert not np.array_equal(
+        Eigenbasis.from_images(images, SIZE, 2, seed=6).examples, first.examples
+    )
+
+
+def test_interruption_leaves_no_thread(tmp_path):
+    for i, image in enumerate(family(30)):
+        save_image(tmp_path / f"{i}.png", image)
+
+    def interrupt(done, total, row):
+        assert (total, row) == (30, {})
+        if done == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Eigenbasis.from_images(tmp_path, SIZE, 2, progress=interrupt)
+    assert not [t for t in threading.enumerate() if t.name.startswith("decode")]
+
+
+def test_interruption_of_a_merge_leaves_no_thread(tmp_path, monkeypatch, blocks_of):
+    for i, image in enumerate(family(30)):
+        save_image(tmp_path / f"{i}.png", image)
+
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    blocks_of(4)
+    monkeypatch.setattr(accumulate, "merge", interrupted)
+    with pytest.raises(KeyboardInterrupt) as caught:  # its traceback keeps the frames alive
+        Eigenbasis.from_images(tmp_path, SIZE, 2)
+    assert not [t for t in threading.enumerate() if t.name.startswith("decode")]
+    assert caught.type is KeyboardInterrupt
+
+
+def test_mixed_sizes_and_bad_files(tmp_path):
+    for i, image in enumerate(family(8)):
+        save_image(tmp_path / f"{i}.png", image if i else resample(image, 40, 20))
+    (tmp_path / "7.png").write_bytes(b"damaged")
+    with pytest.warns(UserWarning) as caught:
+        basis = Eigenbasis.from_images(tmp_path, SIZE, 3)
+    assert [str(w.message)[:16] for w in caught] == ["1 of 8 images we"] * 2
+    assert basis.count == 7
+    for path in tmp_path.iterdir():
+        path.write_bytes(b"damaged")
+    with pytest.raises(ImageError, match=r"none of 8 images can be read, as 0\.png"):
+        Eigenbasis.from_images(tmp_path, SIZE, 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"components": -1}, "components is -1; expected no negative"),
+        ({"components": (1, 2)}, r"components is \(1, 2\); expected a number, or three"),
+        ({"components": 1.5}, "components is 1.5; expected"),
+        ({"components": "abc"}, "components is 'abc'; expected"),
+        ({"energy": 0}, "energy is 0; expected a share"),
+        ({"energy": 1.5}, "energy is 1.5; expected a share"),
+        ({"energy": float("nan")}, "energy is nan; expected a share"),
+        ({"size": (0, 3)}, "size is 0x3"),
+        ({"color": "linear"}, "'linear' is unknown; use one of"),
+        ({"seed": -1}, "seed is -1; expected"),
+    ],
+)
+def test_bad_arguments_are_refused_before_an_image_is_read(options, complaint):
+    def never():
+        raise AssertionError
+        yield
+
+    with pytest.raises(ValueError, match=complaint) as error:
+        Eigenbasis.from_images(never(), **{"size": SIZE, **options})
+    one_line(error)
