@@ -33,6 +33,7 @@ from ..fitting.redistribute import density_for_error, squared_error
 from ..fitting.refine import is_plateau, trace_steps
 from ..fitting.solvers.conjugate_gradient import solve_batch
 from ..gaussian.gaussians import Gaussians
+from ..gaussian.like import like
 from ..image.color import LIGHT, from_sum, to_picture
 from ..image.metrics import float_space, psnr
 from ..raster.kernels import forward
@@ -215,7 +216,7 @@ def _relocate(
         for k in range(len(values))
     ]
     mean, factor, color = (np.concatenate([m[name] for m in moved]) for name in _OWN)
-    stacked = Gaussians.from_arrays(mean, factor, color, **_like(gaussians))
+    stacked = like(gaussians, mean, factor, color)
     types = types_of(gaussians.mean)
     rows = np.stack([m["background"] for m in moved], axis=1)
     return replace(stacked, background=types.FloatX([upload(types.Float, row) for row in rows]))
@@ -234,17 +235,7 @@ def _cut(arrays: dict[str, NDArray[Any]], k: int, batch: Gaussians) -> Gaussians
     """Return the Gaussians of image k out of the `_arrays` of a batch."""
     count = len(arrays["mean"]) // len(arrays["background"])
     mean, factor, color = (arrays[name][k * count : (k + 1) * count] for name in _OWN)
-    return Gaussians.from_arrays(mean, factor, color, arrays["background"][k], **_like(batch))
-
-
-def _like(gaussians: Gaussians) -> dict[str, Any]:
-    """Return the arguments of `Gaussians.from_arrays` for the images of a batch."""
-    return {
-        "size": (gaussians.width, gaussians.height),
-        "space": gaussians.space,
-        "backend": types_of(gaussians.mean).backend,
-        "cutoff": gaussians.cutoff,
-    }
+    return like(batch, mean, factor, color, arrays["background"][k])
 
 
 def _pictures(gaussians: Gaussians, images: int) -> Images:

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import types_of
 from ..gaussian.concatenate import concatenate
 from ..gaussian.gaussians import Gaussians
+from ..gaussian.like import like
 from ..image.resize import resample
 from .placement.peaks import residual_peaks
 from .redistribute import residual
@@ -95,7 +95,7 @@ def densify(
     mean, size, color = residual_peaks(missed, count - len(gaussians), _spacing(gaussians), weight)
     if not len(mean):
         return gaussians
-    return concatenate([gaussians, _like(gaussians, mean, _round(size), color)])
+    return concatenate([gaussians, like(gaussians, mean, _round(size), color).bounded()])
 
 
 class Part(NamedTuple):
@@ -143,7 +143,8 @@ def relocate(
     value = removal_cost(gaussians, target, weight)[own]
     moved = own[np.argsort(value, kind="stable")[: int(share * len(own))]]
     kept = np.setdiff1d(index, moved)
-    rest = _like(gaussians, **{k: v if k == "background" else v[kept] for k, v in arrays.items()})
+    stay = {k: v if k == "background" else v[kept] for k, v in arrays.items()}
+    rest = like(gaussians, **stay).bounded()
     if weight is None:
         held = None if part is None else arrays["background"]
         rest = solve(rest, target, SOLVE_STEPS, warm_start=True, background=held).gaussians
@@ -160,7 +161,7 @@ def relocate(
         new[name] = np.array(arrays[name])
         new[name][kept], new[name][moved[: len(peaks)]] = found[name], peaks
     new["color"][moved[len(mean) :]] = 0
-    there = _like(gaussians, **new)
+    there = like(gaussians, **new).bounded()
     # The set may be of a class with other bounds.
     values = {name: getattr(there, name) for name in new}
     return replace(gaussians, **values).bounded()
@@ -185,22 +186,6 @@ def _coarse_peaks(
 def _round(size: Array) -> Array:
     """Return the factors (n, 3) of round Gaussians with standard deviations (n,)."""
     return np.stack([1 / size, 0 * size, 1 / size], axis=1)
-
-
-def _like(
-    gaussians: Gaussians, mean: Array, factor: Array, color: Array, background: Array | None = None
-) -> Gaussians:
-    """Return a set of other Gaussians, within their bounds, for the image of a set."""
-    return Gaussians.from_arrays(
-        mean,
-        factor,
-        color,
-        background,
-        size=(gaussians.width, gaussians.height),
-        space=gaussians.space,
-        backend=types_of(gaussians.mean).backend,
-        cutoff=gaussians.cutoff,
-    ).bounded()
 
 
 def _spacing(gaussians: Gaussians) -> float:

@@ -21,8 +21,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import types_of
 from ..gaussian.gaussians import Gaussians
+from ..gaussian.like import like
 from ..image.resize import resample
 from ..image.strips import map_threads, strips
 from ..raster.render import render
@@ -97,15 +97,7 @@ def place_like(
     `eigengs_dr.fitting.placement.adaptive.place_adaptive`.
     """
     mean, factor = place_adaptive(image, count, density=density)
-    placed = Gaussians.from_arrays(
-        mean,
-        factor,
-        np.zeros((count, gaussians.channels), np.float32),
-        size=(gaussians.width, gaussians.height),
-        space=gaussians.space,
-        backend=types_of(gaussians.mean).backend,
-        cutoff=gaussians.cutoff,
-    )
+    placed = like(gaussians, mean, factor, np.zeros((count, gaussians.channels), np.float32))
     return solve(placed.bounded(), target, solve_steps).gaussians
 
 

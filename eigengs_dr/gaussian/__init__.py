@@ -1,7 +1,8 @@
 """The representation: sets of 2D Gaussians.
 
 - ``gaussians``: the set
-- ``concatenate``: joining sets
+- ``bounds``: the bounds of its parameters
+- ``concatenate``: joining sets; ``like``: other Gaussians for the same image
 - ``covariance``: factors, Cholesky factors, logarithms, eigenvalues
 - ``tensors``: sets as tensors
 - ``file``: the .npz file, and what makes a set valid
