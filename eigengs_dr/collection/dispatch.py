@@ -101,9 +101,8 @@ def dispatch(
 
     Parameters
     ----------
-    sources : iterable of Source
-        With their output files.
-    job : Job
+    sources, job
+        See `eigengs_dr.collection.run.run_job`.
     executor : Executor
     start : callable
         ``start(names)`` before images travel to a worker.
