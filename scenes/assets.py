@@ -44,11 +44,7 @@ def fitted(folder, name, image, gaussians, color):
     Path
         The file.
     """
-
-    def fit():
-        return eg.fit(image, gaussians=gaussians, iterations=300, color=color).gaussians
-
-    return _kept(folder / f"{name}.npz", fit)
+    return _kept(folder, name, lambda: eg.fit(image, gaussians, 300, color=color).gaussians)
 
 
 def fitted_material(folder, name, maps, gaussians):
@@ -68,15 +64,12 @@ def fitted_material(folder, name, maps, gaussians):
     Path
         The file.
     """
-
-    def fit():
-        return eg.fit_material(maps, gaussians=gaussians, iterations=300).material
-
-    return _kept(folder / f"{name}.npz", fit)
+    return _kept(folder, name, lambda: eg.fit_material(maps, gaussians, 300).material)
 
 
-def _kept(path, fit):
+def _kept(folder, name, fit):
     """Save what a fit returns, unless the file exists; return the file."""
+    path = folder / f"{name}.npz"
     if not path.exists():
         started = time.perf_counter()
         fit().save(path)
