@@ -128,22 +128,6 @@ def log_shapes(factor: Array) -> NDArray[np.float64]:
     return np.stack([0.5 * size, length * np.cos(angle), length * np.sin(angle)], axis=1)
 
 
-def factors_from_log_shapes(shape: Array) -> NDArray[np.float64]:
-    """Return the factors a, b, c, shape (N, 3), of s, u, v; inverse of `log_shapes`."""
-    s, u, v = np.asarray(shape, np.float64).T
-    length, angle = np.hypot(u, v), np.arctan2(v, u)
-    # F^T F / exp(2 s) = cosh(2 length) + sinh(2 length) [[cos, sin], [sin, -cos]] of the angle.
-    # The form of a below avoids the cancellation of digits in cosh + sinh cos.
-    odd = np.sinh(2 * length)
-    a = np.sqrt(np.exp(-2 * length) + 2 * odd * np.cos(0.5 * angle) ** 2)
-    return np.stack([a, odd * np.sin(angle) / a, 1 / a], axis=1) * np.exp(s)[:, None]
-
-
-def sizes_from_log_shapes(shape: Array) -> NDArray[np.float64]:
-    """Return the sizes ``exp(-s)``, shape (N,): geometric means of the standard deviations."""
-    return np.exp(-np.asarray(shape, np.float64)[:, 0])
-
-
 # ---------------------------------------------------------------------------------------------
 #  The Cholesky factor of the covariance, on Dr.Jit arrays
 # ---------------------------------------------------------------------------------------------

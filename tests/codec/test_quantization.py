@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 
+from _helpers.log_shapes import factors_from_log_shapes
 from _helpers.packed import STEPS
 from _helpers.sets import SIZE, few, scenes
 from eigengs_dr.codec import egs as packed
 from eigengs_dr.codec import quantization as qz
 from eigengs_dr.codec.quantization import MAX_SYMBOL, Steps, precision, quantize
-from eigengs_dr.gaussian.covariance import factors_from_log_shapes, log_shapes
+from eigengs_dr.gaussian.covariance import log_shapes
 
 
 def arrays_of(scene):
