@@ -16,8 +16,6 @@ SAME = 0.05  # dB that do not count as a difference
 
 LEVEL = 41.0  # dB, mean over the maps, at which GTC publishes its bits
 
-Curve = dict[int, dict[str, float]]
-
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
     """Lay out bits and PSNR of each method, and the bytes of shared shapes over separate sets."""
