@@ -140,7 +140,8 @@ def run_phase(
                 fixed = problem.relocate(dr.detach(state.gaussians), schedule.relocate_share)
                 state, stop = start_descent(fixed, schedule), step
             if step == stop:
-                stop, moves = next_build(schedule, step, iterations)
+                end = min((s for s in relocations if s > step), default=part.stop)
+                stop, moves = next_build(schedule, step, iterations, min(end, part.stop))
                 pad, growth = variables.reach(fixed, moves)
                 counts, lists = (*levels, len(fixed)), []  # old lists make room for new ones
                 lists = [

@@ -121,7 +121,9 @@ def relocation_steps(schedule: Schedule, iterations: int) -> set[int]:
     return {round(until * (k + 1) / rounds) for k in range(rounds)}
 
 
-def next_build(schedule: Schedule, step: int, iterations: int) -> tuple[int, dict[str, float]]:
+def next_build(
+    schedule: Schedule, step: int, iterations: int, end: int | None = None
+) -> tuple[int, dict[str, float]]:
     """Return how long the tile lists of a step last, and how far the variables move until then.
 
     Parameters
@@ -129,16 +131,18 @@ def next_build(schedule: Schedule, step: int, iterations: int) -> tuple[int, dic
     schedule : Schedule
     step, iterations : int
         The step that needs lists, and the number of steps of the descent.
+    end : int, optional
+        A step that needs no lists, or other ones; by default `iterations`.
 
     Returns
     -------
     stop : int
-        The step that needs new lists, at most `iterations`.
+        The step that needs new lists, at most `end`.
     moves : dict of str to float
         Sums of the rates of every variable.
     """
     largest, total, stop = max(schedule.rates.values()), 0.0, step
-    while stop < iterations:
+    while stop < (iterations if end is None else end):
         factor = lr_factor(schedule, stop, iterations)
         if stop > step and largest * (total + factor) > schedule.drift:
             break

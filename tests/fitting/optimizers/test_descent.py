@@ -13,8 +13,9 @@ from _helpers.waves import SIDE, default, presets, start
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.initializers import FitProblem
-from eigengs_dr.fitting.optimizers.descent import descend, prefix, rate_table
-from eigengs_dr.fitting.optimizers.schedule import lr_factor, next_build
+from eigengs_dr.fitting.optimizers import descent
+from eigengs_dr.fitting.optimizers.descent import descend, prefix, rate_table, run_phase
+from eigengs_dr.fitting.optimizers.schedule import lr_factor, next_build, relocation_steps
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.fitting.redistribute import residual
 from eigengs_dr.image.color import rgb_to_ycbcr
@@ -149,6 +150,24 @@ def test_lists_last_longer_as_rates_fall():
     length = np.diff(builds)
     assert builds[-1] == 1000
     assert length[1] < 5 < 40 < length[-2]
+
+
+def test_lists_are_for_steps_that_are_taken(backend, monkeypatch):
+    """Neither for steps after a part, nor for those after a relocation, which builds others."""
+    stops = []
+
+    def note(*arguments):
+        found = next_build(*arguments)
+        stops.append(found[0])
+        return found
+
+    monkeypatch.setattr(descent, "next_build", note)
+    gaussians, target = start(backend)
+    problem = FitProblem(gaussians, target, relocate=lambda found, share: found)
+    schedule = default(relocate_every=10)
+    list(run_phase(problem, schedule, 40, part=range(5, 37)))
+    assert stops[-1] == 37
+    assert relocation_steps(schedule, 40) <= set(stops)
 
 
 def test_weights(backend):
