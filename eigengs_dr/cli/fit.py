@@ -9,7 +9,7 @@ import click
 
 from ..backend.selection import select
 from ..fitting.initializers import INITIALIZERS
-from ..fitting.options import DEFAULT_BASIS, FitOptions
+from ..fitting.options import DEFAULT_BASIS, FitOptions, Levels
 from ..fitting.presets import PRESETS
 from ..image.color import SPACES
 from .cluster import open_cluster
@@ -22,6 +22,7 @@ from .memory import announce_memory
 from .options import (
     ANY_PATH,
     ImageSource,
+    LevelCounts,
     backend_option,
     choice,
     cluster_option,
@@ -72,7 +73,11 @@ FAILED = 2
     metavar="SIZE",
     help="Fit by blocks of so many pixels a side.  [default: where memory needs it, of 1024]",
 )
-@click.option("--levels", type=int, metavar="N", help="Levels of detail, each 4 times larger.")
+@click.option(
+    "--levels",
+    type=LevelCounts(),
+    help="Levels of detail, each 4 times larger, or the Gaussians up to each: 5000,7000,9000.",
+)
 @click.option(
     "--iterations",
     type=int,
@@ -117,7 +122,7 @@ def fit(
     output: Path | None,
     maps: tuple[MapFile, ...],
     blocks: int | None,
-    levels: int | None,
+    levels: Levels | None,
     preview: Path | None,
     overwrite: bool,
     cluster: str | None,
@@ -151,6 +156,7 @@ def fit(
       eigengs-dr fit photo.jpg -o photo.npz --gaussians 20000 --report photo.json
       eigengs-dr fit photo.jpg -o photo.npz --target-psnr 38
       eigengs-dr fit photo.jpg -o photo.npz --basis natural --iterations 100
+      eigengs-dr fit photo.jpg -o levels.npz --levels 5000,7000,9000
       eigengs-dr fit photos/ -o fits/ --iterations 300 --report fits.json
       eigengs-dr fit photos/ extra.png -o fits/ --overwrite --preview previews/
       eigengs-dr fit "photos/**/*.jpg" -o fits/ --cluster local:4
@@ -165,7 +171,7 @@ def fit(
 
     options = FitOptions(**settings)
     if levels is not None:
-        check_options(options)
+        options = check_options(options, levels)
     if maps:
         files = (output, preview, report)
         context.exit(run_maps(context, images, maps, files, options, levels, quiet))
@@ -217,7 +223,7 @@ def fit(
     _exit(context, records, options)
 
 
-def _decisive(options: FitOptions, levels: int | None) -> dict[str, Any]:
+def _decisive(options: FitOptions, levels: Levels | None) -> dict[str, Any]:
     """Return the settings for a report."""
     settings = {field.name: getattr(options, field.name) for field in fields(options)}
     del settings["backend"]  # the report names the backend that was used
@@ -255,7 +261,7 @@ def _note_mean(options: FitOptions) -> None:
         say("note: the file holds the Gaussians alone; the mean image stays in the basis")
 
 
-def _fitter(options: FitOptions, levels: int | None) -> Callable[..., "Fit"]:
+def _fitter(options: FitOptions, levels: Levels | None) -> Callable[..., "Fit"]:
     """Return ``run(image, progress)``, which fits one image."""
     from ..fitting.fit import fit_image
     from ..fitting.levels import fit_levels

@@ -13,7 +13,7 @@ from .console import progress_bar, say
 from .memory import needs_blocks
 
 if TYPE_CHECKING:
-    from ..fitting.options import FitOptions
+    from ..fitting.options import FitOptions, Levels
 
 WORDS = {
     "survey": "look at all blocks",
@@ -26,7 +26,7 @@ WORDS = {
 
 
 def check_large(
-    options: FitOptions, levels: int | None, preview: Path | None, several: bool = False
+    options: FitOptions, levels: Levels | None, preview: Path | None, several: bool = False
 ) -> None:
     """Raise ValueError for options that a fit by blocks does not have."""
     if options.preset != "default" or options.initializer != "adaptive":
@@ -43,7 +43,7 @@ def check_large(
 
 
 def block_side(
-    path: Path, several: bool, options: FitOptions, levels: int | None, preview: Path | None
+    path: Path, several: bool, options: FitOptions, levels: Levels | None, preview: Path | None
 ) -> int | None:
     """Return the side of the blocks, if a whole image would take too much memory."""
     if several or not needs_blocks(path, options):

@@ -15,7 +15,7 @@ from .console import images_bar, say
 
 if TYPE_CHECKING:
     from ..collection.row import Finished
-    from ..fitting.options import FitOptions
+    from ..fitting.options import FitOptions, Levels
 
 Record = dict[str, Any]
 
@@ -25,7 +25,7 @@ def fit_several(
     folder: Path,
     previews: list[Path],
     options: FitOptions,
-    levels: int | None,
+    levels: Levels | None,
     overwrite: bool,
     quiet: bool,
     measure: bool,

@@ -17,7 +17,7 @@ from .outputs import check_outputs, name_outputs
 from .report import write_report
 
 if TYPE_CHECKING:
-    from ..fitting.options import FitOptions
+    from ..fitting.options import FitOptions, Levels
     from ..material.fit_material import MaterialFit
 
 Record = dict[str, Any]
@@ -65,7 +65,7 @@ def run_maps(
     maps: tuple[MapFile, ...],
     files: tuple[Path | None, Path | None, Path | None],
     options: FitOptions,
-    levels: int | None,
+    levels: Levels | None,
     quiet: bool,
 ) -> int:
     """Fit a material, write the set, the preview and the report, and return the exit code."""
@@ -130,7 +130,7 @@ def fit_maps(
     preview: Path | None,
     quiet: bool,
     options: FitOptions,
-    levels: int | None,
+    levels: Levels | None,
 ) -> Record:
     """Fit the maps of a material, write its files, and return its figures."""
     import eigengs_dr as eg

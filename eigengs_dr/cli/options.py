@@ -112,6 +112,21 @@ class Counts(click.ParamType):
         return counts if len(counts) > 1 else counts[0]
 
 
+class LevelCounts(click.ParamType):
+    """A number of levels, or the numbers of Gaussians up to each, as in "5000,7000,9000"."""
+
+    name = "N|N,N,..."
+
+    def convert(self, value: Any, param: Any, context: Any) -> int | tuple[int, ...]:
+        """Parse the text of an option as one number or several."""
+        if isinstance(value, int):  # the default
+            return value
+        if not re.fullmatch(r"\d{1,18}(,\d{1,18})*", value):
+            self.fail(f"{value}: expected a number, or several such as 5000,7000,9000", param)
+        counts = tuple(map(int, value.split(",")))
+        return counts if len(counts) > 1 else counts[0]
+
+
 class Region(click.ParamType):
     """Left, top, width and height in pixels, as in "100,50,640,480"."""
 

@@ -5,10 +5,12 @@ from pathlib import Path
 import click
 
 from ..backend.selection import select
+from ..fitting.options import Levels
 from .fit_material import MapFile, MapOption
 from .options import (
     ANY_PATH,
     EXISTING,
+    LevelCounts,
     backend_option,
     describe_run,
     encoding_option,
@@ -48,11 +50,10 @@ Dr.Jit."""
 )
 @click.option(
     "--levels",
-    type=click.IntRange(min=1),
-    metavar="N",
+    type=LevelCounts(),
     default=1,
-    help="Levels of the fit. Readers may stop after any level and have a picture. Without this "
-    "option, the order of the levels is lost.",
+    help="Levels of the fit, as for fit. Readers may stop after any level and have a picture. "
+    "Without this option, the order of the levels is lost.",
 )
 @backend_option
 @report_option
@@ -66,7 +67,7 @@ def pack(
     maps: tuple[MapFile, ...],
     encoding: str | None,
     budget: float,
-    levels: int,
+    levels: Levels,
     backend: str | None,
     report: Path | None,
     quiet: bool,

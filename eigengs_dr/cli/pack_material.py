@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..fitting.options import Levels
 from .fit_material import MapFile, by_name, load_map
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ def pack_maps(
     maps: tuple[MapFile, ...],
     encoding: str | None,
     budget: float,
-    levels: int,
+    levels: Levels,
     backend: str | None,
     quiet: bool,
 ) -> dict[str, Any]:
@@ -31,7 +32,7 @@ def pack_maps(
 
     if image:
         raise ValueError(f"{file}: holds a material; give its images by --map NAME=FILE")
-    if levels > 1:
+    if levels != 1:
         raise ValueError(f"{file}: a material has no levels in .egs files; leave --levels out")
     material = eg.Material.load(file, backend)
     spaces = {m.name: m.space for m in material.maps}

@@ -6,7 +6,15 @@ from typing import Any
 import click
 
 from ..backend.selection import select
-from .options import ANY_PATH, EXISTING, backend_option, encoding_option, quiet_option
+from ..fitting.options import Levels
+from .options import (
+    ANY_PATH,
+    EXISTING,
+    LevelCounts,
+    backend_option,
+    encoding_option,
+    quiet_option,
+)
 from .outputs import check_outputs, name_outputs
 
 SUFFIXES = (".html", ".htm")
@@ -24,9 +32,8 @@ SUFFIXES = (".html", ".htm")
 @click.option("--map", "name", metavar="NAME", help="The map of a material to show.")
 @click.option(
     "--levels",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Levels of the fit.  [default: the sections of an .egs file]",
+    type=LevelCounts(),
+    help="Levels of the fit, as for fit.  [default: the sections of an .egs file]",
 )
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
 @backend_option
@@ -37,7 +44,7 @@ def view(
     image: Path | None,
     encoding: str | None,
     name: str | None,
-    levels: int | None,
+    levels: Levels | None,
     opens: bool,
     backend: str | None,
     quiet: bool,
@@ -79,7 +86,7 @@ def view(
 
 
 def _load(
-    file: Path, name: str | None, levels: int | None, backend: str | None
+    file: Path, name: str | None, levels: Levels | None, backend: str | None
 ) -> tuple[Any, list[int]]:
     """Return the set or the model of a file or a name, and the Gaussians up to each level."""
     from itertools import accumulate

@@ -14,7 +14,7 @@ import numpy as np
 from ..backend.selection import select
 from ..fitting.fit import Fit, fit_image
 from ..fitting.levels import check_options, fit_levels
-from ..fitting.options import DEFAULT_BASIS, FitOptions
+from ..fitting.options import DEFAULT_BASIS, FitOptions, Levels
 from ..fitting.pixels import unit_of
 from ..image.color import rendered_as
 from ..image.metrics import float_space, psnr
@@ -46,7 +46,7 @@ def fit_many(
     output: str | os.PathLike[str] | None = None,
     *,
     overwrite: bool = False,
-    levels: int | None = None,
+    levels: Levels | None = None,
     progress: RowProgress | None = None,
     client: Any = None,
     **options: Any,
@@ -71,8 +71,8 @@ def fit_many(
         Fit images whose output exists. By default such images are skipped, whatever the options of
         the earlier run were: a run that was interrupted continues if it is repeated. A file that
         is no set of Gaussians is never replaced.
-    levels : int, optional
-        Number of levels of detail; see `eigengs_dr.fit_levels`, whose options alone then apply.
+    levels : int or sequence of int, optional
+        Levels of detail; see `eigengs_dr.fit_levels`, whose options alone then apply.
     progress : callable, optional
         ``progress(done, total, row)`` after every image, with its `ImageRow`; `total` is None for
         an iterator. It may raise `KeyboardInterrupt` to end the run.
@@ -131,7 +131,7 @@ def fit_each(
     output: str | os.PathLike[str] | None,
     overwrite: bool,
     options: FitOptions,
-    levels: int | None = None,
+    levels: Levels | None = None,
     step: Step | None = None,
     client: Any = None,
 ) -> tuple[int | None, Generator[Finished, None, None]]:
@@ -141,7 +141,7 @@ def fit_each(
     and its `Fit`, they come in order, and `step` is called. On a cluster they come as they end.
     """
     if levels is not None:
-        check_options(options)
+        options = check_options(options, levels)
     if client is not None and options.initializer == "eigen":
         basis = resolve_name(PACK_BASIS)(options.basis or DEFAULT_BASIS, options.backend)
         options = replace(options, basis=basis)
@@ -150,7 +150,7 @@ def fit_each(
     return run_images(images, output, overwrite, job, client)
 
 
-def fit_work(options: FitOptions, levels: int | None = None, step: Step | None = None) -> Work:
+def fit_work(options: FitOptions, levels: Levels | None = None, step: Step | None = None) -> Work:
     """Return the `Work` of a fit of many images, with the basis loaded.
 
     Raises
@@ -177,7 +177,7 @@ def _is_small(pixels: Pixels) -> bool:
 
 
 def _fit_group(
-    images: list[Pixels], options: FitOptions, levels: int | None, step: Step | None
+    images: list[Pixels], options: FitOptions, levels: Levels | None, step: Step | None
 ) -> Iterator[Outcome]:
     """Fit images of one size, together if they are small."""
 
@@ -206,7 +206,7 @@ def _fit_group(
 
 
 def _fit_one(
-    pixels: Pixels, options: FitOptions, levels: int | None, progress: Callable[..., None]
+    pixels: Pixels, options: FitOptions, levels: Levels | None, progress: Callable[..., None]
 ) -> Fit:
     if levels is None:
         return fit_image(pixels, options, progress)

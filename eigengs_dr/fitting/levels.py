@@ -9,10 +9,11 @@ cost does not work: they depend on each other, and the first quarter does not fo
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 
 import drjit as dr
 import numpy as np
@@ -27,7 +28,7 @@ from .fit import Fit, finish
 from .initializers import FitProblem, FitTarget, make_target
 from .optimizers.descent import descend
 from .optimizers.schedule import Schedule
-from .options import FitOptions
+from .options import FitOptions, Levels
 from .pixels import in_unit, read_pixels, unit_of
 from .placement_initializer import start_from_placement
 from .redistribute import place_like, residual
@@ -41,32 +42,37 @@ STEPS_PER_LEVEL = 50
 """Refinement steps between the placements of two levels."""
 
 
-def level_counts(count: int, levels: int) -> list[int]:
+def level_counts(count: int, levels: Levels) -> list[int]:
     """Return the number of Gaussians up to each level.
 
     Parameters
     ----------
     count : int
         Number of Gaussians of the whole set.
-    levels : int
-        Number of levels, with the whole set.
+    levels : int or sequence of int
+        Number of levels, with the whole set: each level has `LEVEL_RATIO` times as many Gaussians
+        as the one before. Or the number of Gaussians up to each level; the last is `count`.
 
     Returns
     -------
     list of int
-        In ascending order; each level has `LEVEL_RATIO` times as many as the one before, and the
-        last has `count`.
+        In ascending order; the last is `count`.
 
     Raises
     ------
     ValueError
-        If the first level would have no Gaussian, or levels is not positive.
+        If the first level would have no Gaussian, levels is not positive, or numbers of Gaussians
+        do not rise up to `count`.
 
     Examples
     --------
     >>> level_counts(5000, 4)
     [78, 312, 1250, 5000]
+    >>> level_counts(9000, [5000, 7000, 9000])
+    [5000, 7000, 9000]
     """
+    if not isinstance(levels, (int, np.integer)):
+        return _check_counts(count, levels)
     most = 1
     while count >= LEVEL_RATIO**most:
         most += 1
@@ -75,19 +81,40 @@ def level_counts(count: int, levels: int) -> list[int]:
     return [count // LEVEL_RATIO**k for k in reversed(range(levels))]
 
 
-def check_options(options: FitOptions) -> None:
-    """Raise ValueError if the options of a fit exclude levels of detail."""
+def _check_counts(count: int | None, levels: Sequence[int]) -> list[int]:
+    """Return numbers of Gaussians that rise up to `count`, if that is known."""
+    counts, written = list(levels), ", ".join(map(str, levels))
+    if not all(isinstance(n, (int, np.integer)) for n in counts):
+        raise ValueError(f"levels {written}: numbers of Gaussians must be whole")
+    if not counts or not all(a < b for a, b in pairwise([0, *counts])):
+        raise ValueError(f"levels {written}: numbers of Gaussians must rise, from 1 or more")
+    if count is not None and counts[-1] != count:
+        raise ValueError(f"levels {written}: the last must be the number of Gaussians, {count}")
+    return [int(n) for n in counts]
+
+
+def check_options(options: FitOptions, levels: Levels) -> FitOptions:
+    """Return the options of a fit in levels; numbers of Gaussians say how many there are in all.
+
+    Raises
+    ------
+    ValueError
+        If the options exclude levels, or contradict them.
+    """
     if options.target_psnr is not None:
         raise ValueError("levels and target_psnr exclude each other; give one of them")
     if options.preset != "default" or options.initializer != "adaptive":
         raise ValueError("levels needs preset 'default' and init 'adaptive'; leave the others out")
+    if isinstance(levels, (int, np.integer)):
+        return options
+    return replace(options, gaussians=_check_counts(options.gaussians, levels)[-1])
 
 
 @exclusive()
 def fit_levels(
     image: ArrayLike,
     gaussians: int | None = None,
-    levels: int = 4,
+    levels: Levels = 4,
     iterations: int = 1000,
     color: str = "ycbcr",
     seed: int = 0,
@@ -95,17 +122,20 @@ def fit_levels(
     progress: FitProgress | None = None,
     encoding: str | None = None,
 ) -> Fit:
-    """Fit nested sets: the first quarter of the Gaussians forms the image too, and so on.
+    """Fit nested sets: the first Gaussians form the image too, for several numbers of them.
 
     Parameters
     ----------
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
         See `eigengs_dr.fit`.
     gaussians : int, optional
-        Number of Gaussians; by default 5000, or one per pixel for smaller images.
-    levels : int, optional
-        Number of levels, with the whole set; `level_counts` returns their sizes. Inside a level,
-        Gaussians with a larger removal cost come first, so that every prefix forms an image.
+        Number of Gaussians; by default the last of `levels`, or 5000, or one per pixel for smaller
+        images.
+    levels : int or sequence of int, optional
+        The number of Gaussians up to each level, such as ``[5000, 7000, 9000]``; or the number of
+        levels, of which each has 4 times as many Gaussians as the one before: `level_counts`
+        returns how many. Inside a level, Gaussians with a larger removal cost come first, so that
+        every prefix forms an image.
     iterations : int, optional
         Largest number of refinement steps of the whole set.
     color : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, optional
@@ -142,6 +172,7 @@ def fit_levels(
         backend=backend,
         encoding=encoding,
     )
+    options = check_options(options, levels)
     pixels, options = read_pixels(image, options)
     options.check_image(pixels)
     unit = unit_of(pixels, options.color)
@@ -157,7 +188,7 @@ def fit_levels(
 def refine_levels(
     target: FitTarget,
     options: FitOptions,
-    levels: int,
+    levels: Levels,
     score: Score,
     progress: FitProgress | None = None,
     interrupted: Callable[[], bool] = lambda: False,
@@ -168,8 +199,8 @@ def refine_levels(
     ----------
     target : FitTarget
     options : FitOptions
-        Options that `check_options` accepts.
-    levels : int
+        Options that `check_options` returns.
+    levels : int or sequence of int
         See `fit_levels`.
     score, progress, interrupted : callable
         See `eigengs_dr.fitting.refine.refine`.

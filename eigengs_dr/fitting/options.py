@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -31,6 +32,9 @@ PIXELS_PER_FIRST_GAUSSIAN = 64
 
 COLOR_PARAMETERS = 5
 """Parameters of a Gaussian without its colour: two of the mean and three of the factor."""
+
+Levels = int | Sequence[int]
+"""A number of levels of detail, or the number of Gaussians up to each level in ascending order."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from ..backend.recording import exclusive
 from ..fitting.fit import FitInterrupted
 from ..fitting.initializers import FitTarget
 from ..fitting.levels import check_options, refine_levels
-from ..fitting.options import FitOptions
+from ..fitting.options import FitOptions, Levels
 from ..fitting.placement_initializer import start_from_placement
 from ..fitting.redistribute import residual
 from ..fitting.refine import FitProgress, Refinement, Score, refine
@@ -71,7 +71,7 @@ def fit_material(
     target_psnr: float | Mapping[str, float] | None = None,
     target_space: str = "ycbcr",
     max_gaussians: int | None = None,
-    levels: int | None = None,
+    levels: Levels | None = None,
     backend: str | None = None,
     progress: FitProgress | None = None,
     cutoff: float = CUTOFF,
@@ -104,8 +104,8 @@ def fit_material(
     max_gaussians : int, optional
         Largest number of Gaussians for `target_psnr`; by default as many as have as many parameters
         as the maps have numbers.
-    levels : int, optional
-        Number of levels of detail, see `eigengs_dr.fit_levels`.
+    levels : int or sequence of int, optional
+        Levels of detail, see `eigengs_dr.fit_levels`.
     backend : {"llvm", "cuda"}, optional
         By default "cuda" if there is a GPU.
     progress : callable, optional
@@ -152,7 +152,7 @@ def fit_material(
     )
     factors = _factors(images, weights or {})
     if levels is not None:
-        check_options(options)
+        options = check_options(options, levels)
     options.check_image(_shape_of(images))
     with defer_interrupts() as interrupted:
         factors = [f * w for f, w in zip(factors, _balance(images, goals, options), strict=True)]
@@ -172,7 +172,7 @@ def fit_material(
 def _run(
     target: FitTarget,
     options: FitOptions,
-    levels: int | None,
+    levels: Levels | None,
     score: Score,
     progress: FitProgress | None,
     interrupted: Callable[[], bool],

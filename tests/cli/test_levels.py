@@ -33,6 +33,33 @@ def test_commands(image, tmp_path):
     expected = picture_of(eg.Gaussians.load(fitted)[:16]).clip(0, 1)
     assert np.abs(eg.load_image(out) - expected).max() < 0.003
 
+
+def test_numbers_of_gaussians(image, tmp_path):
+    photo, fitted, small, page = (tmp_path / f"a.{end}" for end in ("png", "npz", "egs", "html"))
+    eg.save_image(photo, image)
+    base = ["fit", photo, "-o", fitted, "--iterations", 5, "--quiet"]
+    report = tmp_path / "r.json"
+    assert run(*base, "--levels", "16,40,64", "--report", report).exit_code == 0
+    assert json.loads(report.read_text())["levels"] == [16, 40, 64]
+    assert run("pack", fitted, "-o", small, "--levels", "16,40,64", "--quiet").exit_code == 0
+    assert json.loads(run("info", small, "--json").stdout)["sections"] == [16, 24, 24]
+    assert run("view", fitted, "-o", page, "--levels", "16,40,64").exit_code == 0
+    assert '"levels": [16, 40, 64]' in page.read_text()
+    for command in (
+        [*base, "--gaussians", 65, "--levels", "16,40,64"],
+        ["pack", fitted, "-o", small, "--levels", "16,40"],
+        ["view", fitted, "-o", page, "--levels", "40,16,64"],
+        [*base, "--levels", "16;40"],
+    ):
+        refused = run(*command)
+        assert refused.exit_code == 2
+        assert "16" in refused.stderr.splitlines()[-1]
+
+
+def test_options_that_levels_exclude(image, tmp_path):
+    photo = tmp_path / "a.png"
+    eg.save_image(photo, image)
+    base = ["fit", photo, "-o", tmp_path / "a.npz", "--quiet"]
     count = ["--gaussians", 64]
     for extra in (["--target-psnr", 30], [*count, "--init", "grid"], [*count, "--levels", 9]):
         refused = run(*base, "--levels", 2, *extra)

@@ -38,6 +38,37 @@ def test_counts(count, levels, expected):
     assert level_counts(count, levels) == expected
 
 
+def test_numbers_of_gaussians_are_counts():
+    assert level_counts(9000, (5000, np.int64(7000), 9000)) == [5000, 7000, 9000]
+
+
+@pytest.mark.parametrize(
+    ("levels", "message"),
+    [
+        ([5, 5, 9], "levels 5, 5, 9: numbers of Gaussians must rise"),
+        ([0, 9], "must rise, from 1 or more"),
+        ([], "must rise, from 1 or more"),
+        ([4.5, 9], "levels 4.5, 9: numbers of Gaussians must be whole"),
+        ([5, 8], "levels 5, 8: the last must be the number of Gaussians, 9"),
+    ],
+)
+def test_bad_numbers_of_gaussians_are_refused(image, levels, message):
+    for call in (lambda: level_counts(9, levels), lambda: fit_levels(image, 9, levels)):
+        with pytest.raises(ValueError, match=message) as caught:
+            call()
+        assert "\n" not in str(caught.value)
+
+
+def test_every_number_asked_makes_the_image(image):
+    """Numbers that are close together cost little: each prefix is near a fit of its own."""
+    counts = [150, 200, 256]
+    gaussians = fit_levels(image, levels=counts, iterations=150).gaussians
+    assert len(gaussians) == 256
+    for count in counts:
+        own = reached(eg.fit(image, count, iterations=150).gaussians, image)
+        assert reached(gaussians[:count], image) > own - 2
+
+
 @pytest.mark.parametrize(("count", "levels"), [(3, 2), (5, 0), (63, 4), (9, 10**9)])
 def test_too_many_levels_are_refused(count, levels):
     with pytest.raises(ValueError, match=f"levels is {levels}; {count} Gaussians make 1 to"):

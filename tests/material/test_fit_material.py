@@ -80,6 +80,11 @@ def test_goals_of_maps_are_met_by_few():
     assert len(easier.material.gaussians) < len(result.material.gaussians)
 
 
+def test_numbers_of_gaussians_are_levels():
+    result = eg.fit_material(images(), iterations=2, levels=[30, 70])
+    assert len(result.material.gaussians) == 70
+
+
 def test_levels_are_materials_too():
     result = eg.fit_material(images(), 160, iterations=40, levels=2)
     level = result.material.first(40)
