@@ -114,7 +114,7 @@ def inverse(
 @click.argument("image", type=EXISTING, required=False)
 @output_option
 @count_option("--gaussians", 5000)
-@count_option("--levels", 4)
+@click.option("--levels", type=options.LevelCounts(), default=4, show_default=True)
 @count_option("--iterations", 1000)
 @options.seed_option
 @backend_option

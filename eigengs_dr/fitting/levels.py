@@ -2,8 +2,9 @@
 
 Placement adds one level after the other, with more Gaussians where the residual of the earlier
 levels has larger second derivatives. Refinement then moves all levels together and minimises the
-sum of the logarithms of their squared errors. Sorting the Gaussians of a plain fit by their removal
-cost does not work: they depend on each other, and the first quarter does not form an image.
+sum of the logarithms of their squared errors. In its first half, Gaussians of little use relocate
+inside of their levels. Sorting the Gaussians of a plain fit by their removal cost does not work:
+they depend on each other, and the first quarter does not form an image.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
 from ..gaussian.concatenate import concatenate
 from ..gaussian.gaussians import Gaussians
-from .density_control import removal_cost
+from .density_control import relocate_levels, removal_cost
 from .fit import Fit, finish
 from .initializers import FitProblem, FitTarget, make_target
 from .optimizers.descent import descend
@@ -216,12 +217,13 @@ def refine_levels(
     counts = level_counts(options.count_for(target.values), levels)
     schedule = options.method.schedule
     start = start_from_placement(target, replace(options, gaussians=counts[0]))
-    start = start._replace(redistribute=None, relocate=None)  # the levels keep their Gaussians
+    start = start._replace(redistribute=None, relocate=None)
     steps = min(STEPS_PER_LEVEL, options.iterations)
     placed = _place_levels(start, counts, schedule, steps, interrupted)
+    moves = partial(relocate_levels, counts=counts, target=start.target, weight=start.weight)
     seconds_init = time.perf_counter() - started
     refined = refine(
-        start._replace(gaussians=placed),
+        start._replace(gaussians=placed, relocate=moves),
         target.pixels,
         schedule,
         options.iterations,

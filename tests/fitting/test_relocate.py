@@ -1,13 +1,14 @@
 """Gaussians that move in the course of a descent."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 import eigengs_dr as eg
 from _helpers.halves import SIDE, fitted, picture, squared_error
-from eigengs_dr.fitting.density_control import Part, relocate, removal_cost
+from eigengs_dr.fitting.density_control import Part, relocate, relocate_levels, removal_cost
 from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.optimizers.descent import descend
 from eigengs_dr.fitting.optimizers.schedule import relocation_steps
@@ -49,6 +50,20 @@ def test_a_gaussian_moves_to_the_error():
     away = np.linalg.norm(moved.to_arrays()["mean"] - at[1], axis=1)
     assert away.min() < 1
     assert squared_error(moved, target) < 0.2 * squared_error(before, target)
+
+
+@pytest.mark.parametrize("counts", [[20, 60], [20, 35, 60]])
+def test_levels_relocate_inside_themselves(counts):
+    """A quarter of each level, at most, before the same background; colours are not solved for."""
+    start, target = fitted()
+    before = start.gaussians.to_arrays()
+    found = relocate_levels(start.gaussians, 0.25, counts, target).to_arrays()
+    moved = (found["mean"] != before["mean"]).any(axis=1)
+    for low, high in pairwise([0, *counts]):
+        assert 0 < moved[low:high].sum() <= (high - low) // 4
+    kept = ~moved & found["color"].any(axis=1)  # the others found no place
+    np.testing.assert_array_equal(found["color"][kept], before["color"][kept])
+    np.testing.assert_array_equal(found["background"], before["background"])
 
 
 def test_a_part_moves_inside_itself():

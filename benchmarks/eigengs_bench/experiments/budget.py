@@ -95,7 +95,7 @@ def _fit(task: Task, image: Image, count: int, rearranged: bool) -> Row:
 
     def start() -> FitProblem:
         begun = initialize(image, options)
-        return begun if rearranged else begun._replace(redistribute=None)
+        return begun if rearranged else begun._replace(redistribute=None, relocate=None)
 
     warm_up(start, options.method.schedule, task.iterations)
     (moment,) = follow(start, options.method.schedule, task.iterations, (task.iterations,))

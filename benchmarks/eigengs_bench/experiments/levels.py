@@ -1,5 +1,7 @@
 """What levels of detail are worth: PSNR over how many Gaussians of a set are drawn."""
 
+import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ from eigengs_bench.harness.timing import Image
 from eigengs_dr.fitting.density_control import removal_cost
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.levels import fit_levels, level_counts
+from eigengs_dr.fitting.options import Levels
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import picture_of
@@ -19,7 +22,11 @@ SAMPLE, SIDE = "coffee", 256
 
 
 def run(
-    image: Image, gaussians: int, levels: int, progress: Progress = lambda *_: None, **settings: Any
+    image: Image,
+    gaussians: int,
+    levels: Levels,
+    progress: Progress = lambda *_: None,
+    **settings: Any,
 ) -> pd.DataFrame:
     """Fit an image in levels, and by fits of single numbers; see `fit` for the settings.
 
@@ -28,7 +35,8 @@ def run(
     ones of a fit without levels.
     """
     ends = level_counts(gaussians, levels)
-    counts = sorted({*ends, *(2 * end for end in ends[:-1])})
+    between = (round(math.sqrt(low * high)) for low, high in pairwise(ends))
+    counts = sorted({*ends, *between})
     progress("fits", 0, len(counts) + 1)
     nested = fit_levels(image, gaussians, levels, **settings).gaussians
     alone = {}
