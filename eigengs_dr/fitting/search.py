@@ -79,9 +79,9 @@ def search_count(
         placed = _estimate(run, most, tries)
         if run.best.missing > 0 or len(run.best.gaussians) > 1:
             trial = _fit_estimate(run, placed, most, fit)
-            # If the iterations are few, the tries have used them up; polish all the same.
+            # If the iterations are few, or two fits have used them up, polish all the same.
             longest = round(policy.max_length * iterations)
-            most_steps = max(longest, run.step + policy.max_polishes * polish)
+            most_steps = max(longest, run.step + policy.sure_polishes * polish)
             _polish(run, trial, most, polish, most_steps)
         pressed = interrupted()
     except KeyboardInterrupt:
