@@ -179,8 +179,8 @@ def relocate_levels(
     """Move the Gaussians of least use in each level to where the image up to it has most error.
 
     With 850, 1,190 and 1,530 Gaussians on 256x256 pixels of a training photo, these levels gain
-    0.36, 0.62 and 0.75 dB. Solves for the colours of the first level, and a placement of it by its
-    error, gain nothing more.
+    0.36, 0.62 and 0.75 dB in 1,000 steps. Solves for the colours of the first level, and a
+    placement of it by its error, gain nothing more.
 
     Parameters
     ----------

@@ -70,13 +70,14 @@ def test_every_number_asked_makes_the_image(image):
         assert reached(gaussians[:count], image) > own - 1
 
 
-def test_every_level_gains_by_relocation(image, monkeypatch):
-    counts = [150, 200, 256]
-    found = fit_levels(image, levels=counts, iterations=250).gaussians
+def test_every_level_gains_by_relocation(monkeypatch):
+    """Of few Gaussians, whose first places are poor: each level gains a decibel here."""
+    image, counts = eg.sample("coffee")[200:264, 300:364], [100, 140, 180]
+    found = fit_levels(image, levels=counts, iterations=300).gaussians
     monkeypatch.setattr(levels_module, "relocate_levels", lambda gaussians, *_, **__: gaussians)
-    left = fit_levels(image, levels=counts, iterations=250).gaussians
+    left = fit_levels(image, levels=counts, iterations=300).gaussians
     for count in counts:
-        assert reached(found[:count], image) > reached(left[:count], image) + 0.1
+        assert reached(found[:count], image) > reached(left[:count], image) + 0.3
 
 
 @pytest.mark.parametrize(("count", "levels"), [(3, 2), (5, 0), (63, 4), (9, 10**9)])
