@@ -55,13 +55,14 @@ def test_a_fit_that_has_failed_reaches_nothing():
 
 
 def test_placing_anew_makes_a_difference(backend, tmp_path):
-    """After 200 steps; the state before has none of it."""
+    """And moving Gaussians, after 200 steps; the state before has none of it."""
     image, method = one_image(), PRESETS["default"]
     task = task_in(tmp_path, backend, iterations=200)
     once, anew = (budget._fit(task, image, 60, again) for again in (False, True))
     start = initialize(image, FitOptions(gaussians=60, backend=backend))
-    for row, rearrange in ((once, None), (anew, start.redistribute)):
-        *_, last = descend(start._replace(redistribute=rearrange), method.schedule, 200)
+    placed_once = start._replace(redistribute=None, relocate=None)
+    for row, problem in ((once, placed_once), (anew, start)):
+        *_, last = descend(problem, method.schedule, 200)
         assert row["iteration"] == 200
         assert row["psnr_ycbcr"] == psnr(picture_of(last), image, "ycbcr")
     assert once["psnr_ycbcr"] != anew["psnr_ycbcr"]

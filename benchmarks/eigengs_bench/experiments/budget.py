@@ -1,5 +1,6 @@
 """The fewest Gaussians for a PSNR: of fits of fixed numbers, and of the search.
 
+Fits that are not "rearranged" keep the first places: they neither redistribute nor relocate.
 The job of a fit has "gaussians" and "rearranged", and its row the figures of `score`. The job of a
 search has "target", and its row gaussians, stopped, iterations, seconds, psnr_ycbcr and psnr_rgb.
 """
