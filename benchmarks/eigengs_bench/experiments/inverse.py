@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -15,7 +15,6 @@ from eigengs_bench.experiments.inverse_scene import (
     CONDITIONS,
     METHODS,
     Condition,
-    Representation,
     head_on,
     photograph,
     scene_of,
@@ -78,12 +77,12 @@ def run(
         photos, texture = photograph(CONDITIONS[name], square)
         truth = head_on(texture, *size)
         traces = {}
-        for method, represent in METHODS.items():
+        for method, stages in METHODS.items():
             tell = partial(progress, f"{name}, {method}")
             # Once for the kernels, which are compiled and kept, and once for the figures.
-            recover(CONDITIONS[name], photos, represent(model, file), truth, 2)
-            unknown = represent(model, file)
-            traces[method] = recover(CONDITIONS[name], photos, unknown, truth, steps, tell)
+            recover(CONDITIONS[name], photos, stages(model, file, 2), truth, 2)
+            found = stages(model, file, steps)
+            traces[method] = recover(CONDITIONS[name], photos, found, truth, steps, tell)
         results[name] = Result(photos.numpy(), truth, traces)
     return results
 
@@ -91,28 +90,22 @@ def run(
 def recover(
     condition: Condition,
     photos: Any,
-    unknown: Representation,
+    stages: Iterable[tuple[Any, int]],
     truth: Image,
     steps: int,
     progress: Callable[..., None] = lambda *_: None,
 ) -> Trace:
-    """Recover a poster: descent by Adam on squared errors of the rendering."""
-    trace, measuring, started = Trace(), 0.0, time.perf_counter()
-    scene = scene_of(condition, unknown.texture)
-    parameters = mi.traverse(scene)
-    optimizers = [mi.ad.Adam(g.rates, g.start, **g.adam) for g in unknown.groups]
+    """Run the stages of a method: descent by Adam on squared errors of the rendering.
 
-    def put() -> dict[str, Any]:
-        values = {key: value for optimizer in optimizers for key, value in optimizer.items()}
-        unknown.put(values, parameters)
-        parameters.update()
-        return values
+    A stage is a representation and the step at which it ends; the next one starts from it.
+    """
+    trace, step, measuring, started = Trace(), 0, 0.0, time.perf_counter()
 
-    def measure(step: int) -> None:
+    def measure(texture: Any) -> None:
         nonlocal measuring
         dr.sync_thread()
         now = time.perf_counter()
-        picture = head_on(unknown.texture, truth.shape[1], truth.shape[0])
+        picture = head_on(texture, truth.shape[1], truth.shape[0])
         trace.steps.append(step)
         trace.seconds.append(now - started - measuring)
         for space, values in (("ycbcr", trace.psnr_ycbcr), ("rgb", trace.psnr_rgb)):
@@ -121,23 +114,30 @@ def recover(
             trace.pictures[step] = picture
         measuring += time.perf_counter() - now
 
-    values = put()
-    measure(0)
-    for step in range(steps):
-        share = 0.5 + 0.5 * math.cos(math.pi * step / steps)
-        falling = LAST_RATE + (1 - LAST_RATE) * share
-        for group, optimizer in zip(unknown.groups, optimizers, strict=True):
-            optimizer.set_learning_rate({key: r * falling for key, r in group.rates.items()})
-        shown = mi.render(scene, params=parameters, spp=SAMPLES, seed=step)
-        error = dr.sum(dr.square(shown - photos), axis=None)
-        dr.backward(error + unknown.prior(values, dr.width(photos)))
-        for group, optimizer in zip(unknown.groups, optimizers, strict=True):
-            optimizer.step()
-            group.bound(optimizer)
-        values = put()
-        if step + 1 in marks(steps):
-            measure(step + 1)
-        progress(step + 1, steps, {"psnr_rgb": trace.psnr_rgb[-1]})
+    for unknown, last in stages:
+        first, scene = step, scene_of(condition, unknown.texture)
+        parameters = mi.traverse(scene)
+        begin = {key: parameters[key] for key in unknown.rates}
+        values = mi.ad.Adam(unknown.rates, begin, **unknown.adam)
+        unknown.put(values, parameters)
+        parameters.update()
+        if not step:
+            measure(unknown.texture)
+        while step < last:
+            share = 0.5 + 0.5 * math.cos(math.pi * (step - first) / (last - first))
+            falling = LAST_RATE + (1 - LAST_RATE) * share
+            values.set_learning_rate({key: r * falling for key, r in unknown.rates.items()})
+            shown = mi.render(scene, params=parameters, spp=SAMPLES, seed=step)
+            error = dr.sum(dr.square(shown - photos), axis=None)
+            dr.backward(error + unknown.prior(values, dr.width(photos)))
+            values.step()
+            unknown.bound(values)
+            unknown.put(values, parameters)
+            parameters.update()
+            step += 1
+            if step in marks(steps):
+                measure(unknown.texture)
+            progress(step, steps, {"psnr_rgb": trace.psnr_rgb[-1]})
     return trace
 
 

@@ -1,6 +1,6 @@
 """A poster on a wall under a lamp, photos of it, and representations of it to recover."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.gaussians import Gaussians
-from eigengs_dr.gaussian.tensors import to_tensors
 from eigengs_dr.image.color import rgb_to_ycbcr, to_coded, to_linear
 from eigengs_dr.plugins import keep_in_bounds, texture_of
-from eigengs_dr.plugins.parameters import FromModel
 
 DEPTH = 3  # longest path: from the lamp to the poster at once, or over the floor
 SUBPIXELS = 2  # lookups along a side of a pixel of the recovered poster
@@ -123,44 +121,32 @@ SPLAT_RATES = {"mean": 0.2, "factor": 0.03, "color": 0.01, "background": 0.005}
 # Standard deviations of the first component a step, for the largest gradient.
 COEFFICIENTS = f"{POSTER}.coefficients"
 COEFFICIENT_RATE = 0.4
-# Variance, of the variance of the first component, below which components move less and less: the
-# first ones say most of hidden parts.
+# Variance, of the variance of the first component, below which components move less and less: few
+# steps find what the first ones say of hidden parts, and the Gaussians do the rest.
 DAMPING = 0.05
 PRIOR = 1e-5  # weight of ``sum a^2 / lambda`` against the mean squared error of the photos
-PULL = 0.5  # weight of the squared changes of colours that the coefficients do not make
-
-Values = dict[str, Any]
-
-
-class Group(NamedTuple):
-    """Values by name that one optimiser changes, with their rates and its settings.
-
-    ``bound(values)`` brings values inside bounds after a step.
-    """
-
-    start: Values
-    rates: dict[str, float]
-    adam: dict[str, Any]
-    bound: Callable[[Any], None] = lambda values: None
-
-
-def put_all(values: Values, parameters: Any) -> None:
-    """Write values into the parameters of the same names."""
-    for key, value in values.items():
-        parameters[key] = value
+PULL = 0.5  # weight of the squared distance of colours from the first stage
+FIRST_STAGE = 0.04  # share of the steps that the coefficients get before all Gaussians are freed
 
 
 class Representation(NamedTuple):
-    """A texture, and groups of values that describe it.
+    """A texture, and rates of its optimised parameters by their names in the scene.
 
-    ``put(values, parameters)`` writes the values into the scene; gradients flow back to them.
-    ``prior(values, count)`` adds to the sum of squared errors of `count` numbers.
+    Parameters are the values, times `scale` if there is one. ``prior(values, count)`` adds to the
+    sum of squared errors of `count` numbers; ``bound(values)`` brings values inside bounds.
     """
 
     texture: Any
-    groups: tuple[Group, ...]
-    put: Callable[[Values, Any], None] = put_all
-    prior: Callable[[Values, int], Any] = lambda values, count: 0
+    rates: dict[str, float]
+    adam: dict[str, Any]
+    prior: Callable[[Any, int], Any] = lambda values, count: 0
+    bound: Callable[[Any], None] = lambda values: None
+    scale: Any = None
+
+    def put(self, values: Any, parameters: Any) -> None:
+        """Write the values into the scene; gradients flow back to them."""
+        for key in self.rates:
+            parameters[key] = values[key] if self.scale is None else values[key] * self.scale
 
 
 def texels(side: int) -> Representation:
@@ -171,93 +157,71 @@ def texels(side: int) -> Representation:
         values[key] = dr.clip(values[key], 0, 1)
 
     texture = bitmap(np.full((side, side, 3), linear, np.float32))
-    start = {key: mi.traverse(texture)["data"]}
     # Steps in proportion to gradients (Nicolet et al. 2021): else noise moves unseen texels.
-    return Representation(
-        texture, (Group(start, {key: TEXEL_RATES[side]}, {"uniform": True}, bound),)
-    )
+    return Representation(texture, {key: TEXEL_RATES[side]}, {"uniform": True}, bound=bound)
 
 
-def splats(model: EigenGS) -> Representation:
-    """Describe it by all parameters of the Gaussians of a model, from grey."""
-    shapes = model.gaussians.to_arrays()
-    mean, factor, color = (shapes[key] for key in ("mean", "factor", "color"))
-    grey, size = rgb_to_ycbcr(np.full(3, GREY)), (model.gaussians.width, model.gaussians.height)
-    start = Gaussians.from_arrays(mean, factor, np.zeros_like(color), grey, size=size)
-    group = _group_of_splats(start, to_tensors(start))
-    return Representation(mi.load_dict(texture_of(start)), (group,))
+def splats(gaussians: Gaussians, pull: float = 0.0) -> Representation:
+    """Describe it by all parameters of Gaussians; colours are pulled to where they start."""
+    start = mi.TensorXf(gaussians.to_arrays()["color"])
 
+    def prior(values: Any, count: int) -> Any:
+        return pull * dr.sum(dr.square(values[f"{POSTER}.color"] - start), axis=None)
 
-def coefficients(model: EigenGS, file: Any) -> Representation:
-    """Describe it by coefficients, in standard deviations of the first, from the mean image."""
-    scale, prior = statistics(model)
+    def bound(values: Any) -> None:
+        keep_in_bounds(values, POSTER, gaussians)
 
-    def put(values: Values, parameters: Any) -> None:
-        parameters[COEFFICIENTS] = values[COEFFICIENTS] * scale
-
-    texture = mi.load_dict({"type": "gaussian_texture", "model": str(file)})
-    return Representation(texture, (_group_of_coefficients(scale),), put, prior)
-
-
-def both(model: EigenGS) -> Representation:
-    """Describe it by coefficients, and by Gaussians whose colours differ from what these say."""
-    scale, prior = statistics(model)
-    source, own = FromModel(model), to_tensors(model.gaussians)
-    start = own | {name: dr.zeros(mi.TensorXf, own[name].shape) for name in ("color", "background")}
-    color = f"{POSTER}.color"
-
-    def put(values: Values, parameters: Any) -> None:
-        source.coefficients = values[COEFFICIENTS] * scale
-        told = to_tensors(source.gaussians())
-        for name in ("mean", "factor"):
-            parameters[f"{POSTER}.{name}"] = values[f"{POSTER}.{name}"]
-        for name in ("color", "background"):
-            parameters[f"{POSTER}.{name}"] = told[name] + values[f"{POSTER}.{name}"]
-
-    def pulled(values: Values, count: int) -> Any:
-        return prior(values, count) + PULL * dr.sum(dr.square(values[color]), axis=None)
-
-    groups = _group_of_coefficients(scale), _group_of_splats(model.gaussians, start)
-    return Representation(mi.load_dict(texture_of(model.gaussians)), groups, put, pulled)
-
-
-def _group_of_splats(like: Gaussians, start: dict[str, Any]) -> Group:
     rates = {f"{POSTER}.{name}": rate for name, rate in SPLAT_RATES.items()}
     # A rate for each; gradients below epsilon do not count, as a blurred photo has little detail.
     adam = {"beta_2": 0.99, "epsilon": 0.01}
-    values = {f"{POSTER}.{name}": start[name] for name in SPLAT_RATES}
-    return Group(values, rates, adam, lambda values: keep_in_bounds(values, POSTER, like))
+    return Representation(mi.load_dict(texture_of(gaussians)), rates, adam, prior, bound)
 
 
-def _group_of_coefficients(scale: Any) -> Group:
-    # Components are orthonormal: one rate fits all, and the usual momentum of 0.9 overshoots.
-    adam, start = {"beta_1": 0.5, "uniform": True}, dr.zeros(mi.TensorXf, scale.shape)
-    return Group({COEFFICIENTS: start}, {COEFFICIENTS: COEFFICIENT_RATE}, adam)
+def coefficients(model: EigenGS, file: Any) -> Representation:
+    """Describe it by coefficients, in standard deviations of the first, from the mean image.
 
-
-def statistics(model: EigenGS) -> tuple[Any, Callable[[Values, int], Any]]:
-    """Return scales of coefficients, and their prior: minus the logarithm of their normal density.
-
-    The density is that of the PCA, up to a factor, with damped variances.
+    The prior is minus the logarithm of their normal density by the PCA, up to a factor.
     """
     variances = np.zeros((len(model.components), max(model.components)))
-    for row, known in zip(variances, model.eigenvalues, strict=True):
-        row[: len(known)] = known
+    for row, values in zip(variances, model.eigenvalues, strict=True):
+        row[: len(values)] = values
     largest = variances.max()
     damped = variances + DAMPING * largest
-    precisions = mi.TensorXf(largest / damped)
+    scale, precisions = np.sqrt(largest * variances / damped), mi.TensorXf(largest / damped)
 
-    def prior(values: Values, count: int) -> Any:
+    def prior(values: Any, count: int) -> Any:
         return PRIOR * count * dr.sum(precisions * dr.square(values[COEFFICIENTS]), axis=None)
 
-    return mi.TensorXf(np.sqrt(largest * variances / damped)), prior
+    texture = mi.load_dict({"type": "gaussian_texture", "model": str(file)})
+    # Components are orthonormal: one rate fits all, and the usual momentum of 0.9 overshoots.
+    adam, rates = {"beta_1": 0.5, "uniform": True}, {COEFFICIENTS: COEFFICIENT_RATE}
+    return Representation(texture, rates, adam, prior, scale=mi.TensorXf(scale))
 
 
-# How to recover a poster, from a model and its file.
-METHODS: dict[str, Callable[[EigenGS, Any], Representation]] = {
-    "texels1024": lambda model, file: texels(1024),
-    "texels256": lambda model, file: texels(256),
-    "gaussians": lambda model, file: splats(model),
-    "coefficients": coefficients,
-    "both": lambda model, file: both(model),
+# Representations, and the step at which each ends.
+Stages = Iterator[tuple[Representation, int]]
+
+
+def _splats(model: EigenGS, file: Any, steps: int) -> Stages:
+    shapes = model.gaussians.to_arrays()
+    mean, factor, color = (shapes[key] for key in ("mean", "factor", "color"))
+    grey, size = rgb_to_ycbcr(np.full(3, GREY)), (model.gaussians.width, model.gaussians.height)
+    yield splats(Gaussians.from_arrays(mean, factor, np.zeros_like(color), grey, size=size)), steps
+
+
+def _both(model: EigenGS, file: Any, steps: int) -> Stages:
+    first = coefficients(model, file)
+    yield first, max(1, round(FIRST_STAGE * steps))
+    rows = dr.detach(mi.traverse(first.texture)["coefficients"]).numpy()
+    found = model.reconstruct(tuple(r[:k] for r, k in zip(rows, model.components, strict=True)))
+    yield splats(found, PULL), steps
+
+
+# How to recover a poster, from a model, its file and the number of steps.
+METHODS: dict[str, Callable[[EigenGS, Any, int], Stages]] = {
+    "texels1024": lambda model, file, steps: iter([(texels(1024), steps)]),
+    "texels256": lambda model, file, steps: iter([(texels(256), steps)]),
+    "gaussians": _splats,
+    "coefficients": lambda model, file, steps: iter([(coefficients(model, file), steps)]),
+    "both": _both,
 }

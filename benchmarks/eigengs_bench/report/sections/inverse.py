@@ -14,7 +14,7 @@ TITLES = {
     "texels256": "256 x 256 texels",
     "gaussians": "Gaussians from grey",
     "coefficients": "coefficients",
-    "both": "coefficients and Gaussians",
+    "both": "coefficients, then Gaussians",
 }
 
 SIDE, GAP = 96, 4  # side of a picture in a strip, and white pixels between two, in pixels
