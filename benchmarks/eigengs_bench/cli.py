@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from eigengs_bench.cli_single import eigen, inverse, kernels, levels, radiance, texture
+from eigengs_bench.cli_single import eigen, inverse, kernels, levels, prefilter, radiance, texture
 from eigengs_bench.harness.store import Task
 from eigengs_bench.names import (
     FIGURES,
@@ -266,5 +266,5 @@ def report(folder: Path, output: Path, quiet: bool) -> None:
         click.echo(f"wrote {output / 'index.html'} and {output / 'README.md'}")
 
 
-for command in (kernels, eigen, texture, inverse, levels, radiance):
+for command in (kernels, eigen, texture, prefilter, inverse, levels, radiance):
     bench.add_command(command)

@@ -53,6 +53,28 @@ def texture(show: Any, variant: str) -> Any:
 
 
 @click.command()
+@click.argument("images", nargs=-1, type=click.Path(exists=True), metavar="[IMAGE...]")
+@prints_figures
+def prefilter(show: Any, images: tuple[str, ...]) -> Any:
+    """Compare the prefilter of the texture with mip maps, by means over round and long pixels.
+
+    An IMAGE is a square whose side is a power of two; by default textures of scikit-image.
+    """
+    try:
+        from eigengs_bench.experiments.prefilter import TEXTURES, run
+    except ImportError as error:
+        raise ValueError(f"bench prefilter: {error}; pip install 'eigengs-dr[plugins]'") from error
+    from eigengs_bench.report.frames import as_text
+    from eigengs_bench.report.sections.prefilter import psnr_table
+    from eigengs_dr.image.io import load_image
+    from eigengs_dr.image.samples import sample
+
+    squares = {path: load_image(path) for path in images}
+    rows = run(squares or {name: sample(name) for name in TEXTURES}, show)
+    return {"results": rows}, as_text(psnr_table(rows))
+
+
+@click.command()
 @count_option("--gaussians", 20_000)
 @count_option("--iterations", 1000)
 @click.option("--picture", type=ANY_PATH, metavar="P.jpg", help="The fits at two exposures.")

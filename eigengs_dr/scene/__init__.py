@@ -2,6 +2,7 @@
 
 - ``visibility``: pixels to texels; ``rays``: from the cameras to the texture
 - ``back_projection``: the smoothest texture that looks alike
+- ``target``: the texture to fit, and the weights of its errors
 - ``fit_scene``: the fewest Gaussians for a scene
 - ``bitmaps``: the bitmaps of a scene, and which of them must stay
 - ``convert``: a scene with Gaussians in the place of its bitmaps

@@ -1,7 +1,7 @@
 """The function `fit_for_scene`, which finds the fewest Gaussians for the cameras of a scene.
 
 The target of the fit is not the image but a smoother texture that looks the same to the cameras
-(`eigengs_dr.scene.back_projection`). A search then finds the smallest number of Gaussians with
+(`eigengs_dr.scene.target`). A search then finds the smallest number of Gaussians with
 which every camera sees the texture at a given PSNR.
 """
 
@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
+from scipy.ndimage import distance_transform_edt, zoom
 
 from ..backend.recording import exclusive
-from ..fitting.initializers import FitProblem, dark_weight
+from ..fitting.initializers import FitProblem
 from ..fitting.optimizers.descent import descend
 from ..fitting.placement.adaptive import place_adaptive
 from ..fitting.presets import PRESETS
@@ -31,18 +31,11 @@ from ..image.metrics import psnr as psnr_of
 from ..image.pixels import check_data, check_image
 from ..plugins.cone import PIXEL
 from ..raster.render import render
-from .back_projection import back_project, extrapolate
+from .target import MARGIN, error_weights, seen_by, smoothest_target
 from .visibility import Visibility, visibility
 
 COLORS = ("linear", "data")
 """Names of the spaces of textures: linear light, or data."""
-
-BLURS = (0.4, 0.25, 0.15, 0.1)
-"""Standard deviations in pixels of the blur of the back-projection. `fit_for_scene` takes the first
-one that leaves `MARGIN`."""
-
-MARGIN = 6.0
-"""Decibels between the PSNR of the target and the PSNR that its Gaussians must reach."""
 
 PIXELS = 4
 """Pixels per Gaussian at the start of the search."""
@@ -56,9 +49,6 @@ interpolated bilinearly, as bitmaps are; else no sample would show the Gaussians
 
 FINER = 3
 """Factor of the enlargement; odd, so that the centres of texels stay samples."""
-
-EVEN = 2.0
-"""Standard deviation in texels of the blur of the weights, because rays hit texels unevenly."""
 
 Image = NDArray[np.float32]
 
@@ -161,15 +151,15 @@ def fit_for_scene(
         values = zoom(values, (times, times, 1), order=1, mode="nearest", grid_mode=True)
         fine = visibility(scene, texture, times * width, times * height, wrap_mode)
     values, fine, corner = _crop_to_seen(values, fine)
-    goal = [_seen_by(values, rows, color) for rows in fine.pixel_to_texel]
+    goal = [seen_by(values, rows, color) for rows in fine.pixel_to_texel]
 
     def seen(candidate: Image) -> tuple[float, ...]:
         space = "rgb" if color == "linear" else "data"
-        pictures = (_seen_by(candidate, rows, color) for rows in fine.pixel_to_texel)
+        pictures = (seen_by(candidate, rows, color) for rows in fine.pixel_to_texel)
         return tuple(psnr_of(a, b, space) for a, b in zip(pictures, goal, strict=True))
 
-    target = _target(values, fine, lambda t: min(seen(t)) >= psnr + MARGIN)
-    weight = _weights(fine, target, color)
+    target = smoothest_target(values, fine, lambda t: min(seen(t)) >= psnr + MARGIN)
+    weight = error_weights(fine, target, color)
 
     def attempt(count: int) -> tuple[Gaussians, tuple[float, ...]]:
         gaussians = _fit(target, weight, fine.seen, count, iterations, color)
@@ -197,33 +187,6 @@ def _move(gaussians: Gaussians, corner: tuple[int, int], width: int, height: int
     """Shift a set to a corner (column, row) of a larger image."""
     mean = gaussians.mean + type(gaussians.mean)(*corner)
     return replace(gaussians, mean=mean, width=width, height=height)
-
-
-# --- The target ----------------------------------------------------------------------------------
-
-
-def _seen_by(texels: Image, rows: Any, color: str) -> NDArray[Any]:
-    """Return what the pixels of a camera see of a texture, shape (n, 1, C)."""
-    looks = rows @ texels.clip(0, 1).reshape(-1, texels.shape[2])
-    return (to_coded(looks) if color == "linear" else looks)[:, None]
-
-
-def _target(values: Image, found: Visibility, is_close: Callable[[Image], bool]) -> Image:
-    """Find the target of the fit: the smoothest texture that is close enough, or else the image."""
-    whole = extrapolate(values, found.seen)
-    for share in BLURS:
-        target = back_project(whole, found, share / PIXEL)
-        if is_close(target):
-            return target
-    return whole
-
-
-def _weights(found: Visibility, target: Image, color: str) -> Image:
-    """Return factors of the errors: the square root of each texel's share of the pixels."""
-    share = gaussian_filter(found.pixels, EVEN) * found.seen
-    weight = np.sqrt(share / share.max())[..., None]
-    light = dark_weight(target) if color == "linear" else np.ones_like(target)
-    return (weight * light).astype(np.float32)
 
 
 # --- The number ----------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from _helpers.poster import NAME, albedo, bitmap, blocks, board, camera, photo, 
 from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.plugins import texture_of
 from eigengs_dr.scene import fit_scene as scenefit
+from eigengs_dr.scene.target import BLURS, error_weights, smoothest_target
 from eigengs_dr.scene.visibility import Visibility
 
 pytestmark = pytest.mark.mitsuba
@@ -30,13 +31,13 @@ class TestTarget:
             asked.append(target)
             return len(asked) > after
 
-        assert scenefit._target(image, found, lambda t: is_close(t, 1)) is asked[1]
+        assert smoothest_target(image, found, lambda t: is_close(t, 1)) is asked[1]
         assert len(asked) == 2
         np.testing.assert_array_equal(
-            scenefit._target(image, found, lambda t: is_close(t, np.inf)), image
+            smoothest_target(image, found, lambda t: is_close(t, np.inf)), image
         )
         bends = [np.square(laplace(t.mean(axis=2))).sum() for t in asked[2:]]
-        assert len(bends) == len(scenefit.BLURS) and bends == sorted(bends)
+        assert len(bends) == len(BLURS) and bends == sorted(bends)
 
     def test_errors_count_by_the_root_of_the_pixels(self):
         times, side = np.array([1, 4]), 40
@@ -47,7 +48,7 @@ class TestTarget:
         footprint = np.full((side, side), 0.4, np.float32)
         footprint[30:] = np.inf
         grey = np.full((side, side, 3), 0.5, np.float32)
-        weight = scenefit._weights(Visibility(footprint, [rows]), grey, "data")
+        weight = error_weights(Visibility(footprint, [rows]), grey, "data")
         assert (weight[30:] == 0).all() and weight.shape == grey.shape
         np.testing.assert_allclose(weight[10, 35] / weight[10, 5], 2, rtol=1e-3)
 
