@@ -3,13 +3,7 @@
 A fit works on the window of the block, with all Gaussians whose means lie in it; those that only
 touch it are fixed. It moves them all, but returns those of the block alone: those of neighbours
 stand in for what the neighbours do at the same time. Between rounds of steps every block sees what
-the others have reached, see `eigengs_dr.blocks.rounds`. PSNR in YCbCr, in dB, of the 16 pixels
-around borders and elsewhere (1,024x1,024 pixels in blocks of 256, one Gaussian for 20 pixels):
-
-| method | 200 steps | 1,000 steps |
-|---|---|---|
-| rounds | 46.18, 45.61 | 48.53, 47.69 |
-| a fit of the whole | 46.34, 45.94 | 48.64, 48.17 |
+the others have reached, see `eigengs_dr.blocks.rounds`.
 
 In one round, with stand-ins to the end, no block would see what its neighbours draw, and seams
 would stay along the borders. Blocks that wait for the results of their neighbours would fit to
