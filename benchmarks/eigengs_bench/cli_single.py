@@ -136,7 +136,7 @@ def inverse(
 @click.argument("image", type=EXISTING, required=False)
 @output_option
 @count_option("--gaussians", 5000)
-@click.option("--levels", type=options.LevelCounts(), default=4, show_default=True)
+@click.option("--levels", type=options.LEVEL_COUNTS, default=4, show_default=True)
 @count_option("--iterations", 1000)
 @options.seed_option
 @backend_option

@@ -21,8 +21,8 @@ from .fit_one import fit_one
 from .memory import announce_memory
 from .options import (
     ANY_PATH,
+    LEVEL_COUNTS,
     ImageSource,
-    LevelCounts,
     backend_option,
     choice,
     cluster_option,
@@ -75,7 +75,7 @@ FAILED = 2
 )
 @click.option(
     "--levels",
-    type=LevelCounts(),
+    type=LEVEL_COUNTS,
     help="Levels of detail, each 4 times larger, or the Gaussians up to each: 5000,7000,9000.",
 )
 @click.option(

@@ -97,34 +97,29 @@ class ImageSource(click.Path):
         return Path(value) if pattern else super().convert(value, param, context)
 
 
-class Counts(click.ParamType):
-    """One number for all channels, or three with commas, as in "230,60,60"."""
+class Numbers(click.ParamType):
+    """One number, or several with commas, whose text matches a pattern."""
 
-    name = "K"
-
-    def convert(self, value: Any, param: Any, context: Any) -> int | tuple[int, ...]:
-        """Parse the text of an option as one number or three."""
-        if isinstance(value, int):  # the default
-            return value
-        if not re.fullmatch(r"\d+(,\d+,\d+)?", value) or not any(map(int, value.split(","))):
-            self.fail(f"{value}: expected a number above 0, or three such as 230,60,60", param)
-        counts = tuple(map(int, value.split(",")))
-        return counts if len(counts) > 1 else counts[0]
-
-
-class LevelCounts(click.ParamType):
-    """A number of levels, or the numbers of Gaussians up to each, as in "5000,7000,9000"."""
-
-    name = "N|N,N,..."
+    def __init__(self, name: str, pattern: str, expected: str) -> None:
+        self.name, self._pattern, self._expected = name, pattern, expected
 
     def convert(self, value: Any, param: Any, context: Any) -> int | tuple[int, ...]:
         """Parse the text of an option as one number or several."""
         if isinstance(value, int):  # the default
             return value
-        if not re.fullmatch(r"\d{1,18}(,\d{1,18})*", value):
-            self.fail(f"{value}: expected a number, or several such as 5000,7000,9000", param)
-        counts = tuple(map(int, value.split(",")))
-        return counts if len(counts) > 1 else counts[0]
+        if not re.fullmatch(self._pattern, value):
+            self.fail(f"{value}: expected {self._expected}", param)
+        numbers = tuple(map(int, value.split(",")))
+        return numbers if len(numbers) > 1 else numbers[0]
+
+
+COUNTS = Numbers("K", r"(?=.*[1-9])\d+(,\d+,\d+)?", "a number above 0, or three such as 230,60,60")
+"""One number for all channels, or three."""
+
+LEVEL_COUNTS = Numbers(
+    "N|N,N,...", r"\d{1,18}(,\d{1,18})*", "a number, or several such as 5000,7000,9000"
+)
+"""A number of levels, or the numbers of Gaussians up to each."""
 
 
 class Region(click.ParamType):

@@ -10,7 +10,7 @@ from .fit_material import MapFile, MapOption
 from .options import (
     ANY_PATH,
     EXISTING,
-    LevelCounts,
+    LEVEL_COUNTS,
     backend_option,
     describe_run,
     encoding_option,
@@ -50,7 +50,7 @@ Dr.Jit."""
 )
 @click.option(
     "--levels",
-    type=LevelCounts(),
+    type=LEVEL_COUNTS,
     default=1,
     help="Levels of the fit, as for fit. Readers may stop after any level and have a picture. "
     "Without this option, the order of the levels is lost.",

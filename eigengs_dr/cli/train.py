@@ -10,8 +10,8 @@ from .cluster import open_cluster
 from .console import INTERRUPTED, progress_bar, say
 from .options import (
     ANY_PATH,
+    COUNTS,
     FOLDER,
-    Counts,
     Size,
     backend_option,
     choice,
@@ -45,7 +45,7 @@ MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
 )
 @click.option(
     "--components",
-    type=Counts(),
+    type=COUNTS,
     default=300,
     show_default=True,
     help="Limit, or one per channel.",

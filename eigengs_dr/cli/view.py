@@ -10,7 +10,7 @@ from ..fitting.options import Levels
 from .options import (
     ANY_PATH,
     EXISTING,
-    LevelCounts,
+    LEVEL_COUNTS,
     backend_option,
     encoding_option,
     quiet_option,
@@ -32,7 +32,7 @@ SUFFIXES = (".html", ".htm")
 @click.option("--map", "name", metavar="NAME", help="The map of a material to show.")
 @click.option(
     "--levels",
-    type=LevelCounts(),
+    type=LEVEL_COUNTS,
     help="Levels of the fit, as for fit.  [default: the sections of an .egs file]",
 )
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
