@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from ..fitting.optimizers.schedule import Schedule, relocation_steps
+from ..fitting.optimizers.schedule import Schedule, relocations
 
 SHORT_ROUNDS, LAST_ROUNDS = 3, 5
 """Rounds of a descent without relocation, and rounds after the last relocation. More rounds lose
@@ -23,7 +23,7 @@ def rounds(schedule: Schedule, iterations: int) -> list[range]:
     >>> rounds(Schedule("adam", {"color": 0.01}), 30)
     [range(0, 10), range(10, 20), range(20, 30)]
     """
-    cuts = [0, *sorted(relocation_steps(schedule, iterations))]
+    cuts = [0, *relocations(schedule, iterations)]
     number, last = LAST_ROUNDS if cuts[1:] else SHORT_ROUNDS, cuts.pop()
     number = max(1, min(number, iterations - last))
     cuts += [last + k * (iterations - last) // number for k in range(number + 1)]

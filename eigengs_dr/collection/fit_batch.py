@@ -26,7 +26,7 @@ from ..fitting.density_control import relocate
 from ..fitting.fit import Fit
 from ..fitting.initializers import PLACEMENTS, FitProblem, FitTarget, Placement, make_target
 from ..fitting.optimizers.descent import descend
-from ..fitting.optimizers.schedule import Schedule
+from ..fitting.optimizers.schedule import Relocation, Schedule
 from ..fitting.options import FitOptions
 from ..fitting.placement.adaptive import place_adaptive
 from ..fitting.redistribute import density_for_error, squared_error
@@ -206,13 +206,13 @@ def _redistribute(
 
 
 def _relocate(
-    gaussians: Gaussians, share: float, *, values: Images, weight: Images | None
+    gaussians: Gaussians, how: Relocation, *, values: Images, weight: Images | None
 ) -> Gaussians:
     """Relocate the Gaussians of every image, as `eigengs_dr.fitting.density_control` does."""
     weights = [None] * len(values) if weight is None else list(weight)
     arrays = _arrays(gaussians)
     moved = [
-        relocate(_cut(arrays, k, gaussians), share, values[k], weights[k]).to_arrays()
+        relocate(_cut(arrays, k, gaussians), how, values[k], weights[k]).to_arrays()
         for k in range(len(values))
     ]
     mean, factor, color = (np.concatenate([m[name] for m in moved]) for name in _OWN)

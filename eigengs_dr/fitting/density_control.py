@@ -15,6 +15,8 @@ from ..gaussian.concatenate import concatenate
 from ..gaussian.gaussians import Gaussians
 from ..gaussian.like import like
 from ..image.resize import resample
+from .optimizers.schedule import Relocation
+from .perturbation import perturb
 from .placement.peaks import residual_peaks
 from .redistribute import residual
 from .solvers.conjugate_gradient import solve
@@ -54,9 +56,13 @@ def removal_cost(
     ndarray of float64, shape (N,)
         Negative if the set would be better without the Gaussian.
     """
-    counts = np.ones_like(target) if weight is None else np.square(weight).astype(np.float32)
-    missed = residual(gaussians, target) * counts
-    along = inner_products(gaussians, missed)
+    return _removal_cost(gaussians, residual(gaussians, target), weight)
+
+
+def _removal_cost(gaussians: Gaussians, missed: Array, weight: Array | None) -> Array:
+    """Return the removal costs of a set with a known residual."""
+    counts = np.ones_like(missed) if weight is None else np.square(weight).astype(np.float32)
+    along = inner_products(gaussians, missed * counts)
     own = inner_products(gaussians, counts, squared=True)
     color = gaussians.to_arrays()["color"].astype(np.float64)
     return (color * (color * own + 2 * along)).sum(axis=1)
@@ -117,20 +123,20 @@ class Part(NamedTuple):
 
 def relocate(
     gaussians: Gaussians,
-    share: float,
+    how: Relocation,
     target: NDArray[np.float32],
     weight: Array | None = None,
     part: Part | None = None,
 ) -> Gaussians:
-    """Move the Gaussians of least use to where they reduce the error most.
+    """Move the Gaussians of least use to where they reduce the error most, and perturb all.
 
     Without them, the colours of the others are solved for, see `prune`; then round Gaussians at the
-    peaks of the error take their places in the order. For the other parameters see `removal_cost`.
+    peaks of the error take their places in the order. For the other parameters see `removal_cost`,
+    for the perturbation see `eigengs_dr.fitting.perturbation.perturb`.
 
     Parameters
     ----------
-    share : float
-        Share of the Gaussians that move, in [0, 1].
+    how : Relocation
     part : Part, optional
         The Gaussians that may move, and where. The background then stays.
 
@@ -142,8 +148,10 @@ def relocate(
     """
     index, arrays = np.arange(len(gaussians)), gaussians.to_arrays()
     own = index if part is None else index[part.own]
-    value = removal_cost(gaussians, target, weight)[own]
-    moved = own[np.argsort(value, kind="stable")[: int(share * len(own))]]
+    missed = residual(gaussians, target)
+    error = _squares(missed, part) / len(own)
+    value = _removal_cost(gaussians, missed, weight)[own]
+    moved = own[np.argsort(value, kind="stable")[: int(how.share * len(own))]]
     kept = np.setdiff1d(index, moved)
     stay = {k: v if k == "background" else v[kept] for k, v in arrays.items()}
     rest = like(gaussians, **stay).bounded()
@@ -163,6 +171,8 @@ def relocate(
         new[name] = np.array(arrays[name])
         new[name][kept], new[name][moved[: len(peaks)]] = found[name], peaks
     new["color"][moved[len(mean) :]] = 0
+    if how.noise:
+        perturb(new, own, error, how.noise, how.seed)
     there = like(gaussians, **new).bounded()
     # The set may be of a class with other bounds.
     values = {name: getattr(there, name) for name in new}
@@ -171,7 +181,7 @@ def relocate(
 
 def relocate_levels(
     gaussians: Gaussians,
-    share: float,
+    how: Relocation,
     counts: Sequence[int],
     target: NDArray[np.float32],
     weight: Array | None = None,
@@ -186,8 +196,8 @@ def relocate_levels(
     ----------
     gaussians, target, weight
         See `relocate`.
-    share : float
-        Share of the Gaussians of a level that move, in [0, 1].
+    how : Relocation
+        Its share is that of the Gaussians of a level.
     counts : sequence of int
         Numbers of Gaussians up to each level, from `level_counts`.
 
@@ -201,7 +211,7 @@ def relocate_levels(
     everywhere = slice(None), slice(None)
     for before, count in pairwise([0, *counts]):
         part = Part(slice(before, count), everywhere)
-        parts = [relocate(gaussians[:count], share, target, weight, part)]
+        parts = [relocate(gaussians[:count], how, target, weight, part)]
         if count < len(gaussians):  # the background is one for all levels
             later = gaussians[count:]
             parts.append(replace(later, background=0 * later.background))
@@ -223,6 +233,12 @@ def _coarse_peaks(
     assert small[0] is not None
     mean, deviation, color = residual_peaks(small[0], count, spacing / math.sqrt(x * y), small[1])
     return mean * (x, y), deviation * math.sqrt(x * y), color
+
+
+def _squares(missed: Array, part: Part | None) -> float:
+    """Return the sum of the squares of a residual, in double precision without a copy."""
+    inside = missed if part is None else missed[part.core]
+    return float(np.einsum("ijk,ijk->", inside, inside, dtype=np.float64))
 
 
 def _round(size: Array) -> Array:

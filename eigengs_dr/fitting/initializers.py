@@ -19,6 +19,7 @@ from ..image.strips import by_strips
 
 if TYPE_CHECKING:
     from ..gaussian.gaussians import Gaussians
+    from .optimizers.schedule import Relocation
     from .options import FitOptions
 
 PLACEMENTS = {
@@ -95,8 +96,10 @@ class FitProblem(NamedTuple):
         ``redistribute(gaussians, count)`` returns a new set with more Gaussians where the old set
         left more error. None for initialisers other than "adaptive".
     relocate : callable, or None
-        ``relocate(gaussians, share)`` returns as many Gaussians, of which a share has moved to
-        where the old set left most error. None where Gaussians must keep their places.
+        ``relocate(gaussians, how)`` returns as many Gaussians, of which some have moved to where
+        the old set left most error, and all are perturbed; `how` is an
+        `eigengs_dr.fitting.optimizers.schedule.Relocation`. None where Gaussians must keep their
+        places.
     """
 
     gaussians: Gaussians
@@ -104,7 +107,7 @@ class FitProblem(NamedTuple):
     weight: NDArray[np.float32] | None = None
     base_image: NDArray[np.float32] | None = None
     redistribute: Callable[[Gaussians, int], Gaussians] | None = None
-    relocate: Callable[[Gaussians, float], Gaussians] | None = None
+    relocate: Callable[[Gaussians, Relocation], Gaussians] | None = None
 
 
 class Initializer(Protocol):

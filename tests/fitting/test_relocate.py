@@ -11,7 +11,7 @@ from _helpers.halves import SIDE, fitted, picture, squared_error
 from eigengs_dr.fitting.density_control import Part, relocate, relocate_levels, removal_cost
 from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.optimizers.descent import descend
-from eigengs_dr.fitting.optimizers.schedule import relocation_steps
+from eigengs_dr.fitting.optimizers.schedule import Relocation, relocations
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.presets import PRESETS
 
@@ -25,7 +25,7 @@ def test_the_least_useful_move_and_the_others_stay(weighted):
     least = np.argsort(removal_cost(start.gaussians, target, weight), kind="stable")[:12]
     kept = np.setdiff1d(np.arange(60), least)
     before = start.gaussians.to_arrays()
-    found = relocate(start.gaussians, 0.2, target, weight).to_arrays()
+    found = relocate(start.gaussians, Relocation(0.2), target, weight).to_arrays()
     for name in ("mean", "factor"):
         np.testing.assert_array_equal(found[name][kept], before[name][kept])
     assert (found["mean"][least] != before["mean"][least]).any(axis=1).sum() >= 6
@@ -46,7 +46,7 @@ def test_a_gaussian_moves_to_the_error():
         space="data",
         backend="llvm",
     )
-    moved = relocate(before, 1 / 40, target)
+    moved = relocate(before, Relocation(1 / 40), target)
     away = np.linalg.norm(moved.to_arrays()["mean"] - at[1], axis=1)
     assert away.min() < 1
     assert squared_error(moved, target) < 0.2 * squared_error(before, target)
@@ -57,7 +57,7 @@ def test_levels_relocate_inside_themselves(counts):
     """A quarter of each level, at most, before the same background; colours are not solved for."""
     start, target = fitted()
     before = start.gaussians.to_arrays()
-    found = relocate_levels(start.gaussians, 0.25, counts, target).to_arrays()
+    found = relocate_levels(start.gaussians, Relocation(0.25), counts, target).to_arrays()
     moved = (found["mean"] != before["mean"]).any(axis=1)
     for low, high in pairwise([0, *counts]):
         assert 0 < moved[low:high].sum() <= (high - low) // 4
@@ -70,7 +70,7 @@ def test_a_part_moves_inside_itself():
     """Only its own Gaussians, only to its own pixels, before the same background."""
     start, target = fitted()
     before, part = start.gaussians.to_arrays(), Part(slice(20, 50), (slice(0, 16), slice(8, 32)))
-    found = relocate(start.gaussians, 0.5, target, part=part).to_arrays()
+    found = relocate(start.gaussians, Relocation(0.5), target, part=part).to_arrays()
     moved = np.flatnonzero((found["mean"] != before["mean"]).any(axis=1))
     assert 0 < len(moved) <= 15
     assert moved.min() >= 20 and moved.max() < 50
@@ -83,28 +83,33 @@ def test_a_perfect_set_stays_perfect():
     """Without places for them, Gaussians stay where they are, with the colour 0."""
     flat = np.full((SIDE, SIDE, 3), 0.25, np.float32)
     start = initialize(flat, FitOptions(gaussians=40, init="adaptive"))
-    moved = relocate(start.gaussians, 0.5, start.target)
+    moved = relocate(start.gaussians, Relocation(0.5), start.target)
     assert len(moved) == 40
     assert squared_error(moved, start.target) <= squared_error(start.gaussians, start.target) + 1e-6
 
 
 def test_rounds_are_spread_over_the_first_half():
     schedule = replace(SCHEDULE, relocate_every=45)
-    assert relocation_steps(schedule, 100) == set()
-    assert relocation_steps(schedule, 180) == {45, 90}
-    steps = sorted(relocation_steps(schedule, 980))
-    assert steps == [49 * k for k in range(1, 11)]
-    assert max(relocation_steps(schedule, 100_000)) == 50_000
-    assert relocation_steps(replace(schedule, relocate_every=0), 1000) == set()
+    assert relocations(schedule, 100) == {}
+    assert list(relocations(schedule, 180)) == [45, 90]
+    assert list(relocations(schedule, 980)) == [49 * k for k in range(1, 11)]
+    assert list(relocations(schedule, 100_000))[-1] == 50_000
+    assert relocations(replace(schedule, relocate_every=0), 1000) == {}
+
+
+def test_noise_falls_and_seeds_differ():
+    rounds = list(relocations(replace(SCHEDULE, relocate_every=45, noise=3.0), 980).values())
+    np.testing.assert_allclose([move.noise for move in rounds], 3 * np.linspace(1, 0.1, 10))
+    assert len({move.seed for move in rounds}) == 10
 
 
 def test_a_descent_relocates_and_goes_on():
     start = initialize(picture(), FitOptions(gaussians=60, init="adaptive"))
     calls = []
 
-    def move(gaussians, share):
-        calls.append(share)
-        return start.relocate(gaussians, share)
+    def move(gaussians, how):
+        calls.append(how.share)
+        return start.relocate(gaussians, how)
 
     problem = start._replace(redistribute=None, relocate=move)
     sets = list(descend(problem, replace(SCHEDULE, relocate_every=10), 60))

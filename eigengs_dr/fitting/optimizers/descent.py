@@ -24,7 +24,7 @@ from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ...raster.render import batch_to_tiles, bin_gaussians
 from ..initializers import FitProblem
 from .parameterization import Parameterization
-from .schedule import MIN_PHASE_RATIO, Schedule, lr_factor, next_build, relocation_steps
+from .schedule import MIN_PHASE_RATIO, Schedule, lr_factor, next_build, relocations
 
 MSE_EPSILON = 1e-10
 """Mean squared error added before the logarithm, which would diverge at an error of 0."""
@@ -41,7 +41,7 @@ def descend(
         The start and the target. If the problem can redistribute and the run is long enough, a
         first phase of `Schedule.redistribute_after` steps shows where error is left. The rest of
         the steps then starts from redistributed Gaussians. If the problem can relocate, Gaussians
-        move between steps, see `eigengs_dr.fitting.optimizers.schedule.relocation_steps`.
+        move between steps, see `eigengs_dr.fitting.optimizers.schedule.relocations`.
     schedule : Schedule
     iterations : int
         Number of steps, with the first phase.
@@ -130,17 +130,17 @@ def run_phase(
     state, variables = start_descent(fixed, schedule), schedule.variables()
     target = batch_to_tiles(types, problem.target)
     weight = None if problem.weight is None else batch_to_tiles(types, problem.weight)
-    relocations = relocation_steps(schedule, iterations) if problem.relocate else set()
-    start = 0 if part.start in relocations else part.start
+    moves_at = relocations(schedule, iterations) if problem.relocate else {}
+    start = 0 if part.start in moves_at else part.start
     factors = [lr_factor(schedule, step, iterations, start) for step in range(iterations)]
     rates, stop = rate_table(types, schedule, factors), part.start
     with freeze_program(step_program(schedule, fixed, levels)) as take_step:
         for step in part:
-            if step in relocations and problem.relocate:
-                fixed = problem.relocate(dr.detach(state.gaussians), schedule.relocate_share)
+            if step in moves_at and problem.relocate:
+                fixed = problem.relocate(dr.detach(state.gaussians), moves_at[step])
                 state, stop = start_descent(fixed, schedule), step
             if step == stop:
-                end = min((s for s in relocations if s > step), default=part.stop)
+                end = min((s for s in moves_at if s > step), default=part.stop)
                 stop, moves = next_build(schedule, step, iterations, min(end, part.stop))
                 pad, growth = variables.reach(fixed, moves)
                 counts, lists = (*levels, len(fixed)), []  # old lists make room for new ones

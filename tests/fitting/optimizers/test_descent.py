@@ -15,7 +15,7 @@ from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.initializers import FitProblem
 from eigengs_dr.fitting.optimizers import descent
 from eigengs_dr.fitting.optimizers.descent import descend, prefix, rate_table, run_phase
-from eigengs_dr.fitting.optimizers.schedule import lr_factor, next_build, relocation_steps
+from eigengs_dr.fitting.optimizers.schedule import lr_factor, next_build, relocations
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.fitting.redistribute import residual
 from eigengs_dr.image.color import rgb_to_ycbcr
@@ -163,11 +163,11 @@ def test_lists_are_for_steps_that_are_taken(backend, monkeypatch):
 
     monkeypatch.setattr(descent, "next_build", note)
     gaussians, target = start(backend)
-    problem = FitProblem(gaussians, target, relocate=lambda found, share: found)
+    problem = FitProblem(gaussians, target, relocate=lambda found, how: found)
     schedule = default(relocate_every=10)
     list(run_phase(problem, schedule, 40, part=range(5, 37)))
     assert stops[-1] == 37
-    assert relocation_steps(schedule, 40) <= set(stops)
+    assert set(relocations(schedule, 40)) <= set(stops)
 
 
 def test_weights(backend):
