@@ -59,13 +59,14 @@ def removal_cost(
     return _removal_cost(gaussians, residual(gaussians, target), weight)
 
 
-def _removal_cost(gaussians: Gaussians, missed: Array, weight: Array | None) -> Array:
+def _removal_cost(gaussians: Gaussians, missed: Array, weight: Array | None) -> NDArray[np.float64]:
     """Return the removal costs of a set with a known residual."""
     counts = np.ones_like(missed) if weight is None else np.square(weight).astype(np.float32)
     along = inner_products(gaussians, missed * counts)
     own = inner_products(gaussians, counts, squared=True)
     color = gaussians.to_arrays()["color"].astype(np.float64)
-    return (color * (color * own + 2 * along)).sum(axis=1)
+    cost: NDArray[np.float64] = (color * (color * own + 2 * along)).sum(axis=1)
+    return cost
 
 
 def prune(

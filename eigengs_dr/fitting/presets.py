@@ -53,6 +53,7 @@ PRESETS = {
             settings={"beta_1": 0.9, "beta_2": 0.9, "epsilon": 1e-12},
             rates={"mean": 0.26, "factor": 0.2, "color": 0.011},
             relocate_every=45,
+            agility=0.5,
         ),
     ),
     "gaussianimage": Preset(init="random", solves=False, schedule=_ONE_RATE),

@@ -24,7 +24,7 @@ from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ...raster.render import batch_to_tiles, bin_gaussians
 from ..initializers import FitProblem
 from .parameterization import Parameterization
-from .schedule import MIN_PHASE_RATIO, Schedule, lr_factor, next_build, relocations
+from .schedule import MIN_PHASE_RATIO, Schedule, agility_of, lr_factor, next_build, relocations
 
 MSE_EPSILON = 1e-10
 """Mean squared error added before the logarithm, which would diverge at an error of 0."""
@@ -79,21 +79,29 @@ class Descent:
         gets costs a microsecond.
     packed : Float
         The parameters of this set for the kernels.
+    agility : Float or None
+        Factor of the learning rates of means and shapes, one for each Gaussian.
     """
 
     variables: dict[str, Any]
     moments: dict[str, tuple]
     gaussians: Any
     packed: Any
+    agility: Any = None
 
 
-def start_descent(gaussians: Gaussians, schedule: Schedule) -> Descent:
-    """Return the state before the first step."""
+def start_descent(gaussians: Gaussians, schedule: Schedule, images: int = 1) -> Descent:
+    """Return the state before the first step, for the Gaussians of one image after another."""
     encoded, optimizer = schedule.variables().encode(gaussians), schedule.make_optimizer()
     variables = {name: dr.detach(encoded[name]) for name in schedule.rates}
     dr.eval(variables)
     moments = {name: optimizer.start(value) for name, value in variables.items()}
-    return Descent(variables, moments, gaussians, pack(gaussians))
+    agility, Float = None, types_of(gaussians.mean).Float
+    if schedule.agility:
+        rows = [np.broadcast_to(row.numpy(), len(gaussians)) for row in gaussians.color]
+        color = np.stack(rows, axis=1).reshape(images, -1, len(rows))
+        agility = upload(Float, agility_of(color, schedule.agility).ravel())
+    return Descent(variables, moments, gaussians, pack(gaussians), agility)
 
 
 def pack(gaussians: Gaussians) -> Any:
@@ -127,7 +135,7 @@ def run_phase(
     fixed = problem.gaussians
     types = types_of(fixed.mean)
     images = len(problem.target) if problem.target.ndim == 4 else 1
-    state, variables = start_descent(fixed, schedule), schedule.variables()
+    state, variables = start_descent(fixed, schedule, images), schedule.variables()
     target = batch_to_tiles(types, problem.target)
     weight = None if problem.weight is None else batch_to_tiles(types, problem.weight)
     moves_at = relocations(schedule, iterations) if problem.relocate else {}
@@ -138,11 +146,12 @@ def run_phase(
         for step in part:
             if step in moves_at and problem.relocate:
                 fixed = problem.relocate(dr.detach(state.gaussians), moves_at[step])
-                state, stop = start_descent(fixed, schedule), step
+                state, stop = start_descent(fixed, schedule, images), step
             if step == stop:
                 end = min((s for s in moves_at if s > step), default=part.stop)
                 stop, moves = next_build(schedule, step, iterations, min(end, part.stop))
                 pad, growth = variables.reach(fixed, moves)
+                pad = pad if state.agility is None else pad * state.agility
                 counts, lists = (*levels, len(fixed)), []  # old lists make room for new ones
                 lists = [
                     bin_gaussians(
@@ -224,12 +233,14 @@ def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()
         variables, moments = {}, {}
         for k, name in enumerate(schedule.rates):
             rate = dr.gather(Float, rates, index * len(schedule.rates) + k)
+            if state.agility is not None and name != "color":
+                rate *= state.agility
             variables[name], moments[name] = optimizer.step(
                 state.variables[name], slopes[name], state.moments[name], rate, Float(index) + 1
             )
         variables = coordinates.project(fixed, variables, size)
         moved = coordinates.decode(fixed, variables, size)
-        return Descent(variables, moments, moved, pack(moved))
+        return Descent(variables, moments, moved, pack(moved), state.agility)
 
     return step
 

@@ -49,40 +49,24 @@ def _size(g: Gaussians) -> Any:
     return rsqrt(g.factor[0] * g.factor[2])
 
 
-AGILE_COLOR, MAX_AGILITY = 0.15, 1.7
-"""The length of a colour, with 1 for white, at which a Gaussian moves by the learning rates, and
-how much more or less another one may move. See `_units`."""
-
-
-def _units(g: Gaussians) -> dict[str, Any]:
-    """Return how far a Gaussian moves for a change of each variable by 1.
-
-    A bright Gaussian moves less than a faint one, with the root of its colour: in 1,000 steps this
-    gains 0.05 dB.
-    """
-    squares = sum(dr.square(channel) for channel in g.color)
-    agility = dr.clip(rsqrt(dr.sqrt(squares) / AGILE_COLOR), 1 / MAX_AGILITY, MAX_AGILITY)
-    size = _size(g)
-    return {"mean": agility * size, "factor": agility / size, "color": 1}
-
-
 def _encode_relative(g: Gaussians) -> dict[str, Any]:
-    return _relative_to(g, _units(g))
+    return _relative_to(g, _size(g))
 
 
-def _relative_to(g: Gaussians, units: dict[str, Any]) -> dict[str, Any]:
-    return {name: getattr(g, name) / unit for name, unit in units.items()}
+def _relative_to(g: Gaussians, size: Any) -> dict[str, Any]:
+    return {"mean": g.mean / size, "factor": g.factor * size, "color": g.color}
 
 
 def _decode_relative(fixed: Gaussians, variables: dict[str, Any], size: Any = None) -> Gaussians:
-    units = _units(fixed)
+    own = _size(fixed)
+    units = {"mean": own, "factor": 1 / own, "color": 1}
     return replace(fixed, **{name: value * units[name] for name, value in variables.items()})
 
 
 def _project_relative(
     fixed: Gaussians, variables: dict[str, Any], size: Any = None
 ) -> dict[str, Any]:
-    inside = _relative_to(_decode_relative(fixed, variables).bounded(size), _units(fixed))
+    inside = _relative_to(_decode_relative(fixed, variables).bounded(size), _size(fixed))
     return {name: inside[name] for name in variables}
 
 
@@ -96,14 +80,14 @@ Gaussians), and a fit has the PSNR of lists that are built in every step. The st
 def _reach_relative(fixed: Gaussians, moves: dict[str, float]) -> tuple[Any, float]:
     # An array, because another literal in every build would compile the kernels again.
     share = dr.opaque(types_of(fixed.mean).Float, MOVE_SHARE * moves.get("mean", 0.0))
-    return share * _units(fixed)["mean"], 1 + GROWTH_SHARE * moves.get("factor", 0.0)
+    return share * _size(fixed), 1 + GROWTH_SHARE * moves.get("factor", 0.0)
 
 
 SCALE_RELATIVE = Parameterization(
     _encode_relative, _decode_relative, _project_relative, _reach_relative
 )
-"""Mean and factor in units of the Gaussian at the start, see `_units`, and colour. One learning
-rate then serves small and large Gaussians, and images of any size."""
+"""Mean divided by the size of the Gaussian at the start, factor times this size, and colour. One
+learning rate then serves small and large Gaussians, and images of any size."""
 
 
 # ---------------------------------------------------------------------------------------------

@@ -12,6 +12,9 @@ from dataclasses import dataclass, field
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 if TYPE_CHECKING:
     from .moments import Optimizer
     from .parameterization import Parameterization
@@ -66,6 +69,8 @@ class Schedule:
         Share of the Gaussians that move in a round.
     noise : float
         Strength of the perturbation in the first round, see `eigengs_dr.fitting.perturbation`.
+    agility : float
+        Exponent by which the rates of means and shapes fall with the colour, see `agility_of`.
     patience : int
         Number of steps. A refinement stops if this many steps gain less than `least_gain`, all of
         them in its last quarter, where rates are low; see `eigengs_dr.fitting.refine.is_plateau`.
@@ -84,6 +89,7 @@ class Schedule:
     relocate_every: int = 0
     relocate_share: float = 0.1
     noise: float = 2.5
+    agility: float = 0.0
     patience: int = 300
     least_gain: float = 0.01
 
@@ -106,6 +112,34 @@ def lr_factor(schedule: Schedule, step: int, iterations: int, start: int = 0) ->
     along = 0.5 * (1 + math.cos(math.pi * step / iterations))
     left = schedule.decay + (1 - schedule.decay) * along
     return left * min(1.0, max(0, step - start + 1) / max(1, schedule.warm_up))
+
+
+MAX_AGILITY = 1.7
+"""How much faster or slower than the others a Gaussian may move."""
+
+
+def agility_of(color: NDArray[np.floating], exponent: float) -> NDArray[np.float32]:
+    """Return factors of learning rates, for sets of Gaussians.
+
+    The error depends most on bright Gaussians, so they move less. With the length of a colour |c|,
+    the factor is ``(mean |c| / |c|)^exponent``, at most `MAX_AGILITY` and at least its inverse.
+
+    Parameters
+    ----------
+    color : ndarray, shape (M, N, C)
+        Colours of N Gaussians of each of M sets.
+    exponent : float
+
+    Returns
+    -------
+    ndarray of float32, shape (M, N)
+        1 if all colours are 0.
+    """
+    length = np.sqrt(np.square(color, dtype=np.float64).sum(axis=2))
+    mean = length.mean(axis=1, keepdims=True)
+    ratio = np.divide(mean, length, out=np.full_like(length, np.inf), where=length > 0)
+    ratio[(mean == 0).ravel()] = 1
+    return np.clip(ratio**exponent, 1 / MAX_AGILITY, MAX_AGILITY).astype(np.float32)
 
 
 RELOCATE_UNTIL, MIN_RELOCATIONS, MAX_RELOCATIONS = 0.5, 2, 40
