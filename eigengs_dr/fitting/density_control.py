@@ -189,6 +189,7 @@ def relocate_levels(
 ) -> Gaussians:
     """Move the Gaussians of least use in each level to where the image up to it has most error.
 
+    There is no perturbation: what the first level can bear costs the third one half a decibel.
     With 850, 1,190 and 1,530 Gaussians on 256x256 pixels of a training photo, these levels gain
     0.36, 0.62 and 0.75 dB in 1,000 steps. Solves for the colours of the first level, and a
     placement of it by its error, gain nothing more.
@@ -207,6 +208,7 @@ def relocate_levels(
     Gaussians
         As many Gaussians in each level.
     """
+    how = how._replace(noise=0.0)
     # Without a weight, `relocate` would solve for the colours of earlier levels too.
     weight = np.ones_like(target) if weight is None else weight
     everywhere = slice(None), slice(None)
