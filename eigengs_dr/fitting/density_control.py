@@ -149,10 +149,8 @@ def relocate(
     """
     index, arrays = np.arange(len(gaussians)), gaussians.to_arrays()
     own = index if part is None else index[part.own]
-    missed = residual(gaussians, target)
-    error = _squares(missed, part) / len(own)
-    value = _removal_cost(gaussians, missed, weight)[own]
-    moved = own[np.argsort(value, kind="stable")[: int(how.share * len(own))]]
+    value, error = _costs_and_error(gaussians, target, weight, part)
+    moved = own[np.argsort(value[own], kind="stable")[: int(how.share * len(own))]]
     kept = np.setdiff1d(index, moved)
     stay = {k: v if k == "background" else v[kept] for k, v in arrays.items()}
     rest = like(gaussians, **stay).bounded()
@@ -173,7 +171,7 @@ def relocate(
         new[name][kept], new[name][moved[: len(peaks)]] = found[name], peaks
     new["color"][moved[len(mean) :]] = 0
     if how.noise:
-        perturb(new, own, error, how.noise, how.seed)
+        perturb(new, own, error / len(own), how.noise, how.seed)
     there = like(gaussians, **new).bounded()
     # The set may be of a class with other bounds.
     values = {name: getattr(there, name) for name in new}
@@ -238,10 +236,15 @@ def _coarse_peaks(
     return mean * (x, y), deviation * math.sqrt(x * y), color
 
 
-def _squares(missed: Array, part: Part | None) -> float:
-    """Return the sum of the squares of a residual, in double precision without a copy."""
+def _costs_and_error(
+    gaussians: Gaussians, target: NDArray[np.float32], weight: Array | None, part: Part | None
+) -> tuple[NDArray[np.float64], float]:
+    """Return the removal costs and the squared error of a part, from one residual."""
+    missed = residual(gaussians, target)
     inside = missed if part is None else missed[part.core]
-    return float(np.einsum("ijk,ijk->", inside, inside, dtype=np.float64))
+    # einsum converts to double precision without a copy of the whole.
+    error = float(np.einsum("ijk,ijk->", inside, inside, dtype=np.float64))
+    return _removal_cost(gaussians, missed, weight), error
 
 
 def _round(size: Array) -> Array:

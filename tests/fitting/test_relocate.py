@@ -79,6 +79,24 @@ def test_a_part_moves_inside_itself():
     np.testing.assert_array_equal(found["background"], before["background"])
 
 
+@pytest.mark.parametrize("own", [slice(0, 60), slice(20, 50)])
+def test_noise_moves_all_own_gaussians(own):
+    """As often as it is asked for with one seed, and the same Gaussians go to peaks."""
+    start, target = fitted()
+    before, part = start.gaussians.to_arrays(), Part(own, (slice(None), slice(None)))
+    sets = [
+        relocate(start.gaussians, Relocation(0.2, noise, 3), target, part=part).to_arrays()
+        for noise in (0.0, 0.5, 0.5)
+    ]
+    for name in ("mean", "factor"):
+        np.testing.assert_array_equal(sets[1][name], sets[2][name])
+        moved = (sets[1][name] != sets[0][name]).any(axis=1)
+        np.testing.assert_array_equal(np.flatnonzero(moved), np.arange(60)[own])
+        others = np.delete(np.arange(60), own)
+        np.testing.assert_array_equal(sets[1][name][others], before[name][others])
+    np.testing.assert_array_equal(sets[1]["color"], sets[0]["color"])
+
+
 def test_a_perfect_set_stays_perfect():
     """Without places for them, Gaussians stay where they are, with the colour 0."""
     flat = np.full((SIDE, SIDE, 3), 0.25, np.float32)
