@@ -187,7 +187,7 @@ def relocate_levels(
 ) -> Gaussians:
     """Move the Gaussians of least use in each level to where the image up to it has most error.
 
-    There is no perturbation: what the first level can bear costs the third one half a decibel.
+    There is no perturbation: what the first level can bear costs the third one 0.5 to 0.9 dB.
     With 850, 1,190 and 1,530 Gaussians on 256x256 pixels of a training photo, these levels gain
     0.36, 0.62 and 0.75 dB in 1,000 steps. Solves for the colours of the first level, and a
     placement of it by its error, gain nothing more.

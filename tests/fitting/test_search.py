@@ -44,6 +44,7 @@ def test_the_target_is_met_in_its_space(space):
     found = fit(image, target_psnr=reached, target_space=space, iterations=200)
     assert found.stopped == "met"
     assert eg.psnr(image, found.image, space=space) >= reached
+    assert len(found.gaussians) <= 150  # short descents settle less well than one of 200 steps
     last = [row for row in found.trace if row["gaussians"] == len(found.gaussians)][-1]
     assert last[f"psnr_{space}"] >= reached
 
