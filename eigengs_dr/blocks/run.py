@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.executor import Executor
-from ..fitting.optimizers.schedule import MIN_PHASE_RATIO
+from ..fitting.optimizers.schedule import first_phase
 from ..fitting.options import FitOptions
 from ..gaussian.file import SetData
 from ..storage.checkpoint import Checkpoint
@@ -69,9 +69,8 @@ class Run:
 
     def fit(self) -> SetData:
         """Place and fit all Gaussians; a long fit places them again where error was left."""
-        steps, first = self.options.iterations, self.options.method.schedule.redistribute_after
-        if steps < MIN_PHASE_RATIO * first:
-            first = 0
+        steps = self.options.iterations
+        first = first_phase(self.options.method.schedule, steps)
         sets = self._fit_blocks(self._place_all(first), steps - first)
         background = np.array(self.settings.background, np.float32)
         return SetData(

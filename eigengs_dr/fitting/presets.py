@@ -51,7 +51,7 @@ PRESETS = {
         schedule=Schedule(
             optimizer="adam",
             settings={"beta_1": 0.9, "beta_2": 0.9, "epsilon": 1e-12},
-            rates={"mean": 0.26, "factor": 0.2, "color": 0.011},
+            rates={"mean": 0.28, "factor": 0.22, "color": 0.0115},
             relocate_every=45,
             agility=0.5,
         ),

@@ -8,7 +8,7 @@ import pytest
 from _helpers.halves import SIDE, fitted, picture
 from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.optimizers.descent import descend
-from eigengs_dr.fitting.optimizers.schedule import MIN_PHASE_RATIO
+from eigengs_dr.fitting.optimizers.schedule import MIN_PHASE_RATIO, first_phase
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.fitting.redistribute import redistribute
@@ -50,3 +50,10 @@ def test_fits_that_are_long_enough_rearrange_once():
         sets = list(descend(start._replace(redistribute=rearrange), schedule, steps))
         assert len(sets) == steps + 1
         assert calls == [60] * times
+
+
+def test_the_first_phase_is_a_tenth_of_a_short_descent():
+    schedule = PRESETS["default"].schedule
+    steps = (0, 99, 100, 150, 200, 100_000)
+    assert [first_phase(schedule, n) for n in steps] == [0, 0, 10, 15, 20, 20]
+    assert first_phase(replace(schedule, redistribute_after=0), 1000) == 0

@@ -24,7 +24,7 @@ from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ...raster.render import batch_to_tiles, bin_gaussians
 from ..initializers import FitProblem
 from .parameterization import Parameterization
-from .schedule import MIN_PHASE_RATIO, Schedule, agility_of, lr_factor, next_build, relocations
+from .schedule import Schedule, agility_of, first_phase, lr_factor, next_build, relocations
 
 MSE_EPSILON = 1e-10
 """Mean squared error added before the logarithm, which would diverge at an error of 0."""
@@ -38,10 +38,10 @@ def descend(
     Parameters
     ----------
     problem : FitProblem
-        The start and the target. If the problem can redistribute and the run is long enough, a
-        first phase of `Schedule.redistribute_after` steps shows where error is left. The rest of
-        the steps then starts from redistributed Gaussians. If the problem can relocate, Gaussians
-        move between steps, see `eigengs_dr.fitting.optimizers.schedule.relocations`.
+        The start and the target. If the problem can redistribute, a first phase shows where error
+        is left, and the other steps start from redistributed Gaussians, see `first_phase`. If the
+        problem can relocate, Gaussians move between steps, see `relocations`; both functions are in
+        `eigengs_dr.fitting.optimizers.schedule`.
     schedule : Schedule
     iterations : int
         Number of steps, with the first phase.
@@ -55,8 +55,8 @@ def descend(
     """
     with release_later(problem):  # a set of the caller may share NumPy's memory
         yield problem.gaussians
-        first = schedule.redistribute_after
-        if problem.redistribute and first > 0 and iterations >= MIN_PHASE_RATIO * first:
+        first = first_phase(schedule, iterations)
+        if problem.redistribute and first:
             for current in run_phase(problem, schedule, first):
                 yield current
             anew = problem.redistribute(dr.detach(current), len(current))
