@@ -2,9 +2,9 @@
 
 Placement adds one level after the other, with more Gaussians where the residual of the earlier
 levels has larger second derivatives. Refinement then moves all levels together and minimises the
-sum of the logarithms of their squared errors. In its first half, Gaussians of little use relocate
-inside of their levels. Sorting the Gaussians of a plain fit by their removal cost does not work:
-they depend on each other, and the first quarter does not form an image.
+sum of the logarithms of their squared errors. In its first two thirds, Gaussians of little use
+relocate inside of their levels. Sorting the Gaussians of a plain fit by their removal cost does not
+work: they depend on each other, and the first quarter does not form an image.
 """
 
 from __future__ import annotations
