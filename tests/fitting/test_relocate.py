@@ -106,7 +106,7 @@ def test_a_perfect_set_stays_perfect():
     assert squared_error(moved, start.target) <= squared_error(start.gaussians, start.target) + 1e-6
 
 
-def test_rounds_are_end_after_two_thirds():
+def test_rounds_end_after_two_thirds():
     schedule = replace(SCHEDULE, relocate_every=45)
     assert relocations(schedule, 100) == {}
     assert list(relocations(schedule, 140)) == [46, 91]

@@ -32,12 +32,12 @@ PARAMETERIZATIONS = {
 """Parameterizations by name: the variables that an optimiser moves."""
 
 MIN_PHASE_RATIO = 10
-"""Smallest ratio of the steps of the whole run to the steps of its first phase."""
+"""Smallest ratio of the steps of a descent to those of its first phase."""
 
 MIN_FIRST_PHASE = 10
 """Fewest steps of a first phase. With 0.013 and 0.076 Gaussians a pixel, redistribution gains 0.07
-and 0.6 dB in 100 steps, and 0.2 and 0.9 dB in 150; in 60 steps, after 6 of them, it gains 0 and
-0.3 dB, less than more steps would in the same time."""
+and 0.6 dB in 100 steps (5 photos); in 60 steps, after 6 of them, it gains 0 and 0.3 dB, less than
+more steps would in the same time."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,12 @@ class Schedule:
 
 def first_phase(schedule: Schedule, iterations: int) -> int:
     """Return the steps of the first phase, after which Gaussians are redistributed; 0 for none.
+
+    Parameters
+    ----------
+    schedule : Schedule
+    iterations : int
+        Number of steps of the descent, with the first phase.
 
     Examples
     --------
