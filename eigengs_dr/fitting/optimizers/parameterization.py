@@ -97,6 +97,10 @@ learning rate then serves small and large Gaussians, and images of any size."""
 CHOLESKY_BOUND = 0.5
 """Pixels added to the diagonal of the Cholesky factor, as GaussianImage does."""
 
+MIN_DIAGONAL = 0.01
+"""Smallest diagonal entry of the Cholesky factor in pixels. GaussianImage has no such bound, but an
+entry that reaches 0 makes the covariance singular, and the set not finite."""
+
 
 def _encode_cholesky(g: Gaussians) -> dict[str, Any]:
     types = types_of(g.mean)
@@ -132,7 +136,12 @@ def _decode_cholesky(fixed: Gaussians, variables: dict[str, Any], size: Any = No
 def _project_cholesky(
     fixed: Gaussians, variables: dict[str, Any], size: Any = None
 ) -> dict[str, Any]:
-    return variables
+    if "cholesky" not in variables:
+        return variables
+    l1, l2, l3 = variables["cholesky"]
+    least = MIN_DIAGONAL - CHOLESKY_BOUND
+    inside = type(variables["cholesky"])(dr.maximum(l1, least), l2, dr.maximum(l3, least))
+    return {**variables, "cholesky": inside}
 
 
 def _reach_cholesky(fixed: Gaussians, moves: dict[str, float]) -> tuple[Any, float]:

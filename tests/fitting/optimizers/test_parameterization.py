@@ -8,7 +8,12 @@ from hypothesis.extra import numpy as hnp
 
 from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.optimizers.parameterization import CHOLESKY, CHOLESKY_BOUND, SCALE_RELATIVE
+from eigengs_dr.fitting.optimizers.parameterization import (
+    CHOLESKY,
+    CHOLESKY_BOUND,
+    MIN_DIAGONAL,
+    SCALE_RELATIVE,
+)
 from eigengs_dr.gaussian.bounds import MIN_DEVIATION
 
 
@@ -82,3 +87,17 @@ def test_natural_variables_come_back_into_their_bounds(backend, values):
     assert (diagonal * slack >= 1 / (2 * max(SIZE))).all()
     assert (np.abs(found["factor"]) <= slack / MIN_DEVIATION).all()
     assert np.isfinite(found["color"]).all()
+
+
+@few
+@given(values=hnp.arrays(np.float32, (3, COUNT), elements=st.floats(-100, 100, width=32)))
+def test_covariances_of_cholesky_variables_are_never_singular(backend, values):
+    """A diagonal entry of 0 would make its set not finite; other entries stay as they are."""
+    module = select(backend)
+    fixed = random_scene().on(backend)
+    variables = {"cholesky": module.Array3f(*values)}
+    inside = CHOLESKY.project(fixed, variables)
+    expected = values.copy()
+    expected[[0, 2]] = np.maximum(values[[0, 2]], np.float32(MIN_DIAGONAL - CHOLESKY_BOUND))
+    np.testing.assert_array_equal(inside["cholesky"].numpy(), expected)
+    assert np.isfinite(CHOLESKY.decode(fixed, inside).to_arrays()["factor"]).all()
