@@ -92,7 +92,8 @@ def fit_batch(
         closing(descend(problem, schedule, options.iterations)) as sets,
     ):
         for step, reached in enumerate(sets):
-            if step in marks:
+            # A set with more Gaussians than asked for does not compare, see `refine`.
+            if step in marks and len(reached) == len(problem.gaussians):
                 seconds = (time.perf_counter() - started) / len(images)
                 for record, shown, pixels in zip(
                     records, _pictures(reached, len(images)), images, strict=True

@@ -132,8 +132,9 @@ def relocate(
     """Move the Gaussians of least use to where they reduce the error most, and perturb all.
 
     Without them, the colours of the others are solved for, see `prune`; then round Gaussians at the
-    peaks of the error take their places in the order. For the other parameters see `removal_cost`,
-    for the perturbation see `eigengs_dr.fitting.perturbation.perturb`.
+    peaks of the error take their places in the order, except those that are dropped. For the other
+    parameters see `removal_cost`, for the perturbation see
+    `eigengs_dr.fitting.perturbation.perturb`.
 
     Parameters
     ----------
@@ -144,13 +145,14 @@ def relocate(
     Returns
     -------
     Gaussians
-        A set of as many Gaussians. Where `residual_peaks` finds too few places, Gaussians of least
-        use stay, with the colour 0.
+        A set with as many Gaussians, less those dropped. Where `residual_peaks` finds too few
+        places, Gaussians of least use stay, with the colour 0.
     """
     index, arrays = np.arange(len(gaussians)), gaussians.to_arrays()
     own = index if part is None else index[part.own]
     value, error = _costs_and_error(gaussians, target, weight, part)
-    moved = own[np.argsort(value[own], kind="stable")[: int(how.share * len(own))]]
+    leaving = max(int(how.share * len(own)), how.dropped)
+    moved = own[np.argsort(value[own], kind="stable")[:leaving]]
     kept = np.setdiff1d(index, moved)
     stay = {k: v if k == "background" else v[kept] for k, v in arrays.items()}
     rest = like(gaussians, **stay).bounded()
@@ -162,7 +164,8 @@ def relocate(
         inside = np.zeros_like(missed)
         inside[part.core] = missed[part.core]
         missed = inside
-    mean, size, color = _coarse_peaks(missed, len(moved), _spacing(gaussians), weight)
+    places = leaving - how.dropped
+    mean, size, color = _coarse_peaks(missed, places, _spacing(gaussians), weight)
     found = rest.to_arrays()
     rows = {"mean": mean, "factor": _round(size), "color": color}
     new = {"background": found["background"]}
@@ -172,6 +175,8 @@ def relocate(
     new["color"][moved[len(mean) :]] = 0
     if how.noise:
         perturb(new, own, error / len(own), how.noise, how.seed)
+    for name in rows:
+        new[name] = np.delete(new[name], moved[places:], axis=0)
     there = like(gaussians, **new).bounded()
     # The set may be of a class with other bounds.
     values = {name: getattr(there, name) for name in new}

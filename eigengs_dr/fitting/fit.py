@@ -40,6 +40,8 @@ class Fit:
         Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb. A search for the number of
         Gaussians adds the key gaussians. Row 0 shows the set before refinement. Seconds count from
         the call of `fit`; they include placement, upload, the colour solve and the measurements.
+        A descent has more Gaussians than asked for up to 65 % of its steps, see
+        `eigengs_dr.fitting.optimizers.schedule.surplus_for`; those sets have no rows.
         With color "data" or "normal", psnr_rgb is the PSNR of the data after clamping and rounding
         to 8 bits, and psnr_ycbcr the PSNR of the unchanged data; for values above 1.5, the largest
         of them is the peak. With color "radiance" or "log", psnr_ycbcr is in PU21, see
@@ -149,7 +151,7 @@ def fit(
         By default "cuda" if there is a GPU.
     progress : callable, optional
         Called every 10 steps as ``progress(iteration, iterations, row)`` with the last row of the
-        trace.
+        trace, or a row of a set with more Gaussians than asked for.
     target_psnr : float, optional
         PSNR in dB to reach with as few Gaussians as possible; excludes `gaussians`. The search
         takes up to about twice `iterations` steps, see `eigengs_dr.fitting.search`.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import MAX_PSNR, float_space, psnrs_by_rows
 from ..raster.picture import picture_rows
+from .density_control import prune
 from .initializers import FitProblem
 from .optimizers.descent import descend
 from .optimizers.schedule import Schedule
@@ -32,7 +33,8 @@ class Refinement(NamedTuple):
     gaussians : Gaussians
         The set with the highest psnr_ycbcr in the trace.
     trace : list of dict
-        Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb.
+        Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb, for sets with as many
+        Gaussians as the start.
     iterations : int
         Number of steps.
     stopped : str
@@ -74,7 +76,8 @@ def refine(
         Sizes of the prefixes of the set that shall form the image too; see `descend`.
     progress : callable, optional
         Called every 10 steps as ``progress(iteration, iterations, row)`` with the last row of the
-        trace. It may raise `KeyboardInterrupt` to end the refinement.
+        trace, or that of a set with more Gaussians than the start. It may raise `KeyboardInterrupt`
+        to end the refinement.
     interrupted : callable, optional
         Called before every step; True ends the refinement. See
         `eigengs_dr.backend.interrupt.defer_interrupts`.
@@ -85,21 +88,24 @@ def refine(
     Returns
     -------
     Refinement
-        A set never worse than the start. After an interrupt, the last row of the trace measures
-        the last step.
+        A set never worse than the start, with as many Gaussians. After an interrupt, the last row
+        of the trace measures the last step, without the Gaussians that the descent has in addition.
     """
     started = time.perf_counter() if started is None else started
     if score is None:
         score = partial(measure, image=image, started=started, base_image=problem.base_image)
     marks, trace = trace_steps(iterations), list[dict[str, Any]]()
     best, current, highest = problem.gaussians, problem.gaussians, -math.inf
-    stopped, step = "iterations", 0
+    stopped, step, latest = "iterations", 0, dict[str, Any]()
 
     def judge() -> None:
-        nonlocal best, highest
-        trace.append({"iteration": step, **score(current)})
-        if trace[-1]["psnr_ycbcr"] > highest:
-            best, highest = current, trace[-1]["psnr_ycbcr"]
+        nonlocal best, highest, latest
+        latest = {"iteration": step, **score(current)}
+        if len(current) > len(problem.gaussians):  # more than asked for: it does not compare
+            return
+        trace.append(latest)
+        if latest["psnr_ycbcr"] > highest:
+            best, highest = current, latest["psnr_ycbcr"]
 
     try:
         with closing(descend(problem, schedule, iterations, levels)) as sets:
@@ -109,7 +115,7 @@ def refine(
                     judge()
                 if progress and (step in marks or step % 10 == 0):
                     dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
-                    progress(step, iterations, trace[-1])
+                    progress(step, iterations, latest)
                 if interrupted():
                     break
                 if step in marks and is_plateau(trace, schedule, iterations):
@@ -119,7 +125,11 @@ def refine(
             stopped = "interrupted"
     except KeyboardInterrupt:
         stopped = "interrupted"
-    if stopped == "interrupted" and step not in marks:
+    if stopped == "interrupted" and trace[-1]["iteration"] != step:
+        if len(current) > len(problem.gaussians):
+            current = prune(
+                dr.detach(current), problem.target, len(problem.gaussians), problem.weight
+            )
         judge()
     return Refinement(dr.detach(best), trace, step, stopped)
 

@@ -21,7 +21,7 @@ from ..gaussian.gaussians import Gaussians
 from .density_control import densify, prune
 from .initializers import FitProblem
 from .optimizers.descent import descend
-from .optimizers.schedule import Schedule
+from .optimizers.schedule import Schedule, surplus_for
 from .options import SearchPolicy
 from .refine import FitProgress, Refinement
 
@@ -76,11 +76,11 @@ def search_count(
     tries, fit, polish = (max(1, round(share * iterations)) for share in shares)
     run.planned = policy.max_tries * tries + fit + policy.max_polishes * polish
     try:
-        placed = _estimate(run, most, tries)
+        estimate = _estimate(run, most, tries)
         if run.best.missing > 0 or len(run.best.gaussians) > 1:
-            trial = _fit_estimate(run, placed, most, fit)
-            # If the iterations are few, or two fits have used them up, polish all the same.
             longest = round(policy.max_length * iterations)
+            trial = _fit_estimate(run, estimate, most, fit, longest)
+            # If the iterations are few, or two fits have used them up, polish all the same.
             most_steps = max(longest, run.step + policy.sure_polishes * polish)
             _polish(run, trial, most, polish, most_steps)
         pressed = interrupted()
@@ -119,7 +119,9 @@ class _Run:
         self.db_per_doubling = self.policy.db_per_doubling
         self.best = self.score(self.start.gaussians)
 
-    def descend(self, gaussians: Gaussians, steps: int, share: float = 1.0) -> _Trial:
+    def descend(
+        self, gaussians: Gaussians, steps: int, share: float = 1.0, surplus: int = 0
+    ) -> _Trial:
         """Take some steps at a fraction of the learning rates, and score the set."""
         rates = {name: share * rate for name, rate in self.schedule.rates.items()}
         schedule = replace(self.schedule, rates=rates)
@@ -127,7 +129,7 @@ class _Run:
         problem = self.start._replace(gaussians=gaussians, redistribute=None)
         if share < 1:  # a polish moves Gaussians by itself
             problem = problem._replace(relocate=None)
-        with closing(descend(problem, schedule, steps)) as sets:
+        with closing(descend(problem, schedule, steps, surplus=surplus)) as sets:
             current = next(sets)
             while not self.interrupted():
                 following = next(sets, None)
@@ -157,8 +159,15 @@ def _better(a: _Trial, b: _Trial) -> bool:
     return a.missing < b.missing
 
 
-def _estimate(run: _Run, most: int, steps: int) -> Gaussians:
-    """Estimate the number of Gaussians by tries, and place them where the last try left error."""
+class _Estimate(NamedTuple):
+    """The set of the last try, and the estimated number of Gaussians with a margin."""
+
+    tried: Gaussians
+    number: int
+
+
+def _estimate(run: _Run, most: int, steps: int) -> _Estimate:
+    """Estimate the number of Gaussians by tries, each placed where the one before left error."""
     assert run.start.redistribute is not None
     placed, before, last = run.start.gaussians, run.best, None
     for _ in range(run.policy.max_tries):
@@ -179,17 +188,24 @@ def _estimate(run: _Run, most: int, steps: int) -> Gaussians:
         last, before = trial, run.score(placed)
         if close or run.interrupted():
             break
-    return placed
+    return _Estimate(trial.gaussians, len(placed))
 
 
-def _fit_estimate(run: _Run, placed: Gaussians, most: int, steps: int) -> _Trial:
-    """Fit the estimated number; if it was far off, redistribute and fit once more."""
-    trial = run.descend(placed, steps)
-    count = _count_for_gain(run, len(placed), trial.missing, most)
-    if run.interrupted() or abs(count - len(placed)) <= run.policy.fit_tolerance * len(placed):
+def _fit_estimate(run: _Run, estimate: _Estimate, most: int, steps: int, most_steps: int) -> _Trial:
+    """Fit the estimated number; if it was far off, fit once more, in the steps that are left."""
+    trial = _fit(run, *estimate, steps)
+    count = _count_for_gain(run, estimate.number, trial.missing, most)
+    near = run.policy.fit_tolerance * estimate.number
+    if run.interrupted() or abs(count - estimate.number) <= near:
         return trial
+    return _fit(run, trial.gaussians, count, max(1, min(steps, most_steps - run.step)))
+
+
+def _fit(run: _Run, tried: Gaussians, count: int, steps: int) -> _Trial:
+    """Place Gaussians where another set left error, and fit them, with a surplus that leaves."""
     assert run.start.redistribute is not None
-    return run.descend(run.start.redistribute(trial.gaussians, count), steps)
+    more = surplus_for(run.schedule, count, tried.width * tried.height, steps)
+    return run.descend(run.start.redistribute(tried, count + more), steps, surplus=more)
 
 
 def _update_slope(run: _Run, last: _Trial | None, trial: _Trial) -> None:

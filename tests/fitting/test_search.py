@@ -153,9 +153,10 @@ def searched(monkeypatch, measure):
     start = initialize(picture(), FitOptions(gaussians=60, init="adaptive"))
     steps = []
 
-    def stand(problem, schedule, count):
+    def stand(problem, schedule, count, surplus):
         steps.append(count)
-        return (problem.gaussians for _ in range(count + 1))
+        left = problem.gaussians[: len(problem.gaussians) - surplus]
+        return (left for _ in range(count + 1))
 
     def judge(gaussians):
         return {"decibels": measure(gaussians, steps)}
@@ -172,7 +173,7 @@ def test_a_search_tries_more_than_once_and_fits_once(monkeypatch, octave, needed
     """Where only their number counts, of which the search begins with 60."""
     _, steps = searched(monkeypatch, lambda g, _: octave * np.log2(len(g) / needed))
     assert steps[:2] == [100, 100]
-    assert steps.count(700) == 1
+    assert steps.count(1000) == 1
 
 
 def test_a_search_adds_nothing_where_steps_lead_to_the_goal(monkeypatch):
@@ -180,10 +181,10 @@ def test_a_search_adds_nothing_where_steps_lead_to_the_goal(monkeypatch):
     added, fitted = [], []
 
     def measure(gaussians, steps):
-        if steps and steps[-1] == 700:
+        if steps and steps[-1] == 1000:
             fitted.append(len(gaussians))
         needed = 1.005 * fitted[0] if fitted else 100
-        settled = sum(count for count in steps if count not in (100, 700))
+        settled = sum(count for count in steps if count not in (100, 1000))
         return 4 * np.log2(len(gaussians) / needed) + 0.0005 * settled
 
     def counted(gaussians, target, count, *rest):
@@ -192,7 +193,7 @@ def test_a_search_adds_nothing_where_steps_lead_to_the_goal(monkeypatch):
 
     monkeypatch.setattr(budget, "densify", counted)
     result, _ = searched(monkeypatch, measure)
-    assert any(row["decibels"] < 0 and row["iteration"] > 800 for row in result.trace)
+    assert any(row["decibels"] < 0 and row["iteration"] > 1100 for row in result.trace)
     assert added
     assert not any(added)
 
@@ -202,10 +203,10 @@ def test_a_search_goes_on_where_the_fit_just_meets_the_goal(monkeypatch):
     fitted = []
 
     def measure(gaussians, steps):
-        if steps and steps[-1] == 700:
+        if steps and steps[-1] == 1000:
             fitted.append(len(gaussians))
         needed = fitted[0] if fitted else 100
-        settled = sum(count for count in steps if count not in (100, 700))
+        settled = sum(count for count in steps if count not in (100, 1000))
         return 4 * np.log2(len(gaussians) / needed) + 0.001 + settled / 600
 
     result, _ = searched(monkeypatch, measure)

@@ -5,5 +5,6 @@
 - ``moments``: the interface of optimisers, and moving averages
 - ``adam``: Adam
 - ``adan``: Adan
+- ``state``: what a step changes
 - ``descent``: the steps
 """

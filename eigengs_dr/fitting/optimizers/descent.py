@@ -7,7 +7,7 @@ of an image; the adjoint; and the optimiser, with one lane per Gaussian.
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -19,19 +19,23 @@ from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint_pieces, sum_pieces
 from ...raster.binning.lists import TileLists
 from ...raster.kernels import residual, sum_lanes
-from ...raster.layout import pack_parameters
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ...raster.render import batch_to_tiles, bin_gaussians
 from ..initializers import FitProblem
 from .parameterization import Parameterization
-from .schedule import Schedule, agility_of, first_phase, lr_factor, next_build, relocations
+from .schedule import Schedule, first_phase, lr_factor, next_build, relocations, surplus_for
+from .state import Descent, pack, start_descent
 
 MSE_EPSILON = 1e-10
 """Mean squared error added before the logarithm, which would diverge at an error of 0."""
 
 
 def descend(
-    problem: FitProblem, schedule: Schedule, iterations: int, levels: Sequence[int] = ()
+    problem: FitProblem,
+    schedule: Schedule,
+    iterations: int,
+    levels: Sequence[int] = (),
+    surplus: int = 0,
 ) -> Generator[Gaussians, None, None]:
     """Yield the set before the first step and after every step of gradient descent.
 
@@ -40,18 +44,23 @@ def descend(
     problem : FitProblem
         The start and the target. If the problem can redistribute, a first phase shows where error
         is left, and the other steps start from redistributed Gaussians, see `first_phase`. If the
-        problem can relocate, Gaussians move between steps, see `relocations`; both functions are in
-        `eigengs_dr.fitting.optimizers.schedule`.
+        problem can relocate, Gaussians move between steps, see `relocations`. If it can do both,
+        there are more Gaussians until the last of these moves, see `surplus_for`. These functions
+        are in `eigengs_dr.fitting.optimizers.schedule`.
     schedule : Schedule
     iterations : int
         Number of steps, with the first phase.
     levels : sequence of int, optional
         Numbers n. The first n Gaussians shall form the image too, as well as they can.
+    surplus : int, optional
+        Number of Gaussians of each image that relocations drop from the start. A problem that can
+        redistribute has none, and gets its own.
 
     Yields
     ------
     Gaussians
-        The current set. Steps run asynchronously: its arrays may not be computed yet.
+        The current set. After the last step it has as many Gaussians as the start, less the
+        argument `surplus`. Steps run asynchronously: its arrays may not be computed yet.
     """
     with release_later(problem):  # a set of the caller may share NumPy's memory
         yield problem.gaussians
@@ -59,54 +68,18 @@ def descend(
         if problem.redistribute and first:
             for current in run_phase(problem, schedule, first):
                 yield current
-            anew = problem.redistribute(dr.detach(current), len(current))
-            problem, iterations = problem._replace(gaussians=anew), iterations - first
-        yield from run_phase(problem, schedule, iterations, levels)
+            iterations, images = iterations - first, number_of_images(problem)
+            if problem.relocate:
+                pixels = current.width * current.height
+                surplus = surplus_for(schedule, len(current) // images, pixels, iterations)
+            anew = problem.redistribute(dr.detach(current), len(current) + images * surplus)
+            problem = problem._replace(gaussians=anew)
+        yield from run_phase(problem, schedule, iterations, levels, surplus=surplus)
 
 
-@dataclass(frozen=True)
-class Descent:
-    """The state of a descent.
-
-    Attributes
-    ----------
-    variables : dict of str to arrays
-        The variables that the optimiser moves.
-    moments : dict of str to tuple
-        The state of the optimiser for each variable.
-    gaussians : Gaussians or None
-        The set of these variables. A step does not need it, and each array that a frozen program
-        gets costs a microsecond.
-    packed : Float
-        The parameters of this set for the kernels.
-    agility : Float or None
-        Factor of the learning rates of means and shapes, one for each Gaussian.
-    """
-
-    variables: dict[str, Any]
-    moments: dict[str, tuple]
-    gaussians: Any
-    packed: Any
-    agility: Any = None
-
-
-def start_descent(gaussians: Gaussians, schedule: Schedule, images: int = 1) -> Descent:
-    """Return the state before the first step, for the Gaussians of one image after another."""
-    encoded, optimizer = schedule.variables().encode(gaussians), schedule.make_optimizer()
-    variables = {name: dr.detach(encoded[name]) for name in schedule.rates}
-    dr.eval(variables)
-    moments = {name: optimizer.start(value) for name, value in variables.items()}
-    agility, Float = None, types_of(gaussians.mean).Float
-    if schedule.agility:
-        rows = [np.broadcast_to(row.numpy(), len(gaussians)) for row in gaussians.color]
-        color = np.stack(rows, axis=1).reshape(images, -1, len(rows))
-        agility = upload(Float, agility_of(color, schedule.agility).ravel())
-    return Descent(variables, moments, gaussians, pack(gaussians), agility)
-
-
-def pack(gaussians: Gaussians) -> Any:
-    """Return the parameters of a set for the kernels, in their layout in memory."""
-    return pack_parameters([*kernel_shape(gaussians), *gaussians.color])
+def number_of_images(problem: FitProblem) -> int:
+    """Return how many images a problem has: more than one for a batch."""
+    return len(problem.target) if problem.target.ndim == 4 else 1
 
 
 def run_phase(
@@ -115,6 +88,7 @@ def run_phase(
     iterations: int,
     levels: Sequence[int] = (),
     part: range | None = None,
+    surplus: int = 0,
 ) -> Generator[Gaussians, None, None]:
     """Yield the set after every step of one phase of `descend`, or of a part of its steps.
 
@@ -130,15 +104,17 @@ def run_phase(
         Number of steps of the phase.
     part : range, optional
         The steps to take, some of ``range(iterations)``; by default all.
+    surplus : int, optional
+        Number of Gaussians of each image that relocations drop.
     """
     part = range(iterations) if part is None else part
     fixed = problem.gaussians
     types = types_of(fixed.mean)
-    images = len(problem.target) if problem.target.ndim == 4 else 1
+    images = number_of_images(problem)
     state, variables = start_descent(fixed, schedule, images), schedule.variables()
     target = batch_to_tiles(types, problem.target)
     weight = None if problem.weight is None else batch_to_tiles(types, problem.weight)
-    moves_at = relocations(schedule, iterations) if problem.relocate else {}
+    moves_at = relocations(schedule, iterations, surplus) if problem.relocate else {}
     start = 0 if part.start in moves_at else part.start
     factors = [lr_factor(schedule, step, iterations, start) for step in range(iterations)]
     rates, stop = rate_table(types, schedule, factors), part.start

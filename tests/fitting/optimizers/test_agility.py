@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from _helpers.sets import random_scene
-from eigengs_dr.fitting.optimizers.descent import start_descent
 from eigengs_dr.fitting.optimizers.schedule import MAX_AGILITY, agility_of
+from eigengs_dr.fitting.optimizers.state import start_descent
 from eigengs_dr.fitting.presets import PRESETS
 
 
