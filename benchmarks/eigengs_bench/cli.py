@@ -15,6 +15,7 @@ from eigengs_bench.names import (
     PARTS,
     PRESETS,
     SETS,
+    SOLVE_STEPS,
     TABLES,
 )
 from eigengs_bench.options import (
@@ -177,12 +178,18 @@ def stability(task: Task, cases: Names, presets: Names) -> Any:
 @bench.command()
 @click.argument("data", type=FOLDER, metavar="DATA")
 @counts_option("--counts", KODAK_COUNTS, "Gaussians; may be repeated.")
-@counts_option("--steps", (1000,), "Steps of a fit; may be repeated.")
+@counts_option("--steps", (1000,), "Steps of a fit; may be repeated.", least=0)
+@count_option("--solve-steps", SOLVE_STEPS, "Steps of the colour solve.")
 @count_option("--photos", 24, "The first ones.")
 @click.option("--timed", is_flag=True, help="Nothing else runs: the seconds count.")
 @measures_rows("kodak.jsonl", iterations=None)
 def kodak(
-    task: Task, photos: int, counts: tuple[int, ...], steps: tuple[int, ...], timed: bool
+    task: Task,
+    photos: int,
+    counts: tuple[int, ...],
+    steps: tuple[int, ...],
+    solve_steps: int,
+    timed: bool,
 ) -> Any:
     """Fit the Kodak photos by numbers of Gaussians, beside what other methods published.
 
@@ -191,6 +198,7 @@ def kodak(
       eigengs-dr bench kodak data -o F
       eigengs-dr bench kodak data -o F --counts 5000 --counts 10000 --steps 5000
       eigengs-dr bench kodak data -o F --photos 4 --timed
+      eigengs-dr bench kodak data -o F --counts 28000 --steps 0 --solve-steps 30
 
     DATA has the photos in kodak/. Ctrl-C keeps the fits that are done. FOLDER gets charts of PSNR
     over Gaussians, and over the seconds of timed fits.
@@ -198,7 +206,7 @@ def kodak(
     from eigengs_bench.experiments.kodak import run
     from eigengs_bench.report.sections.kodak import summarize
 
-    return summarize(run(task._replace(images=photos), counts, steps, timed))
+    return summarize(run(task._replace(images=photos), counts, steps, solve_steps, timed))
 
 
 @bench.command()

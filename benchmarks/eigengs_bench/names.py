@@ -30,3 +30,4 @@ FIGURES = ("iterations", "colors", "curves", "radii", "split", "cross")
 CONDITIONS = ("cameras", "grazing", "hidden", "noise")
 PARTS = ("pixels", "splats", "threads", "small")
 KODAK_COUNTS = (5_000, 10_000, 30_000, 50_000, 70_000)  # Gaussians of published tables
+SOLVE_STEPS = 10  # of the colour solve of a fit, by default

@@ -32,9 +32,9 @@ def count_option(name: str, default: int, text: str = "", least: int = 1) -> Any
     return click.option(name, type=kind, default=default, show_default=True, help=text)
 
 
-def counts_option(name: str, default: tuple[int, ...], text: str) -> Any:
-    """Make an option that takes several numbers, each from 1 on."""
-    kind: Any = {"type": click.IntRange(min=1), "default": default, "show_default": True}
+def counts_option(name: str, default: tuple[int, ...], text: str, least: int = 1) -> Any:
+    """Make an option that takes several numbers, each from `least` on."""
+    kind: Any = {"type": click.IntRange(min=least), "default": default, "show_default": True}
     return click.option(name, multiple=True, callback=_each_once, help=text, **kind)
 
 

@@ -27,8 +27,8 @@ def data(tmp_path, monkeypatch):
 
 def test_a_fit_is_measured_in_the_metric_of_the_field(backend):
     image, task = 0.999 * one_image(), task_in("unused", backend)
-    found = kodak._measure(task, image, 40, 20)
-    expected = fit(image, 40, 20, color="rgb", backend=backend)
+    found = kodak._measure(task, image, 40, 20, 3)
+    expected = fit(image, 40, 20, color="rgb", solve_steps=3, backend=backend)
     error = np.clip(expected.image, 0, 1).astype(np.float64) - image
     assert found["psnr_float"] == pytest.approx(-10 * np.log10(np.mean(error**2)), abs=1e-6)
     assert found["psnr_rgb"] == pytest.approx(psnr(expected.image, image), abs=1e-6)
@@ -39,18 +39,19 @@ def test_an_interrupted_run_goes_on(backend, data, monkeypatch):
     task = task_in(data, backend, data)
     monkeypatch.setattr(kodak, "fit", broken_off)
     with pytest.raises(KeyboardInterrupt):
-        kodak.run(task, (10, 20), (2,), False)
+        kodak.run(task, (10, 20), (2,), 10, False)
     monkeypatch.undo()
     monkeypatch.setitem(SETS, "kodak", ImageSet("kodak", 32, 24, 40))
-    rows = kodak.run(task, (10, 20), (2, 3), False)
+    rows = kodak.run(task, (10, 20), (2, 3), 10, False)
     jobs = [(j["iterations"], j["image"], j["gaussians"]) for j in (row["job"] for row in rows)]
     assert jobs == [(k, name, n) for k in (2, 3) for name in ("a.png", "b.png") for n in (10, 20)]
     monkeypatch.setattr(kodak, "fit", broken_off)
-    assert kodak.run(task, (20,), (3,), False) == [rows[5], rows[7]]
+    assert kodak.run(task, (20,), (3,), 10, False) == [rows[5], rows[7]]
 
 
-def row(image, count, decibels, timed=False, seconds=1.0, steps=1000):
+def row(image, count, decibels, timed=False, seconds=1.0, steps=1000, depth=10):
     job = {"image": image, "gaussians": count, "iterations": steps, "timed": timed}
+    job["solve_steps"] = depth
     figures = {"psnr_float": decibels, "psnr_rgb": decibels - 0.1, "ms_ssim": 0.9}
     return {"job": job, **figures, "seconds": seconds, "run": RUN}
 
@@ -67,6 +68,19 @@ def test_the_table_shows_ours_beside_published_figures():
     assert [int(line[0].replace(",", "")) for line in lines] == sorted(
         int(line[0].replace(",", "")) for line in lines
     )
+
+
+def test_fits_without_steps_are_told_apart_by_their_solves():
+    few, many = (row("a", 28_000, d, True, s, 0, k) for d, s, k in ((30, 0.2, 10), (31, 0.8, 30)))
+    section = summarize([few, many, row("a", 28_000, 40.0)])
+    ours = [line[1:7] for line in lines_of(section.tables[0]) if line[1].startswith("default")]
+    assert ours == [
+        ("default", "0", "30.00", "29.90", "0.9000", "0.2"),
+        ("default, solve_steps=30", "0", "31.00", "30.90", "0.9000", "0.8"),
+        ("default", "1,000", "40.00", "39.90", "0.9000", "-"),
+    ]
+    labels = section.charts["kodak-seconds"][1].axes[0].get_legend_handles_labels()[1]
+    assert {"default, 0 steps", "default, solve_steps=30, 0 steps"} <= set(labels)
 
 
 def test_charts_show_means_and_the_seconds_of_timed_fits():

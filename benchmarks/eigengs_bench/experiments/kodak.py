@@ -14,6 +14,7 @@ import numpy as np
 from eigengs_bench.harness.datasets import images_of
 from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.timing import Image, decibels
+from eigengs_bench.names import SOLVE_STEPS
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.image.metrics import ms_ssim
 
@@ -26,12 +27,16 @@ WARM_UP = 200  # untimed steps on a small image: as many compile all programs of
 SMALL, FEW = 64, 100  # pixels of a side, Gaussians
 
 
-def run(task: Task, counts: Sequence[int], steps: Sequence[int], timed: bool) -> list[Row]:
+def run(
+    task: Task, counts: Sequence[int], steps: Sequence[int], solve_steps: int, timed: bool
+) -> list[Row]:
     """Fit the photos by each number of Gaussians, with each number of steps."""
-    return task.measure(FILE, list(_jobs(task, counts, steps, timed)), SET)
+    return task.measure(FILE, list(_jobs(task, counts, steps, solve_steps, timed)), SET)
 
 
-def _jobs(task: Task, counts: Sequence[int], steps: Sequence[int], timed: bool) -> Iterator[Job]:
+def _jobs(
+    task: Task, counts: Sequence[int], steps: Sequence[int], solve_steps: int, timed: bool
+) -> Iterator[Job]:
     """Name the fits: all of the first number of steps before the next, photo by photo."""
     photos = images_of(task, SET)
 
@@ -43,16 +48,19 @@ def _jobs(task: Task, counts: Sequence[int], steps: Sequence[int], timed: bool) 
 
     def work(image: Image, count: int, iterations: int) -> Row:
         compile_programs()
-        return _measure(task, image, count, iterations)
+        return _measure(task, image, count, iterations, solve_steps)
 
-    shared = {"set": SET, "color": COLOR, "seed": task.seed, "timed": timed}
+    shared: Row = {"set": SET, "color": COLOR, "seed": task.seed, "timed": timed}
+    if solve_steps != SOLVE_STEPS:
+        shared["solve_steps"] = solve_steps
     for iterations, (file, image), count in product(steps, photos, counts):
         name = {**shared, "image": file, "gaussians": count, "iterations": iterations}
         yield name, partial(work, image, count, iterations)
 
 
-def _measure(task: Task, image: Image, count: int, iterations: int) -> Row:
-    found = fit(image, count, iterations, color=COLOR, seed=task.seed, backend=task.backend)
+def _measure(task: Task, image: Image, count: int, iterations: int, solve_steps: int) -> Row:
+    shared: Row = {"color": COLOR, "seed": task.seed, "backend": task.backend}
+    found = fit(image, count, iterations, solve_steps=solve_steps, **shared)
     return {
         "psnr_float": decibels(np.clip(found.image, 0, 1), image, "data"),
         "psnr_rgb": decibels(found.image, image, "rgb"),

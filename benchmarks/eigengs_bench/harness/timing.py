@@ -36,6 +36,7 @@ def follow(
     """Run a descent to its last step and yield its state after the steps in `marks`.
 
     It takes all steps, and shows the set as it is, where `eigengs_dr.fit` stops and keeps the best.
+    A set on the way may have more Gaussians than the first and the last one.
     The time of `begin` counts; the clock stops between moments.
     """
     spent, resumed = 0.0, time.perf_counter()

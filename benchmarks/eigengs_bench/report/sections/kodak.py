@@ -2,18 +2,19 @@
 
 from collections.abc import Sequence
 from importlib.resources import files
-from typing import Any
 
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from eigengs_bench.harness.store import Row
+from eigengs_bench.names import SOLVE_STEPS
 from eigengs_bench.report import frames as fr
 from eigengs_bench.report.charts import label_axes, new_figure
 
 PUBLISHED = "published_kodak.csv"
-FIT = ["iterations", "image", "gaussians"]
+KIND = ["iterations", "solve_steps"]
+FIT = [*KIND, "image", "gaussians"]
 COLUMNS = (
     "Gaussians",
     "method",
@@ -34,7 +35,9 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
 
     Seconds are those of timed fits alone.
     """
-    fits, known = fr.frame_of(rows), published()
+    usual = {"solve_steps": SOLVE_STEPS}  # rows of fits with the default do not name it
+    fits = fr.frame_of([{**row, "job": {**usual, **row["job"]}} for row in rows])
+    known = published()
     photos = fits.drop_duplicates(FIT)
     timed = fits[fits.timed]
     caption = f"kodak: {CAPTION}; seconds of fits while nothing else ran (median, middle half)"
@@ -58,12 +61,13 @@ def published() -> pd.DataFrame:
 
 def _our_lines(photos: pd.DataFrame, timed: pd.DataFrame) -> list[tuple]:
     lines = []
-    for (steps, count), part in photos.groupby(["iterations", "gaussians"], sort=True):
-        clock = timed[(timed.iterations == steps) & (timed.gaussians == count)].seconds
+    for kind, part in photos.groupby([*KIND, "gaussians"], sort=True):
+        steps, depth, count = kind
+        clock = timed[(timed[[*KIND, "gaussians"]] == list(kind)).all(axis=1)].seconds
         lines.append(
             (
                 count,
-                "default",
+                _name(depth),
                 f"{steps:,}",
                 fr.mean(part.psnr_float, 2),
                 fr.mean(part.psnr_rgb, 2),
@@ -74,6 +78,11 @@ def _our_lines(photos: pd.DataFrame, timed: pd.DataFrame) -> list[tuple]:
             )
         )
     return lines
+
+
+def _name(depth: int) -> str:
+    """Name our method with the steps of its colour solve, if they are not the usual ones."""
+    return "default" if depth == SOLVE_STEPS else f"default, solve_steps={depth}"
 
 
 def _published_lines(known: pd.DataFrame) -> list[tuple]:
@@ -90,7 +99,7 @@ def _over_gaussians(photos: pd.DataFrame, known: pd.DataFrame) -> Figure:
     """Draw PSNR over the number of Gaussians: a line a number of steps, a line a method."""
     figure = new_figure(7.5, 5, f"Kodak, {fr.counted(photos.image)}")
     axis = figure.subplots()
-    _draw_ours(axis, photos, photos.groupby(["iterations", "gaussians"]).gaussians.first())
+    _draw_ours(axis, photos, "gaussians")
     for color, (name, part) in zip(OTHERS, known.groupby("method", sort=False), strict=False):
         axis.plot(part.gaussians, part.psnr_float, "s--", ms=4, color=color, label=name)
     label_axes(axis, "Gaussians", "PSNR in float RGB / dB")
@@ -101,7 +110,7 @@ def _over_seconds(timed: pd.DataFrame, known: pd.DataFrame) -> Figure:
     """Draw PSNR over the seconds of a fit, with the number of Gaussians beside each point."""
     figure = new_figure(7.5, 5, f"Kodak, {fr.counted(timed.image)} that were timed")
     axis = figure.subplots()
-    _draw_ours(axis, timed, timed.groupby(["iterations", "gaussians"]).seconds.median(), True)
+    _draw_ours(axis, timed, "seconds")
     clocked = known.dropna(subset=["seconds"])
     for color, row in zip(OTHERS, clocked.itertuples(), strict=False):
         label = f"{row.method}, on {row.machine}"
@@ -111,14 +120,17 @@ def _over_seconds(timed: pd.DataFrame, known: pd.DataFrame) -> Figure:
     return figure
 
 
-def _draw_ours(axis: Axes, fits: pd.DataFrame, x: pd.Series, named: bool = False) -> None:
-    """Draw the means of our fits over the values `x`, which are by steps and Gaussians."""
-    means = fits.groupby(["iterations", "gaussians"]).psnr_float.mean()
-    for steps, alpha in zip(x.index.unique("iterations"), (1.0, 0.6, 0.4, 0.3), strict=False):
-        style: Any = {"color": "#0b6e99", "alpha": alpha, "label": f"default, {steps:,} steps"}
-        axis.plot(x[steps], means[steps], "o-", ms=5, **style)
-        for count in x[steps].index if named else ():
-            _name_point(axis, count, x[steps][count], means[steps][count])
+def _draw_ours(axis: Axes, fits: pd.DataFrame, over: str) -> None:
+    """Draw the means of our fits over their Gaussians or, with the number at each, seconds."""
+    for ((steps, depth), part), alpha in zip(
+        fits.groupby(KIND), (1.0, 0.6, 0.4, 0.3), strict=False
+    ):
+        points = part.groupby("gaussians")
+        x, y = points[over].median(), points.psnr_float.mean()
+        label = f"{_name(depth)}, {steps:,} steps"
+        axis.plot(x, y, "o-", ms=5, color="#0b6e99", alpha=alpha, label=label)
+        for count in x.index if over == "seconds" else ():
+            _name_point(axis, count, x[count], y[count])
 
 
 def _name_point(axis: Axes, count: int, x: float, y: float) -> None:
