@@ -125,7 +125,7 @@ def refine(
             stopped = "interrupted"
     except KeyboardInterrupt:
         stopped = "interrupted"
-    if stopped == "interrupted" and trace[-1]["iteration"] != step:
+    if stopped == "interrupted" and step not in [row["iteration"] for row in trace]:
         if len(current) > len(problem.gaussians):
             current = prune(
                 dr.detach(current), problem.target, len(problem.gaussians), problem.weight

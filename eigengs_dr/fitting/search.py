@@ -122,7 +122,7 @@ class _Run:
     def descend(
         self, gaussians: Gaussians, steps: int, share: float = 1.0, surplus: int = 0
     ) -> _Trial:
-        """Take some steps at a fraction of the learning rates, and score the set."""
+        """Take some steps at a fraction of the learning rates, and score what is left then."""
         rates = {name: share * rate for name, rate in self.schedule.rates.items()}
         schedule = replace(self.schedule, rates=rates)
         self.planned = max(self.planned, self.step + steps)
@@ -140,7 +140,10 @@ class _Run:
                 if self.progress and self.step % 10 == 0:
                     dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
                     self.progress(self.step, self.planned, self.trace[-1])
-        return self.score(dr.detach(current))
+        current, wanted = dr.detach(current), len(gaussians) - surplus
+        if len(current) > wanted:  # an interrupt came before the last relocation
+            current = prune(current, self.start.target, wanted, self.start.weight)
+        return self.score(current)
 
     def score(self, gaussians: Gaussians) -> _Trial:
         figures = self.measure(gaussians)

@@ -17,13 +17,15 @@ from eigengs_dr.fitting.optimizers.schedule import Relocation, relocations, surp
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.fitting.refine import refine
+from eigengs_dr.fitting.search import search_count
+from eigengs_dr.raster.render import picture_of
 
 SCHEDULE = replace(PRESETS["default"].schedule, relocate_every=15)
 COUNT, STEPS = 30, 100
 
 
-def start_of(image):
-    return initialize(image, FitOptions(gaussians=COUNT, init="adaptive"))
+def start_of(image, backend=None):
+    return initialize(image, FitOptions(gaussians=COUNT, init="adaptive", backend=backend))
 
 
 @pytest.mark.parametrize(("share", "dropped", "left"), [(0.2, 0, 60), (0.2, 5, 55), (0.1, 9, 51)])
@@ -74,9 +76,9 @@ def test_how_many():
     assert surplus_for(replace(schedule, surplus=0.0), 1000, 256 * 256, 980) == 0
 
 
-def test_a_descent_ends_with_the_number_asked_for():
+def test_a_descent_ends_with_the_number_asked_for(backend):
     """As many in the first phase, more after it, and fewer after each round."""
-    with closing(descend(start_of(picture()), SCHEDULE, STEPS)) as sets:
+    with closing(descend(start_of(picture(), backend), SCHEDULE, STEPS)) as sets:
         counts = [len(current) for current in sets]
     more = surplus_for(SCHEDULE, COUNT, SIDE * SIDE, STEPS - 10)
     assert more > 0
@@ -84,11 +86,11 @@ def test_a_descent_ends_with_the_number_asked_for():
     assert (np.diff(counts[11:]) <= 0).all() and counts[-1] == COUNT
 
 
-def test_a_recorded_step_serves_all_counts(monkeypatch):
+def test_a_recorded_step_serves_all_counts(backend, monkeypatch):
     """The program is recorded with the largest set; without recording the descent is the same."""
 
     def end():
-        with closing(descend(start_of(picture()), SCHEDULE, STEPS)) as sets:
+        with closing(descend(start_of(picture(), backend), SCHEDULE, STEPS)) as sets:
             for current in sets:
                 last = current
         return dr.detach(last).to_arrays()
@@ -133,3 +135,29 @@ def test_an_interrupt_in_between_leaves_the_number_asked_for(color, monkeypatch)
     best = max(row["psnr_ycbcr"] for row in result.trace)
     assert best >= result.trace[0]["psnr_ycbcr"]
     assert eg.psnr(result.image, image, "ycbcr") == pytest.approx(best, abs=1e-4)
+
+
+def test_an_interrupted_search_has_no_more_than_it_may():
+    """Pressed in the fit, while it has a surplus."""
+    image, most, pressed = eg.sample("coffee")[:64, :64], 100, []
+
+    def measure(gaussians):
+        return {"decibels": eg.psnr(picture_of(gaussians), image)}
+
+    def press(iteration, iterations, row):
+        pressed.extend([iteration] * (iteration == 100))  # at most 80 steps are tries
+
+    result = search_count(
+        start_of(image),
+        measure,
+        "decibels",
+        60.0,
+        most,
+        SCHEDULE,
+        200,
+        progress=press,
+        interrupted=lambda: bool(pressed),
+    )
+    assert (result.stopped, result.iterations) == ("interrupted", 100)
+    assert result.trace[-1]["gaussians"] == most
+    assert max(row["gaussians"] for row in result.trace) == most
