@@ -164,7 +164,7 @@ def fit_maps(
         if preview:
             eg.save_image(preview, _preview(images, result))
     width, height = result.material.gaussians.width, result.material.gaussians.height
-    figures = result.trace[-1] if result.stopped == "interrupted" else _best(result.trace)
+    figures = _best(result.trace)
     record = {
         "input": {name: str(item.path) for name, item in maps.items()},
         "output": str(output),

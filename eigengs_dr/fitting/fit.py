@@ -40,7 +40,7 @@ class Fit:
         Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb. A search for the number of
         Gaussians adds the key gaussians. Row 0 shows the set before refinement. Seconds count from
         the call of `fit`; they include placement, upload, the colour solve and the measurements.
-        A descent has more Gaussians than asked for up to 65 % of its steps, see
+        A descent has more Gaussians than asked for in its first two thirds, see
         `eigengs_dr.fitting.optimizers.schedule.surplus_for`; those sets have no rows.
         With color "data" or "normal", psnr_rgb is the PSNR of the data after clamping and rounding
         to 8 bits, and psnr_ycbcr the PSNR of the unchanged data; for values above 1.5, the largest

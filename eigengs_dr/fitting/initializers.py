@@ -96,8 +96,8 @@ class FitProblem(NamedTuple):
         ``redistribute(gaussians, count)`` returns a new set with more Gaussians where the old set
         left more error. None for initialisers other than "adaptive".
     relocate : callable, or None
-        ``relocate(gaussians, how)`` returns as many Gaussians, of which some have moved to where
-        the old set left most error, and all are perturbed; `how` is an
+        ``relocate(gaussians, how)`` returns as many Gaussians, less those that `how` drops. Some
+        have moved to where the old set left most error, and all are perturbed; `how` is an
         `eigengs_dr.fitting.optimizers.schedule.Relocation`. None where Gaussians must keep their
         places.
     """

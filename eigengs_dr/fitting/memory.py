@@ -19,7 +19,7 @@ largest resident memory of processes that fit a mosaic of photos with the backen
 | 2,048x2,048 | 3 | 20,000 | 0.64 GB | 0.63 GB |
 | 2,048x2,048 | 3 | 320,000 | 0.88 GB | 0.84 GB |
 | 2,048x2,048 | 1 | 320,000 | 0.63 GB | 0.65 GB |
-| 4,000x3,000 | 3 | 5,000 | 1.17 GB | 1.16 GB |
+| 4,000x3,000 | 3 | 5,000 | 1.17 GB | 1.17 GB |
 | 4,096x4,096 | 3 | 1,280,000 | 2.37 GB | 2.43 GB |
 
 Rows of equal size give `BYTES_PER_GAUSSIAN` and `BYTES_PER_VALUE`, the two largest sizes
@@ -53,7 +53,7 @@ def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> i
     -------
     int
         Bytes, to about a sixth for sets that `eigengs_dr.fit` places. Large Gaussians touch more
-        tiles and take more.
+        tiles and take more. It counts the largest surplus, which short fits do not have.
     """
     pixels = width * height
     in_strips = min(pixels, STRIP_PIXELS * min(MAX_THREADS, available_cores()))

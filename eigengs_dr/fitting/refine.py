@@ -97,22 +97,26 @@ def refine(
     marks, trace = trace_steps(iterations), list[dict[str, Any]]()
     best, current, highest = problem.gaussians, problem.gaussians, -math.inf
     stopped, step, latest = "iterations", 0, dict[str, Any]()
+    count, larger = len(problem.gaussians), list[tuple[float, int, Gaussians]]()
 
-    def judge() -> None:
+    def judge(step: int, gaussians: Gaussians) -> None:
         nonlocal best, highest, latest
-        latest = {"iteration": step, **score(current)}
-        if len(current) > len(problem.gaussians):  # more than asked for: it does not compare
+        latest = {"iteration": step, **score(gaussians)}
+        figure = latest["psnr_ycbcr"]
+        if len(gaussians) > count:  # it does not compare; the best one is kept for an interrupt
+            larger[:] = [max([*larger, (figure, step, gaussians)], key=lambda found: found[0])]
             return
+        larger.clear()
         trace.append(latest)
-        if latest["psnr_ycbcr"] > highest:
-            best, highest = current, latest["psnr_ycbcr"]
+        if figure > highest:
+            best, highest = gaussians, figure
 
     try:
         with closing(descend(problem, schedule, iterations, levels)) as sets:
             for step, reached in enumerate(sets):
                 current = reached
                 if step in marks:
-                    judge()
+                    judge(step, current)
                 if progress and (step in marks or step % 10 == 0):
                     dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
                     progress(step, iterations, latest)
@@ -125,13 +129,17 @@ def refine(
             stopped = "interrupted"
     except KeyboardInterrupt:
         stopped = "interrupted"
-    if stopped == "interrupted" and step not in [row["iteration"] for row in trace]:
-        if len(current) > len(problem.gaussians):
-            current = prune(
-                dr.detach(current), problem.target, len(problem.gaussians), problem.weight
-            )
-        judge()
+    if stopped == "interrupted":
+        for _, at, found in [*larger, (0.0, step, current)]:
+            if at not in [row["iteration"] for row in trace]:
+                judge(at, _at_most(count, dr.detach(found), problem))
     return Refinement(dr.detach(best), trace, step, stopped)
+
+
+def _at_most(count: int, gaussians: Gaussians, problem: FitProblem) -> Gaussians:
+    if len(gaussians) <= count:
+        return gaussians
+    return prune(gaussians, problem.target, count, problem.weight)
 
 
 def measure(

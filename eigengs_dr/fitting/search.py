@@ -77,7 +77,7 @@ def search_count(
     run.planned = policy.max_tries * tries + fit + policy.max_polishes * polish
     try:
         estimate = _estimate(run, most, tries)
-        if run.best.missing > 0 or len(run.best.gaussians) > 1:
+        if not interrupted() and (run.best.missing > 0 or len(run.best.gaussians) > 1):
             longest = round(policy.max_length * iterations)
             trial = _fit_estimate(run, estimate, most, fit, longest)
             # If the iterations are few, or two fits have used them up, polish all the same.
@@ -163,10 +163,10 @@ def _better(a: _Trial, b: _Trial) -> bool:
 
 
 class _Estimate(NamedTuple):
-    """The set of the last try, and the estimated number of Gaussians with a margin."""
+    """The set of the last try, and the estimated number of Gaussians placed where it left error."""
 
     tried: Gaussians
-    number: int
+    placed: Gaussians
 
 
 def _estimate(run: _Run, most: int, steps: int) -> _Estimate:
@@ -191,24 +191,28 @@ def _estimate(run: _Run, most: int, steps: int) -> _Estimate:
         last, before = trial, run.score(placed)
         if close or run.interrupted():
             break
-    return _Estimate(trial.gaussians, len(placed))
+    return _Estimate(trial.gaussians, placed)
 
 
 def _fit_estimate(run: _Run, estimate: _Estimate, most: int, steps: int, most_steps: int) -> _Trial:
     """Fit the estimated number; if it was far off, fit once more, in the steps that are left."""
-    trial = _fit(run, *estimate, steps)
-    count = _count_for_gain(run, estimate.number, trial.missing, most)
-    near = run.policy.fit_tolerance * estimate.number
-    if run.interrupted() or abs(count - estimate.number) <= near:
+    trial, number = _fit(run, estimate, steps), len(estimate.placed)
+    count = _count_for_gain(run, number, trial.missing, most)
+    if run.interrupted() or abs(count - number) <= run.policy.fit_tolerance * number:
         return trial
-    return _fit(run, trial.gaussians, count, max(1, min(steps, most_steps - run.step)))
-
-
-def _fit(run: _Run, tried: Gaussians, count: int, steps: int) -> _Trial:
-    """Place Gaussians where another set left error, and fit them, with a surplus that leaves."""
     assert run.start.redistribute is not None
-    more = surplus_for(run.schedule, count, tried.width * tried.height, steps)
-    return run.descend(run.start.redistribute(tried, count + more), steps, surplus=more)
+    again = _Estimate(trial.gaussians, run.start.redistribute(trial.gaussians, count))
+    return _fit(run, again, max(1, min(steps, most_steps - run.step)))
+
+
+def _fit(run: _Run, estimate: _Estimate, steps: int) -> _Trial:
+    """Fit the estimated number, with a surplus that is placed as well and leaves."""
+    tried, placed = estimate
+    more = surplus_for(run.schedule, len(placed), placed.width * placed.height, steps)
+    if more:
+        assert run.start.redistribute is not None
+        placed = run.start.redistribute(tried, len(placed) + more)
+    return run.descend(placed, steps, surplus=more)
 
 
 def _update_slope(run: _Run, last: _Trial | None, trial: _Trial) -> None:

@@ -40,6 +40,19 @@ def test_results_are_those_of_single_fits(backend, color, init):
             np.testing.assert_allclose(shown, found.image, atol=1e-5)
 
 
+@pytest.mark.parametrize("color", ["ycbcr", "linear"])
+def test_a_surplus_leaves_every_image_alike(backend, color):
+    """As in single fits: on llvm bit for bit."""
+    settings = options(backend, color=color, gaussians=30, iterations=150)
+    for image, found in zip(pictures(3), fit_batch(pictures(3), settings), strict=True):
+        alone = eg.fit(image, 30, 150, color=color, backend=backend)
+        assert [r["iteration"] for r in found.trace] == [r["iteration"] for r in alone.trace]
+        assert len(found.gaussians) == 30
+        if backend == "llvm":
+            for name, values in alone.gaussians.to_arrays().items():
+                np.testing.assert_array_equal(found.gaussians.to_arrays()[name], values)
+
+
 def test_gaussians_are_placed_anew_in_long_fits(backend):
     """From 200 steps on."""
     found = fit_batch(pictures(2), options(backend, iterations=200))

@@ -161,3 +161,19 @@ def test_an_interrupted_search_has_no_more_than_it_may():
     assert (result.stopped, result.iterations) == ("interrupted", 100)
     assert result.trace[-1]["gaussians"] == most
     assert max(row["gaussians"] for row in result.trace) == most
+
+
+def test_an_interrupt_after_the_last_round_keeps_the_best_set_before_it():
+    """Just after noise the last step is poor; the best set with a surplus is pruned as well."""
+    image = picture()
+
+    def stop(iteration, iterations, row):
+        if iteration == 140:  # the last relocation was at 134
+            raise KeyboardInterrupt
+
+    found = refine(start_of(image), image, SCHEDULE, 200, progress=stop)
+    assert [row["iteration"] for row in found.trace] == [0, 10, 20, 100, 140]
+    assert len(found.gaussians) == COUNT
+    psnrs = [row["psnr_ycbcr"] for row in found.trace]
+    shown = eg.psnr(picture_of(found.gaussians), image, "ycbcr")
+    assert shown == pytest.approx(max(psnrs), abs=1e-4)

@@ -63,8 +63,7 @@ def measure_cell(case: Case, preset: str, seed: int, backend: str | None) -> Row
 
     "needs", alone, says what a preset lacks. Else "finite" is true if all parameters and pixels are
     finite at all marks of `trace_steps`; start, end and half are PSNRs of the first and of the last
-    moment and of the last set in half precision, drop is the loss from the best moment to the last
-    one, of those with as many Gaussians;
+    moment and of the last set in half precision, drop is the loss from the best moment to the last;
     "condition" is the highest of a covariance, "peak_gib" the memory of a case in its own process,
     "shorter_ycbcr" the PSNR at the end of a run of the shorter number of steps of the case.
     """
@@ -126,8 +125,6 @@ def _score(followed: list[Moment], image: Image) -> Row:
     # What a descent adds to its set, the dense mean, is not stored with it.
     added = last.picture - picture_of(last.gaussians)
     half = picture_of(_round_to_half(last.gaussians)) + added
-    # A descent has more Gaussians on its way than in the end.
-    compared = [m for m in followed if len(m.gaussians) == len(last.gaussians)]
     row: Row = {
         "finite": all(finite),
         "condition": max(float(condition_number(kept["factor"]).max()) for kept in arrays),
@@ -137,7 +134,7 @@ def _score(followed: list[Moment], image: Image) -> Row:
     }
     for space in ("ycbcr", "rgb"):
         # Above EXACT there is rounding only: no drop. NaN stays.
-        seen = [decibels(m.picture, image, space) for m in compared]
+        seen = [decibels(m.picture, image, space) for m in followed]
         row[f"start_{space}"], row[f"end_{space}"] = float(seen[0]), float(seen[-1])
         row[f"drop_{space}"] = float(np.max(seen) - seen[-1])
         row[f"half_{space}"] = decibels(half, image, space)

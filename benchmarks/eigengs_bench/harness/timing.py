@@ -36,14 +36,14 @@ def follow(
     """Run a descent to its last step and yield its state after the steps in `marks`.
 
     It takes all steps, and shows the set as it is, where `eigengs_dr.fit` stops and keeps the best.
-    A set on the way may have more Gaussians than the first and the last one.
+    Sets with more Gaussians than the first one, which a descent has on its way, are left out.
     The time of `begin` counts; the clock stops between moments.
     """
     spent, resumed = 0.0, time.perf_counter()
     start = begin()
     sets = descend(start, schedule, iterations)
     for iteration, current in enumerate(sets):
-        if iteration not in marks:
+        if iteration not in marks or len(current) != len(start.gaussians):
             continue
         dr.eval(current)
         dr.sync_thread()  # steps run asynchronously

@@ -53,13 +53,13 @@ def descend(
     levels : sequence of int, optional
         Numbers n. The first n Gaussians shall form the image too, as well as they can.
     surplus : int, optional
-        Number of Gaussians of each image that relocations drop from the start. A problem that can
-        redistribute has none, and gets its own.
+        Number of Gaussians of each image that relocations, if there are any, drop from the start.
+        A problem that can redistribute has none, and gets its own.
 
     Yields
     ------
     Gaussians
-        The current set. After the last step it has as many Gaussians as the start, less the
+        The current set. After the last relocation it has as many Gaussians as the start, less the
         argument `surplus`. Steps run asynchronously: its arrays may not be computed yet.
     """
     with release_later(problem):  # a set of the caller may share NumPy's memory
@@ -69,9 +69,9 @@ def descend(
             for current in run_phase(problem, schedule, first):
                 yield current
             iterations, images = iterations - first, number_of_images(problem)
-            if problem.relocate:
-                pixels = current.width * current.height
-                surplus = surplus_for(schedule, len(current) // images, pixels, iterations)
+            count, pixels = len(current) // images, current.width * current.height
+            may_drop = problem.relocate is not None
+            surplus = surplus_for(schedule, count, pixels, iterations) if may_drop else 0
             anew = problem.redistribute(dr.detach(current), len(current) + images * surplus)
             problem = problem._replace(gaussians=anew)
         yield from run_phase(problem, schedule, iterations, levels, surplus=surplus)

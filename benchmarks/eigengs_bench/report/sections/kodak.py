@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from importlib.resources import files
+from itertools import cycle
 
 import pandas as pd
 from matplotlib.axes import Axes
@@ -122,9 +123,8 @@ def _over_seconds(timed: pd.DataFrame, known: pd.DataFrame) -> Figure:
 
 def _draw_ours(axis: Axes, fits: pd.DataFrame, over: str) -> None:
     """Draw the means of our fits over their Gaussians or, with the number at each, seconds."""
-    for ((steps, depth), part), alpha in zip(
-        fits.groupby(KIND), (1.0, 0.6, 0.4, 0.3), strict=False
-    ):
+    shades = cycle((1.0, 0.6, 0.4, 0.3))
+    for ((steps, depth), part), alpha in zip(fits.groupby(KIND), shades, strict=False):
         points = part.groupby("gaussians")
         x, y = points[over].median(), points.psnr_float.mean()
         label = f"{_name(depth)}, {steps:,} steps"
