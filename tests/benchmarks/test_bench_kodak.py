@@ -93,6 +93,7 @@ def test_charts_show_means_and_the_seconds_of_timed_fits():
     }
     ours = curves["kodak-gaussians"]["default, 1,000 steps"]
     np.testing.assert_allclose(ours, [[5000, 32.5], [10_000, 36.0]])
+    assert set(published().method) < set(curves["kodak-gaussians"])
     np.testing.assert_allclose(curves["kodak-seconds"]["default, 1,000 steps"], [[9.0, 32.0]])
     assert "GaussianImage, on NVIDIA V100" in curves["kodak-seconds"]
 

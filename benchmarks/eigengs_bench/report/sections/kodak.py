@@ -28,7 +28,7 @@ COLUMNS = (
     "source",
 )
 CAPTION = "PSNR in RGB of float pixels clamped to [0, 1], means over the photos"
-OTHERS = ("#b5442f", "#c27c0e", "#7a4f9a", "#5a8f3c", "#8a6d3b", "#666666", "#c2549a")
+OTHERS = ("#b5442f", "#c27c0e", "#7a4f9a", "#5a8f3c", "#8a6d3b", "#666666", "#c2549a", "#2f8f83")
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
@@ -101,7 +101,9 @@ def _over_gaussians(photos: pd.DataFrame, known: pd.DataFrame) -> Figure:
     figure = new_figure(7.5, 5, f"Kodak, {fr.counted(photos.image)}")
     axis = figure.subplots()
     _draw_ours(axis, photos, "gaussians")
-    for color, (name, part) in zip(OTHERS, known.groupby("method", sort=False), strict=False):
+    for color, (name, part) in zip(
+        cycle(OTHERS), known.groupby("method", sort=False), strict=False
+    ):
         axis.plot(part.gaussians, part.psnr_float, "s--", ms=4, color=color, label=name)
     label_axes(axis, "Gaussians", "PSNR in float RGB / dB")
     return figure
@@ -113,7 +115,7 @@ def _over_seconds(timed: pd.DataFrame, known: pd.DataFrame) -> Figure:
     axis = figure.subplots()
     _draw_ours(axis, timed, "seconds")
     clocked = known.dropna(subset=["seconds"])
-    for color, row in zip(OTHERS, clocked.itertuples(), strict=False):
+    for color, row in zip(cycle(OTHERS), clocked.itertuples(), strict=False):
         label = f"{row.method}, on {row.machine}"
         axis.plot(row.seconds, row.psnr_float, "s", color=color, label=label)
         _name_point(axis, row.gaussians, row.seconds, row.psnr_float)
