@@ -41,9 +41,8 @@ more steps would in the same time."""
 
 
 MAX_SURPLUS = 1.0
-"""Gaussians of a long descent in addition to those asked for, relative to them, see `surplus_for`.
-With 0.0127 Gaussians a pixel, 1,000 steps and 9 training photos, 0.5, 1 and 2 gain 0.23, 0.24 and
-0.12 dB."""
+"""Gaussians of a long descent in addition to those asked for, relative to them. With 0.0127
+Gaussians a pixel, 1,000 steps and 9 training photos, 0.5, 1 and 2 gain 0.23, 0.24 and 0.12 dB."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +77,7 @@ class Schedule:
     noise : float
         Strength of the perturbation in the first round, see `eigengs_dr.fitting.perturbation`.
     surplus : float
-        Share of Gaussians that redistribution places in addition and relocation drops, see
-        `surplus_for`.
+        Share of Gaussians that are placed in addition and leave again, see `surplus_for`.
     agility : float
         Exponent by which the rates of means and shapes fall with the colour, see `agility_of`.
     patience : int
@@ -182,8 +180,7 @@ more than rounds would, for the same time. With 5,000 steps, 72 rounds gain 0.07
 FULL_ROUNDS = 10
 """Number of rounds from which on noise and surplus have their full strength. A short descent does
 not recover from more: with 300 steps and 0.076 Gaussians a pixel, a `Schedule.noise` of 4 costs 0.8
-dB. With 300 steps and 0.0127 Gaussians a pixel, a surplus of 0.5 gains 0.24 dB, one of 1 0.18 dB.
-"""
+dB. With 0.0127 Gaussians a pixel, a surplus of 0.5 gains 0.24 dB there, and one of 1 0.18 dB."""
 
 
 class Relocation(NamedTuple):
@@ -198,8 +195,8 @@ class Relocation(NamedTuple):
     seed : int
         Seed of the perturbation.
     dropped : int
-        How many of those that leave are gone. The others move to where the error is largest. If
-        more Gaussians are dropped than the share says, only these leave.
+        How many of those that leave are gone, even if the share says fewer. The others move to
+        where the error is largest.
     """
 
     share: float
@@ -250,16 +247,11 @@ training photos, surpluses up to this density gain 0.24, 0.22 and 0.10 dB with 0
 def surplus_for(schedule: Schedule, count: int, pixels: int, iterations: int) -> int:
     """Return how many more Gaussians than asked for a descent has before its first relocation.
 
-    Many Gaussians find more of the image than few. The descent drops those of least use, round
-    after round, and keeps a better set than it finds with the number asked for.
-
     Parameters
     ----------
     schedule : Schedule
-    count : int
-        Number of Gaussians asked for, for one image.
-    pixels : int
-        Number of pixels of the image.
+    count, pixels : int
+        Number of Gaussians asked for, and of pixels, both of one image.
     iterations : int
         Number of steps of the descent, without the first phase.
 
