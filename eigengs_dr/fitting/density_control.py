@@ -78,8 +78,10 @@ def prune(
     """Keep the `count` Gaussians of largest removal cost, in order, and solve for the colours.
 
     For the other parameters see `removal_cost`. With a weight the colours stay, because the solve
-    minimises the error without weights.
+    minimises the error without weights. A set with `count` or fewer Gaussians stays as it is.
     """
+    if count >= len(gaussians):
+        return gaussians
     value = removal_cost(gaussians, target, weight)
     kept = np.sort(np.argsort(-value, kind="stable")[:count])
     if weight is not None:

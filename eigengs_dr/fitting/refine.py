@@ -132,14 +132,8 @@ def refine(
     if stopped == "interrupted":
         for _, at, found in [*larger, (0.0, step, current)]:
             if at not in [row["iteration"] for row in trace]:
-                judge(at, _at_most(count, dr.detach(found), problem))
+                judge(at, prune(dr.detach(found), problem.target, count, problem.weight))
     return Refinement(dr.detach(best), trace, step, stopped)
-
-
-def _at_most(count: int, gaussians: Gaussians, problem: FitProblem) -> Gaussians:
-    if len(gaussians) <= count:
-        return gaussians
-    return prune(gaussians, problem.target, count, problem.weight)
 
 
 def measure(

@@ -140,10 +140,9 @@ class _Run:
                 if self.progress and self.step % 10 == 0:
                     dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
                     self.progress(self.step, self.planned, self.trace[-1])
-        current, wanted = dr.detach(current), len(gaussians) - surplus
-        if len(current) > wanted:  # an interrupt came before the last relocation
-            current = prune(current, self.start.target, wanted, self.start.weight)
-        return self.score(current)
+        # An interrupt may come before the last relocation.
+        wanted, start = len(gaussians) - surplus, self.start
+        return self.score(prune(dr.detach(current), start.target, wanted, start.weight))
 
     def score(self, gaussians: Gaussians) -> _Trial:
         figures = self.measure(gaussians)
