@@ -44,22 +44,30 @@ help:
 
 setup: $(READY)
 
+# pip prints hundreds of lines; the log has them, and its end is shown where pip fails.
 $(READY): pyproject.toml benchmarks/pyproject.toml
 	@$(APT_INSTALL); $(PYTHON) -c 'import ensurepip' 2>/dev/null \
 		|| apt_install python3-venv "$(VENV_ADVICE)"
-	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --editable '.[dev]' --editable ./benchmarks
+	@$(PYTHON) -m venv .venv
+	@echo "make setup: installing into .venv, in about a minute"
+	@$(BIN)/python -m pip install --disable-pip-version-check --editable '.[dev]' \
+		--editable ./benchmarks >.venv/setup.log 2>&1 \
+		|| { tail -n 20 .venv/setup.log >&2; \
+			echo "make setup: pip failed; .venv/setup.log has all that it said" >&2; exit 1; }
 	@$(APT_INSTALL); $(BIN)/eigengs-dr doctor >/dev/null \
 		|| apt_install "libllvm19 libatomic1" "$(LLVM_ADVICE)"
-	$(BIN)/eigengs-dr doctor
+	@$(BIN)/eigengs-dr doctor >>.venv/setup.log 2>&1 || { $(BIN)/eigengs-dr doctor; exit 1; }
 	@touch $@
 
 demo: $(READY)
-	@mkdir -p build/demo
-	$(BIN)/eigengs-dr fit $(PHOTO) --init eigen --basis natural --iterations 0 \
-		-o build/demo/instant.npz --preview build/demo/instant.png
-	$(BIN)/eigengs-dr fit $(PHOTO) -o build/demo/coffee.npz \
+	@mkdir -p build/demo && rm -f build/demo/*
+	@echo "A photo as 5,000 Gaussians, in 1,000 steps:"
+	@$(BIN)/eigengs-dr fit $(PHOTO) -o build/demo/coffee.npz \
 		--preview build/demo/coffee.png --report build/demo/coffee.json
+	@echo "The same photo from the basis that ships, without a step. A basis pays for many images"
+	@echo "on one set of shapes, or for a scene that has few unknowns; never for a photo at hand:"
+	@$(BIN)/eigengs-dr fit $(PHOTO) --init eigen --basis natural --iterations 0 \
+		-o build/demo/instant.npz --preview build/demo/instant.png
 
 scenes: $(READY)
 	$(BIN)/python scenes/assets.py
