@@ -12,6 +12,7 @@ from ..fitting.initializers import INITIALIZERS
 from ..fitting.options import DEFAULT_BASIS, FitOptions, Levels
 from ..fitting.presets import PRESETS
 from ..image.color import SPACES
+from ..image.metrics import float_space, target_key
 from .cluster import open_cluster
 from .console import INTERRUPTED, say
 from .fit_large import block_side, check_large, fit_by_blocks
@@ -61,10 +62,10 @@ FAILED = 2
 @click.option(
     "--space",
     "target_space",
-    type=click.Choice(["ycbcr", "rgb"]),
-    default="ycbcr",
+    type=click.Choice(["rgb", "ycbcr"]),
+    default="rgb",
     show_default=True,
-    help="Space of --target-psnr.",
+    help="Space of --target-psnr for images.",
 )
 @click.option("--max-gaussians", type=int, metavar="N", help="Limit for --target-psnr.")
 @click.option(
@@ -283,12 +284,13 @@ def _exit(context: click.Context, records: list[dict[str, Any]], options: FitOpt
     if any(record["stopped"] == "failed" for record in records):
         context.exit(FAILED)
     failures = [record for record in records if record["stopped"] == "out of reach"]
+    key = target_key(options.color, options.target_space)
+    name = "psnr_rgb" if key == "psnr_rgb" else f"psnr_{float_space(options.color)}"
     for record in failures:
-        psnr = record["psnr_" + options.target_space]
         say(
-            f"{record['input']}: {options.target_psnr:g} dB are out of reach: "
-            f"{record['gaussians']} Gaussians have {psnr:.2f}; lower --target-psnr, or raise "
-            "--max-gaussians or --iterations"
+            f"{record['input']}: {options.target_psnr:g} dB {name} are out of reach: "
+            f"{record['gaussians']} Gaussians have {record[key]:.2f}; lower --target-psnr, or "
+            "raise --max-gaussians or --iterations"
         )
     if failures:
         context.exit(MISSED)

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..image.color import rendered_as
+from ..image.metrics import float_space
 from .console import images_bar, say
+from .fit_one import measure_fit
 
 if TYPE_CHECKING:
     from ..collection.row import Finished
@@ -87,7 +88,8 @@ def fit_several(
         say(f"interrupted; {done}; the same command fits the others")
     ordered = [records[place] for place in sorted(records)]
     if not quiet:
-        click.echo(_summary(ordered, folder, time.perf_counter() - started))
+        space = float_space(options.color)
+        click.echo(_summary(ordered, folder, time.perf_counter() - started, space))
     return ordered, interrupted
 
 
@@ -114,15 +116,11 @@ def _record(finished: Finished, preview: Path | None, color: str, measure: bool)
         except ValueError as error:
             return {**record, "stopped": "failed", "error": str(error)}
     if measure:
-        record["ssim"] = eg.ssim(pixels, result.image)
-        record["ms_ssim"] = eg.ms_ssim(
-            pixels, result.image, space="ycbcr" if rendered_as(color) else "data"
-        )
-        record["trace"] = result.trace
+        record |= measure_fit(pixels, result, color) | {"trace": result.trace}
     return record
 
 
-def _summary(records: list[Record], folder: Path, seconds: float) -> str:
+def _summary(records: list[Record], folder: Path, seconds: float, space: str) -> str:
     """Describe a run for a terminal."""
     fitted = [record for record in records if "psnr_rgb" in record]
     counts = Counter(record["stopped"] for record in records)
@@ -134,7 +132,7 @@ def _summary(records: list[Record], folder: Path, seconds: float) -> str:
             for key in ("psnr_ycbcr", "psnr_rgb")
         )
         rate = f" ({len(fitted) / seconds:.2g} images/s)"
-        text += f"{rate}\n  mean psnr_ycbcr {ycbcr:.2f} dB, psnr_rgb {rgb:.2f} dB"
+        text += f"{rate}\n  mean psnr_{space} {ycbcr:.2f} dB, psnr_rgb {rgb:.2f} dB"
     if counts["skipped"]:
         text += "\n  --overwrite fits the skipped images, whose results exist, again"
     return f"{text}\n  wrote {folder}" if fitted else text

@@ -89,12 +89,12 @@ def run_maps(
         return INTERRUPTED
     if record["stopped"] != "out of reach":
         return 0
-    figure = f"psnr_{options.target_space}"
-    name, least = min(((m["name"], m[figure]) for m in record["maps"]), key=lambda m: m[1])
+    maps_of = [(m["name"], *_figure(m, options.target_space)) for m in record["maps"]]
+    name, figure, least = min(maps_of, key=lambda found: found[2])
     say(
         f"{output}: {options.target_psnr:g} dB are out of reach: with {record['gaussians']} "
-        f"Gaussians {name} has {least:.2f}; lower --target-psnr, or raise --max-gaussians or "
-        "--iterations"
+        f"Gaussians {name} has {figure} {least:.2f} dB; lower --target-psnr, or raise "
+        "--max-gaussians or --iterations"
     )
     return MISSED
 
@@ -164,7 +164,6 @@ def fit_maps(
         if preview:
             eg.save_image(preview, _preview(images, result))
     width, height = result.material.gaussians.width, result.material.gaussians.height
-    figures = _best(result.trace)
     record = {
         "input": {name: str(item.path) for name, item in maps.items()},
         "output": str(output),
@@ -172,16 +171,16 @@ def fit_maps(
         "height": height,
         "gaussians": len(result.material.gaussians),
         **course_of(result, started, loaded),
-        "psnr_ycbcr": figures["psnr_ycbcr"],
-        "psnr_rgb": figures["psnr_rgb"],
+        "psnr_ycbcr": result.psnr_ycbcr,
+        "psnr_rgb": result.psnr_rgb,
         "maps": [
-            {"name": m.name, "space": m.space, "channels": m.channels, **figures["maps"][m.name]}
+            {"name": m.name, "space": m.space, "channels": m.channels, **result.maps[m.name]}
             for m in result.material.maps
         ],
         "trace": result.trace,
     }
     if not quiet:
-        click.echo(_summary(record, preview))
+        click.echo(_summary(record, preview, options.target_space))
     return record
 
 
@@ -194,16 +193,6 @@ def load_map(item: MapFile, encoding: str | None) -> Any:
 
     data = rendered_as(item.space or usual_space(item.name)) is None
     return eg.load_image(item.path, data, None if data else encoding)
-
-
-def _best(trace: list[Record]) -> Record:
-    """Return the row of the set that a fit returns."""
-    if "spare" in trace[-1]:
-        met = [row for row in trace if row["spare"] >= 0]
-        if met:
-            return min(met, key=lambda row: row["gaussians"])
-        return max(trace, key=lambda row: row["spare"])
-    return max(trace, key=lambda row: row["psnr_ycbcr"])
 
 
 def _preview(images: dict[str, Any], result: MaterialFit) -> Any:
@@ -219,17 +208,26 @@ def _preview(images: dict[str, Any], result: MaterialFit) -> Any:
     return np.concatenate(rows)
 
 
-def _summary(record: Record, preview: Path | None) -> str:
+def _figure(record: Record, target_space: str) -> tuple[str, float]:
+    """Return the name and the value of the PSNR of a map that a target means."""
+    from ..image.metrics import float_space, target_key
+
+    key = target_key(record["space"], target_space)
+    return "psnr_rgb" if key == "psnr_rgb" else f"psnr_{float_space(record['space'])}", record[key]
+
+
+def _summary(record: Record, preview: Path | None, target_space: str) -> str:
     """Describe a fit for a terminal."""
     lines = [
         "{width}x{height}, {gaussians} Gaussians, {iterations} iterations "
         "in {seconds:.1f} s ({seconds_total:.1f} s with loading)".format(**record)
     ]
-    lines += [
-        "  {name} in {space} (channels: {channels}), psnr_rgb {psnr_rgb:.2f} dB".format(**m)
-        for m in record["maps"]
-    ]
-    lines.append(f"  mean psnr_rgb {record['psnr_rgb']:.2f} dB\n  wrote {record['output']}")
+    for m in record["maps"]:
+        figure, value = _figure(m, target_space)
+        lines.append(
+            "  {name} in {space} (channels: {channels}), ".format(**m) + f"{figure} {value:.2f} dB"
+        )
+    lines.append(f"  wrote {record['output']}")
     if preview:
         lines.append(f"  wrote {preview} (image, fit and outlines of each map)")
     return "\n".join(lines)

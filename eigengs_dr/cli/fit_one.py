@@ -48,7 +48,7 @@ def fit_one(
         show(f"{path.name}: measure", 0, 1)
         shown = displayed(image, options.color)
         color = result.gaussians.space
-        figures = _measure(shown, result, color)
+        figures = measure_fit(shown, result, color)
         if preview:
             eg.save_image(preview, comparison(shown, result.image, result.gaussians))
     record = {
@@ -78,17 +78,19 @@ def course_of(result: Fit | MaterialFit, started: float, loaded: float) -> dict[
     }
 
 
-def _measure(image: Any, result: Fit, color: str) -> dict[str, float]:
-    """Compare a fit with its image."""
+def measure_fit(image: Any, result: Fit, color: str) -> dict[str, float]:
+    """Compare a fit with its image; data are in the unit of the fit."""
     import eigengs_dr as eg
 
-    from ..image.metrics import float_space
+    from ..fitting.pixels import unit_of
 
+    unit = unit_of(image, color)
+    pair = (image, result.image) if unit == 1 else (image / unit, result.image / unit)
     return {
-        "psnr_ycbcr": eg.psnr(image, result.image, space=float_space(color)),
-        "psnr_rgb": eg.psnr(image, result.image, space="rgb"),
-        "ssim": eg.ssim(image, result.image),
-        "ms_ssim": eg.ms_ssim(image, result.image, space="ycbcr" if rendered_as(color) else "data"),
+        "psnr_ycbcr": result.psnr_ycbcr,
+        "psnr_rgb": result.psnr_rgb,
+        "ssim": eg.ssim(*pair),
+        "ms_ssim": eg.ms_ssim(*pair, space="ycbcr" if rendered_as(color) else "data"),
     }
 
 

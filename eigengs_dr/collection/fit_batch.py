@@ -119,6 +119,7 @@ class _Record:
 
     trace: list[dict[str, Any]] = field(default_factory=list)
     highest: float = -math.inf
+    psnr_rgb: float = -math.inf
     best: Gaussians | None = None
     picture: Images | None = None
     stopped: str = "iterations"
@@ -141,6 +142,7 @@ class _Record:
         self.trace.append(figures)
         if figures["psnr_ycbcr"] > self.highest:
             self.best, self.highest, self.picture = reached, figures["psnr_ycbcr"], shown
+            self.psnr_rgb = figures["psnr_rgb"]
 
     def end_at_plateau(self, schedule: Schedule, iterations: int) -> None:
         """Notice a plateau of a run with some steps."""
@@ -280,6 +282,8 @@ def _results(records: list[_Record], seconds: float, seconds_init: float) -> lis
                 seconds_init=seconds_init,
                 iterations=record.trace[-1]["iteration"],
                 stopped=record.stopped,
+                psnr_ycbcr=record.highest,
+                psnr_rgb=record.psnr_rgb,
             )
         )
     return results

@@ -17,8 +17,7 @@ from ..fitting.levels import check_options, fit_levels
 from ..fitting.options import DEFAULT_BASIS, FitOptions, Levels
 from ..fitting.pixels import unit_of
 from ..image.color import rendered_as
-from ..image.metrics import float_space, psnr
-from ..image.pixels import LinearImage, check_image
+from ..image.pixels import LinearImage
 from .fit_batch import fit_batch, fits_in_batches
 from .plan import run_images
 from .row import Finished, ImageRow, Outcome, Pixels, RowProgress, collect
@@ -194,8 +193,8 @@ def _fit_group(
         except FAILURES:
             pass  # below, each image says what is wrong with it
         else:
-            for pixels, result in zip(images, results, strict=True):
-                yield Outcome(result.gaussians, result, _figures(pixels, result, options.color))
+            for result in results:
+                yield Outcome(result.gaussians, result, _figures(result))
             return
     for pixels in images:
         try:
@@ -203,7 +202,7 @@ def _fit_group(
         except FAILURES as error:
             yield Outcome(None, None, {"error": str(error) or type(error).__name__})
         else:
-            yield Outcome(result.gaussians, result, _figures(pixels, result, options.color))
+            yield Outcome(result.gaussians, result, _figures(result))
 
 
 def _fit_one(
@@ -216,15 +215,7 @@ def _fit_one(
     return fit_levels(pixels, levels=levels, progress=progress, **common)
 
 
-def _figures(pixels: Pixels, result: Fit, color: str) -> dict[str, Any]:
+def _figures(result: Fit) -> dict[str, Any]:
     """Return the figures of a fit for its row."""
-    data = rendered_as(color) is None
-    shown = np.asarray(pixels) if data else check_image(pixels, copy=False)
-    space = float_space(result.gaussians.space)
-    return {
-        "psnr_ycbcr": psnr(shown, result.image, space=space),
-        "psnr_rgb": psnr(shown, result.image, space="rgb"),
-        "seconds": result.seconds,
-        "iterations": result.iterations,
-        "stopped": result.stopped,
-    }
+    names = ("psnr_ycbcr", "psnr_rgb", "seconds", "iterations", "stopped")
+    return {name: getattr(result, name) for name in names}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
+from ..image.metrics import float_space, target_key
 from ..raster.render import picture_of
 from .initializers import FitProblem, initialize
 from .options import FitOptions
@@ -58,6 +60,8 @@ class Fit:
     mean_image : ndarray of float32, shape (H, W, 3), or None
         RGB image to add to renderings of the set. The preset "eigengs" keeps the mean image of its
         basis as pixels. The attribute `image` includes the mean image.
+    psnr_ycbcr, psnr_rgb : float
+        PSNR of the set in dB, from its row of the trace.
     """
 
     gaussians: Gaussians
@@ -68,14 +72,15 @@ class Fit:
     iterations: int
     stopped: str
     mean_image: NDArray[np.float32] | None = field(default=None, repr=False)
+    psnr_ycbcr: float = math.nan
+    psnr_rgb: float = math.nan
 
     def __repr__(self) -> str:
-        last = self.trace[-1] if self.trace else {}
+        space = float_space(self.gaussians.space)
         return (
             f"Fit({len(self.gaussians)} Gaussians, "
             f"{self.image.shape[1]}x{self.image.shape[0]} pixels, {self.iterations} iterations, "
-            f"psnr_ycbcr={last.get('psnr_ycbcr', np.nan):.2f}, "
-            f"psnr_rgb={last.get('psnr_rgb', np.nan):.2f}, "
+            f"psnr_{space}={self.psnr_ycbcr:.2f}, psnr_rgb={self.psnr_rgb:.2f}, "
             f"seconds={self.seconds:.2f}, stopped={self.stopped!r})"
         )
 
@@ -109,7 +114,7 @@ def fit(
     backend: str | None = None,
     progress: FitProgress | None = None,
     target_psnr: float | None = None,
-    target_space: str = "ycbcr",
+    target_space: str = "rgb",
     max_gaussians: int | None = None,
     cutoff: float = CUTOFF,
     encoding: str | None = None,
@@ -155,8 +160,9 @@ def fit(
     target_psnr : float, optional
         PSNR in dB to reach with as few Gaussians as possible; excludes `gaussians`. The search
         takes up to about twice `iterations` steps, see `eigengs_dr.fitting.search`.
-    target_space : {"ycbcr", "rgb"}, optional
-        Whether `target_psnr` is a psnr_ycbcr or a psnr_rgb.
+    target_space : {"rgb", "ycbcr"}, optional
+        Whether `target_psnr` is a psnr_rgb or a psnr_ycbcr of an image. Data, normals and light
+        above 1 have one PSNR alone, see `eigengs_dr.image.metrics.float_space`.
     max_gaussians : int, optional
         Largest number of Gaussians for `target_psnr`. By default the Gaussians have at most as
         many parameters as the image has numbers: 3 Gaussians for 8 pixels in colour.
@@ -250,7 +256,7 @@ def _search(
     return search_count(
         start,
         partial(measure, image=pixels, started=started),
-        f"psnr_{options.target_space}",
+        target_key(start.gaussians.space, options.target_space),
         options.target_psnr,
         options.most_for(pixels),
         options.method.schedule,
@@ -284,6 +290,8 @@ def finish(
         iterations=found.iterations,
         stopped=found.stopped,
         mean_image=base_image,
+        psnr_ycbcr=found.row["psnr_ycbcr"],
+        psnr_rgb=found.row["psnr_rgb"],
     )
     if found.stopped == "interrupted":
         raise FitInterrupted(result)

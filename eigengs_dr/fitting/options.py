@@ -58,7 +58,7 @@ class FitOptions:
     backend: str | None = None
     cutoff: float = CUTOFF
     target_psnr: float | None = None
-    target_space: str = "ycbcr"
+    target_space: str = "rgb"
     max_gaussians: int | None = None
     encoding: str | None = None
 
@@ -69,7 +69,7 @@ class FitOptions:
             ("init", self.init, ("auto", *INITIALIZERS)),
             ("preset", self.preset, tuple(PRESETS)),
             ("color", self.color, SPACES),
-            ("target_space", self.target_space, ("ycbcr", "rgb")),
+            ("target_space", self.target_space, ("rgb", "ycbcr")),
         ):
             if value not in known:
                 raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(known)}")
@@ -128,7 +128,7 @@ class FitOptions:
             self,
             gaussians=min(self.most_for(pixels), few),
             target_psnr=None,
-            target_space="ycbcr",
+            target_space="rgb",
             max_gaussians=None,
         )
 
@@ -149,7 +149,7 @@ class FitOptions:
     def _check_search(self) -> None:
         """Raise ValueError for options that contradict a search for the number of Gaussians."""
         if self.target_psnr is None:
-            if self.max_gaussians is not None or self.target_space != "ycbcr":
+            if self.max_gaussians is not None or self.target_space != "rgb":
                 raise ValueError(
                     "max_gaussians and target_space belong to target_psnr; give target_psnr too"
                 )

@@ -39,12 +39,15 @@ class Refinement(NamedTuple):
         Number of steps.
     stopped : str
         "iterations", "plateau" or "interrupted"; see also `eigengs_dr.fitting.search.search_count`.
+    row : dict
+        The row of the trace that measures the set.
     """
 
     gaussians: Gaussians
     trace: list[dict[str, Any]]
     iterations: int
     stopped: str
+    row: dict[str, Any]
 
 
 def refine(
@@ -96,11 +99,11 @@ def refine(
         score = partial(measure, image=image, started=started, base_image=problem.base_image)
     marks, trace = trace_steps(iterations), list[dict[str, Any]]()
     best, current, highest = problem.gaussians, problem.gaussians, -math.inf
-    stopped, step, latest = "iterations", 0, dict[str, Any]()
+    stopped, step, latest, row = "iterations", 0, dict[str, Any](), dict[str, Any]()
     count, larger = len(problem.gaussians), list[tuple[float, int, Gaussians]]()
 
     def judge(step: int, gaussians: Gaussians) -> None:
-        nonlocal best, highest, latest
+        nonlocal best, highest, latest, row
         latest = {"iteration": step, **score(gaussians)}
         figure = latest["psnr_ycbcr"]
         if len(gaussians) > count:  # it does not compare; the best one is kept for an interrupt
@@ -109,7 +112,7 @@ def refine(
         larger.clear()
         trace.append(latest)
         if figure > highest:
-            best, highest = gaussians, figure
+            best, highest, row = gaussians, figure, latest
 
     try:
         with closing(descend(problem, schedule, iterations, levels)) as sets:
@@ -133,7 +136,7 @@ def refine(
         for _, at, found in [*larger, (0.0, step, current)]:
             if at not in [row["iteration"] for row in trace]:
                 judge(at, prune(dr.detach(found), problem.target, count, problem.weight))
-    return Refinement(dr.detach(best), trace, step, stopped)
+    return Refinement(dr.detach(best), trace, step, stopped, row)
 
 
 def measure(

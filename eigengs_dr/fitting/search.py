@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 
 from ..gaussian.gaussians import Gaussians
+from ..image.metrics import MAX_PSNR
 from .density_control import densify, prune
 from .initializers import FitProblem
 from .optimizers.descent import descend
@@ -87,14 +88,16 @@ def search_count(
     except KeyboardInterrupt:
         pressed = True
     met = "met" if run.best.missing <= 0 else "out of reach"
-    return Refinement(run.best.gaussians, run.trace, run.step, "interrupted" if pressed else met)
+    stopped = "interrupted" if pressed else met
+    return Refinement(run.best.gaussians, run.trace, run.step, stopped, run.best.row)
 
 
 class _Trial(NamedTuple):
-    """A set, and by how many decibels it misses the goal."""
+    """A set, by how many decibels it misses the goal, and its row of the trace."""
 
     gaussians: Gaussians
     missing: float
+    row: Row
 
 
 @dataclass
@@ -148,7 +151,8 @@ class _Run:
         figures = self.measure(gaussians)
         row = {"iteration": self.step, "gaussians": len(gaussians), **figures}
         self.trace.append(row)
-        trial = _Trial(gaussians, self.goal - figures[self.figure])
+        # The PSNR of a set without error is infinite, and differences of two such are no numbers.
+        trial = _Trial(gaussians, self.goal - min(figures[self.figure], MAX_PSNR), row)
         if len(self.trace) == 1 or _better(trial, self.best):
             self.best = trial
         return trial

@@ -141,6 +141,15 @@ def float_space(color: str) -> str:
     return "ycbcr" if rendered_as(color) else "data"
 
 
+def target_key(space: str, target_space: str) -> str:
+    """Return the key of the figure in a trace that a target PSNR means, for sets of a `space`.
+
+    It is "psnr_rgb" or "psnr_ycbcr" for images. Data, normals and light above 1 may exceed what
+    psnr_rgb clamps, so that for them it is psnr_ycbcr, which compares as `float_space` says.
+    """
+    return "psnr_rgb" if target_space == "rgb" and float_space(space) == "ycbcr" else "psnr_ycbcr"
+
+
 def psnr_from_mse(mse: float) -> float:
     """Return ``10 log10(1 / mse)``, the PSNR of a mean squared error whose peak is 1; inf for 0."""
     return math.inf if mse == 0 else -10 * math.log10(mse)

@@ -50,6 +50,10 @@ class MaterialFit:
         Number of refinement steps.
     stopped : str
         As for `eigengs_dr.Fit`.
+    psnr_ycbcr, psnr_rgb : float
+        Means over the maps in dB, from the row of the trace that measures the set.
+    maps : dict of str to dict
+        psnr_ycbcr and psnr_rgb of each map, from the same row.
     """
 
     material: Material
@@ -59,6 +63,9 @@ class MaterialFit:
     seconds_init: float = field(repr=False)
     iterations: int
     stopped: str
+    psnr_ycbcr: float
+    psnr_rgb: float
+    maps: dict[str, dict[str, float]] = field(repr=False)
 
 
 @exclusive()
@@ -69,7 +76,7 @@ def fit_material(
     spaces: Mapping[str, str] | None = None,
     weights: Mapping[str, float] | None = None,
     target_psnr: float | Mapping[str, float] | None = None,
-    target_space: str = "ycbcr",
+    target_space: str = "rgb",
     max_gaussians: int | None = None,
     levels: Levels | None = None,
     backend: str | None = None,
@@ -99,8 +106,9 @@ def fit_material(
     target_psnr : float or mapping of str to float, optional
         PSNR in dB that each map shall reach, with as few Gaussians as possible; a mapping names
         every map. Excludes `gaussians`.
-    target_space : {"ycbcr", "rgb"}, optional
-        Whether `target_psnr` is a psnr_ycbcr or a psnr_rgb.
+    target_space : {"rgb", "ycbcr"}, optional
+        Whether `target_psnr` of a colour is a psnr_rgb or a psnr_ycbcr. Data and normals have one
+        PSNR alone, see `eigengs_dr.image.metrics.float_space`.
     max_gaussians : int, optional
         Largest number of Gaussians for `target_psnr`; by default as many as have as many parameters
         as the maps have numbers.
@@ -274,6 +282,7 @@ def _finish(
         seconds_init=seconds_init,
         iterations=found.iterations,
         stopped=found.stopped,
+        **{name: found.row[name] for name in ("psnr_ycbcr", "psnr_rgb", "maps")},
     )
     if found.stopped == "interrupted":
         raise FitInterrupted(result)

@@ -15,7 +15,7 @@ from ..fitting.options import FitOptions
 from ..fitting.pixels import read_pixels, unit_of
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
-from ..image.metrics import float_space, psnrs_by_rows
+from ..image.metrics import float_space, psnrs_by_rows, target_key
 from ..image.pixels import ImageError
 from ..raster.picture import picture_rows
 from ..storage.npz import BadValue
@@ -129,7 +129,7 @@ def score_maps(
     weights: Sequence[float],
     started: float,
     goals: Sequence[float] | None = None,
-    space: str = "ycbcr",
+    space: str = "rgb",
 ) -> dict[str, Any]:
     """Measure a set of all channels, each times the weight of its map.
 
@@ -153,7 +153,7 @@ def score_maps(
         "maps": found,
     }
     if goals is not None:
-        levels = [figures[f"psnr_{space}"] for figures in found.values()]
+        levels = [found[image.name][target_key(image.space, space)] for image in images]
         row["spare"] = min(level - goal for level, goal in zip(levels, goals, strict=True))
     return row
 
