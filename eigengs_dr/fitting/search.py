@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -72,10 +72,10 @@ def search_count(
         measured set, with iteration, gaussians and the values of `measure`. `stopped` is "met",
         "out of reach" or "interrupted".
     """
-    run = _Run(start, measure, figure, goal, schedule, progress, interrupted, policy)
     shares = (policy.try_share, policy.fit_share, policy.polish_share)
     tries, fit, polish = (max(1, round(share * iterations)) for share in shares)
-    run.planned = policy.max_tries * tries + fit + policy.max_polishes * polish
+    planned = policy.max_tries * tries + fit + policy.max_polishes * polish
+    run = _Run(start, measure, figure, goal, schedule, progress, interrupted, policy, planned)
     try:
         estimate = _estimate(run, most, tries)
         if not interrupted() and (run.best.missing > 0 or len(run.best.gaussians) > 1):
@@ -87,6 +87,10 @@ def search_count(
         pressed = interrupted()
     except KeyboardInterrupt:
         pressed = True
+    if pressed:
+        run.progress = None  # it may have raised the interrupt
+        with suppress(KeyboardInterrupt):
+            _trim(run)
     met = "met" if run.best.missing <= 0 else "out of reach"
     stopped = "interrupted" if pressed else met
     return Refinement(run.best.gaussians, run.trace, run.step, stopped, run.best.row)
@@ -112,7 +116,7 @@ class _Run:
     progress: FitProgress | None
     interrupted: Callable[[], bool]
     policy: SearchPolicy
-    planned: int = 0
+    planned: int
     step: int = 0
     db_per_doubling: float = field(init=False)
     trace: list[Row] = field(default_factory=list)
@@ -155,6 +159,8 @@ class _Run:
         trial = _Trial(gaussians, self.goal - min(figures[self.figure], MAX_PSNR), row)
         if len(self.trace) == 1 or _better(trial, self.best):
             self.best = trial
+        if self.progress:
+            self.progress(self.step, self.planned, row)
         return trial
 
 
@@ -201,7 +207,7 @@ def _fit_estimate(run: _Run, estimate: _Estimate, most: int, steps: int, most_st
     """Fit the estimated number; if it was far off, fit once more, in the steps that are left."""
     trial, number = _fit(run, estimate, steps), len(estimate.placed)
     count = _count_for_gain(run, number, trial.missing, most)
-    if run.interrupted() or abs(count - number) <= run.policy.fit_tolerance * number:
+    if run.interrupted() or count - number <= run.policy.fit_tolerance * number:
         return trial
     assert run.start.redistribute is not None
     again = _Estimate(trial.gaussians, run.start.redistribute(trial.gaussians, count))
@@ -252,7 +258,7 @@ def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
         if trial.missing <= 0:
             wanted = max(
                 _count_for_gain(run, count, missing, count),
-                math.floor((1 - run.policy.max_drop) * count),
+                math.floor((1 - run.policy.drop_for(-trial.missing)) * count),
             )
             if wanted == count or -missing < run.policy.surplus:
                 return
@@ -275,3 +281,21 @@ def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
         expected = trial.missing + run.db_per_doubling * math.log2(count / len(changed))
         trial = run.descend(changed, steps, run.policy.polish_rate)
         gain = run.policy.gain_decay * max(0.0, expected - trial.missing)
+
+
+TRIMS = 5
+"""Sets that an interrupted search tries without a step; each takes about as long as a step."""
+
+
+def _trim(run: _Run) -> None:
+    """Drop Gaussians of a set above the goal without a step, by bisection; `run` keeps the best."""
+    target, weight, above = run.start.target, run.start.weight, run.best
+    if above.missing > 0:
+        return
+    too_few = _count_for_gain(run, len(above.gaussians), above.missing, len(above.gaussians))
+    for _ in range(TRIMS):
+        wanted = (too_few + len(above.gaussians)) // 2
+        if wanted in (too_few, len(above.gaussians)):
+            return
+        trial = run.score(prune(above.gaussians, target, wanted, weight))
+        above, too_few = (trial, too_few) if trial.missing <= 0 else (above, wanted)

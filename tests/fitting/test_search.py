@@ -23,10 +23,10 @@ def test_a_constant_image_takes_one_splat():
 def test_two_colours_take_few():
     image = np.full((SIDE, SIDE, 3), 0.4, np.float32)
     image[:, SIDE // 2 :] = (0.9, 0.2, 0.1)
-    result = fit(image, target_psnr=38, iterations=300)
+    result = fit(image, target_psnr=32, iterations=300)
     assert result.stopped == "met"
     assert len(result.gaussians) <= 12
-    assert eg.psnr(image, result.image, space="ycbcr") >= 38
+    assert eg.psnr(image, result.image) >= 32
 
 
 def test_noise_is_out_of_reach():
@@ -55,7 +55,7 @@ def test_the_search_finds_about_as_few():
     for row, column in ((40, 100), (70, 120), (100, 140), (130, 160), (160, 180)):
         image = photo[row : row + SIDE, column : column + SIDE]
         plain = fit(image, gaussians=100, iterations=200)
-        found = fit(image, target_psnr=plain.trace[-1]["psnr_ycbcr"], iterations=200)
+        found = fit(image, target_psnr=plain.psnr_rgb, iterations=200)
         assert found.stopped == "met"
         counts.append(len(found.gaussians))
     assert np.median(counts) <= 130
@@ -76,14 +76,14 @@ def test_progress_counts_up_to_its_total():
     assert {"gaussians", "psnr_rgb", "psnr_ycbcr", "seconds"} <= seen[-1][2].keys()
 
 
-def test_interrupted_while_it_settles_it_keeps_the_best():
+def test_interrupted_while_it_settles_it_keeps_the_goal_with_fewer():
     """Also by an error, as in a thread or at a second Ctrl-C."""
     whole = fit(picture(), target_psnr=28, iterations=200)
     assert whole.stopped == "met"
-    best = [row["gaussians"] for row in whole.trace if row["psnr_ycbcr"] >= 28]
+    best = [row["gaussians"] for row in whole.trace if row["psnr_rgb"] >= 28]
 
     def press(iteration, iterations, row):
-        if row["psnr_ycbcr"] >= 28:  # the search has met its goal, and settles
+        if row["psnr_rgb"] >= 28:  # the search has met its goal, and settles
             raise KeyboardInterrupt
 
     with pytest.raises(FitInterrupted) as interruption:
@@ -91,8 +91,21 @@ def test_interrupted_while_it_settles_it_keeps_the_best():
     found = interruption.value.result
     assert found.stopped == "interrupted"
     assert found.iterations < whole.iterations
-    assert len(found.gaussians) == best[0]
-    assert eg.psnr(picture(), found.image, space="ycbcr") >= 28
+    assert len(found.gaussians) <= best[0]
+    assert 28 <= found.psnr_rgb == eg.psnr(picture(), found.image)
+
+
+@pytest.mark.parametrize("goal", [26, 28, 30])
+def test_interrupted_after_half_its_time_it_is_near_its_goal(goal):
+    """The sets of its estimates may be decibels above."""
+
+    def press(iteration, iterations, row):
+        if iteration >= 200:
+            raise KeyboardInterrupt
+
+    with pytest.raises(FitInterrupted) as interruption:
+        fit(picture(), target_psnr=goal, iterations=200, progress=press)
+    assert goal <= interruption.value.result.psnr_rgb < goal + 1
 
 
 def test_interrupted_it_returns_what_there_is():
@@ -114,6 +127,15 @@ def test_interrupted_it_returns_what_there_is():
     assert result.stopped == "interrupted"
     assert result.iterations <= 7
     assert len(result.gaussians) <= 100
+
+
+@pytest.mark.parametrize("space", ["ycbcr", "rgb", "linear", "log", "data"])
+@pytest.mark.parametrize("value", [0.0, 0.4])
+def test_an_image_that_is_fitted_without_error(space, value):
+    """The PSNR of a set without error is infinite."""
+    image = np.full((SIDE, SIDE, 1 if space == "data" else 3), value, np.float32)
+    result = fit(image, target_psnr=40, iterations=40, color=space)
+    assert (len(result.gaussians), result.stopped, result.psnr_rgb) == (1, "met", np.inf)
 
 
 def test_a_search_whose_goal_is_not_met_ends():
@@ -232,12 +254,12 @@ def test_a_search_ends_where_no_place_is_left_to_grow(monkeypatch):
         ({"target_psnr": 0}, "above 0"),
         ({"target_psnr": np.nan}, "above 0"),
         ({"target_psnr": 101}, "at most 100"),
-        ({"target_space": "lab"}, "use one of ycbcr, rgb"),
+        ({"target_space": "lab"}, "use one of rgb, ycbcr"),
         ({"max_gaussians": 0}, "takes 1 to 1024"),
         ({"max_gaussians": 2000}, "takes 1 to 1024"),
         ({"max_gaussians": 50.5}, "max_gaussians is 50.5; it must be .* whole"),
         ({"target_psnr": None, "max_gaussians": 50}, "belong to target_psnr"),
-        ({"target_psnr": None, "target_space": "rgb"}, "belong to target_psnr"),
+        ({"target_psnr": None, "target_space": "ycbcr"}, "belong to target_psnr"),
     ],
 )
 def test_what_cannot_be_searched_for_is_said_in_one_line(settings, told):
