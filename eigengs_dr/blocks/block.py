@@ -27,6 +27,7 @@ from ..fitting.density_control import Part, relocate
 from ..fitting.initializers import FitProblem, FitTarget, make_target
 from ..fitting.optimizers.descent import run_phase
 from ..fitting.options import FitOptions
+from ..fitting.pixels import read_data, unit_of
 from ..fitting.placement.adaptive import density_from_hessian
 from ..fitting.placement.density import density_ratio, scale_by_owner
 from ..fitting.placement.nearest import nearest_center
@@ -65,10 +66,14 @@ class Settings:
 
 
 class Surveyed(NamedTuple):
-    """Result of `survey`: the integral of the density over the core, and the sums of its values."""
+    """Result of `survey`: the integral of the density over the core, and the sums of its values.
+
+    Data have a unit too: 1, or the largest magnitude, see `eigengs_dr.fitting.pixels.unit_of`.
+    """
 
     mass: float
     total: NDArray[np.float64]
+    unit: float
 
 
 class PlaceTask(NamedTuple):
@@ -116,12 +121,16 @@ class FitTask(NamedTuple):
 def survey(task: PlaceTask, settings: Settings) -> Surveyed:
     """Measure how many Gaussians a block needs, relative to others, before any fit."""
     options = settings.options
-    target = make_target(task.window.read(), options.color)
+    pixels = task.window.read()
+    if options.color == "normal":
+        read_data(pixels, options.color)  # no other range makes normals
+    target = make_target(pixels, options.color)
     density = window_density(placement_image(target, options.color), settings.spacing)
     core = task.block.core
     return Surveyed(
         float(density[core].sum(dtype=np.float64)),
         target.values[core].sum(axis=(0, 1), dtype=np.float64),
+        unit_of(pixels, options.color),
     )
 
 

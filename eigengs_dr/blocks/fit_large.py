@@ -14,7 +14,7 @@ from ..backend.executor import executor_for
 from ..backend.interrupt import defer_interrupts
 from ..backend.selection import select
 from ..fitting.options import FitOptions
-from ..gaussian.file import CUTOFF, write
+from ..gaussian.file import CUTOFF, SetData, write
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
 from ..image.metrics import psnr_from_mse
@@ -164,6 +164,7 @@ def fit_large(
             run = Run(image, blocks, options, executor_for(client), checkpoint, progress, pressed)
             data = run.fit()
             errors = run.measure(data)
+            data = _in_unit(data, run.image.unit)
             if output is not None:
                 write(output, data)
     finally:
@@ -201,6 +202,14 @@ def plan(image: Source, options: FitOptions, side: int) -> tuple[list[Block], Fi
             f"gaussians is {count}; an image of {image.width}x{image.height} takes 1 to {pixels}"
         )
     return blocks, replace(options, gaussians=count)
+
+
+def _in_unit(data: SetData, unit: float) -> SetData:
+    """Multiply the colours and the background of a set."""
+    if unit == 1:
+        return data
+    scaled = {k: data.arrays[k] * np.float32(unit) for k in ("color", "background")}
+    return data._replace(arrays=data.arrays | scaled)
 
 
 def _decisive(options: FitOptions, side: int) -> dict[str, Any]:

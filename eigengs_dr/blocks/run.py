@@ -48,6 +48,8 @@ class Run:
     ----------
     resumed : int
         Number of blocks, of all rounds, that an earlier call had fitted.
+    image : Source
+        After `fit` with the unit of the fit, in which the set is.
     """
 
     def __init__(
@@ -96,10 +98,18 @@ class Run:
         return self._place(mass, old)
 
     def _survey(self) -> NDArray[np.float64]:
-        """Return the masses of all blocks, and set the background: the mean of the image."""
+        """Return the masses of all blocks, and set the background: the mean of the image.
+
+        Data above the unit of a fit are looked at twice: they are fitted, and so placed, in a unit
+        that the whole image says.
+        """
         self._begin("survey", len(self.blocks))
         tasks = (PlaceTask(self._window(block), block) for block in self.blocks)
         found = {b.number: value for b, value in self._map(survey, tasks, self.blocks)}
+        unit = max(value.unit for value in found.values())
+        if unit > 1:
+            self.image = replace(self.image, unit=unit)
+            return self._survey()
         figures = np.array([[value.mass, *value.total] for _, value in sorted(found.items())])
         mean = figures[:, 1:].sum(axis=0) / (self.image.width * self.image.height)
         self.settings = replace(self.settings, background=tuple(mean.tolist()))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..image.formats.registry import kind_of
 from ..image.io import ImageError, load_image, open_picture, picture_pixels
-from ..image.pixels import LinearImage, check_data, check_image, check_range, encoding_of
+from ..image.pixels import LinearImage, check_data, check_image, encoding_of
 from .tiff import TIFF_SUFFIXES, holds_floats, read_window, window_shape
 
 MAX_SIDE = 1 << 16
@@ -41,12 +41,15 @@ class Window(NamedTuple):
         The image and the part, for errors.
     encoding : {"srgb", "linear"}
         What the pixels are.
+    unit : float
+        Data are divided by it.
     """
 
     load: Callable[[], Array]
     keep_grey: bool
     name: str
     encoding: str = "srgb"
+    unit: float = 1.0
 
     def read(self) -> NDArray[np.float32]:
         """Return the pixels: float32 of shape (h, w, 3), in sRGB, or data, perhaps (h, w, 1).
@@ -54,12 +57,14 @@ class Window(NamedTuple):
         Raises
         ------
         ImageError
-            If the file cannot be read, or a pixel is not finite or far outside [0, 1].
+            If the file cannot be read, a pixel is not finite, or one of an image is far outside
+            [0, 1].
         """
         pixels = self.load()
         try:
             if self.keep_grey:
-                return check_range(check_data(pixels, copy=False), "image")
+                data = check_data(pixels, copy=False)
+                return data if self.unit == 1 else data / np.float32(self.unit)
             return check_image(pixels, copy=False, encoding=self.encoding)
         except ImageError as error:
             raise ImageError(f"{self.name}: {str(error).removeprefix('image: ')}") from None
@@ -81,7 +86,7 @@ class Source:
         What tells this image from others, in numbers and texts.
     cut : callable
         ``cut(rows, columns)`` returns what `Window.load` holds.
-    keep_grey, encoding
+    keep_grey, encoding, unit
         See `Window`.
     """
 
@@ -93,12 +98,14 @@ class Source:
     cut: Callable[[slice, slice], Callable[[], Array]]
     keep_grey: bool
     encoding: str = "srgb"
+    unit: float = 1.0
 
     def window(self, rows: slice, columns: slice) -> Window:
         """Return a part of the image."""
         part = f"rows {rows.start} to {rows.stop}, columns {columns.start} to {columns.stop}"
         name = f"{self.name}, {part}"
-        return Window(self.cut(rows, columns), self.keep_grey, name, self.encoding)
+        load = self.cut(rows, columns)
+        return Window(load, self.keep_grey, name, self.encoding, self.unit)
 
 
 def open_source(source: Any, keep_grey: bool = False, encoding: str | None = None) -> Source:

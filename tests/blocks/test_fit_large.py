@@ -91,6 +91,18 @@ def test_spaces(color):
     assert result.psnr_rgb > 22
 
 
+def test_data_of_any_range():
+    """As `fit`: heights of 100 m are fitted in a unit, and measured in it."""
+    heights = 200 * mosaic(96)[..., :1].astype(np.float32) / 255 - 100
+    result = eg.fit_large(heights, **FEW | {"color": "data", "gaussians": 500})
+    same = eg.fit_large(heights / 100, **FEW | {"color": "data", "gaussians": 500})
+    assert result.psnr_ycbcr == pytest.approx(same.psnr_ycbcr, abs=0.5)
+    error = np.square(eg.picture_of(result.gaussians) - heights).mean()
+    assert result.psnr_ycbcr == pytest.approx(
+        -10 * np.log10(error / np.abs(heights).max() ** 2), abs=0.01
+    )
+
+
 def test_one_block_is_the_whole():
     result = eg.fit_large(mosaic(64), gaussians=200, iterations=20, backend="llvm")
     whole = eg.fit(mosaic(64), gaussians=200, iterations=20, backend="llvm")

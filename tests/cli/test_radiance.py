@@ -93,6 +93,29 @@ def test_data_of_16_bits(tmp_path):
     assert np.abs(found - heights).mean() < 60  # a step of 8 bits is 257
 
 
+def test_data_beyond_1_have_one_psnr(tmp_path):
+    """The trace, the report, rows of many images and a fit by blocks measure in one unit."""
+    heights = 2 * smooth_pixels(64, 64).astype(np.float32)[..., 0] - 250
+    reports = []
+    for name, more in (("one", []), ("blocks", ["--blocks", 32]), ("several", [])):
+        folder = tmp_path / name
+        folder.mkdir()
+        save_image(folder / "a.pfm", heights)
+        out, report = folder / "out", tmp_path / f"{name}.json"
+        images = [folder / "a.pfm"] if name != "several" else [folder]
+        target = [out if name == "several" else folder / "a.npz", "--report", report, *more, *FEW]
+        succeeded(run("fit", *images, "--color", "data", "-o", *target))
+        found = json.loads(report.read_text())
+        reports.append(found["images"][0] if name == "several" else found)
+    one, blocks, several = reports
+    assert one["psnr_ycbcr"] == one["trace"][-1]["psnr_ycbcr"] > 25
+    assert several["psnr_ycbcr"] == one["psnr_ycbcr"]
+    assert blocks["psnr_ycbcr"] == pytest.approx(one["psnr_ycbcr"], abs=2)
+    goal = ["--target-psnr", 30, "--iterations", 60, "--color", "data", "-o", tmp_path / "few.npz"]
+    told = succeeded(run("fit", tmp_path / "one" / "a.pfm", *goal)).output
+    assert float(told.split("psnr_data ")[1].split(" dB")[0]) >= 30
+
+
 def test_pack_and_several_images_of_light(sky, tmp_path):
     folder, _ = sky
     command = ["pack", folder / "sky.npz", "-o", tmp_path / "y.egs", "--image", folder / "sky.exr"]
