@@ -37,8 +37,8 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
 
     Parameters
     ----------
-    a, b : array_like of float, shape (H, W, 3) or (H, W, 1)
-        RGB or grey, 1 is white. Their order does not matter. Light from `eigengs_dr.load_image` is
+    a, b : array_like, shape (H, W, 3) or (H, W, 1)
+        RGB or grey: floats with 1 as white, uint8 or uint16. Their order does not matter. Light from `eigengs_dr.load_image` is
         encoded as sRGB first.
     space : {"rgb", "ycbcr", "data", "pu21"}
         Space in which the mean squared error over all pixels and channels is computed.
@@ -52,7 +52,7 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     Raises
     ------
     ValueError
-        If the shapes differ or are not as above, or the space is unknown.
+        If the shapes differ, shapes or dtypes are not as above, or the space is unknown.
 
     Examples
     --------
@@ -164,8 +164,8 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
 
     Parameters
     ----------
-    a, b : array_like of float, shape (H, W, 3) or (H, W, 1)
-        RGB or grey, 1 is white. Their order does not matter.
+    a, b : array_like, shape (H, W, 3) or (H, W, 1)
+        RGB or grey: floats with 1 as white, uint8 or uint16. Their order does not matter.
 
     Returns
     -------
@@ -175,7 +175,7 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
     Raises
     ------
     ValueError
-        If the shapes differ or are not as above.
+        If the shapes differ, or shapes or dtypes are not as above.
 
     References
     ----------
@@ -212,8 +212,8 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
 
     Parameters
     ----------
-    a, b : array_like of float, shape (H, W, 3) or (H, W, 1)
-        RGB or grey, 1 is white. Their order does not matter.
+    a, b : array_like, shape (H, W, 3) or (H, W, 1)
+        RGB or grey: floats with 1 as white, uint8 or uint16. Their order does not matter.
     space : {"ycbcr", "data"}
         Channels to compare: Y, Cb and Cr, or the channels of the images.
 
@@ -225,7 +225,7 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     Raises
     ------
     ValueError
-        If the shapes differ or are not as above, or the space is unknown.
+        If the shapes differ, shapes or dtypes are not as above, or the space is unknown.
 
     References
     ----------
@@ -250,11 +250,8 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
 
 
 def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return both images as RGB of one shape (H, W, 3) without a copy; grey is replicated."""
-    x, y = (
-        check_image(image) if isinstance(image, LinearImage) else np.asarray(image)
-        for image in (a, b)
-    )
+    """Return both images as RGB of one shape (H, W, 3); grey is replicated, floats not copied."""
+    x, y = _floats(a), _floats(b)
     if x.shape != y.shape:
         raise ValueError(f"images have shapes {x.shape} and {y.shape}; crop or scale one of them")
     if x.ndim != 3 or x.shape[2] not in (1, 3) or x.size == 0:
@@ -263,3 +260,19 @@ def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
         )
     shape = (*x.shape[:2], 3)
     return np.broadcast_to(x, shape), np.broadcast_to(y, shape)
+
+
+def _floats(image: ArrayLike) -> NDArray[np.floating]:
+    """Return floats as they are, and 8 or 16 bits by the range of their type, as `check_image`."""
+    if isinstance(image, LinearImage):
+        return check_image(image)
+    array = np.asarray(image)
+    if array.dtype.kind == "f":
+        return array
+    if array.dtype.kind == "b":
+        return array.astype(np.float32)
+    if array.dtype not in (np.uint8, np.uint16):
+        raise ValueError(
+            f"images have pixels of {array.dtype}; expected floats with 1 as white, uint8 or uint16"
+        )
+    return array / np.float64(np.iinfo(array.dtype).max)

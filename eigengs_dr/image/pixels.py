@@ -32,11 +32,19 @@ class ImageError(ValueError):
     """An image cannot be used; one line names the image, the reason and what to do."""
 
 
+_LINEAR = {np.add, np.subtract, np.negative, np.positive, np.maximum, np.minimum}
+"""Functions whose results are light if any operand is."""
+
+_SCALING = {np.multiply, np.matmul}
+"""Functions whose results are light if one operand is: light times light is not."""
+
+
 class LinearImage(np.ndarray):
     """An array of linear light, which `eigengs_dr.fit` and `eigengs_dr.save_image` know as such.
 
-    It is a `numpy.ndarray` in every other way. Parts of it, and results of arithmetic with it, are
-    linear light too; `numpy.asarray` makes a plain array of it, whose pixels count as sRGB.
+    It is a `numpy.ndarray` in every other way. Parts of it are light too, and so are sums,
+    differences, and products and quotients with other numbers. All else makes plain arrays:
+    powers, roots, comparisons, integers. A plain array counts as sRGB; `numpy.asarray` makes one.
 
     Attributes
     ----------
@@ -46,11 +54,35 @@ class LinearImage(np.ndarray):
     Examples
     --------
     >>> light = np.full((2, 2, 3), 0.5).view(LinearImage)
-    >>> type(2 * light[:1]).__name__, type(np.asarray(light)).__name__
+    >>> type(2 * light[:1]).__name__, type(light ** (1 / 2.2)).__name__
     ('LinearImage', 'ndarray')
     """
 
     encoding = "linear"
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        """Compute with plain arrays, and mark the result if it is light."""
+        marked = [isinstance(value, LinearImage) for value in inputs]
+        light = ufunc in _LINEAR or (ufunc in _SCALING and sum(marked) == 1)
+        light |= ufunc is np.divide and marked == [True, False]
+        out = kwargs.get("out", ())
+        if out:
+            kwargs["out"] = tuple(_plain(value) for value in out)
+        result = getattr(ufunc, method)(*map(_plain, inputs), **kwargs)
+        if out:
+            return out[0] if len(out) == 1 else out
+        if light and isinstance(result, np.ndarray) and result.dtype.kind == "f":
+            return result.view(LinearImage)
+        return result
+
+    def astype(self, dtype: Any, *args: Any, **kwargs: Any) -> Any:
+        """Convert the numbers; only floats stay light."""
+        found = np.asarray(self).astype(dtype, *args, **kwargs)
+        return found.view(LinearImage) if found.dtype.kind == "f" else found
+
+
+def _plain(value: Any) -> Any:
+    return np.asarray(value) if isinstance(value, LinearImage) else value
 
 
 def is_bitmap(image: Any) -> bool:

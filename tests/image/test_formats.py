@@ -223,10 +223,47 @@ def test_light_beyond_single_precision():
         check_image(np.full((2, 2), 1e10), encoding="linear")
 
 
-def test_linear_image_follows_arithmetic():
-    light = LIGHT.view(LinearImage)
-    assert isinstance((2 * light)[:2].copy(), LinearImage)
-    assert type(np.asarray(light)) is np.ndarray
+@pytest.mark.parametrize(
+    ("stays", "compute"),
+    [
+        (True, lambda light: (2 * light)[:2].copy()),
+        (True, lambda light: light / 3 + light - 0.25 * light),
+        (True, lambda light: light * np.array([1.0, 0.5, 0.25], np.float32)),
+        (True, lambda light: light.mean(axis=0, keepdims=True)),
+        (True, lambda light: np.maximum(light, 0)),
+        (True, lambda light: light @ np.eye(3)),
+        (True, lambda light: light.astype(np.float16)),
+        (False, lambda light: light ** (1 / 2.2)),
+        (False, lambda light: np.sqrt(light)),
+        (False, lambda light: np.log(1 + light)),
+        (False, lambda light: light * light),
+        (False, lambda light: light / light.max(axis=0)),
+        (False, lambda light: 1 / (1 + light)),
+        (False, lambda light: light > 0.5),
+        (False, lambda light: light.astype(np.uint8)),
+        (False, np.asarray),
+    ],
+)
+def test_light_stays_marked_while_it_is_light(stays, compute):
+    """Powers, ratios and integers are no light: they would be encoded a second time."""
+    result = compute(np.abs(LIGHT).view(LinearImage) + 1)
+    assert (type(result) is LinearImage) == stays
+    assert stays or type(result) is np.ndarray
+    plain = compute(np.abs(LIGHT) + 1)
+    np.testing.assert_array_equal(np.asarray(result), plain)
+
+
+def test_light_in_place():
+    light = np.abs(LIGHT).view(LinearImage)
+    light *= 2
+    assert type(light) is LinearImage
+    np.testing.assert_array_equal(np.asarray(light), 2 * np.abs(LIGHT))
+
+
+def test_coded_light_is_not_coded_again(tmp_path):
+    light = np.full((2, 2, 3), 0.214041, np.float32).view(LinearImage)
+    save_image(tmp_path / "a.png", light ** (1 / 2.2))
+    np.testing.assert_allclose(load_image(tmp_path / "a.png"), 0.4962, atol=1 / 255)
 
 
 @pytest.mark.mitsuba

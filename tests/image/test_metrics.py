@@ -216,3 +216,23 @@ def slow_ms_ssim(a, b, scales):
             )
         values.append(value)
     return np.mean(values)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_integers_have_the_range_of_their_type(rng, dtype):
+    most = np.iinfo(dtype).max
+    a, b = (rng.integers(0, most, (40, 40, 3), dtype=dtype, endpoint=True) for _ in range(2))
+    assert psnr(a, b, space="data") == pytest.approx(
+        metrics.peak_signal_noise_ratio(a, b, data_range=most), abs=1e-6
+    )
+    for metric in (psnr, ssim, ms_ssim):
+        assert metric(a, b) == pytest.approx(metric(a / most, b / most), abs=1e-6)
+        assert metric(a, b / most) == pytest.approx(metric(a, b), abs=1e-6)
+    assert psnr(np.full((9, 9, 3), 10, dtype), np.full((9, 9, 3), most, dtype)) < 1
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.uint32, complex])
+@pytest.mark.parametrize("metric", [psnr, ssim, ms_ssim])
+def test_other_numbers_are_refused(metric, dtype):
+    with pytest.raises(ValueError, match="expected floats with 1 as white, uint8 or uint16"):
+        metric(np.ones((12, 12, 3), dtype), np.ones((12, 12, 3), dtype))
