@@ -77,9 +77,9 @@ def weights(
         Cutoff, see `eigengs_dr.raster.parameters.kernel_radius`.
     steep : bool, optional
         Whether to evaluate an exponential at every point. False is faster: products continue one
-        exponential of each row, with a relative error of about 2e-6, and 1e-5 for the narrowest Gaussians.
-        It needs a width of 4 and a Gaussian for which `is_steep` is false, and Dr.Jit cannot
-        differentiate it.
+        exponential of each row, with a relative error of about 2e-6, and 1e-5 for the narrowest
+        Gaussians. It needs a width of 4 and a Gaussian for which `is_steep` is false, and Dr.Jit
+        cannot differentiate it.
 
     Returns
     -------
