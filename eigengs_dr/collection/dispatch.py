@@ -1,12 +1,13 @@
 """The images of a run on the workers of a cluster, a chunk of images a task.
 
-A worker reads its images, writes their results and returns their rows. Chunks change no result.
+A worker reads its images, writes their results and returns their rows. What the images are decides
+the chunks, never how long they took, so that a run repeats itself.
 """
 
 from __future__ import annotations
 
+import math
 import os
-import time
 import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -26,15 +27,18 @@ from .row import Finished
 from .run import Job, row_of, run_job
 from .sources import Source
 
-CHUNK_SECONDS = 4.0
-"""Aim for the time of a chunk. A task costs Dask some milliseconds, and a lost worker loses half a
-chunk on average."""
+MAX_CHUNK_WORK = 1 << 27
+"""Pixels times steps of a chunk, for some seconds; the bytes of a file stand for its pixels. A task
+costs Dask some milliseconds, and a lost worker loses half a chunk on average."""
 
-LAST_CHUNK_SECONDS = 1.5
-"""Aim for the time of the last chunks; shorter ones would part groups of images."""
+MAX_CHUNK = 256
+"""Images of the largest chunk."""
 
-FIRST_CHUNK, MAX_CHUNK = 4, 256
-"""Images of the first chunks, before the time of one is known, and of the largest."""
+FIRST_STEPS = 10
+"""Steps of gradient descent that take as long as what comes before the first one."""
+
+URL_SIZE = 1 << 16
+"""Pixels that stand for an image behind a URL, which nothing is known of."""
 
 MAX_CHUNK_BYTES = 1 << 24
 """Bytes of the arrays of a chunk: the scheduler keeps a copy until the chunk is done."""
@@ -59,10 +63,9 @@ class Chunk(NamedTuple):
 
 
 class ChunkResult(NamedTuple):
-    """What a worker returns for a chunk: an entry for each image, its time, and its warnings."""
+    """What a worker returns for a chunk: an entry for each image, and its warnings."""
 
     finished: list[Finished]
-    seconds: float
     notes: list[str]
 
 
@@ -79,14 +82,14 @@ def run_chunk(chunk: Chunk, job: Job) -> ChunkResult:
     ChunkResult
         Results of Dr.Jit as NumPy arrays, and no pixels.
     """
-    started, finished = time.perf_counter(), list[Finished]()
+    finished = list[Finished]()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         for entry in run_job(chunk.sources, job):
             result = _to_arrays(entry.row.result) if chunk.keep_results else None
             finished.append(entry._replace(row=replace(entry.row, result=result), pixels=None))
     notes = [str(note.message) for note in caught if issubclass(note.category, UserWarning)]
-    return ChunkResult(finished, time.perf_counter() - started, notes)
+    return ChunkResult(finished, notes)
 
 
 def dispatch(
@@ -123,7 +126,7 @@ def dispatch(
     ClusterError
         If the cluster is lost.
     """
-    chunks = _Chunks(sources, total, executor.workers, start, keep_results)
+    chunks = _Chunks(sources, total, executor.workers, start, keep_results, job.steps)
     again = deque[Source]()
     tries = Counter[int]()
 
@@ -145,7 +148,6 @@ def dispatch(
             elif lost:
                 again.extend(chunk.sources)
             else:
-                chunks.note_time(result.seconds / len(chunk.sources))
                 yield from settle(chunk, result)
             yield from chunks.without_work()
     yield from chunks.without_work()
@@ -170,34 +172,31 @@ class _Chunks:
     workers: int
     start: Callable[[list[str]], None]
     keep_results: bool
+    steps: int
 
     def __post_init__(self) -> None:
         self.under_way: dict[int, Chunk] = {}
         self.named: dict[int, Source] = {}  # the sources as the user named them, by place
         self._passed = deque[Source]()
         self._begun = 0
-        self._seconds = CHUNK_SECONDS / FIRST_CHUNK
 
     def __iter__(self) -> Iterator[Chunk]:
-        chunk, held, drawn = list[Source](), 0, 0
-        for source in self.sources:
-            drawn += 1
+        chunk, held, work, most = list[Source](), 0, 0, self._most(0)
+        for drawn, source in enumerate(self.sources, 1):
             if source.status:
                 self._passed.append(source)
                 continue
             if source.path is None:
-                source = source._replace(image=np.array(source.image))  # its owner may reuse it
+                # A copy, as its owner may reuse it; light stays light.
+                source = source._replace(image=np.array(source.image, subok=True))
                 held += source.image.nbytes
             chunk.append(source)
-            if len(chunk) >= self._length(drawn) or held >= MAX_CHUNK_BYTES:
+            work += _size_of(source) * (FIRST_STEPS + self.steps)
+            if len(chunk) >= most or work >= MAX_CHUNK_WORK or held >= MAX_CHUNK_BYTES:
                 yield self._begin(chunk)
-                chunk, held = [], 0
+                chunk, held, work, most = [], 0, 0, self._most(drawn)
         if chunk:
             yield self._begin(chunk)
-
-    def note_time(self, seconds: float) -> None:
-        """Learn how long an image takes."""
-        self._seconds = seconds
 
     def without_work(self) -> Iterator[Finished]:
         """Yield the images that were drawn and need no work."""
@@ -205,17 +204,14 @@ class _Chunks:
             source = self._passed.popleft()
             yield Finished(row_of(source), place=source.place)
 
-    def _length(self, drawn: int) -> int:
-        """Return the number of images of a chunk, a power of 2, as small images go in groups.
+    def _most(self, drawn: int) -> int:
+        """Return the most images of a chunk, after some were drawn.
 
         The last chunks are shorter, so that all workers end at about the same time.
         """
-        seconds = CHUNK_SECONDS
-        if self.total is not None:
-            share = self._seconds * (self.total - drawn) / (2 * self.workers)
-            seconds = min(seconds, max(share, LAST_CHUNK_SECONDS))
-        length = min(max(1, int(seconds / max(self._seconds, 1e-6))), MAX_CHUNK)
-        return 1 << (length.bit_length() - 1)
+        if self.total is None:
+            return MAX_CHUNK
+        return min(MAX_CHUNK, max(1, (self.total - drawn) // (2 * self.workers)))
 
     def _begin(self, sources: list[Source]) -> Chunk:
         self.start([source.name for source in sources])
@@ -224,6 +220,18 @@ class _Chunks:
         self.under_way[self._begun] = chunk
         self._begun += 1
         return chunk
+
+
+def _size_of(source: Source) -> int:
+    """Return the pixels of an array, or the bytes of a file."""
+    if source.path is None:
+        return int(math.prod(np.shape(source.image)[:2]))
+    if isinstance(source.path, str):
+        return URL_SIZE
+    try:
+        return source.path.stat().st_size
+    except OSError:  # the worker says what is wrong with it
+        return 0
 
 
 def _absolute(source: Source) -> Source:

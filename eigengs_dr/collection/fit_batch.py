@@ -44,10 +44,27 @@ from ..raster.render import batch_from_tiles, bin_gaussians, decode_parameters
 Images = NDArray[np.float32]
 
 
-def fits_in_batches(options: FitOptions) -> bool:
-    """Return whether `fit_batch` takes these options: a placement, a colour solve and no search."""
+MAX_SIDE = 256
+"""Longer side, in pixels, of the largest images that are fitted in batches."""
+
+MAX_GAUSSIANS = 1 << 15
+"""Most Gaussians of an image of a batch: Dr.Jit adds up to so many numbers in one order, more in
+parts that depend on how many sums there are."""
+
+MAX_CUTOFF = 3.1
+"""Largest cutoff at which no Gaussian of a fit is steep, see `eigengs_dr.raster.evaluate.is_steep`.
+One steep Gaussian changes the arithmetic of all, so those of another image may not share it."""
+
+
+def fits_in_batches(options: FitOptions, pixels: NDArray[np.float32]) -> bool:
+    """Return whether `fit_batch` fits images like `pixels` (H, W, C) bit for bit as alone."""
     return (
-        options.initializer in PLACEMENTS and options.method.solves and options.target_psnr is None
+        options.initializer in PLACEMENTS
+        and options.method.solves
+        and options.target_psnr is None
+        and options.cutoff <= MAX_CUTOFF
+        and max(pixels.shape[:2]) <= MAX_SIDE
+        and options.count_for(pixels) <= MAX_GAUSSIANS
     )
 
 
@@ -60,19 +77,16 @@ def fit_batch(
     Parameters
     ----------
     images : ndarray of float32, shape (M, H, W, C)
-        Images from `eigengs_dr.image.io.check_image`.
+        Images from `eigengs_dr.image.io.check_image`, of which `fits_in_batches` is true.
     options : FitOptions
-        Options for which `fits_in_batches` is true.
     progress : callable, optional
         ``progress(share)`` every 10 steps, with the share of the steps that are done.
 
     Returns
     -------
     list of Fit
-        The results of `eigengs_dr.fit`, on llvm bit for bit: sums run in the same order. A result
-        depends on the other images only if a Gaussian gets narrower than about 0.2 pixels: all of
-        them are then evaluated by another formula, with weights that differ by 2e-6, see
-        `eigengs_dr.raster.evaluate.weights`. The seconds are an equal share of the whole time.
+        The results of `eigengs_dr.fit`, on llvm bit for bit: sums run in the same order, and no
+        image changes the arithmetic of another. The seconds are an equal share of the whole time.
 
     Raises
     ------

@@ -18,14 +18,11 @@ from ..fitting.options import DEFAULT_BASIS, FitOptions, Levels
 from ..fitting.pixels import unit_of
 from ..image.color import rendered_as
 from ..image.pixels import LinearImage
-from .fit_batch import fit_batch, fits_in_batches
+from .fit_batch import MAX_SIDE, fit_batch, fits_in_batches
 from .plan import run_images
 from .row import Finished, ImageRow, Outcome, Pixels, RowProgress, collect
 from .run import FAILURES, Job, Work
 from .sources import Images
-
-MAX_GROUP_SIDE = 256
-"""Longer side, in pixels, of the largest images that are fitted in groups."""
 
 MAX_GROUP_PIXELS = 1 << 18
 """Largest number of pixels of a group: 4 images of 256x256, or 64 of 64x64. Larger groups are not
@@ -77,8 +74,8 @@ def fit_many(
         an iterator. It may raise `KeyboardInterrupt` to end the run.
     client : distributed.Client, optional
         Fit on the workers of this Dask cluster; None is this process. Workers read the files and
-        write the results, so they need the same file system, or URLs. The results have the same
-        bits whatever the number of workers.
+        write the results, so they need the same file system, or URLs. On llvm the results have
+        the same bits whatever the number of workers.
     options : Any
         Keyword arguments, the options of `eigengs_dr.fit`: gaussians, iterations, init, basis,
         preset, solve_steps, color, seed, backend, target_psnr, target_space, max_gaussians,
@@ -109,9 +106,9 @@ def fit_many(
     Notes
     -----
     Small images of one size that follow each other are fitted in groups, see
-    `eigengs_dr.collection.fit_batch`. On llvm a result equals that of `eigengs_dr.fit` bit for bit
-    and does not depend on the other images, but for rounding where a Gaussian gets narrower than
-    about 0.2 pixels. Some do in most fits of a thousand steps.
+    `eigengs_dr.collection.fit_batch`. On llvm a result equals that of `eigengs_dr.fit` bit for bit,
+    whatever the other images are. On cuda sums run in another order: long fits end some tenths of a
+    decibel apart, up or down.
 
     Examples
     --------
@@ -146,7 +143,8 @@ def fit_each(
         basis = resolve_name(PACK_BASIS)(options.basis or DEFAULT_BASIS, options.backend)
         options = replace(options, basis=basis)
     make_work = partial(fit_work, options, levels, None if client is not None else step)
-    job = Job(make_work, _may_join, rendered_as(options.color) is None, options.encoding)
+    keep_grey = rendered_as(options.color) is None
+    job = Job(make_work, _may_join, keep_grey, options.encoding, options.iterations)
     return run_images(images, output, overwrite, job, client)
 
 
@@ -173,7 +171,7 @@ def _may_join(group: list[Pixels], pixels: Pixels) -> bool:
 
 
 def _is_small(pixels: Pixels) -> bool:
-    return max(pixels.shape[:2]) <= MAX_GROUP_SIDE
+    return max(pixels.shape[:2]) <= MAX_SIDE
 
 
 def _fit_group(
@@ -187,7 +185,7 @@ def _fit_group(
 
     plain = not isinstance(images[0], LinearImage)
     plain &= all(unit_of(image, options.color) == 1 for image in images)
-    if levels is None and plain and _is_small(images[0]) and fits_in_batches(options):
+    if levels is None and plain and fits_in_batches(options, images[0]):
         try:
             results = fit_batch(np.stack(images), options, step)
         except FAILURES:

@@ -49,12 +49,15 @@ class Job:
         See `MayJoin`.
     keep_grey, encoding
         See `eigengs_dr.image.io.load_image`.
+    steps
+        Steps of gradient descent of an image: how much work it is.
     """
 
     make_work: Callable[[], Work]
     may_join: MayJoin
     keep_grey: bool = False
     encoding: str | None = None
+    steps: int = 0
 
     @cached_property
     def work(self) -> Work:

@@ -38,8 +38,8 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     Parameters
     ----------
     a, b : array_like, shape (H, W, 3) or (H, W, 1)
-        RGB or grey: floats with 1 as white, uint8 or uint16. Their order does not matter. Light from `eigengs_dr.load_image` is
-        encoded as sRGB first.
+        RGB or grey: floats with 1 as white, uint8 or uint16. Their order does not matter. Light
+        from `eigengs_dr.load_image` is encoded as sRGB first.
     space : {"rgb", "ycbcr", "data", "pu21"}
         Space in which the mean squared error over all pixels and channels is computed.
 

@@ -17,6 +17,9 @@ from ..backend.arrays import types_of
 
 LN2 = math.log(2)
 
+STEEP = 122.0
+"""Largest exponent of the products of `weights` before a Gaussian is steep, see `is_steep`."""
+
 
 def exp2_neg(q: Any) -> Any:
     """Return ``2^-q`` for ``-126 <= q <= 126``: relative error < 3e-7, on cuda < 5e-7.
@@ -74,8 +77,9 @@ def weights(
         Cutoff, see `eigengs_dr.raster.parameters.kernel_radius`.
     steep : bool, optional
         Whether to evaluate an exponential at every point. False is faster: products continue one
-        exponential of each row, with a relative error of about 2e-6. It needs a width of 4 and a
-        Gaussian for which `is_steep` is false, and Dr.Jit cannot differentiate it.
+        exponential of each row, with a relative error of about 2e-6, and 1e-5 for the narrowest
+        Gaussians. It needs a width of 4 and a Gaussian for which `is_steep` is false, and Dr.Jit
+        cannot differentiate it.
 
     Returns
     -------
@@ -157,8 +161,9 @@ def is_steep(shape: list, radius: float) -> Any:
 
     Beside a pixel inside the ellipse, ``|u| <= radius + 2 a`` at the second pixel of the row, and
     ``|u| <= radius + 2 a + 2 |b|`` in the row where the ratios start. The exponents of the weight
-    there, ``u^2 + v^2``, and of the ratio, ``2 a u + a^2``, must stay below 126; 120 leaves room
-    for Gaussians that shrink until the next test.
+    there, ``u^2 + v^2``, and of the ratio, ``2 a u + a^2``, must stay below 126; `STEEP` leaves
+    room for Gaussians that shrink until the next test. Gaussians within their bounds, see
+    `eigengs_dr.gaussian.bounds`, reach 121.2 at a cutoff of 3: a fit has no steep Gaussian.
 
     Parameters
     ----------
@@ -175,7 +180,7 @@ def is_steep(shape: list, radius: float) -> Any:
     _, _, a, b, _ = shape
     reach = dr.fma(2.0, a, radius)
     ratio = dr.fma(2 * a, reach + 2 * dr.abs(b), a * a)
-    return ~((reach * reach <= 120) & (ratio <= 120))
+    return ~((reach * reach <= STEEP) & (ratio <= STEEP))
 
 
 def weights_vjp(

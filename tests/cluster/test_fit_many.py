@@ -211,10 +211,26 @@ def test_a_worker_without_memory(photos, output, expected):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 3])
-def test_the_number_of_workers_changes_no_bit(photos, output, expected, workers):
+def test_the_number_of_workers_changes_no_bit(tmp_path, output, workers):
+    """At the default steps; nor does a stop."""
+    photo = np.round(eg.sample("coffee") * 255).astype(np.uint8)
+    photos = tmp_path / "crops"
+    photos.mkdir()
+    for k in range(12):
+        crop = photo[10 * k : 10 * k + 48, 30 * k : 30 * k + 48]
+        Image.fromarray(crop).save(photos / f"{k:02d}.png")
+    here = eg.fit_many(photos, tmp_path / "here", gaussians=300)
+    alone = eg.fit(eg.load_image(photos / "05.png"), gaussians=300)
+    assert here[5].psnr_rgb == max(row["psnr_rgb"] for row in alone.trace)
+
+    def stop(done, total, row):
+        raise KeyboardInterrupt
+
     with connect(f"local:{workers}") as client:
-        eg.fit_many(photos, output, client=client, **QUICK)
-    assert_complete(output, expected)
+        with pytest.raises(eg.RunInterrupted):
+            eg.fit_many(photos, output, client=client, progress=stop, gaussians=300)
+        eg.fit_many(photos, output, client=client, gaussians=300)
+    assert_complete(output, files_of(tmp_path / "here"))
 
 
 def test_encoded_images_are_those_of_this_process(client, photos, output):

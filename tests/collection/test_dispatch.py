@@ -7,6 +7,7 @@ import eigengs_dr as eg
 from _helpers.clusters import QUICK, Here, files_of, folder_of_photos
 from eigengs_dr.collection import dispatch as module
 from eigengs_dr.collection import run
+from eigengs_dr.image.pixels import LinearImage
 
 
 @pytest.fixture
@@ -56,8 +57,8 @@ def test_images_of_a_lost_chunk_are_done_one_by_one(photos, tmp_path):
     assert [row.name for row in rows if row.status == "failed"] == ["02"]
     assert rows[2].error == f"{photos / '02.png'}: its worker ended 2 times"
     assert sum(row.status == "done" for row in rows) == 11
-    assert ["02", "03"] in executor.names
-    assert ["02"] in executor.names and ["03"] in executor.names
+    assert ["00", "01", "02"] in executor.names
+    assert all([name] in executor.names for name in ("00", "01", "02"))
 
 
 def test_a_failure_that_may_pass_is_tried_again(photos, tmp_path, monkeypatch):
@@ -87,17 +88,28 @@ def test_images_without_work_pass_by(photos, tmp_path):
     assert not any("01" in names for names in executor.names)
 
 
-def test_chunks_grow_to_their_time_and_shrink_at_the_end(monkeypatch):
-    sources = [module.Source(str(k), "x://a", place=k) for k in range(1000)]
-    chunks = module._Chunks(sources, 1000, 2, lambda names: None, False)
-    lengths = []
-    for chunk in chunks:
-        lengths.append(len(chunk.sources))
-        chunks.note_time(module.CHUNK_SECONDS / 50)
-    assert lengths[0] == module.FIRST_CHUNK and lengths[1] == 32
-    assert sum(lengths) == 1000
-    assert sorted(lengths[1:], reverse=True) == lengths[1:]
-    assert 16 in lengths and 8 not in lengths  # shorter ones would part groups
+@pytest.mark.parametrize(
+    ("side", "iterations", "longest"), [(4, 0, 8), (64, 10000, 4), (128, 10000, 1)]
+)
+def test_images_and_steps_decide_the_chunks(side, iterations, longest):
+    """Long chunks of little work; the last ones are short, so that all workers end together."""
+    images = [np.full((side, side, 3), 0.5, np.float32)] * 32
+    again = []
+    for _ in range(2):
+        executor = Here(lost=[f"{k:06d}" for k in range(32)])  # nothing is fitted
+        eg.fit_many(images, client=executor, gaussians=2, iterations=iterations)
+        chunks = sorted(names for names in executor.names if len(names) > 1)
+        lengths = [len(names) for names in chunks]
+        assert max(lengths, default=1) == longest
+        assert sorted(lengths, reverse=True) == lengths
+        again.append(chunks)
+    assert again[0] == again[1]
+
+
+def test_light_stays_light(photos):
+    light = eg.sample("coffee")[:24, :32].astype(np.float32).view(LinearImage)
+    [far], [here] = (eg.fit_many([light], client=client, **QUICK) for client in (Here(), None))
+    np.testing.assert_array_equal(far.result.image, here.result.image)
 
 
 def test_warnings_of_workers_are_said_here(tmp_path):

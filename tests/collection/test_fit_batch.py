@@ -6,8 +6,12 @@ import pytest
 import eigengs_dr as eg
 from _helpers.waves import picture
 from eigengs_dr.collection import fit_batch as module
-from eigengs_dr.collection.fit_batch import fit_batch, fits_in_batches
+from eigengs_dr.collection.fit_batch import MAX_CUTOFF, fit_batch, fits_in_batches
 from eigengs_dr.fitting.options import FitOptions
+from eigengs_dr.gaussian.bounds import MIN_DEVIATION
+from eigengs_dr.gaussian.file import CUTOFF
+from eigengs_dr.raster.evaluate import is_steep
+from eigengs_dr.raster.parameters import kernel_radius, kernel_shape
 
 
 def pictures(count, height=30, width=33):
@@ -53,14 +57,60 @@ def test_a_surplus_leaves_every_image_alike(backend, color):
                 np.testing.assert_array_equal(found.gaussians.to_arrays()[name], values)
 
 
-def test_gaussians_are_placed_anew_in_long_fits(backend):
-    """From 200 steps on."""
-    found = fit_batch(pictures(2), options(backend, iterations=200))
-    for image, result in zip(pictures(2), found, strict=True):
-        alone = eg.fit(image, 60, 200, backend=backend)
-        assert result.trace[-1]["psnr_ycbcr"] == pytest.approx(
-            alone.trace[-1]["psnr_ycbcr"], abs=0.5
-        )
+def assert_same_bits(found, expected):
+    """The same set, picture and trace."""
+    for name, values in expected.gaussians.to_arrays().items():
+        np.testing.assert_array_equal(found.gaussians.to_arrays()[name], values)
+    np.testing.assert_array_equal(found.image, expected.image)
+    keys = ("iteration", "psnr_ycbcr", "psnr_rgb")
+    for row, other in zip(found.trace, expected.trace, strict=True):
+        assert [row[key] for key in keys] == [other[key] for key in keys]
+
+
+def test_default_fits_have_the_bits_of_single_ones():
+    """A thousand steps, until Gaussians are as narrow as they may be."""
+    photo = eg.sample("coffee")
+    crops = [photo[y : y + 48, x : x + 48] for y, x in ((40, 60), (110, 190), (200, 300))]
+    together, two = (eg.fit_many(part, gaussians=300) for part in (crops, crops[:2]))
+    alone = eg.fit(crops[0], gaussians=300)
+    assert np.abs(alone.gaussians.to_arrays()["factor"]).max() > 0.99 / MIN_DEVIATION
+    assert_same_bits(together[0].result, alone)
+    for row, other in zip(together, two, strict=False):
+        assert_same_bits(row.result, other.result)
+
+
+def test_a_run_that_was_stopped_has_the_bits_of_one_that_was_not(tmp_path):
+    """The second call has other groups: what is done is left out."""
+    photo = eg.sample("coffee")
+    crops = [photo[y : y + 40, y : y + 40] for y in (40, 110, 200)]
+    whole = eg.fit_many(crops, tmp_path / "whole", gaussians=200)
+    eg.fit_many(crops, tmp_path / "again", gaussians=200)
+    (tmp_path / "again" / "000001.npz").unlink()
+    again = eg.fit_many(crops, tmp_path / "again", gaussians=200)
+    assert [row.status for row in again] == ["skipped", "done", "skipped"]
+    assert again[1].psnr_rgb == whole[1].psnr_rgb
+    found, expected = (np.load(tmp_path / run / "000001.npz") for run in ("again", "whole"))
+    for name in expected:
+        np.testing.assert_array_equal(found[name], expected[name])
+
+
+def test_no_gaussian_of_a_batch_is_steep():
+    """A steep one would change the arithmetic of the images beside its own."""
+    corners = np.array([[a, b, c] for a in (0, 9) for b in (-9, 0, 9) for c in (0, 9)], np.float32)
+    count = len(corners)
+    narrowest = eg.Gaussians.from_arrays(
+        np.full((count, 2), 4), corners + 1e-9, np.zeros((count, 3)), size=(8, 8), backend="llvm"
+    ).bounded()
+    for cutoff, expected in ((CUTOFF, False), (MAX_CUTOFF, False), (4.0, True)):
+        steep = is_steep(kernel_shape(narrowest), kernel_radius(cutoff))
+        assert steep.numpy().any() == expected
+
+
+def test_many_gaussians_an_image():
+    """Dr.Jit adds up more than 32,768 numbers in another order in batches."""
+    images = pictures(4, 180, 190)
+    rows = eg.fit_many(images, gaussians=33000, iterations=0)
+    assert_same_bits(rows[1].result, eg.fit(images[1], 33000, 0))
 
 
 def test_results_do_not_depend_on_the_other_images(backend):
@@ -109,7 +159,10 @@ def test_too_many_gaussians_are_refused(backend):
 @pytest.mark.parametrize(
     ("changed", "expected"),
     [({}, True), ({"init": "grid"}, True), ({"preset": "gaussianimage"}, False),
-     ({"target_psnr": 30.0, "gaussians": None}, False), ({"init": "eigen"}, False)],
+     ({"target_psnr": 30.0, "gaussians": None}, False), ({"init": "eigen"}, False),
+     ({"cutoff": 4.0}, False), ({"gaussians": 33000}, False)],
 )  # fmt: skip
 def test_which_options_go_together(changed, expected):
-    assert fits_in_batches(options(None, **changed)) == expected
+    pixels = np.zeros((256, 256, 3), np.float32)
+    assert fits_in_batches(options(None, **changed), pixels) == expected
+    assert not fits_in_batches(options(None, **changed), np.zeros((257, 8, 3), np.float32))

@@ -33,13 +33,18 @@ class Granularity(NamedTuple):
     ordered: bool
     products: bool
 
-    def visits_for(self, entries: int) -> int:
-        """Return the largest number of tiles of a lane, for the pairs in the lists of an image."""
-        return self.long_visits if entries >= MIN_PIECES * self.long_visits else self.visits
+    def visits_for(self, entries: int, tiles: int) -> int:
+        """Return the largest number of tiles of a lane, for the lists of an image of some tiles."""
+        large = tiles > SMALL and entries >= MIN_PIECES * self.long_visits
+        return self.long_visits if large else self.visits
 
 
 MIN_PIECES = 1 << 15
 """Pieces that keep all cores of a large CPU busy."""
+
+SMALL = 1 << 12
+"""Most tiles of an image, 256x256 pixels, that takes `Granularity.visits` whatever its lists. In a
+batch the number may not depend on the lists of other images: it decides in which order sums run."""
 
 GRANULARITY = {
     "llvm": Granularity(rows=4, visits=16, long_visits=64, ordered=True, products=True),

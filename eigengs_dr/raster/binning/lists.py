@@ -151,7 +151,7 @@ def build_lists(
             f"{dr.width(touched)} Gaussians touch {entries} tiles, the limit is "
             f"{MAX_LIST_ENTRIES}: use fewer or smaller Gaussians, or a smaller image"
         )
-    visits = share.visits_for(entries // grid.images)
+    visits = share.visits_for(entries // grid.images, grid.tiles // grid.images)
     number = (touched + (visits - 1)) // visits
     # One prefix sum for the tiles and the pieces: each sum fits into 32 bits.
     both = dr.fma(UInt64(number), 1 << 32, UInt64(touched))

@@ -40,11 +40,15 @@ def test_long_lists_have_longer_pieces(backend, monkeypatch):
     monkeypatch.setitem(GRANULARITY, backend, few)
     short = build_lists(shape, RADIUS, GRID)
     monkeypatch.setattr(granularity, "MIN_PIECES", 1)
+    small = build_lists(shape, RADIUS, GRID)
+    monkeypatch.setattr(granularity, "SMALL", 0)
     long = build_lists(shape, RADIUS, GRID)
     found, visits = pairs_by_splat(long)
     before, most = pairs_by_splat(short)
     np.testing.assert_array_equal(found, before)
     assert most.max() == 2 and 2 < visits.max() <= 5
+    # In small images, which go in batches, the length of the lists changes nothing.
+    np.testing.assert_array_equal(pairs_by_splat(small)[1], most)
 
 
 @few
