@@ -24,18 +24,15 @@ from .visibility import Visibility
 ITERATIONS = 20
 """Steps of the back-projection."""
 
-KNOWN = 0.3
-"""Fraction of seen texels under a kernel at which their mean fully replaces that of the next wider
-kernel."""
-
 Image = NDArray[np.float32]
 
 
 def extrapolate(values: Image, seen: NDArray[np.bool_]) -> Image:
     """Replace unseen texels of an image by a smooth continuation of the seen ones.
 
-    The value of an unseen texel is the mean of the seen texels under a Gaussian kernel, which is
-    narrow near seen texels and wide far from them.
+    Push and pull (Gortler et al., The Lumigraph, 1996): each level of a pyramid has the means of
+    the seen texels of the level below, and what is unseen there interpolates the level above. The
+    cost is linear in the texels.
 
     Parameters
     ----------
@@ -49,13 +46,40 @@ def extrapolate(values: Image, seen: NDArray[np.bool_]) -> Image:
         Equal to `values` at seen texels.
     """
     known = seen[..., None].astype(np.float32)
-    result = np.broadcast_to(values[seen].mean(axis=0, dtype=np.float32), values.shape)
-    for power in reversed(range(max(seen.shape).bit_length())):
-        sigma = (2.0**power, 2.0**power, 0)
-        near = gaussian_filter(known, sigma, mode="nearest")
-        means = gaussian_filter(values * known, sigma, mode="nearest") / np.maximum(near, 1e-9)
-        result = result + np.minimum(near / KNOWN, 1) * (means - result)
-    return np.where(seen[..., None], values, result)
+    level = np.where(seen[..., None], values, np.float32(0)), known
+    levels = [level]
+    while max(levels[-1][1].shape) > 1:
+        levels.append(_pull(*levels[-1]))
+    filled = levels[-1][0]
+    for mean, share in reversed(levels[:-1]):
+        filled = share * mean + (1 - share) * _push(filled, mean.shape[:2])
+    return np.where(seen[..., None], values, filled)
+
+
+def _pull(mean: Image, share: Image) -> tuple[Image, Image]:
+    """Halve an image: means of its known parts, and how much of 2x2 texels is known, up to 1."""
+    height, width = share.shape[:2]
+    blocks = ((height + 1) // 2, 2, (width + 1) // 2, 2)
+    odd = ((0, height % 2), (0, width % 2), (0, 0))
+
+    def total(image: Image) -> Image:
+        result: Image = np.pad(image, odd).reshape(*blocks, -1).sum(axis=(1, 3))
+        return result
+
+    weight = total(share)
+    return total(mean * share) / np.maximum(weight, 1e-9), np.minimum(weight, 1)
+
+
+def _push(image: Image, shape: tuple[int, ...]) -> Image:
+    """Double an image by linear interpolation between centres of texels, and crop it."""
+    for axis in (0, 1):
+        side = image.shape[axis]
+        at = (np.arange(shape[axis], dtype=np.float32) - 0.5) / 2
+        first = np.floor(at).astype(int)
+        part = (at - first).reshape([-1 if k == axis else 1 for k in range(3)])
+        low, high = (image.take(n.clip(0, side - 1), axis) for n in (first, first + 1))
+        image = low + part * (high - low)
+    return image
 
 
 def back_project(whole: Image, found: Visibility, share: float) -> Image:
