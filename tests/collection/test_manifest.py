@@ -150,6 +150,18 @@ def test_a_run_that_was_killed_holds_no_lock(photos, output):
     assert [row.status for row in eg.fit_many(photos, output, **QUICK)] == ["done"] * 3
 
 
+def test_a_system_without_locks_makes_no_file(tmp_path):
+    """Windows deletes no file that is open."""
+    code = (
+        "import os, sys, pathlib; sys.modules['fcntl'] = None\n"
+        "from eigengs_dr.storage.lock import lock_folder\n"
+        "with lock_folder(pathlib.Path(sys.argv[1])): print(os.listdir(sys.argv[1]))"
+    )
+    command = [sys.executable, "-c", code, tmp_path]
+    found = subprocess.run(command, check=True, timeout=60, capture_output=True, text=True)
+    assert found.stdout == "[]\n"
+
+
 def test_interrupted_runs_leave_one_row_an_image(photos, output):
     def press(done, total, row):
         raise KeyboardInterrupt
