@@ -57,8 +57,8 @@ $(READY): pyproject.toml benchmarks/pyproject.toml
 demo: $(READY)
 	@mkdir -p build/demo
 	$(BIN)/eigengs-dr fit $(PHOTO) --init eigen --basis natural --iterations 0 \
-		-o build/demo/instant.npz --preview build/demo/instant.png
-	$(BIN)/eigengs-dr fit $(PHOTO) -o build/demo/coffee.npz \
+		--overwrite -o build/demo/instant.npz --preview build/demo/instant.png
+	$(BIN)/eigengs-dr fit $(PHOTO) --overwrite -o build/demo/coffee.npz \
 		--preview build/demo/coffee.png --report build/demo/coffee.json
 
 scenes: $(READY)
