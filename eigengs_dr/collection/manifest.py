@@ -69,16 +69,17 @@ class Manifest:
             if not clean:
                 self._rewrite()  # else the next row would continue a half line
             self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-            stack.callback(os.close, self._file)
             self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *details: Any) -> None:
         """Leave one row an image, and free the folder."""
-        # If the disk is too full for a second file, the journal holds the same rows.
-        with self._stack, suppress(OSError):
-            self._rewrite()
-            remove_stale(self.path.parent)
+        with self._stack:
+            os.close(self._file)  # Windows replaces no file that is open
+            # If the disk is too full for a second file, the journal holds the same rows.
+            with suppress(OSError):
+                self._rewrite()
+                remove_stale(self.path.parent)
 
     def start(self, names: Iterable[str]) -> None:
         """Record that the work on some images begins, and which results they had before."""
