@@ -4,6 +4,11 @@ import signal
 from functools import cache
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# No test depends on time: another program may use the machine, and a first example compiles.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 pytest.register_assert_rewrite("_helpers")
 

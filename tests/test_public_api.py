@@ -61,7 +61,7 @@ def test_import_starts_nothing():
     code = """
 import sys
 import eigengs_dr
-slow = {"click", "drjit", "matplotlib", "mitsuba", "scipy", "skimage", "tqdm"}
+slow = {"click", "drjit", "matplotlib", "mitsuba", "numpy", "PIL", "scipy", "skimage", "tqdm"}
 print(sorted(slow & set(sys.modules)))
 if sys.platform == "linux":
     # Dr.Jit loads libLLVM when it is imported, and with it what a user may not want.
@@ -91,13 +91,6 @@ print(chosen[0] == os.environ.get("DRJIT_LIBLLVM_PATH"), bool(chosen[0]))
         pytest.skip("needs a libLLVM")
     process = run_python(code, EAGER_IMPORT="1", DRJIT_LIBLLVM_PATH=None)
     assert process.stdout.split() == ["True", "True"], process.stderr
-
-
-def test_import_takes_less_than_half_a_second():
-    """The quickest of several, because others may use the machine."""
-    code = "import time; start = time.perf_counter(); import eigengs_dr; "
-    code += "print(time.perf_counter() - start)"
-    assert min(float(run_python(code).stdout) for _ in range(3)) < 0.5
 
 
 @pytest.mark.parametrize("name", ["fit_for_scene", "register_plugins"])

@@ -126,6 +126,9 @@ def fit_large(
         If the output cannot be written.
     BackendError
         If the backend is not available.
+    ClusterError
+        If the cluster cannot be used or is lost, or a block ends its worker again and again. The
+        same call goes on.
     KeyboardInterrupt
         After Ctrl-C or SIGTERM. The folder keeps the blocks that are done: repeat the call to go
         on.

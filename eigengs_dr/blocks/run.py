@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.executor import Executor
+from ..backend.executor import ClusterError, Executor
 from ..fitting.optimizers.schedule import first_phase
 from ..fitting.options import FitOptions
 from ..gaussian.file import SetData
@@ -219,7 +219,7 @@ class Run:
         with closing(self.executor.map(function, tasks, self.settings)) as ended:
             for done in ended:
                 if done.lost:
-                    raise RuntimeError(f"{self.image.name}: {done.lost}")
+                    raise ClusterError(f"{self.image.name}: {done.lost}")
                 yield parts[done.index], done.value
                 self._advance(steps)  # the caller has kept the result: `progress` may raise
                 self._stop_if_pressed()

@@ -157,6 +157,8 @@ def _open_file(path: Path, keep_grey: bool, encoding: str | None) -> Source:
         state = path.stat()
     except OSError as error:
         raise ImageError(f"{path}: {error.strerror or error}; check the path") from None
+    if path.is_dir():
+        raise ImageError(f"{path}: is a folder; name an image file in it")
     if path.suffix.lower() in TIFF_SUFFIXES:
         shape = window_shape(absolute)
     default = "srgb"

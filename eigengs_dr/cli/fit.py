@@ -32,7 +32,7 @@ from .options import (
     quiet_option,
     report_option,
 )
-from .outputs import check_outputs, name_outputs
+from .outputs import check_outputs, keeps_result, name_outputs
 from .report import write_report
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ FAILED = 2
     help="Seed of --init random.",
 )
 @click.option("--preview", type=ANY_PATH, help="Picture (or folder) of photo, fit and outlines.")
-@click.option("--overwrite", is_flag=True, help="Fit images of several whose results exist.")
+@click.option("--overwrite", is_flag=True, help="Fit images whose results exist again.")
 @cluster_option
 @backend_option
 @report_option
@@ -135,9 +135,11 @@ def fit(
 
     An IMAGE may be a folder of images, a pattern in quotes, or a URL. For several images, -o and
     --preview name folders, and the files in them have the names of the images; manifest.jsonl has a
-    row for each. An image whose result exists is skipped, so that the same command continues a run;
-    --overwrite fits it again. An image that cannot be fitted is left out; the exit code is then 2.
-    With --cluster the processes of a Dask cluster fit the images, with the same results.
+    row for each. An image that cannot be fitted is left out; the exit code is then 2. With
+    --cluster the processes of a Dask cluster fit the images, with the same results.
+
+    An image whose result exists is skipped, so that the same command continues a run; --overwrite
+    fits it again. A file that is no set of Gaussians is never replaced.
 
     Ctrl-C writes the best fit so far of one image, or ends after the last complete one of several,
     and exits with code 130. If --target-psnr cannot be reached, the command says so, writes the
@@ -175,7 +177,7 @@ def fit(
         options = check_options(options, levels)
     if maps:
         files = (output, preview, report)
-        context.exit(run_maps(context, images, maps, files, options, levels, quiet))
+        context.exit(run_maps(context, images, maps, files, options, levels, overwrite, quiet))
     if not images:
         raise click.UsageError("no image is given; name image files, or maps with --map")
     paths = [file for source in images for file in _expand(source)]
@@ -185,8 +187,8 @@ def fit(
     outputs = name_outputs(paths, output, [".npz"], several)
     previews = name_outputs(paths, preview, list(SAVE_OPTIONS), several) if preview else []
     check_outputs([*outputs, *previews, report], [*paths, *_basis_file(options)])
-    if output is None:
-        _check_replaced(outputs)
+    if not several and keeps_result(outputs[0], overwrite, quiet):
+        return
     side = blocks or block_side(Path(paths[0]), several, options, levels, preview)
     if side:
         check_large(options, levels, preview, several)
@@ -244,16 +246,6 @@ def _basis_file(options: FitOptions) -> list[Path]:
     """Return the file of the basis, if there is one; no output may overwrite it."""
     files = [Path(str(options.basis))] if options.basis else []
     return [path for path in files if path.is_file()]
-
-
-def _check_replaced(outputs: list[Path]) -> None:
-    """Raise ValueError if a name that was not asked for is taken by something else than a set."""
-    from ..gaussian.file import FORMAT
-    from ..storage import npz
-
-    for path in outputs:
-        if path.exists() and npz.format_of(path) != FORMAT:
-            raise ValueError(f"{path}: exists and is no set of Gaussians; choose a name with -o")
 
 
 def _note_mean(options: FitOptions) -> None:

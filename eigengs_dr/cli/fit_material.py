@@ -13,7 +13,7 @@ from ..backend.selection import select
 from .console import INTERRUPTED, progress_bar, say
 from .fit_one import course_of
 from .options import describe_run
-from .outputs import check_outputs, name_outputs
+from .outputs import check_outputs, keeps_result, name_outputs
 from .report import write_report
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ Record = dict[str, Any]
 MISSED = 1
 """Exit code if the target PSNR cannot be reached."""
 
-ELSEWHERE = ("init", "basis", "preset", "color", "seed", "blocks", "cluster", "overwrite")
+ELSEWHERE = ("init", "basis", "preset", "color", "seed", "blocks", "cluster")
 """Options of the command that materials do not take."""
 
 
@@ -66,9 +66,11 @@ def run_maps(
     files: tuple[Path | None, Path | None, Path | None],
     options: FitOptions,
     levels: Levels | None,
+    overwrite: bool,
     quiet: bool,
 ) -> int:
     """Fit a material, write the set, the preview and the report, and return the exit code."""
+    from ..gaussian.file import MATERIAL
     from ..image.io import SAVE_OPTIONS
 
     output, preview, report = files
@@ -80,6 +82,8 @@ def run_maps(
     if preview:
         [preview] = name_outputs(inputs[:1], preview, list(SAVE_OPTIONS))
     check_outputs([output, preview, report], inputs)
+    if keeps_result(output, overwrite, quiet, MATERIAL, "material"):
+        return 0
     select(options.backend)
     record = fit_maps(named, output, preview, quiet, options, levels)
     if report:

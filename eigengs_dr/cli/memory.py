@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..fitting.memory import check_memory, estimate_memory, installed_memory
+from ..fitting.memory import check_memory, estimate_memory, usable_memory
 from ..fitting.options import PIXELS_PER_FIRST_GAUSSIAN, FitOptions, default_count
 from ..image.color import rendered_as
 from .console import say
@@ -13,7 +13,7 @@ NOTABLE = 1_000_000_000
 """Bytes from which on a fit says its memory."""
 
 COMFORTABLE = 0.5
-"""Share of the installed memory up to which an image is fitted as a whole."""
+"""Share of the usable memory up to which an image is fitted as a whole."""
 
 TURNED = range(5, 9)
 """EXIF orientations that swap width and height."""
@@ -38,7 +38,7 @@ def announce_memory(path: Path, options: FitOptions, quiet: bool) -> None:
     Raises
     ------
     ValueError
-        If this machine has too little memory.
+        If this process may use too little memory.
     """
     problem = _problem(path, options)
     if problem is None:
@@ -53,10 +53,10 @@ def announce_memory(path: Path, options: FitOptions, quiet: bool) -> None:
 
 def needs_blocks(path: Path, options: FitOptions) -> bool:
     """Return whether the fit of a whole image takes more than a comfortable share of the memory."""
-    problem, installed = _problem(path, options), installed_memory()
-    if problem is None or installed is None:
+    problem, usable = _problem(path, options), usable_memory()
+    if problem is None or usable is None:
         return False
-    return estimate_memory(*problem) > COMFORTABLE * installed
+    return estimate_memory(*problem) > COMFORTABLE * usable
 
 
 def _problem(path: Path, options: FitOptions) -> tuple[int, int, int, int] | None:

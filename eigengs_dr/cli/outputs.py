@@ -5,7 +5,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from ..collection.remote import stem_of
+from ..gaussian.file import FORMAT
+from ..storage import npz
 from ..storage.atomic import require_writable
+from .console import say
 
 
 def name_outputs(
@@ -83,3 +86,37 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | str]) 
             raise ValueError(f"{output}: {uses[real]} too; write to another file")
         uses[real] = "is written"
         require_writable(output)
+
+
+def keeps_result(
+    output: Path, overwrite: bool, quiet: bool, kind: str = FORMAT, name: str = "set of Gaussians"
+) -> bool:
+    """Return whether the result of a fit exists and stays; say so in one line.
+
+    Parameters
+    ----------
+    output : Path
+        The file of the result.
+    overwrite : bool
+        Whether a result is replaced.
+    quiet : bool
+        Say nothing.
+    kind, name : str, optional
+        The format of results, and what it is called.
+
+    Raises
+    ------
+    ValueError
+        If the file is something else than a result. It is never replaced.
+    """
+    if not output.exists():
+        return False
+    try:
+        found = npz.format_of(output)
+    except ValueError:
+        found = ""
+    if found != kind:
+        raise ValueError(f"{output}: exists and is no {name}; choose another name with -o")
+    if not overwrite and not quiet:
+        say(f"{output}: exists and is kept; --overwrite fits it again")
+    return not overwrite

@@ -26,6 +26,11 @@ POLL_SECONDS = 0.5
 NO_WORKER_SECONDS = 60.0
 """Time without any worker after which a run ends. A nanny restarts a worker in some seconds."""
 
+PATIENCE = {"distributed.deploy.lost-worker-timeout": "52w"}
+"""Setting of Dask for workers of this machine. After that time, 15 s by default, from any end of a
+worker, Dask looks whether the worker is there. If it starts slowly, or has just ended once more,
+Dask ends the nanny that is about to restart it, and the cluster stays smaller for ever."""
+
 Numbered = tuple[int, Any]
 """A task with its place."""
 
@@ -64,7 +69,8 @@ class ClusterExecutor:
         except Exception as error:
             raise ClusterError(self._gone) from error
         _check_versions(client)
-        client.register_plugin(WorkerSetup(local=is_local(client)))
+        self._local = is_local(client)
+        client.register_plugin(WorkerSetup(local=self._local))
         self.workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
 
     def map(
@@ -83,7 +89,7 @@ class ClusterExecutor:
         constant = self._submit(_identity, shared)
         suspects = deque[Numbered]()
         most = at_once or AHEAD * self.workers
-        with terminate_as_interrupt():
+        with dask.config.set(PATIENCE if self._local else {}), terminate_as_interrupt():
             with closing(self._run(function, enumerate(tasks), constant, most)) as ended:
                 for numbered, done in ended:
                     if done.lost:  # perhaps by the fault of another task of that worker

@@ -9,6 +9,7 @@ import ctypes
 import getpass
 import os
 import signal
+import stat
 import tempfile
 import threading
 from contextlib import suppress
@@ -94,14 +95,31 @@ def keep_freed_memory() -> None:
         mallopt(M_TRIM_THRESHOLD, 1 << 27)
 
 
-def use_own_kernel_cache() -> None:
+def use_own_kernel_cache(temporary: Path | None = None) -> None:
     """Keep compiled kernels on the disk of this machine: home folders of clusters are remote.
 
     A variable ``DRJIT_CACHE_DIR`` that is set stays. The folder outlives the worker.
+
+    Parameters
+    ----------
+    temporary : Path, optional
+        Where the folder is made; by default the folder of the system for temporary files. There
+        other users may have made one of its name, with code that Dr.Jit would run: a folder that
+        others own or may write is left alone, and this worker gets a new one.
     """
-    folder = Path(tempfile.gettempdir()) / f"eigengs-dr-kernels-{getpass.getuser()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    os.environ.setdefault("DRJIT_CACHE_DIR", str(folder))
+    if "DRJIT_CACHE_DIR" in os.environ:
+        return
+    user = os.getuid() if hasattr(os, "getuid") else getpass.getuser()
+    folder = Path(temporary or tempfile.gettempdir()) / f"eigengs-dr-kernels-{user}"
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    found = folder.lstat()
+    private = stat.S_ISDIR(found.st_mode)
+    if hasattr(os, "getuid"):  # on Windows each user has an own folder of temporary files
+        private &= found.st_uid == os.getuid() and not found.st_mode & 0o022
+    if not private:
+        folder = Path(tempfile.mkdtemp(prefix="eigengs-dr-kernels-", dir=temporary))
+    os.environ["DRJIT_CACHE_DIR"] = str(folder)
 
 
 def choose_gpu(name: Any) -> None:

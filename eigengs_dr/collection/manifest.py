@@ -1,10 +1,10 @@
 """The manifest of an output folder: one row an image, from which a run continues.
 
 ``manifest.jsonl`` holds one JSON object a line. During a run it is a journal: an image that begins
-has a line with the status "started", and its last line says what became of it. So a result whose
-run ended before its row was written is known to be unfinished, and is computed again; a result
-that no run began belongs to somebody else, and is kept. The end of a run leaves one line an image,
-sorted by name.
+has a line with the status "started", and its last line says what became of it. Files of results
+are whole or not there, so an image whose run ended between its file and its row is done, too: its
+file is not the one that the line "started" saw. A result that no run began belongs to somebody
+else, and is kept. The end of a run leaves one line an image, sorted by name.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import math
 import os
 from collections.abc import Iterable
 from contextlib import ExitStack, suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -69,26 +69,35 @@ class Manifest:
             if not clean:
                 self._rewrite()  # else the next row would continue a half line
             self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-            stack.callback(os.close, self._file)
             self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *details: Any) -> None:
         """Leave one row an image, and free the folder."""
-        # If the disk is too full for a second file, the journal holds the same rows.
-        with self._stack, suppress(OSError):
-            self._rewrite()
-            remove_stale(self.path.parent)
+        with self._stack:
+            os.close(self._file)  # Windows replaces no file that is open
+            # If the disk is too full for a second file, the journal holds the same rows.
+            with suppress(OSError):
+                self._rewrite()
+                remove_stale(self.path.parent)
 
     def start(self, names: Iterable[str]) -> None:
-        """Record that the work on some images begins."""
-        self._append([{"name": name, "status": STARTED} for name in names])
+        """Record that the work on some images begins, and which results they had before."""
+        self._append(
+            [{"name": k, "status": STARTED, "before": stamp(self.output(k))} for k in names]
+        )
 
     def add(self, row: ImageRow) -> None:
         """Record what became of an image. A skipped image keeps the row of its result."""
         if row.status == "skipped" and row.name in self.rows:
-            return
+            if self.rows[row.name]["status"] != STARTED:
+                return
+            row = replace(row, status="done")  # by a run that ended before it wrote the row
         self._append([_to_json(row)])
+
+    def output(self, name: str) -> Path:
+        """Return the file of the result of an image."""
+        return self.path.with_name(f"{name}.npz")
 
     def _append(self, rows: list[Row]) -> None:
         """Write lines at the end of the file."""
@@ -104,6 +113,14 @@ class Manifest:
         with atomic_write(self.path) as temporary:
             lines = (json.dumps(self.rows[name]) + "\n" for name in sorted(self.rows))
             temporary.write_text("".join(lines), encoding="utf-8")
+
+
+def stamp(path: Path) -> int | None:
+    """Return the time of the last change of a file in nanoseconds, or None if there is no file."""
+    try:
+        return path.stat().st_mtime_ns
+    except FileNotFoundError:
+        return None
 
 
 def read_manifest(path: Path) -> tuple[dict[str, Row], bool]:

@@ -11,11 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..gaussian.file import FORMAT
+from ..gaussian.file import read_head
 from ..image.folder import image_files
-from ..storage import npz
 from ..storage.atomic import refuse_url, require_writable
-from .manifest import STARTED, Manifest
+from .manifest import STARTED, Manifest, stamp
 from .remote import is_url, list_urls, stem_of
 
 Images = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | ArrayLike]
@@ -159,36 +158,35 @@ def plan_output(source: Source, manifest: Manifest, overwrite: bool) -> Source:
     ----------
     source : Source
     manifest : Manifest
-        The manifest of the output folder. If it says that a run began the image and did not end it,
-        the image is done again.
+        The manifest of the output folder. If it says that a run began the image, the file is its
+        result only if it has changed since.
     overwrite : bool
         Do images again whose result exists. A file that holds something else, such as a basis, is
         never replaced.
     """
     if source.status:
         return source
-    output = manifest.path.with_name(f"{source.name}.npz")
+    output = manifest.output(source.name)
     planned = source._replace(output=output)
     if not output.exists():
         return planned
     row = manifest.rows.get(source.name, {})
     if row.get("status") == "done" and not overwrite:
         return planned._replace(status="skipped", figures=_figures(row))
-    if not _is_set(output):
+    try:
+        head = read_head(output)
+    except (ValueError, OSError):
         error = f"{output}: exists and is no set of Gaussians; move it, or use another folder"
         return planned._replace(status="failed", error=error)
-    again = overwrite or row.get("status") in (STARTED, "failed")
-    return planned if again else planned._replace(status="skipped")
+    unfinished = row.get("status") == STARTED and row.get("before") == stamp(output)
+    if overwrite or unfinished or row.get("status") == "failed":
+        return planned
+    width, height = head.size
+    figures = {"width": width, "height": height, "gaussians": head.gaussians}
+    return planned._replace(status="skipped", figures=figures)
 
 
 def _figures(row: dict[str, Any]) -> dict[str, Any]:
     """Return the figures of a row of a manifest, which may come from another version."""
     names = ("width", "height", "gaussians", "psnr_ycbcr", "psnr_rgb", "seconds", "iterations")
     return {name: row.get(name) for name in names}
-
-
-def _is_set(path: Path) -> bool:
-    try:
-        return npz.format_of(path) == FORMAT
-    except (ValueError, OSError):
-        return False

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
 
 from ..image.strips import MAX_THREADS, STRIP_PIXELS, available_cores
 from .optimizers.schedule import MAX_SURPLUS, MAX_SURPLUS_DENSITY
@@ -66,12 +69,45 @@ def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> i
     )
 
 
-def installed_memory() -> int | None:
-    """Return the bytes of memory of this machine, or None if the system does not say."""
+def usable_memory(root: Path = Path("/")) -> int | None:
+    """Return the bytes of memory that this process may use, or None if the system does not say.
+
+    They are those of the machine, or fewer in a container, or in a job of a batch system: Linux
+    limits the memory of a control group and of the groups that it lies in, by version 1 or 2.
+
+    Parameters
+    ----------
+    root : Path, optional
+        The root of the file system with ``proc`` and ``sys``.
+    """
     try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):  # Windows has no `sysconf`
         return None
+    return min([installed, *_group_limits(root)])
+
+
+def _group_limits(root: Path) -> Iterator[int]:
+    """Yield the limits of the control groups of this process that are visible from here."""
+    try:
+        lines = (root / "proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if not controllers:
+            mount, name = root / "sys/fs/cgroup", "memory.max"
+        elif "memory" in controllers.split(","):
+            mount, name = root / "sys/fs/cgroup/memory", "memory.limit_in_bytes"
+        else:
+            continue
+        group = mount / path.lstrip("/")
+        # A container may see its own group alone, at the mount, and not the path to it.
+        for folder in [group, *group.parents]:
+            with suppress(OSError, ValueError):  # no such file, or "max"
+                yield int((folder / name).read_text())
+            if folder == mount:
+                break
 
 
 def check_memory(width: int, height: int, channels: int, gaussians: int) -> str:
@@ -82,16 +118,16 @@ def check_memory(width: int, height: int, channels: int, gaussians: int) -> str:
     Raises
     ------
     ValueError
-        If this machine has less memory: one line that says so and what to do.
+        If this process may use less memory: one line that says so and what to do.
     """
-    needed, installed = estimate_memory(width, height, channels, gaussians), installed_memory()
+    needed, usable = estimate_memory(width, height, channels, gaussians), usable_memory()
     line = (
         f"{gaussians:,} Gaussians on {width}x{height} pixels take about {needed / 1e9:.1f} GB "
         "of memory"
     )
-    if installed is not None and needed > installed:
+    if usable is not None and needed > usable:
         raise ValueError(
-            f"{line}, this machine has {installed / 1e9:.1f} GB: "
+            f"{line}, this process may use {usable / 1e9:.1f} GB: "
             "scale the image down or use fewer Gaussians"
         )
     return line

@@ -68,17 +68,13 @@ def remove_stale(folder: Path) -> None:
     Parameters
     ----------
     folder : Path
-        A folder of results. Files younger than `STALE_SECONDS` stay: they may be written now.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be deleted.
+        A folder of results. Files younger than `STALE_SECONDS` stay: they may be written now. So do
+        folders, in which work may go on for long, and what cannot be deleted.
     """
     now = time.time()
     for path in folder.glob(".*"):
-        if TEMPORARY.fullmatch(path.stem):
-            with suppress(FileNotFoundError):
+        if TEMPORARY.fullmatch(path.stem) and path.is_file():
+            with suppress(OSError):
                 if now - path.stat().st_mtime > STALE_SECONDS:
                     path.unlink()
 

@@ -23,8 +23,9 @@ def lock_folder(folder: Path) -> Iterator[None]:
     """Hold the file ``.lock`` of a folder during a block.
 
     The operating system frees the lock when the process ends, however it ends. Network file systems
-    (NFS from version 4 on, Lustre with ``flock``) lock between machines too. On Windows, and on a
-    file system without locks, the block runs without a lock.
+    (NFS from version 4 on, Lustre with ``flock``) lock between machines too. On a file system
+    without locks the block runs without a lock. So it does on Windows, without the file too: it
+    could not be deleted while it is open.
 
     Parameters
     ----------
@@ -37,6 +38,9 @@ def lock_folder(folder: Path) -> Iterator[None]:
         If another run holds the lock: one line that names the folder and the run. If the file
         cannot be created.
     """
+    if fcntl is None:
+        yield
+        return
     path = folder / ".lock"
     file = _locked(path, folder)
     try:
@@ -70,8 +74,6 @@ def _locked(path: Path, folder: Path) -> int:
 
 def _take(file: int) -> None:
     """Lock a file, or raise BlockingIOError."""
-    if fcntl is None:
-        return
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:

@@ -20,11 +20,19 @@ else:
 """
 
 
+HUNG = """
+import faulthandler, os
+# An import of Dr.Jit hides standard error, so the watch has its own copy.
+faulthandler.dump_traceback_later(200, exit=True, file=os.dup(2))
+"""
+"""What lets a program that hangs end, and say where: libLLVM, Dr.Jit and threads are in play."""
+
+
 def run_python(code, **environment):
     """Run code in a fresh interpreter, with environment variables set, or unset by None."""
     merged = {**os.environ, **environment}
     return subprocess.run(
-        [sys.executable, "-c", code],
+        [sys.executable, "-c", HUNG + code],
         env={key: value for key, value in merged.items() if value is not None},
         capture_output=True,
         text=True,

@@ -21,7 +21,7 @@ from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.initializers import FitProblem
 from eigengs_dr.fitting.optimizers.descent import descend
 
-WAIT = 30
+WAIT = 100
 """Seconds after which a thread that does not answer fails its test."""
 
 

@@ -166,7 +166,7 @@ def test_lost_task_is_one_line():
         def map(self, function, tasks, shared=None, at_once=None):
             yield Done(0, None, "a task ended its worker 3 times")
 
-    with pytest.raises(RuntimeError, match="image: a task ended its worker 3 times"):
+    with pytest.raises(eg.ClusterError, match="image: a task ended its worker 3 times"):
         eg.fit_large(mosaic(128), **FEW, client=Losing())
 
 

@@ -1,10 +1,12 @@
 """Files that commands read and write."""
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from _helpers.command import SMALL, run, smooth_pixels, succeeded
 from _helpers.photos import random_fields
+from eigengs_dr.gaussian.file import SetData, write
 
 
 @pytest.fixture
@@ -39,8 +41,10 @@ def trained(tmp_path_factory):
 def existing(tmp_path):
     """An output file of an earlier run, which a refused run has to leave as it is."""
     path = tmp_path / "existing.npz"
-    path.write_bytes(b"earlier")
-    before = sorted(tmp_path.iterdir())
+    shapes = np.zeros((1, 2), np.float32), np.float32([[1, 0, 1]]), np.zeros((1, 3), np.float32)
+    data = dict(zip(("mean", "factor", "color"), shapes, strict=True))
+    write(path, SetData(data | {"background": np.zeros(3, np.float32)}, (8, 8), "ycbcr"))
+    before, earlier = sorted(tmp_path.iterdir()), path.read_bytes()
     yield path
-    assert path.read_bytes() == b"earlier"
+    assert path.read_bytes() == earlier
     assert set(before) <= set(tmp_path.iterdir())

@@ -95,14 +95,15 @@ def test_fit_several_images_into_folders(photo, tmp_path):
     ],
 )
 def test_bad_settings(photo, existing, option, value, word):
-    assert_refused(run("fit", photo, "-o", existing, option, value), word)
+    assert_refused(run("fit", photo, "-o", existing, "--overwrite", option, value), word)
 
 
 def test_cuda_without_gpu(photo, existing):
     try:
         select("cuda")
     except BackendError:
-        assert_refused(run("fit", photo, "-o", existing, "--backend", "cuda"), "CUDA", "llvm")
+        command = ["fit", photo, "-o", existing, "--overwrite", "--backend", "cuda"]
+        assert_refused(run(*command), "CUDA", "llvm")
     else:
         pytest.skip("this machine has a GPU")
 
@@ -129,7 +130,7 @@ def test_interrupted_before_there_is_a_fit(photo, existing, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(fit_module, "fit_image", interrupted)
-    result = run("fit", photo, "-o", existing)
+    result = run("fit", photo, "-o", existing, "--overwrite")
     assert result.exit_code == 130
     assert result.stderr.strip() == "eigengs-dr: interrupted"
 
@@ -137,7 +138,8 @@ def test_interrupted_before_there_is_a_fit(photo, existing, monkeypatch):
 def test_command_finds_few_or_says_that_it_cannot(tmp_path):
     image, out, report = tmp_path / "a.png", tmp_path / "a.npz", tmp_path / "a.json"
     eg.save_image(image, picture())
-    base = ["fit", image, "-o", out, "--quiet", "--iterations", 40, "--report", report]
+    base = ["fit", image, "-o", out, "--overwrite", "--quiet", "--iterations", 40]
+    base += ["--report", report]
     assert run(*base, "--target-psnr", 26).exit_code == 0
     told = json.loads(report.read_text())
     assert told["stopped"] == "met" and told["psnr_rgb"] >= 26
@@ -233,9 +235,28 @@ def test_a_bad_image_does_not_end_a_folder(photo, tmp_path):
     assert "b.png" in images[1]["error"]
 
 
-def test_the_default_name_replaces_no_model(trained, photo, tmp_path, monkeypatch):
+@pytest.mark.parametrize("options", [[], ["-o", "photo.npz"], ["--overwrite"], ["--blocks", 32]])
+def test_a_model_is_never_replaced(trained, photo, tmp_path, monkeypatch, options):
     monkeypatch.chdir(tmp_path)
     shutil.copy(trained[0] / "m.npz", tmp_path / "photo.npz")
-    assert_refused(run("fit", photo, *QUICK), "photo.npz", "-o")
-    succeeded(run("fit", photo, "-o", "photo.npz", *QUICK))
-    succeeded(run("fit", photo, *QUICK))
+    before = (tmp_path / "photo.npz").read_bytes()
+    reason = "photo.npz: exists and is no set of Gaussians; choose another name with -o"
+    assert_refused(run("fit", photo, *options, *QUICK), reason)
+    assert (tmp_path / "photo.npz").read_bytes() == before
+
+
+@pytest.mark.parametrize("options", [[], ["-o", "photo.npz"], ["--blocks", 32]])
+def test_a_result_is_kept(photo, tmp_path, monkeypatch, options):
+    """As those of several images are; nothing else is written either."""
+    monkeypatch.chdir(tmp_path)
+    command = ["fit", photo, *options, "--gaussians", 20, "--iterations"]
+    succeeded(run(*command, 1))
+    before = (tmp_path / "photo.npz").read_bytes()
+    again = succeeded(run(*command, 2, "--report", "r.json"))
+    line = "eigengs-dr: photo.npz: exists and is kept; --overwrite fits it again\n"
+    assert (again.stdout, again.stderr) == ("", line)
+    assert succeeded(run(*command, 2, "--quiet")).output == ""
+    assert (tmp_path / "photo.npz").read_bytes() == before
+    assert not (tmp_path / "r.json").exists()
+    succeeded(run(*command, 2, "--overwrite"))
+    assert (tmp_path / "photo.npz").read_bytes() != before

@@ -59,7 +59,7 @@ def test_the_papers_form_lacks_the_mean_image(trained, photo, tmp_path):
 
 def test_bases_that_do_not_fit(trained, fitted, photo, existing, tmp_path):
     folder, _ = trained
-    eigen = ["fit", photo, "-o", existing, "--init", "eigen"]
+    eigen = ["fit", photo, "-o", existing, "--overwrite", "--init", "eigen"]
     model = folder / "m.npz"
     assert_refused(run(*eigen, "--basis", "nowhere"), "'nowhere'", "natural")
     assert_refused(run(*eigen, "--basis", fitted[0] / "fit.npz"), "eigengs_dr.gaussians")
@@ -80,7 +80,7 @@ def test_the_names_of_inits_and_bases():
 def test_a_basis_implies_its_start(trained, photo, tmp_path):
     """It is read, or the command says that it cannot be."""
     model, report = trained[0] / "m.npz", tmp_path / "r.json"
-    output = ["-o", tmp_path / "x.npz", "--iterations", 0, "--report", report]
+    output = ["-o", tmp_path / "x.npz", "--overwrite", "--iterations", 0, "--report", report]
     succeeded(run("fit", photo, *output, "--basis", model))
     told = json.loads(report.read_text())
     assert (told["gaussians"], told["basis"]) == (60, str(model))

@@ -68,9 +68,9 @@ def test_folder_as_image(tmp_path, existing):
 @pytest.mark.parametrize("content", [b"", b"this is text, not a picture\n"])
 def test_file_that_is_no_image(tmp_path, existing, content):
     (tmp_path / "x.png").write_bytes(content)
-    assert_refused(run("fit", tmp_path / "x.png", "-o", existing), "x.png")
+    assert_refused(run("fit", tmp_path / "x.png", "-o", existing, "--overwrite"), "x.png")
 
 
 def test_truncated_image(photo, existing):
     photo.write_bytes(photo.read_bytes()[:300])
-    assert_refused(run("fit", photo, "-o", existing), photo)
+    assert_refused(run("fit", photo, "-o", existing, "--overwrite"), photo)

@@ -38,7 +38,7 @@ def test_fit_by_blocks(photo, tmp_path):
 
 def test_blocks_are_chosen_where_memory_says_so(photo, tmp_path, monkeypatch):
     for module in (memory, estimate):
-        monkeypatch.setattr(module, "installed_memory", lambda: 200_000_000)
+        monkeypatch.setattr(module, "usable_memory", lambda: 200_000_000)
     result = succeeded(run("fit", photo, "-o", tmp_path / "x.npz", "--iterations", 2))
     assert "takes too much memory; it is fitted by blocks" in result.stderr
     assert f"{128 * 128 // 20} Gaussians" in result.stdout

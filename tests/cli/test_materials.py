@@ -102,6 +102,23 @@ def test_an_interrupted_fit_is_kept(folder, tmp_path, monkeypatch):
     assert len(eg.Material.load(tmp_path / "m.npz").gaussians) == 5
 
 
+def test_a_result_is_kept(fitted, folder, tmp_path):
+    """A material, as a set, and what is no material is never replaced."""
+    file, set_file = tmp_path / "m.npz", tmp_path / "set.npz"
+    file.write_bytes(fitted.read_bytes())
+    eg.Material.load(fitted)["albedo"].save(set_file)
+    command = ["fit", *maps(folder), "--gaussians", 9, "--iterations", 1, "-o"]
+    again = run(*command, file)
+    assert again.exit_code == 0 and file.read_bytes() == fitted.read_bytes()
+    assert again.stderr == f"eigengs-dr: {file}: exists and is kept; --overwrite fits it again\n"
+    before = set_file.read_bytes()
+    other = run(*command, set_file, "--overwrite")
+    assert other.exit_code == 2 and set_file.read_bytes() == before
+    assert "set.npz: exists and is no material; choose another name with -o" in other.stderr
+    assert run(*command, file, "--overwrite").exit_code == 0
+    assert len(eg.Material.load(file).gaussians) == 9
+
+
 def test_out_of_reach(folder, tmp_path):
     settings = ("--target-psnr", 90, "--max-gaussians", 20, "--iterations", 5)
     result = run("fit", *maps(folder, "albedo"), "-o", tmp_path / "m.npz", *settings)

@@ -26,16 +26,16 @@ def header(path, width, height, grey=False):
 
 
 def test_fit_that_does_not_fit_is_refused_before_the_image_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(memory, "installed_memory", lambda: 2_000_000_000)
+    monkeypatch.setattr(memory, "usable_memory", lambda: 2_000_000_000)
     photo, output = header(tmp_path / "large.png", 8192, 8192), tmp_path / "x.npz"
     result = run("fit", photo, "-o", output, "--gaussians", 5_000_000)
     count = "5,000,000 Gaussians on 8192x8192 pixels"
-    assert_refused(result, photo, count, "this machine has 2.0 GB", "scale the image down")
+    assert_refused(result, photo, count, "this process may use 2.0 GB", "scale the image down")
     assert not output.exists()
 
 
 def test_large_fit_says_its_memory(photo, tmp_path, monkeypatch):
-    monkeypatch.setattr(memory, "installed_memory", lambda: None)
+    monkeypatch.setattr(memory, "usable_memory", lambda: None)
     monkeypatch.setattr(announced, "NOTABLE", 1)
     arguments = ["fit", photo, "-o", tmp_path / "x.npz", "--gaussians", 9, "--iterations", 1]
     line = "eigengs-dr: 9 Gaussians on 32x32 pixels take about 0.1 GB of memory\n"

@@ -4,16 +4,19 @@ import os
 import signal
 import time
 
+import dask
 import numpy as np
 import pytest
+from distributed import Client
 
 from _helpers import clusters
 from eigengs_dr.backend.executor import ClusterError, Done, executor_for
 from eigengs_dr.cluster import executor as module
+from eigengs_dr.cluster.connect import local_cluster
 from eigengs_dr.cluster.worker import versions
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def executor(client):
     return executor_for(client)
 
@@ -80,6 +83,17 @@ def test_a_worker_that_ends_is_replaced(executor, tmp_path):
     found = done(executor, clusters.die_once, range(6), str(tmp_path))
     assert found == [Done(k, k) for k in range(6)]
     assert (tmp_path / "died").exists()
+
+
+def test_a_worker_that_starts_slowly_comes_back(tmp_path):
+    """Dask must not give it up while its nanny restarts it."""
+    with (
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "100ms"}),
+        local_cluster(1) as cluster,
+        Client(cluster) as client,
+    ):
+        found = done(executor_for(client), clusters.die_once, range(3), str(tmp_path))
+    assert found == [Done(k, k) for k in range(3)]
 
 
 def test_a_task_that_ends_all_workers_is_given_up(executor):

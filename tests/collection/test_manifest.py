@@ -1,6 +1,7 @@
 """The manifest of a folder: rows, resuming, half lines, two runs at once."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -52,13 +53,27 @@ def test_skipped_images_keep_their_figures(photos, output):
 
 
 def test_an_image_that_was_begun_is_done_again(photos, output):
-    """Its file may be there, but not its row: the run ended between the two."""
+    """The run that should have replaced its result ended before it did."""
     eg.fit_many(photos, output, **QUICK)
     with Manifest(output) as manifest:
         manifest.start(["01"])
     assert statuses(output)["01"] == "started"
     rows = eg.fit_many(photos, output, **QUICK)
     assert [row.status for row in rows] == ["skipped", "done", "skipped"]
+    assert set(statuses(output).values()) == {"done"}
+
+
+def test_a_file_that_was_written_before_its_row_is_done(photos, output):
+    """The run ended between the two; the file is whole."""
+    eg.fit_many(photos, output, **QUICK)
+    whole = (output / "01.npz").read_bytes()
+    (output / "01.npz").unlink()
+    with Manifest(output) as manifest:
+        manifest.start(["01"])
+        (output / "01.npz").write_bytes(whole)
+    rows = eg.fit_many(photos, output, **QUICK)
+    assert [row.status for row in rows] == ["skipped"] * 3
+    assert (rows[1].width, rows[1].height, rows[1].gaussians) == (32, 24, 20)
     assert set(statuses(output).values()) == {"done"}
 
 
@@ -103,6 +118,16 @@ def test_another_file_of_this_name_is_kept(photos, output, text):
     assert [path.name for path in output.iterdir()] == [NAME]
 
 
+def test_what_a_killed_conversion_left_stops_no_run(photos, output):
+    """Its folder has a name like those of temporary files; perhaps it still works there."""
+    work = output / ".0123456789abcdef"
+    work.mkdir(parents=True)
+    (work / "bark.npz").write_bytes(b"half")
+    os.utime(work, (0, 0))
+    assert [row.status for row in eg.fit_many(photos, output, **QUICK)] == ["done"] * 3
+    assert (work / "bark.npz").exists()
+
+
 def test_two_runs_into_one_folder(photos, output):
     output.mkdir()
     with (
@@ -125,19 +150,30 @@ def test_a_run_that_was_killed_holds_no_lock(photos, output):
     assert [row.status for row in eg.fit_many(photos, output, **QUICK)] == ["done"] * 3
 
 
+def test_a_system_without_locks_makes_no_file(tmp_path):
+    """Windows deletes no file that is open."""
+    code = (
+        "import os, sys, pathlib; sys.modules['fcntl'] = None\n"
+        "from eigengs_dr.storage.lock import lock_folder\n"
+        "with lock_folder(pathlib.Path(sys.argv[1])): print(os.listdir(sys.argv[1]))"
+    )
+    command = [sys.executable, "-c", code, tmp_path]
+    found = subprocess.run(command, check=True, timeout=60, capture_output=True, text=True)
+    assert found.stdout == "[]\n"
+
+
 def test_interrupted_runs_leave_one_row_an_image(photos, output):
     def press(done, total, row):
         raise KeyboardInterrupt
 
     with pytest.raises(eg.RunInterrupted):
         eg.fit_many(photos, output, progress=press, **QUICK)
-    # All were one group: the others are begun, and done again.
+    # All were one group: the others are begun, and perhaps written.
     assert statuses(output) == {"00": "done", "01": "started", "02": "started"}
-    assert [row.status for row in eg.fit_many(photos, output, **QUICK)] == [
-        "skipped",
-        "done",
-        "done",
-    ]
+    written = set(files_of(output))
+    for row in eg.fit_many(photos, output, **QUICK):
+        assert row.status == ("skipped" if row.output.name in written else "done")
+    assert set(statuses(output).values()) == {"done"}
 
 
 def test_encoded_images_have_rows_too(photos, output):

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from eigengs_dr.fitting import memory
-from eigengs_dr.fitting.memory import check_memory, estimate_memory
+from eigengs_dr.fitting.memory import check_memory, estimate_memory, usable_memory
 
 
 def test_memory_grows_with_every_argument():
@@ -22,7 +22,7 @@ def test_memory_grows_with_every_argument():
 
 
 def test_line_names_size_count_and_memory(monkeypatch):
-    monkeypatch.setattr(memory, "installed_memory", lambda: None)
+    monkeypatch.setattr(memory, "usable_memory", lambda: None)
     gigabytes = estimate_memory(4096, 2048, 3, 640_000) / 1e9
     assert check_memory(4096, 2048, 3, 640_000) == (
         f"640,000 Gaussians on 4096x2048 pixels take about {gigabytes:.1f} GB of memory"
@@ -30,12 +30,42 @@ def test_line_names_size_count_and_memory(monkeypatch):
 
 
 def test_fit_larger_than_the_machine_is_refused_in_one_line(monkeypatch):
-    monkeypatch.setattr(memory, "installed_memory", lambda: 1_000_000_000)
+    monkeypatch.setattr(memory, "usable_memory", lambda: 1_000_000_000)
     with pytest.raises(
-        ValueError, match=r"this machine has 1\.0 GB: scale the image down"
+        ValueError, match=r"this process may use 1\.0 GB: scale the image down"
     ) as found:
         check_memory(8192, 8192, 3, 5_000_000)
     assert "\n" not in str(found.value)
+
+
+GROUPS = {
+    "version 2": ("0::/job/task", {"job/memory.max": 5000, "job/task/memory.max": "max"}),
+    "version 2, own root": ("0::/", {"memory.max": 5000}),
+    "version 1": (
+        "5:cpu:/job\n4:memory:/job",
+        {
+            "memory/memory.limit_in_bytes": 9223372036854771712,
+            "memory/job/memory.limit_in_bytes": 5000,
+        },
+    ),
+    "version 1, own root": ("4:memory:/docker/123", {"memory/memory.limit_in_bytes": 5000}),
+    "two controllers": ("2:memory,hugetlb:/", {"memory/memory.limit_in_bytes": 5000}),
+}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux has control groups")
+@pytest.mark.parametrize("name", GROUPS)
+def test_memory_of_a_container_is_that_of_its_group(tmp_path, name):
+    installed = usable_memory(tmp_path)
+    groups, limits = GROUPS[name]
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/self/cgroup").write_text(groups + "\n")
+    assert usable_memory(tmp_path) == installed > 5000
+    for file, limit in limits.items():
+        path = tmp_path / "sys/fs/cgroup" / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{limit}\n")
+    assert usable_memory(tmp_path) == 5000
 
 
 FIT = """

@@ -109,7 +109,7 @@ def test_order_is_that_of_the_source_whatever_is_ready_first(tmp_path, monkeypat
 
     def slow(path):
         if path == files[0]:
-            assert second.wait(10)
+            assert second.wait(100)
         if path == files[1]:
             second.set()
         return load_image(path)

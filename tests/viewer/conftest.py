@@ -15,6 +15,9 @@ def window():
             key = repr(device)
             if key not in windows:
                 windows[key] = browser.new_page(**device)
+                windows[key].set_default_timeout(
+                    200_000
+                )  # milliseconds; others may use the machine
             return windows[key]
 
         yield window

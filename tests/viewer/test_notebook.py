@@ -133,7 +133,7 @@ def test_the_notebook_runs():
     pytest.importorskip("ipykernel", reason="no kernel for notebooks")
     book = nbformat.read(NOTEBOOK, 4)
     assert not any(cell.get("outputs") for cell in book.cells), "outputs are not stored"
-    client.NotebookClient(book, timeout=200, kernel_name="python3").execute()
+    client.NotebookClient(book, timeout=200, startup_timeout=200, kernel_name="python3").execute()
     outputs = [output for cell in book.cells for output in cell.get("outputs", [])]
     shown = [output for output in outputs if "text/html" in output.get("data", {})]
     assert len(shown) == 7
