@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def fit_one(
-    path: Path,
+    path: Path | str,
     output: Path,
     preview: Path | None,
     quiet: bool,
@@ -34,18 +34,19 @@ def fit_one(
     from ..viewer.pictures import comparison, displayed
 
     started = time.perf_counter()
+    name = Path(path).name
     with progress_bar(quiet) as show:
-        show(f"{path.name}: load", 0, 1)
+        show(f"{name}: load", 0, 1)
         image = eg.load_image(path, rendered_as(options.color) is None, options.encoding)
         loaded = time.perf_counter()
         try:
-            result = run(image, progress=partial(show, path.name))
+            result = run(image, progress=partial(show, name))
         except FitInterrupted as interrupt:
             result = interrupt.result
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         result.gaussians.save(output)
-        show(f"{path.name}: measure", 0, 1)
+        show(f"{name}: measure", 0, 1)
         shown = displayed(image, options.color)
         color = result.gaussians.space
         figures = _measure(shown, result, color)

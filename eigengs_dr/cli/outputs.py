@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from ..collection.remote import stem_of
+from ..image.remote import stem_of
 from ..storage.atomic import require_writable
 
 

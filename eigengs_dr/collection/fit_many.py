@@ -144,11 +144,19 @@ def fit_each(
     if levels is not None:
         options = check_options(options, levels)
     if client is not None and options.initializer == "eigen":
-        basis = resolve_name(PACK_BASIS)(options.basis or DEFAULT_BASIS, options.backend)
+        basis = resolve_name(PACK_BASIS)(
+            options.basis or DEFAULT_BASIS, options.backend, options.gaussians
+        )
         options = replace(options, basis=basis)
     make_work = partial(fit_work, options, levels, None if client is not None else step)
     job = Job(make_work, _may_join, rendered_as(options.color) is None, options.encoding)
     return run_images(images, output, overwrite, job, client)
+
+
+def _load(function: str, options: FitOptions) -> Any:
+    """Load or pack the basis of the options, see `eigengs_dr.eigenbasis.registry`."""
+    basis = options.basis or DEFAULT_BASIS
+    return resolve_name(function)(basis, options.backend, options.gaussians)
 
 
 def fit_work(options: FitOptions, levels: Levels | None = None, step: Step | None = None) -> Work:
@@ -161,7 +169,9 @@ def fit_work(options: FitOptions, levels: Levels | None = None, step: Step | Non
     """
     select(options.backend)
     if options.initializer == "eigen":
-        model = resolve_name(LOAD_BASIS)(options.basis or DEFAULT_BASIS, options.backend)
+        model = resolve_name(LOAD_BASIS)(
+            options.basis or DEFAULT_BASIS, options.backend, options.gaussians
+        )
         options = replace(options, basis=model)
     return partial(_fit_group, options=options, levels=levels, step=step)
 

@@ -20,7 +20,8 @@ from ..backend.recording import exclusive
 from ..collection.row import ImageRow, RowProgress
 from ..collection.sources import Images
 from ..gaussian.gaussians import Gaussians
-from ..image.io import check_image
+from ..image.folder import Source
+from ..image.io import check_image, read_image
 from ..image.resize import resample
 from .encode_many import check_encoding, encode_each
 from .encoder import Encoder
@@ -78,7 +79,7 @@ class EigenGS:
     @exclusive()
     def fit(
         cls,
-        basis: Eigenbasis,
+        basis: Eigenbasis | Source,
         gaussians: int = 5000,
         frequency_aware: bool | str = "auto",
         seed: int = 0,
@@ -92,7 +93,8 @@ class EigenGS:
 
         Parameters
         ----------
-        basis : Eigenbasis
+        basis : Eigenbasis, or path, array or iterable
+            Images stand for their basis, ``Eigenbasis.from_images(images)``.
         gaussians : int, optional
             Number of Gaussians, at most one per pixel.
         frequency_aware : {"auto", True, False}, optional
@@ -121,6 +123,8 @@ class EigenGS:
         ClusterError
             If the cluster cannot be used, or is lost.
         """
+        if not isinstance(basis, Eigenbasis):
+            basis = Eigenbasis.from_images(basis, seed=seed, client=client)
         options = TrainOptions(
             size=(basis.width, basis.height),
             gaussians=gaussians,
@@ -182,7 +186,7 @@ class EigenGS:
         UserWarning
             If all components miss the target; the result then has all of them.
         """
-        return self.encoder.project(check_image(image, copy=False), target_psnr)
+        return self.encoder.project(check_image(read_image(image), copy=False), target_psnr)
 
     @exclusive()
     def reconstruct(
@@ -234,7 +238,7 @@ class EigenGS:
             As `project`; also if an option is unknown, or a target comes with exact colours.
         """
         check_encoding(colors, mean, target_psnr)
-        pixels = check_image(image, copy=False)
+        pixels = check_image(read_image(image), copy=False)
         return self.encoder.encode([pixels], colors, mean, target_psnr)[0]
 
     def encode_many(

@@ -23,7 +23,7 @@ OnImage = Callable[[int], None]
 
 
 def truncation_curve_on(
-    basis: Eigenbasis, files: Sequence[Path], watch: OnImage
+    basis: Eigenbasis, files: Sequence[Path | str], watch: OnImage
 ) -> TruncationCurve | None:
     """Measure the truncation curve of images; see `Eigenbasis.truncation_curve`.
 
@@ -46,7 +46,7 @@ def truncation_curve_on(
 
 
 def evaluate(
-    model: EigenGS, basis: Eigenbasis, files: Sequence[Path], watch: OnImage
+    model: EigenGS, basis: Eigenbasis, files: Sequence[Path | str], watch: OnImage
 ) -> dict[str, float]:
     """Measure the PSNR of PCA, of projected colours and of exact colours.
 
@@ -86,7 +86,7 @@ def evaluate(
 
 
 def _readable(
-    files: Sequence[Path], basis: Eigenbasis, watch: OnImage, bad: list[str]
+    files: Sequence[Path | str], basis: Eigenbasis, watch: OnImage, bad: list[str]
 ) -> Iterator[NDArray[np.float32]]:
     """Read images and crop them to the size of a basis; append errors to `bad`."""
     for i, path in enumerate(files):
@@ -95,7 +95,7 @@ def _readable(
             image = center_crop(
                 check_image(load_image(path), copy=False), basis.width, basis.height
             )
-        except ImageError as error:
+        except (ImageError, OSError) as error:
             bad.append(str(error))
         else:
             yield image

@@ -26,6 +26,7 @@ from .search import search_count
 
 if TYPE_CHECKING:
     from ..eigenbasis.eigengs import EigenGS
+    from ..eigenbasis.pca.basis import Eigenbasis
 
 
 @dataclass(frozen=True)
@@ -70,16 +71,37 @@ class Fit:
     mean_image: NDArray[np.float32] | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
-        last = self.trace[-1] if self.trace else {}
         return (
             f"Fit({len(self.gaussians)} Gaussians, "
             f"{self.image.shape[1]}x{self.image.shape[0]} pixels, {self.iterations} iterations, "
-            f"psnr_ycbcr={last.get('psnr_ycbcr', np.nan):.2f}, "
-            f"psnr_rgb={last.get('psnr_rgb', np.nan):.2f}, "
+            f"psnr_ycbcr={self.psnr_ycbcr:.2f}, "
+            f"psnr_rgb={self.psnr_rgb:.2f}, "
             f"seconds={self.seconds:.2f}, stopped={self.stopped!r})"
         )
 
     _repr_html_ = to_html  # what a notebook shows
+
+    @property
+    def psnr_ycbcr(self) -> float:
+        """PSNR of the set in dB, see `trace`, of which its row need not be the last."""
+        return figure_of(self.trace, len(self.gaussians), "psnr_ycbcr")
+
+    @property
+    def psnr_rgb(self) -> float:
+        """PSNR of the set in RGB in dB, see `psnr_ycbcr`."""
+        return figure_of(self.trace, len(self.gaussians), "psnr_rgb")
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the set; see `eigengs_dr.Gaussians.save`."""
+        self.gaussians.save(path)
+
+
+def figure_of(trace: list[dict[str, Any]], count: int, name: str) -> float:
+    """Return a figure of the set that a fit returns: its best with so many Gaussians; or NaN."""
+    rows = [row for row in trace if row.get("gaussians", count) == count]
+    if not rows:
+        return float("nan")
+    return float(max(rows, key=lambda row: row.get("spare", row["psnr_ycbcr"]))[name])
 
 
 class FitInterrupted(KeyboardInterrupt):
@@ -97,11 +119,11 @@ class FitInterrupted(KeyboardInterrupt):
 
 
 def fit(
-    image: ArrayLike,
+    image: ArrayLike | os.PathLike[str],
     gaussians: int | None = None,
     iterations: int = 1000,
     init: str = "auto",
-    basis: str | os.PathLike[str] | EigenGS | None = None,
+    basis: str | os.PathLike[str] | EigenGS | Eigenbasis | None = None,
     preset: str = "default",
     solve_steps: int = 10,
     color: str = "ycbcr",
@@ -118,8 +140,8 @@ def fit(
 
     Parameters
     ----------
-    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
-        See `eigengs_dr.image.io.check_image`.
+    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like or URL
+        A file, see `eigengs_dr.load_image`, or pixels, see `eigengs_dr.image.io.check_image`.
     gaussians : int, optional
         Number of Gaussians, at most one per pixel. By default 5000, or one per pixel for smaller
         images; with an eigenbasis, the number of Gaussians of the basis.
@@ -128,9 +150,10 @@ def fit(
     init : {"auto", "adaptive", "grid", "random", "eigen"}, optional
         Initialiser. "auto" is "eigen" if a basis is given, else the initialiser of the preset:
         "adaptive" for "default".
-    basis : str, path-like or EigenGS, optional
-        Basis for "eigen": the name of a basis in this package, the path of a basis file, or a
-        model. By default "natural", which ships with the package.
+    basis : str, path-like, EigenGS or Eigenbasis, optional
+        Basis for "eigen": the name of a basis in this package, the path of a basis file, a model,
+        or an `eigengs_dr.Eigenbasis`, to which a model is fitted first. By default
+        "natural", which ships with the package.
     preset : {"default", "gaussianimage", "eigengs"}, optional
         The method, see `eigengs_dr.fitting.presets`.
     solve_steps : int, optional
@@ -211,7 +234,7 @@ def fit(
 
 
 @exclusive()
-def fit_image(image: ArrayLike, options: FitOptions, progress: FitProgress | None = None) -> Fit:
+def fit_image(image: Any, options: FitOptions, progress: FitProgress | None = None) -> Fit:
     """Fit an image with the options of one record; see `fit` for results and errors."""
     started = time.perf_counter()
     pixels, options = read_pixels(image, options)

@@ -20,6 +20,7 @@ from .presets import PRESETS, Preset
 
 if TYPE_CHECKING:
     from ..eigenbasis.eigengs import EigenGS
+    from ..eigenbasis.pca.basis import Eigenbasis
 
 DEFAULT_COUNT = 5000
 """Number of Gaussians by default."""
@@ -50,7 +51,7 @@ class FitOptions:
     gaussians: int | None = None
     iterations: int = 1000
     init: str = "auto"
-    basis: str | os.PathLike[str] | EigenGS | None = None
+    basis: str | os.PathLike[str] | EigenGS | Eigenbasis | None = None
     preset: str = "default"
     solve_steps: int = 10
     color: str = "ycbcr"

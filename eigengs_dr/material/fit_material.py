@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.display import to_html
 from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
-from ..fitting.fit import FitInterrupted
+from ..fitting.fit import FitInterrupted, figure_of
 from ..fitting.initializers import FitTarget
 from ..fitting.levels import check_options, refine_levels
 from ..fitting.options import FitOptions, Levels
@@ -60,6 +62,22 @@ class MaterialFit:
     iterations: int
     stopped: str
 
+    _repr_html_ = to_html  # what a notebook shows
+
+    @property
+    def psnr_ycbcr(self) -> float:
+        """Mean psnr_ycbcr of the maps in dB, see `trace`, of which its row need not be the last."""
+        return figure_of(self.trace, len(self.material.gaussians), "psnr_ycbcr")
+
+    @property
+    def psnr_rgb(self) -> float:
+        """Mean psnr_rgb of the maps in dB, see `psnr_ycbcr`."""
+        return figure_of(self.trace, len(self.material.gaussians), "psnr_rgb")
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the material; see `eigengs_dr.Material.save`."""
+        self.material.save(path)
+
 
 @exclusive()
 def fit_material(
@@ -81,7 +99,7 @@ def fit_material(
 
     Parameters
     ----------
-    maps : mapping of str to array_like, shape (H, W, 3), (H, W, 1) or (H, W)
+    maps : mapping of str to array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like or URL
         Images of one size by name, with at most 16 channels together. Data whose three channels are
         equal count as one channel.
     gaussians : int, optional

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...backend.display import to_html
 from ...image.color import ycbcr_to_rgb
 from ...image.folder import ReadProgress, Source
-from ...image.io import check_image
+from ...image.io import check_image, read_image
 from ...image.planes import check_size, to_planes
 from ...image.resize import resample
 from .accumulate import PCAOptions, accumulate
@@ -276,7 +276,7 @@ class Eigenbasis:
 
     def _centred(self, image: ArrayLike) -> NDArray[np.float32]:
         """Resample and convert an image and subtract the mean; shape (C, H, W)."""
-        pixels = resample(check_image(image), self.width, self.height)
+        pixels = resample(check_image(read_image(image)), self.width, self.height)
         planes = to_planes(pixels, self.space) - self.mean.reshape(self.channels, -1)
         return planes.reshape(self.mean.shape)
 
