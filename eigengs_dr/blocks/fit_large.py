@@ -13,7 +13,7 @@ import numpy as np
 from ..backend.executor import executor_for
 from ..backend.interrupt import defer_interrupts
 from ..backend.selection import select
-from ..fitting.options import FitOptions
+from ..fitting.options import FitOptions, named_options
 from ..gaussian.file import CUTOFF, write
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
@@ -67,6 +67,7 @@ class LargeFit:
     seconds: float
 
 
+@named_options
 def fit_large(
     source: Any,
     output: str | os.PathLike[str] | None = None,

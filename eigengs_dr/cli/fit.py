@@ -245,11 +245,10 @@ def _basis_file(options: FitOptions) -> list[Path]:
 
 def _check_replaced(outputs: list[Path]) -> None:
     """Raise ValueError if a name that was not asked for is taken by something else than a set."""
-    from ..gaussian.file import FORMAT
-    from ..storage import npz
+    from ..collection.sources import is_set
 
     for path in outputs:
-        if path.exists() and npz.format_of(path) != FORMAT:
+        if path.exists() and not is_set(path):
             raise ValueError(f"{path}: exists and is no set of Gaussians; choose a name with -o")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pkgutil import resolve_name
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 from ..backend.selection import select
 from ..fitting.fit import Fit, fit_image
 from ..fitting.levels import check_options, fit_levels
-from ..fitting.options import DEFAULT_BASIS, FitOptions, Levels
+from ..fitting.options import DEFAULT_BASIS, FitOptions, Levels, refuse_unknown
 from ..fitting.pixels import unit_of
 from ..image.color import rendered_as
 from ..image.metrics import float_space, psnr
@@ -122,6 +122,8 @@ def fit_many(
     >>> [(row.name, row.status, row.gaussians) for row in rows]
     [('000000', 'done', 200), ('000001', 'done', 200)]
     """
+    own = ("images", "output", "overwrite", "levels", "progress", "client")
+    refuse_unknown(options, [*(field.name for field in fields(FitOptions)), *own])
     settings = FitOptions(**options)
     total, finished = fit_each(images, output, overwrite, settings, levels, client=client)
     return collect(total, finished, output is None, progress)

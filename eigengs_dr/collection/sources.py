@@ -174,7 +174,7 @@ def plan_output(source: Source, manifest: Manifest, overwrite: bool) -> Source:
     row = manifest.rows.get(source.name, {})
     if row.get("status") == "done" and not overwrite:
         return planned._replace(status="skipped", figures=_figures(row))
-    if not _is_set(output):
+    if not is_set(output):
         error = f"{output}: exists and is no set of Gaussians; move it, or use another folder"
         return planned._replace(status="failed", error=error)
     again = overwrite or row.get("status") in (STARTED, "failed")
@@ -187,7 +187,8 @@ def _figures(row: dict[str, Any]) -> dict[str, Any]:
     return {name: row.get(name) for name in names}
 
 
-def _is_set(path: Path) -> bool:
+def is_set(path: Path) -> bool:
+    """Return whether a file is a set of Gaussians."""
     try:
         return npz.format_of(path) == FORMAT
     except (ValueError, OSError):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.warn import warn
 from ..image.io import ImageError, check_image, load_image
 from ..image.metrics import psnr
 from ..image.resize import center_crop
@@ -81,7 +81,7 @@ def evaluate(
         rows.append({name: psnr(image, picture, "ycbcr") for name, picture in pictures.items()})
     if bad:
         message = f"{len(bad)} of {len(files)} images held out were skipped, as {bad[0]}"
-        warnings.warn(message, stacklevel=2)
+        warn(message)
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]} if rows else {}
 
 

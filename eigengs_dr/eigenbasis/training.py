@@ -6,7 +6,6 @@ import json
 import os
 import sys
 import time
-import warnings
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict
@@ -18,6 +17,7 @@ import numpy as np
 
 from ..backend.executor import executor_for
 from ..backend.interrupt import defer_interrupts
+from ..backend.warn import warn
 from ..image.folder import list_images, read_blocks
 from ..image.io import ImageError
 from ..image.remote import is_url
@@ -110,10 +110,9 @@ def train(
     record = {**asdict(settings), "steps": steps, "folder": str(folder)}
     with Checkpoint(output, json.loads(json.dumps(record)), names) as checkpoint:
         if names != checkpoint.files:
-            warnings.warn(
+            warn(
                 f"{folder}: the images have changed since this training began; it goes on with "
-                f"the {len(checkpoint.files)} that were there",
-                stacklevel=2,
+                f"the {len(checkpoint.files)} that were there"
             )
         files = [name if is_url(name) else Path(folder) / name for name in checkpoint.files]
         held_out = files[HELD_OUT - 1 :: HELD_OUT]
@@ -220,7 +219,7 @@ def _state(files: list[Path | str], ranks: tuple[int, ...], run: Run) -> EigenSt
     except ImageError as error:
         if not state.count:  # else an earlier run has read some images, and only the rest is bad
             raise
-        warnings.warn(f"the remaining images were skipped: {error}", stacklevel=2)
+        warn(f"the remaining images were skipped: {error}")
     return state
 
 

@@ -19,7 +19,7 @@ from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..raster.render import picture_of
 from .initializers import FitProblem, initialize
-from .options import FitOptions
+from .options import FitOptions, named_options
 from .pixels import in_unit, read_pixels, unit_of
 from .refine import FitProgress, Refinement, measure, refine
 from .search import search_count
@@ -118,6 +118,7 @@ class FitInterrupted(KeyboardInterrupt):
         self.result = result
 
 
+@named_options
 def fit(
     image: ArrayLike | os.PathLike[str],
     gaussians: int | None = None,

@@ -29,7 +29,7 @@ from .fit import Fit, finish
 from .initializers import FitProblem, FitTarget, make_target
 from .optimizers.descent import descend
 from .optimizers.schedule import Schedule
-from .options import FitOptions, Levels
+from .options import FitOptions, Levels, named_options
 from .pixels import in_unit, read_pixels, unit_of
 from .placement_initializer import start_from_placement
 from .redistribute import place_like, residual
@@ -111,6 +111,7 @@ def check_options(options: FitOptions, levels: Levels) -> FitOptions:
     return replace(options, gaussians=_check_counts(options.gaussians, levels)[-1])
 
 
+@named_options
 @exclusive()
 def fit_levels(
     image: ArrayLike,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.warn import warn
 from .io import SUFFIXES, ImageError, check_image, load_image
 from .planes import BASIS_SPACES, check_size, to_planes
 from .remote import is_url, list_urls
@@ -189,12 +189,9 @@ def _blocks(
         raise ImageError(f"none of {done} images can be read, as {problems[0]}; check the files")
     if problems:
         named = ", ".join(problems[:MAX_NAMED]) + (", ..." if len(problems) > MAX_NAMED else "")
-        warnings.warn(f"{len(problems)} of {done} images were skipped: {named}", stacklevel=2)
+        warn(f"{len(problems)} of {done} images were skipped: {named}")
     if fitted:
-        warnings.warn(
-            f"{fitted} of {done} images were centre-cropped and resized to {size[0]}x{size[1]}",
-            stacklevel=2,
-        )
+        warn(f"{fitted} of {done} images were centre-cropped and resized to {size[0]}x{size[1]}")
 
 
 def _prepare_images(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.warn import warn
 from ..storage.atomic import atomic_write, refuse_url
 from .color import to_coded, to_linear
 from .formats.openimageio import ADVICE, is_installed
@@ -109,9 +109,9 @@ def load_image(
             frames = getattr(file, "n_frames", 1)
             pixels, transparent = picture_pixels(file)
         if transparent:
-            warnings.warn(f"{path}: transparent pixels are shown over white", stacklevel=2)
+            warn(f"{path}: transparent pixels are shown over white")
         if frames > 1:
-            warnings.warn(f"{path}: holds {frames} frames, the first is used", stacklevel=2)
+            warn(f"{path}: holds {frames} frames, the first is used")
         found = pixels, "srgb"
     image = to_floats(found[0], str(path), keep_grey)
     if (encoding or found[1]) == "linear":
@@ -135,7 +135,7 @@ def _load_deep(path: Path, keep_grey: bool) -> tuple[NDArray[Any], str] | None:
     """
     with image_errors(path):
         if kind_of(path) == "png" and not is_installed():
-            warnings.warn(f"{path}: keeps 8 of its 16 bits; to keep all {ADVICE}", stacklevel=3)
+            warn(f"{path}: keeps 8 of its 16 bits; to keep all {ADVICE}")
             return None
         try:
             found = read_deep(path)
@@ -157,7 +157,7 @@ def _load_deep(path: Path, keep_grey: bool) -> tuple[NDArray[Any], str] | None:
     if (alpha >= peak).all():
         return color, encoding
     ground = "black" if found.associated else "white"
-    warnings.warn(f"{path}: transparent pixels are shown over {ground}", stacklevel=3)
+    warn(f"{path}: transparent pixels are shown over {ground}")
     if found.associated:
         return color, encoding
     share = np.divide(alpha, peak, dtype=np.float32)

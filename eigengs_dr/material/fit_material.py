@@ -18,7 +18,7 @@ from ..backend.recording import exclusive
 from ..fitting.fit import FitInterrupted, figure_of
 from ..fitting.initializers import FitTarget
 from ..fitting.levels import check_options, refine_levels
-from ..fitting.options import FitOptions, Levels
+from ..fitting.options import FitOptions, Levels, named_options
 from ..fitting.placement_initializer import start_from_placement
 from ..fitting.redistribute import residual
 from ..fitting.refine import FitProgress, Refinement, Score, refine
@@ -79,6 +79,7 @@ class MaterialFit:
         self.material.save(path)
 
 
+@named_options
 @exclusive()
 def fit_material(
     maps: Mapping[str, ArrayLike],

@@ -80,6 +80,7 @@ def render(
     ((8, 8, 1), (16, 16, 1))
     """
     gaussians = set_of(gaussians)
+    _check_rows(gaussians)
     width, height = _size(gaussians, width, height)
     check_index_range(width, height, gaussians.channels, TILE)
     scaled = gaussians.scaled(width, height)
@@ -118,6 +119,18 @@ def picture_of(
     gaussians = set_of(gaussians)
     image = render(dr.detach(gaussians), width, height, cutoff).numpy()
     return to_picture(gaussians.space, image)
+
+
+def _check_rows(gaussians: Gaussians) -> None:
+    """Raise ValueError for arrays of other shapes, of which Dr.Jit says nothing plain."""
+    count = len(gaussians)
+    for name, rows in (("mean", 2), ("factor", 3), ("color", gaussians.channels)):
+        array = getattr(gaussians, name)
+        if len(array) != rows or dr.width(array) not in (1, count):
+            raise ValueError(
+                f"Gaussians: {name} has shape ({dr.width(array)}, {len(array)}), expected "
+                f"({count}, {rows})"
+            )
 
 
 def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[int, int]:

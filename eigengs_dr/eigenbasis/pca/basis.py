@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...backend.display import to_html
+from ...backend.warn import warn
 from ...image.color import ycbcr_to_rgb
 from ...image.folder import ReadProgress, Source
 from ...image.io import check_image, read_image
@@ -153,7 +153,7 @@ class Eigenbasis:
         most = check_components(components, energy)
         if energy is None and state.count <= max(most):
             have = "1 image gives" if state.count == 1 else f"{state.count} images give"
-            warnings.warn(f"{have} at most {state.count - 1} components a channel", stacklevel=2)
+            warn(f"{have} at most {state.count - 1} components a channel")
         shape = (size[1], size[0])
         basis = cls(
             mean=state.mean.astype(np.float32).reshape(-1, *shape),
