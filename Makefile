@@ -4,6 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 DOCS_READY := .venv/docs-ready
+SETUP_LOG := build/setup.log
 # A photo inside the scikit-image wheel, so that none has to be downloaded.
 PHOTO := .venv/lib/python3*/site-packages/skimage/data/coffee.png
 
@@ -44,22 +45,29 @@ help:
 
 setup: $(READY)
 
+# What pip says goes to a file, whose end is shown if it fails.
 $(READY): pyproject.toml benchmarks/pyproject.toml
 	@$(APT_INSTALL); $(PYTHON) -c 'import ensurepip' 2>/dev/null \
 		|| apt_install python3-venv "$(VENV_ADVICE)"
-	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --editable '.[dev]' --editable ./benchmarks
+	@echo "make setup: installing into .venv, a minute or two; details in $(SETUP_LOG)"
+	@mkdir -p $(dir $(SETUP_LOG))
+	@{ $(PYTHON) -m venv .venv && $(BIN)/python -m pip install --editable '.[dev]' \
+		--editable ./benchmarks; } >$(SETUP_LOG) 2>&1 \
+		|| { tail -n 5 $(SETUP_LOG) >&2; echo "make setup: failed, see $(SETUP_LOG)" >&2; exit 1; }
 	@$(APT_INSTALL); $(BIN)/eigengs-dr doctor >/dev/null \
 		|| apt_install "libllvm19 libatomic1" "$(LLVM_ADVICE)"
-	$(BIN)/eigengs-dr doctor
+	@$(BIN)/eigengs-dr doctor >>$(SETUP_LOG) || { tail -n 5 $(SETUP_LOG) >&2; exit 1; }
 	@touch $@
 
 demo: $(READY)
-	@mkdir -p build/demo
-	$(BIN)/eigengs-dr fit $(PHOTO) --init eigen --basis natural --iterations 0 \
-		-o build/demo/instant.npz --preview build/demo/instant.png
-	$(BIN)/eigengs-dr fit $(PHOTO) -o build/demo/coffee.npz \
+	@rm -rf build/demo && mkdir -p build/demo
+	@echo "The default, 1,000 steps:"
+	@$(BIN)/eigengs-dr fit $(PHOTO) -o build/demo/coffee.npz \
 		--preview build/demo/coffee.png --report build/demo/coffee.json
+	@echo "A basis, 0 steps. It serves families of images and new ones; for a photo at hand the"
+	@echo "default is better, also at 0 steps:"
+	@$(BIN)/eigengs-dr fit $(PHOTO) --basis natural --iterations 0 \
+		-o build/demo/instant.npz --preview build/demo/instant.png
 
 scenes: $(READY)
 	$(BIN)/python scenes/assets.py
