@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import types_of
+from ..backend.display import to_html
 from ..backend.recording import exclusive
 from ..fitting.fit import Fit
 from ..gaussian.gaussians import Gaussians
@@ -81,6 +82,10 @@ class PackResult(NamedTuple):
     psnr: float
     psnr_drop: float
     steps: Steps
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        return to_html(self)
 
 
 @exclusive()

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..backend.display import shows_progress
 from ..backend.selection import select
 from ..fitting.fit import Fit, fit_image
 from ..fitting.levels import check_options, fit_levels
@@ -21,7 +22,7 @@ from ..image.metrics import float_space, psnr
 from ..image.pixels import LinearImage, check_image
 from .fit_batch import fit_batch, fits_in_batches
 from .plan import run_images
-from .row import Finished, ImageRow, Outcome, Pixels, RowProgress, collect
+from .row import Finished, ImageRow, Outcome, Pixels, collect
 from .run import FAILURES, Job, Work
 from .sources import Images
 
@@ -41,13 +42,14 @@ Step = Callable[[float], None]
 """``step(share)``: which share of the current image is done, from 0 to 1."""
 
 
+@shows_progress
 def fit_many(
     images: Images,
     output: str | os.PathLike[str] | None = None,
     *,
     overwrite: bool = False,
     levels: Levels | None = None,
-    progress: RowProgress | None = None,
+    progress: Any = None,
     client: Any = None,
     **options: Any,
 ) -> list[ImageRow]:
@@ -73,7 +75,8 @@ def fit_many(
         is no set of Gaussians is never replaced.
     levels : int or sequence of int, optional
         Levels of detail; see `eigengs_dr.fit_levels`, whose options alone then apply.
-    progress : callable, optional
+    progress : bool or callable, optional
+        By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         ``progress(done, total, row)`` after every image, with its `ImageRow`; `total` is None for
         an iterator. It may raise `KeyboardInterrupt` to end the run.
     client : distributed.Client, optional

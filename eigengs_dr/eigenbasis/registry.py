@@ -93,7 +93,9 @@ def load_basis(
     """
     if isinstance(basis, Eigenbasis):
         pixels = basis.width * basis.height
-        return EigenGS.fit(basis, gaussians or default_count(pixels), backend=backend)
+        return EigenGS.fit(
+            basis, gaussians or default_count(pixels), backend=backend, progress=False
+        )
     if isinstance(basis, PackedModel):
         basis = basis.model
     if isinstance(basis, EigenGS):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.display import to_html
+from ..backend.display import shows_progress, to_html
 from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
 from ..gaussian.file import CUTOFF
@@ -119,6 +119,7 @@ class FitInterrupted(KeyboardInterrupt):
 
 
 @named_options
+@shows_progress
 def fit(
     image: ArrayLike | os.PathLike[str],
     gaussians: int | None = None,
@@ -130,7 +131,7 @@ def fit(
     color: str = "ycbcr",
     seed: int = 0,
     backend: str | None = None,
-    progress: FitProgress | None = None,
+    progress: Any = None,
     target_psnr: float | None = None,
     target_space: str = "ycbcr",
     max_gaussians: int | None = None,
@@ -173,7 +174,8 @@ def fit(
         solve use random numbers; the preset "default" gives one result for all seeds.
     backend : {"llvm", "cuda"}, optional
         By default "cuda" if there is a GPU.
-    progress : callable, optional
+    progress : bool or callable, optional
+        By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         Called every 10 steps as ``progress(iteration, iterations, row)`` with the last row of the
         trace, or a row of a set with more Gaussians than asked for.
     target_psnr : float, optional

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.display import to_html
+from ..backend.display import shows_progress, to_html
 from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
 from ..fitting.fit import FitInterrupted, figure_of
@@ -80,6 +80,7 @@ class MaterialFit:
 
 
 @named_options
+@shows_progress
 @exclusive()
 def fit_material(
     maps: Mapping[str, ArrayLike],
@@ -92,7 +93,7 @@ def fit_material(
     max_gaussians: int | None = None,
     levels: Levels | None = None,
     backend: str | None = None,
-    progress: FitProgress | None = None,
+    progress: Any = None,
     cutoff: float = CUTOFF,
     encoding: str | None = None,
 ) -> MaterialFit:
@@ -127,7 +128,8 @@ def fit_material(
         Levels of detail, see `eigengs_dr.fit_levels`.
     backend : {"llvm", "cuda"}, optional
         By default "cuda" if there is a GPU.
-    progress : callable, optional
+    progress : bool or callable, optional
+        By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         See `eigengs_dr.fit`.
     cutoff : float, optional
         Radius of a Gaussian in standard deviations, in (0, 12].

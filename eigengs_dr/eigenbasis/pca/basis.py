@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...backend.display import to_html
+from ...backend.display import shows_progress, to_html
 from ...backend.warn import warn
 from ...image.color import ycbcr_to_rgb
-from ...image.folder import ReadProgress, Source
+from ...image.folder import Source
 from ...image.io import check_image, read_image
 from ...image.planes import check_size, to_planes
 from ...image.resize import resample
@@ -70,6 +70,7 @@ class Eigenbasis:
     examples: NDArray[np.float32]
 
     @classmethod
+    @shows_progress
     def from_images(
         cls,
         source: Source,
@@ -78,7 +79,7 @@ class Eigenbasis:
         energy: float | None = None,
         color: str = "ycbcr",
         seed: int = 0,
-        progress: ReadProgress | None = None,
+        progress: Any = None,
         client: Any = None,
         checkpoint: str | os.PathLike[str] | None = None,
         solver: str = "incremental",
@@ -102,7 +103,8 @@ class Eigenbasis:
             Space of the channels.
         seed : int
             Seed of the random examples.
-        progress : callable, optional
+        progress : bool or callable, optional
+            By default a bar, in a terminal or a notebook, after two seconds; False shows none.
             ``progress(done, total, {})`` after every image, on a cluster after every shard; `total`
             may be None.
         client : distributed.Client, optional
