@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,7 +46,7 @@ def fit_one(
             result = interrupt.result
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-        result.gaussians.save(output)
+        replace(result, source=name).save(output)
         show(f"{name}: measure", 0, 1)
         shown = displayed(image, options.color)
         color = result.gaussians.space

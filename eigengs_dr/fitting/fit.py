@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..backend.display import shows_progress, to_html
 from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
-from ..gaussian.file import CUTOFF
+from ..gaussian.file import CUTOFF, FitFigures, write
 from ..gaussian.gaussians import Gaussians
 from ..raster.render import picture_of
 from .initializers import FitProblem, initialize
@@ -59,6 +59,8 @@ class Fit:
     mean_image : ndarray of float32, shape (H, W, 3), or None
         RGB image to add to renderings of the set. The preset "eigengs" keeps the mean image of its
         basis as pixels. The attribute `image` includes the mean image.
+    source : str
+        Name of the image, if it was a file or a URL.
     """
 
     gaussians: Gaussians
@@ -69,6 +71,7 @@ class Fit:
     iterations: int
     stopped: str
     mean_image: NDArray[np.float32] | None = field(default=None, repr=False)
+    source: str = field(default="", repr=False)
 
     def __repr__(self) -> str:
         return (
@@ -92,8 +95,9 @@ class Fit:
         return figure_of(self.trace, len(self.gaussians), "psnr_rgb")
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the set; see `eigengs_dr.Gaussians.save`."""
-        self.gaussians.save(path)
+        """Write the set with its PSNR, steps and source; see `eigengs_dr.Gaussians.save`."""
+        figures = FitFigures(self.psnr_ycbcr, self.psnr_rgb, self.iterations, self.source)
+        write(path, self.gaussians.data(), figures)
 
 
 def figure_of(trace: list[dict[str, Any]], count: int, name: str) -> float:
@@ -233,7 +237,10 @@ def fit(
         max_gaussians=max_gaussians,
         encoding=encoding,
     )
-    return fit_image(image, options, progress)
+    result = fit_image(image, options, progress)
+    if not isinstance(image, (str, os.PathLike)):
+        return result
+    return replace(result, source=os.path.basename(image))
 
 
 @exclusive()
