@@ -12,18 +12,20 @@ import numpy as np
 
 from eigengs_dr.backend.arrays import types_of, upload_tensor
 from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.fitting.fit import Fit
 from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.gaussian.like import set_of
 from eigengs_dr.gaussian.tensors import FIELDS, from_tensors, to_tensors
 
 from .shared import SharedFile
 
 
-def texture_of(gaussians: Gaussians, **properties: Any) -> dict[str, Any]:
+def texture_of(gaussians: Gaussians | Fit, **properties: Any) -> dict[str, Any]:
     """Return a set as the dictionary of a ``gaussian_texture``, for `mitsuba.load_dict`.
 
     Parameters
     ----------
-    gaussians : Gaussians
+    gaussians : Gaussians or Fit
     **properties
         Other properties of the texture: ``wrap_mode``, ``to_uv``, ``raw``, ``prefilter``,
         ``cutoff``.
@@ -40,6 +42,7 @@ def texture_of(gaussians: Gaussians, **properties: Any) -> dict[str, Any]:
     >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
     >>> bsdf = mi.load_dict({"type": "diffuse", "reflectance": texture_of(g, wrap_mode="clamp")})
     """
+    gaussians = set_of(gaussians)
     tensors = to_tensors(gaussians)
     # Mitsuba would try to read a flat tensor of three numbers as a colour, and fail.
     tensors["background"] = tensors["background"][None]

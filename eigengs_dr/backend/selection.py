@@ -6,7 +6,6 @@ import os
 import platform
 import re
 import sys
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from .libllvm import MIN_VERSION, advice, load_failure, loaded_path
+from .warn import warn
 
 UNTESTED_ON_GPU = "tested with a simulated driver only, not yet on a GPU"
 """State of the cuda backend, until the whole suite has passed on a GPU."""
@@ -78,7 +78,7 @@ def _announce_cuda() -> None:
     global _cuda_announced
     if not _cuda_announced:
         _cuda_announced = True
-        warnings.warn(f"backend cuda: {UNTESTED_ON_GPU}; compare with backend 'llvm'", stacklevel=3)
+        warn(f"backend cuda: {UNTESTED_ON_GPU}; compare with backend 'llvm'")
 
 
 def describe(backend: str | None = None) -> dict[str, Any]:

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from ..backend.display import shows_progress
 from ..backend.executor import executor_for
 from ..backend.interrupt import defer_interrupts
 from ..backend.selection import select
-from ..fitting.options import FitOptions
+from ..fitting.options import FitOptions, named_options
 from ..gaussian.file import CUTOFF, SetData, write
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
@@ -21,7 +22,7 @@ from ..image.metrics import psnr_from_mse
 from ..storage.atomic import require_writable
 from ..storage.checkpoint import Checkpoint
 from .grid import Block, choose_halo, divide
-from .run import Progress, Run
+from .run import Run
 from .source import Source, forget_pictures, open_source
 
 BLOCK_SIDE = 1024
@@ -67,6 +68,8 @@ class LargeFit:
     seconds: float
 
 
+@named_options
+@shows_progress
 def fit_large(
     source: Any,
     output: str | os.PathLike[str] | None = None,
@@ -78,7 +81,7 @@ def fit_large(
     solve_steps: int = 10,
     cutoff: float = CUTOFF,
     backend: str | None = None,
-    progress: Progress | None = None,
+    progress: Any = None,
     client: Any = None,
     encoding: str | None = None,
 ) -> LargeFit:
@@ -103,7 +106,8 @@ def fit_large(
         Largest side of a block in pixels, at least 32.
     color, solve_steps, cutoff, backend : optional
         See `eigengs_dr.fit`.
-    progress : callable, optional
+    progress : bool or callable, optional
+        By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         ``progress(done, total, row)``: what is done of a stage, in blocks or steps of blocks. The
         row has the key stage ("survey", "place", "density", "place", "fit", "measure", in
         this order; the first pair with "density" for long fits alone), and blocks, their number.

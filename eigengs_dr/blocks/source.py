@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..image.formats.registry import kind_of
 from ..image.io import ImageError, load_image, open_picture, picture_pixels
 from ..image.pixels import LinearImage, check_data, check_image, encoding_of
+from ..image.remote import is_url
 from .tiff import TIFF_SUFFIXES, holds_floats, read_window, window_shape
 
 MAX_SIDE = 1 << 16
@@ -134,6 +135,8 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
     ImageError
         If there is no such file, it is no image, or the shape or the size is wrong.
     """
+    if is_url(source):
+        source = load_image(source, keep_grey, encoding)
     if isinstance(source, (str, os.PathLike)):
         return _open_file(Path(source), keep_grey, encoding)
     if not hasattr(source, "shape") or not hasattr(source, "dtype"):

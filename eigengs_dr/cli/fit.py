@@ -189,19 +189,17 @@ def fit(
     check_outputs([*outputs, *previews, report], [*paths, *_basis_file(options)])
     if not several and keeps_result(outputs[0], overwrite, quiet):
         return
-    side = blocks or block_side(Path(paths[0]), several, options, levels, preview)
+    side = blocks or block_side(paths[0], several, options, levels, preview)
     if side:
         check_large(options, levels, preview, several)
     elif not several:
-        announce_memory(Path(paths[0]), options, quiet)
+        announce_memory(paths[0], options, quiet)
     if not cluster:
         select(options.backend)
     _note_mean(options)
     if side:
         with open_cluster(cluster) as client:
-            record, interrupted = fit_by_blocks(
-                Path(paths[0]), outputs[0], side, options, quiet, client
-            )
+            record, interrupted = fit_by_blocks(paths[0], outputs[0], side, options, quiet, client)
         records = [record]
     elif several:
         folder, measured = outputs[0].parent, report is not None
@@ -212,7 +210,7 @@ def fit(
     else:
         picture = previews[0] if previews else None
         fitter = _fitter(options, levels)
-        records = [fit_one(Path(paths[0]), outputs[0], picture, quiet, options, fitter)]
+        records = [fit_one(paths[0], outputs[0], picture, quiet, options, fitter)]
         interrupted = records[0]["stopped"] == "interrupted"
     if report:
         figures = {"images": records} if several else records[0]

@@ -43,7 +43,11 @@ def check_large(
 
 
 def block_side(
-    path: Path, several: bool, options: FitOptions, levels: Levels | None, preview: Path | None
+    path: Path | str,
+    several: bool,
+    options: FitOptions,
+    levels: Levels | None,
+    preview: Path | None,
 ) -> int | None:
     """Return the side of the blocks, if a whole image would take too much memory."""
     if several or not needs_blocks(path, options):
@@ -59,13 +63,15 @@ def block_side(
 
 
 def fit_by_blocks(
-    path: Path, output: Path, side: int, options: FitOptions, quiet: bool, client: Any = None
+    path: Path | str, output: Path, side: int, options: FitOptions, quiet: bool, client: Any = None
 ) -> tuple[dict[str, Any], bool]:
     """Fit one image by blocks into a file.
 
     Parameters
     ----------
-    path, output : Path
+    path : Path or str
+        A file or a URL.
+    output : Path
     side : int
         Largest side of a block in pixels.
     options : FitOptions
@@ -89,7 +95,7 @@ def fit_by_blocks(
     started = time.perf_counter()
     record: dict[str, Any] = {"input": str(path), "output": str(output), "stopped": "interrupted"}
     with progress_bar(quiet) as show:
-        progress = partial(_show, show, path.name)
+        progress = partial(_show, show, Path(path).name)
         try:
             result = fit_large(
                 path, output, block=side, progress=progress, client=client, **settings

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from ..backend.selection import select
+from ..image.remote import is_url
 from .console import INTERRUPTED, progress_bar, say
 from .fit_one import course_of
 from .options import describe_run
@@ -33,7 +34,7 @@ class MapFile(NamedTuple):
     """The image file of a map, and its space if it is not the usual one."""
 
     name: str
-    path: Path
+    path: Path | str
     space: str | None
 
 
@@ -53,8 +54,8 @@ class MapOption(click.ParamType):
             self.fail(f"{value}: expected a name and a file, such as albedo=bark.jpg", parameter)
         if colon and space not in SPACES:
             self.fail(f"{value}: space {space!r} is not in {', '.join(SPACES)}", parameter)
-        path = Path(file)
-        if not path.is_file():
+        path = file if is_url(file) else Path(file)
+        if isinstance(path, Path) and not path.is_file():
             self.fail(f"{path}: no such file", parameter)
         return MapFile(name, path, space or None)
 

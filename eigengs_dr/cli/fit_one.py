@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def fit_one(
-    path: Path,
+    path: Path | str,
     output: Path,
     preview: Path | None,
     quiet: bool,
@@ -34,18 +35,19 @@ def fit_one(
     from ..viewer.pictures import comparison, displayed
 
     started = time.perf_counter()
+    name = Path(path).name
     with progress_bar(quiet) as show:
-        show(f"{path.name}: load", 0, 1)
+        show(f"{name}: load", 0, 1)
         image = eg.load_image(path, rendered_as(options.color) is None, options.encoding)
         loaded = time.perf_counter()
         try:
-            result = run(image, progress=partial(show, path.name))
+            result = run(image, progress=partial(show, name))
         except FitInterrupted as interrupt:
             result = interrupt.result
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-        result.gaussians.save(output)
-        show(f"{path.name}: measure", 0, 1)
+        replace(result, source=name).save(output)
+        show(f"{name}: measure", 0, 1)
         shown = displayed(image, options.color)
         color = result.gaussians.space
         figures = measure_fit(shown, result, color)
@@ -85,12 +87,12 @@ def measure_fit(image: Any, result: Fit, color: str) -> dict[str, float]:
     from ..fitting.pixels import unit_of
 
     unit = unit_of(image, color)
-    pair = (image, result.image) if unit == 1 else (image / unit, result.image / unit)
+    seen, shown = image / unit, result.image / unit
     return {
         "psnr_ycbcr": result.psnr_ycbcr,
         "psnr_rgb": result.psnr_rgb,
-        "ssim": eg.ssim(*pair),
-        "ms_ssim": eg.ms_ssim(*pair, space="ycbcr" if rendered_as(color) else "data"),
+        "ssim": eg.ssim(seen, shown),
+        "ms_ssim": eg.ms_ssim(seen, shown, space="ycbcr" if rendered_as(color) else "data"),
     }
 
 

@@ -1,6 +1,7 @@
 """The command ``eigengs-dr info``: show the contents of a file."""
 
 import json
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     """Show the contents of a fitted image, a material or a model.
 
     NAME is a basis of the package, such as natural. For a fitted image, bpp is the size of the
-    file in bits per pixel. For a packed image, the command also shows the steps of the
+    file in bits per pixel, and a table shows what each array takes. The PSNR, the steps and the
+    source are those of the fit. For a packed image, the command also shows the steps of the
     quantisation.
 
     For a material, a table shows its maps; bpp is for all of them together.
@@ -71,6 +73,8 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     facts: dict[str, Any] = {"file": str(file), "kind": kind, "bytes": file.stat().st_size}
     if kind == "image" and not packed.is_egs(file):
         facts |= _describe_head(setfile.read_head(file))
+        figures = setfile.read_figures(file)
+        facts |= _describe_figures(figures) if figures else {}
     elif kind == "material" and not packed.is_egs(file):
         facts |= _describe_material(materialfile.read_head(file))
     else:
@@ -79,6 +83,8 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
         facts["bpp"] = round(8 * facts["bytes"] / (facts["width"] * facts["height"]), 4)
     if packed.is_egs(file):
         facts |= _describe_packed(packed.read(file))
+    else:
+        facts["ledger"] = npz.sizes_of(file)
     if picture:
         draw(file, picture)
     click.echo(json.dumps(facts, indent=2) if as_json else _text(**facts))
@@ -105,6 +111,13 @@ def _describe_head(head: Any) -> dict[str, Any]:
         "space": head.space,
         "cutoff": head.cutoff,
     }
+
+
+def _describe_figures(figures: Any) -> dict[str, Any]:
+    """Describe the fit of a set; JSON has no infinity."""
+    psnr = {"psnr_ycbcr": figures.psnr_ycbcr, "psnr_rgb": figures.psnr_rgb}
+    shown = {name: round(v, 2) if isfinite(v) else str(v) for name, v in psnr.items()}
+    return {**shown, "iterations": figures.iterations, "source": figures.source}
 
 
 def _describe_material(found: Any) -> dict[str, Any]:
@@ -161,7 +174,7 @@ def _rows(fall: Any, held_out: Any) -> list[dict[str, Any]]:
     return rows
 
 
-def _text(fall: Any = (), maps: Any = (), **facts: Any) -> str:
+def _text(fall: Any = (), maps: Any = (), ledger: Any = (), **facts: Any) -> str:
     """Format facts as lines, and maps and the truncation curve as tables below."""
     width = max(map(len, facts)) + 1
     lines = [f"{key:{width}} {value}" for key, value in facts.items()]
@@ -170,6 +183,9 @@ def _text(fall: Any = (), maps: Any = (), **facts: Any) -> str:
     for m in maps:
         row = "{name:16} {channels:8} {space:>9} {weight:8.3g}"
         lines.append(row.format(**m))
+    if ledger:
+        lines += ["", f"{'array':16} {'bytes':>12}"]
+        lines += [f"{name[:16]:16} {size:12,}" for name, size in ledger.items()]
     if fall:
         lines += ["", f"components{'':16} {'variance':>8} {'training':>9} {'held out':>9}"]
     for row in fall:

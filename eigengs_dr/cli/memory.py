@@ -22,12 +22,12 @@ ORIENTATION = 0x0112
 """EXIF tag of the orientation."""
 
 
-def announce_memory(path: Path, options: FitOptions, quiet: bool) -> None:
+def announce_memory(path: Path | str, options: FitOptions, quiet: bool) -> None:
     """Say how much memory the fit of a large image takes, from the header of its file.
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         An image file. A file that cannot be opened is left to `eigengs_dr.load_image`, which says
         why.
     options : FitOptions
@@ -51,7 +51,7 @@ def announce_memory(path: Path, options: FitOptions, quiet: bool) -> None:
         say(line)
 
 
-def needs_blocks(path: Path, options: FitOptions) -> bool:
+def needs_blocks(path: Path | str, options: FitOptions) -> bool:
     """Return whether the fit of a whole image takes more than a comfortable share of the memory."""
     problem, usable = _problem(path, options), usable_memory()
     if problem is None or usable is None:
@@ -59,7 +59,7 @@ def needs_blocks(path: Path, options: FitOptions) -> bool:
     return estimate_memory(*problem) > COMFORTABLE * usable
 
 
-def _problem(path: Path, options: FitOptions) -> tuple[int, int, int, int] | None:
+def _problem(path: Path | str, options: FitOptions) -> tuple[int, int, int, int] | None:
     """Return width, height, channels and Gaussians of a fit, or None if they are not known."""
     size = _image_size(path)
     if size is None:
@@ -71,13 +71,15 @@ def _problem(path: Path, options: FitOptions) -> tuple[int, int, int, int] | Non
     return width, height, 1 if grey and rendered_as(options.color) is None else 3, count
 
 
-def _image_size(path: Path) -> tuple[int, int, bool] | None:
+def _image_size(path: Path | str) -> tuple[int, int, bool] | None:
     """Return width, height and whether an image file is grey, or None if it cannot be opened."""
     from PIL import Image
 
     from ..blocks.source import GREY, any_size
     from ..blocks.tiff import TIFF_SUFFIXES, window_shape
 
+    if isinstance(path, str):  # a URL, which is read once
+        return None
     if path.suffix.lower() in TIFF_SUFFIXES and (shape := window_shape(str(path))):
         return shape[1], shape[0], shape[2] == 1
     try:

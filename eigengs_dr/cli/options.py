@@ -9,13 +9,24 @@ from typing import Any
 import click
 
 from ..backend.selection import describe
-from ..collection.remote import is_url
 from ..image.pixels import ENCODINGS
+from ..image.remote import is_url
 from ..storage.atomic import refuse_url
 from .console import NAME
 
 EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
-FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+
+
+class PathOrUrl(click.Path):
+    """A path, or a URL, which is passed as text."""
+
+    def convert(self, value: Any, param: Any, context: Any) -> Any:
+        """Return a `Path`, or the text of a URL."""
+        return value if is_url(value) else super().convert(value, param, context)
+
+
+IMAGE = PathOrUrl(exists=True, dir_okay=False, path_type=Path)
+FOLDER = PathOrUrl(exists=True, file_okay=False, path_type=Path)
 
 
 class OutputPath(click.Path):
@@ -83,7 +94,7 @@ class Size(click.ParamType):
         return check_pixels(int(match[1]), int(match[2]))
 
 
-class ImageSource(click.Path):
+class ImageSource(PathOrUrl):
     """An image file, a folder of images, a pattern such as "a/*.png", or a URL of one of them."""
 
     def __init__(self) -> None:
@@ -91,9 +102,7 @@ class ImageSource(click.Path):
 
     def convert(self, value: Any, param: Any, context: Any) -> Any:
         """Return a `Path`, or the text of a URL; a pattern need not exist."""
-        if is_url(value):
-            return value
-        pattern = glob.has_magic(str(value)) and not Path(value).exists()
+        pattern = glob.has_magic(str(value)) and not (is_url(value) or Path(value).exists())
         return Path(value) if pattern else super().convert(value, param, context)
 
 

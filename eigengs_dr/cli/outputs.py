@@ -4,8 +4,8 @@ import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from ..collection.remote import stem_of
 from ..gaussian.file import FORMAT
+from ..image.remote import stem_of
 from ..storage import npz
 from ..storage.atomic import require_writable
 from .console import say

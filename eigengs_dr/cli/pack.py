@@ -10,6 +10,7 @@ from .fit_material import MapFile, MapOption
 from .options import (
     ANY_PATH,
     EXISTING,
+    IMAGE,
     LEVEL_COUNTS,
     backend_option,
     describe_run,
@@ -31,7 +32,7 @@ Dr.Jit."""
 @click.option(
     "-o", "--output", required=True, type=ANY_PATH, metavar="Y.egs", help="File to write."
 )
-@click.option("--image", type=EXISTING, help="The original image, to measure the loss with.")
+@click.option("--image", type=IMAGE, help="The original image, to measure the loss with.")
 @click.option(
     "--map",
     "maps",

@@ -87,7 +87,7 @@ MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
 def train(
     context: click.Context,
     /,
-    folder: Path,
+    folder: Path | str,
     output: Path,
     cluster: str | None,
     backend: str | None,
@@ -96,7 +96,7 @@ def train(
     quiet: bool,
     **options: Any,
 ) -> None:
-    """Train a model on a folder of images.
+    """Train a model on a folder of images, or on its URL.
 
     A model is one set of Gaussians that renders all principal components of the images. One image
     in ten is held out and measured at the end. --energy counts the variance of each channel of
@@ -112,12 +112,12 @@ def train(
       eigengs-dr train /shared/faces/ -o /shared/faces.npz --cluster tcp://node1:8786
       eigengs-dr fit photo.jpg --basis photos.npz
     """
-    from ..image.folder import image_files
+    from ..image.folder import list_images
     from ..image.io import SAVE_OPTIONS
 
     [output] = name_outputs([folder], output, [".npz"])
     [picture] = name_outputs([folder], preview, list(SAVE_OPTIONS)) if preview else [None]
-    check_outputs([output, picture, report], image_files(folder))
+    check_outputs([output, picture, report], list_images(folder))
     select(backend)
     from ..eigenbasis import training
 

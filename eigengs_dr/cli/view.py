@@ -9,7 +9,7 @@ from ..backend.selection import select
 from ..fitting.options import Levels
 from .options import (
     ANY_PATH,
-    EXISTING,
+    IMAGE,
     LEVEL_COUNTS,
     backend_option,
     encoding_option,
@@ -26,7 +26,7 @@ SUFFIXES = (".html", ".htm")
     "-o", "--output", type=ANY_PATH, metavar="PAGE.html", help="Page.  [default: in this folder]"
 )
 @click.option(
-    "--image", type=EXISTING, help="The photo, to compare with; a model encodes it and moves it."
+    "--image", type=IMAGE, help="The photo, to compare with; a model encodes it and moves it."
 )
 @encoding_option
 @click.option("--map", "name", metavar="NAME", help="The map of a material to show.")
@@ -41,7 +41,7 @@ SUFFIXES = (".html", ".htm")
 def view(
     file: Path,
     output: Path | None,
-    image: Path | None,
+    image: Path | str | None,
     encoding: str | None,
     name: str | None,
     levels: Levels | None,

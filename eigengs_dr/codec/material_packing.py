@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import types_of
+from ..backend.display import to_html
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
 from ..image.color import LIGHT
@@ -57,6 +58,10 @@ class MaterialPackResult(NamedTuple):
     psnr: dict[str, float]
     psnr_drop: float
     steps: Steps
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        return to_html(self)
 
 
 @exclusive()

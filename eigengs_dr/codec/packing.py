@@ -17,9 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import types_of
+from ..backend.display import to_html
 from ..backend.recording import exclusive
+from ..fitting.fit import Fit
 from ..gaussian.gaussians import Gaussians
+from ..gaussian.like import set_of
 from ..image.color import LIGHT, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_coded, to_linear
+from ..image.io import read_image
 from ..image.metrics import MAX_PSNR, psnr_from_mse
 from ..image.pixels import check_data, check_image
 from ..image.radiance import to_log, to_pu21
@@ -79,10 +83,14 @@ class PackResult(NamedTuple):
     psnr_drop: float
     steps: Steps
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        return to_html(self)
+
 
 @exclusive()
 def pack(
-    gaussians: Gaussians,
+    gaussians: Gaussians | Fit,
     path: str | os.PathLike[str],
     image: ArrayLike | None = None,
     budget: float = BUDGET,
@@ -94,7 +102,7 @@ def pack(
 
     Parameters
     ----------
-    gaussians : Gaussians
+    gaussians : Gaussians or Fit
     path : path-like
         File to write; `pack` replaces an existing file atomically. `Gaussians.load` reads it.
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W), optional
@@ -130,29 +138,29 @@ def pack(
     On one machine and backend, the same arguments give the same file bit for bit.
     """
     check_request(path, budget)
-    rows = section_rows(len(gaussians), sections)
-    gaussians = dr.detach(gaussians)
+    whole: Gaussians = dr.detach(set_of(gaussians))
+    rows = section_rows(len(whole), sections)
     if cutoff is not None:
-        gaussians = replace(gaussians, cutoff=float(cutoff))
-    shown = _shown(gaussians) if image is None else _compared(gaussians, image, encoding)
+        whole = replace(whole, cutoff=float(cutoff))
+    shown = _shown(whole) if image is None else _compared(whole, image, encoding)
     # The best linear light is not the best sRGB picture. So compensation keeps a set in linear
     # light near its own rendering, not near the image.
-    keeps = image is None or gaussians.space in LIGHT
-    target = _planes_of(gaussians) if keeps else shown
+    keeps = image is None or whole.space in LIGHT
+    target = _planes_of(whole) if keeps else shown
     unseen = MSE_WITHOUT_IMAGE if image is None else 0
 
     def errors(found: Gaussians) -> list[float]:
         parts = [*(found[: r.stop] for r in rows[:-1]), found]
         return [_error(part, shown) for part in parts]
 
-    packed, drop = compress(gaussians, target, errors, budget, rows, unseen)
+    packed, drop = compress(whole, target, errors, budget, rows, unseen)
     content = to_bytes(packed)
     write(path, content)
     return PackResult(
-        gaussians=Gaussians.load(path, types_of(gaussians.mean).backend),
+        gaussians=Gaussians.load(path, types_of(whole.mean).backend),
         bytes=len(content),
-        bits_per_pixel=8 * len(content) / (gaussians.width * gaussians.height),
-        psnr=psnr_from_mse(errors(to_gaussians(packed, gaussians))[-1]),
+        bits_per_pixel=8 * len(content) / (whole.width * whole.height),
+        psnr=psnr_from_mse(errors(to_gaussians(packed, whole))[-1]),
         psnr_drop=drop,
         steps=packed.steps,
     )
@@ -258,6 +266,7 @@ def _compared(gaussians: Gaussians, image: ArrayLike, encoding: str | None) -> A
     """
     grey = gaussians.channels == 1
     data = rendered_as(gaussians.space) is None
+    image = read_image(image, data, None if data else encoding)
     pixels = check_data(image) if data else check_image(image, grey, encoding=encoding)
     expected = (gaussians.height, gaussians.width, gaussians.channels)
     if pixels.shape != expected:

@@ -20,6 +20,7 @@ import numpy as np
 
 from ..backend.executor import Executor
 from ..backend.recording import exclusive
+from ..backend.warn import warn
 from ..fitting.fit import Fit
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
@@ -132,7 +133,7 @@ def dispatch(
 
     def settle(chunk: Chunk, result: ChunkResult) -> Iterator[Finished]:
         for note in result.notes:
-            warnings.warn(note, stacklevel=2)
+            warn(note)
         for source, entry in zip(chunk.sources, result.finished, strict=True):
             tries[source.place] += 1
             if entry.may_pass and tries[source.place] <= RETRIES:

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
 
+from ..backend.display import shows_progress
 from ..backend.selection import select
 from ..fitting.fit import Fit, fit_image
 from ..fitting.levels import check_options, fit_levels
-from ..fitting.options import DEFAULT_BASIS, FitOptions, Levels
+from ..fitting.options import DEFAULT_BASIS, FitOptions, Levels, refuse_unknown
 from ..fitting.pixels import unit_of
 from ..image.color import rendered_as
 from ..image.pixels import LinearImage
 from .fit_batch import MAX_SIDE, fit_batch, fits_in_batches
 from .plan import run_images
-from .row import Finished, ImageRow, Outcome, Pixels, RowProgress, collect
+from .row import Finished, ImageRow, Outcome, Pixels, collect
 from .run import FAILURES, Job, Work
 from .sources import Images
 
@@ -37,13 +38,14 @@ Step = Callable[[float], None]
 """``step(share)``: which share of the current image is done, from 0 to 1."""
 
 
+@shows_progress
 def fit_many(
     images: Images,
     output: str | os.PathLike[str] | None = None,
     *,
     overwrite: bool = False,
     levels: Levels | None = None,
-    progress: RowProgress | None = None,
+    progress: Any = None,
     client: Any = None,
     **options: Any,
 ) -> list[ImageRow]:
@@ -69,7 +71,8 @@ def fit_many(
         is no set of Gaussians is never replaced.
     levels : int or sequence of int, optional
         Levels of detail; see `eigengs_dr.fit_levels`, whose options alone then apply.
-    progress : callable, optional
+    progress : bool or callable, optional
+        By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         ``progress(done, total, row)`` after every image, with its `ImageRow`; `total` is None for
         an iterator. It may raise `KeyboardInterrupt` to end the run.
     client : distributed.Client, optional
@@ -118,6 +121,8 @@ def fit_many(
     >>> [(row.name, row.status, row.gaussians) for row in rows]
     [('000000', 'done', 200), ('000001', 'done', 200)]
     """
+    own = ("images", "output", "overwrite", "levels", "progress", "client")
+    refuse_unknown(options, [*(field.name for field in fields(FitOptions)), *own])
     settings = FitOptions(**options)
     total, finished = fit_each(images, output, overwrite, settings, levels, client=client)
     return collect(total, finished, output is None, progress)
@@ -140,12 +145,20 @@ def fit_each(
     if levels is not None:
         options = check_options(options, levels)
     if client is not None and options.initializer == "eigen":
-        basis = resolve_name(PACK_BASIS)(options.basis or DEFAULT_BASIS, options.backend)
+        basis = resolve_name(PACK_BASIS)(
+            options.basis or DEFAULT_BASIS, options.backend, options.gaussians
+        )
         options = replace(options, basis=basis)
     make_work = partial(fit_work, options, levels, None if client is not None else step)
     keep_grey = rendered_as(options.color) is None
     job = Job(make_work, _may_join, keep_grey, options.encoding, options.iterations)
     return run_images(images, output, overwrite, job, client)
+
+
+def _load(function: str, options: FitOptions) -> Any:
+    """Load or pack the basis of the options, see `eigengs_dr.eigenbasis.registry`."""
+    basis = options.basis or DEFAULT_BASIS
+    return resolve_name(function)(basis, options.backend, options.gaussians)
 
 
 def fit_work(options: FitOptions, levels: Levels | None = None, step: Step | None = None) -> Work:
@@ -158,7 +171,9 @@ def fit_work(options: FitOptions, levels: Levels | None = None, step: Step | Non
     """
     select(options.backend)
     if options.initializer == "eigen":
-        model = resolve_name(LOAD_BASIS)(options.basis or DEFAULT_BASIS, options.backend)
+        model = resolve_name(LOAD_BASIS)(
+            options.basis or DEFAULT_BASIS, options.backend, options.gaussians
+        )
         options = replace(options, basis=model)
     return partial(_fit_group, options=options, levels=levels, step=step)
 

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..image import io
-from .remote import load_url
 from .sources import Source
 
 THREADS = 2
@@ -104,9 +103,7 @@ def _submit(
 def _decode(source: Source, keep_grey: bool, encoding: str | None) -> Decoded:
     """Read one image, or note why it cannot be read."""
     try:
-        if isinstance(source.image, str):
-            return Decoded(source, load_url(source.image, keep_grey, encoding))
-        if isinstance(source.image, Path):
+        if isinstance(source.image, (Path, str)):
             return Decoded(source, io.load_image(source.image, keep_grey, encoding))
         check = io.check_data if keep_grey else partial(io.mark_image, encoding=encoding)
         return Decoded(source, check(source.image))

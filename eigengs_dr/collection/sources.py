@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from ..gaussian.file import read_head
 from ..image.folder import image_files
+from ..image.remote import is_url, list_urls, stem_of
 from ..storage.atomic import refuse_url, require_writable
 from .manifest import STARTED, Manifest, stamp
-from .remote import is_url, list_urls, stem_of
 
 Images = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | ArrayLike]
 """A folder, a glob, a URL of one of them, or any iterable of image files, their URLs and arrays."""

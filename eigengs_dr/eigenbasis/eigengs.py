@@ -15,17 +15,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.display import to_html
+from ..backend.display import shows_progress, to_html
 from ..backend.recording import exclusive
-from ..collection.row import ImageRow, RowProgress
+from ..collection.row import ImageRow
 from ..collection.sources import Images
 from ..gaussian.gaussians import Gaussians
-from ..image.io import check_image
+from ..image.folder import Source
+from ..image.io import check_image, read_image
 from ..image.resize import resample
 from .encode_many import check_encoding, encode_each
 from .encoder import Encoder
 from .model_file import read_members, write_model
-from .model_fit import TrainProgress, fit_model
+from .model_fit import fit_model
 from .options import TrainOptions
 from .pca.basis import Eigenbasis
 from .pca.component_counts import name_components
@@ -75,24 +76,26 @@ class EigenGS:
     figures: dict[str, float] = field(default_factory=dict)
 
     @classmethod
+    @shows_progress
     @exclusive()
     def fit(
         cls,
-        basis: Eigenbasis,
+        basis: Eigenbasis | Source,
         gaussians: int = 5000,
         frequency_aware: bool | str = "auto",
         seed: int = 0,
         preset: str = "default",
         steps: int | None = None,
         backend: str | None = None,
-        progress: TrainProgress | None = None,
+        progress: Any = None,
         client: Any = None,
     ) -> EigenGS:
         """Fit one set of Gaussians to the mean image and all components of an eigenbasis.
 
         Parameters
         ----------
-        basis : Eigenbasis
+        basis : Eigenbasis, or path, array or iterable
+            Images stand for their basis, ``Eigenbasis.from_images(images)``.
         gaussians : int, optional
             Number of Gaussians, at most one per pixel.
         frequency_aware : {"auto", True, False}, optional
@@ -106,7 +109,8 @@ class EigenGS:
             Training steps. "default" trains the shapes (0 by default; 300 gain 0.3 dB), "eigengs"
             shapes and weights (15,000 by default, which take hours without a GPU).
         backend : {"llvm", "cuda"}, optional
-        progress : callable, optional
+        progress : bool or callable, optional
+            By default a bar, in a terminal or a notebook, after two seconds; False shows none.
             ``progress(step, steps, {})`` after every round of training.
         client : distributed.Client, optional
             Solve for the weights on the workers of this Dask cluster; their number does not change
@@ -121,6 +125,8 @@ class EigenGS:
         ClusterError
             If the cluster cannot be used, or is lost.
         """
+        if not isinstance(basis, Eigenbasis):
+            basis = Eigenbasis.from_images(basis, seed=seed, client=client, progress=False)
         options = TrainOptions(
             size=(basis.width, basis.height),
             gaussians=gaussians,
@@ -182,7 +188,7 @@ class EigenGS:
         UserWarning
             If all components miss the target; the result then has all of them.
         """
-        return self.encoder.project(check_image(image, copy=False), target_psnr)
+        return self.encoder.project(check_image(read_image(image), copy=False), target_psnr)
 
     @exclusive()
     def reconstruct(
@@ -234,9 +240,10 @@ class EigenGS:
             As `project`; also if an option is unknown, or a target comes with exact colours.
         """
         check_encoding(colors, mean, target_psnr)
-        pixels = check_image(image, copy=False)
+        pixels = check_image(read_image(image), copy=False)
         return self.encoder.encode([pixels], colors, mean, target_psnr)[0]
 
+    @shows_progress
     def encode_many(
         self,
         images: Images,
@@ -246,7 +253,7 @@ class EigenGS:
         colors: str = "exact",
         mean: str = "gaussians",
         target_psnr: float | None = None,
-        progress: RowProgress | None = None,
+        progress: Any = None,
         client: Any = None,
     ) -> list[ImageRow]:
         """Encode many images; a bad image is a row with its error and does not end the run.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.warn import warn
 from ..image.io import ImageError, check_image, load_image
 from ..image.metrics import psnr
 from ..image.resize import center_crop
@@ -23,7 +23,7 @@ OnImage = Callable[[int], None]
 
 
 def truncation_curve_on(
-    basis: Eigenbasis, files: Sequence[Path], watch: OnImage
+    basis: Eigenbasis, files: Sequence[Path | str], watch: OnImage
 ) -> TruncationCurve | None:
     """Measure the truncation curve of images; see `Eigenbasis.truncation_curve`.
 
@@ -46,7 +46,7 @@ def truncation_curve_on(
 
 
 def evaluate(
-    model: EigenGS, basis: Eigenbasis, files: Sequence[Path], watch: OnImage
+    model: EigenGS, basis: Eigenbasis, files: Sequence[Path | str], watch: OnImage
 ) -> dict[str, float]:
     """Measure the PSNR of PCA, of projected colours and of exact colours.
 
@@ -81,12 +81,12 @@ def evaluate(
         rows.append({name: psnr(image, picture, "ycbcr") for name, picture in pictures.items()})
     if bad:
         message = f"{len(bad)} of {len(files)} images held out were skipped, as {bad[0]}"
-        warnings.warn(message, stacklevel=2)
+        warn(message)
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]} if rows else {}
 
 
 def _readable(
-    files: Sequence[Path], basis: Eigenbasis, watch: OnImage, bad: list[str]
+    files: Sequence[Path | str], basis: Eigenbasis, watch: OnImage, bad: list[str]
 ) -> Iterator[NDArray[np.float32]]:
     """Read images and crop them to the size of a basis; append errors to `bad`."""
     for i, path in enumerate(files):
@@ -95,7 +95,7 @@ def _readable(
             image = center_crop(
                 check_image(load_image(path), copy=False), basis.width, basis.height
             )
-        except ImageError as error:
+        except (ImageError, OSError) as error:
             bad.append(str(error))
         else:
             yield image

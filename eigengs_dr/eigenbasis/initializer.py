@@ -25,7 +25,7 @@ def start_from_basis(target: FitTarget, options: FitOptions) -> FitProblem:
     ValueError
         If the model and the options differ in the number of Gaussians, space or backend.
     """
-    model = load_basis(options.basis or DEFAULT_BASIS, options.backend)
+    model = load_basis(options.basis or DEFAULT_BASIS, options.backend, options.gaussians)
     _check_basis(model, target.pixels, options.gaussians, options.color)
     encoded = _encode(model, target, options)
     if options.method.mean != "dense":

@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from ..backend.arrays import types_of
+from ..fitting.options import default_count
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
 from .eigengs import EigenGS
+from .pca.basis import Eigenbasis
 
 SHIPPED = {"natural": Path(__file__).parent / "data" / "natural.npz"}
 """Files of the package's models, by name; see ``tools/train_natural.py``."""
@@ -46,7 +48,9 @@ class PackedModel:
 
 
 def pack_basis(
-    basis: str | os.PathLike[str] | EigenGS, backend: str | None = None
+    basis: str | os.PathLike[str] | EigenGS | Eigenbasis,
+    backend: str | None = None,
+    gaussians: int | None = None,
 ) -> str | PackedModel:
     """Return a model in a form that travels to another process, for `load_basis` there.
 
@@ -57,24 +61,29 @@ def pack_basis(
     backend : {"llvm", "cuda"}, optional
         Backend there.
     """
-    if basis in SHIPPED:
-        return str(basis)
-    model = load_basis(basis)
+    if isinstance(basis, str) and basis in SHIPPED:
+        return basis
+    model = load_basis(basis, gaussians=gaussians)
     names = [field.name for field in fields(EigenGS) if field.name != "gaussians"]
     members = {name: getattr(model, name) for name in names}
     return PackedModel(model.gaussians.data(), members, backend)
 
 
 def load_basis(
-    basis: str | os.PathLike[str] | EigenGS | PackedModel, backend: str | None = None
+    basis: str | os.PathLike[str] | EigenGS | Eigenbasis | PackedModel,
+    backend: str | None = None,
+    gaussians: int | None = None,
 ) -> EigenGS:
     """Load a model by name or file.
 
     Parameters
     ----------
-    basis : str, path-like, EigenGS or PackedModel
-        A name of `SHIPPED`, whose file is read once; a file; or a model, which is returned.
+    basis : str, path-like, EigenGS, Eigenbasis or PackedModel
+        A name of `SHIPPED`, whose file is read once; a file; a model, which is returned; or an
+        `Eigenbasis`, to which a model is fitted.
     backend : {"llvm", "cuda"}, optional
+    gaussians : int, optional
+        Number of Gaussians of a model that is fitted.
 
     Raises
     ------
@@ -82,6 +91,11 @@ def load_basis(
         If the name or file does not exist, the file is no model, or the model is on another
         backend.
     """
+    if isinstance(basis, Eigenbasis):
+        pixels = basis.width * basis.height
+        return EigenGS.fit(
+            basis, gaussians or default_count(pixels), backend=backend, progress=False
+        )
     if isinstance(basis, PackedModel):
         basis = basis.model
     if isinstance(basis, EigenGS):

@@ -6,7 +6,6 @@ import json
 import os
 import sys
 import time
-import warnings
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict
@@ -18,8 +17,10 @@ import numpy as np
 
 from ..backend.executor import executor_for
 from ..backend.interrupt import defer_interrupts
-from ..image.folder import image_files, read_blocks
+from ..backend.warn import warn
+from ..image.folder import list_images, read_blocks
 from ..image.io import ImageError
+from ..image.remote import is_url
 from ..storage.checkpoint import Checkpoint
 from .components.solve import State
 from .eigengs import EigenGS
@@ -103,18 +104,17 @@ def train(
         If a file cannot be written.
     """
     started = time.perf_counter()
-    folder = Path(folder)
-    names = [path.name for path in image_files(folder)]
+    found = list_images(folder)
+    names = [path if isinstance(path, str) else path.name for path in found]
     steps = settings.training_steps
     record = {**asdict(settings), "steps": steps, "folder": str(folder)}
     with Checkpoint(output, json.loads(json.dumps(record)), names) as checkpoint:
         if names != checkpoint.files:
-            warnings.warn(
+            warn(
                 f"{folder}: the images have changed since this training began; it goes on with "
-                f"the {len(checkpoint.files)} that were there",
-                stacklevel=2,
+                f"the {len(checkpoint.files)} that were there"
             )
-        files = [folder / name for name in checkpoint.files]
+        files = [name if is_url(name) else Path(folder) / name for name in checkpoint.files]
         held_out = files[HELD_OUT - 1 :: HELD_OUT]
         training = [path for i, path in enumerate(files) if i % HELD_OUT != HELD_OUT - 1]
         with defer_interrupts() as pressed:
@@ -173,7 +173,7 @@ class Run(NamedTuple):
         self.stop_if_pressed()
 
 
-def _basis(files: list[Path], held_out: list[Path], run: Run) -> Eigenbasis:
+def _basis(files: list[Path | str], held_out: list[Path | str], run: Run) -> Eigenbasis:
     """Find the components block by block, or read them from the checkpoint."""
     settings, checkpoint = run.settings, run.checkpoint
     if (path := checkpoint.folder / "basis.npz").exists():
@@ -196,7 +196,7 @@ def _basis(files: list[Path], held_out: list[Path], run: Run) -> Eigenbasis:
     return basis
 
 
-def _state(files: list[Path], ranks: tuple[int, ...], run: Run) -> EigenState:
+def _state(files: list[Path | str], ranks: tuple[int, ...], run: Run) -> EigenState:
     """Merge the images block by block; the checkpoint holds the state after each block."""
     settings, checkpoint = run.settings, run.checkpoint
     arrays = checkpoint.load("pca")
@@ -219,11 +219,11 @@ def _state(files: list[Path], ranks: tuple[int, ...], run: Run) -> EigenState:
     except ImageError as error:
         if not state.count:  # else an earlier run has read some images, and only the rest is bad
             raise
-        warnings.warn(f"the remaining images were skipped: {error}", stacklevel=2)
+        warn(f"the remaining images were skipped: {error}")
     return state
 
 
-def _state_of_shards(files: list[Path], ranks: tuple[int, ...], run: Run) -> EigenState:
+def _state_of_shards(files: list[Path | str], ranks: tuple[int, ...], run: Run) -> EigenState:
     """Merge the images in shards; the checkpoint holds the states of shards."""
     settings = run.settings
 

@@ -6,28 +6,29 @@ import math
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.display import to_html
+from ..backend.display import shows_progress, to_html
 from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
-from ..gaussian.file import CUTOFF
+from ..gaussian.file import CUTOFF, FitFigures, write
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import float_space, target_key
 from ..raster.render import picture_of
 from .initializers import FitProblem, initialize
-from .options import FitOptions
+from .options import FitOptions, named_options
 from .pixels import in_unit, read_pixels, unit_of
 from .refine import FitProgress, Refinement, measure, refine
 from .search import search_count
 
 if TYPE_CHECKING:
     from ..eigenbasis.eigengs import EigenGS
+    from ..eigenbasis.pca.basis import Eigenbasis
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,8 @@ class Fit:
         basis as pixels. The attribute `image` includes the mean image.
     psnr_ycbcr, psnr_rgb : float
         PSNR of the set in dB, from its row of the trace.
+    source : str
+        Name of the image, if it was a file or a URL.
     """
 
     gaussians: Gaussians
@@ -74,6 +77,7 @@ class Fit:
     mean_image: NDArray[np.float32] | None = field(default=None, repr=False)
     psnr_ycbcr: float = math.nan
     psnr_rgb: float = math.nan
+    source: str = field(default="", repr=False)
 
     def __repr__(self) -> str:
         space = float_space(self.gaussians.space)
@@ -85,6 +89,11 @@ class Fit:
         )
 
     _repr_html_ = to_html  # what a notebook shows
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the set with its PSNR, steps and source; see `eigengs_dr.Gaussians.save`."""
+        figures = FitFigures(self.psnr_ycbcr, self.psnr_rgb, self.iterations, self.source)
+        write(path, self.gaussians.data(), figures)
 
 
 class FitInterrupted(KeyboardInterrupt):
@@ -101,18 +110,20 @@ class FitInterrupted(KeyboardInterrupt):
         self.result = result
 
 
+@named_options
+@shows_progress
 def fit(
-    image: ArrayLike,
+    image: ArrayLike | os.PathLike[str],
     gaussians: int | None = None,
     iterations: int = 1000,
     init: str = "auto",
-    basis: str | os.PathLike[str] | EigenGS | None = None,
+    basis: str | os.PathLike[str] | EigenGS | Eigenbasis | None = None,
     preset: str = "default",
     solve_steps: int = 10,
     color: str = "ycbcr",
     seed: int = 0,
     backend: str | None = None,
-    progress: FitProgress | None = None,
+    progress: Any = None,
     target_psnr: float | None = None,
     target_space: str = "rgb",
     max_gaussians: int | None = None,
@@ -123,8 +134,8 @@ def fit(
 
     Parameters
     ----------
-    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
-        See `eigengs_dr.image.io.check_image`.
+    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like or URL
+        A file, see `eigengs_dr.load_image`, or pixels, see `eigengs_dr.image.io.check_image`.
     gaussians : int, optional
         Number of Gaussians, at most one per pixel. By default 5000, or one per pixel for smaller
         images; with an eigenbasis, the number of Gaussians of the basis.
@@ -133,9 +144,10 @@ def fit(
     init : {"auto", "adaptive", "grid", "random", "eigen"}, optional
         Initialiser. "auto" is "eigen" if a basis is given, else the initialiser of the preset:
         "adaptive" for "default".
-    basis : str, path-like or EigenGS, optional
-        Basis for "eigen": the name of a basis in this package, the path of a basis file, or a
-        model. By default "natural", which ships with the package.
+    basis : str, path-like, EigenGS or Eigenbasis, optional
+        Basis for "eigen": the name of a basis in this package, the path of a basis file, a model,
+        or an `eigengs_dr.Eigenbasis`, to which a model is fitted first. By default
+        "natural", which ships with the package.
     preset : {"default", "gaussianimage", "eigengs"}, optional
         The method, see `eigengs_dr.fitting.presets`.
     solve_steps : int, optional
@@ -154,7 +166,8 @@ def fit(
         solve use random numbers; the preset "default" gives one result for all seeds.
     backend : {"llvm", "cuda"}, optional
         By default "cuda" if there is a GPU.
-    progress : callable, optional
+    progress : bool or callable, optional
+        By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         Called every 10 steps as ``progress(iteration, iterations, row)`` with the last row of the
         trace, or a row of a set with more Gaussians than asked for.
     target_psnr : float, optional
@@ -213,11 +226,14 @@ def fit(
         max_gaussians=max_gaussians,
         encoding=encoding,
     )
-    return fit_image(image, options, progress)
+    result = fit_image(image, options, progress)
+    if not isinstance(image, (str, os.PathLike)):
+        return result
+    return replace(result, source=os.path.basename(image))
 
 
 @exclusive()
-def fit_image(image: ArrayLike, options: FitOptions, progress: FitProgress | None = None) -> Fit:
+def fit_image(image: Any, options: FitOptions, progress: FitProgress | None = None) -> Fit:
     """Fit an image with the options of one record; see `fit` for results and errors."""
     started = time.perf_counter()
     pixels, options = read_pixels(image, options)

@@ -15,11 +15,13 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..backend.display import shows_progress
 from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
 from ..gaussian.concatenate import concatenate
@@ -29,7 +31,7 @@ from .fit import Fit, finish
 from .initializers import FitProblem, FitTarget, make_target
 from .optimizers.descent import descend
 from .optimizers.schedule import Schedule
-from .options import FitOptions, Levels
+from .options import FitOptions, Levels, named_options
 from .pixels import in_unit, read_pixels, unit_of
 from .placement_initializer import start_from_placement
 from .redistribute import place_like, residual
@@ -111,6 +113,8 @@ def check_options(options: FitOptions, levels: Levels) -> FitOptions:
     return replace(options, gaussians=_check_counts(options.gaussians, levels)[-1])
 
 
+@named_options
+@shows_progress
 @exclusive()
 def fit_levels(
     image: ArrayLike,
@@ -120,7 +124,7 @@ def fit_levels(
     color: str = "ycbcr",
     seed: int = 0,
     backend: str | None = None,
-    progress: FitProgress | None = None,
+    progress: Any = None,
     encoding: str | None = None,
 ) -> Fit:
     """Fit nested sets: the first Gaussians form the image too, for several numbers of them.
@@ -144,7 +148,8 @@ def fit_levels(
     seed : int, optional
         Not used: the placement draws no random numbers.
     backend : {"llvm", "cuda"}, optional
-    progress : callable, optional
+    progress : bool or callable, optional
+        By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         ``progress(iteration, iterations, row)``, see `eigengs_dr.fit`.
     encoding : {"srgb", "linear"}, optional
         What the pixels are, see `eigengs_dr.fit`.

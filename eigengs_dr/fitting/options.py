@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from difflib import get_close_matches
+from functools import wraps
+from inspect import signature
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +23,7 @@ from .presets import PRESETS, Preset
 
 if TYPE_CHECKING:
     from ..eigenbasis.eigengs import EigenGS
+    from ..eigenbasis.pca.basis import Eigenbasis
 
 DEFAULT_COUNT = 5000
 """Number of Gaussians by default."""
@@ -37,6 +41,30 @@ Levels = int | Sequence[int]
 """A number of levels of detail, or the number of Gaussians up to each level in ascending order."""
 
 
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def refuse_unknown(given: Collection[str], known: Collection[str]) -> None:
+    """Raise TypeError for an option that is unknown, with the name that it resembles."""
+    for name in given:
+        if name not in known:
+            [*close] = get_close_matches(name, known, 1)
+            advice = f"did you mean {close[0]!r}?" if close else f"use one of {', '.join(known)}"
+            raise TypeError(f"unknown option {name!r}; {advice}")
+
+
+def named_options(function: Function) -> Function:
+    """Decorate a function whose unknown keywords `refuse_unknown` reports."""
+    known = list(signature(function).parameters)
+
+    @wraps(function)
+    def call(*arguments: Any, **options: Any) -> Any:
+        refuse_unknown(options, known)
+        return function(*arguments, **options)
+
+    return call  # type: ignore[return-value]
+
+
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
     """The options of `eigengs_dr.fit`, which describes each of them.
@@ -50,7 +78,7 @@ class FitOptions:
     gaussians: int | None = None
     iterations: int = 1000
     init: str = "auto"
-    basis: str | os.PathLike[str] | EigenGS | None = None
+    basis: str | os.PathLike[str] | EigenGS | Eigenbasis | None = None
     preset: str = "default"
     solve_steps: int = 10
     color: str = "ycbcr"

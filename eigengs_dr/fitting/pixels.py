@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
+from ..image.io import read_image
 from ..image.pixels import (
     MAX_PIXEL,
     MIN_PIXEL,
@@ -47,6 +48,7 @@ def read_pixels(image: Any, options: FitOptions) -> tuple[NDArray[np.float32], F
     """
     if rendered_as(options.color) is None:
         return read_data(image, options.color), options
+    image = read_image(image, encoding=options.encoding)
     encoding = encoding_of(image, options.encoding) or "srgb"
     pixels = check_image(image, copy=False, encoding=encoding)
     if options.color == "linear" and encoding == "linear" and pixels.max() > WHITE:
@@ -62,7 +64,7 @@ def read_data(image: Any, space: str) -> NDArray[np.float32]:
     ImageError
         If the image is unusable, or no normal map.
     """
-    pixels = check_data(image, copy=False)
+    pixels = check_data(read_image(image, keep_grey=True), copy=False)
     if space != "normal":
         return pixels
     if pixels.shape[2] != 3:

@@ -165,9 +165,12 @@ class _Run:
 
 
 def _better(a: _Trial, b: _Trial) -> bool:
-    """Return whether a meets the goal with fewer Gaussians than b, or comes nearer to it."""
+    """Return whether a meets the goal with fewer Gaussians than b, or comes nearer to it.
+
+    Of two sets of one size that meet it, the one with the higher PSNR is better.
+    """
     if a.missing <= 0 and b.missing <= 0:
-        return len(a.gaussians) < len(b.gaussians)
+        return (len(a.gaussians), a.missing) < (len(b.gaussians), b.missing)
     return a.missing < b.missing
 
 

@@ -49,6 +49,12 @@ LAYOUT: dict[str, Field] = {
 CUTOFF_FIELD = Field("f8", 0)
 """The array that version 2 added; sets of version 1 have the cutoff `CUTOFF`."""
 
+FIGURES: dict[str, Field] = {"figures": Field("f8", 1, 3), "source": Field("U", 0)}
+"""Arrays that a file may have besides: what the fit of the set reached; see `FitFigures`."""
+
+MAX_SOURCE = 64
+"""Characters of the name of an image that a file keeps: its last."""
+
 READERS = {b"\x89EGS": "eigengs_dr.codec.egs:read_set"}
 """Readers of other formats, by the first bytes of a file: 'module:function'. The function takes
 (path, sections) and returns a `SetData`; its module is imported when a file needs it."""
@@ -77,7 +83,16 @@ class SetData(NamedTuple):
     cutoff: float = CUTOFF
 
 
-def write(path: str | os.PathLike[str], data: SetData) -> None:
+class FitFigures(NamedTuple):
+    """What a fit reached, in a file: its PSNR in dB, its steps, and the name of the image."""
+
+    psnr_ycbcr: float
+    psnr_rgb: float
+    iterations: int
+    source: str = ""
+
+
+def write(path: str | os.PathLike[str], data: SetData, figures: FitFigures | None = None) -> None:
     """Write a set as an ``.npz`` file in single precision, completely or not at all.
 
     Raises
@@ -90,6 +105,9 @@ def write(path: str | os.PathLike[str], data: SetData) -> None:
     if Path(path).suffix.lower() == ".egs":
         raise ValueError(f"{path}: only eigengs_dr.pack writes .egs files; save as .npz")
     members = to_members(data.arrays, data.size, data.cutoff) | {"space": np.array(data.space)}
+    if figures is not None:
+        members["figures"] = np.array(figures[:3], np.float64)
+        members["source"] = np.array(figures.source[-MAX_SOURCE:])
     npz.write(path, FORMAT, VERSION, members, compressed=len(members["mean"]) < PLAIN_COUNT)
 
 
@@ -130,6 +148,18 @@ def read_head(path: Path) -> SetHead:
     width, height = found["size"].tolist()
     cutoff = float(found.get("cutoff", np.array(CUTOFF)))
     return SetHead(count, channels, (width, height), str(found["space"]), cutoff)
+
+
+def read_figures(path: Path) -> FitFigures | None:
+    """Return what the fit of a set reached, if its ``.npz`` file says it; errors as `read_head`."""
+    if not set(FIGURES) <= set(npz.sizes_of(path)):
+        return None
+    found = npz.read(path, FORMAT, VERSION, FIGURES)
+    values, source = found["figures"], str(found["source"])
+    if values.shape != (3,) or not (np.isfinite(values[2]) and 0 <= values[2] < 1 << 53):
+        raise ValueError(f"{path}: figures are {values.tolist()}, expected two PSNR and the steps")
+    printable = "".join(c if c.isprintable() else "?" for c in source)
+    return FitFigures(float(values[0]), float(values[1]), int(values[2]), printable)
 
 
 def read(path: Path, sections: int | None = None) -> SetData:

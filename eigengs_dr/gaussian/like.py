@@ -1,6 +1,8 @@
-"""Other Gaussians for the image of a set."""
+"""Gaussians from what holds or resembles them."""
 
 from __future__ import annotations
+
+from typing import Any
 
 from numpy.typing import ArrayLike
 
@@ -29,3 +31,23 @@ def like(
         backend=types_of(gaussians.mean).backend,
         cutoff=gaussians.cutoff,
     )
+
+
+def set_of(source: Any) -> Gaussians:
+    """Return a set, or the set of a fit.
+
+    Raises
+    ------
+    TypeError
+        If the source is something else.
+    ValueError
+        If the fit has a mean image of pixels, which the set lacks.
+    """
+    if isinstance(source, Gaussians):
+        return source
+    if not hasattr(source, "trace") or not hasattr(source, "gaussians"):
+        raise TypeError(f"{type(source).__name__} is no set of Gaussians; pass Gaussians or a Fit")
+    if source.mean_image is not None:
+        raise ValueError("the fit has a mean image of pixels, which its set lacks; use .gaussians")
+    found: Gaussians = source.gaussians
+    return found

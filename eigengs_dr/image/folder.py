@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,8 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.warn import warn
 from .io import SUFFIXES, ImageError, check_image, load_image
 from .planes import BASIS_SPACES, check_size, to_planes
+from .remote import is_url, list_urls
 from .resize import center_crop
 
 DECODE_THREADS = min(8, os.cpu_count() or 1)
@@ -29,7 +30,7 @@ MAX_NAMED = 3
 """Largest number of skipped files that a warning names."""
 
 Source = str | os.PathLike[str] | NDArray[Any] | Iterable[str | os.PathLike[str] | NDArray[Any]]
-"""A folder, an array of images, or any iterable of files or such arrays."""
+"""A folder or its URL, an array of images, or any iterable of files, of URLs and of such arrays."""
 
 ReadProgress = Callable[[int, int | None, dict[str, Any]], None]
 """``progress(done, total, row)``; the total is None if it is unknown."""
@@ -87,6 +88,11 @@ def image_files(folder: str | Path) -> list[Path]:
     return files
 
 
+def list_images(folder: str | os.PathLike[str]) -> list[Path] | list[str]:
+    """List the images of a folder, as `image_files`, or behind a URL, as `list_urls`."""
+    return list_urls(str(folder)) if is_url(folder) else image_files(Path(folder))
+
+
 def read_blocks(
     source: Source,
     size: tuple[int, int],
@@ -102,9 +108,10 @@ def read_blocks(
     Parameters
     ----------
     source : path, array or iterable
-        A folder, an array of images (n, H, W, 3) or (n, H, W), or an iterable of files, of arrays
-        of images or of RGB images (H, W, 3). Pixels as for `eigengs_dr.image.io.check_image`. An
-        iterator may overwrite an array after the next one is requested.
+        A folder or its URL, an array of images (n, H, W, 3) or (n, H, W), or an iterable of files,
+        of URLs, of arrays of images or of RGB images (H, W, 3). Pixels as for
+        `eigengs_dr.image.io.check_image`. An iterator may overwrite an array after the next one is
+        requested.
     size : (int, int)
         Width and height in pixels. Images of another size are centre-cropped and resized.
     space : {"ycbcr", "rgb"}
@@ -138,7 +145,7 @@ def read_blocks(
     if length < 1:
         raise ValueError(f"length is {length}; a block needs at least 1 image")
     if isinstance(source, str | os.PathLike):
-        source = image_files(Path(source))
+        source = list_images(source)
     elif isinstance(source, np.ndarray):
         source = [source]
     total = None
@@ -182,12 +189,9 @@ def _blocks(
         raise ImageError(f"none of {done} images can be read, as {problems[0]}; check the files")
     if problems:
         named = ", ".join(problems[:MAX_NAMED]) + (", ..." if len(problems) > MAX_NAMED else "")
-        warnings.warn(f"{len(problems)} of {done} images were skipped: {named}", stacklevel=2)
+        warn(f"{len(problems)} of {done} images were skipped: {named}")
     if fitted:
-        warnings.warn(
-            f"{fitted} of {done} images were centre-cropped and resized to {size[0]}x{size[1]}",
-            stacklevel=2,
-        )
+        warn(f"{fitted} of {done} images were centre-cropped and resized to {size[0]}x{size[1]}")
 
 
 def _prepare_images(
@@ -200,7 +204,7 @@ def _prepare_images(
         for place, item in enumerate(_singles(source)):
             waiting.append(pool.submit(_prepare, item, place, size, space))
             # Finish an array at once: its owner may overwrite it.
-            while len(waiting) > (MAX_WAITING if isinstance(item, Path) else 0):
+            while len(waiting) > (MAX_WAITING if _is_file(item) else 0):
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
@@ -212,22 +216,22 @@ def _singles(source: Iterable[Any]) -> Iterator[Any]:
     """Yield files and single images."""
     for item in source:
         if _is_file(item):
-            yield Path(item)
+            yield item if is_url(item) else Path(item)
         else:
             yield from _images(item)
 
 
 def _prepare(item: Any, place: int, size: tuple[int, int], space: str) -> PreparedImage:
     """Read, crop and convert one image."""
-    loaded = isinstance(item, Path)
+    loaded = _is_file(item)
     try:
         image = check_image(load_image(item) if loaded else item, copy=not loaded)
-    except ImageError as error:
+    except (ImageError, OSError) as error:
         if not loaded:
             raise ImageError(f"image {place} of the source{str(error)[len('image') :]}") from None
         # A warning that lists several files has room for the name and the reason only.
         reason = str(error).removeprefix(f"{item}: ").split("; ")[0]
-        return PreparedImage(None, False, f"{item.name} ({reason})")
+        return PreparedImage(None, False, f"{Path(item).name} ({reason})")
     width, height = size
     fitted = image.shape[:2] != (height, width)
     if fitted:

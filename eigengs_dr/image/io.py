@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import warnings
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..storage.atomic import atomic_write
+from ..backend.warn import warn
+from ..storage.atomic import atomic_write, refuse_url
 from .color import to_coded, to_linear
 from .formats.openimageio import ADVICE, is_installed
 from .formats.pillow import SAVE_OPTIONS, image_errors, open_picture, picture_pixels
@@ -26,6 +27,7 @@ from .pixels import (
     mark_image,
     to_floats,
 )
+from .remote import is_url, local_copy
 from .strips import map_threads, strips
 
 __all__ = [
@@ -41,6 +43,7 @@ __all__ = [
     "mark_image",
     "open_picture",
     "picture_pixels",
+    "read_image",
     "save_image",
     "to_8bit",
     "to_file",
@@ -64,7 +67,8 @@ def load_image(
     Parameters
     ----------
     path : str or Path
-        PNG, JPEG and other files that Pillow reads; TIFF; EXR; Radiance HDR; PFM.
+        PNG, JPEG and other files that Pillow reads; TIFF; EXR; Radiance HDR; PFM. Or the URL of
+        such a file, which needs fsspec, from the extra ``cluster``.
     keep_grey : bool, optional
         Return one channel if the file is opaque grey.
     encoding : {"srgb", "linear"}, optional
@@ -87,8 +91,17 @@ def load_image(
     ImageError
         If the file is missing, empty, damaged, too large or not an image; a pixel is not finite; or
         an EXR file holds one channel without `keep_grey`, or several layers.
+    OSError
+        If a URL cannot be read.
     """
     check_encoding(encoding)
+    if is_url(path):
+        url = str(path)
+        with local_copy(url) as file:
+            try:
+                return load_image(file, keep_grey, encoding)
+            except ImageError as error:
+                raise ImageError(str(error).replace(str(file), url)) from None
     path = Path(path)
     found = _load_deep(path, keep_grey)
     if found is None:
@@ -96,14 +109,23 @@ def load_image(
             frames = getattr(file, "n_frames", 1)
             pixels, transparent = picture_pixels(file)
         if transparent:
-            warnings.warn(f"{path}: transparent pixels are shown over white", stacklevel=2)
+            warn(f"{path}: transparent pixels are shown over white")
         if frames > 1:
-            warnings.warn(f"{path}: holds {frames} frames, the first is used", stacklevel=2)
+            warn(f"{path}: holds {frames} frames, the first is used")
         found = pixels, "srgb"
     image = to_floats(found[0], str(path), keep_grey)
     if (encoding or found[1]) == "linear":
         return check_light(image, str(path)).view(LinearImage)
     return check_range(image, str(path))
+
+
+def read_image(image: Any, keep_grey: bool = False, encoding: str | None = None) -> Any:
+    """Read an image that is a file or a URL; return anything else as it is.
+
+    For parameters, results and errors see `load_image`.
+    """
+    is_file = isinstance(image, (str, os.PathLike))
+    return load_image(image, keep_grey, encoding) if is_file else image
 
 
 def _load_deep(path: Path, keep_grey: bool) -> tuple[NDArray[Any], str] | None:
@@ -113,7 +135,7 @@ def _load_deep(path: Path, keep_grey: bool) -> tuple[NDArray[Any], str] | None:
     """
     with image_errors(path):
         if kind_of(path) == "png" and not is_installed():
-            warnings.warn(f"{path}: keeps 8 of its 16 bits; to keep all {ADVICE}", stacklevel=3)
+            warn(f"{path}: keeps 8 of its 16 bits; to keep all {ADVICE}")
             return None
         try:
             found = read_deep(path)
@@ -135,7 +157,7 @@ def _load_deep(path: Path, keep_grey: bool) -> tuple[NDArray[Any], str] | None:
     if (alpha >= peak).all():
         return color, encoding
     ground = "black" if found.associated else "white"
-    warnings.warn(f"{path}: transparent pixels are shown over {ground}", stacklevel=3)
+    warn(f"{path}: transparent pixels are shown over {ground}")
     if found.associated:
         return color, encoding
     share = np.divide(alpha, peak, dtype=np.float32)
@@ -176,6 +198,7 @@ def save_image(
         If the array is not an image, the suffix is unknown, the format has no such bits, a package
         is missing or the file cannot be written. An existing file does not change.
     """
+    refuse_url(path)
     path = Path(path)
     bits = bits_of(path, bits)
     said = encoding_of(image, encoding)

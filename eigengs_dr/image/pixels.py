@@ -7,12 +7,12 @@ light that is decoded as sRGB is too dark. Files of integers hold sRGB, files of
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.warn import warn
 from .color import to_coded
 from .strips import by_strips, map_threads, strips
 
@@ -135,10 +135,9 @@ def encoding_of(image: Any, encoding: str | None = None) -> str | None:
     if is_bitmap(image):
         return "srgb" if image.srgb_gamma() else "linear"
     if is_tensor(image) and tuple(getattr(image, "shape", ()))[2:] == (3,):
-        warnings.warn(
+        warn(
             "a Dr.Jit tensor does not say what its pixels are; say encoding='linear' for light, as "
-            "of mitsuba.render, or encoding='srgb'",
-            stacklevel=3,
+            "of mitsuba.render, or encoding='srgb'"
         )
     return None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,12 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.display import shows_progress, to_html
 from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
 from ..fitting.fit import FitInterrupted
 from ..fitting.initializers import FitTarget
 from ..fitting.levels import check_options, refine_levels
-from ..fitting.options import FitOptions, Levels
+from ..fitting.options import FitOptions, Levels, named_options
 from ..fitting.placement_initializer import start_from_placement
 from ..fitting.redistribute import residual
 from ..fitting.refine import FitProgress, Refinement, Score, refine
@@ -67,7 +69,15 @@ class MaterialFit:
     psnr_rgb: float
     maps: dict[str, dict[str, float]] = field(repr=False)
 
+    _repr_html_ = to_html  # what a notebook shows
 
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the material; see `eigengs_dr.Material.save`."""
+        self.material.save(path)
+
+
+@named_options
+@shows_progress
 @exclusive()
 def fit_material(
     maps: Mapping[str, ArrayLike],
@@ -80,7 +90,7 @@ def fit_material(
     max_gaussians: int | None = None,
     levels: Levels | None = None,
     backend: str | None = None,
-    progress: FitProgress | None = None,
+    progress: Any = None,
     cutoff: float = CUTOFF,
     encoding: str | None = None,
 ) -> MaterialFit:
@@ -88,7 +98,7 @@ def fit_material(
 
     Parameters
     ----------
-    maps : mapping of str to array_like, shape (H, W, 3), (H, W, 1) or (H, W)
+    maps : mapping of str to array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like or URL
         Images of one size by name, with at most 16 channels together. Data whose three channels are
         equal count as one channel.
     gaussians : int, optional
@@ -116,7 +126,8 @@ def fit_material(
         Levels of detail, see `eigengs_dr.fit_levels`.
     backend : {"llvm", "cuda"}, optional
         By default "cuda" if there is a GPU.
-    progress : callable, optional
+    progress : bool or callable, optional
+        By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         See `eigengs_dr.fit`.
     cutoff : float, optional
         Radius of a Gaussian in standard deviations, in (0, 12].

@@ -12,6 +12,7 @@ import drjit as dr
 from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
+from ..backend.display import to_html
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
 from ..raster.render import render
@@ -67,6 +68,8 @@ class Material:
     def __repr__(self) -> str:
         g = self.gaussians
         return f"Material({len(g)} Gaussians, {g.width}x{g.height} pixels: {', '.join(self)})"
+
+    _repr_html_ = to_html  # what a notebook shows
 
     def __len__(self) -> int:
         """Return the number of maps."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from operator import index
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
@@ -14,6 +14,7 @@ from ..backend.arrays import ArrayTypes
 from ..backend.recording import exclusive
 from ..gaussian.file import MAX_CUTOFF
 from ..gaussian.gaussians import Gaussians
+from ..gaussian.like import set_of
 from ..image.color import decode, from_sum, to_picture
 from .adjoint import adjoint
 from .binning.lists import TileLists, build_lists
@@ -24,10 +25,13 @@ from .limits import check_index_range
 from .parameters import KernelParameters, detached_shape, kernel_radius, kernel_shape
 from .rows import to_tensor
 
+if TYPE_CHECKING:
+    from ..fitting.fit import Fit
+
 
 @exclusive()
 def render(
-    gaussians: Gaussians,
+    gaussians: Gaussians | Fit,
     width: int | None = None,
     height: int | None = None,
     cutoff: float | None = None,
@@ -41,7 +45,7 @@ def render(
 
     Parameters
     ----------
-    gaussians : Gaussians
+    gaussians : Gaussians or Fit
     width, height : int, optional
         Size of the image in pixels; by default the native size. If only one is given, the native
         aspect ratio gives the other.
@@ -75,6 +79,8 @@ def render(
     >>> eg.render(g).shape, eg.render(g, width=16).shape
     ((8, 8, 1), (16, 16, 1))
     """
+    gaussians = set_of(gaussians)
+    _check_rows(gaussians)
     width, height = _size(gaussians, width, height)
     check_index_range(width, height, gaussians.channels, TILE)
     scaled = gaussians.scaled(width, height)
@@ -90,7 +96,7 @@ def render(
 
 @exclusive()
 def picture_of(
-    gaussians: Gaussians,
+    gaussians: Gaussians | Fit,
     width: int | None = None,
     height: int | None = None,
     cutoff: float | None = None,
@@ -99,7 +105,7 @@ def picture_of(
 
     Parameters
     ----------
-    gaussians : Gaussians
+    gaussians : Gaussians or Fit
     width, height : int, optional
         Size of the image in pixels, as for `render`.
     cutoff : float, optional
@@ -110,8 +116,21 @@ def picture_of(
     ndarray, shape (height, width, C)
         1 is white. Negative linear light becomes 0; other values are not clamped.
     """
+    gaussians = set_of(gaussians)
     image = render(dr.detach(gaussians), width, height, cutoff).numpy()
     return to_picture(gaussians.space, image)
+
+
+def _check_rows(gaussians: Gaussians) -> None:
+    """Raise ValueError for arrays of other shapes, of which Dr.Jit says nothing plain."""
+    count = len(gaussians)
+    for name, rows in (("mean", 2), ("factor", 3), ("color", gaussians.channels)):
+        array = getattr(gaussians, name)
+        if len(array) != rows or dr.width(array) not in (1, count):
+            raise ValueError(
+                f"Gaussians: {name} has shape ({dr.width(array)}, {len(array)}), expected "
+                f"({count}, {rows})"
+            )
 
 
 def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[int, int]:
@@ -153,7 +172,7 @@ def bin_gaussians(
 
     Parameters
     ----------
-    gaussians : Gaussians
+    gaussians : Gaussians or Fit
     pad : float or Float, shape (N,), optional
         Pixels by which ellipses are enlarged, so that the lists stay valid while Gaussians move.
     growth : float, optional

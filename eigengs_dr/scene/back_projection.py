@@ -67,7 +67,8 @@ def _pull(mean: Image, share: Image) -> tuple[Image, Image]:
         return result
 
     weight = total(share)
-    return total(mean * share) / np.maximum(weight, 1e-9), np.minimum(weight, 1)
+    mean = (total(mean * share) / np.maximum(weight, 1e-9)).astype(np.float32)
+    return mean, np.minimum(weight, 1).astype(np.float32)
 
 
 def _push(image: Image, shape: tuple[int, ...]) -> Image:

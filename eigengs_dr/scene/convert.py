@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..backend.display import shows_progress
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
 from ..storage.atomic import refuse_url
@@ -76,6 +77,7 @@ class ConvertedScene:
     psnr: list[float] = field(default_factory=list)
 
 
+@shows_progress
 @exclusive()
 def convert_scene(
     scene: str | os.PathLike[str] | dict[str, Any],
@@ -84,7 +86,7 @@ def convert_scene(
     iterations: int = 100,
     spp: int | None = None,
     parameters: Mapping[str, str] | None = None,
-    progress: Progress = lambda *_: None,
+    progress: Any = None,
 ) -> ConvertedScene:
     """Replace every bitmap of a scene by as many Gaussians as its cameras resolve.
 
@@ -106,7 +108,8 @@ def convert_scene(
         Samples per pixel of the renderings, by default those of the scene; 0 renders nothing.
     parameters : mapping of str to str, optional
         Values for the defaults of an XML file.
-    progress : callable, optional
+    progress : bool or callable, optional
+        By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         ``progress(label, done, total)``.
 
     Returns
@@ -134,6 +137,7 @@ def convert_scene(
         raise ValueError("no variant is set; call mi.set_variant('llvm_ad_rgb') first")
     if not 0 < psnr < 60:
         raise ValueError(f"psnr is {psnr:g}; it must be above 0 and below 60 dB")
+    progress = progress or (lambda *_: None)
     refuse_url(folder)
     target = Path(folder)
     work = _workplace(target)

@@ -138,6 +138,12 @@ def read_shapes(
         return shapes
 
 
+def sizes_of(path: str | os.PathLike[str]) -> dict[str, int]:
+    """Return the bytes that each array takes in a file, by its name; errors as for `read`."""
+    with _opened(Path(path), "eigengs_dr") as archive:
+        return {e.filename.removesuffix(".npy"): e.compress_size for e in archive.infolist()}
+
+
 @contextmanager
 def _opened(path: Path, name: str) -> Iterator[zipfile.ZipFile]:
     """Open a file, and turn every error inside the block into one line."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import singledispatch
 from html import escape
 from typing import Any
@@ -9,10 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..codec.material_packing import MaterialPackResult
+from ..codec.packing import PackResult
 from ..eigenbasis.eigengs import EigenGS
 from ..eigenbasis.pca.basis import Eigenbasis
 from ..fitting.fit import Fit
 from ..gaussian.gaussians import Gaussians
+from ..material.fit_material import MaterialFit
+from ..material.material import Material
 from ..raster.render import picture_of
 from .curve import draw_curve
 from .photo import photo_uri
@@ -47,6 +52,50 @@ def _show_fit(fit: Fit) -> str:
     curve = [(row["seconds"], row["psnr_rgb"]) for row in fit.trace]
     picture = _image(fit.image[::scale, ::scale])
     return _block(repr(fit), picture, draw_curve(curve, "seconds", "PSNR in RGB, dB"))
+
+
+@to_html.register
+def _show_material(material: Material) -> str:
+    if len(material.gaussians) > MAX_GAUSSIANS:
+        return _block(repr(material))
+    g = material.gaussians
+    scale = min(1.0, MAX_SIDE / max(g.width, g.height))
+    size = [max(1, round(scale * side)) for side in (g.width, g.height)]
+    return _block(repr(material), *_maps(material.pictures(*size)))
+
+
+@to_html.register
+def _show_material_fit(fit: MaterialFit) -> str:
+    scale = -(-max(next(iter(fit.images.values())).shape[:2]) // MAX_SIDE)
+    curve = [(row["seconds"], row["psnr_rgb"]) for row in fit.trace]
+    text = (
+        f"{fit.material!r}: psnr_ycbcr={fit.psnr_ycbcr:.2f}, psnr_rgb={fit.psnr_rgb:.2f}, "
+        f"seconds={fit.seconds:.2f}, stopped={fit.stopped!r}"
+    )
+    pictures = _maps({name: image[::scale, ::scale] for name, image in fit.images.items()})
+    return _block(text, *pictures, draw_curve(curve, "seconds", "PSNR in RGB, dB"))
+
+
+@to_html.register
+def _show_packed(packed: PackResult) -> str:
+    text = f"{packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bpp, psnr={packed.psnr:.2f}"
+    return _block(text) + _show_set(packed.gaussians)
+
+
+@to_html.register
+def _show_packed_material(packed: MaterialPackResult) -> str:
+    psnr = ", ".join(f"{name} {value:.2f}" for name, value in packed.psnr.items())
+    text = f"{packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bpp, psnr_rgb: {psnr}"
+    return _block(text) + _show_material(packed.material)
+
+
+def _maps(pictures: Mapping[str, NDArray[Any]]) -> list[str]:
+    """Return the pictures of maps with their names."""
+    return [
+        f'<figure style="margin: 0; text-align: center">{_image(picture)}'
+        f"<figcaption>{escape(name)}</figcaption></figure>"
+        for name, picture in pictures.items()
+    ]
 
 
 @to_html.register

@@ -12,6 +12,7 @@ from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.gaussians import Gaussians
 from ..image.color import UNBOUNDED, rendered_as
+from ..image.io import read_image
 from ..image.pixels import check_data, check_image
 from .model_facts import describe_model, describe_share
 from .page import Page, build_page
@@ -109,4 +110,5 @@ def view(
 def _photo(image: ArrayLike, space: str, encoding: str | None) -> NDArray[np.float32]:
     """Return a photo as people look at it: sRGB, or data."""
     data = rendered_as(space) is None
+    image = read_image(image, data, None if data else encoding)
     return check_data(image) if data else check_image(image, encoding=encoding)

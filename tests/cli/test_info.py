@@ -14,7 +14,7 @@ def test_info(fitted):
     found = json.loads(succeeded(run("info", folder / "fit.npz", "--json")).stdout)
     expected = {"gaussians": 50, "width": 32, "height": 24, "channels": 3, "space": "ycbcr"}
     assert {key: found[key] for key in expected} == expected
-    assert "gaussians  50" in run("info", folder / "fit.npz").stdout
+    assert "gaussians   50" in run("info", folder / "fit.npz").stdout
 
 
 def test_info_of_a_model(trained, tmp_path):

@@ -7,8 +7,8 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.clusters import QUICK, folder_of_photos
-from eigengs_dr.collection.remote import is_url, list_urls, load_url
 from eigengs_dr.collection.sources import list_sources
+from eigengs_dr.image.remote import is_url, list_urls
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def test_images_inside_of_an_archive(photos, tmp_path):
         archive.write(photos / "01.png", "in/01.png")
     urls = list_urls(f"zip://in/*.png::{tmp_path}/all.zip")
     assert [source.name for source in list_sources(urls)] == ["00", "01"]
-    np.testing.assert_array_equal(load_url(urls[1]), eg.load_image(photos / "01.png"))
+    np.testing.assert_array_equal(eg.load_image(urls[1]), eg.load_image(photos / "01.png"))
 
 
 def test_what_is_a_url(tmp_path):

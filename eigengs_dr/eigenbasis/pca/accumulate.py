@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from ...backend.executor import executor_for
-from ...image.folder import ReadProgress, Source, image_files, read_blocks
+from ...image.folder import ReadProgress, Source, list_images, read_blocks
 from .lazy_images import LazyImages, is_lazy
 from .solvers.gram import gram_state
 from .solvers.incremental_pca import EigenState, block_length, empty_state, merge, rank_for
@@ -75,7 +75,7 @@ def accumulate(
     """
     images: Any = source
     if isinstance(source, (str, os.PathLike)):
-        images = image_files(Path(source))
+        images = list_images(source)
     elif is_lazy(source):
         images = LazyImages(source, options.size)
     if client is not None and not is_countable(images):

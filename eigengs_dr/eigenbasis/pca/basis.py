@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...backend.display import to_html
+from ...backend.display import shows_progress, to_html
+from ...backend.warn import warn
 from ...image.color import ycbcr_to_rgb
-from ...image.folder import ReadProgress, Source
-from ...image.io import check_image
+from ...image.folder import Source
+from ...image.io import check_image, read_image
 from ...image.planes import check_size, to_planes
 from ...image.resize import resample
 from .accumulate import PCAOptions, accumulate
@@ -70,6 +70,7 @@ class Eigenbasis:
     examples: NDArray[np.float32]
 
     @classmethod
+    @shows_progress
     def from_images(
         cls,
         source: Source,
@@ -78,7 +79,7 @@ class Eigenbasis:
         energy: float | None = None,
         color: str = "ycbcr",
         seed: int = 0,
-        progress: ReadProgress | None = None,
+        progress: Any = None,
         client: Any = None,
         checkpoint: str | os.PathLike[str] | None = None,
         solver: str = "incremental",
@@ -102,7 +103,8 @@ class Eigenbasis:
             Space of the channels.
         seed : int
             Seed of the random examples.
-        progress : callable, optional
+        progress : bool or callable, optional
+            By default a bar, in a terminal or a notebook, after two seconds; False shows none.
             ``progress(done, total, {})`` after every image, on a cluster after every shard; `total`
             may be None.
         client : distributed.Client, optional
@@ -153,7 +155,7 @@ class Eigenbasis:
         most = check_components(components, energy)
         if energy is None and state.count <= max(most):
             have = "1 image gives" if state.count == 1 else f"{state.count} images give"
-            warnings.warn(f"{have} at most {state.count - 1} components a channel", stacklevel=2)
+            warn(f"{have} at most {state.count - 1} components a channel")
         shape = (size[1], size[0])
         basis = cls(
             mean=state.mean.astype(np.float32).reshape(-1, *shape),
@@ -276,7 +278,7 @@ class Eigenbasis:
 
     def _centred(self, image: ArrayLike) -> NDArray[np.float32]:
         """Resample and convert an image and subtract the mean; shape (C, H, W)."""
-        pixels = resample(check_image(image), self.width, self.height)
+        pixels = resample(check_image(read_image(image)), self.width, self.height)
         planes = to_planes(pixels, self.space) - self.mean.reshape(self.channels, -1)
         return planes.reshape(self.mean.shape)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Sequence
 from operator import index
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...backend.warn import warn
 from .basis_file import ENERGY_TOLERANCE
 
 CHANNELS = {"ycbcr": ("Y", "Cb", "Cr"), "rgb": ("R", "G", "B")}
@@ -67,10 +67,9 @@ def ranks_for_energy(
         ranks.append(int(np.searchsorted(shares, energy)) + 1)
         share = shares[-1] if len(shares) else 0.0
         if total > 0 and len(shares) == cap and share < energy - ENERGY_TOLERANCE:
-            warnings.warn(
+            warn(
                 f"channel {name}: {cap} components hold {share:.2%} of the variance, "
-                f"less than {energy:.2%}; raise components",
-                stacklevel=3,
+                f"less than {energy:.2%}; raise components"
             )
     return ranks
 

@@ -15,12 +15,13 @@ For one image, each channel has its own rank, and the sum of the ranks is minima
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ...backend.warn import warn
 
 MIN_MSE = 1e-12
 """Smallest mean squared error, 120 dB; smaller errors are rounding of single precision."""
@@ -186,7 +187,4 @@ def _decibels(error: NDArray[np.float64] | float) -> Values:
 
 def _warn_out_of_reach(target_psnr: float, counts: Iterable[int], reached: float) -> None:
     every = "+".join(map(str, counts))
-    warnings.warn(
-        f"{target_psnr:g} dB are out of reach: all {every} components have {reached:.2f}",
-        stacklevel=3,
-    )
+    warn(f"{target_psnr:g} dB are out of reach: all {every} components have {reached:.2f}")

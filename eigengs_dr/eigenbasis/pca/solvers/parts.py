@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....image.io import ImageError
+from ....image.remote import is_url
 from ..lazy_images import LazyImages
 
 Images = Sequence[Any] | NDArray[Any] | LazyImages
@@ -36,7 +37,10 @@ def absolute(images: Images) -> Images:
     if not isinstance(images, Sequence):
         return images
     is_file = (str, os.PathLike)
-    return [Path(item).absolute() if isinstance(item, is_file) else item for item in images]
+    return [
+        Path(item).absolute() if isinstance(item, is_file) and not is_url(item) else item
+        for item in images
+    ]
 
 
 def readable(images: Images) -> Any:

@@ -6,7 +6,6 @@ any number of workers. The channels of a shard are states of their own: a merge 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....backend.executor import Executor, completed
+from ....backend.warn import warn
 from ....image.folder import ReadProgress, read_blocks
 from ....image.io import ImageError
 from ....storage.checkpoint import read_arrays, write_arrays
@@ -159,7 +159,7 @@ def shard_states(
     with closing(completed(executor, make_shard, tasks, options)) as ended:
         for index, made in ended:
             for note in made.notes:
-                warnings.warn(note, stacklevel=3)
+                warn(note)
             states |= {(wanted[index], c): state for c, state in enumerate(made.states)}
             progress(done := done + _size(wanted[index], len(source)), len(source))
     for below, level in pairwise(levels):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ....backend.executor import Executor, completed
+from ....backend.warn import warn
 from ....image.folder import ReadProgress, read_blocks
 from ....image.io import ImageError
 from .parts import Images, absolute, collect_notes, is_countable, readable
@@ -109,7 +109,7 @@ def store_images_by(
     with closing(completed(executor, store_batch, tasks, options)) as ended:
         for index, notes in ended:
             for note in notes:
-                warnings.warn(note, stacklevel=3)
+                warn(note)
             done += min(length, total - starts[index])
             if progress:
                 progress(done, total, {})

@@ -7,15 +7,16 @@ stores such as ``s3`` and ``gcs`` need the package that its message names.
 from __future__ import annotations
 
 import glob
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from ..image.io import SUFFIXES, ImageError, load_image
+from .formats.pillow import SAVE_OPTIONS
+from .formats.registry import FLOAT_SUFFIXES
+from .pixels import ImageError
 
 
 def is_url(name: Any) -> bool:
@@ -65,17 +66,27 @@ def list_urls(url: str) -> list[str]:
     return sorted(system.unstrip_protocol(name) + tail for name in names)
 
 
-def load_url(url: str, keep_grey: bool = False, encoding: str | None = None) -> NDArray[np.float32]:
-    """Read an image behind a URL; see `eigengs_dr.image.io.load_image`.
+@contextmanager
+def local_copy(url: str) -> Iterator[Path]:
+    """Copy the file behind a URL to a temporary file for the time of a block.
+
+    Parameters
+    ----------
+    url : str
+
+    Yields
+    ------
+    Path
+        It has the suffix of the URL.
 
     Raises
     ------
     ImageError
-        If fsspec is missing, or the file is not an image; the message names the URL.
+        If fsspec is missing.
     OSError
         If the file cannot be read, which may pass; the message names the URL.
     """
-    suffix = PurePosixPath(url.partition("::")[0]).suffix
+    suffix = PurePosixPath(url.partition("::")[0].partition("?")[0]).suffix
     with TemporaryDirectory() as folder:
         file = Path(folder) / f"image{suffix}"
         system = _fsspec()
@@ -84,10 +95,7 @@ def load_url(url: str, keep_grey: bool = False, encoding: str | None = None) -> 
                 file.write_bytes(remote.read())
         except Exception as error:  # each store raises its own types
             raise OSError(f"{url}: cannot be read ({_reason(error)})") from error
-        try:
-            return load_image(file, keep_grey, encoding)
-        except ImageError as error:
-            raise ImageError(str(error).replace(str(file), url)) from None
+        yield file
 
 
 def _fsspec() -> ModuleType:
@@ -103,7 +111,7 @@ def _fsspec() -> ModuleType:
 
 def _is_image(name: str) -> bool:
     path = PurePosixPath(name)
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+    return path.suffix.lower() in (*SAVE_OPTIONS, *FLOAT_SUFFIXES) and not path.name.startswith(".")
 
 
 def _reason(error: Exception) -> str:

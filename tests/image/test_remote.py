@@ -1,0 +1,168 @@
+"""Files and URLs where images are taken, and fits where sets are."""
+
+import http.server
+import threading
+import zipfile
+from functools import partial
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from eigengs_dr.cli.main import main
+
+pytest.importorskip("fsspec")
+
+QUICK = {"gaussians": 60, "iterations": 10}
+
+
+class Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    """A folder with four photos of 32x32, and an archive of them."""
+    folder = tmp_path_factory.mktemp("photos")
+    photo = eg.sample("coffee")
+    with zipfile.ZipFile(folder / "all.zip", "w") as archive:
+        for k in range(4):
+            eg.save_image(folder / f"{k}.png", photo[40 * k :, 60 * k :][:32, :32])
+            archive.write(folder / f"{k}.png", f"in/{k}.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def served(photos):
+    """The URL of the folder."""
+    pytest.importorskip("aiohttp")
+    with http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), partial(Quiet, directory=photos)
+    ) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture(params=["file", "zip", "path"])
+def place(request, photos):
+    """The folder of the photos in several ways."""
+    if request.param == "path":
+        return str(photos)
+    return f"file://{photos}" if request.param == "file" else f"zip://in/{{}}::{photos}/all.zip"
+
+
+def item(place, name):
+    return place.format(name) if "{}" in place else f"{place}/{name}"
+
+
+def run(*arguments):
+    with pytest.raises(SystemExit) as end:
+        main([str(argument) for argument in arguments])
+    return end.value.code or 0
+
+
+def test_an_image_may_be_a_file_or_a_url(place, photos, tmp_path):
+    url, pixels = item(place, "1.png"), eg.load_image(photos / "1.png")
+    np.testing.assert_array_equal(eg.load_image(url), pixels)
+    want = eg.fit(pixels, **QUICK).image
+    np.testing.assert_array_equal(eg.fit(url, **QUICK).image, want)
+    eg.fit_levels(url, levels=2, **QUICK)
+    assert eg.fit(url, color="data", **QUICK).gaussians.channels == 3
+    found = eg.fit_material({"albedo": url, "roughness": url}, **QUICK)
+    assert list(found.material) == ["albedo", "roughness"]
+    large = eg.fit_large(url, tmp_path / "large.npz", block=32, **QUICK)
+    assert len(large.gaussians) == 60
+
+
+def test_a_url_of_http(served, tmp_path):
+    assert eg.load_image(f"{served}/2.png").shape == (32, 32, 3)
+    with pytest.raises(OSError, match=rf"{served}/none.png: cannot be read"):
+        eg.load_image(f"{served}/none.png")
+    assert run("fit", f"{served}/2.png", "-o", tmp_path / "a.npz", "--iterations", 5) == 0
+    assert eg.Gaussians.load(tmp_path / "a.npz").width == 32
+
+
+def test_images_of_a_basis_and_a_model(place, photos, tmp_path):
+    folder = item(place, "").rstrip("/") if "{}" not in place else place.format("*.png")
+    basis = eg.Eigenbasis.from_images(folder, size=(32, 32), components=2)
+    assert basis.count == 4
+    each = [item(place, f"{k}.png") for k in range(4)]
+    again = eg.Eigenbasis.from_images(each, size=(32, 32), components=2)
+    np.testing.assert_array_equal(again.mean, basis.mean)
+    model = eg.EigenGS.fit(basis, gaussians=60)
+    assert model.encode(each[0]).width == 32
+    assert [len(basis.project(each[0])[0])] == [2]
+    result = eg.fit(each[0], basis=basis, gaussians=60, iterations=0)
+    np.testing.assert_allclose(result.image, eg.picture_of(model.encode(each[0])), atol=1e-4)
+
+
+def test_commands_take_urls(photos, tmp_path, capsys):
+    url, out = f"file://{photos}/3.png", tmp_path / "a.npz"
+    assert run("fit", url, "-o", out, "--iterations", 5) == 0
+    assert run("view", out, "--image", url, "-o", tmp_path / "a.html") == 0
+    assert run("pack", out, "--image", url, "-o", tmp_path / "a.egs") == 0
+    assert run("fit", "--map", f"albedo={url}", "-o", tmp_path / "m.npz", "--iterations", 5) == 0
+    train = ("train", f"file://{photos}", "--size", "16x16", "--gaussians", 50, "--components", 2)
+    assert run(*train, "-o", tmp_path / "model.npz") == 0
+    capsys.readouterr()
+    assert run("fit", f"file://{photos}/none.png", "-o", out) == 2
+    message = capsys.readouterr().err.strip()
+    assert "none.png: cannot be read" in message and "\n" not in message
+
+
+@pytest.mark.parametrize("write", ["save", "save_image", "pack", "fit_large"])
+def test_an_output_that_is_a_url_is_refused(write, photos):
+    url = "memory://out/a" + {"pack": ".egs", "save_image": ".png"}.get(write, ".npz")
+    result = eg.fit(photos / "0.png", gaussians=20, iterations=0)
+    calls = {
+        "save": lambda: result.save(url),
+        "save_image": lambda: eg.save_image(url, result.image),
+        "pack": lambda: eg.pack(result, url),
+        "fit_large": lambda: eg.fit_large(result.image, url),
+    }
+    with pytest.raises(OSError, match="cannot be written to URLs"):
+        calls[write]()
+
+
+def test_a_fit_works_where_a_set_does(photos, tmp_path):
+    result = eg.fit(photos / "0.png", **QUICK)
+    want = eg.render(result.gaussians).numpy()
+    np.testing.assert_array_equal(eg.render(result).numpy(), want)
+    np.testing.assert_array_equal(eg.picture_of(result), eg.picture_of(result.gaussians))
+    result.save(tmp_path / "a.npz")
+    np.testing.assert_array_equal(eg.render(eg.Gaussians.load(tmp_path / "a.npz")).numpy(), want)
+    assert (
+        eg.pack(result, tmp_path / "a.egs").bytes
+        == eg.pack(result.gaussians, tmp_path / "b.egs").bytes
+    )
+    assert "Gaussians" in eg.view(result).html
+    with pytest.raises(TypeError, match="ndarray is no set of Gaussians; pass Gaussians or a Fit"):
+        eg.render(result.image)
+    pixels = eg.load_image(photos / "0.png")
+    assert result.psnr_rgb == pytest.approx(eg.psnr(pixels, result.image, space="rgb"), abs=1e-4)
+    assert result.psnr_ycbcr == pytest.approx(
+        eg.psnr(pixels, result.image, space="ycbcr"), abs=1e-4
+    )
+    assert f"psnr_rgb={result.psnr_rgb:.2f}" in repr(result)
+
+
+def test_figures_are_those_of_the_set_of_a_search(photos):
+    pixels = eg.load_image(photos / "0.png")
+    result = eg.fit(pixels, target_psnr=27, iterations=60)
+    assert result.psnr_ycbcr == pytest.approx(
+        eg.psnr(pixels, result.image, space="ycbcr"), abs=1e-4
+    )
+    found = eg.fit_material({"roughness": pixels[..., 0]}, 60, iterations=20)
+    assert found.psnr_rgb == found.trace[-1]["psnr_rgb"]
+
+
+def test_a_texture_of_a_fit(photos):
+    pytest.importorskip("mitsuba")
+    from eigengs_dr.plugins import texture_of
+
+    result = eg.fit(photos / "0.png", gaussians=20, iterations=0)
+    assert texture_of(result)["width"] == 32

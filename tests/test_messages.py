@@ -1,0 +1,61 @@
+"""What users read when they mistype, or pass something else."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+
+
+@pytest.fixture(scope="module")
+def photo():
+    return eg.sample("coffee")[:32, :32]
+
+
+@pytest.mark.parametrize("name", ["fit", "fit_many", "fit_levels", "fit_large", "fit_material"])
+def test_a_mistyped_option_says_the_right_one(name, photo):
+    text = "^unknown option 'itertions'; did you mean 'iterations'\\?$"
+    with pytest.raises(TypeError, match=text):
+        getattr(eg, name)(photo, itertions=5)
+    with pytest.raises(TypeError, match=r"unknown option 'zzz'; use one of .*iterations"):
+        getattr(eg, name)(photo, zzz=5)
+
+
+def test_a_foreign_file_beside_the_photo_is_said_to_be_foreign(
+    photo, tmp_path, monkeypatch, capsys
+):
+    from eigengs_dr.cli.main import main
+
+    monkeypatch.chdir(tmp_path)
+    eg.save_image("photo.png", photo)
+    np.savez("photo.npz", data=np.zeros(3))
+    with pytest.raises(SystemExit):
+        main(["fit", "photo.png"])
+    assert "photo.npz: exists and is no set of Gaussians" in capsys.readouterr().err
+    [row] = eg.fit_many(["photo.png"], ".", iterations=0)
+    assert "exists and is no set of Gaussians" in row.error
+
+
+def test_arrays_of_other_shapes_are_refused_by_name(photo):
+    g = eg.fit(photo, 20, iterations=0).gaussians
+    with pytest.raises(ValueError, match=r"mean has shape \(7, 2\), expected \(20, 2\)"):
+        eg.render(replace(g, mean=g[:7].mean))
+    with pytest.raises(ValueError, match=r"mean has shape \(20, 3\), expected \(20, 2\)"):
+        eg.render(replace(g, mean=g.factor))
+
+
+def test_warnings_point_at_the_line_of_the_user(photo, tmp_path):
+    from PIL import Image
+
+    Image.fromarray(np.zeros((32, 32, 4), np.uint8)).save(tmp_path / "a.png")
+    (tmp_path / "photos").mkdir()
+    eg.save_image(tmp_path / "photos" / "b.png", photo)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        eg.load_image(tmp_path / "a.png")
+        eg.fit(tmp_path / "a.png", 20, iterations=0)
+        eg.Eigenbasis.from_images(tmp_path / "photos", size=(16, 16), components=3)
+    assert len(found) >= 4
+    assert {warning.filename for warning in found} == {__file__}
