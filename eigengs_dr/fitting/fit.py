@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ..eigenbasis.eigengs import EigenGS
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """Result of `fit`.
 

@@ -21,7 +21,7 @@ from .bounds import clip_parameters
 from .file import CUTOFF, SetData, check, read, write
 
 
-@dataclass(repr=False)
+@dataclass(repr=False, eq=False)
 class Gaussians:
     """N two-dimensional Gaussians and a constant background: an image of any size.
 

@@ -37,8 +37,8 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
 
     Parameters
     ----------
-    a, b : array_like of float, shape (H, W, 3) or (H, W, 1)
-        RGB or grey, 1 is white. Their order does not matter. Light from `eigengs_dr.load_image` is
+    a, b : array_like, shape (H, W, 3) or (H, W, 1)
+        RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to [0, 1]). Their order does not matter. Light from `eigengs_dr.load_image` is
         encoded as sRGB first.
     space : {"rgb", "ycbcr", "data", "pu21"}
         Space in which the mean squared error over all pixels and channels is computed.
@@ -155,8 +155,8 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
 
     Parameters
     ----------
-    a, b : array_like of float, shape (H, W, 3) or (H, W, 1)
-        RGB or grey, 1 is white. Their order does not matter.
+    a, b : array_like, shape (H, W, 3) or (H, W, 1)
+        RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to [0, 1]). Their order does not matter.
 
     Returns
     -------
@@ -203,8 +203,8 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
 
     Parameters
     ----------
-    a, b : array_like of float, shape (H, W, 3) or (H, W, 1)
-        RGB or grey, 1 is white. Their order does not matter.
+    a, b : array_like, shape (H, W, 3) or (H, W, 1)
+        RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to [0, 1]). Their order does not matter.
     space : {"ycbcr", "data"}
         Channels to compare: Y, Cb and Cr, or the channels of the images.
 
@@ -240,10 +240,21 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     return float(product.mean())
 
 
+def _scaled(image: NDArray[Any]) -> NDArray[Any]:
+    """Scale integers to [0, 1] by their type; floats stay as they are."""
+    if image.dtype.kind == "f":
+        return image
+    if image.dtype.kind == "b":
+        return image.astype(np.float64)
+    if image.dtype.kind == "u" and image.itemsize <= 2:
+        return image / np.float64(np.iinfo(image.dtype).max)
+    raise ValueError(f"pixels are {image.dtype}; expected uint8, uint16 or floats in [0, 1]")
+
+
 def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return both images as RGB of one shape (H, W, 3) without a copy; grey is replicated."""
     x, y = (
-        check_image(image) if isinstance(image, LinearImage) else np.asarray(image)
+        check_image(image) if isinstance(image, LinearImage) else _scaled(np.asarray(image))
         for image in (a, b)
     )
     if x.shape != y.shape:

@@ -35,8 +35,9 @@ class ImageError(ValueError):
 class LinearImage(np.ndarray):
     """An array of linear light, which `eigengs_dr.fit` and `eigengs_dr.save_image` know as such.
 
-    It is a `numpy.ndarray` in every other way. Parts of it, and results of arithmetic with it, are
-    linear light too; `numpy.asarray` makes a plain array of it, whose pixels count as sRGB.
+    It is a `numpy.ndarray` in every other way. Parts, sums, clamped values and multiples of it are
+    linear light too. All else, as powers, comparisons and integers, is a plain array, and so is
+    what `numpy.asarray` makes of it: its pixels count as sRGB.
 
     Attributes
     ----------
@@ -51,6 +52,34 @@ class LinearImage(np.ndarray):
     """
 
     encoding = "linear"
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        """Compute with plain arrays, and mark the result if it is still linear light."""
+        light = [isinstance(x, LinearImage) for x in inputs]
+        plain = [np.asarray(x) if mark else x for x, mark in zip(inputs, light, strict=True)]
+        if "out" in options:
+            options["out"] = tuple(
+                np.asarray(x) if isinstance(x, LinearImage) else x for x in options["out"]
+            )
+        found = getattr(ufunc, method)(*plain, **options)
+        linear = (
+            ufunc in _LINEAR
+            or ufunc.__name__ == "clip"
+            or (ufunc is np.multiply and method == "__call__" and sum(light) == 1)
+            or (ufunc is np.true_divide and light == [True, False])
+        )
+        if linear and isinstance(found, np.ndarray) and found.dtype.kind == "f":
+            return found.view(LinearImage)
+        return found
+
+    def astype(self, dtype: Any, *arguments: Any, **options: Any) -> Any:
+        """Convert as NumPy does; integers are no light."""
+        found = super().astype(dtype, *arguments, **options)
+        return found if found.dtype.kind == "f" else np.asarray(found)
+
+
+_LINEAR = (np.add, np.subtract, np.positive, np.maximum, np.minimum)
+"""Functions whose results are light if an argument is."""
 
 
 def is_bitmap(image: Any) -> bool:
