@@ -87,8 +87,13 @@ def write(path: str | os.PathLike[str], data: SetData) -> None:
     OSError
         If the file cannot be written; an existing file does not change.
     """
-    if Path(path).suffix.lower() == ".egs":
+    suffix = Path(path).suffix.lower()
+    if suffix == ".egs":
         raise ValueError(f"{path}: only eigengs_dr.pack writes .egs files; save as .npz")
+    if suffix in (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".hdr", ".webp"):
+        raise ValueError(
+            f"{path}: a set is no image file; save as .npz, or its picture by save_image"
+        )
     members = to_members(data.arrays, data.size, data.cutoff) | {"space": np.array(data.space)}
     npz.write(path, FORMAT, VERSION, members, compressed=len(members["mean"]) < PLAIN_COUNT)
 

@@ -38,7 +38,8 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     Parameters
     ----------
     a, b : array_like, shape (H, W, 3) or (H, W, 1)
-        RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to [0, 1]). Their order does not matter. Light from `eigengs_dr.load_image` is
+        RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to
+        [0, 1]). Their order does not matter. Light from `eigengs_dr.load_image` is
         encoded as sRGB first.
     space : {"rgb", "ycbcr", "data", "pu21"}
         Space in which the mean squared error over all pixels and channels is computed.
@@ -156,7 +157,8 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
     Parameters
     ----------
     a, b : array_like, shape (H, W, 3) or (H, W, 1)
-        RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to [0, 1]). Their order does not matter.
+        RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to
+        [0, 1]). Their order does not matter.
 
     Returns
     -------
@@ -204,7 +206,8 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     Parameters
     ----------
     a, b : array_like, shape (H, W, 3) or (H, W, 1)
-        RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to [0, 1]). Their order does not matter.
+        RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to
+        [0, 1]). Their order does not matter.
     space : {"ycbcr", "data"}
         Channels to compare: Y, Cb and Cr, or the channels of the images.
 

@@ -77,3 +77,37 @@ def test_sets_compare_by_identity():
         eg.Gaussians.from_arrays([[1, 1]], [[1, 0, 1]], [[1, 1, 1]], size=(8, 8)) for _ in range(2)
     )
     assert a == a and a != b
+
+
+def test_a_size_that_is_not_whole_is_refused():
+    with pytest.raises(ValueError, match="whole pixels"):
+        eg.Gaussians.from_arrays([[1, 1]], [[1, 0, 1]], [[1, 1, 1]], size=(8.0, 8.0))
+
+
+def test_a_tiff_that_claims_too_many_pixels_is_refused_before_it_is_decoded(tmp_path):
+    eg.save_image(tmp_path / "a.tif", LIGHT, bits=16)
+    content = bytearray((tmp_path / "a.tif").read_bytes())
+    tifffile = pytest.importorskip("tifffile")
+    with tifffile.TiffFile(tmp_path / "a.tif") as file:
+        tags = [file.pages[0].tags[name] for name in ("ImageWidth", "ImageLength")]
+        order = file.byteorder
+        for tag in tags:
+            size = 4 if tag.dtype == 4 else 2
+            start = tag.valueoffset
+            content[start : start + size] = (60_000).to_bytes(
+                size, "little" if order == "<" else "big"
+            )
+    (tmp_path / "a.tif").write_bytes(content)
+    with pytest.raises(eg.ImageError, match="more than 536,870,912 pixels"):
+        eg.load_image(tmp_path / "a.tif")
+
+
+def test_floats_from_0_to_255_are_not_written_as_white(tmp_path):
+    with pytest.raises(eg.ImageError, match="divide by 255"):
+        eg.save_image(tmp_path / "a.png", 255 * LIGHT)
+
+
+def test_a_set_is_not_written_under_the_name_of_an_image(tmp_path):
+    one = eg.Gaussians.from_arrays([[1, 1]], [[1, 0, 1]], [[1, 1, 1]], size=(8, 8))
+    with pytest.raises(ValueError, match="save as .npz"):
+        one.save(tmp_path / "a.png")
