@@ -91,9 +91,7 @@ def write(path: str | os.PathLike[str], data: SetData) -> None:
     if suffix == ".egs":
         raise ValueError(f"{path}: only eigengs_dr.pack writes .egs files; save as .npz")
     if suffix in (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".hdr", ".webp"):
-        raise ValueError(
-            f"{path}: a set is no image file; save as .npz, or its picture by save_image"
-        )
+        raise ValueError(f"{path}: a set is no image; save as .npz, its picture by save_image")
     members = to_members(data.arrays, data.size, data.cutoff) | {"space": np.array(data.space)}
     npz.write(path, FORMAT, VERSION, members, compressed=len(members["mean"]) < PLAIN_COUNT)
 
