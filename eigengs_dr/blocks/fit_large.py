@@ -15,7 +15,7 @@ from ..backend.executor import executor_for
 from ..backend.interrupt import defer_interrupts
 from ..backend.selection import select
 from ..fitting.options import FitOptions, named_options
-from ..gaussian.file import CUTOFF, SetData, write
+from ..gaussian.file import CUTOFF, SetData, check_suffix, write
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
 from ..image.metrics import psnr_from_mse
@@ -164,6 +164,7 @@ def fit_large(
     select(backend)
     keep: Any = nullcontext()
     if output is not None:
+        check_suffix(output)
         require_writable(output)
         keep = Checkpoint(output, image.identity | _decisive(options, block), [])
     try:

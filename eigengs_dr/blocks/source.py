@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..image.formats.pillow import image_errors
 from ..image.formats.registry import kind_of
 from ..image.io import ImageError, load_image, open_picture, picture_pixels
 from ..image.pixels import LinearImage, check_data, check_image, encoding_of
@@ -240,6 +241,14 @@ def _loaded(path: str, modified: int, keep_grey: bool) -> Array:
 @lru_cache(maxsize=1)
 def _decoded(path: str, modified: int) -> Any:
     """Decode a file, and keep it for the next window; `modified` tells its versions apart."""
+    from PIL import Image
+
+    # The turn by EXIF, in open_picture, decodes already.
+    with any_size(), image_errors(Path(path)), Image.open(path) as header:
+        if max(header.size) > MAX_SIDE:
+            width, height = header.size
+            limit = f"sides go from 1 to {MAX_SIDE:,}"
+            raise ImageError(f"{path}: {width}x{height} pixels; {limit}")
     with any_size(), open_picture(Path(path)) as picture:
         picture.load()
         return picture

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ..eigenbasis.pca.basis import Eigenbasis
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """Result of `fit`.
 

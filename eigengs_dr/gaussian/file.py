@@ -25,6 +25,9 @@ CUTOFF = 3.0
 """Default cutoff, in standard deviations. At the cutoff a Gaussian has ``exp(-cutoff^2 / 2)`` of
 its amplitude: 1.1 % at 3, 0.034 % at 4, 3.7e-6 at 5."""
 
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".hdr", ".webp")
+"""Suffixes of pictures, which a set is not."""
+
 MAX_CUTOFF = 12.0
 """Largest cutoff, in standard deviations. The fast exponential needs a bound, and ``exp(-72)`` is
 below single precision."""
@@ -92,6 +95,15 @@ class FitFigures(NamedTuple):
     source: str = ""
 
 
+def check_suffix(path: str | os.PathLike[str]) -> None:
+    """Raise ValueError if the suffix of a file for a set says that the file is something else."""
+    suffix = Path(path).suffix.lower()
+    if suffix == ".egs":
+        raise ValueError(f"{path}: only eigengs_dr.pack writes .egs files; save as .npz")
+    if suffix in IMAGE_SUFFIXES:
+        raise ValueError(f"{path}: a set is no image; save as .npz, its picture by save_image")
+
+
 def write(path: str | os.PathLike[str], data: SetData, figures: FitFigures | None = None) -> None:
     """Write a set as an ``.npz`` file in single precision, completely or not at all.
 
@@ -102,8 +114,7 @@ def write(path: str | os.PathLike[str], data: SetData, figures: FitFigures | Non
     OSError
         If the file cannot be written; an existing file does not change.
     """
-    if Path(path).suffix.lower() == ".egs":
-        raise ValueError(f"{path}: only eigengs_dr.pack writes .egs files; save as .npz")
+    check_suffix(path)
     members = to_members(data.arrays, data.size, data.cutoff) | {"space": np.array(data.space)}
     if figures is not None:
         members["figures"] = np.array(figures[:3], np.float64)

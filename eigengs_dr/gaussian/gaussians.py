@@ -21,7 +21,7 @@ from .bounds import clip_parameters
 from .file import CUTOFF, SetData, check, read, write
 
 
-@dataclass(repr=False)
+@dataclass(repr=False, eq=False)
 class Gaussians:
     """N two-dimensional Gaussians and a constant background: an image of any size.
 
@@ -109,6 +109,12 @@ class Gaussians:
         checked = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
         checked.setdefault("background", np.zeros(checked["color"].shape[1:], np.float32))
         try:
+            size = tuple(index(side) for side in size)  # type: ignore[assignment]
+        except TypeError:
+            raise ValueError(
+                f"Gaussians: size is {size}; give whole pixels, as (640, 480)"
+            ) from None
+        try:
             check(SetData(checked, size, space, cutoff))
         except BadValue as error:
             raise ValueError(f"Gaussians: {error}") from None
@@ -118,8 +124,8 @@ class Gaussians:
             factor=types.Float3(*_columns(types, checked["factor"])),
             color=types.FloatX(_columns(types, checked["color"])),
             background=types.FloatX(_columns(types, checked["background"][None])),
-            width=index(size[0]),
-            height=index(size[1]),
+            width=size[0],
+            height=size[1],
             space=space,
             cutoff=float(cutoff),  # a NumPy scalar would promote Dr.Jit arrays to float64
         )

@@ -16,6 +16,7 @@ from .formats.openimageio import ADVICE, is_installed
 from .formats.pillow import SAVE_OPTIONS, image_errors, open_picture, picture_pixels
 from .formats.registry import BITS, FLOAT_SUFFIXES, kind_of, read_deep, turn, write_deep
 from .pixels import (
+    MAX_PIXEL,
     ImageError,
     LinearImage,
     check_data,
@@ -207,6 +208,11 @@ def save_image(
         return write_pixels(path, np.asarray(image), bits)  # large pictures need no copy
     floats = to_floats(image, "image", keep_grey=True, copy=False)
     kind = dtype_of(path, bits)
+    if said != "linear" and kind != np.float32 and MAX_PIXEL < floats.mean() <= 255:
+        raise ImageError(
+            f"{path}: pixels run from {floats.min():g} to {floats.max():g}, and 1 is white; "
+            "divide by 255, or say encoding='linear' for light"
+        )
     pixels = np.empty(floats.shape, kind)
 
     def fill(rows: slice) -> None:

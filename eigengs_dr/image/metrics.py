@@ -38,8 +38,9 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     Parameters
     ----------
     a, b : array_like, shape (H, W, 3) or (H, W, 1)
-        RGB or grey: floats with 1 as white, uint8 or uint16. Their order does not matter. Light
-        from `eigengs_dr.load_image` is encoded as sRGB first.
+        RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to
+        [0, 1]). Their order does not matter. Light from `eigengs_dr.load_image` is
+        encoded as sRGB first.
     space : {"rgb", "ycbcr", "data", "pu21"}
         Space in which the mean squared error over all pixels and channels is computed.
 
@@ -165,7 +166,8 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
     Parameters
     ----------
     a, b : array_like, shape (H, W, 3) or (H, W, 1)
-        RGB or grey: floats with 1 as white, uint8 or uint16. Their order does not matter.
+        RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to
+        [0, 1]). Their order does not matter.
 
     Returns
     -------
@@ -213,7 +215,8 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     Parameters
     ----------
     a, b : array_like, shape (H, W, 3) or (H, W, 1)
-        RGB or grey: floats with 1 as white, uint8 or uint16. Their order does not matter.
+        RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to
+        [0, 1]). Their order does not matter.
     space : {"ycbcr", "data"}
         Channels to compare: Y, Cb and Cr, or the channels of the images.
 
@@ -249,9 +252,23 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     return float(product.mean())
 
 
+def _scaled(image: NDArray[Any]) -> NDArray[Any]:
+    """Scale integers to [0, 1] by their type; floats stay as they are."""
+    if image.dtype.kind == "f":
+        return image
+    if image.dtype.kind == "b":
+        return image.astype(np.float64)
+    if image.dtype.kind == "u" and image.itemsize <= 2:
+        return image / np.float64(np.iinfo(image.dtype).max)
+    raise ValueError(f"pixels are {image.dtype}; expected uint8, uint16 or floats in [0, 1]")
+
+
 def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return both images as RGB of one shape (H, W, 3); grey is replicated, floats not copied."""
-    x, y = _floats(a), _floats(b)
+    """Return both images as RGB of one shape (H, W, 3) without a copy; grey is replicated."""
+    x, y = (
+        check_image(image) if isinstance(image, LinearImage) else _scaled(np.asarray(image))
+        for image in (a, b)
+    )
     if x.shape != y.shape:
         raise ValueError(f"images have shapes {x.shape} and {y.shape}; crop or scale one of them")
     if x.ndim != 3 or x.shape[2] not in (1, 3) or x.size == 0:
@@ -260,19 +277,3 @@ def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
         )
     shape = (*x.shape[:2], 3)
     return np.broadcast_to(x, shape), np.broadcast_to(y, shape)
-
-
-def _floats(image: ArrayLike) -> NDArray[np.floating]:
-    """Return floats as they are, and 8 or 16 bits by the range of their type, as `check_image`."""
-    if isinstance(image, LinearImage):
-        return check_image(image)
-    array = np.asarray(image)
-    if array.dtype.kind == "f":
-        return array
-    if array.dtype.kind == "b":
-        return array.astype(np.float32)
-    if array.dtype not in (np.uint8, np.uint16):
-        raise ValueError(
-            f"images have pixels of {array.dtype}; expected floats with 1 as white, uint8 or uint16"
-        )
-    return array / np.float64(np.iinfo(array.dtype).max)

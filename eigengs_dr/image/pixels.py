@@ -32,19 +32,12 @@ class ImageError(ValueError):
     """An image cannot be used; one line names the image, the reason and what to do."""
 
 
-_LINEAR = {np.add, np.subtract, np.negative, np.positive, np.maximum, np.minimum}
-"""Functions whose results are light if any operand is."""
-
-_SCALING = {np.multiply, np.matmul}
-"""Functions whose results are light if one operand is: light times light is not."""
-
-
 class LinearImage(np.ndarray):
     """An array of linear light, which `eigengs_dr.fit` and `eigengs_dr.save_image` know as such.
 
-    It is a `numpy.ndarray` in every other way. Parts of it are light too, and so are sums,
-    differences, and products and quotients with other numbers. All else makes plain arrays:
-    powers, roots, comparisons, integers. A plain array counts as sRGB; `numpy.asarray` makes one.
+    It is a `numpy.ndarray` in every other way. Parts, sums, clamped values and multiples of it are
+    linear light too. All else, as powers, comparisons and integers, is a plain array, and so is
+    what `numpy.asarray` makes of it: its pixels count as sRGB.
 
     Attributes
     ----------
@@ -60,29 +53,33 @@ class LinearImage(np.ndarray):
 
     encoding = "linear"
 
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
-        """Compute with plain arrays, and mark the result if it is light."""
-        marked = [isinstance(value, LinearImage) for value in inputs]
-        light = ufunc in _LINEAR or (ufunc in _SCALING and sum(marked) == 1)
-        light |= ufunc is np.divide and marked == [True, False]
-        out = kwargs.get("out", ())
-        if out:
-            kwargs["out"] = tuple(_plain(value) for value in out)
-        result = getattr(ufunc, method)(*map(_plain, inputs), **kwargs)
-        if out:
-            return out[0] if len(out) == 1 else out
-        if light and isinstance(result, np.ndarray) and result.dtype.kind == "f":
-            return result.view(LinearImage)
-        return result
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        """Compute with plain arrays, and mark the result if it is still linear light."""
+        light = [isinstance(x, LinearImage) for x in inputs]
+        plain = [np.asarray(x) if mark else x for x, mark in zip(inputs, light, strict=True)]
+        if "out" in options:
+            options["out"] = tuple(
+                np.asarray(x) if isinstance(x, LinearImage) else x for x in options["out"]
+            )
+        found = getattr(ufunc, method)(*plain, **options)
+        linear = (
+            ufunc in _LINEAR
+            or ufunc.__name__ == "clip"
+            or (ufunc in (np.multiply, np.matmul) and method == "__call__" and sum(light) == 1)
+            or (ufunc is np.true_divide and light == [True, False])
+        )
+        if linear and isinstance(found, np.ndarray) and found.dtype.kind == "f":
+            return found.view(LinearImage)
+        return found
 
-    def astype(self, dtype: Any, *args: Any, **kwargs: Any) -> Any:
-        """Convert the numbers; only floats stay light."""
-        found = np.asarray(self).astype(dtype, *args, **kwargs)
-        return found.view(LinearImage) if found.dtype.kind == "f" else found
+    def astype(self, dtype: Any, *arguments: Any, **options: Any) -> Any:
+        """Convert as NumPy does; integers are no light."""
+        found = super().astype(dtype, *arguments, **options)
+        return found if found.dtype.kind == "f" else np.asarray(found)
 
 
-def _plain(value: Any) -> Any:
-    return np.asarray(value) if isinstance(value, LinearImage) else value
+_LINEAR = (np.add, np.subtract, np.positive, np.maximum, np.minimum)
+"""Functions whose results are light if an argument is."""
 
 
 def is_bitmap(image: Any) -> bool:

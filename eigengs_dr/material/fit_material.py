@@ -32,7 +32,7 @@ MIN_MSE = (1 / 255) ** 2 / 12
 """Mean squared error of rounding to 8 bits: maps below it do not get more weight."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MaterialFit:
     """Result of `fit_material`.
 

@@ -21,7 +21,7 @@ from .file import MaterialData, read, write
 from .maps import TextureMap, check_maps, find_map, show_sums, slices
 
 
-@dataclass
+@dataclass(eq=False)
 class Material:
     """Several maps on the same means and shapes: albedo, roughness, normals, ...
 

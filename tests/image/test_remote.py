@@ -109,7 +109,7 @@ def test_commands_take_urls(photos, tmp_path, capsys):
     train = ("train", f"file://{photos}", "--size", "16x16", "--gaussians", 50, "--components", 2)
     assert run(*train, "-o", tmp_path / "model.npz") == 0
     capsys.readouterr()
-    assert run("fit", f"file://{photos}/none.png", "-o", out) == 2
+    assert run("fit", f"file://{photos}/none.png", "-o", tmp_path / "none.npz") == 2
     message = capsys.readouterr().err.strip()
     assert "none.png: cannot be read" in message and "\n" not in message
 

@@ -35,8 +35,8 @@ def is_installed() -> bool:
     return True
 
 
-def read(path: Path) -> Pixels:
-    """Read a PNG of 16 bits or a Radiance HDR file.
+def read(path: Path, integers: bool) -> Pixels:
+    """Read a PNG of 16 bits (`integers`) or a Radiance HDR file; the suffix may be any.
 
     Returns
     -------
@@ -50,7 +50,7 @@ def read(path: Path) -> Pixels:
     """
     oiio = _library()
     file = _open(oiio, path)
-    return _pixels(oiio, file, oiio.UINT16 if path.suffix.lower() == ".png" else oiio.FLOAT)
+    return _pixels(oiio, file, oiio.UINT16 if integers else oiio.FLOAT)
 
 
 def read_exr(path: Path) -> Pixels:

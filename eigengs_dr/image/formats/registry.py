@@ -91,9 +91,9 @@ def read_deep(path: Path) -> DeepPixels | None:
     """
     readers: dict[str | None, Callable[[Path], DeepPixels | None]] = {
         "exr": _read_exr,
-        "hdr": lambda path: DeepPixels(openimageio.read(path)),
+        "hdr": lambda path: DeepPixels(openimageio.read(path, integers=False)),
         "pfm": lambda path: DeepPixels(pfm.read(path)),
-        "png": lambda path: DeepPixels(openimageio.read(path)),
+        "png": lambda path: DeepPixels(openimageio.read(path, integers=True)),
         "tiff": _read_tiff,
     }
     reader = readers.get(kind_of(path))

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 DEEP = ("u2", "f2", "f4", "f8")
 """Types of values that this module reads."""
 
+MAX_PIXELS = 1 << 29
+"""Largest number of pixels, as of other files; a damaged header may claim more than fits."""
+
 PLAIN = (1, 2)
 """Photometric interpretations: black is zero, and RGB."""
 
@@ -38,6 +41,8 @@ def read(path: Path) -> tuple[NDArray[Any], int] | None:
             known = page.dtype is not None and page.dtype.str[1:] in DEEP
             if not known or page.photometric not in PLAIN or page.samplesperpixel > 4:
                 return None
+            if page.imagewidth * page.imagelength > MAX_PIXELS:
+                raise ValueError(f"more than {MAX_PIXELS:,} pixels")
             pixels = page.asarray()
             turned = page.tags["Orientation"].value if "Orientation" in page.tags else 1
             if pixels.ndim == 3 and page.planarconfig == 2:
