@@ -69,6 +69,8 @@ def from_tensors(tensors: Mapping[str, Any], like: Gaussians) -> Gaussians:
     ------
     ValueError
         If shapes do not fit each other.
+    TypeError
+        If a value is no tensor of Dr.Jit.
 
     Examples
     --------
@@ -81,6 +83,11 @@ def from_tensors(tensors: Mapping[str, Any], like: Gaussians) -> Gaussians:
     # The number of Gaussians may only differ from `like` if all of its Gaussians are replaced.
     count = max(counts) if len(counts) == 3 else len(like)
     for name, tensor in given.items():
+        if not dr.is_tensor_v(tensor):
+            raise TypeError(
+                f"{name} is a {type(tensor).__module__}.{type(tensor).__name__}, expected a tensor "
+                "of Dr.Jit; drjit.wrap makes them for functions of PyTorch and JAX"
+            )
         columns = FIELDS[name] or like.channels
         expected = (columns,) if name == "background" else (count, columns)
         if tuple(tensor.shape) != expected or not count:
@@ -92,5 +99,6 @@ def _rows(like: Any, tensor: Any) -> Any:
     """Return the columns of a tensor as a nested array with the type of `like`."""
     types = types_of(like)
     number = tensor.shape[-1]
-    index = dr.arange(types.UInt, dr.width(tensor.array) // number) * number
-    return type(like)([dr.gather(types.Float, tensor.array, index + k) for k in range(number)])
+    values = types.Float(tensor.array)  # of another precision, perhaps
+    index = dr.arange(types.UInt, dr.width(values) // number) * number
+    return type(like)([dr.gather(types.Float, values, index + k) for k in range(number)])

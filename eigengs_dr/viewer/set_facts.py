@@ -72,8 +72,8 @@ def to_text(array: NDArray[Any], kind: DTypeLike) -> str:
 
 
 def light_of(space: str) -> int:
-    """Return what sums are: 0 for codes and data, 1 for linear light, 2 for logarithms of light."""
-    return 2 if space == "log" else int(space in LIGHT)
+    """Return what sums are: 0 codes and data, 1 linear light, 2 logarithms of light, 3 normals."""
+    return {"log": 2, "normal": 3}.get(space, int(space in LIGHT))
 
 
 def channel_views(channels: int) -> list[tuple[str, tuple[int, int, int]]]:

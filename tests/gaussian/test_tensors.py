@@ -88,3 +88,20 @@ def test_colours_of_fewer_splats_than_there_are(backend, count):
     colors = types_of(g.mean).Tensor(np.ones((count, 3), np.float32))
     with pytest.raises(ValueError, match=rf"color has shape \({count}, 3\), expected \(24, 3\)"):
         eg.from_tensors({"color": colors}, like=g)
+
+
+def test_tensors_of_another_precision_are_converted(backend):
+    g = random_scene().on(backend)
+    double = types_of(random_scene().on(backend, bits=64).mean).Tensor
+    colors = double(eg.to_tensors(g)["color"])
+    dr.enable_grad(colors)
+    converted = eg.from_tensors({"color": colors}, like=g)
+    np.testing.assert_array_equal(converted.to_arrays()["color"], g.to_arrays()["color"])
+    dr.backward(dr.sum(converted.color, axis=None))
+    np.testing.assert_array_equal(dr.grad(colors).numpy(), 1)
+
+
+def test_arrays_that_are_no_tensors_are_refused():
+    g = random_scene().on("llvm")
+    with pytest.raises(TypeError, match="color is a numpy.ndarray, expected a tensor of Dr.Jit"):
+        eg.from_tensors({"color": np.ones((24, 3))}, like=g)

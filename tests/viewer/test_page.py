@@ -31,6 +31,12 @@ def test_shows_each_channel_of_data(actual):
     assert differ(tab.image(), whole[..., [4, 4, 4]]) < 0.05
 
 
+def test_normals_have_length_1(actual):
+    gaussians = make_set("normal")
+    tab = actual(eg.view(gaussians))
+    assert differ(tab.image(), codes(gaussians)) < 0.05
+
+
 def test_light_is_exposed(actual):
     gaussians = make_set("radiance")
     tab = actual(eg.view(gaussians))

@@ -71,7 +71,7 @@ uniform vec4 frame, center;
 uniform vec3 background;
 uniform vec2 canvas, imageSize;
 uniform float scale, wipe, share, exposure;
-uniform int light;  // 0: codes as they are, 1: linear light, 2: logarithms of light
+uniform int light;  // 0: codes as they are, 1: linear light, 2: logarithms of light, 3: normals
 out vec4 result;
 
 vec3 toCoded(vec3 x) {
@@ -89,7 +89,11 @@ void main() {
   }
   vec3 sum = background + texelFetch(sums, ivec2(at * share), 0).rgb;
   if (light == 2) sum = (exp(sum * 4.6151205) - 1.0) * 0.01;  // log(101)
-  if (light > 0) sum = toCoded(max(sum, 0.0) * exposure);
+  if (light == 1 || light == 2) sum = toCoded(max(sum, 0.0) * exposure);
+  if (light == 3) {  // as image/normals.py
+    vec3 normal = 2.0 * sum - 1.0;
+    sum = 0.5 + 0.5 * normal * inversesqrt(max(dot(normal, normal), 1e-6));
+  }
   result = vec4(clamp(sum, 0.0, 1.0), 1.0);
 }`;
 
