@@ -226,7 +226,7 @@ def compress(
     if found is None:
         raise ValueError(TOO_FINE)
     packed = found[1].packed
-    after = errors(to_gaussians(packed, gaussians))[-1] + unseen
+    after = max(errors(to_gaussians(packed, gaussians))[-1] + unseen, MIN_MSE)
     return packed, psnr_from_mse(before[-1]) - psnr_from_mse(after)
 
 

@@ -174,3 +174,11 @@ def test_mistakes_leave_the_old_file(fitted, path):
     with pytest.raises(ValueError, match=r"bounded\(\)"):
         eg.pack(far, path)
     assert path.read_text() == "old"
+
+
+def test_a_set_without_error_loses_a_finite_number_of_decibels(tmp_path):
+    image = np.full((16, 16, 3), 0.5, np.float32)
+    exact = eg.fit(image, 4, iterations=0, color="rgb", backend="llvm").gaussians
+    assert eg.psnr(eg.picture_of(exact), image) == math.inf
+    receipt = eg.pack(exact, tmp_path / "a.egs", image)
+    assert 0 <= receipt.psnr_drop <= 0.5
