@@ -19,9 +19,6 @@ from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
 
 from .cone import seen_metric
 
-INSIDE = 0.01
-"""Distance in pixels of clamped points from the border."""
-
 
 def sum_here(texture: Any, x: Any, y: Any, active: Any) -> list:
     """Sum the Gaussians at a point.
@@ -73,9 +70,6 @@ def sum_over_footprint(texture: Any, si: Any, column: tuple, row: tuple, active:
     # an axis on which the point lies outside of a clamped image.
     (x, sx), (y, sy) = column, row
     sx, sy = sx * texture.width, sy * texture.height
-    if texture.wrap == "clamp":  # a footprint without width would count half on a border
-        x = dr.clip(x, INSIDE, texture.width - INSIDE)
-        y = dr.clip(y, INSIDE, texture.height - INSIDE)
     inverse, valid = seen_metric(si, texture.transform.inverse, texture.angle)
     unit, blind = bound_covariance(inverse)
     sizes = (sx * sx, sx * sy, sy * sy)

@@ -157,13 +157,31 @@ def flat_middle():
 class TestWhere:
     @pytest.mark.parametrize(
         ("wrap", "inside"),
-        [("repeat", [0.8, 0.25]), ("mirror", [0.2, 0.75]), ("clamp", [0.0, 1.0])],
+        [
+            ("repeat", [0.8, 0.25]),
+            ("mirror", [0.2, 0.75]),
+            ("clamp", [0.5 / SIZE[0], 1 - 0.5 / SIZE[1]]),
+        ],
     )
     def test_outside_of_the_image(self, wrap, inside):
         tex = texture(gaussians(), wrap_mode=wrap)
         found = np.array(tex.eval(at(mi.Float(-0.2), mi.Float(1.25))))
         expected = np.array(tex.eval(at(mi.Float(inside[0]), mi.Float(inside[1]))))
         np.testing.assert_allclose(found, expected, atol=1e-5)
+
+    def test_a_clamped_texture_repeats_the_centres_of_pixels_as_a_bitmap(self):
+        """Further out than the centres of the outermost pixels, Gaussians fall off."""
+        g = gaussians("data")
+        data = mi.TensorXf(eg.render(g).numpy())
+        bitmap = {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"}
+        u, v = np.meshgrid([-0.3, 0.1 / SIZE[0], 1.7], (np.arange(SIZE[1]) + 0.5) / SIZE[1])
+        si = at(*(mi.Float(np.float32(k.ravel())) for k in (u, v)))
+        expected = np.array(mi.load_dict(bitmap).eval(si))
+        for prefilter in (0.0, 1e-6):
+            si.t, si.wi, si.sh_frame = 1.0, mi.Vector3f(0, 0, 1), mi.Frame3f([0, 0, 1])
+            si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+            found = np.array(texture(g, wrap_mode="clamp", prefilter=prefilter).eval(si))
+            np.testing.assert_allclose(found, expected, atol=1e-3)
 
     @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
     @pytest.mark.parametrize("prefilter", [0.0, 0.001])

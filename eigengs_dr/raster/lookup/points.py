@@ -127,19 +127,21 @@ def fold(x: Any, side: int, wrap: str) -> tuple[Any, Any]:
     side : int
         Width or height of the image, in pixels.
     wrap : {"repeat", "mirror", "clamp"}
-        Continuation of the image outside its borders.
+        Continuation of the image outside its borders. "clamp" repeats the centres of the outermost
+        pixels, as Mitsuba's ``bitmap``: further out, Gaussians fall off.
 
     Returns
     -------
     x : Float
-        In [0, side]; NaN and infinities become 0.
+        In [0, side], with "clamp" in [0.5, side - 0.5]; NaN and infinities become 0, or 0.5.
     slope : Float
         The derivative: 1, or -1 in a mirrored copy, or 0 in a clamped part.
     """
     x = dr.select(dr.isfinite(x), x, 0)
     one = type(x)(1)
     if wrap == "clamp":
-        return dr.clip(x, 0, side), dr.select((x >= 0) & (x <= side), one, 0)
+        first, last = 0.5, side - 0.5
+        return dr.clip(x, first, last), dr.select((x >= first) & (x <= last), one, 0)
     period = dr.floor(x * (1 / side))
     # Far from the image, rounding errors exceed its size.
     local = dr.clip(dr.fma(period, -side, x), 0, side)

@@ -185,7 +185,7 @@ class TestFold:
         [
             ("repeat", [8, 3, 3, 3, 8], [1, 1, 1, 1, 1]),
             ("mirror", [2, 3, 7, 3, 8], [-1, 1, -1, 1, 1]),
-            ("clamp", [0, 3, 10, 10, 0], [0, 1, 0, 0, 0]),
+            ("clamp", [0.5, 3, 9.5, 9.5, 0.5], [0, 1, 0, 0, 0]),
         ],
     )
     def test_known_values(self, backend, wrap, expected, slope):
@@ -204,9 +204,9 @@ class TestFold:
         assert slope[0] in (-1, 0, 1)
 
     @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
-    def test_what_is_not_finite_becomes_zero(self, backend, wrap):
+    def test_what_is_not_finite_becomes_the_first_place(self, backend, wrap):
         found, _ = self.folded(backend, [np.nan, np.inf, -np.inf], wrap)
-        np.testing.assert_array_equal(found, 0)
+        np.testing.assert_array_equal(found, 0.5 if wrap == "clamp" else 0)
 
 
 @pytest.mark.parametrize(("count", "side"), [(1, 256), (500, 8), (5000, 4), (65536, 1)])
