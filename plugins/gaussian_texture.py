@@ -7,6 +7,7 @@ derivatives inside a virtual call. So the class below only passes arrays to the 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -31,6 +32,7 @@ from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
 from eigengs_dr.raster.render import decode_parameters
 
 from .cone import footprint_inputs
+from .derived import derived
 from .emission import emission_of
 from .lookup import sum_here, sum_over_footprint
 from .properties import cutoff, file_name, prefilter, raw, source_of, wrap_mode
@@ -111,23 +113,36 @@ def gaussian_texture() -> type:
 
         def _take_over(self, moved: bool) -> None:
             """Take over the Gaussians; with new lists if they have moved."""
-            parameters = decode_parameters(self.source.gaussians())
-            shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
+            inputs = self.source.inputs()
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
             if moved:
-                self._list([dr.detach(s) for s in shape])
-            self.background = [keep_finite(b) for b in parameters.background]
-            self.packed = pack_parameters([*shape, *color])
+                fixed = self.source.gaussians(dr.detach(inputs))
+                self._list(list(decode_parameters(fixed).shape))
+            found = derived(inputs, self._prepare)
+            self.packed, self.background = found["packed"], found["background"]
+            self.arranged = found["arranged"]
             if self.filtered():
-                self.arranged = arrange(self.cells.splat, shape, color)
-            else:
-                self.arranged = in_list_order(self.cells.splat, [*shape, *color])
-            dr.eval(self.packed, self.background, self.arranged)
-            if self.filtered():
-                number = NUM_SHAPE_PARAMS + self.channels
-                self.pyramid = build_pyramid(self.sizes, self.packed, number, self.cutoff)
-                self.average = pyramid_mean(self.pyramid)
-                dr.eval(self.average)
+                self.pyramid = replace(self.levels, values=found["values"])
+                self.average = found["average"]
+
+        def _prepare(self, inputs: dict[str, Any]) -> dict[str, Any]:
+            """Compute what lookups read from the parameters."""
+            parameters = decode_parameters(self.source.gaussians(inputs))
+            shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
+            found: dict[str, Any] = {"background": [keep_finite(b) for b in parameters.background]}
+            found["packed"] = pack_parameters([*shape, *color])
+            if not self.filtered():
+                found["arranged"] = in_list_order(self.cells.splat, [*shape, *color])
+                dr.eval(found)
+                return found
+            found["arranged"] = arrange(self.cells.splat, shape, color)
+            dr.eval(found)
+            number = NUM_SHAPE_PARAMS + self.channels
+            pyramid = build_pyramid(self.sizes, found["packed"], number, self.cutoff)
+            self.levels = replace(pyramid, values=None)
+            found |= {"values": pyramid.values, "average": pyramid_mean(pyramid)}
+            dr.eval(found["average"])
+            return found
 
         def _list(self, shape: list) -> None:
             """List the Gaussians near every cell."""

@@ -128,8 +128,12 @@ class FromSet:
         for name, tensor in self.tensors.items():
             callback.put(name, tensor, mi.ParamFlags.Differentiable)
 
-    def gaussians(self) -> Gaussians:
-        """Return the set of the parameters; gradients flow back to them.
+    def inputs(self) -> dict[str, Any]:
+        """Return the parameters by name."""
+        return self.tensors
+
+    def gaussians(self, inputs: dict[str, Any]) -> Gaussians:
+        """Return the set of some `inputs`; gradients flow back to them.
 
         Raises
         ------
@@ -137,7 +141,7 @@ class FromSet:
             If the shapes of the parameters do not match.
         """
         try:
-            return from_tensors(self.tensors, self.start)
+            return from_tensors(inputs, self.start)
         except ValueError as error:
             raise ValueError(f"gaussian_texture: {error}") from error
 
@@ -184,8 +188,12 @@ class FromModel:
         """Show the coefficients to `mitsuba.traverse`."""
         callback.put("coefficients", self.coefficients, mi.ParamFlags.Differentiable)
 
-    def gaussians(self) -> Gaussians:
-        """Return the set of the coefficients; gradients flow back to them.
+    def inputs(self) -> dict[str, Any]:
+        """Return the coefficients by their name."""
+        return {"coefficients": self.coefficients}
+
+    def gaussians(self, inputs: dict[str, Any]) -> Gaussians:
+        """Return the set of some `inputs`; gradients flow back to them.
 
         Raises
         ------
@@ -193,7 +201,8 @@ class FromModel:
             If the coefficients have the wrong shape.
         """
         start, expected = self.start, (len(self.weights), self.weights[0].shape[1])
-        found = tuple(self.coefficients.shape)
+        coefficients = inputs["coefficients"]
+        found = tuple(coefficients.shape)
         if found != expected:
             raise ValueError(
                 f"gaussian_texture: coefficients has shape {found}, expected {expected}"
@@ -203,7 +212,7 @@ class FromModel:
         colors, background = [], []
         splat, last = dr.arange(types.UInt, count), types.UInt(count)
         for c, weights in enumerate(self.weights):
-            row = dr.gather(types.Float, self.coefficients.array, _run(c, expected[1]))
+            row = dr.gather(types.Float, coefficients.array, _run(c, expected[1]))
             # An optimiser may leave values that are not finite; times zero weights, they give NaN.
             row = mi.TensorXf(dr.select(dr.isfinite(row), row, 0), (expected[1], 1))
             change = (weights @ row).array

@@ -113,6 +113,34 @@ class TestIntegrators:
         found = (np.array(image) * upstream()).sum()
         assert found == pytest.approx((expected * direction).sum(), rel=1e-3)
 
+    def along_parameters(self, integrator, names, prefilter=0.0):
+        """A picture whose parameters depend on one variable, and this variable."""
+        scene = small_scene(wall(gaussians(), prefilter=prefilter), integrator, SIDE, 8)
+        parameters, along = of_texture(scene), mi.Float(0)
+        dr.enable_grad(along)
+        for name in names:
+            start = mi.TensorXf(parameters[f"{TEXTURE}.{name}"])
+            parameters[f"{TEXTURE}.{name}"] = start + along * mi.TensorXf(direction_like(start))
+        parameters.update()
+        return mi.render(scene, parameters, seed=SEED, spp=8), along
+
+    @pytest.mark.parametrize("integrator", ["direct", "prb"])
+    @pytest.mark.parametrize("names", [[name] for name in PARAMETERS] + [PARAMETERS])
+    def test_forward_mode_in_the_usual_order(self, integrator, names):
+        """Rendered first and walked then, from a variable behind the parameters."""
+        image, along = self.along_parameters(integrator, names)
+        dr.forward(along)
+        found = (np.array(dr.grad(image)) * upstream()).sum()
+        image, along = self.along_parameters(integrator, names)
+        dr.backward(dr.sum(image * mi.TensorXf(upstream()), axis=None))
+        assert abs(dr.grad(along)[0]) > 1e-3
+        assert found == pytest.approx(dr.grad(along)[0], rel=1e-3)
+
+    def test_forward_mode_of_a_prefilter_says_that_there_is_none(self):
+        _, along = self.along_parameters("prb", ["color"], prefilter=0.05)
+        with pytest.raises(RuntimeError, match="no forward mode with a prefilter"):
+            dr.forward(along)
+
 
 class TestBroken:
     @pytest.mark.parametrize("name", PARAMETERS)
