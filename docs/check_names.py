@@ -1,9 +1,11 @@
 """List the names in the manual that the package does not have: ``python docs/check_names.py``."""
 
+import ast
 import importlib
 import re
 import sys
 from pathlib import Path
+from types import ModuleType
 
 FOLDER = Path(__file__).parent
 NAME = re.compile(r"`(eigengs_dr(?:\.\w+)+)`(?:, `(\w+)` \|)?")
@@ -13,19 +15,36 @@ FORMATS = {f"eigengs_dr.{kind}" for kind in ("gaussians", "eigenbasis", "model",
 
 
 def exists(name: str) -> bool:
-    """Tell whether a dotted name can be imported, or is an attribute of what can be."""
+    """Tell whether a dotted name is a module, or is defined where the name says.
+
+    A package may name what its modules define. A module that only imports a name has it not.
+    """
     parts = name.split(".")
     for split in range(len(parts), 0, -1):
         try:
             found = importlib.import_module(".".join(parts[:split]))
         except ImportError:
             continue
+        if split < len(parts) and not hasattr(found, "__path__") and parts[split] not in own(found):
+            return False
         for part in parts[split:]:
             if not hasattr(found, part):
                 return False
             found = getattr(found, part)
         return True
     return False
+
+
+def own(module: ModuleType) -> set[str]:
+    """Return the names that a module defines itself, at its top level."""
+    names: set[str] = set()
+    for node in ast.parse(Path(str(module.__file__)).read_text()).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names |= {n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)}
+    return names
 
 
 def missing() -> list[str]:

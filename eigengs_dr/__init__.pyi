@@ -22,7 +22,7 @@ from .image.samples import sample
 from .material.fit_material import MaterialFit, fit_material
 from .material.material import Material
 from .plugins import register_plugins
-from .raster.render import picture_of, render
+from .raster.render import picture_of, render, tile_lists
 from .scene.convert import ConvertedScene, convert_scene
 from .scene.fit_scene import fit_for_scene
 from .viewer.page import Page
@@ -71,6 +71,7 @@ __all__ = [
     "sample",
     "save_image",
     "ssim",
+    "tile_lists",
     "to_tensors",
     "view",
 ]

@@ -56,9 +56,9 @@ def types_of(array: Any) -> ArrayTypes:
     return _types(module, 64 if dr.type_v(leaf) == dr.VarType.Float64 else 32)
 
 
-def types_in(module: Any) -> ArrayTypes:
-    """Return the single-precision types of ``drjit.llvm.ad`` or ``drjit.cuda.ad``."""
-    return _types(module.__name__, 32)
+def types_in(module: Any, bits: int = 32) -> ArrayTypes:
+    """Return the types of ``drjit.llvm.ad`` or ``drjit.cuda.ad`` with 32 or 64 bits a float."""
+    return _types(module.__name__, bits)
 
 
 def _types(module: str, bits: int) -> ArrayTypes:

@@ -139,8 +139,8 @@ def _retire(release: Callable[[], Any]) -> None:
 
 
 def _clear_retired() -> None:
-    """Free what nobody uses any more, unless a program is being called."""
-    while _retired and not _calls:
+    """Free what nobody uses any more, unless a program is being called, or a user's is recorded."""
+    while _retired and not _calls and not dr.flag(dr.JitFlag.FreezingScope):
         _retired.popleft()()
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..backend.arrays import types_in, types_of, upload, upload_rows
 from ..backend.display import to_html
@@ -79,8 +79,9 @@ class Gaussians:
         space: str = "ycbcr",
         backend: str | None = None,
         cutoff: float = CUTOFF,
+        dtype: DTypeLike = np.float32,
     ) -> Gaussians:
-        """Create a set from NumPy arrays, in single precision.
+        """Create a set from NumPy arrays.
 
         Parameters
         ----------
@@ -97,6 +98,8 @@ class Gaussians:
             See `Gaussians`.
         backend : {"llvm", "cuda"}, optional
             By default "cuda" if the machine has a CUDA GPU, else "llvm".
+        dtype : {numpy.float32, numpy.float64}, optional
+            Precision of the arrays, of renderings and of derivatives.
 
         Raises
         ------
@@ -106,8 +109,11 @@ class Gaussians:
         arrays = {"mean": mean, "factor": factor, "color": color}
         if background is not None:
             arrays["background"] = background
-        checked = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
-        checked.setdefault("background", np.zeros(checked["color"].shape[1:], np.float32))
+        kind = np.dtype(dtype)
+        if kind not in (np.float32, np.float64):
+            raise ValueError(f"Gaussians: dtype is {kind}; give numpy.float32 or numpy.float64")
+        checked = {k: np.asarray(v, kind) for k, v in arrays.items()}
+        checked.setdefault("background", np.zeros(checked["color"].shape[1:], kind))
         try:
             size = tuple(index(side) for side in size)  # type: ignore[assignment]
         except TypeError:
@@ -118,7 +124,7 @@ class Gaussians:
             check(SetData(checked, size, space, cutoff))
         except BadValue as error:
             raise ValueError(f"Gaussians: {error}") from None
-        types = types_in(select(backend))
+        types = types_in(select(backend), 8 * kind.itemsize)
         return cls(
             mean=types.Float2(*_columns(types, checked["mean"])),
             factor=types.Float3(*_columns(types, checked["factor"])),
@@ -131,11 +137,18 @@ class Gaussians:
         )
 
     @classmethod
-    def from_data(cls, data: SetData, backend: str | None = None) -> Gaussians:
-        """Create a set from the content of a file; for the backend and errors see `from_arrays`."""
+    def from_data(
+        cls, data: SetData, backend: str | None = None, dtype: DTypeLike = np.float32
+    ) -> Gaussians:
+        """Create a set from the content of a file; for the arguments see `from_arrays`."""
         arrays: dict[str, Any] = data.arrays
         return cls.from_arrays(
-            **arrays, size=data.size, space=data.space, backend=backend, cutoff=data.cutoff
+            **arrays,
+            size=data.size,
+            space=data.space,
+            backend=backend,
+            cutoff=data.cutoff,
+            dtype=dtype,
         )
 
     def data(self) -> SetData:
@@ -260,6 +273,7 @@ class Gaussians:
         path: str | os.PathLike[str],
         backend: str | None = None,
         sections: int | None = None,
+        dtype: DTypeLike = np.float32,
     ) -> Gaussians:
         """Read a set that `save` or `eigengs_dr.pack` wrote.
 
@@ -271,6 +285,8 @@ class Gaussians:
         sections : int, optional
             Number of sections to read from the start of an ``.egs`` file, which may end after
             them. By default all sections.
+        dtype : {numpy.float32, numpy.float64}, optional
+            As for `from_arrays`. Files hold single precision.
 
         Raises
         ------
@@ -280,7 +296,7 @@ class Gaussians:
         OSError
             If the file cannot be opened.
         """
-        return cls.from_data(read(Path(path), sections), backend)
+        return cls.from_data(read(Path(path), sections), backend, dtype)
 
 
 def broadcast(row: Any, count: int) -> Any:

@@ -35,6 +35,7 @@ def render(
     width: int | None = None,
     height: int | None = None,
     cutoff: float | None = None,
+    lists: TileLists | None = None,
 ) -> Any:
     """Render a set of Gaussians at any size.
 
@@ -51,6 +52,9 @@ def render(
         aspect ratio gives the other.
     cutoff : float, optional
         Standard deviations at which a Gaussian ends, in (0, 12]; by default the cutoff of the set.
+    lists : TileLists, optional
+        What `tile_lists` returned for this set, its size and its cutoff, or for a set that it was
+        a few steps ago. By default they are made anew, which `drjit.freeze` cannot record.
 
     Returns
     -------
@@ -60,17 +64,17 @@ def render(
     Raises
     ------
     ValueError
-        If a side is not positive, the image is too large to index by 32 bits, or the cutoff is not
-        in (0, 12].
+        If a side is not positive, the image is too large to index by 32 bits, the cutoff is not
+        in (0, 12], the lists are of another size or number of Gaussians, or `drjit.freeze` records
+        without lists.
 
     Notes
     -----
     The order of summation depends only on the input, so renderings on one machine and backend are
     equal bit by bit. A Gaussian is not drawn if its mean or factor is not finite. If its colour is
     not finite, pixels of the tiles that it touches may be wrong. `drjit.freeze` cannot record
-    `render`, because the construction of tile lists reads sizes back. Freeze a function that takes
-    the result of `bin_gaussians` and calls `rasterize`, as `eigengs_dr.fitting.optimizers.descent`
-    does.
+    the construction of tile lists, which reads sizes back: make them by `tile_lists`, and give them
+    to the frozen function as an argument.
 
     Examples
     --------
@@ -81,17 +85,69 @@ def render(
     """
     gaussians = set_of(gaussians)
     _check_rows(gaussians)
-    width, height = _size(gaussians, width, height)
-    check_index_range(width, height, gaussians.channels, TILE)
-    scaled = gaussians.scaled(width, height)
-    if cutoff is not None:
-        # A NumPy scalar would promote Dr.Jit arrays to float64.
-        scaled = replace(scaled, cutoff=float(cutoff))
+    scaled = _at_size(gaussians, width, height, cutoff)
     parameters = decode_parameters(scaled)
-    lists = bin_gaussians(scaled, adjoint=dr.grad_enabled(parameters))
+    if lists is not None:
+        _check_lists(lists, scaled)
+    elif dr.flag(dr.JitFlag.FreezingScope):
+        raise ValueError(
+            "render: drjit.freeze cannot record how tile lists are made; make them by "
+            "eigengs_dr.tile_lists before, and give them to the frozen function as an argument"
+        )
+    else:
+        lists = bin_gaussians(scaled, adjoint=dr.grad_enabled(parameters))
     image = rasterize(parameters, lists, scaled.cutoff)
     tensor = to_tensor(image, lists.grid, len(parameters.background))
     return from_sum(gaussians.space, tensor)
+
+
+@exclusive()
+def tile_lists(
+    gaussians: Gaussians | Fit,
+    width: int | None = None,
+    height: int | None = None,
+    cutoff: float | None = None,
+    margin: float = 0.0,
+) -> TileLists:
+    """List the Gaussians that each tile of a rendering needs, for `render` inside `drjit.freeze`.
+
+    Lists carry no derivatives. Within the margin, a tile that a Gaussian newly reaches is listed
+    already. Beyond it the rendering misses that Gaussian there, and so do the derivatives: make the
+    lists anew every few steps.
+
+    Parameters
+    ----------
+    gaussians : Gaussians or Fit
+    width, height, cutoff : optional
+        As for `render`, which must get the same.
+    margin : float, optional
+        Pixels of the rendering by which Gaussians may move or grow before lists miss a tile.
+
+    Returns
+    -------
+    TileLists
+        A PyTree of Dr.Jit arrays. A frozen function is recorded again when their sizes change.
+
+    Raises
+    ------
+    ValueError
+        As for `render`; or if the margin is not finite or below 0.
+
+    Examples
+    --------
+    >>> import drjit as dr
+    >>> import eigengs_dr as eg
+    >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
+    >>> frozen = dr.freeze(lambda g, lists: eg.render(g, lists=lists))
+    >>> frozen(g, eg.tile_lists(g)).shape
+    (8, 8, 1)
+    """
+    gaussians = set_of(gaussians)
+    _check_rows(gaussians)
+    if not 0 <= margin < np.inf:
+        raise ValueError(f"margin is {margin}; it must be finite and at least 0 pixels")
+    scaled = _at_size(dr.detach(gaussians), width, height, cutoff)
+    return bin_gaussians(scaled, float(margin))
 
 
 @exclusive()
@@ -131,6 +187,29 @@ def _check_rows(gaussians: Gaussians) -> None:
                 f"Gaussians: {name} has shape ({dr.width(array)}, {len(array)}), expected "
                 f"({count}, {rows})"
             )
+
+
+def _check_lists(lists: TileLists, gaussians: Gaussians) -> None:
+    """Raise ValueError for lists of another size or number of Gaussians."""
+    assert lists.pieces is not None
+    found = lists.grid.width, lists.grid.height, dr.width(lists.pieces.number)
+    wanted = gaussians.width, gaussians.height, len(gaussians)
+    if found != wanted:
+        raise ValueError(
+            "render: the lists are of {}x{} pixels and {} Gaussians, ".format(*found)
+            + "the rendering has {}x{} and {}; make them anew by tile_lists".format(*wanted)
+        )
+
+
+def _at_size(
+    gaussians: Gaussians, width: int | None, height: int | None, cutoff: float | None
+) -> Gaussians:
+    """Return the set at the size and with the cutoff of a rendering."""
+    width, height = _size(gaussians, width, height)
+    check_index_range(width, height, gaussians.channels, TILE)
+    scaled = gaussians.scaled(width, height)
+    # A NumPy scalar would promote Dr.Jit arrays to float64.
+    return scaled if cutoff is None else replace(scaled, cutoff=float(cutoff))
 
 
 def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[int, int]:

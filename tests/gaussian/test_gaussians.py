@@ -9,6 +9,7 @@ import pytest
 from _helpers.sets import COUNT, NAMES, SIZE, arrays_of, check_equal, random_scene
 from eigengs_dr.backend.selection import select
 from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.raster.render import render
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 7])
@@ -191,3 +192,26 @@ def test_sets_are_trees_of_arrays(backend):
     assert isinstance(gradient, Gaussians)
     np.testing.assert_allclose(gradient.color, 2 * gaussians.to_arrays()["color"].T, rtol=1e-6)
     assert not dr.grad_enabled(dr.detach(gaussians).mean)
+
+
+def test_sets_in_double_precision(backend, tmp_path):
+    """Values keep 64 bits, renderings have them, and files hold 32."""
+    arrays = arrays_of(random_scene())
+    arrays = {name: np.asarray(array, np.float64) + 1e-9 for name, array in arrays.items()}
+    g = Gaussians.from_arrays(**arrays, size=SIZE, space="data", backend=backend, dtype=np.float64)
+    for name, array in g.to_arrays().items():
+        np.testing.assert_array_equal(array, arrays[name])
+    single = Gaussians.from_arrays(**arrays, size=SIZE, space="data", backend=backend)
+    picture = render(g)
+    assert picture.numpy().dtype == np.float64
+    np.testing.assert_allclose(picture.numpy(), render(single).numpy(), atol=1e-4)
+    g.save(tmp_path / "g.npz")
+    again = Gaussians.load(tmp_path / "g.npz", backend, dtype="float64")
+    assert type(again.mean) is type(g.mean)
+    np.testing.assert_array_equal(again.mean.numpy(), single.mean.numpy())
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.int32, complex])
+def test_other_precisions_are_refused(dtype):
+    with pytest.raises(ValueError, match=r"give numpy\.float32 or numpy\.float64"):
+        Gaussians.from_arrays([[4, 5]], [[1, 0, 1]], [[1]], size=(8, 8), dtype=dtype)

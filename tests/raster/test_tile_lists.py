@@ -1,0 +1,90 @@
+"""Renderings with lists that were made before: recorded by `drjit.freeze`, and while sets move."""
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.sets import SIZE, arrays_of, random_scene
+from eigengs_dr.backend import recording
+
+NAMES = ("mean", "factor", "color", "background")
+
+
+def on(backend, count=30, dtype=np.float32):
+    arrays = arrays_of(random_scene(count=count))
+    return eg.Gaussians.from_arrays(**arrays, size=SIZE, space="rgb", backend=backend, dtype=dtype)
+
+
+def step(gaussians, lists, size):
+    """The picture, and the gradient of its mean square."""
+    gaussians = dr.detach(gaussians)
+    dr.enable_grad(gaussians)
+    picture = eg.render(gaussians, *size, lists=lists)
+    dr.backward(dr.mean(dr.square(picture), axis=None))
+    return dr.detach(picture), dr.grad(gaussians)
+
+
+@pytest.mark.parametrize("size", [(), (50, 37)])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_frozen_rendering_and_its_gradient(backend, size, dtype):
+    """The bits of plain ones, in the recording, in replays, and with other values."""
+    g = on(backend, dtype=dtype)
+    frozen = dr.freeze(lambda g, lists: step(g, lists, size))
+    for shift in (0, 0, 0.25, 0.5):
+        moved = replace(g, mean=g.mean + shift)
+        found, wanted = frozen(moved, eg.tile_lists(moved, *size)), step(moved, None, size)
+        np.testing.assert_array_equal(found[0].numpy(), wanted[0].numpy())
+        for name in NAMES:
+            pair = [getattr(gradient, name).numpy() for gradient in (found[1], wanted[1])]
+            np.testing.assert_array_equal(*pair)
+
+
+def test_without_lists_a_recording_says_what_to_do(backend):
+    g = on(backend)
+    with pytest.raises(RuntimeError) as error:
+        dr.freeze(eg.render)(g)
+    assert "make them by eigengs_dr.tile_lists" in str(error.value.__cause__)
+    assert eg.render(g).numpy().any()  # Dr.Jit goes on
+
+
+def test_lists_serve_sets_that_move_within_the_margin(backend):
+    g = on(backend)
+    moved = replace(g, mean=g.mean + 1)
+    wanted = eg.render(moved).numpy()
+    assert (eg.render(moved, lists=eg.tile_lists(g)).numpy() != wanted).any()
+    found = eg.render(moved, lists=eg.tile_lists(g, margin=1.5)).numpy()
+    np.testing.assert_allclose(found, wanted, atol=1e-6)
+
+
+def test_lists_of_another_size_or_number_are_refused(backend):
+    g = on(backend)
+    lists = eg.tile_lists(g)
+    with pytest.raises(ValueError, match="make them anew by tile_lists"):
+        eg.render(g, width=99, lists=lists)
+    with pytest.raises(ValueError, match=r"the lists are of .* 30 Gaussians"):
+        eg.render(g[:20], lists=lists)
+
+
+@pytest.mark.parametrize("margin", [-1, np.nan, np.inf])
+def test_margins_that_are_refused(backend, margin):
+    with pytest.raises(ValueError, match="margin is"):
+        eg.tile_lists(on(backend), margin=margin)
+
+
+def test_nothing_is_freed_while_a_user_records(backend):
+    """What other threads dropped waits until the recording has ended."""
+    freed, seen, g = [], [], on(backend)
+
+    def program(g, lists):
+        recording._retired.append(lambda: freed.append(True))
+        picture = eg.render(g, lists=lists)
+        seen.extend(freed)
+        return picture
+
+    dr.freeze(program)(g, eg.tile_lists(g))
+    assert not seen
+    with eg.exclusive():
+        assert freed

@@ -1,0 +1,195 @@
+"""Pages of the manual: their Python runs in order, and what they claim of derivatives holds."""
+
+import re
+import runpy
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from eigengs_dr.fitting.optimizers.schedule import first_phase, next_build, relocations
+from eigengs_dr.fitting.presets import PRESETS
+
+FOLDER = Path(__file__).parent.parent / "docs"
+STEP = 1e-7  # so small that no pixel meets its target, where L1 has no derivative
+BLOCK = re.compile(r"(<!-- not run -->\n)?^```python\n(.*?)^```", re.M | re.S)
+
+
+def run_page(name, gaussians=None):
+    """Run the blocks of a page as one program, perhaps with fewer Gaussians; its variables."""
+    text = (FOLDER / name).read_text()
+    if gaussians:
+        text = re.sub(r"gaussians=\d+", f"gaussians={gaussians}", text)
+    space = {"__name__": "page"}
+    for found in BLOCK.finditer(text):
+        if not found[1]:
+            line = text.count("\n", 0, found.start(2))
+            exec(compile("\n" * line + found[2], str(FOLDER / name), "exec"), space)
+    return space
+
+
+@pytest.fixture(scope="module")
+def own_loop():
+    return run_page("how-to/own-loop.md")
+
+
+def numbers(tensor):
+    return np.array(dr.detach(tensor).numpy(), np.float64)
+
+
+def test_the_loss_of_the_page_is_ssim(own_loop):
+    pictures = [np.clip(numbers(eg.render(own_loop[name])), 0, 1) for name in ("found", "start")]
+    tensors = [own_loop["TensorXf"](p.astype(np.float32)) for p in pictures]
+    found = own_loop["ssim"](*tensors).array[0]
+    assert abs(found - eg.ssim(*pictures)) < 1e-5
+
+
+def test_the_loops_of_the_page_fit(own_loop):
+    """The frozen loop takes the steps of the plain one, but for the lists of five steps."""
+    image = own_loop["image"]
+    before, plain, frozen = (
+        eg.psnr(numbers(eg.render(own_loop[name])), image) for name in ("start", "found", "frozen")
+    )
+    assert plain > before + 2
+    assert abs(plain - frozen) < 0.1
+    assert own_loop["take_step"].n_recordings <= 3
+    a, _, c = own_loop["found"].factor.numpy()
+    assert (a > 0).all() and (c > 0).all()
+
+
+def moved(gaussians, step, generator):
+    """A set in double precision, and it moved by a step along a random direction."""
+    names = ("mean", "factor", "color", "background")
+    direction = {n: generator.normal(size=getattr(gaussians, n).shape) for n in names}
+    direction["factor"] *= 0.1
+    plus, minus = (
+        replace(
+            gaussians,
+            **{
+                n: getattr(gaussians, n) + type(getattr(gaussians, n))(sign * step * direction[n])
+                for n in names
+            },
+        )
+        for sign in (1, -1)
+    )
+    return direction, plus, minus
+
+
+@pytest.mark.parametrize("name", ["squares", "L1 and SSIM"])
+def test_gradients_of_the_page_are_those_of_finite_differences(own_loop, name):
+    double, exact = dr.detach(own_loop["double"]), own_loop["exact"]
+    double = replace(double, cutoff=6.0)  # the step at the cutoff has no derivative
+    if name == "squares":
+        loss = lambda g: dr.mean(dr.square(eg.render(g) - exact), axis=None)  # noqa: E731
+    else:
+        loss = lambda g: own_loop["loss_of"](eg.render(g), exact)  # noqa: E731
+    direction, plus, minus = moved(double, STEP, np.random.default_rng(3))
+    dr.enable_grad(double)
+    dr.backward(loss(double))
+    gradient = dr.grad(double)
+    found = sum((getattr(gradient, n).numpy() * d).sum() for n, d in direction.items())
+    wanted = (loss(plus).array[0] - loss(minus).array[0]) / (2 * STEP)
+    assert found == pytest.approx(wanted, rel=1e-5)
+
+
+def test_forward_mode_of_the_page_is_a_finite_difference(own_loop):
+    g, h = replace(dr.detach(own_loop["double"]), cutoff=6.0), 1e-6
+    kind = type(g.mean)
+    shift = dr.leaf_t(kind)(0)
+    dr.enable_grad(shift)
+    picture = eg.render(replace(g, mean=kind(g.mean.x + shift, g.mean.y)))
+    dr.forward(shift)
+    ends = [numbers(eg.render(replace(g, mean=kind(g.mean.x + s, g.mean.y)))) for s in (h, -h)]
+    found, wanted = dr.grad(picture).numpy(), (ends[0] - ends[1]) / (2 * h)
+    assert np.abs(found - wanted).max() < 1e-5 * np.abs(wanted).max()
+    assert np.abs(own_loop["slope"].numpy()).max() > 0
+
+
+def test_pixels_in_a_hole_do_not_count(own_loop):
+    """Whatever fills the hole, the loss and its gradient are the same bits."""
+    g = dr.detach(own_loop["found"])
+    dr.enable_grad(g)
+    loss = own_loop["masked_loss"](eg.render(g))
+    dr.backward(loss)
+    kept = dr.grad(g).mean.numpy()
+    filled = own_loop["filled"]
+    other = numbers(filled)
+    other[20:40, 20:40] = 0.7
+    own_loop["masked_loss"].__globals__["filled"] = type(filled)(other.astype(np.float32))
+    try:
+        g = dr.detach(own_loop["found"])
+        dr.enable_grad(g)
+        again = own_loop["masked_loss"](eg.render(g))
+        dr.backward(again)
+    finally:
+        own_loop["masked_loss"].__globals__["filled"] = filled
+    assert again.array[0] == loss.array[0]
+    np.testing.assert_array_equal(dr.grad(g).mean.numpy(), kept)
+
+
+def test_the_traced_loop_of_the_page_is_a_sum_with_derivatives(own_loop):
+    g = dr.detach(own_loop["double"])
+    Float = dr.leaf_t(g.mean)
+    at = [np.array([10.5, 30.5]), np.array([20.5, 40.5])]
+    x, y = map(Float, at)
+    dr.enable_grad(g.mean)
+    found = own_loop["brightness"](g, x, y, len(g))
+    dr.backward(dr.sum(found))
+
+    def total(mean):
+        (a, b, c), (dx, dy) = g.factor.numpy()[..., None], np.array(at)[:, None] - mean[..., None]
+        return np.exp(-0.5 * ((a * dx + b * dy) ** 2 + (c * dy) ** 2)).sum(0)
+
+    mean = dr.detach(g.mean).numpy()
+    np.testing.assert_allclose(found.numpy(), total(mean), rtol=1e-9)
+    step = np.random.default_rng(1).normal(size=mean.shape)
+    wanted = (total(mean + 1e-6 * step) - total(mean - 1e-6 * step)).sum() / 2e-6
+    assert (dr.grad(g.mean).numpy() * step).sum() == pytest.approx(wanted, rel=1e-5)
+
+
+def test_getting_started_runs_without_a_warning(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    eg.save_image("photo.jpg", eg.sample("coffee")[100:164, 200:264])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        run_page("getting-started.md", gaussians="300")
+    assert eg.load_image("large.png").shape == (2048, 2048, 3)
+
+
+def test_getting_started_lists_all_extras():
+    text = (FOLDER / "getting-started.md").read_text()
+    said = set(re.findall(r"^\| `(\w+)` \|", text, re.M))
+    extras = (FOLDER.parent / "pyproject.toml").read_text()
+    extras = extras.split("[project.optional-dependencies]")[1].split("\n[")[0]
+    assert set(re.findall(r"^(\w+) = \[", extras, re.M)) == said
+
+
+def test_names_are_where_the_manual_says():
+    check = runpy.run_path(str(FOLDER / "check_names.py"))
+    assert check["missing"]() == []
+    assert check["exists"]("eigengs_dr.fitting.placement.density.target_density")
+    assert not check["exists"]("eigengs_dr.fitting.redistribute.target_density")
+    assert not check["exists"]("eigengs_dr.fitting.redistribute.nothing")
+
+
+def test_the_manual_counts_builds_of_lists():
+    """The number that two pages name, of 1,000 steps of the preset `default`."""
+    builds = 0
+    schedule = PRESETS["default"].schedule
+    first = first_phase(schedule, 1000)
+    for steps, surplus in ((first, 0), (1000 - first, 1)):
+        moves = relocations(schedule, steps, surplus) if surplus else {}
+        stop = 0
+        for step in range(steps):
+            if step in moves:
+                stop = step
+            if step == stop:
+                end = min((s for s in moves if s > step), default=steps)
+                stop, _ = next_build(schedule, step, steps, min(end, steps))
+                builds += 1
+    for page in ("how-to/gpu.md", "theory/fitting.md"):
+        assert re.search(rf"\b{builds} in (all )?1,000 steps", (FOLDER / page).read_text()), builds
