@@ -50,7 +50,7 @@ def test_fit(name):
 def test_search():
     """The target is reached, by as few Gaussians; another CPU rounds otherwise, so a few more."""
     image = photo("face")
-    found = eg.fit(image, target_psnr=32, iterations=60, backend="llvm")
+    found = eg.fit(image, target_psnr=32, target_space="ycbcr", iterations=60, backend="llvm")
     assert found.stopped == "met"
     assert eg.psnr(image, found.image, space="ycbcr") >= 32
     assert len(found.gaussians) <= 1.1 * 42

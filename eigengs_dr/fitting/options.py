@@ -215,8 +215,9 @@ class SearchPolicy:
         Largest number of tries.
     max_polishes : int
         Number of polishes after which a search ends if a set meets the goal.
-    sure_polishes : int
-        Number of polishes that a search may take whatever its steps were before.
+    sure_polishes, sure_drops : int
+        Number of polishes that a search may take whatever its steps were before; and if the fit
+        met the goal, so that they drop Gaussians.
     db_per_doubling : float
         Gain of twice as many Gaussians, in dB, until two tries of the image measure it; see
         `eigengs_dr.fitting.placement.density.ERROR_EXPONENT`.
@@ -256,6 +257,7 @@ class SearchPolicy:
     max_tries: int = 4
     max_polishes: int = 7
     sure_polishes: int = 3
+    sure_drops: int = 5
     db_per_doubling: float = 4.0
     doubling_range: tuple[float, float] = (2.0, 12.0)
     min_octaves: float = 0.25

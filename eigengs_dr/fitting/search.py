@@ -82,7 +82,8 @@ def search_count(
             longest = round(policy.max_length * iterations)
             trial = _fit_estimate(run, estimate, most, fit, longest)
             # If the iterations are few, or two fits have used them up, polish all the same.
-            most_steps = max(longest, run.step + policy.sure_polishes * polish)
+            sure = policy.sure_drops if trial.missing <= 0 else policy.sure_polishes
+            most_steps = max(longest, run.step + sure * polish)
             _polish(run, trial, most, polish, most_steps)
         pressed = interrupted()
     except KeyboardInterrupt:

@@ -1,6 +1,7 @@
 """What info says of the fit and of the bytes of a file."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -62,7 +63,7 @@ def test_hostile_figures_are_refused_in_one_line(change, fitted, capsys):
 
 
 def test_lossless_psnr_and_strange_names_are_shown(fitted, capsys, tmp_path):
-    result = replace(fitted[0], source="a\x1b[31m.png", trace=[])
+    result = replace(fitted[0], source="a\x1b[31m.png", psnr_rgb=math.inf)
     result.save(tmp_path / "c.npz")
     facts = json.loads(info(capsys, tmp_path / "c.npz", "--json")[1])
-    assert facts["source"] == "a?[31m.png" and facts["psnr_rgb"] == "nan"
+    assert facts["source"] == "a?[31m.png" and facts["psnr_rgb"] == "inf"
