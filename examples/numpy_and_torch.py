@@ -19,7 +19,7 @@ folder = Path(sys.argv[1] if len(sys.argv) > 1 else "build/examples")
 folder.mkdir(parents=True, exist_ok=True)
 
 photo = eg.sample("rocket")[40:232, 200:392]
-rocket = eg.fit(photo, gaussians=1500, iterations=100, color="rgb").gaussians
+rocket = eg.fit(photo, gaussians=1500, iterations=100, space="rgb").gaussians
 
 # %%
 # NumPy

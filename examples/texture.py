@@ -22,10 +22,10 @@ mi.set_variant("llvm_ad_rgb")
 eg.register_plugins()  # Mitsuba now knows the texture "gaussian_texture"
 
 # %%
-# A reflectance adds up in linear light, not in sRGB codes. So fit it with ``color="linear"``.
+# A reflectance adds up in linear light, not in sRGB codes. So fit it with ``space="linear"``.
 
 photo = eg.sample("coffee")[:, 100:500]
-cups = eg.fit(photo, gaussians=4000, iterations=100, color="linear").gaussians
+cups = eg.fit(photo, gaussians=4000, iterations=100, space="linear").gaussians
 
 # %%
 # The floor repeats the picture 40 x 40 times. ``texture_of`` writes the set as a dictionary for

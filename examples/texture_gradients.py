@@ -132,7 +132,7 @@ print(f"PSNR after the coefficients, {len(losses)} steps: {eg.psnr(photo, guess)
 # The second stage places 3,000 Gaussians by the first result, in linear light, and then changes all
 # of their parameters. The rates are in units of light, in pixels, and in 1 / pixels.
 
-start = eg.fit(guess, gaussians=3000, iterations=0, color="linear").gaussians
+start = eg.fit(guess, gaussians=3000, iterations=0, space="linear").gaussians
 scene = room(texture_of(start))
 parameters = mi.traverse(scene)
 rates = {f"{NAME}.color": 0.02, f"{NAME}.mean": 0.1, f"{NAME}.factor": 0.005}

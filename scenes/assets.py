@@ -44,7 +44,7 @@ def fitted(folder, name, image, gaussians, color):
     Path
         The file.
     """
-    return _kept(folder, name, lambda: eg.fit(image, gaussians, 300, color=color).gaussians)
+    return _kept(folder, name, lambda: eg.fit(image, gaussians, 300, space=color).gaussians)
 
 
 def fitted_material(folder, name, maps, gaussians):

@@ -16,8 +16,8 @@ NATURAL = {"init": "eigen", "basis": "natural"}
 FITS = {
     "default": ("coffee", COUNT, 41.01, 47.03),
     "detail": ("face", COUNT, 35.40, 41.64),
-    "rgb": ("face", {**COUNT, "color": "rgb"}, 35.40, 41.51),
-    "linear": ("face", {**COUNT, "color": "linear"}, 34.65, 40.80),
+    "rgb": ("face", {**COUNT, "space": "rgb"}, 35.40, 41.51),
+    "linear": ("face", {**COUNT, "space": "linear"}, 34.65, 40.80),
     "start": ("face", {**COUNT, "iterations": 0}, 29.39, 35.61),
     "grid": ("face", {**COUNT, "iterations": 0, "init": "grid"}, 25.87, 32.08),
     "gaussianimage": ("face", {**COUNT, "iterations": 300, "preset": "gaussianimage"}, 9.39, 14.56),

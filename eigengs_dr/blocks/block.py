@@ -122,23 +122,23 @@ def survey(task: PlaceTask, settings: Settings) -> Surveyed:
     """Measure how many Gaussians a block needs, relative to others, before any fit."""
     options = settings.options
     pixels = task.window.read()
-    if options.color == "normal":
-        read_data(pixels, options.color)  # no other range makes normals
-    target = make_target(pixels, options.color)
-    density = window_density(placement_image(target, options.color), settings.spacing)
+    if options.space == "normal":
+        read_data(pixels, options.space)  # no other range makes normals
+    target = make_target(pixels, options.space)
+    density = window_density(placement_image(target, options.space), settings.spacing)
     core = task.block.core
     return Surveyed(
         float(density[core].sum(dtype=np.float64)),
         target.values[core].sum(axis=(0, 1), dtype=np.float64),
-        unit_of(pixels, options.color),
+        unit_of(pixels, options.space),
     )
 
 
 def place(task: PlaceTask, settings: Settings) -> tuple[Array, Array]:
     """Place the Gaussians of a block; see `eigengs_dr.blocks.place.place_block`."""
     options = settings.options
-    target = make_target(task.window.read(), options.color)
-    image = placement_image(target, options.color)
+    target = make_target(task.window.read(), options.space)
+    image = placement_image(target, options.space)
     return place_block(image, task.block, task.gaussians, settings.spacing, task.old)
 
 
@@ -156,7 +156,7 @@ def find_density(task: FitTask, settings: Settings, step_done: StepDone | None =
         The means (n, 2) of the own Gaussians in pixels of the window, ratio (n, 1), see
         `eigengs_dr.blocks.place.OldSet`, and the mass (1,) of the density in the core.
     """
-    target = make_target(task.window.read(), settings.options.color)
+    target = make_target(task.window.read(), settings.options.space)
     problem = _start(task, target, settings)
     found = _descend(problem, task, settings, step_done)
     mean = found.to_arrays()["mean"]
@@ -180,7 +180,7 @@ def fit_block(task: FitTask, settings: Settings, step_done: StepDone | None = No
     dict of str to ndarray
         Mean, factor and color of the own Gaussians, in pixels of the window.
     """
-    target = make_target(task.window.read(), settings.options.color)
+    target = make_target(task.window.read(), settings.options.space)
     problem = _start(task, target, settings)
     part = Part(task.own, task.block.core)
     move = partial(relocate, target=problem.target, weight=problem.weight, part=part)
@@ -208,7 +208,7 @@ def _start(task: FitTask, target: FitTarget, settings: Settings) -> FitProblem:
         np.zeros((len(task.mean), channels), np.float32) if task.color is None else task.color,
         background,
         size=(width, height),
-        space=options.color,
+        space=options.space,
         backend=options.backend,
         cutoff=options.cutoff,
     ).bounded()

@@ -77,7 +77,7 @@ def fit_large(
     gaussians: int | None = None,
     iterations: int = 1000,
     block: int = BLOCK_SIDE,
-    color: str = "ycbcr",
+    space: str = "ycbcr",
     solve_steps: int = 10,
     cutoff: float = CUTOFF,
     backend: str | None = None,
@@ -153,13 +153,13 @@ def fit_large(
     options = FitOptions(
         gaussians=gaussians,
         iterations=iterations,
-        color=color,
+        space=space,
         solve_steps=solve_steps,
         cutoff=cutoff,
         backend=backend,
         encoding=encoding,
     )
-    image = open_source(source, rendered_as(color) is None, encoding)
+    image = open_source(source, rendered_as(space) is None, encoding)
     blocks, options = plan(image, options, block)
     select(backend)
     keep: Any = nullcontext()

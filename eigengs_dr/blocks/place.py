@@ -42,9 +42,9 @@ class OldSet(NamedTuple):
     ratio: Array
 
 
-def placement_image(target: FitTarget, color: str) -> NDArray[np.float32]:
+def placement_image(target: FitTarget, space: str) -> NDArray[np.float32]:
     """Return the image that shapes the Gaussians: linear light would neglect dark parts."""
-    return target.pixels if color in LIGHT else target.values
+    return target.pixels if space in LIGHT else target.values
 
 
 def window_density(image: Array, spacing: float, old: OldSet | None = None) -> NDArray[np.float32]:

@@ -78,7 +78,7 @@ class Run:
         return SetData(
             sets.arrays | {"background": background},
             (self.image.width, self.image.height),
-            self.options.color,
+            self.options.space,
             self.options.cutoff,
         )
 

@@ -274,8 +274,8 @@ def _exit(context: click.Context, records: list[dict[str, Any]], options: FitOpt
     if any(record["stopped"] == "failed" for record in records):
         context.exit(FAILED)
     failures = [record for record in records if record["stopped"] == "out of reach"]
-    key = target_key(options.color, options.target_space)
-    name = "psnr_rgb" if key == "psnr_rgb" else f"psnr_{float_space(options.color)}"
+    key = target_key(options.space, options.target_space)
+    name = "psnr_rgb" if key == "psnr_rgb" else f"psnr_{float_space(options.space)}"
     for record in failures:
         say(
             f"{record['input']}: {options.target_psnr:g} dB {name} are out of reach: "

@@ -119,7 +119,7 @@ def fit_by_blocks(
         "psnr_rgb": result.psnr_rgb,
     }
     if not quiet:
-        click.echo(_summary(record, options.color))
+        click.echo(_summary(record, options.space))
     return record, False
 
 
@@ -127,7 +127,7 @@ def _show(show: Any, name: str, done: int, total: int, row: dict[str, Any]) -> N
     show(f"{name}: {WORDS[row['stage']]}", done, total)
 
 
-def _summary(record: dict[str, Any], color: str) -> str:
+def _summary(record: dict[str, Any], space: str) -> str:
     """Describe a fit for a terminal."""
     from ..image.metrics import float_space
 
@@ -135,4 +135,4 @@ def _summary(record: dict[str, Any], color: str) -> str:
         "{input}: {width}x{height} in {blocks} blocks, {gaussians:,} Gaussians, "
         "{iterations} iterations in {seconds:.1f} s\n"
         "  psnr_{space} {psnr_ycbcr:.2f} dB, psnr_rgb {psnr_rgb:.2f} dB\n  wrote {output}"
-    ).format(**record, space=float_space(color))
+    ).format(**record, space=float_space(space))

@@ -74,7 +74,7 @@ def fit_several(
             with closing(images):
                 for finished in images:
                     preview = previews[finished.place] if previews else None
-                    record = _record(finished, preview, options.color, measure)
+                    record = _record(finished, preview, options.space, measure)
                     records[finished.place] = record
                     if record["stopped"] == "failed":
                         say(f"error: {record['error']}")
@@ -88,12 +88,12 @@ def fit_several(
         say(f"interrupted; {done}; the same command fits the others")
     ordered = [records[place] for place in sorted(records)]
     if not quiet:
-        space = float_space(options.color)
+        space = float_space(options.space)
         click.echo(_summary(ordered, folder, time.perf_counter() - started, space))
     return ordered, interrupted
 
 
-def _record(finished: Finished, preview: Path | None, color: str, measure: bool) -> Record:
+def _record(finished: Finished, preview: Path | None, space: str, measure: bool) -> Record:
     """Return the figures of one image, and write its preview."""
     import eigengs_dr as eg
 
@@ -108,7 +108,7 @@ def _record(finished: Finished, preview: Path | None, color: str, measure: bool)
     record |= {name: getattr(row, name) for name in (*names, "psnr_ycbcr", "psnr_rgb")}
     if pixels is None:  # it stays with the worker that fitted it
         return record
-    result, pixels = row.result, displayed(pixels, color)
+    result, pixels = row.result, displayed(pixels, space)
     record["seconds_init"] = result.seconds_init
     if preview:
         try:
@@ -116,7 +116,7 @@ def _record(finished: Finished, preview: Path | None, color: str, measure: bool)
         except ValueError as error:
             return {**record, "stopped": "failed", "error": str(error)}
     if measure:
-        record |= measure_fit(pixels, result, color) | {"trace": result.trace}
+        record |= measure_fit(pixels, result, space) | {"trace": result.trace}
     return record
 
 

@@ -153,7 +153,7 @@ def fit_maps(
                 images,
                 gaussians=options.gaussians,
                 iterations=options.iterations,
-                spaces={name: item.space for name, item in maps.items() if item.space},
+                space={name: item.space for name, item in maps.items() if item.space},
                 target_psnr=options.target_psnr,
                 target_space=options.target_space,
                 max_gaussians=options.max_gaussians,

@@ -38,7 +38,7 @@ def fit_one(
     name = Path(path).name
     with progress_bar(quiet) as show:
         show(f"{name}: load", 0, 1)
-        image = eg.load_image(path, rendered_as(options.color) is None, options.encoding)
+        image = eg.load_image(path, rendered_as(options.space) is None, options.encoding)
         loaded = time.perf_counter()
         try:
             result = run(image, progress=partial(show, name))
@@ -48,7 +48,7 @@ def fit_one(
             raise ValueError(f"{path}: {error}") from None
         replace(result, source=name).save(output)
         show(f"{name}: measure", 0, 1)
-        shown = displayed(image, options.color)
+        shown = displayed(image, options.space)
         color = result.gaussians.space
         figures = measure_fit(shown, result, color)
         if preview:
@@ -80,23 +80,23 @@ def course_of(result: Fit | MaterialFit, started: float, loaded: float) -> dict[
     }
 
 
-def measure_fit(image: Any, result: Fit, color: str) -> dict[str, float]:
+def measure_fit(image: Any, result: Fit, space: str) -> dict[str, float]:
     """Compare a fit with its image; data are in the unit of the fit."""
     import eigengs_dr as eg
 
     from ..fitting.pixels import unit_of
 
-    unit = unit_of(image, color)
+    unit = unit_of(image, space)
     seen, shown = image / unit, result.image / unit
     return {
         "psnr_ycbcr": result.psnr_ycbcr,
         "psnr_rgb": result.psnr_rgb,
         "ssim": eg.ssim(seen, shown),
-        "ms_ssim": eg.ms_ssim(seen, shown, space="ycbcr" if rendered_as(color) else "data"),
+        "ms_ssim": eg.ms_ssim(seen, shown, space="ycbcr" if rendered_as(space) else "data"),
     }
 
 
-def _summary(record: dict[str, Any], preview: Path | None, color: str) -> str:
+def _summary(record: dict[str, Any], preview: Path | None, space: str) -> str:
     """Describe a fit for a terminal."""
     from ..image.metrics import float_space
 
@@ -105,5 +105,5 @@ def _summary(record: dict[str, Any], preview: Path | None, color: str) -> str:
         "in {seconds:.1f} s ({seconds_total:.1f} s with loading and measuring)\n"
         "  psnr_{space} {psnr_ycbcr:.2f} dB, psnr_rgb {psnr_rgb:.2f} dB, "
         "SSIM {ssim:.4f}, MS-SSIM {ms_ssim:.4f}\n  wrote {output}"
-    ).format(**record, space=float_space(color))
+    ).format(**record, space=float_space(space))
     return f"{text}\n  wrote {preview} (photo, fit and outlines side by side)" if preview else text

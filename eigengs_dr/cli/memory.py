@@ -68,7 +68,7 @@ def _problem(path: Path | str, options: FitOptions) -> tuple[int, int, int, int]
     count = options.gaussians or default_count(width * height)
     if options.target_psnr is not None:
         count = max(1, width * height // PIXELS_PER_FIRST_GAUSSIAN)
-    return width, height, 1 if grey and rendered_as(options.color) is None else 3, count
+    return width, height, 1 if grey and rendered_as(options.space) is None else 3, count
 
 
 def _image_size(path: Path | str) -> tuple[int, int, bool] | None:

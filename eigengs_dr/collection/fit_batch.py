@@ -167,7 +167,7 @@ class _Record:
 def _start(images: Images, options: FitOptions) -> FitProblem:
     """Place the Gaussians of every image, and solve for the colours of all of them."""
     place: Placement = resolve_name(PLACEMENTS[options.initializer])
-    targets = [make_target(pixels, options.color) for pixels in images]
+    targets = [make_target(pixels, options.space) for pixels in images]
     shown = [_shown(t, options) for t in targets]
     count = options.count_for(images[0])
     placed = [place(s, count, np.random.default_rng(options.seed)) for s in shown]
@@ -185,7 +185,7 @@ def _start(images: Images, options: FitOptions) -> FitProblem:
 
 def _shown(target: FitTarget, options: FitOptions) -> Images:
     """Return the image that shapes the Gaussians; linear light would neglect dark parts."""
-    return target.pixels if options.color in LIGHT else target.values
+    return target.pixels if options.space in LIGHT else target.values
 
 
 def _stack(placed: list, shape: tuple[int, ...], options: FitOptions) -> Gaussians:
@@ -196,7 +196,7 @@ def _stack(placed: list, shape: tuple[int, ...], options: FitOptions) -> Gaussia
         factor,
         np.zeros((len(mean), shape[3]), np.float32),
         size=(shape[2], shape[1]),
-        space=options.color,
+        space=options.space,
         backend=options.backend,
         cutoff=options.cutoff,
     ).bounded()

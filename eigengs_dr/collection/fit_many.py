@@ -150,7 +150,7 @@ def fit_each(
         )
         options = replace(options, basis=basis)
     make_work = partial(fit_work, options, levels, None if client is not None else step)
-    keep_grey = rendered_as(options.color) is None
+    keep_grey = rendered_as(options.space) is None
     job = Job(make_work, _may_join, keep_grey, options.encoding, options.iterations)
     return run_images(images, output, overwrite, job, client)
 
@@ -199,7 +199,7 @@ def _fit_group(
             step(iteration / max(1, iterations))
 
     plain = not isinstance(images[0], LinearImage)
-    plain &= all(unit_of(image, options.color) == 1 for image in images)
+    plain &= all(unit_of(image, options.space) == 1 for image in images)
     if levels is None and plain and fits_in_batches(options, images[0]):
         try:
             results = fit_batch(np.stack(images), options, step)

@@ -26,12 +26,12 @@ def start_from_basis(target: FitTarget, options: FitOptions) -> FitProblem:
         If the model and the options differ in the number of Gaussians, space or backend.
     """
     model = load_basis(options.basis or DEFAULT_BASIS, options.backend, options.gaussians)
-    _check_basis(model, target.pixels, options.gaussians, options.color)
+    _check_basis(model, target.pixels, options.gaussians, options.space)
     encoded = _encode(model, target, options)
     if options.method.mean != "dense":
         return FitProblem(encoded, target.values, target.weight)
     dense = model.dense_mean(encoded.width, encoded.height)
-    base_image = _picture(dense, options.color)
+    base_image = _picture(dense, options.space)
     return FitProblem(encoded, target.values - dense, target.weight, base_image)
 
 
@@ -48,10 +48,10 @@ def _encode(model: EigenGS, target: FitTarget, options: FitOptions) -> Gaussians
     return start
 
 
-def _picture(planes: NDArray[np.float32], color: str) -> NDArray[np.float32]:
+def _picture(planes: NDArray[np.float32], space: str) -> NDArray[np.float32]:
     """Return the RGB that planes add to a rendering, which already holds the RGB of zeros."""
-    rgb = np.stack(decode(color, list(np.moveaxis(planes, 2, 0))), axis=2)
-    return rgb - np.array(decode(color, [0.0] * planes.shape[2]), np.float32)
+    rgb = np.stack(decode(space, list(np.moveaxis(planes, 2, 0))), axis=2)
+    return rgb - np.array(decode(space, [0.0] * planes.shape[2]), np.float32)
 
 
 def _check_basis(

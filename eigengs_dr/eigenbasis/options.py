@@ -48,7 +48,7 @@ class TrainOptions:
     frequency_aware: bool | str = "auto"
     preset: str = "default"
     steps: int | None = None
-    color: str = "ycbcr"
+    space: str = "ycbcr"
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -59,9 +59,9 @@ class TrainOptions:
                 raise ValueError(
                     "energy and target_psnr both choose the components; give one of them"
                 )
-        if self.color not in BASIS_SPACES:
+        if self.space not in BASIS_SPACES:
             raise ValueError(
-                f"color {self.color!r} is unknown; use one of {', '.join(BASIS_SPACES)}"
+                f"color {self.space!r} is unknown; use one of {', '.join(BASIS_SPACES)}"
             )
         if self.preset not in STEPS:
             raise ValueError(f"preset {self.preset!r} is unknown; use one of {', '.join(STEPS)}")

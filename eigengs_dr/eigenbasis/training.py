@@ -182,7 +182,7 @@ def _basis(files: list[Path | str], held_out: list[Path | str], run: Run) -> Eig
     large = run.client is not None or is_large(files)
     state = (_state_of_shards if large else _state)(files, ranks, run)
     basis = Eigenbasis.from_state(
-        state, settings.size, settings.components, settings.energy, settings.color
+        state, settings.size, settings.components, settings.energy, settings.space
     )
     if settings.target_psnr is not None:
         if (fall := truncation_curve_on(basis, held_out, run.stop_if_pressed)) is None:
@@ -208,7 +208,7 @@ def _state(files: list[Path | str], ranks: tuple[int, ...], run: Run) -> EigenSt
         run.progress("components", first + done, len(files))
         run.stop_if_pressed()
 
-    source = read_blocks(files[first:], settings.size, settings.color, length, advance)
+    source = read_blocks(files[first:], settings.size, settings.space, length, advance)
     try:
         with closing(source) as blocks:
             for number, block in enumerate(blocks, 1):
@@ -233,7 +233,7 @@ def _state_of_shards(files: list[Path | str], ranks: tuple[int, ...], run: Run) 
 
     options = ShardOptions(
         settings.size,
-        settings.color,
+        settings.space,
         ranks,
         settings.seed,
         shard_block_length(settings.size, len(files)),

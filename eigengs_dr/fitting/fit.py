@@ -120,7 +120,7 @@ def fit(
     basis: str | os.PathLike[str] | EigenGS | Eigenbasis | None = None,
     preset: str = "default",
     solve_steps: int = 10,
-    color: str = "ycbcr",
+    space: str = "ycbcr",
     seed: int = 0,
     backend: str | None = None,
     progress: Any = None,
@@ -217,7 +217,7 @@ def fit(
         basis=basis,
         preset=preset,
         solve_steps=solve_steps,
-        color=color,
+        space=space,
         seed=seed,
         backend=backend,
         cutoff=cutoff,
@@ -238,7 +238,7 @@ def fit_image(image: Any, options: FitOptions, progress: FitProgress | None = No
     started = time.perf_counter()
     pixels, options = read_pixels(image, options)
     options.check_image(pixels)
-    unit = unit_of(pixels, options.color)
+    unit = unit_of(pixels, options.space)
     if unit != 1:
         pixels = pixels / np.float32(unit)
     with defer_interrupts() as interrupted:

@@ -136,16 +136,16 @@ def initialize(pixels: NDArray[np.float32], options: FitOptions) -> FitProblem:
         If the basis contradicts another option.
     """
     start: Initializer = resolve_name(INITIALIZERS[options.initializer])
-    return start(make_target(pixels, options.color), options)
+    return start(make_target(pixels, options.space), options)
 
 
-def make_target(pixels: NDArray[np.float32], color: str) -> FitTarget:
+def make_target(pixels: NDArray[np.float32], space: str) -> FitTarget:
     """Convert pixels (H, W, C) to the space of the colours, and weigh the errors there."""
-    if color == "ycbcr":
+    if space == "ycbcr":
         return FitTarget(pixels, by_strips(rgb_to_ycbcr, pixels))
-    if color == "log":
+    if space == "log":
         return FitTarget(pixels, by_strips(lambda part: to_log(to_linear(part)), pixels))
-    if color in LIGHT:
+    if space in LIGHT:
         light = by_strips(to_linear, pixels)
         return FitTarget(pixels, light, by_strips(dark_weight, light), shown=pixels)
     return FitTarget(pixels, pixels)

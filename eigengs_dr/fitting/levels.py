@@ -121,7 +121,7 @@ def fit_levels(
     gaussians: int | None = None,
     levels: Levels = 4,
     iterations: int = 1000,
-    color: str = "ycbcr",
+    space: str = "ycbcr",
     seed: int = 0,
     backend: str | None = None,
     progress: Any = None,
@@ -173,7 +173,7 @@ def fit_levels(
     options = FitOptions(
         gaussians=gaussians,
         iterations=iterations,
-        color=color,
+        space=space,
         seed=seed,
         backend=backend,
         encoding=encoding,
@@ -181,12 +181,12 @@ def fit_levels(
     options = check_options(options, levels)
     pixels, options = read_pixels(image, options)
     options.check_image(pixels)
-    unit = unit_of(pixels, options.color)
+    unit = unit_of(pixels, options.space)
     if unit != 1:
         pixels = pixels / np.float32(unit)
     score = partial(measure, image=pixels, started=started)
     with defer_interrupts() as interrupted:
-        target = make_target(pixels, options.color)
+        target = make_target(pixels, options.space)
         found, seconds_init = refine_levels(target, options, levels, score, progress, interrupted)
     return finish(found, in_unit(found.gaussians, unit), None, started, seconds_init)
 

@@ -81,7 +81,7 @@ class FitOptions:
     basis: str | os.PathLike[str] | EigenGS | Eigenbasis | None = None
     preset: str = "default"
     solve_steps: int = 10
-    color: str = "ycbcr"
+    space: str = "ycbcr"
     seed: int = 0
     backend: str | None = None
     cutoff: float = CUTOFF
@@ -96,7 +96,7 @@ class FitOptions:
         for name, value, known in (
             ("init", self.init, ("auto", *INITIALIZERS)),
             ("preset", self.preset, tuple(PRESETS)),
-            ("color", self.color, SPACES),
+            ("color", self.space, SPACES),
             ("target_space", self.target_space, ("rgb", "ycbcr")),
         ):
             if value not in known:

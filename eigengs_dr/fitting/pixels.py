@@ -46,13 +46,13 @@ def read_pixels(image: Any, options: FitOptions) -> tuple[NDArray[np.float32], F
     ImageError
         If the image is unusable.
     """
-    if rendered_as(options.color) is None:
-        return read_data(image, options.color), options
+    if rendered_as(options.space) is None:
+        return read_data(image, options.space), options
     image = read_image(image, encoding=options.encoding)
     encoding = encoding_of(image, options.encoding) or "srgb"
     pixels = check_image(image, copy=False, encoding=encoding)
-    if options.color == "linear" and encoding == "linear" and pixels.max() > WHITE:
-        options = replace(options, color="radiance")
+    if options.space == "linear" and encoding == "linear" and pixels.max() > WHITE:
+        options = replace(options, space="radiance")
     return pixels, options
 
 
@@ -79,9 +79,9 @@ def read_data(image: Any, space: str) -> NDArray[np.float32]:
     return pixels
 
 
-def unit_of(pixels: NDArray[np.float32], color: str) -> float:
+def unit_of(pixels: NDArray[np.float32], space: str) -> float:
     """Return the unit in which data are fitted: steps of colours are made for values up to 1."""
-    largest = float(np.abs(pixels).max()) if color == "data" else 0.0
+    largest = float(np.abs(pixels).max()) if space == "data" else 0.0
     return largest if largest > MAX_PIXEL else 1.0
 
 

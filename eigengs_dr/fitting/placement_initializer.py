@@ -29,7 +29,7 @@ def start_from_placement(target: FitTarget, options: FitOptions) -> FitProblem:
         factor,
         np.zeros(shape, np.float32) if method.solves else generator.uniform(0, 1, shape),
         size=(target.values.shape[1], target.values.shape[0]),
-        space=options.color,
+        space=options.space,
         backend=options.backend,
         cutoff=options.cutoff,
     ).bounded()

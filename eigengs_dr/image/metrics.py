@@ -131,15 +131,15 @@ def _sum_squares(a: NDArray[np.float64], b: NDArray[np.float64], space: str) -> 
     return float(a.sum()) / (255**2 if space == "rgb" else 1)
 
 
-def float_space(color: str) -> str:
+def float_space(space: str) -> str:
     """Return the space in which psnr_ycbcr compares sets of the space `color`.
 
     Data and normals have no YCbCr, so their channels are compared directly. Light above 1
     is compared in PU21, which has bounds.
     """
-    if color in UNBOUNDED:
+    if space in UNBOUNDED:
         return "pu21"
-    return "ycbcr" if rendered_as(color) else "data"
+    return "ycbcr" if rendered_as(space) else "data"
 
 
 def target_key(space: str, target_space: str) -> str:

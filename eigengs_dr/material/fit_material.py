@@ -162,7 +162,7 @@ def fit_material(
     options = FitOptions(
         gaussians=gaussians,
         iterations=iterations,
-        color="data",
+        space="data",
         backend=backend,
         cutoff=cutoff,
         target_psnr=None if goals is None else max(goals),

@@ -72,15 +72,15 @@ def _read_map(name: str, image: ArrayLike, space: str | None, encoding: str | No
     except BadValue as error:
         raise ValueError(str(error)) from None
     try:
-        options = FitOptions(color=space or usual_space(name), encoding=encoding)
+        options = FitOptions(space=space or usual_space(name), encoding=encoding)
         pixels, options = read_pixels(image, options)
     except ValueError as error:
         text = str(error).removeprefix("image: ")
         raise type(error)(f"map {name!r}: {text}") from None
-    if rendered_as(options.color) is None and options.color != "normal":
+    if rendered_as(options.space) is None and options.space != "normal":
         pixels = _without_copies(pixels)
-    unit = unit_of(pixels, options.color)
-    return MapImage(name, options.color, pixels if unit == 1 else pixels / np.float32(unit), unit)
+    unit = unit_of(pixels, options.space)
+    return MapImage(name, options.space, pixels if unit == 1 else pixels / np.float32(unit), unit)
 
 
 def _without_copies(pixels: Image) -> Image:

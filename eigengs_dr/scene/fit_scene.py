@@ -198,11 +198,11 @@ def _fit(
     seen: NDArray[np.bool_],
     count: int,
     iterations: int,
-    color: str,
+    space: str,
 ) -> Gaussians:
     """Place `count` Gaussians, drop those that reach no seen texel, and fit the rest."""
     height, width, channels = target.shape
-    picture = to_coded(target) if color == "linear" else target
+    picture = to_coded(target) if space == "linear" else target
     mean, factor = place_adaptive(picture, count, np.random.default_rng(0))
     kept = _reaches_seen(mean, factor, seen)
     start = Gaussians.from_arrays(
@@ -210,7 +210,7 @@ def _fit(
         factor[kept],
         np.zeros((int(kept.sum()), channels)),
         size=(width, height),
-        space=color,
+        space=space,
         backend="cuda" if "cuda" in mi.variant() else "llvm",
     ).bounded()
     start = solve(start, target).gaussians

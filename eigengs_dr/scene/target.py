@@ -32,7 +32,7 @@ EVEN = 2.0
 Image = NDArray[np.float32]
 
 
-def seen_by(texels: Image, rows: Any, color: str) -> NDArray[Any]:
+def seen_by(texels: Image, rows: Any, space: str) -> NDArray[Any]:
     """Return what the pixels of a camera see of a texture.
 
     Parameters
@@ -49,7 +49,7 @@ def seen_by(texels: Image, rows: Any, color: str) -> NDArray[Any]:
     ndarray, shape (n, 1, C)
     """
     looks = rows @ texels.clip(0, 1).reshape(-1, texels.shape[2])
-    return (to_coded(looks) if color == "linear" else looks)[:, None]
+    return (to_coded(looks) if space == "linear" else looks)[:, None]
 
 
 def smoothest_target(values: Image, found: Visibility, is_close: Callable[[Image], bool]) -> Image:
@@ -74,7 +74,7 @@ def smoothest_target(values: Image, found: Visibility, is_close: Callable[[Image
     return whole
 
 
-def error_weights(found: Visibility, target: Image, color: str) -> Image:
+def error_weights(found: Visibility, target: Image, space: str) -> Image:
     """Return factors of the errors: the square root of each texel's share of the pixels.
 
     Parameters
@@ -90,5 +90,5 @@ def error_weights(found: Visibility, target: Image, color: str) -> Image:
     """
     share = gaussian_filter(found.pixels, EVEN) * found.seen
     weight = np.sqrt(share / share.max())[..., None]
-    light = dark_weight(target) if color == "linear" else np.ones_like(target)
+    light = dark_weight(target) if space == "linear" else np.ones_like(target)
     return (weight * light).astype(np.float32)

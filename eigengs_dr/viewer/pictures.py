@@ -80,9 +80,9 @@ def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
     return _outlined(under, subset, [HIGH_COLOR] * len(subset))
 
 
-def displayed(image: Picture, color: str) -> Picture:
+def displayed(image: Picture, space: str) -> Picture:
     """Return an image from `eigengs_dr.load_image` as people look at it: sRGB, or data."""
-    return np.asarray(image) if rendered_as(color) is None else check_image(image, copy=False)
+    return np.asarray(image) if rendered_as(space) is None else check_image(image, copy=False)
 
 
 def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Picture:

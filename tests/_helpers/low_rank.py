@@ -41,4 +41,4 @@ def assert_same(a, b):
 @cache
 def basis_of(space):
     """Components of `family`: 12 of the first channel, 5 of the others."""
-    return Eigenbasis.from_images(family(), SIZE, (12, 5, 5), color=space)
+    return Eigenbasis.from_images(family(), SIZE, (12, 5, 5), space=space)

@@ -28,7 +28,7 @@ def data(tmp_path, monkeypatch):
 def test_a_fit_is_measured_in_the_metric_of_the_field(backend):
     image, task = 0.999 * one_image(), task_in("unused", backend)
     found = kodak._measure(task, image, 40, 20, 3)
-    expected = fit(image, 40, 20, color="rgb", solve_steps=3, backend=backend)
+    expected = fit(image, 40, 20, space="rgb", solve_steps=3, backend=backend)
     error = np.clip(expected.image, 0, 1).astype(np.float64) - image
     assert found["psnr_float"] == pytest.approx(-10 * np.log10(np.mean(error**2)), abs=1e-6)
     assert found["psnr_rgb"] == pytest.approx(psnr(expected.image, image), abs=1e-6)

@@ -94,8 +94,8 @@ def test_spaces(color):
 def test_data_of_any_range():
     """As `fit`: heights of 100 m are fitted in a unit, and measured in it."""
     heights = 200 * mosaic(96)[..., :1].astype(np.float32) / 255 - 100
-    result = eg.fit_large(heights, **FEW | {"color": "data", "gaussians": 500})
-    same = eg.fit_large(heights / 100, **FEW | {"color": "data", "gaussians": 500})
+    result = eg.fit_large(heights, **FEW | {"space": "data", "gaussians": 500})
+    same = eg.fit_large(heights / 100, **FEW | {"space": "data", "gaussians": 500})
     assert result.psnr_ycbcr == pytest.approx(same.psnr_ycbcr, abs=0.5)
     error = np.square(eg.picture_of(result.gaussians) - heights).mean()
     assert result.psnr_ycbcr == pytest.approx(

@@ -55,7 +55,7 @@ def test_small_fit_says_nothing(photo, tmp_path):
         (False, {"gaussians": 70}, (8000, 4000, 3, 70)),
         (False, {"target_psnr": 30.0}, (8000, 4000, 3, 500_000)),
         (True, {}, (8000, 4000, 3, 5000)),
-        (True, {"color": "data"}, (8000, 4000, 1, 5000)),
+        (True, {"space": "data"}, (8000, 4000, 1, 5000)),
     ],
 )
 def test_size_and_count(tmp_path, monkeypatch, grey, options, expected):

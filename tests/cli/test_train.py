@@ -60,7 +60,7 @@ def test_train_report(trained):
         "frequency_aware": True,
         "energy": None,
         "preset": "default",
-        "color": "ycbcr",
+        "space": "ycbcr",
         "seed": 0,
         "resumed": False,
     }
@@ -91,7 +91,7 @@ def test_train_options(trained, tmp_path):
     result = succeeded(run("train", folder / "photos", *outputs, *size, *options))
     assert result.stdout == ""
     report = json.loads((tmp_path / "m.json").read_text())
-    expected = {"energy": 0.5, "color": "rgb", "seed": 3, "preset": "eigengs", "steps": 2}
+    expected = {"energy": 0.5, "space": "rgb", "seed": 3, "preset": "eigengs", "steps": 2}
     assert {key: report[key] for key in expected} == expected
     assert report["gaussians"] == 256  # one a pixel
     assert report["most_components"] == [6, 5, 4]

@@ -245,5 +245,5 @@ def test_splats_are_bounded(path, monkeypatch):
 @pytest.mark.parametrize("cutoff", [3.0, 4.5])
 def test_the_cutoff_is_kept(path, cutoff):
     gaussians = replace(random_scene().on("llvm", space="rgb"), cutoff=cutoff)
-    result = eg.pack(gaussians, path, budget=3.0)
+    result = eg.pack(gaussians, path, max_psnr_drop=3.0)
     assert eg.Gaussians.load(path).cutoff == result.gaussians.cutoff == cutoff

@@ -82,7 +82,7 @@ def test_without_an_image_the_rendering_is_kept(fitted, path):
 
 def test_light_is_compared_as_it_is_shown(fitted, path):
     image = fitted[1] ** 3  # dark
-    gaussians = eg.fit(image, 60, iterations=40, color="linear", backend="llvm").gaussians
+    gaussians = eg.fit(image, 60, iterations=40, space="linear", backend="llvm").gaussians
     found = eg.pack(gaussians, path, image).gaussians
     before, after = (eg.psnr(picture_of(g), image, "data") for g in (gaussians, found))
     assert 0.7 * packing.BUDGET < before - after <= packing.BUDGET + 1e-3
@@ -178,7 +178,7 @@ def test_mistakes_leave_the_old_file(fitted, path):
 
 def test_a_set_without_error_loses_a_finite_number_of_decibels(tmp_path):
     image = np.full((16, 16, 3), 0.5, np.float32)
-    exact = eg.fit(image, 4, iterations=0, color="rgb", backend="llvm").gaussians
+    exact = eg.fit(image, 4, iterations=0, space="rgb", backend="llvm").gaussians
     assert eg.psnr(eg.picture_of(exact), image) == math.inf
     receipt = eg.pack(exact, tmp_path / "a.egs", image)
     assert 0 <= receipt.psnr_drop <= 0.5

@@ -29,7 +29,7 @@ def test_results_are_those_of_single_fits(backend, color, init):
     """On llvm bit for bit."""
     settings = options(backend, color=color, init=init)
     for image, found in zip(pictures(3), fit_batch(pictures(3), settings), strict=True):
-        alone = eg.fit(image, 60, 30, init=init, color=color, backend=backend)
+        alone = eg.fit(image, 60, 30, init=init, space=color, backend=backend)
         for row, other in zip(found.trace, alone.trace, strict=True):
             assert row["iteration"] == other["iteration"]
             assert row["psnr_ycbcr"] == pytest.approx(other["psnr_ycbcr"], abs=0.05)
@@ -49,7 +49,7 @@ def test_a_surplus_leaves_every_image_alike(backend, color):
     """As in single fits: on llvm bit for bit."""
     settings = options(backend, color=color, gaussians=30, iterations=150)
     for image, found in zip(pictures(3), fit_batch(pictures(3), settings), strict=True):
-        alone = eg.fit(image, 30, 150, color=color, backend=backend)
+        alone = eg.fit(image, 30, 150, space=color, backend=backend)
         assert [r["iteration"] for r in found.trace] == [r["iteration"] for r in alone.trace]
         assert len(found.gaussians) == 30
         if backend == "llvm":

@@ -37,14 +37,16 @@ def test_one_seed_one_model(backend):
 def test_paper_preset(backend):
     """Joint training fits the components better with every round; the mean comes solved."""
     few, more = (
-        eg.EigenGS.fit(small_basis(), SPLATS, preset="eigengs", steps=steps, backend=backend)
+        eg.EigenGS.fit(small_basis(), SPLATS, preset="eigengs", iterations=steps, backend=backend)
         for steps in (20, 300)
     )
     assert more.figures["psnr_components"] > few.figures["psnr_components"] + 1
     mean = eg.render(more.gaussians).numpy()
     nothing = small_basis().reconstruct([np.zeros(k) for k in more.components])
     assert eg.psnr(mean, nothing, "ycbcr") > 35
-    split = eg.EigenGS.fit(small_basis(), SPLATS, True, preset="eigengs", steps=20, backend=backend)
+    split = eg.EigenGS.fit(
+        small_basis(), SPLATS, True, preset="eigengs", iterations=20, backend=backend
+    )
     assert split.low == 10
     assert not split.weights[0][6:, :10].any()
 
@@ -198,7 +200,7 @@ def test_few_or_equal_images(backend, kind, split):
 
 
 def test_rgb(backend, others):
-    model = small_model(backend, color="rgb")
+    model = small_model(backend, space="rgb")
     assert model.gaussians.space == "rgb"
     basis = small_basis("rgb")
     pca = fidelity([basis.reconstruct(basis.project(image)) for image in others], others)

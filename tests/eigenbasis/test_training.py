@@ -60,7 +60,7 @@ def test_the_file_encodes_as_what_was_trained(folder, output):
     [
         {"preset": "eigengs", "steps": 3},
         {"frequency_aware": True},
-        {"color": "rgb"},
+        {"space": "rgb"},
         {"energy": 0.5},
         {"gaussians": 1024},
     ],

@@ -138,9 +138,9 @@ def test_the_image_is_left_alone(backend, color):
     """An image of float32 is not copied, so nothing may write to it: it can be read-only."""
     image = picture()
     image.setflags(write=False)
-    found = fit(image, SPLATS, 3, color=color, backend=backend)
+    found = fit(image, SPLATS, 3, space=color, backend=backend)
     np.testing.assert_array_equal(image, picture())
-    expected = fit(picture().astype(np.float64), SPLATS, 3, color=color, backend=backend)
+    expected = fit(picture().astype(np.float64), SPLATS, 3, space=color, backend=backend)
     np.testing.assert_array_equal(found.image, expected.image)
 
 

@@ -15,7 +15,7 @@ from eigengs_dr.raster.render import render
 
 @pytest.mark.parametrize("color", ["ycbcr", "rgb"])
 def test_colour_spaces(backend, color):
-    result = fit(picture(), SPLATS, 60, color=color, backend=backend)
+    result = fit(picture(), SPLATS, 60, space=color, backend=backend)
     check_sound(result, picture())
     assert result.gaussians.space == color
     assert result.trace[-1]["psnr_rgb"] > 25
@@ -23,7 +23,7 @@ def test_colour_spaces(backend, color):
 
 def test_fit_in_linear_light(backend):
     """The sum is linear light, and its picture sRGB."""
-    result = fit(picture(), SPLATS, 60, color="linear", backend=backend)
+    result = fit(picture(), SPLATS, 60, space="linear", backend=backend)
     check_sound(result, picture())
     assert result.gaussians.space == "linear"
     light = render(result.gaussians).numpy()
@@ -37,7 +37,7 @@ def test_fit_in_linear_light(backend):
 def test_a_ramp_of_light_needs_no_more_than_a_few_splats(backend):
     """In sRGB it is bent; the light of the fit rises in equal steps."""
     light = np.broadcast_to(np.linspace(0.2, 0.8, SIDE)[:, None], (SIDE, SIDE, 3))
-    result = fit(to_coded(light), SPLATS, 60, color="linear", backend=backend)
+    result = fit(to_coded(light), SPLATS, 60, space="linear", backend=backend)
     columns = render(result.gaussians).numpy().mean(axis=(0, 2))
     np.testing.assert_allclose(columns, light[0, :, 0], atol=4e-3)
 
@@ -45,7 +45,7 @@ def test_a_ramp_of_light_needs_no_more_than_a_few_splats(backend):
 def test_linear_light_places_by_what_one_sees(backend):
     """As many splats in the dark as a fit of the coded picture has there."""
     placed = [
-        fit(picture(), SPLATS, 0, color=color, backend=backend).gaussians.to_arrays()
+        fit(picture(), SPLATS, 0, space=color, backend=backend).gaussians.to_arrays()
         for color in ("linear", "rgb")
     ]
     np.testing.assert_array_equal(placed[0]["mean"], placed[1]["mean"])
@@ -60,7 +60,7 @@ def test_linear_light_weighs_errors_in_the_dark(backend, monkeypatch):
         dark, shown = photo[y : y + SIDE, x : x + SIDE] * light, []
         for darkness in (DARKNESS, 0.0):
             monkeypatch.setattr(starting, "DARKNESS", darkness)
-            image = fit(dark, SPLATS, 60, color="linear", backend=backend).image
+            image = fit(dark, SPLATS, 60, space="linear", backend=backend).image
             shown.append(np.square(image - dark)[: SIDE // 3].mean())
         logarithms.append(np.log(shown[0] / shown[1]))
     assert np.mean(logarithms) < np.log(0.85)
@@ -72,9 +72,9 @@ def test_data_is_taken_as_it_is(backend, preset, channels):
     data = picture()[..., :channels]
     if preset == "eigengs":
         with pytest.raises(ValueError, match="color is 'data', but the basis is in 'ycbcr'; use"):
-            fit(data, SPLATS, 3, preset=preset, basis=small_model(backend), color="data")
+            fit(data, SPLATS, 3, preset=preset, basis=small_model(backend), space="data")
         return
-    result = fit(data, SPLATS, 60, preset=preset, color="data", backend=backend)
+    result = fit(data, SPLATS, 60, preset=preset, space="data", backend=backend)
     assert result.gaussians.space == "data"
     assert result.gaussians.channels == channels
     assert result.image.shape == data.shape
@@ -96,8 +96,8 @@ def test_data_is_taken_as_it_is(backend, preset, channels):
 def test_data_of_one_channel(backend, init):
     """Of two axes or of three; what three equal channels give, if one is enough."""
     data = picture()[..., 0]
-    one = fit(data, SPLATS, 20, init=init, color="data", backend=backend)
-    same = fit(data[..., None], SPLATS, 20, init=init, color="data", backend=backend)
+    one = fit(data, SPLATS, 20, init=init, space="data", backend=backend)
+    same = fit(data[..., None], SPLATS, 20, init=init, space="data", backend=backend)
     assert one.gaussians.channels == same.gaussians.channels == 1
     np.testing.assert_array_equal(one.image, same.image)
     assert figures(one)[-1] > 20
@@ -106,4 +106,4 @@ def test_data_of_one_channel(backend, init):
 @pytest.mark.parametrize(("color", "hint"), [("linear", "another init"), ("rgb", "train a basis")])
 def test_a_basis_of_another_space(backend, color, hint):
     with pytest.raises(ValueError, match=f"color is '{color}', but the basis .* or {hint}"):
-        fit(picture(), init="eigen", basis=small_model(backend), color=color, backend=backend)
+        fit(picture(), init="eigen", basis=small_model(backend), space=color, backend=backend)

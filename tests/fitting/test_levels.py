@@ -131,7 +131,7 @@ def test_one_level_is_a_set_like_any(image):
 
 @pytest.mark.parametrize("color", ["linear", "rgb", "data"])
 def test_other_colours(image, color):
-    found = fit_levels(image, 64, 2, iterations=5, color=color)
+    found = fit_levels(image, 64, 2, iterations=5, space=color)
     assert found.gaussians.space == color
     assert np.isfinite(picture_of(found.gaussians[:16])).all()
 

@@ -24,7 +24,7 @@ def light():
 
 @pytest.mark.parametrize(("color", "space"), [("linear", "radiance"), ("log", "log")])
 def test_light_above_1(light, color, space):
-    result = eg.fit(light, color=color, encoding="linear", **SMALL)
+    result = eg.fit(light, space=color, encoding="linear", **SMALL)
     assert result.gaussians.space == space
     rendered = eg.render(result.gaussians).numpy()
     assert rendered.max() == pytest.approx(light.max(), rel=0.1)
@@ -38,7 +38,7 @@ def test_light_above_1(light, color, space):
 
 def test_logarithms_leave_less_error(light):
     figures = [
-        eg.fit(light, color=color, encoding="linear", **SMALL).trace[-1]["psnr_ycbcr"]
+        eg.fit(light, space=color, encoding="linear", **SMALL).trace[-1]["psnr_ycbcr"]
         for color in ("radiance", "log")
     ]
     assert figures[1] > figures[0]
@@ -46,16 +46,16 @@ def test_logarithms_leave_less_error(light):
 
 def test_light_of_a_picture_stays_linear(light):
     dim = np.minimum(light, 1)
-    assert eg.fit(dim, color="linear", encoding="linear", **SMALL).gaussians.space == "linear"
+    assert eg.fit(dim, space="linear", encoding="linear", **SMALL).gaussians.space == "linear"
 
 
 def test_linear_input_is_decoded_once(light):
     dim = np.minimum(light, 1)
     for image, said in ((dim, "linear"), (dim.view(LinearImage), None), (to_coded(dim), None)):
-        result = eg.fit(image, color="linear", encoding=said, **SMALL)
+        result = eg.fit(image, space="linear", encoding=said, **SMALL)
         mean = eg.render(result.gaussians).numpy().mean()
         assert mean == pytest.approx(dim.mean(), rel=0.02)
-    dark = eg.fit(dim, color="linear", **SMALL)  # an array counts as sRGB
+    dark = eg.fit(dim, space="linear", **SMALL)  # an array counts as sRGB
     decoded = eg.render(dark.gaussians).numpy().mean()
     assert decoded == pytest.approx(to_linear(dim).mean(), rel=0.05)
 
@@ -63,14 +63,14 @@ def test_linear_input_is_decoded_once(light):
 @pytest.mark.parametrize("color", ["ycbcr", "rgb"])
 def test_light_becomes_srgb_in_other_spaces(light, color):
     dim = np.minimum(light, 1)
-    one = eg.fit(dim, color=color, encoding="linear", **SMALL)
-    two = eg.fit(to_coded(dim), color=color, **SMALL)
+    one = eg.fit(dim, space=color, encoding="linear", **SMALL)
+    two = eg.fit(to_coded(dim), space=color, **SMALL)
     np.testing.assert_array_equal(one.image, two.image)
 
 
 def test_light_without_a_word_is_refused_above_1(light):
     with pytest.raises(ValueError, match="say encoding='linear' for light") as error:
-        eg.fit(light, color="linear", **SMALL)
+        eg.fit(light, space="linear", **SMALL)
     one_line(error)
     with pytest.raises(ValueError, match="encoding 'raw' is unknown"):
         eg.fit(light, encoding="raw", **SMALL)
@@ -79,11 +79,11 @@ def test_light_without_a_word_is_refused_above_1(light):
 def test_data_of_any_range():
     y, x = np.mgrid[:40, :48].astype(np.float32)
     heights = 1200 + 300 * np.sin(x / 9) * np.cos(y / 7)
-    result = eg.fit(heights, color="data", **SMALL)
+    result = eg.fit(heights, space="data", **SMALL)
     error = np.sqrt(np.mean((eg.render(result.gaussians).numpy()[..., 0] - heights) ** 2))
     assert error < 3
     np.testing.assert_allclose(result.image[..., 0], heights, atol=30)
-    levels = eg.fit_levels(heights, levels=2, color="data", **SMALL)
+    levels = eg.fit_levels(heights, levels=2, space="data", **SMALL)
     np.testing.assert_allclose(levels.image[..., 0], heights, atol=60)
 
 
@@ -91,27 +91,27 @@ def test_normals_from_minus_1_to_1():
     y, x = np.mgrid[:40, :48].astype(np.float32)
     slopes = np.stack([np.sin(x / 9), np.cos(y / 7), np.ones_like(x)], 2)
     normals = slopes / np.linalg.norm(slopes, axis=2, keepdims=True)
-    result = eg.fit(normals, color="data", **SMALL)
+    result = eg.fit(normals, space="data", **SMALL)
     assert np.abs(eg.render(result.gaussians).numpy() - normals).mean() < 0.01
 
 
 def test_many_images_of_light(tmp_path, light):
     for name in ("a.pfm", "b.pfm"):
         eg.save_image(tmp_path / name, light)
-    rows = eg.fit_many(tmp_path, tmp_path / "out", color="log", **SMALL)
+    rows = eg.fit_many(tmp_path, tmp_path / "out", space="log", **SMALL)
     assert [row.status for row in rows] == ["done", "done"]
-    alone = eg.fit(light, color="log", encoding="linear", **SMALL)
+    alone = eg.fit(light, space="log", encoding="linear", **SMALL)
     found = eg.Gaussians.load(tmp_path / "out" / "a.npz")
     np.testing.assert_array_equal(found.to_arrays()["color"], alone.gaussians.to_arrays()["color"])
     assert rows[0].psnr_ycbcr == pytest.approx(alone.trace[-1]["psnr_ycbcr"], abs=0.5)
-    rows = eg.fit_many([light, light], color="linear", encoding="linear", **SMALL)
+    rows = eg.fit_many([light, light], space="linear", encoding="linear", **SMALL)
     assert [row.result.gaussians.space for row in rows] == ["radiance", "radiance"]
 
 
 @pytest.mark.parametrize("color", ["radiance", "log"])
 def test_by_blocks(light, color):
     result = eg.fit_large(
-        light, gaussians=200, iterations=30, block=32, color=color, encoding="linear"
+        light, gaussians=200, iterations=30, block=32, space=color, encoding="linear"
     )
     assert result.psnr_ycbcr > 18
     assert eg.render(result.gaussians).numpy().max() > 100
@@ -119,8 +119,8 @@ def test_by_blocks(light, color):
 
 @pytest.mark.parametrize("color", ["linear", "log"])
 def test_pack(tmp_path, light, color):
-    gaussians = eg.fit(light, color=color, encoding="linear", **SMALL).gaussians
-    packed = eg.pack(gaussians, tmp_path / "a.egs", light, budget=0.5, encoding="linear")
+    gaussians = eg.fit(light, space=color, encoding="linear", **SMALL).gaussians
+    packed = eg.pack(gaussians, tmp_path / "a.egs", light, max_psnr_drop=0.5, encoding="linear")
     assert 0 < packed.psnr_drop <= 0.5
     loaded = eg.Gaussians.load(tmp_path / "a.egs")
     assert loaded.space == gaussians.space
@@ -130,7 +130,7 @@ def test_pack(tmp_path, light, color):
 def test_gradients_of_logarithms(light):
     import drjit as dr
 
-    gaussians = eg.fit(light, color="log", encoding="linear", **SMALL).gaussians
+    gaussians = eg.fit(light, space="log", encoding="linear", **SMALL).gaussians
     dr.enable_grad(gaussians.color)
     dr.backward(dr.sum(eg.render(gaussians).array))
     slope = dr.grad(gaussians.color)[0].numpy()

@@ -134,7 +134,7 @@ def test_interrupted_it_returns_what_there_is():
 def test_an_image_that_is_fitted_without_error(space, value):
     """The PSNR of a set without error is infinite."""
     image = np.full((SIDE, SIDE, 1 if space == "data" else 3), value, np.float32)
-    result = fit(image, target_psnr=40, iterations=40, color=space)
+    result = fit(image, target_psnr=40, iterations=40, space=space)
     assert (len(result.gaussians), result.stopped, result.psnr_rgb) == (1, "met", np.inf)
 
 

@@ -128,7 +128,7 @@ def test_an_interrupt_in_between_leaves_the_number_asked_for(color, monkeypatch)
             raise KeyboardInterrupt
 
     with pytest.raises(eg.FitInterrupted) as caught:
-        eg.fit(image, COUNT, 200, color=color, progress=stop)
+        eg.fit(image, COUNT, 200, space=color, progress=stop)
     result = caught.value.result
     assert len(result.gaussians) == COUNT
     assert result.trace[-1]["iteration"] == result.iterations == 60

@@ -62,7 +62,7 @@ def test_derivatives_of_the_length(backend, mode):
 
 
 def test_a_fit_has_unit_normals_and_its_file_too(tmp_path):
-    result = eg.fit(bumps(), 60, iterations=10, color="normal")
+    result = eg.fit(bumps(), 60, iterations=10, space="normal")
     np.testing.assert_allclose(lengths(result.image), 1, atol=1e-5)
     assert result.trace[-1]["psnr_ycbcr"] > 30
     few = result.gaussians[:8]
@@ -76,6 +76,6 @@ def test_a_fit_has_unit_normals_and_its_file_too(tmp_path):
 
 def test_what_is_no_normal_map():
     with pytest.raises(ImageError, match="a normal map has three channels; use color 'data'"):
-        eg.fit(bumps()[..., :1], 10, iterations=0, color="normal")
+        eg.fit(bumps()[..., :1], 10, iterations=0, space="normal")
     with pytest.raises(ImageError, match=r"normals run from -.* not 0 to 1; pass \(n \+ 1\) / 2"):
-        eg.fit(2 * bumps() - 1.5, 10, iterations=0, color="normal")
+        eg.fit(2 * bumps() - 1.5, 10, iterations=0, space="normal")

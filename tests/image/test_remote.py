@@ -71,7 +71,7 @@ def test_an_image_may_be_a_file_or_a_url(place, photos, tmp_path):
     want = eg.fit(pixels, **QUICK).image
     np.testing.assert_array_equal(eg.fit(url, **QUICK).image, want)
     eg.fit_levels(url, levels=2, **QUICK)
-    assert eg.fit(url, color="data", **QUICK).gaussians.channels == 3
+    assert eg.fit(url, space="data", **QUICK).gaussians.channels == 3
     found = eg.fit_material({"albedo": url, "roughness": url}, **QUICK)
     assert list(found.material) == ["albedo", "roughness"]
     large = eg.fit_large(url, tmp_path / "large.npz", block=32, **QUICK)

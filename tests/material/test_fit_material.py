@@ -94,7 +94,7 @@ def test_levels_are_materials_too():
 def test_packing(tmp_path):
     result = eg.fit_material(images(), 12, iterations=40)
     before = figures(result)
-    packed = eg.pack_material(result.material, tmp_path / "m.egs", images(), budget=0.5)
+    packed = eg.pack_material(result.material, tmp_path / "m.egs", images(), max_psnr_drop=0.5)
     assert 0 < packed.psnr_drop <= 0.5
     assert packed.bytes == (tmp_path / "m.egs").stat().st_size < 12 * 12 * 4
     loaded = eg.Material.load(tmp_path / "m.egs")

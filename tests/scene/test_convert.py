@@ -73,7 +73,7 @@ def test_a_dictionary_with_a_mesh(folder, tmp_path):
 
 
 def test_nothing_is_rendered_on_request(folder, tmp_path):
-    found = eg.convert_scene(wall(folder), tmp_path / "new", spp=0, psnr=20, iterations=1)
+    found = eg.convert_scene(wall(folder), tmp_path / "new", spp=0, target_psnr=20, iterations=1)
     assert found.psnr == [] and not list((tmp_path / "new").glob("*.png"))
 
 

@@ -95,7 +95,7 @@ class TestFit:
         # The poster fills the picture, or nearly: what is around it is the same for both.
         image = photo()
         found = eg.fit_for_scene(
-            scene_of(camera([0, 0, distance])), NAME, image, psnr=BOUND, iterations=STEPS
+            scene_of(camera([0, 0, distance])), NAME, image, target_psnr=BOUND, iterations=STEPS
         )
         assert min(found.psnr) >= BOUND
         rendered = seen_by_a_renderer(found, scene_of, [0, 0, distance], image)
@@ -107,7 +107,11 @@ class TestFit:
         counts = [
             len(
                 eg.fit_for_scene(
-                    scene_of(camera([0, 0, distance])), NAME, photo(), psnr=BOUND, iterations=STEPS
+                    scene_of(camera([0, 0, distance])),
+                    NAME,
+                    photo(),
+                    target_psnr=BOUND,
+                    iterations=STEPS,
                 ).gaussians
             )
             for distance in (2.7, 7.0, 20.0)
@@ -126,7 +130,7 @@ class TestFit:
 
     def test_every_camera_is_content(self):
         scene = scene_of(camera([0, 0, 5.0]), camera([3, 0, 4.0]))
-        found = eg.fit_for_scene(scene, NAME, photo(), psnr=BOUND, iterations=STEPS)
+        found = eg.fit_for_scene(scene, NAME, photo(), target_psnr=BOUND, iterations=STEPS)
         assert len(found.psnr) == 2 and min(found.psnr) >= BOUND
         counts = [count for count, reached in found.tried if reached >= BOUND]
         assert min(counts) == len(found.gaussians)
@@ -134,7 +138,12 @@ class TestFit:
     def test_data_of_one_channel(self):
         data = photo()[..., :1]
         found = eg.fit_for_scene(
-            scene_of(camera([0, 0, 5.0])), NAME, data, psnr=BOUND, color="data", iterations=STEPS
+            scene_of(camera([0, 0, 5.0])),
+            NAME,
+            data,
+            target_psnr=BOUND,
+            space="data",
+            iterations=STEPS,
         )
         assert found.gaussians.space == "data" and found.gaussians.channels == 1
         rows = found.visibility.pixel_to_texel[0]
@@ -146,7 +155,7 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("arguments", "words"),
         [
-            ({"color": "ycbcr"}, ["color 'ycbcr'", "linear"]),
+            ({"space": "ycbcr"}, ["color 'ycbcr'", "linear"]),
             ({"psnr": 80.0}, ["psnr is 80"]),
             ({"psnr": float("nan")}, ["psnr is nan"]),
             ({"iterations": -1}, ["iterations"]),

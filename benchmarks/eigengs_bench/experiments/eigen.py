@@ -72,7 +72,7 @@ def _measure(model: EigenGS, image: Image, iterations: int) -> Any:
         picture = render(refined.gaussians).numpy()
         yield from _row(name, image, picture, time.perf_counter() - started)
     for name in PLACED:
-        fitted = fit(image, len(model.gaussians), iterations, init=name, color=space)
+        fitted = fit(image, len(model.gaussians), iterations, init=name, space=space)
         yield from _row(name, image, fitted.image, fitted.seconds)
 
 

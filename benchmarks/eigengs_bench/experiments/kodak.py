@@ -44,7 +44,7 @@ def _jobs(
     def compile_programs() -> None:
         for _, photo in photos[:1]:
             small = np.ascontiguousarray(photo[:SMALL, :SMALL])
-            fit(small, FEW, WARM_UP, color=COLOR, seed=task.seed, backend=task.backend)
+            fit(small, FEW, WARM_UP, space=COLOR, seed=task.seed, backend=task.backend)
 
     def work(image: Image, count: int, iterations: int) -> Row:
         compile_programs()

@@ -60,7 +60,7 @@ def run(images: Mapping[str, Image], progress: Progress = lambda *_: None) -> li
         side = len(image)
         if image.shape[1] != side or side & (side - 1):
             raise ValueError(f"{name}: {image.shape[1]}x{side} pixels; use a square of 2^n pixels")
-        errors.append(_errors(fit(image, GAUSSIANS, STEPS, color="linear").gaussians))
+        errors.append(_errors(fit(image, GAUSSIANS, STEPS, space="linear").gaussians))
         progress("images", done + 1, len(images))
     for row, *each in zip(rows, *errors, strict=True):
         for method in each[0]:

@@ -55,7 +55,7 @@ def run(
         def step(done: int, total: int, row: Any, number: int = number) -> None:
             progress("fits", number * total + done, len(ways) * total)
 
-        found = fit(image, gaussians, iterations, color=color, progress=step)
+        found = fit(image, gaussians, iterations, space=color, progress=step)
         shown = np.clip(found.image, 0, 1) if name == "8bit" else found.image
         results[name] = to_linear(shown)
     figures = {

@@ -36,7 +36,7 @@ class Method(NamedTuple):
     preset: str
     source: str = ""
     components: int = 0
-    color: str = "ycbcr"
+    space: str = "ycbcr"
     split: str = "auto"  # or "split" or "whole": frequency_aware of EigenGS.fit
 
 
@@ -84,9 +84,9 @@ def _preparation(task: Task, name: str, picture: Image) -> Ready:
         model: EigenGS | None = None
         if method.source:
             split = {"split": True, "whole": False}.get(method.split, "auto")
-            model = model_for(task, name, method.source, method.components, method.color, split)
+            model = model_for(task, name, method.source, method.components, method.space, split)
         count = None if method.source else SETS[name].gaussians
-        chosen: Any = {"preset": method.preset, "color": method.color, "backend": task.backend}
+        chosen: Any = {"preset": method.preset, "color": method.space, "backend": task.backend}
         options = FitOptions(gaussians=count, basis=model, **chosen)
 
         def start(image: Image, seed: int, depth: int = 10) -> FitProblem:

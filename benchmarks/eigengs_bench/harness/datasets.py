@@ -55,7 +55,7 @@ def model_for(
     name: str,
     source: str,
     components: int,
-    color: str = "ycbcr",
+    space: str = "ycbcr",
     split: bool | str = "auto",
 ) -> EigenGS:
     """Load a model of the training images of the set `source`, for images of the set `name`.
@@ -64,7 +64,7 @@ def model_for(
     each channel; `split` is `frequency_aware` of `EigenGS.fit`.
     """
     used, models = SETS[name], task.folder / "models"
-    stem = f"{source}-{used.width}x{used.height}-{color}"
+    stem = f"{source}-{used.width}x{used.height}-{space}"
     kind = "auto" if isinstance(split, str) else "split" if split else "whole"
     path = models / f"{stem}-{components}-{used.gaussians}-{kind}.npz"
     if not path.exists():
@@ -75,7 +75,7 @@ def model_for(
                 Path(task.data or "") / SETS[source].folder / "train",
                 (used.width, used.height),
                 MAX_COMPONENTS,
-                color=color,
+                space=space,
                 progress=lambda done, total, row: task.progress(basis.stem, done, total or 0),
             ).save(basis)
         task.progress(path.stem, 0, 1)

@@ -42,7 +42,7 @@ class PCAOptions:
     """
 
     size: tuple[int, int]
-    color: str
+    space: str
     components: tuple[int, ...]
     seed: int
     solver: str = "incremental"
@@ -86,7 +86,7 @@ def accumulate(
         return _in_shards(images, options, progress, client, checkpoint)
     ranks = [rank_for(k) for k in options.components]
     length, state = block_length(options.size), empty_state(options.size, options.seed)
-    blocks = read_blocks(readable(images), options.size, options.color, length, progress)
+    blocks = read_blocks(readable(images), options.size, options.space, length, progress)
     with closing(blocks):
         for block in blocks:
             state = merge(state, block, ranks)
@@ -107,7 +107,7 @@ def _in_shards(
         if progress:
             progress(done, total, {})
 
-    size, color, seed = options.size, options.color, options.seed
+    size, color, seed = options.size, options.space, options.seed
     ranks = tuple(rank_for(k) for k in options.components)
     with ExitStack() as stack:
         if checkpoint is None and client is None:  # the states of all shards would fill the memory
@@ -133,7 +133,7 @@ def _by_gram(
         )
     with ExitStack() as stack:
         folder = Path(checkpoint or stack.enter_context(TemporaryDirectory())).absolute()
-        shared = StoreOptions(options.size, options.color, folder)
+        shared = StoreOptions(options.size, options.space, folder)
         executor = executor_for(client)
         if client is None:
             store = store_images(images, shared, progress)

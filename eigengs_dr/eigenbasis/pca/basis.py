@@ -77,7 +77,7 @@ class Eigenbasis:
         size: tuple[int, int] = (256, 256),
         components: int | Sequence[int] = 300,
         energy: float | None = None,
-        color: str = "ycbcr",
+        space: str = "ycbcr",
         seed: int = 0,
         progress: Any = None,
         client: Any = None,
@@ -136,9 +136,9 @@ class Eigenbasis:
             If images are skipped, cropped or too few, or `components` is too low for the energy.
         """
         size, most = check_size(size), check_components(components, energy)
-        options = PCAOptions(size, color, most, seed, solver)
+        options = PCAOptions(size, space, most, seed, solver)
         state = accumulate(source, options, progress, client, checkpoint)
-        return cls.from_state(state, size, components, energy, color)
+        return cls.from_state(state, size, components, energy, space)
 
     @classmethod
     def from_state(
@@ -147,7 +147,7 @@ class Eigenbasis:
         size: tuple[int, int],
         components: int | Sequence[int] = 300,
         energy: float | None = None,
-        color: str = "ycbcr",
+        space: str = "ycbcr",
     ) -> Eigenbasis:
         """Build the basis of all images of a state; parameters as for `from_images`."""
         if state.count == 0:
@@ -168,14 +168,14 @@ class Eigenbasis:
             ),
             variance=state.squares / state.count,
             count=state.count,
-            space=color,
+            space=space,
             examples=np.stack(
-                [_rgb(planes.reshape(-1, *shape), color) for planes in state.examples]
+                [_rgb(planes.reshape(-1, *shape), space) for planes in state.examples]
             ),
         )
         if energy is None:
             return basis
-        ranks = ranks_for_energy(basis.energy(), basis.variance, most, energy, color)
+        ranks = ranks_for_energy(basis.energy(), basis.variance, most, energy, space)
         return basis.truncated(ranks)
 
     def __repr__(self) -> str:

@@ -28,7 +28,7 @@ def test_training_shapes_pays(backend):
     model = eg.EigenGS.fit(
         small_basis(),
         SPLATS,
-        steps=4 * ROUND,
+        iterations=4 * ROUND,
         backend=backend,
         progress=lambda done, total, row: seen.append((done, total)),
     )

@@ -48,7 +48,7 @@ def psnr_of(basis, images):
 @pytest.mark.parametrize("space", ["ycbcr", "rgb"])
 def test_one_block_is_exact(space):
     images = family()
-    basis = Eigenbasis.from_images(images, SIZE, 12, color=space)
+    basis = Eigenbasis.from_images(images, SIZE, 12, space=space)
     assert (basis.width, basis.height, basis.channels) == (*SIZE, 3)
     assert (basis.count, basis.space) == (60, space)
     assert basis.mean.dtype == basis.components[0].dtype == np.float32
@@ -77,7 +77,7 @@ def test_eigenvalues_are_the_variances_of_the_coefficients():
 
 def test_reconstruction_is_that_of_scikit_learn():
     images, others = family(), family(seed=1)[:5]
-    basis, references = Eigenbasis.from_images(images, SIZE, 12, color="rgb"), exact(images, "rgb")
+    basis, references = Eigenbasis.from_images(images, SIZE, 12, space="rgb"), exact(images, "rgb")
     for image in others:
         result = basis.reconstruct(basis.project(image))
         for c, reference in enumerate(references):

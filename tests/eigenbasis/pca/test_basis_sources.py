@@ -94,7 +94,7 @@ def test_mixed_sizes_and_bad_files(tmp_path):
         ({"energy": 1.5}, "energy is 1.5; expected a share"),
         ({"energy": float("nan")}, "energy is nan; expected a share"),
         ({"size": (0, 3)}, "size is 0x3"),
-        ({"color": "linear"}, "'linear' is unknown; use one of"),
+        ({"space": "linear"}, "'linear' is unknown; use one of"),
         ({"seed": -1}, "seed is -1; expected"),
     ],
 )

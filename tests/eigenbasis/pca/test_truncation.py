@@ -41,7 +41,7 @@ def others():
 def test_held_out_images_tell_the_rank():
     """Noise of the training images alone is no reason to keep components of it."""
     basis = eg.Eigenbasis.from_images(
-        low_rank(60, 1e-3, seed=1), (SIDE, SIDE), components=20, color="rgb"
+        low_rank(60, 1e-3, seed=1), (SIDE, SIDE), components=20, space="rgb"
     )
     assert [len(c) for c in basis.components] == [20] * 3
     fall = basis.truncation_curve(low_rank(20, 0, seed=2))
@@ -51,7 +51,7 @@ def test_held_out_images_tell_the_rank():
         >= 50
     )
     energy = eg.Eigenbasis.from_images(
-        low_rank(60, 1e-4, seed=1), (SIDE, SIDE), energy=0.999, color="rgb"
+        low_rank(60, 1e-4, seed=1), (SIDE, SIDE), energy=0.999, space="rgb"
     )
     assert tuple(map(len, energy.components)) == RANKS
 

@@ -130,7 +130,7 @@ def label(method: Method, name: str) -> str:
         return method.preset
     basis = {NATURAL: "universal", name: "own"}.get(method.source, method.source)
     text = f"{method.preset}, {method.components} components, {basis} basis"
-    return text if method.split == "auto" else f"{method.preset}, {method.color}, {method.split}"
+    return text if method.split == "auto" else f"{method.preset}, {method.space}, {method.split}"
 
 
 def _glances(groups: dict[Any, pd.DataFrame]) -> Iterator[fr.Table]:

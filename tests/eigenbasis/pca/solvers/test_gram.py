@@ -43,7 +43,7 @@ def assert_is_pca(basis, images, components, space="ycbcr"):
 @pytest.mark.parametrize("space", ["ycbcr", "rgb"])
 def test_both_solvers_are_scikit_learn_with_its_signs(solver, space):
     images = family(90, noise=0)
-    basis = Eigenbasis.from_images(images, SIZE, 12, solver=solver, color=space)
+    basis = Eigenbasis.from_images(images, SIZE, 12, solver=solver, space=space)
     assert_is_pca(basis, images, 12, space)
 
 

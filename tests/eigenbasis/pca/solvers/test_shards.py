@@ -121,7 +121,7 @@ def test_states_of_nothing_change_nothing():
 
 def test_examples_come_from_all_shards():
     images = family(100)
-    basis = Eigenbasis.from_images(images, SIZE, 2, color="rgb")
+    basis = Eigenbasis.from_images(images, SIZE, 2, space="rgb")
     assert basis.examples.shape == (16, SIZE[1], SIZE[0], 3)
     places = [int(np.abs(images - example).sum((1, 2, 3)).argmin()) for example in basis.examples]
     assert len(set(places)) == 16 and len({place // 20 for place in places}) >= 3
