@@ -71,7 +71,7 @@ class LargeFit:
 @named_options
 @shows_progress
 def fit_large(
-    source: Any,
+    image: Any,
     output: str | os.PathLike[str] | None = None,
     *,
     gaussians: int | None = None,
@@ -89,7 +89,7 @@ def fit_large(
 
     Parameters
     ----------
-    source : path-like or array
+    image : path-like or array
         A TIFF file by strips or tiles and a ``.npy`` file are read by windows; other files are
         decoded whole, into 4 bytes a pixel. Or an array (H, W, 3), (H, W, 1) or (H, W): NumPy's,
         also memory-mapped, zarr's or Dask's, of which parts are read by slices.
@@ -104,7 +104,7 @@ def fit_large(
         Number of steps of every block.
     block : int, optional
         Largest side of a block in pixels, at least 32.
-    color, solve_steps, cutoff, backend : optional
+    space, solve_steps, cutoff, backend : optional
         See `eigengs_dr.fit`.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
@@ -114,7 +114,7 @@ def fit_large(
     client : distributed.Client, optional
         Where blocks are fitted; by default in this process.
     encoding : {"srgb", "linear"}, optional
-        What the pixels are, see `eigengs_dr.fit`. For light above 1, give the color "log" or
+        What the pixels are, see `eigengs_dr.fit`. For light above 1, give the space "log" or
         "radiance": nobody looks at all pixels first.
 
     Returns
@@ -159,17 +159,17 @@ def fit_large(
         backend=backend,
         encoding=encoding,
     )
-    image = open_source(source, rendered_as(space) is None, encoding)
-    blocks, options = plan(image, options, block)
+    source = open_source(image, rendered_as(space) is None, encoding)
+    blocks, options = plan(source, options, block)
     select(backend)
     keep: Any = nullcontext()
     if output is not None:
         check_suffix(output)
         require_writable(output)
-        keep = Checkpoint(output, image.identity | _decisive(options, block), [])
+        keep = Checkpoint(output, source.identity | _decisive(options, block), [])
     try:
         with keep as checkpoint, defer_interrupts() if client is None else nullcontext() as pressed:
-            run = Run(image, blocks, options, executor_for(client), checkpoint, progress, pressed)
+            run = Run(source, blocks, options, executor_for(client), checkpoint, progress, pressed)
             data = run.fit()
             errors = run.measure(data)
             data = _in_unit(data, run.image.unit)
@@ -177,7 +177,7 @@ def fit_large(
                 write(output, data)
     finally:
         forget_pictures()
-    ycbcr, rgb = (psnr_from_mse(e / (3 * image.width * image.height)) for e in errors)
+    ycbcr, rgb = (psnr_from_mse(e / (3 * source.width * source.height)) for e in errors)
     result = Gaussians.from_data(data, backend)
     seconds = time.perf_counter() - started
     return LargeFit(result, ycbcr, rgb, len(blocks), run.resumed, iterations, seconds)
@@ -222,7 +222,7 @@ def _in_unit(data: SetData, unit: float) -> SetData:
 
 def _decisive(options: FitOptions, side: int) -> dict[str, Any]:
     """Return the options on which the result depends."""
-    names = ("gaussians", "iterations", "color", "solve_steps", "cutoff", "encoding")
+    names = ("gaussians", "iterations", "space", "solve_steps", "cutoff", "encoding")
     values = {name: getattr(options, name) for name in names} | {"block": side}
     # JSON has no numbers of NumPy.
     return {k: v.item() if isinstance(v, np.generic) else v for k, v in values.items()}

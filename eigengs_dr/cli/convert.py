@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     "-o", "--output", required=True, type=ANY_PATH, metavar="FOLDER", help="New or empty folder."
 )
 @click.option(
+    "--target-psnr",
     "--psnr",
+    "target_psnr",
     type=float,
     default=40.0,
     show_default=True,
@@ -54,7 +56,7 @@ def convert(
     context: click.Context,
     scene: Path,
     output: Path,
-    psnr: float,
+    target_psnr: float,
     iterations: int,
     spp: int | None,
     variant: str | None,
@@ -72,7 +74,7 @@ def convert(
     \b
     Examples:
       eigengs-dr convert room.xml -o room-gaussians/
-      eigengs-dr convert room.xml -o room-gaussians/ --psnr 36 --spp 64
+      eigengs-dr convert room.xml -o room-gaussians/ --target-psnr 36 --spp 64
       eigengs-dr scene room-gaussians/scene.xml -o room.png
     """
     check_outputs([report], [scene])
@@ -83,7 +85,7 @@ def convert(
     try:
         with progress_bar(quiet) as show:
             found = convert_scene(
-                scene, output, psnr, iterations, spp, dict(definitions), progress=show
+                scene, output, target_psnr, iterations, spp, dict(definitions), progress=show
             )
     except OSError:
         raise

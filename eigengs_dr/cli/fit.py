@@ -60,8 +60,7 @@ FAILED = 2
 @click.option("--gaussians", type=int, metavar="N", help="Number of Gaussians.  [default: 5000]")
 @click.option("--target-psnr", type=float, metavar="DB", help="Find the fewest for this PSNR.")
 @click.option(
-    "--space",
-    "target_space",
+    "--target-space",
     type=click.Choice(["rgb", "ycbcr"]),
     default="rgb",
     show_default=True,
@@ -95,7 +94,7 @@ FAILED = 2
 )
 @choice("--preset", list(PRESETS), "Our method, or that of a paper.")
 @choice(
-    "--color",
+    "--space",
     list(SPACES),
     "Colour space; linear for textures, log for light above 1, normal for normal maps, data for "
     "other values.",
@@ -164,8 +163,8 @@ def fit(
       eigengs-dr fit photos/ extra.png -o fits/ --overwrite --preview previews/
       eigengs-dr fit "photos/**/*.jpg" -o fits/ --cluster local:4
       eigengs-dr fit s3://bucket/photos/ -o /shared/fits/ --cluster tcp://node1:8786
-      eigengs-dr fit roughness.png -o roughness.npz --color data
-      eigengs-dr fit sky.exr -o sky.npz --color log --gaussians 20000
+      eigengs-dr fit roughness.png -o roughness.npz --space data
+      eigengs-dr fit sky.exr -o sky.npz --space log --gaussians 20000
       eigengs-dr fit huge.tif -o huge.npz --blocks 1024
       eigengs-dr fit --map albedo=a.jpg --map roughness=r.jpg --map normal=n.jpg -o bark.npz
     """
@@ -258,7 +257,7 @@ def _fitter(options: FitOptions, levels: Levels | None) -> Callable[..., "Fit"]:
     from ..fitting.levels import fit_levels
 
     if levels is not None:
-        names = ("gaussians", "iterations", "color", "seed", "backend", "encoding")
+        names = ("gaussians", "iterations", "space", "seed", "backend", "encoding")
         common = {name: getattr(options, name) for name in names}
         return lambda image, progress: fit_levels(image, levels=levels, progress=progress, **common)
     if options.initializer == "eigen":

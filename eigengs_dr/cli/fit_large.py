@@ -90,7 +90,7 @@ def fit_by_blocks(
     """
     from ..blocks.fit_large import fit_large
 
-    names = ("gaussians", "iterations", "color", "solve_steps", "cutoff", "backend", "encoding")
+    names = ("gaussians", "iterations", "space", "solve_steps", "cutoff", "backend", "encoding")
     settings = {name: getattr(options, name) for name in names}
     started = time.perf_counter()
     record: dict[str, Any] = {"input": str(path), "output": str(output), "stopped": "interrupted"}

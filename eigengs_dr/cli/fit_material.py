@@ -26,7 +26,7 @@ Record = dict[str, Any]
 MISSED = 1
 """Exit code if the target PSNR cannot be reached."""
 
-ELSEWHERE = ("init", "basis", "preset", "color", "seed", "blocks", "cluster")
+ELSEWHERE = ("init", "basis", "preset", "space", "seed", "blocks", "cluster")
 """Options of the command that materials do not take."""
 
 

@@ -42,7 +42,7 @@ Dr.Jit."""
 )
 @encoding_option
 @click.option(
-    "--budget",
+    "--max-psnr-drop",
     type=float,
     default=BUDGET,
     show_default=True,
@@ -67,7 +67,7 @@ def pack(
     image: Path | None,
     maps: tuple[MapFile, ...],
     encoding: str | None,
-    budget: float,
+    max_psnr_drop: float,
     levels: Levels,
     backend: str | None,
     report: Path | None,
@@ -82,7 +82,7 @@ def pack(
     \b
     Examples:
       eigengs-dr pack photo.npz -o photo.egs --image photo.jpg
-      eigengs-dr pack photo.npz -o photo.egs --budget 0.1
+      eigengs-dr pack photo.npz -o photo.egs --max-psnr-drop 0.1
       eigengs-dr pack levels.npz -o levels.egs --levels 4
       eigengs-dr pack bark.npz -o bark.egs --map albedo=a.jpg --map normal=n.jpg
     """
@@ -95,7 +95,9 @@ def pack(
     from ..material.file import holds_material
 
     if holds_material(file):
-        figures = pack_maps(file, target, image, maps, encoding, budget, levels, backend, quiet)
+        figures = pack_maps(
+            file, target, image, maps, encoding, max_psnr_drop, levels, backend, quiet
+        )
         if report:
             write_report(report, {**describe_run(context, backend), **figures})
         return
@@ -108,11 +110,11 @@ def pack(
     try:
         counts = eg.level_counts(len(gaussians), levels)
         sections = [n - before for before, n in zip([0, *counts], counts, strict=False)]
-        receipt = eg.pack(gaussians, target, pixels, budget, sections)
+        receipt = eg.pack(gaussians, target, pixels, max_psnr_drop, sections)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
     if report:
-        figures = packing_figures(file, target, receipt.gaussians, budget, receipt, "psnr")
+        figures = packing_figures(file, target, receipt.gaussians, max_psnr_drop, receipt, "psnr")
         write_report(report, {**describe_run(context, backend), **figures})
     if not quiet:
         against = "the image" if image else "the rendering of the input"

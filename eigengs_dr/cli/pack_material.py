@@ -22,7 +22,7 @@ def pack_maps(
     image: Path | None,
     maps: tuple[MapFile, ...],
     encoding: str | None,
-    budget: float,
+    max_psnr_drop: float,
     levels: Levels,
     backend: str | None,
     quiet: bool,
@@ -42,7 +42,7 @@ def pack_maps(
     }
     images = {name: load_map(item, encoding) for name, item in named.items()} or None
     try:
-        packed = eg.pack_material(material, target, images, budget, encoding)
+        packed = eg.pack_material(material, target, images, max_psnr_drop, encoding)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
     before = file.stat().st_size
@@ -55,14 +55,14 @@ def pack_maps(
             f"{packed.bits_per_pixel:.3f} bits per pixel for all maps\n"
             f"  lost {packed.psnr_drop:.2f} dB; psnr_rgb against {against}: {shown}"
         )
-    return packing_figures(file, target, material.gaussians, budget, packed, "psnr_rgb")
+    return packing_figures(file, target, material.gaussians, max_psnr_drop, packed, "psnr_rgb")
 
 
 def packing_figures(
     file: Path,
     target: Path,
     gaussians: Gaussians,
-    budget: float,
+    max_psnr_drop: float,
     packed: PackResult | MaterialPackResult,
     psnr: str,
 ) -> dict[str, Any]:
@@ -71,7 +71,7 @@ def packing_figures(
         "input": str(file),
         "output": str(target),
         "gaussians": len(gaussians),
-        "budget": budget,
+        "max_psnr_drop": max_psnr_drop,
         "bytes_before": file.stat().st_size,
         "bytes": packed.bytes,
         "bits_per_pixel": packed.bits_per_pixel,

@@ -71,12 +71,12 @@ MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
 @choice("--frequency-aware", list(FREQUENCY_AWARE), "Reserve a tenth for the first components.")
 @choice("--preset", ["default", "eigengs"], "Solve, or train (paper).")
 @click.option(
-    "--steps",
+    "--iterations",
     type=click.IntRange(min=0),
     metavar="N",
     help="Training steps.  [default: 0; eigengs: 15000]",
 )
-@choice("--color", ["ycbcr", "rgb"], "Space of the components.")
+@choice("--space", ["ycbcr", "rgb"], "Space of the components.")
 @seed_option
 @click.option("--preview", type=ANY_PATH, help="Picture of the components.")
 @cluster_option
@@ -100,7 +100,7 @@ def train(
 
     A model is one set of Gaussians that renders all principal components of the images. One image
     in ten is held out and measured at the end. --energy counts the variance of each channel of
-    the training images; --target-psnr measures PCA, in --color, of the images held out. After
+    the training images; --target-psnr measures PCA, in --space, of the images held out. After
     Ctrl-C or a crash, the same command resumes from the folder MODEL.npz.checkpoint. With --cluster
     the processes of a Dask cluster find components and weights; all see FOLDER and MODEL.npz.
 

@@ -47,7 +47,7 @@ class MaterialPackResult(NamedTuple):
         psnr_rgb in dB of each map against its image; without images, against the rendering before
         rounding.
     psnr_drop : float
-        Loss in dB, see the budget of `pack_material`.
+        Loss in dB, see max_psnr_drop of `pack_material`.
     steps : Steps
         Steps of the rounding.
     """
@@ -67,9 +67,9 @@ class MaterialPackResult(NamedTuple):
 @exclusive()
 def pack_material(
     material: Material,
-    path: str | os.PathLike[str],
+    output: str | os.PathLike[str],
     images: Mapping[str, ArrayLike] | None = None,
-    budget: float = BUDGET,
+    max_psnr_drop: float = BUDGET,
     encoding: str | None = None,
 ) -> MaterialPackResult:
     """Write a material to the smallest ``.egs`` file whose loss of PSNR stays within a budget.
@@ -80,11 +80,11 @@ def pack_material(
     Parameters
     ----------
     material : Material
-    path : path-like
+    output : path-like
         File to write; an existing file is replaced atomically. `Material.load` reads it.
     images : mapping of str to array_like, optional
         The images of the fit, as `eigengs_dr.fit_material` takes them. By default the renderings.
-    budget : float, optional
+    max_psnr_drop : float, optional
         Largest loss in dB, above 0 and at most 100: of the mean over the maps of the squared error
         (of colours as sRGB) over that before. Without images, over that of weighted errors of 40
         dB.
@@ -102,7 +102,7 @@ def pack_material(
     OSError
         If the file cannot be written; an existing file then stays unchanged.
     """
-    check_request(path, budget)
+    check_request(output, max_psnr_drop)
     maps, g = material.maps, dr.detach(material.gaussians)
     own = render(g).numpy()
     shown, values = _shown(own, maps), own
@@ -127,10 +127,10 @@ def pack_material(
 
     weighted = scale_channels(g, scale.tolist())
     rows = section_rows(len(g), None)
-    packed, drop = compress(weighted, values * scale, errors, budget, rows, unseen)
+    packed, drop = compress(weighted, values * scale, errors, max_psnr_drop, rows, unseen)
     content = to_bytes(packed._replace(maps=maps))
-    write(path, content)
-    found = Material.load(path, types_of(g.mean).backend)
+    write(output, content)
+    found = Material.load(output, types_of(g.mean).backend)
     pictures = found.pictures()
     return MaterialPackResult(
         material=found,

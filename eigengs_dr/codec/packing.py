@@ -91,9 +91,9 @@ class PackResult(NamedTuple):
 @exclusive()
 def pack(
     gaussians: Gaussians | Fit,
-    path: str | os.PathLike[str],
+    output: str | os.PathLike[str],
     image: ArrayLike | None = None,
-    budget: float = BUDGET,
+    max_psnr_drop: float = BUDGET,
     sections: Sequence[int] | None = None,
     cutoff: float | None = None,
     encoding: str | None = None,
@@ -103,11 +103,11 @@ def pack(
     Parameters
     ----------
     gaussians : Gaussians or Fit
-    path : path-like
+    output : path-like
         File to write; `pack` replaces an existing file atomically. `Gaussians.load` reads it.
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W), optional
         The image of the fit, as `fit` takes it. By default the rendering of the set.
-    budget : float, optional
+    max_psnr_drop : float, optional
         Largest loss of PSNR in dB, above 0 and at most 100: against the image, at the native size
         and in the space of the set (psnr_ycbcr for YCbCr; `pack` compares linear light as sRGB, and
         radiance in PU21).
@@ -137,7 +137,7 @@ def pack(
     -----
     On one machine and backend, the same arguments give the same file bit for bit.
     """
-    check_request(path, budget)
+    check_request(output, max_psnr_drop)
     whole: Gaussians = dr.detach(set_of(gaussians))
     rows = section_rows(len(whole), sections)
     if cutoff is not None:
@@ -153,11 +153,11 @@ def pack(
         parts = [*(found[: r.stop] for r in rows[:-1]), found]
         return [_error(part, shown) for part in parts]
 
-    packed, drop = compress(whole, target, errors, budget, rows, unseen)
+    packed, drop = compress(whole, target, errors, max_psnr_drop, rows, unseen)
     content = to_bytes(packed)
-    write(path, content)
+    write(output, content)
     return PackResult(
-        gaussians=Gaussians.load(path, types_of(whole.mean).backend),
+        gaussians=Gaussians.load(output, types_of(whole.mean).backend),
         bytes=len(content),
         bits_per_pixel=8 * len(content) / (whole.width * whole.height),
         psnr=psnr_from_mse(errors(to_gaussians(packed, whole))[-1]),
@@ -170,7 +170,7 @@ def compress(
     gaussians: Gaussians,
     target: Array,
     errors: Callable[[Gaussians], list[float]],
-    budget: float,
+    max_psnr_drop: float,
     rows: list[slice],
     unseen: float = 0.0,
 ) -> tuple[EgsContent, float]:
@@ -184,7 +184,7 @@ def compress(
         What compensation for the rounding aims at, in the space of the set.
     errors : callable
         ``errors(gaussians)`` returns the mean squared error of each prefix that `rows` end at.
-    budget : float
+    max_psnr_drop : float
         Allowed loss of each prefix in dB.
     rows : list of slice
         The sections.
@@ -203,7 +203,7 @@ def compress(
         If no rounding meets the budget.
     """
     before = [max(error + unseen, MIN_MSE) for error in errors(gaussians)]
-    limits = [error * 10 ** (budget / 10) - unseen for error in before]
+    limits = [error * 10 ** (max_psnr_drop / 10) - unseen for error in before]
     if min(limits) <= 0:
         raise ValueError(TOO_FINE)
 
@@ -237,13 +237,14 @@ def _steps(gaussians: Gaussians, octaves: float) -> Steps:
     return Steps(*values.tolist())
 
 
-def check_request(path: str | os.PathLike[str], budget: float) -> None:
+def check_request(output: str | os.PathLike[str], max_psnr_drop: float) -> None:
     """Raise ValueError for another suffix than ``.egs``, or a budget out of range."""
-    if Path(path).suffix.lower() != SUFFIX:
-        raise ValueError(f"{path}: pack writes {SUFFIX} files; use this suffix, or save()")
-    if not 0 < budget <= MAX_PSNR:
+    if Path(output).suffix.lower() != SUFFIX:
+        raise ValueError(f"{output}: pack writes {SUFFIX} files; use this suffix, or save()")
+    if not 0 < max_psnr_drop <= MAX_PSNR:
         raise ValueError(
-            f"pack: budget is {budget}; it must be above 0 and at most {MAX_PSNR:g} dB, such as 0.5"
+            f"pack: max_psnr_drop is {max_psnr_drop}; it must be above 0 and at most "
+            f"{MAX_PSNR:g} dB, such as 0.5"
         )
 
 

@@ -81,7 +81,7 @@ def fit_many(
         the same bits whatever the number of workers.
     options : Any
         Keyword arguments, the options of `eigengs_dr.fit`: gaussians, iterations, init, basis,
-        preset, solve_steps, color, seed, backend, target_psnr, target_space, max_gaussians,
+        preset, solve_steps, space, seed, backend, target_psnr, target_space, max_gaussians,
         cutoff and encoding. A basis is read once.
 
     Returns
@@ -223,7 +223,7 @@ def _fit_one(
 ) -> Fit:
     if levels is None:
         return fit_image(pixels, options, progress)
-    names = ("gaussians", "iterations", "color", "seed", "backend", "encoding")
+    names = ("gaussians", "iterations", "space", "seed", "backend", "encoding")
     common = {name: getattr(options, name) for name in names}
     return fit_levels(pixels, levels=levels, progress=progress, **common)
 

@@ -85,7 +85,7 @@ class EigenGS:
         frequency_aware: bool | str = "auto",
         seed: int = 0,
         preset: str = "default",
-        steps: int | None = None,
+        iterations: int | None = None,
         backend: str | None = None,
         progress: Any = None,
         client: Any = None,
@@ -105,7 +105,7 @@ class EigenGS:
         preset : {"default", "eigengs"}, optional
             "default" places Gaussians on a grid and solves for all weights by one factorisation.
             "eigengs" trains shapes and weights from a random start, with the paper's settings.
-        steps : int, optional
+        iterations : int, optional
             Training steps. "default" trains the shapes (0 by default; 300 gain 0.3 dB), "eigengs"
             shapes and weights (15,000 by default, which take hours without a GPU).
         backend : {"llvm", "cuda"}, optional
@@ -132,7 +132,7 @@ class EigenGS:
             gaussians=gaussians,
             frequency_aware=frequency_aware,
             preset=preset,
-            steps=steps,
+            iterations=iterations,
             seed=seed,
         )
         return cls(**fit_model(basis, options, backend, progress, client=client))

@@ -55,10 +55,10 @@ def _picture(planes: NDArray[np.float32], space: str) -> NDArray[np.float32]:
 
 
 def _check_basis(
-    model: EigenGS, pixels: NDArray[np.float32], gaussians: int | None, color: str
+    model: EigenGS, pixels: NDArray[np.float32], gaussians: int | None, space: str
 ) -> None:
     """Raise ValueError unless a basis fits the image and the options."""
-    count, space = len(model.gaussians), model.gaussians.space
+    count, of_basis = len(model.gaussians), model.gaussians.space
     if gaussians not in (None, count):
         raise ValueError(
             f"gaussians is {gaussians}, but the basis has {count}; leave the number out, use "
@@ -70,8 +70,9 @@ def _check_basis(
             f"the basis has {count} Gaussians, more than an image of {width}x{height} has pixels; "
             "use init 'adaptive'"
         )
-    if color != space:
-        advice = f"train a basis with --color {color}" if color in BASIS_SPACES else "another init"
+    if space != of_basis:
+        advice = f"train a basis with --space {space}" if space in BASIS_SPACES else "another init"
         raise ValueError(
-            f"color is {color!r}, but the basis is in {space!r}; use color {space!r}, or {advice}"
+            f"space is {space!r}, but the basis is in {of_basis!r}; use space "
+            f"{of_basis!r}, or {advice}"
         )

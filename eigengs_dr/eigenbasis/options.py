@@ -29,9 +29,9 @@ class TrainOptions:
     target_psnr : float or None
         Keep the fewest components whose PCA has this mean PSNR, in dB, on the images held out; see
         `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`.
-    gaussians, frequency_aware, preset, steps, seed
+    gaussians, frequency_aware, preset, iterations, seed
         See `eigengs_dr.EigenGS.fit`.
-    color : {"ycbcr", "rgb"}
+    space : {"ycbcr", "rgb"}
         Space of the components.
 
     Raises
@@ -47,7 +47,7 @@ class TrainOptions:
     gaussians: int = 5000
     frequency_aware: bool | str = "auto"
     preset: str = "default"
-    steps: int | None = None
+    iterations: int | None = None
     space: str = "ycbcr"
     seed: int = 0
 
@@ -61,14 +61,14 @@ class TrainOptions:
                 )
         if self.space not in BASIS_SPACES:
             raise ValueError(
-                f"color {self.space!r} is unknown; use one of {', '.join(BASIS_SPACES)}"
+                f"space {self.space!r} is unknown; use one of {', '.join(BASIS_SPACES)}"
             )
         if self.preset not in STEPS:
             raise ValueError(f"preset {self.preset!r} is unknown; use one of {', '.join(STEPS)}")
         counts = {
             "gaussians": self.gaussians,
             "seed": self.seed,
-            "steps": self.training_steps,
+            "iterations": self.training_steps,
         }
         for name, number in counts.items():
             if not isinstance(number, (int, np.integer)) or number < 0:
@@ -80,7 +80,7 @@ class TrainOptions:
                 f"{width * height}"
             )
         if self.preset == "eigengs" and self.training_steps < 1:
-            raise ValueError("steps is 0; preset 'eigengs' needs training, so give at least 1")
+            raise ValueError("iterations is 0; preset 'eigengs' needs training, so give at least 1")
         if not isinstance(self.frequency_aware, bool) and self.frequency_aware != "auto":
             raise ValueError(
                 f"frequency_aware is {self.frequency_aware!r}; use 'auto', True or False"
@@ -89,4 +89,4 @@ class TrainOptions:
     @property
     def training_steps(self) -> int:
         """The number of steps: as given, or that of the preset."""
-        return STEPS[self.preset] if self.steps is None else self.steps
+        return STEPS[self.preset] if self.iterations is None else self.iterations

@@ -53,7 +53,7 @@ class Training(NamedTuple):
     """Result of `train`: the model, the basis that it renders, and figures.
 
     The figures are ``seconds``, ``pca_seconds``, ``shape_seconds``, ``weight_seconds`` (of the last
-    run alone if ``resumed``), ``peak_rss_mb``, ``images``, ``steps``, ``components`` (of each
+    run alone if ``resumed``), ``peak_rss_mb``, ``images``, ``iterations``, ``components`` (of each
     channel), ``gaussians``, ``frequency_aware``, ``split_reason``, ``psnr_held_out`` (`held_out` of
     the model), and those of `eigengs_dr.eigenbasis.components.solve.ComponentFit` and
     `eigengs_dr.eigenbasis.evaluation.evaluate`.
@@ -107,7 +107,7 @@ def train(
     found = list_images(folder)
     names = [path if isinstance(path, str) else path.name for path in found]
     steps = settings.training_steps
-    record = {**asdict(settings), "steps": steps, "folder": str(folder)}
+    record = {**asdict(settings), "iterations": steps, "folder": str(folder)}
     with Checkpoint(output, json.loads(json.dumps(record)), names) as checkpoint:
         if names != checkpoint.files:
             warn(
@@ -140,7 +140,7 @@ def train(
             "frequency_aware": model.low > 0,
             "split_reason": model.split_reason,
             "psnr_held_out": model.held_out.tolist(),
-            "steps": steps,
+            "iterations": steps,
             "pca_seconds": pca_seconds,
             **model.figures,
             **scores,

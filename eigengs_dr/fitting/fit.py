@@ -45,9 +45,9 @@ class Fit:
         the call of `fit`; they include placement, upload, the colour solve and the measurements.
         A descent has more Gaussians than asked for in its first two thirds, see
         `eigengs_dr.fitting.optimizers.schedule.surplus_for`; those sets have no rows.
-        With color "data" or "normal", psnr_rgb is the PSNR of the data after clamping and rounding
+        With space "data" or "normal", psnr_rgb is the PSNR of the data after clamping and rounding
         to 8 bits, and psnr_ycbcr the PSNR of the unchanged data; for values above 1.5, the largest
-        of them is the peak. With color "radiance" or "log", psnr_ycbcr is in PU21, see
+        of them is the peak. With space "radiance" or "log", psnr_ycbcr is in PU21, see
         `eigengs_dr.psnr`.
     image : ndarray of float32, shape (H, W, 3), or (H, W, 1) for data of one channel
         The rendering of the set: RGB without clamping; for light, sRGB clamped at 0; or the data.
@@ -153,7 +153,7 @@ def fit(
     solve_steps : int, optional
         Steps of conjugate gradients in the colour solve. "eigen" uses them only if the image and
         the basis differ in size.
-    color : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, optional
+    space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, optional
         Space of the colours and of the squared error. "linear" decodes sRGB: the Gaussians sum to
         linear light, as textures need it, and errors weigh more in the dark. "data" uses one or
         three channels unchanged (roughness, heights). "normal" uses the codes ``(n + 1) / 2`` of a

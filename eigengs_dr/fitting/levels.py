@@ -143,7 +143,7 @@ def fit_levels(
         every prefix forms an image.
     iterations : int, optional
         Largest number of refinement steps of the whole set.
-    color : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, optional
+    space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, optional
         See `eigengs_dr.fit`.
     seed : int, optional
         Not used: the placement draws no random numbers.

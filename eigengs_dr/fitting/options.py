@@ -96,7 +96,7 @@ class FitOptions:
         for name, value, known in (
             ("init", self.init, ("auto", *INITIALIZERS)),
             ("preset", self.preset, tuple(PRESETS)),
-            ("color", self.space, SPACES),
+            ("space", self.space, SPACES),
             ("target_space", self.target_space, ("rgb", "ycbcr")),
         ):
             if value not in known:

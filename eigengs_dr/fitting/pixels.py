@@ -39,7 +39,7 @@ def read_pixels(image: Any, options: FitOptions) -> tuple[NDArray[np.float32], F
     pixels : ndarray of float32, shape (H, W, 3) or (H, W, 1)
         sRGB, above 1 for light above 1; or the data. They may be the image itself.
     options : FitOptions
-        With the color "radiance" instead of "linear" if the image is light above 1.
+        With the space "radiance" instead of "linear" if the image is light above 1.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def read_data(image: Any, space: str) -> NDArray[np.float32]:
         return pixels
     if pixels.shape[2] != 3:
         raise ImageError(
-            f"image: shape {pixels.shape}; a normal map has three channels; use color 'data'"
+            f"image: shape {pixels.shape}; a normal map has three channels; use space 'data'"
         )
     if pixels.min() < MIN_PIXEL or pixels.max() > MAX_PIXEL:
         raise ImageError(

@@ -147,7 +147,7 @@ def _load_deep(path: Path, keep_grey: bool) -> tuple[NDArray[Any], str] | None:
     if found.one_channel and not keep_grey:
         raise ImageError(
             f"{path}: holds one channel, not R, G and B; read it as data (keep_grey=True, "
-            "--color data), or export it as RGB"
+            "--space data), or export it as RGB"
         )
     pixels = turn(found.pixels, found.orientation)
     encoding = "linear" if pixels.dtype.kind == "f" else "srgb"

@@ -132,7 +132,7 @@ def _sum_squares(a: NDArray[np.float64], b: NDArray[np.float64], space: str) -> 
 
 
 def float_space(space: str) -> str:
-    """Return the space in which psnr_ycbcr compares sets of the space `color`.
+    """Return the space in which psnr_ycbcr compares sets of a `space`.
 
     Data and normals have no YCbCr, so their channels are compared directly. Light above 1
     is compared in PU21, which has bounds.

@@ -80,10 +80,10 @@ class MaterialFit:
 @shows_progress
 @exclusive()
 def fit_material(
-    maps: Mapping[str, ArrayLike],
+    images: Mapping[str, ArrayLike],
     gaussians: int | None = None,
     iterations: int = 1000,
-    spaces: Mapping[str, str] | None = None,
+    space: Mapping[str, str] | None = None,
     weights: Mapping[str, float] | None = None,
     target_psnr: float | Mapping[str, float] | None = None,
     target_space: str = "rgb",
@@ -98,14 +98,14 @@ def fit_material(
 
     Parameters
     ----------
-    maps : mapping of str to array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like or URL
+    images : mapping of str to array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like or URL
         Images of one size by name, with at most 16 channels together. Data whose three channels are
         equal count as one channel.
     gaussians : int, optional
         Number of Gaussians, at most one per pixel. By default 5000.
     iterations : int, optional
         Largest number of refinement steps.
-    spaces : mapping of str to str, optional
+    space : mapping of str to str, optional
         Space of a map, see the colours of `eigengs_dr.fit`. By default "linear" for albedo, color
         and the like, "normal" for normals, and "data" for other names, see
         `eigengs_dr.material.maps.usual_space`.
@@ -157,8 +157,8 @@ def fit_material(
     Material(100 Gaussians, 32x32 pixels: albedo, roughness)
     """
     started = time.perf_counter()
-    images = read_maps(maps, spaces or {}, encoding)
-    goals = _goals(images, target_psnr)
+    maps = read_maps(images, space or {}, encoding)
+    goals = _goals(maps, target_psnr)
     options = FitOptions(
         gaussians=gaussians,
         iterations=iterations,
@@ -169,23 +169,23 @@ def fit_material(
         target_space=target_space,
         max_gaussians=max_gaussians,
     )
-    factors = _factors(images, weights or {})
+    factors = _factors(maps, weights or {})
     if levels is not None:
         options = check_options(options, levels)
-    options.check_image(_shape_of(images))
+    options.check_image(_shape_of(maps))
     with defer_interrupts() as interrupted:
-        factors = [f * w for f, w in zip(factors, _balance(images, goals, options), strict=True)]
-        target = combine(images, factors)
+        factors = [f * w for f, w in zip(factors, _balance(maps, goals, options), strict=True)]
+        target = combine(maps, factors)
         score = partial(
             score_maps,
-            images=images,
+            images=maps,
             weights=factors,
             started=started,
             goals=goals,
             space=target_space,
         )
         found, seconds_init = _run(target, options, levels, score, progress, interrupted, started)
-    return _finish(found, maps_of(images, factors), started, seconds_init)
+    return _finish(found, maps_of(maps, factors), started, seconds_init)
 
 
 def _run(

@@ -52,7 +52,7 @@ def read_maps(
     For parameters and errors see `eigengs_dr.fit_material`.
     """
     if unknown := [name for name in spaces if name not in maps]:
-        raise ValueError(f"spaces names {unknown[0]!r}, which is no map; maps are {_list(maps)}")
+        raise ValueError(f"space names {unknown[0]!r}, which is no map; maps are {_list(maps)}")
     images = [_read_map(name, image, spaces.get(name), encoding) for name, image in maps.items()]
     sizes = {image.name: f"{image.pixels.shape[1]}x{image.pixels.shape[0]}" for image in images}
     if len(set(sizes.values())) > 1:

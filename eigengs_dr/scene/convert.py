@@ -81,8 +81,8 @@ class ConvertedScene:
 @exclusive()
 def convert_scene(
     scene: str | os.PathLike[str] | dict[str, Any],
-    folder: str | os.PathLike[str],
-    psnr: float = 40.0,
+    output: str | os.PathLike[str],
+    target_psnr: float = 40.0,
     iterations: int = 100,
     spp: int | None = None,
     parameters: Mapping[str, str] | None = None,
@@ -98,9 +98,9 @@ def convert_scene(
     ----------
     scene : path-like or dict
         XML file, or dictionary as for `mitsuba.load_dict`, with images in files.
-    folder : path-like
+    output : path-like
         Folder to write; it must not exist, or be empty. It is written as a whole, or not at all.
-    psnr : float, optional
+    target_psnr : float, optional
         Lowest PSNR in dB with which a camera sees a texture, see `eigengs_dr.fit_for_scene`.
     iterations : int, optional
         Steps of refinement for each number of Gaussians.
@@ -130,16 +130,16 @@ def convert_scene(
     --------
     After ``mi.set_variant("llvm_ad_rgb")``::
 
-        result = eg.convert_scene("room.xml", "room-gaussians/", psnr=40)
+        result = eg.convert_scene("room.xml", "room-gaussians/", target_psnr=40)
         image = mi.render(mi.load_file(str(result.scene)))
     """
     if not mi.variant():
         raise ValueError("no variant is set; call mi.set_variant('llvm_ad_rgb') first")
-    if not 0 < psnr < 60:
-        raise ValueError(f"psnr is {psnr:g}; it must be above 0 and below 60 dB")
+    if not 0 < target_psnr < 60:
+        raise ValueError(f"target_psnr is {target_psnr:g}; it must be above 0 and below 60 dB")
     progress = progress or (lambda *_: None)
-    refuse_url(folder)
-    target = Path(folder)
+    refuse_url(output)
+    target = Path(output)
     work = _workplace(target)
     try:
         parsed, again = parse(scene, parameters), parse(scene, parameters)
@@ -149,7 +149,7 @@ def convert_scene(
         textures = list[ConvertedTexture]()
         for group in _by_image(uses, progress):
             file = _file_name(group[0], {texture.file for texture in textures})
-            found = _convert(before, parsed, group, psnr, iterations)
+            found = _convert(before, parsed, group, target_psnr, iterations)
             if isinstance(found, str):
                 left += [(use.name, found) for use in group]
                 continue

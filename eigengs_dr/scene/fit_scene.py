@@ -80,9 +80,9 @@ def fit_for_scene(
     scene: Any,
     texture: Any,
     image: ArrayLike,
-    psnr: float = 40.0,
-    color: str = "linear",
-    most: int | None = None,
+    target_psnr: float = 40.0,
+    space: str = "linear",
+    max_gaussians: int | None = None,
     iterations: int = 100,
     wrap_mode: str | Sequence[str] = "repeat",
     encoding: str | None = None,
@@ -99,13 +99,13 @@ def fit_for_scene(
         ``"poster.bsdf.reflectance"``. Several are uses of the image.
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W)
         Image for the texture, float in [0, 1] or unsigned integers; row 0 at v = 0.
-    psnr : float, optional
+    target_psnr : float, optional
         Smallest PSNR of any camera in dB, above 0 and below 60. It compares means of the clamped
         texture over pixels, in even light and without noise: as 8-bit sRGB for colours, unchanged
         for data.
-    color : {"linear", "data"}, optional
+    space : {"linear", "data"}, optional
         "linear" if the image is a colour, which is decoded to light; or "data".
-    most : int, optional
+    max_gaussians : int, optional
         Largest number of Gaussians; by default the number of seen texels.
     iterations : int, optional
         Steps of refinement for each number of Gaussians.
@@ -132,18 +132,19 @@ def fit_for_scene(
         found = eg.fit_for_scene(room, "poster.bsdf.reflectance", eg.load_image("poster.jpg"))
         poster = texture_of(found.gaussians)
     """
-    if color not in COLORS:
-        raise ValueError(f"color {color!r} is unknown; textures hold {' or '.join(COLORS)}")
-    if not 0 < psnr < 60:  # from 59 dB on, 8-bit values have no error
-        raise ValueError(f"psnr is {psnr:g}; it must be above 0 and below 60 dB")
-    if iterations < 0 or (most is not None and most < 1):
+    if space not in COLORS:
+        raise ValueError(f"space {space!r} is unknown; textures hold {' or '.join(COLORS)}")
+    if not 0 < target_psnr < 60:  # from 59 dB on, 8-bit values have no error
+        raise ValueError(f"target_psnr is {target_psnr:g}; it must be above 0 and below 60 dB")
+    if iterations < 0 or (max_gaussians is not None and max_gaussians < 1):
         raise ValueError(
-            f"iterations is {iterations} and most is {most}; they must be at least 0 and at least 1"
+            f"iterations is {iterations} and max_gaussians is {max_gaussians}; they must be at "
+            "least 0 and at least 1"
         )
-    checked = check_data(image) if color == "data" else check_image(image, encoding=encoding)
+    checked = check_data(image) if space == "data" else check_image(image, encoding=encoding)
     pixels = checked.clip(0, 1)
     height, width = pixels.shape[:2]
-    values = to_linear(pixels) if color == "linear" else pixels
+    values = to_linear(pixels) if space == "linear" else pixels
     found = visibility(scene, texture, width, height, wrap_mode)
     times = FINER if found.footprint.min() < ENOUGH * PIXEL else 1
     fine = found
@@ -151,24 +152,24 @@ def fit_for_scene(
         values = zoom(values, (times, times, 1), order=1, mode="nearest", grid_mode=True)
         fine = visibility(scene, texture, times * width, times * height, wrap_mode)
     values, fine, corner = _crop_to_seen(values, fine)
-    goal = [seen_by(values, rows, color) for rows in fine.pixel_to_texel]
+    goal = [seen_by(values, rows, space) for rows in fine.pixel_to_texel]
 
     def seen(candidate: Image) -> tuple[float, ...]:
-        space = "rgb" if color == "linear" else "data"
-        pictures = (seen_by(candidate, rows, color) for rows in fine.pixel_to_texel)
-        return tuple(psnr_of(a, b, space) for a, b in zip(pictures, goal, strict=True))
+        compared = "rgb" if space == "linear" else "data"
+        pictures = (seen_by(candidate, rows, space) for rows in fine.pixel_to_texel)
+        return tuple(psnr_of(a, b, compared) for a, b in zip(pictures, goal, strict=True))
 
-    target = smoothest_target(values, fine, lambda t: min(seen(t)) >= psnr + MARGIN)
-    weight = error_weights(fine, target, color)
+    target = smoothest_target(values, fine, lambda t: min(seen(t)) >= target_psnr + MARGIN)
+    weight = error_weights(fine, target, space)
 
     def attempt(count: int) -> tuple[Gaussians, tuple[float, ...]]:
-        gaussians = _fit(target, weight, fine.seen, count, iterations, color)
+        gaussians = _fit(target, weight, fine.seen, count, iterations, space)
         return gaussians, seen(render(gaussians).numpy())
 
-    most = min(most or int(found.seen.sum()), fine.seen.size)
+    max_gaussians = min(max_gaussians or int(found.seen.sum()), fine.seen.size)
     looks = np.minimum(PIXEL / found.footprint[found.seen], 1) ** 2  # pixels per texel, at most 1
     start = max(1, int(looks.sum()) // PIXELS)
-    gaussians, reached, tried = _search_count(attempt, psnr, start, most)
+    gaussians, reached, tried = _search_count(attempt, target_psnr, start, max_gaussians)
     placed = _move(gaussians, corner, times * width, times * height).scaled(width, height)
     return SceneFit(placed, reached, found, tried)
 

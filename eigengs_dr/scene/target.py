@@ -41,7 +41,7 @@ def seen_by(texels: Image, rows: Any, space: str) -> NDArray[Any]:
         Linear light or data; clamped to [0, 1].
     rows : scipy.sparse array, shape (n, H * W)
         One of `Visibility.pixel_to_texel`.
-    color : {"linear", "data"}
+    space : {"linear", "data"}
         Whether means of light are coded as sRGB.
 
     Returns
@@ -81,7 +81,7 @@ def error_weights(found: Visibility, target: Image, space: str) -> Image:
     ----------
     found : Visibility
     target : ndarray of float32, shape (H, W, C)
-    color : {"linear", "data"}
+    space : {"linear", "data"}
         In linear light dark texels weigh more, see `eigengs_dr.fitting.initializers.dark_weight`.
 
     Returns

@@ -60,7 +60,7 @@ def moment(iteration, decibels, seconds=1.0):
 def fit_row(image, moments, preset="default", run=RUN, iterations=1000, **method):
     """A row of `tables` on the set faces256."""
     job = {"set": "faces256", "image": image, "iterations": iterations, "seed": 0, "gaussians": 60}
-    usual = {"preset": preset, "source": "", "components": 0, "color": "ycbcr", "split": "auto"}
+    usual = {"preset": preset, "source": "", "components": 0, "space": "ycbcr", "split": "auto"}
     return {"job": {**job, **usual, **method}, "moments": moments, "run": run}
 
 

@@ -42,7 +42,7 @@ def test_every_method_is_measured_and_figures_are_those_of_fit(data, tmp_path, b
     bases = {(j["source"], j["components"]) for j in jobs if j["preset"] == "eigengs"}
     assert bases == {(source, k) for source in ("faces256", "natural256") for k in (4, 8)}
     ends = {
-        (j["preset"], j["source"], j["components"], j["color"], j["split"]): row["moments"]
+        (j["preset"], j["source"], j["components"], j["space"], j["split"]): row["moments"]
         for j, row in zip(jobs, fits, strict=True)
     }
     (image,) = [image for _, image in images_of(task, "faces256")]
@@ -120,7 +120,7 @@ def test_cells_are_means_over_images():
 def test_the_ablation_shows_both_spaces():
     kinds = [(color, split) for color in ("ycbcr", "rgb") for split in ("split", "whole")]
     method = {"preset": "eigengs", "source": "faces256", "components": 300}
-    rows = [fit_row("a", [moment(1000, 40.0)], **method, color=c, split=s) for c, s in kinds]
+    rows = [fit_row("a", [moment(1000, 40.0)], **method, space=c, split=s) for c, s in kinds]
     ablation, printed = methods.summarize(rows).tables
     assert ablation.caption.startswith("Colour space and split: faces256")
     assert lines_of(ablation)[0] == ("eigengs, ycbcr, split", "PSNR YCbCr / dB", "40.0")

@@ -139,7 +139,7 @@ def test_progress():
         ({"gaussians": 128 * 128 + 1}, "takes 1 to 16384"),
         ({"gaussians": 0}, "gaussians is 0; blocks"),
         ({"iterations": -1}, "iterations is -1"),
-        ({"color": "cmyk"}, "color 'cmyk' is unknown"),
+        ({"space": "cmyk"}, "space 'cmyk' is unknown"),
         ({"cutoff": 0}, "cutoff is 0"),
     ],
 )

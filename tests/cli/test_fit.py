@@ -150,13 +150,13 @@ def test_command_finds_few_or_says_that_it_cannot(tmp_path):
     assert "60 dB psnr_rgb are out of reach: 50 Gaussians have" in result.stderr
     assert len(eg.Gaussians.load(out)) == 50
 
-    assert run(*base, "--target-psnr", 26, "--space", "ycbcr").exit_code == 0
+    assert run(*base, "--target-psnr", 26, "--target-space", "ycbcr").exit_code == 0
     assert json.loads(report.read_text())["psnr_ycbcr"] >= 26
 
     for option in (
-        ("--space", "ycbcr"),
+        ("--target-space", "ycbcr"),
         ("--max-gaussians", 50),
-        ("--levels", 2, "--space", "ycbcr"),
+        ("--levels", 2, "--target-space", "ycbcr"),
     ):
         alone = run(*base, *option)
         assert alone.exit_code == 2 and "belong to target_psnr" in alone.stderr

@@ -65,13 +65,13 @@ def test_bases_that_do_not_fit(trained, fitted, photo, existing, tmp_path):
     assert_refused(run(*eigen, "--basis", fitted[0] / "fit.npz"), "eigengs_dr.gaussians")
     assert_refused(run(*eigen, "--basis", tmp_path), "basis")
     assert_refused(run(*eigen, "--basis", model, "--gaussians", 50), photo, "50", "60")
-    assert_refused(run(*eigen, "--basis", model, "--color", "rgb"), photo, "'rgb'", "'ycbcr'")
+    assert_refused(run(*eigen, "--basis", model, "--space", "rgb"), photo, "'rgb'", "'ycbcr'")
 
 
 def test_the_names_of_inits_and_bases():
     [option] = [p for p in main.commands["fit"].params if p.name == "init"]
     assert tuple(option.type.choices) == ("auto", *INITIALIZERS)
-    [option] = [p for p in main.commands["fit"].params if p.name == "color"]
+    [option] = [p for p in main.commands["fit"].params if p.name == "space"]
     assert tuple(option.type.choices) == SPACES
     [option] = [p for p in main.commands["fit"].params if p.name == "basis"]
     assert DEFAULT_BASIS in bases.SHIPPED and DEFAULT_BASIS in option.help

@@ -80,7 +80,7 @@ def test_info(fitted, tmp_path):
 
 def test_pack(fitted, folder, tmp_path):
     target = tmp_path / "m.egs"
-    result = run("pack", fitted, "-o", target, *maps(folder), "--budget", 3)
+    result = run("pack", fitted, "-o", target, *maps(folder), "--max-psnr-drop", 3)
     assert result.exit_code == 0, result.output
     assert "roughness" in result.output
     facts = json.loads(run("info", target, "--json").output)
@@ -133,7 +133,7 @@ MISTAKES = {
     "space": (["--map", "ao:hsv={0}/other.png"], "space 'hsv' is not in"),
     "twice": (["--map", "albedo={0}/other.png"], "--map albedo is given twice"),
     "an image": (["{0}/other.png"], "an image without a name"),
-    "colour": (["--color", "rgb"], "--color and --map exclude each other"),
+    "colour": (["--space", "rgb"], "--space and --map exclude each other"),
     "basis": (["--basis", "natural"], "--basis and --map exclude each other"),
     "suffix": (["-o", "x.egs"], "the name must end in .npz"),
     "channels": (

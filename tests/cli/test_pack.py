@@ -15,7 +15,7 @@ def test_commands_pack_and_read(tmp_path):
     gaussians.save(tmp_path / "x.npz")
     eg.save_image(tmp_path / "x.png", image)
     source, target = tmp_path / "x.npz", tmp_path / "x.egs"
-    told = run("pack", source, "-o", target, "--image", tmp_path / "x.png", "--budget", 0.2)
+    told = run("pack", source, "-o", target, "--image", tmp_path / "x.png", "--max-psnr-drop", 0.2)
     assert told.exit_code == 0, told.output
     size = (tmp_path / "x.egs").stat().st_size
     assert f"{size:,} bytes, {8 * size / 1024:.3f} bits per pixel" in told.output

@@ -22,7 +22,7 @@ def sky(tmp_path_factory):
     save_image(folder / "sky.exr", light)
     report = folder / "r.json"
     preview = folder / "p.png"
-    command = ["fit", folder / "sky.exr", "-o", folder / "sky.npz", "--color", "log", *FEW]
+    command = ["fit", folder / "sky.exr", "-o", folder / "sky.npz", "--space", "log", *FEW]
     succeeded(run(*command, "--report", report, "--preview", preview))
     return folder, light
 
@@ -75,7 +75,7 @@ def test_a_fit_of_codes_becomes_light_in_exr(tmp_path):
 
 def test_encoding_of_the_file_can_be_said(tmp_path):
     save_image(tmp_path / "a.png", smooth_pixels(32, 24))
-    command = ["fit", tmp_path / "a.png", "-o", tmp_path / "a.npz", "--color", "linear", *FEW]
+    command = ["fit", tmp_path / "a.png", "-o", tmp_path / "a.npz", "--space", "linear", *FEW]
     succeeded(run(*command, "--encoding", "linear"))
     succeeded(run("render", tmp_path / "a.npz", "-o", tmp_path / "y.exr"))
     means = [float(load_image(tmp_path / name).mean()) for name in ("a.png", "y.exr")]
@@ -86,7 +86,7 @@ def test_data_of_16_bits(tmp_path):
     y, x = np.mgrid[:24, :32]
     heights = (30_000 + 200 * x + 90 * y).astype(np.uint16)
     save_image(tmp_path / "a.png", heights, bits=16)
-    command = ["fit", tmp_path / "a.png", "-o", tmp_path / "a.npz", "--color", "data", *FEW]
+    command = ["fit", tmp_path / "a.png", "-o", tmp_path / "a.npz", "--space", "data", *FEW]
     succeeded(run(*command))
     succeeded(run("render", tmp_path / "a.npz", "-o", tmp_path / "y.png", "--bits", 16))
     found = np.rint(load_image(tmp_path / "y.png", keep_grey=True) * 65535)[..., 0]
@@ -104,14 +104,14 @@ def test_data_beyond_1_have_one_psnr(tmp_path):
         out, report = folder / "out", tmp_path / f"{name}.json"
         images = [folder / "a.pfm"] if name != "several" else [folder]
         target = [out if name == "several" else folder / "a.npz", "--report", report, *more, *FEW]
-        succeeded(run("fit", *images, "--color", "data", "-o", *target))
+        succeeded(run("fit", *images, "--space", "data", "-o", *target))
         found = json.loads(report.read_text())
         reports.append(found["images"][0] if name == "several" else found)
     one, blocks, several = reports
     assert one["psnr_ycbcr"] == one["trace"][-1]["psnr_ycbcr"] > 25
     assert several["psnr_ycbcr"] == one["psnr_ycbcr"]
     assert blocks["psnr_ycbcr"] == pytest.approx(one["psnr_ycbcr"], abs=2)
-    goal = ["--target-psnr", 30, "--iterations", 60, "--color", "data", "-o", tmp_path / "few.npz"]
+    goal = ["--target-psnr", 30, "--iterations", 60, "--space", "data", "-o", tmp_path / "few.npz"]
     told = succeeded(run("fit", tmp_path / "one" / "a.pfm", *goal)).output
     assert float(told.split("psnr_data ")[1].split(" dB")[0]) >= 30
 
@@ -121,7 +121,7 @@ def test_pack_and_several_images_of_light(sky, tmp_path):
     command = ["pack", folder / "sky.npz", "-o", tmp_path / "y.egs", "--image", folder / "sky.exr"]
     assert "dB in log" in said(*command)
     save_image(tmp_path / "a.pfm", load_image(folder / "sky.exr"))
-    options = ["--color", "linear", *FEW]
+    options = ["--space", "linear", *FEW]
     succeeded(run("fit", tmp_path / "a.pfm", folder / "sky.exr", "-o", tmp_path / "out", *options))
     assert read(tmp_path / "out" / "sky.npz").space == "radiance"
 
@@ -136,7 +136,7 @@ def test_what_is_refused(sky, tmp_path):
     light[3, 4] = np.nan
     content.write_bytes(b"PF\n32 24\n-1\n" + light[::-1].tobytes())
     for path, words in (
-        (grey, ["holds one channel", "--color data"]),
+        (grey, ["holds one channel", "--space data"]),
         (broken, ["damaged or unsupported"]),
         (content, ["not finite", "[3, 4]"]),
     ):

@@ -42,9 +42,9 @@ def test_spaces_of_textures(tmp_path, color, channels, modes):
     assert Image.open(tmp_path / "a.png").mode == modes[0]
     outputs = ["-o", tmp_path / "a.npz", "--preview", tmp_path / "both.png"]
     settings = ["--gaussians", 100, "--iterations", 20, "--report", tmp_path / "a.json"]
-    result = succeeded(run("fit", tmp_path / "a.png", "--color", color, *outputs, *settings))
+    result = succeeded(run("fit", tmp_path / "a.png", "--space", color, *outputs, *settings))
     report = json.loads((tmp_path / "a.json").read_text())
-    assert report["color"] == color
+    assert report["space"] == color
     assert ("psnr_data" if color == "data" else "psnr_ycbcr") in result.stdout
     assert report["psnr_rgb"] > 25 and 0.9 < report["ms_ssim"] <= 1
     info = json.loads(run("info", tmp_path / "a.npz", "--json").stdout)

@@ -85,13 +85,24 @@ def test_train_without_images_to_hold_out(tmp_path):
 
 def test_train_options(trained, tmp_path):
     folder, _ = trained
-    options = ["--energy", 0.5, "--color", "rgb", "--seed", 3, "--preset", "eigengs", "--steps", 2]
+    options = [
+        "--energy",
+        0.5,
+        "--space",
+        "rgb",
+        "--seed",
+        3,
+        "--preset",
+        "eigengs",
+        "--iterations",
+        2,
+    ]
     size = ["--size", "16x16", "--components", "6,5,4", "--quiet"]
     outputs = ["-o", tmp_path / "m.npz", "--report", tmp_path / "m.json"]
     result = succeeded(run("train", folder / "photos", *outputs, *size, *options))
     assert result.stdout == ""
     report = json.loads((tmp_path / "m.json").read_text())
-    expected = {"energy": 0.5, "space": "rgb", "seed": 3, "preset": "eigengs", "steps": 2}
+    expected = {"energy": 0.5, "space": "rgb", "seed": 3, "preset": "eigengs", "iterations": 2}
     assert {key: report[key] for key in expected} == expected
     assert report["gaussians"] == 256  # one a pixel
     assert report["most_components"] == [6, 5, 4]
@@ -137,10 +148,10 @@ def test_train_interrupted_goes_on(trained, tmp_path, monkeypatch):
         (["--size", "32"], "such as 1024x768"),
         (["--size", "0x32"], "0x32"),
         (["--size", "99999x99999"], "99999x99999"),
-        (["--steps", -1], "steps"),
+        (["--iterations", -1], "iterations"),
         (["--frequency-aware", "perhaps"], "frequency-aware"),
         (["--preset", "gaussianimage"], "preset"),
-        (["--color", "lab"], "color"),
+        (["--space", "lab"], "space"),
     ],
 )
 def test_train_with_bad_settings(trained, existing, options, word):

@@ -160,10 +160,10 @@ def test_mistakes_leave_the_old_file(fitted, path):
     gaussians, image = fitted
     path.write_text("old")
     for words, arguments in {
-        "budget is 0": (None, 0),
+        "max_psnr_drop is 0": (None, 0),
         "no rounding is fine enough": (None, 1e-16),
-        "budget is 10000.*at most 100 dB": (None, 1e4),
-        "budget is nan": (None, math.nan),
+        "max_psnr_drop is 10000.*at most 100 dB": (None, 1e4),
+        "max_psnr_drop is nan": (None, math.nan),
         r"shape \(16, 32, 3\)": (image[:16],),
         "sections are": (None, 0.5, [50, 49]),
         "sections are ": (None, 0.5, [0, 100]),

@@ -27,7 +27,7 @@ def options(backend, **changed):
 @pytest.mark.parametrize("init", ["adaptive", "random"])
 def test_results_are_those_of_single_fits(backend, color, init):
     """On llvm bit for bit."""
-    settings = options(backend, color=color, init=init)
+    settings = options(backend, space=color, init=init)
     for image, found in zip(pictures(3), fit_batch(pictures(3), settings), strict=True):
         alone = eg.fit(image, 60, 30, init=init, space=color, backend=backend)
         for row, other in zip(found.trace, alone.trace, strict=True):
@@ -47,7 +47,7 @@ def test_results_are_those_of_single_fits(backend, color, init):
 @pytest.mark.parametrize("color", ["ycbcr", "linear"])
 def test_a_surplus_leaves_every_image_alike(backend, color):
     """As in single fits: on llvm bit for bit."""
-    settings = options(backend, color=color, gaussians=30, iterations=150)
+    settings = options(backend, space=color, gaussians=30, iterations=150)
     for image, found in zip(pictures(3), fit_batch(pictures(3), settings), strict=True):
         alone = eg.fit(image, 30, 150, space=color, backend=backend)
         assert [r["iteration"] for r in found.trace] == [r["iteration"] for r in alone.trace]

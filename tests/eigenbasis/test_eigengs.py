@@ -215,8 +215,8 @@ def test_rgb(backend, others):
         ({"gaussians": 2.5}, "gaussians is 2.5"),
         ({"frequency_aware": "yes"}, "frequency_aware is 'yes'; use 'auto', True or False"),
         ({"preset": "best"}, "preset 'best' is unknown; use one of default, eigengs"),
-        ({"steps": -1}, "steps is -1"),
-        ({"preset": "eigengs", "steps": 0}, "steps is 0"),
+        ({"iterations": -1}, "iterations is -1"),
+        ({"preset": "eigengs", "iterations": 0}, "iterations is 0"),
         ({"seed": -1}, "seed is -1"),
     ],
 )

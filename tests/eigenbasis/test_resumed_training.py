@@ -67,9 +67,9 @@ STOPS = [
 @pytest.mark.parametrize(
     ("changed", "more_stops"),
     [
-        ({"steps": 50}, []),
-        ({"steps": 50, "preset": "eigengs"}, []),
-        ({"steps": 50, "frequency_aware": True}, [("shapes", 3), ("shapes", 2)]),
+        ({"iterations": 50}, []),
+        ({"iterations": 50, "preset": "eigengs"}, []),
+        ({"iterations": 50, "frequency_aware": True}, [("shapes", 3), ("shapes", 2)]),
     ],
     ids=["default", "eigengs", "split"],
 )
@@ -84,7 +84,7 @@ def test_killed_in_every_stage(folder, output, tmp_path, in_pieces, changed, mor
 
 
 def test_killed_by_the_system(folder, output, tmp_path, in_pieces):
-    train(folder, tmp_path / "whole.npz", settings(steps=40))
+    train(folder, tmp_path / "whole.npz", settings(iterations=40))
     script = f"""
 import os, signal
 from eigengs_dr.eigenbasis import training
@@ -94,12 +94,13 @@ def progress(stage, done, total):
     seen.append(stage)
     if seen.count("shapes") == 3:
         os.kill(os.getpid(), signal.SIGKILL)
-training.train({str(folder)!r}, {str(output)!r}, training.{settings(steps=40)!r}, None, progress)
+training.train(
+    {str(folder)!r}, {str(output)!r}, training.{settings(iterations=40)!r}, None, progress)
 """
     process = subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parents[2])
     assert process.returncode == -signal.SIGKILL
     assert not output.exists()
-    assert train(folder, output, settings(steps=40)).figures["resumed"]
+    assert train(folder, output, settings(iterations=40)).figures["resumed"]
     assert_same_models(tmp_path / "whole.npz", output)
 
 
@@ -116,22 +117,22 @@ def test_ctrl_c(folder, output, in_pieces, stage, call, kept):
             os.kill(os.getpid(), signal.SIGINT)
 
     with pytest.raises(Interrupted, match="goes on from here" if kept else "nothing is saved"):
-        train(folder, output, settings(steps=26), progress=press)
+        train(folder, output, settings(iterations=26), progress=press)
     assert checkpoint_of(output).exists() == kept
     assert not output.exists()
-    assert train(folder, output, settings(steps=26)).figures["resumed"] == kept
+    assert train(folder, output, settings(iterations=26)).figures["resumed"] == kept
 
 
 @pytest.mark.parametrize(
-    ("changed", "words"), [({"seed": 1}, "seed 0 instead of 1"), ({"steps": 25}, "steps")]
+    ("changed", "words"), [({"seed": 1}, "seed 0 instead of 1"), ({"iterations": 25}, "iterations")]
 )
 def test_other_settings_than_the_checkpoint(folder, output, in_pieces, changed, words):
-    kill(folder, output, "weights", steps=3)
+    kill(folder, output, "weights", iterations=3)
     with pytest.raises(ValueError, match=words) as caught:
-        train(folder, output, settings(**{"steps": 3, **changed}))
+        train(folder, output, settings(**{"iterations": 3, **changed}))
     assert str(checkpoint_of(output)) in str(caught.value)
     assert "delete" in str(caught.value)
-    assert train(folder, output, settings(steps=3)).figures["resumed"]
+    assert train(folder, output, settings(iterations=3)).figures["resumed"]
 
 
 def test_another_folder_than_the_checkpoint(folder, output, tmp_path):
@@ -160,13 +161,13 @@ def test_a_folder_that_grew_meanwhile(folder, output, tmp_path, in_pieces):
     ],
 )
 def test_damaged_checkpoint(folder, output, in_pieces, stage, call, name):
-    kill(folder, output, stage, call, steps=30)
+    kill(folder, output, stage, call, iterations=30)
     file = checkpoint_of(output) / name
     content = file.read_bytes()
     for damaged in (b"", content[: len(content) // 2]):
         file.write_bytes(damaged)
         with pytest.raises(ValueError, match=r"model\.npz\.checkpoint") as caught:
-            train(folder, output, settings(steps=30))
+            train(folder, output, settings(iterations=30))
         assert "\n" not in str(caught.value)
 
 

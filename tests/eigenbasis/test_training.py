@@ -58,7 +58,7 @@ def test_the_file_encodes_as_what_was_trained(folder, output):
 @pytest.mark.parametrize(
     "changed",
     [
-        {"preset": "eigengs", "steps": 3},
+        {"preset": "eigengs", "iterations": 3},
         {"frequency_aware": True},
         {"space": "rgb"},
         {"energy": 0.5},
@@ -137,7 +137,7 @@ def test_channels_in_which_nothing_varies(tmp_path, output, count, channels, pre
     folder = random_fields(tmp_path / "flat", count, channels=channels)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a single image has no components, as is said
-        train(folder, output, settings(preset=preset, steps=3))
+        train(folder, output, settings(preset=preset, iterations=3))
     assert EigenGS.load(output).components[1:] == (0, 0)
 
 
@@ -151,12 +151,12 @@ def test_fewer_splats_than_components(folder, output, count):
     [
         ({"gaussians": 1025}, "gaussians is 1025; a basis of 32x32 takes 1 to 1024"),
         ({"gaussians": 0}, "gaussians is 0"),
-        ({"steps": -1}, "steps is -1"),
+        ({"iterations": -1}, "iterations is -1"),
         ({"seed": -1}, "seed is -1"),
         ({"preset": "none"}, "preset 'none'"),
-        ({"preset": "eigengs", "steps": 0}, "steps is 0"),
+        ({"preset": "eigengs", "iterations": 0}, "iterations is 0"),
         ({"frequency_aware": "maybe"}, "frequency_aware is 'maybe'"),
-        ({"color": "lab"}, "color 'lab' is unknown; use one of ycbcr, rgb"),
+        ({"space": "lab"}, "space 'lab' is unknown; use one of ycbcr, rgb"),
         ({"size": (0, 1)}, "size is 0x1"),
         ({"components": -1}, "components is -1"),
         ({"components": (3, 4)}, "expected a number, or three"),

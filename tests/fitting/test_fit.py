@@ -177,7 +177,7 @@ def test_rates_far_too_high(backend, preset, factor):
         ("solve_steps", -1, "solve_steps is -1"),
         ("init", "eigen2", "init 'eigen2' is unknown; use one of auto, random, grid, adaptive"),
         ("preset", "best", "preset 'best' is unknown; use one of default, gaussianimage"),
-        ("color", "hsv", "color 'hsv' is unknown; use one of ycbcr, rgb, linear, data"),
+        ("space", "hsv", "space 'hsv' is unknown; use one of ycbcr, rgb, linear, data"),
         ("backend", "opencl", "backend 'opencl' is unknown"),
         ("image", np.zeros((0, 4, 3)), "image"),
         ("image", np.full((4, 4, 3), np.nan), "image"),

@@ -61,7 +61,7 @@ def test_fit_by_the_paper(backend, others):
     ("options", "words"),
     [
         ({"gaussians": 50}, "gaussians is 50, but the basis has 100"),
-        ({"space": "rgb"}, "color is 'rgb', but the basis is in 'ycbcr'"),
+        ({"space": "rgb"}, "space is 'rgb', but the basis is in 'ycbcr'"),
         ({"basis": "nothing"}, "basis 'nothing' is neither a file nor one of: natural"),
         ({"basis": "natural"}, "more than an image of 32x32 has pixels"),
         ({"preset": "eigengs", "init": "grid"}, "preset 'eigengs' starts from a basis"),

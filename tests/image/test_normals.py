@@ -75,7 +75,7 @@ def test_a_fit_has_unit_normals_and_its_file_too(tmp_path):
 
 
 def test_what_is_no_normal_map():
-    with pytest.raises(ImageError, match="a normal map has three channels; use color 'data'"):
+    with pytest.raises(ImageError, match="a normal map has three channels; use space 'data'"):
         eg.fit(bumps()[..., :1], 10, iterations=0, space="normal")
     with pytest.raises(ImageError, match=r"normals run from -.* not 0 to 1; pass \(n \+ 1\) / 2"):
         eg.fit(2 * bumps() - 1.5, 10, iterations=0, space="normal")

@@ -155,7 +155,7 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("arguments", "words"),
         [
-            ({"space": "ycbcr"}, ["color 'ycbcr'", "linear"]),
+            ({"space": "ycbcr"}, ["space 'ycbcr'", "linear"]),
             ({"psnr": 80.0}, ["psnr is 80"]),
             ({"psnr": float("nan")}, ["psnr is nan"]),
             ({"iterations": -1}, ["iterations"]),

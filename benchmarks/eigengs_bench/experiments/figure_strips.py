@@ -114,7 +114,7 @@ def colors(task: Task) -> Iterator[Figure]:
     for done, (color, heading) in enumerate({"ycbcr": "YCbCr", "rgb": "RGB"}.items()):
         task.progress("colors", done, 2)
         cells = [("photo", image)]
-        for moment in preset_descent(task, image, model, "default", marks, color=color):
+        for moment in preset_descent(task, image, model, "default", marks, space=color):
             one, other = (psnr(moment.picture, image, space) for space in ("ycbcr", "rgb"))
             error = 0.5 + MAGNIFIED * (moment.picture - image)
             cells.append((f"{_at(moment)}: {one:.1f} / {other:.1f}", moment.picture))

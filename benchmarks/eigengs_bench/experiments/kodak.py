@@ -50,7 +50,7 @@ def _jobs(
         compile_programs()
         return _measure(task, image, count, iterations, solve_steps)
 
-    shared: Row = {"set": SET, "color": COLOR, "seed": task.seed, "timed": timed}
+    shared: Row = {"set": SET, "space": COLOR, "seed": task.seed, "timed": timed}
     if solve_steps != SOLVE_STEPS:
         shared["solve_steps"] = solve_steps
     for iterations, (file, image), count in product(steps, photos, counts):
@@ -59,7 +59,7 @@ def _jobs(
 
 
 def _measure(task: Task, image: Image, count: int, iterations: int, solve_steps: int) -> Row:
-    shared: Row = {"color": COLOR, "seed": task.seed, "backend": task.backend}
+    shared: Row = {"space": COLOR, "seed": task.seed, "backend": task.backend}
     found = fit(image, count, iterations, solve_steps=solve_steps, **shared)
     return {
         "psnr_float": decibels(np.clip(found.image, 0, 1), image, "data"),

@@ -86,7 +86,7 @@ def _preparation(task: Task, name: str, picture: Image) -> Ready:
             split = {"split": True, "whole": False}.get(method.split, "auto")
             model = model_for(task, name, method.source, method.components, method.space, split)
         count = None if method.source else SETS[name].gaussians
-        chosen: Any = {"preset": method.preset, "color": method.space, "backend": task.backend}
+        chosen: Any = {"preset": method.preset, "space": method.space, "backend": task.backend}
         options = FitOptions(gaussians=count, basis=model, **chosen)
 
         def start(image: Image, seed: int, depth: int = 10) -> FitProblem:

@@ -29,7 +29,7 @@ class PCAOptions:
     Attributes
     ----------
     size : (int, int)
-    color : {"ycbcr", "rgb"}
+    space : {"ycbcr", "rgb"}
     components : tuple of 3 ints
         Most components of each channel. The incremental solver keeps some more in the state.
     seed : int
@@ -107,14 +107,14 @@ def _in_shards(
         if progress:
             progress(done, total, {})
 
-    size, color, seed = options.size, options.space, options.seed
+    size, space, seed = options.size, options.space, options.seed
     ranks = tuple(rank_for(k) for k in options.components)
     with ExitStack() as stack:
         if checkpoint is None and client is None:  # the states of all shards would fill the memory
             checkpoint = stack.enter_context(TemporaryDirectory())
         folder = None if checkpoint is None else Path(checkpoint)
         length = shard_block_length(size, len(images))
-        shared = ShardOptions(size, color, ranks, seed, length, folder)
+        shared = ShardOptions(size, space, ranks, seed, length, folder)
         return shard_states(images, shared, executor_for(client), report)
 
 

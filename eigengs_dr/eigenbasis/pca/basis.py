@@ -73,7 +73,7 @@ class Eigenbasis:
     @shows_progress
     def from_images(
         cls,
-        source: Source,
+        images: Source,
         size: tuple[int, int] = (256, 256),
         components: int | Sequence[int] = 300,
         energy: float | None = None,
@@ -90,7 +90,7 @@ class Eigenbasis:
 
         Parameters
         ----------
-        source : path, array or iterable
+        images : path, array or iterable
             See `eigengs_dr.image.folder.read_blocks`; or a dask.array of images (n, H, W, 3), or of
             rows of RGB (n, 3 H W), see `eigengs_dr.eigenbasis.pca.lazy_images.LazyImages`.
         size : (int, int)
@@ -99,7 +99,7 @@ class Eigenbasis:
             Most components of each channel.
         energy : float, optional
             Keep the fewest components with this share of a channel's variance, in (0, 1].
-        color : {"ycbcr", "rgb"}
+        space : {"ycbcr", "rgb"}
             Space of the channels.
         seed : int
             Seed of the random examples.
@@ -137,7 +137,7 @@ class Eigenbasis:
         """
         size, most = check_size(size), check_components(components, energy)
         options = PCAOptions(size, space, most, seed, solver)
-        state = accumulate(source, options, progress, client, checkpoint)
+        state = accumulate(images, options, progress, client, checkpoint)
         return cls.from_state(state, size, components, energy, space)
 
     @classmethod
