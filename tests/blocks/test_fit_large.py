@@ -85,7 +85,7 @@ def test_kind_of_source_does_not_matter(tmp_path):
 
 @pytest.mark.parametrize("color", ["rgb", "linear", "data"])
 def test_spaces(color):
-    result = eg.fit_large(mosaic(96)[..., :1], **FEW | {"color": color, "gaussians": 500})
+    result = eg.fit_large(mosaic(96)[..., :1], **FEW | {"space": color, "gaussians": 500})
     assert result.gaussians.space == color
     assert result.gaussians.channels == (1 if color == "data" else 3)
     assert result.psnr_rgb > 22

@@ -9,7 +9,7 @@ from eigengs_dr.backend.executor import ClusterError, Done
 from eigengs_dr.eigenbasis.components import weights
 
 
-@pytest.mark.parametrize("options", [{}, {"frequency_aware": True}, {"steps": 1}])
+@pytest.mark.parametrize("options", [{}, {"frequency_aware": True}, {"iterations": 1}])
 def test_the_bits_of_one_process(client, monkeypatch, options):
     monkeypatch.setattr(weights, "BATCH", 5)  # several groups of each channel
     here = eg.EigenGS.fit(small_basis(), SPLATS, backend="llvm", **options)

@@ -71,7 +71,7 @@ def test_linear_light_weighs_errors_in_the_dark(backend, monkeypatch):
 def test_data_is_taken_as_it_is(backend, preset, channels):
     data = picture()[..., :channels]
     if preset == "eigengs":
-        with pytest.raises(ValueError, match="color is 'data', but the basis is in 'ycbcr'; use"):
+        with pytest.raises(ValueError, match="space is 'data', but the basis is in 'ycbcr'; use"):
             fit(data, SPLATS, 3, preset=preset, basis=small_model(backend), space="data")
         return
     result = fit(data, SPLATS, 60, preset=preset, space="data", backend=backend)
@@ -105,5 +105,5 @@ def test_data_of_one_channel(backend, init):
 
 @pytest.mark.parametrize(("color", "hint"), [("linear", "another init"), ("rgb", "train a basis")])
 def test_a_basis_of_another_space(backend, color, hint):
-    with pytest.raises(ValueError, match=f"color is '{color}', but the basis .* or {hint}"):
+    with pytest.raises(ValueError, match=f"space is '{color}', but the basis .* or {hint}"):
         fit(picture(), init="eigen", basis=small_model(backend), space=color, backend=backend)

@@ -13,7 +13,7 @@ from eigengs_dr.image.io import load_image  # noqa: E402
 
 pytestmark = pytest.mark.mitsuba
 
-QUICK = {"psnr": 30, "iterations": 20}
+QUICK = {"target_psnr": 30, "iterations": 20}
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_mistakes(folder, tmp_path):
     for scene, target, settings, error, words in (
         (good, tmp_path / "full", {}, ValueError, "exists and is not empty"),
         (good, tmp_path / "a" / "b", {}, OSError, "cannot create a folder in"),
-        (good, tmp_path / "new", {"psnr": 70}, ValueError, "psnr is 70"),
+        (good, tmp_path / "new", {"target_psnr": 70}, ValueError, "target_psnr is 70"),
         (tmp_path / "bad.xml", tmp_path / "new", {}, RuntimeError, "pars"),
         (tmp_path / "shape.xml", tmp_path / "new", {}, ValueError, "holds no scene"),
         (good, "s3://x/y", {}, OSError, "cannot be written to URLs"),
