@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from eigengs_dr.backend.recording import without_collector
+from eigengs_dr.backend.recording import guest, without_collector
 from eigengs_dr.image.color import rendered_as
 from eigengs_dr.raster.layout import pack_parameters
 from eigengs_dr.raster.lookup.coarsen import build_pyramid
@@ -82,6 +82,7 @@ def gaussian_texture() -> type:
             Radius of a Gaussian in standard deviations; by default the cutoff of the set.
         """
 
+        @guest()  # a thread of Mitsuba, whose caller may hold the lock
         def __init__(self, props: Any) -> None:
             super().__init__(props)
             self.source = source_of(props)

@@ -40,7 +40,8 @@ def exclusive() -> Iterator[None]:
     The functions of this package that use Dr.Jit do so by themselves, as `eigengs_dr.fit` and
     `eigengs_dr.render`. Use it around your own use of Dr.Jit or Mitsuba, such as `drjit.backward`
     or `mitsuba.render`, if another thread may call this package meanwhile. Blocks of one thread
-    may nest. A block that waits for another thread must not hold what that thread waits for.
+    may nest. Scenes may be loaded in a block: Mitsuba's loading threads are let in. A block that
+    waits for any other thread must not hold what that thread waits for.
 
     Returns
     -------
@@ -56,12 +57,42 @@ def exclusive() -> Iterator[None]:
     ...     dr.enable_grad(start.color)
     ...     dr.backward(dr.sum(eg.render(start).array))
     """
+    if _guests.here:
+        yield
+        return
     with _LOCK:
         _clear_retired()
         try:
             yield
         finally:
             _clear_retired()
+
+
+class _Guests(threading.local):
+    """Whether this thread works for another one, which may hold the lock and waits for it."""
+
+    here = False
+
+
+_guests = _Guests()
+
+_ONE_GUEST = threading.RLock()
+"""The guest that holds it may use Dr.Jit."""
+
+
+@contextmanager
+def guest() -> Iterator[None]:
+    """Use Dr.Jit for a thread that waits for this one: `exclusive` takes no lock in the block.
+
+    Mitsuba makes the objects of a scene in threads of its own, for which the caller waits. If the
+    caller holds the lock, they would wait for it for ever. Guests take turns.
+    """
+    with _ONE_GUEST:
+        before, _guests.here = _guests.here, True
+        try:
+            yield
+        finally:
+            _guests.here = before
 
 
 MANY_RECORDINGS = 1000

@@ -160,8 +160,7 @@ def convert_scene(
         (work / SCENE).write_text(_to_xml(again), encoding="utf-8")
         seen = list[float]()
         if spp != 0:
-            # Threads of Mitsuba would wait for the lock of this thread to read the sets.
-            after = mi.load_file(str(work / SCENE), parallel=False)
+            after = mi.load_file(str(work / SCENE))
             seen = compare_renderings(before, after, work, spp, progress)
         if target.exists():
             target.rmdir()  # it is empty
