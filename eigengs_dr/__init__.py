@@ -4,6 +4,9 @@
 package neither loads Dr.Jit nor sets a Mitsuba variant.
 """
 
+import sys
+from importlib.util import spec_from_file_location
+from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 
@@ -16,6 +19,27 @@ __version__ = "0.1.0"
 # Dr.Jit looks for libLLVM once, while it is imported; lazy_loader imports it here if EAGER_IMPORT
 # is set.
 select_libllvm()
+
+
+class _Checkout:
+    """Finds the plugins of a checkout, which lie beside the package; an install has them inside.
+
+    Python started in the root of a checkout takes the package from there, also beside an install.
+    """
+
+    FOLDER = Path(__file__).parents[1] / "plugins"
+
+    @classmethod
+    def find_spec(cls, name: str, path: Any = None, target: Any = None) -> Any:
+        """Return how to import the plugins, and nothing else."""
+        if name != f"{__name__}.plugins" or not (cls.FOLDER / "__init__.py").is_file():
+            return None
+        return spec_from_file_location(
+            name, cls.FOLDER / "__init__.py", submodule_search_locations=[str(cls.FOLDER)]
+        )
+
+
+sys.meta_path.append(_Checkout)  # type: ignore[arg-type]
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 

@@ -3,6 +3,7 @@
 Needs the package to be installed, as ``make setup`` does.
 """
 
+import os
 import shutil
 import subprocess
 import sys
@@ -31,6 +32,21 @@ def test_installed(tmp_path):
     where, top_level = find_plugins(tmp_path)
     assert Path(where).parent.name == "plugins"
     assert top_level == "None"
+
+
+def test_in_the_root_of_a_checkout(tmp_path):
+    """Its package comes before an installed one; -S leaves editable installs out."""
+    libraries = os.pathsep.join(path for path in sys.path if path.endswith("site-packages"))
+    code = "import eigengs_dr.plugins.cone, eigengs_dr; print(eigengs_dr.plugins.__file__)"
+    process = subprocess.run(
+        [sys.executable, "-S", "-c", code],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": libraries},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert process.stdout.strip() == str(ROOT / "plugins" / "__init__.py"), process.stderr
 
 
 def test_wheel(tmp_path):

@@ -9,6 +9,7 @@ import os
 import platform
 import subprocess
 import sys
+from importlib.metadata import requires
 from typing import Any
 
 from . import libllvm
@@ -109,7 +110,11 @@ def _mitsuba_line(version: str | None, variants: list[str] | None) -> str:
     """Describe the installation of Mitsuba."""
     if version is None:
         return "not installed; only the plugins need it: pip install 'mitsuba==3.9.*'"
-    return f"{version}: {', '.join(variants) if variants else 'cannot be imported'}"
+    if variants:
+        return f"{version}: {', '.join(variants)}"
+    wanted = [r for r in requires("mitsuba") or [] if r.startswith("drjit")]
+    pin = f"; it needs {wanted[0]}, and drjit {version_of('drjit')} is installed" if wanted else ""
+    return f"{version}: cannot be imported{pin}: pip install 'mitsuba==3.9.*'"
 
 
 def _try(name: str) -> dict[str, Any]:
