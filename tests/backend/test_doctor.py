@@ -3,6 +3,8 @@
 from _helpers.process import run_python
 
 
+def test_a_mitsuba_for_another_drjit_is_explained(tmp_path):
+    """Both pin each other: a Mitsuba before 3.9 cannot be imported beside this package."""
     (tmp_path / "mitsuba").mkdir()
     (tmp_path / "mitsuba" / "__init__.py").write_text("raise ImportError('another drjit')")
     facts = tmp_path / "mitsuba-3.8.0.dist-info"
