@@ -27,7 +27,7 @@ from ..fitting.density_control import Part, relocate
 from ..fitting.initializers import FitProblem, FitTarget, make_target
 from ..fitting.optimizers.descent import run_phase
 from ..fitting.options import FitOptions
-from ..fitting.pixels import read_data, unit_of
+from ..fitting.pixels import BRIGHT, WHITE, read_data, unit_of
 from ..fitting.placement.adaptive import density_from_hessian
 from ..fitting.placement.density import density_ratio, scale_by_owner
 from ..fitting.placement.nearest import nearest_center
@@ -35,6 +35,7 @@ from ..fitting.redistribute import residual, squared_error
 from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
+from ..image.pixels import ImageError
 from .draw import draw
 from .grid import Block
 from .place import OldSet, place_block, placement_image, window_density
@@ -122,6 +123,9 @@ def survey(task: PlaceTask, settings: Settings) -> Surveyed:
     """Measure how many Gaussians a block needs, relative to others, before any fit."""
     options = settings.options
     pixels = task.window.read()
+    bright = BRIGHT.get(options.space)
+    if bright and task.window.encoding == "linear" and pixels.max() > WHITE:
+        raise ImageError(f"{task.window.name}: light above 1; give the space {bright!r}")
     if options.space == "normal":
         read_data(pixels, options.space)  # no other range makes normals
     target = make_target(pixels, options.space)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .console import progress_bar
+from .fit import MISSED
 from .options import ANY_PATH, EXISTING, describe_run, quiet_option, report_option
 from .outputs import check_outputs
 from .report import write_report
@@ -67,9 +68,10 @@ def convert(
     """Replace every bitmap of a Mitsuba scene by as many Gaussians as its cameras resolve.
 
     FOLDER gets scene.xml, a set for each image, and for each camera the renderings before and
-    after, and 8 times their difference. Environment maps, alpha masks, images of two values, values
-    above 1 and images that no camera sees stay as they are; the command says why. Other files stay
-    where they are, and the new scene names them relative to FOLDER.
+    after, and 8 times their difference. If a rendering misses the PSNR, the command says so and
+    exits with code 1. Environment maps, alpha masks, bump maps, images of two values, values above
+    1 and images that no camera sees stay as they are; the command says why. Other files stay where
+    they are, and the new scene names them relative to FOLDER.
 
     \b
     Examples:
@@ -98,6 +100,8 @@ def convert(
     if not quiet:
         click.echo(_table(found))
         click.echo(f"wrote {found.scene} in {time.perf_counter() - started:.1f} s")
+    if any(psnr < target_psnr for psnr in found.psnr):
+        context.exit(MISSED)
 
 
 def _figures(found: ConvertedScene) -> dict[str, Any]:

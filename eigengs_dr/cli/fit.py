@@ -273,9 +273,10 @@ def _exit(context: click.Context, records: list[dict[str, Any]], options: FitOpt
     if any(record["stopped"] == "failed" for record in records):
         context.exit(FAILED)
     failures = [record for record in records if record["stopped"] == "out of reach"]
-    key = target_key(options.space, options.target_space)
-    name = "psnr_rgb" if key == "psnr_rgb" else f"psnr_{float_space(options.space)}"
     for record in failures:
+        space = record.get("space", options.space)  # light above 1 has another one
+        key = target_key(space, options.target_space)
+        name = "psnr_rgb" if key == "psnr_rgb" else f"psnr_{float_space(space)}"
         say(
             f"{record['input']}: {options.target_psnr:g} dB {name} are out of reach: "
             f"{record['gaussians']} Gaussians have {record[key]:.2f}; lower --target-psnr, or "

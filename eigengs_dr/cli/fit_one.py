@@ -59,6 +59,7 @@ def fit_one(
         "width": image.shape[1],
         "height": image.shape[0],
         "gaussians": len(result.gaussians),
+        "space": result.gaussians.space,
         **course_of(result, started, loaded),
         **figures,
         "trace": result.trace,
@@ -103,7 +104,7 @@ def _summary(record: dict[str, Any], preview: Path | None, space: str) -> str:
     text = (
         "{input}: {width}x{height}, {gaussians} Gaussians, {iterations} iterations "
         "in {seconds:.1f} s ({seconds_total:.1f} s with loading and measuring)\n"
-        "  psnr_{space} {psnr_ycbcr:.2f} dB, psnr_rgb {psnr_rgb:.2f} dB, "
+        "  psnr_{shown} {psnr_ycbcr:.2f} dB, psnr_rgb {psnr_rgb:.2f} dB, "
         "SSIM {ssim:.4f}, MS-SSIM {ms_ssim:.4f}\n  wrote {output}"
-    ).format(**record, space=float_space(space))
+    ).format(**record, shown=float_space(space))
     return f"{text}\n  wrote {preview} (photo, fit and outlines side by side)" if preview else text

@@ -158,9 +158,9 @@ def fit(
         linear light, as textures need it, and errors weigh more in the dark. "data" uses one or
         three channels unchanged (roughness, heights). "normal" uses the codes ``(n + 1) / 2`` of a
         normal map; renderings have normals of length 1. "radiance" is "linear" without an
-        upper bound; "linear" becomes "radiance" for an image of light above 1. "log" suits such
-        images best: the Gaussians sum to logarithms of light, see
-        `eigengs_dr.image.radiance.to_log`.
+        upper bound. "log" suits light above 1 best: the Gaussians sum to logarithms of light, see
+        `eigengs_dr.image.radiance.to_log`. For an image of light above 1, "linear" becomes
+        "radiance", and "ycbcr" and "rgb" become "log": a texture would clamp their sums.
     seed : int, optional
         Seed of the random numbers. Only the initialiser "random" and presets without a colour
         solve use random numbers; the preset "default" gives one result for all seeds.

@@ -25,6 +25,10 @@ WHITE = 1.001
 """Largest sRGB code of light that counts as bounded by white; renderings exceed 1 by rounding."""
 
 
+BRIGHT = {"ycbcr": "log", "rgb": "log", "linear": "radiance"}
+"""Space of a fit of light above 1 for the space asked for: textures clamp sums in the others."""
+
+
 def read_pixels(image: Any, options: FitOptions) -> tuple[NDArray[np.float32], FitOptions]:
     """Check an image, and convert it to what `eigengs_dr.fitting` works on.
 
@@ -39,7 +43,7 @@ def read_pixels(image: Any, options: FitOptions) -> tuple[NDArray[np.float32], F
     pixels : ndarray of float32, shape (H, W, 3) or (H, W, 1)
         sRGB, above 1 for light above 1; or the data. They may be the image itself.
     options : FitOptions
-        With the space "radiance" instead of "linear" if the image is light above 1.
+        With another space if the image is light above 1, see `BRIGHT`.
 
     Raises
     ------
@@ -51,8 +55,8 @@ def read_pixels(image: Any, options: FitOptions) -> tuple[NDArray[np.float32], F
     image = read_image(image, encoding=options.encoding)
     encoding = encoding_of(image, options.encoding) or "srgb"
     pixels = check_image(image, copy=False, encoding=encoding)
-    if options.space == "linear" and encoding == "linear" and pixels.max() > WHITE:
-        options = replace(options, space="radiance")
+    if encoding == "linear" and pixels.max() > WHITE:
+        options = replace(options, space=BRIGHT.get(options.space, options.space))
     return pixels, options
 
 

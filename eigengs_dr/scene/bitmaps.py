@@ -156,6 +156,8 @@ def _reason(props: Any, slots: list[tuple[str, str]]) -> str:
         return "its file is missing"
     if any(slot in MASKS for slot in slots):
         return "an alpha mask: Gaussians would soften its edges"
+    if any(plugin == "bumpmap" for plugin, _ in slots):
+        return "heights of a bump map: cameras see their slopes, and a PSNR of heights says little"
     if str(props.get("filter_type", "bilinear")) != "bilinear":
         return "its filter shows single texels"
     return ""

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from ..backend.display import shows_progress
 from ..backend.recording import exclusive
+from ..backend.warn import warn
 from ..gaussian.gaussians import Gaussians
 from ..storage.atomic import refuse_url
 from .bitmaps import KEPT, Parsed, Use, parse, read_pixels, uses_of
@@ -91,8 +92,8 @@ def convert_scene(
     """Replace every bitmap of a scene by as many Gaussians as its cameras resolve.
 
     Uses of one image share a set. The function leaves alone what Gaussians would spoil or cannot
-    replace: environment maps, alpha masks, images of two values, values above 1, images that no
-    camera sees, and those that would take more Gaussians than texels.
+    replace: environment maps, alpha masks, bump maps, images of two values, values above 1, images
+    that no camera sees, and those that would take more Gaussians than texels.
 
     Parameters
     ----------
@@ -125,6 +126,11 @@ def convert_scene(
         Mitsuba's error, if the scene does not parse.
     OSError
         If the folder cannot be written.
+
+    Warns
+    -----
+    UserWarning
+        If a rendering after misses `target_psnr` against the one before.
 
     Examples
     --------
@@ -168,6 +174,12 @@ def convert_scene(
     except BaseException:
         shutil.rmtree(work, ignore_errors=True)
         raise
+    for camera, decibels in enumerate(seen, 1):
+        if decibels < target_psnr:
+            warn(
+                f"{target}: camera {camera} sees psnr_rgb {decibels:.1f} dB between the "
+                f"renderings, below the goal of {target_psnr:g}; look at difference-{camera}.png"
+            )
     return ConvertedScene(target / SCENE, textures, left, seen)
 
 

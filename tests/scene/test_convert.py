@@ -64,9 +64,33 @@ def test_what_stays_and_why(folder, tmp_path):
     assert str(folder) not in found.scene.read_text()  # other files are named relative to it
 
 
+def test_a_bump_map_stays(folder, tmp_path):
+    """Cameras see its slopes: Gaussians of 40 dB in heights left 26 dB between the renderings."""
+    scene = wall(folder)
+    text = scene.read_text().replace("normalmap", "bumpmap")
+    bumpy = scene.with_name("bumpy.xml")
+    bumpy.write_text(text)
+    found = eg.convert_scene(bumpy, tmp_path / "new", **QUICK)
+    assert "slopes" in dict(found.left)["normals.png (bumpmap.bumpmap)"]
+    assert {t.file for t in found.textures} == {"photo.npz", "rough.npz"}
+
+
+def test_renderings_that_miss_the_goal_are_named(folder, tmp_path):
+    """The goal is that of textures in even light; a strong lamp amplifies errors in the dark."""
+    eg.save_image(folder / "night.png", 0.15 * eg.sample("coffee")[:192:6, :192:6])
+    lamp = '<emitter type="constant"><rgb name="radiance" value="40"/></emitter>'
+    text = wall(folder).read_text().replace('<emitter type="constant"/>', lamp)
+    scene = folder / "night.xml"
+    scene.write_text(text.replace("photo.png", "night.png"))
+    with pytest.warns(UserWarning, match=r"new: camera 1 sees psnr_rgb .* below the goal of 30"):
+        found = eg.convert_scene(scene, tmp_path / "new", **QUICK)
+    assert min(found.psnr) < 30
+
+
 def test_a_dictionary_with_a_mesh(folder, tmp_path):
     found = eg.convert_scene(room(mi, folder), tmp_path / "new", spp=2, **QUICK)
-    assert {t.file for t in found.textures} == {"photo.npz", "rough.npz"}
+    assert {t.file for t in found.textures} == {"photo.npz"}
+    assert any("slopes" in reason for _, reason in found.left)
     scene = mi.load_file(str(found.scene))
     assert np.isfinite(np.array(mi.render(scene, spp=1))).all()
     assert "quad.ply" in found.scene.read_text()
