@@ -144,6 +144,12 @@ def sizes_of(path: str | os.PathLike[str]) -> dict[str, int]:
         return {e.filename.removesuffix(".npy"): e.compress_size for e in archive.infolist()}
 
 
+UNPACKED, SHRINKS = 1 << 26, 16
+"""Bytes of an array that may be compressed at will, and how much more a larger one may shrink.
+`write` compresses sets of up to a million Gaussians, and floats shrink by some percent; a file of
+4 MB could claim 4 GB."""
+
+
 @contextmanager
 def _opened(path: Path, name: str) -> Iterator[zipfile.ZipFile]:
     """Open a file, and turn every error inside the block into one line."""
@@ -153,6 +159,10 @@ def _opened(path: Path, name: str) -> Iterator[zipfile.ZipFile]:
                 yield archive
         except BadValue as error:
             raise ValueError(f"{path}: {error}") from None
+        except MemoryError:
+            raise ValueError(
+                f"{path}: needs more memory than there is; if it is not so large, it is damaged"
+            ) from None
         except Exception as error:  # zlib, lzma, zipfile and NumPy raise many types
             raise ValueError(
                 f"{path}: not a readable {name} file ({' '.join(str(error).split())[:80]}); "
@@ -193,6 +203,9 @@ def _checked_header(
         raise BadValue(f"key '{key}' is a text of over 64 characters")
     if count > field.most or count * dtype.itemsize > entry.file_size:
         raise BadValue(f"key '{key}' claims shape {shape}, more than the file holds")
+    claimed, packed = count * dtype.itemsize, entry.compress_size
+    if claimed > max(UNPACKED, packed * SHRINKS):
+        raise BadValue(f"key '{key}' claims {claimed:,} bytes, of {packed:,} in the file")
     return shape, fortran, dtype
 
 

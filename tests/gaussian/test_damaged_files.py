@@ -199,3 +199,11 @@ def test_a_file_that_claims_gigabytes(path, rows):
         struct.pack_into("<I", content, place + 24, 0xFFFFFFFE)
         place = content.find(b"PK\x01\x02", place + 4)
     check_refused(path, bytes(content))
+
+
+def test_a_small_file_of_large_arrays(path):
+    """Zeros shrink a thousand times; sets of so many Gaussians are not compressed."""
+    rows = (1 << 23) + 1
+    content = zipped(members(mean=npy(np.zeros((rows, 2), np.float32))))
+    assert len(content) < 1 << 20
+    check_refused(path, content, "key 'mean' claims 67,108,872 bytes")
