@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -13,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..image.formats.pillow import image_errors
 from ..image.formats.registry import kind_of
 from ..image.io import ImageError, load_image, open_picture, picture_pixels
 from ..image.pixels import LinearImage, check_data, check_image, encoding_of
@@ -223,8 +221,9 @@ def _read_picture(path: str, modified: int, rows: slice, columns: slice) -> Arra
     """Return a part of a file that Pillow decodes."""
     box = (columns.start, rows.start, columns.stop, rows.stop)
     picture = _decoded(path, modified)
-    with any_size():
-        return picture_pixels(picture.crop(box))[0]
+    # A crop would check the limit on pixels of the whole process.
+    part = picture.resize((box[2] - box[0], box[3] - box[1]), resample=0, box=box)
+    return picture_pixels(part)[0]
 
 
 def _read_loaded(path: str, modified: int, keep_grey: bool, rows: slice, columns: slice) -> Array:
@@ -241,15 +240,7 @@ def _loaded(path: str, modified: int, keep_grey: bool) -> Array:
 @lru_cache(maxsize=1)
 def _decoded(path: str, modified: int) -> Any:
     """Decode a file, and keep it for the next window; `modified` tells its versions apart."""
-    from PIL import Image
-
-    # The turn by EXIF, in open_picture, decodes already.
-    with any_size(), image_errors(Path(path)), Image.open(path) as header:
-        if max(header.size) > MAX_SIDE:
-            width, height = header.size
-            limit = f"sides go from 1 to {MAX_SIDE:,}"
-            raise ImageError(f"{path}: {width}x{height} pixels; {limit}")
-    with any_size(), open_picture(Path(path)) as picture:
+    with open_picture(Path(path), MAX_SIDE) as picture:
         picture.load()
         return picture
 
@@ -258,16 +249,3 @@ def forget_pictures() -> None:
     """Free the memory of the file that Pillow decoded last."""
     _decoded.cache_clear()
     _loaded.cache_clear()
-
-
-@contextmanager
-def any_size() -> Iterator[None]:
-    """Let Pillow open images of any size during a block; `_checked` bounds the sides."""
-    from PIL import Image
-
-    before = Image.MAX_IMAGE_PIXELS
-    Image.MAX_IMAGE_PIXELS = None
-    try:
-        yield
-    finally:
-        Image.MAX_IMAGE_PIXELS = before

@@ -73,17 +73,16 @@ def _problem(path: Path | str, options: FitOptions) -> tuple[int, int, int, int]
 
 def _image_size(path: Path | str) -> tuple[int, int, bool] | None:
     """Return width, height and whether an image file is grey, or None if it cannot be opened."""
-    from PIL import Image
-
-    from ..blocks.source import GREY, any_size
+    from ..blocks.source import GREY
     from ..blocks.tiff import TIFF_SUFFIXES, window_shape
+    from ..image.formats.pillow import open_header
 
     if isinstance(path, str):  # a URL, which is read once
         return None
     if path.suffix.lower() in TIFF_SUFFIXES and (shape := window_shape(str(path))):
         return shape[1], shape[0], shape[2] == 1
     try:
-        with any_size(), Image.open(path) as file:
+        with open_header(path) as file:
             width, height = file.size
             # Pillow decodes a PNG file to find its EXIF data; they seldom turn it.
             turned = file.format != "PNG" and file.getexif().get(ORIENTATION) in TURNED

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,13 +31,46 @@ SAVE_OPTIONS: dict[str, dict[str, Any]] = {
 
 
 @contextmanager
-def open_picture(path: Path) -> Iterator[Image]:
-    """Open an image file with Pillow, turned as its EXIF header says; errors as `load_image`."""
+def open_picture(path: Path, most: int | None = None) -> Iterator[Image]:
+    """Open an image file with Pillow, turned as its EXIF header says; errors as `load_image`.
+
+    With `most`, the sides have at most so many pixels, which the header says before anything is
+    decoded, and Pillow's own limit, of the whole process, does not count.
+    """
     from PIL import Image, ImageOps  # 0.05 s
 
-    with image_errors(path), Image.open(path) as file:
+    with image_errors(path), Image.open(path) if most is None else open_header(path) as file:
+        if most is not None and max(file.size) > most:
+            width, height = file.size
+            raise ImageError(f"{path}: {width}x{height} pixels; sides go from 1 to {most:,}")
         ImageOps.exif_transpose(file, in_place=True)  # a copy only if it turns the image
         yield file
+
+
+def open_header(path: Path) -> Any:
+    """Return what `PIL.Image.open` returns, of any size: nothing is decoded yet.
+
+    Pillow's limit on pixels is a variable of the whole process, which threads share.
+
+    Raises
+    ------
+    PIL.UnidentifiedImageError
+        If Pillow does not know the file.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    Image.init()
+    file = path.open("rb")
+    prefix = file.read(16)
+    for name in Image.ID:
+        factory, accepts = Image.OPEN[name]
+        known = accepts is None or accepts(prefix)
+        if known and not isinstance(known, str):
+            file.seek(0)
+            with suppress(SyntaxError, IndexError, TypeError, struct.error):  # as Image.open
+                return factory(file, str(path))
+    file.close()
+    raise UnidentifiedImageError(f"cannot identify image file {path}")
 
 
 @contextmanager
