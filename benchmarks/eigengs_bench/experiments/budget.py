@@ -104,7 +104,8 @@ def _fit(task: Task, image: Image, count: int, rearranged: bool) -> Row:
 
 
 def _search(task: Task, image: Image, target: float) -> Row:
-    search = partial(fit, image, target_psnr=target, seed=task.seed, backend=task.backend)
+    goal = {"target_psnr": target, "target_space": "ycbcr"}
+    search = partial(fit, image, seed=task.seed, backend=task.backend, **goal)
     search(iterations=min(MIN_PHASE_RATIO, task.iterations))  # untimed, to compile
     found = search(iterations=task.iterations)
     return {
