@@ -71,7 +71,8 @@ def test_placing_anew_makes_a_difference(backend, tmp_path):
 def test_a_search_is_that_of_fit(backend, tmp_path, monkeypatch):
     image, task = one_image(), task_in(tmp_path, backend, iterations=20)
     row = budget._search(task, image, 30.0)
-    fitted = fit(image, iterations=20, target_psnr=30.0, backend=backend)
+    goal = {"target_psnr": 30.0, "target_space": "ycbcr"}
+    fitted = fit(image, iterations=20, **goal, backend=backend)
     assert row["gaussians"] == len(fitted.gaussians)
     assert (row["stopped"], row["iterations"]) == (fitted.stopped, fitted.iterations)
     assert row["psnr_ycbcr"] == psnr(fitted.image, image, "ycbcr") >= 30
