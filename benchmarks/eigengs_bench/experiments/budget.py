@@ -104,8 +104,8 @@ def _fit(task: Task, image: Image, count: int, rearranged: bool) -> Row:
 
 
 def _search(task: Task, image: Image, target: float) -> Row:
-    goal = {"target_psnr": target, "target_space": "ycbcr"}
-    search = partial(fit, image, seed=task.seed, backend=task.backend, **goal)
+    search = partial(fit, image, target_psnr=target, target_space="ycbcr", seed=task.seed)
+    search = partial(search, backend=task.backend)
     search(iterations=min(MIN_PHASE_RATIO, task.iterations))  # untimed, to compile
     found = search(iterations=task.iterations)
     return {
