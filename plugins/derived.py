@@ -44,9 +44,7 @@ class _Derived(dr.CustomOp):
 
     def forward(self) -> None:
         """Push the derivatives of the parameters through the graph."""
-        if (
-            "values" in self.outputs
-        ):  # its pyramid sums in loops, which Dr.Jit 1.5 walks backward only
+        if "values" in self.outputs:  # loops of a pyramid, which Dr.Jit 1.5 walks backward only
             raise RuntimeError(
                 "gaussian_texture: no forward mode with a prefilter; use drjit.backward, or "
                 "prefilter = 0"

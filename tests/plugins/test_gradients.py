@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from _helpers.families import small_model
+from _helpers.process import run_python
 from _helpers.sets import SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
@@ -58,6 +59,24 @@ def difference(scene, name, step, direction, weight):
 
 def direction_like(array):
     return np.random.default_rng(2).normal(size=array.shape).astype(np.float32)
+
+
+FORWARD_WITH_PREFILTER = """
+import drjit as dr, eigengs_dr as eg, mitsuba as mi
+from eigengs_dr.plugins import texture_of
+mi.set_variant("llvm_ad_rgb")
+eg.register_plugins()
+g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1, 1, 1]], size=(8, 8), space="linear")
+texture = mi.load_dict(texture_of(g, prefilter=0.05))
+parameters, along = mi.traverse(texture), mi.Float(0)
+dr.enable_grad(along)
+parameters["color"] = parameters["color"] + along
+parameters.update()
+try:
+    dr.forward(along)
+except RuntimeError as error:
+    print(error, flush=True)
+"""
 
 
 def upstream(shape=(SIDE, SIDE, 3)):
@@ -137,9 +156,9 @@ class TestIntegrators:
         assert found == pytest.approx(dr.grad(along)[0], rel=1e-3)
 
     def test_forward_mode_of_a_prefilter_says_that_there_is_none(self):
-        _, along = self.along_parameters("prb", ["color"], prefilter=0.05)
-        with pytest.raises(RuntimeError, match="no forward mode with a prefilter"):
-            dr.forward(along)
+        """In another process: after an error in a walk, Dr.Jit 1.5 may end it when it exits."""
+        told = run_python(FORWARD_WITH_PREFILTER).stdout
+        assert told.startswith("gaussian_texture: no forward mode with a prefilter")
 
 
 class TestBroken:
