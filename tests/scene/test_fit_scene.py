@@ -118,6 +118,16 @@ class TestFit:
         ]
         assert counts[0] > 2 * counts[1] > 4 * counts[2]
 
+    def test_texels_beyond_what_cameras_resolve_change_nothing(self):
+        scene, image = scene_of(camera([0, 0, 7.0])), photo()
+        more = np.kron(image, np.ones((4, 4, 1), np.float32))
+        few, many = (
+            eg.fit_for_scene(scene, NAME, x, target_psnr=BOUND, iterations=STEPS).gaussians
+            for x in (image, more)
+        )
+        assert (many.width, many.height) == (192, 192)
+        np.testing.assert_allclose(many.mean.numpy(), 4 * few.mean.numpy(), atol=0.4)
+
     def test_none_is_spent_on_what_is_hidden(self):
         arguments = (NAME, photo(), BOUND)
         whole = eg.fit_for_scene(scene_of(camera([0, 0, 5.0])), *arguments, iterations=STEPS)
