@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from eigengs_dr.fitting.optimizers.schedule import first_phase, next_build, relocations
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import PRESETS
+from eigengs_dr.fitting.schedule import first_phase, next_build, relocations
 
 FOLDER = Path(__file__).parent.parent / "docs"
 STEP = 1e-6

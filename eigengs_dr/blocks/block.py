@@ -24,15 +24,14 @@ from numpy.typing import NDArray
 
 from ..backend.recording import exclusive, release_later
 from ..fitting.density_control import Part, relocate
+from ..fitting.descent import run_phase
 from ..fitting.initializers import FitProblem, FitTarget, make_target
-from ..fitting.optimizers.descent import run_phase
 from ..fitting.options import FitOptions
-from ..fitting.pixels import BRIGHT, WHITE, read_data, unit_of
 from ..fitting.placement.adaptive import density_from_hessian
-from ..fitting.placement.density import density_ratio, scale_by_owner
-from ..fitting.placement.nearest import nearest_center
+from ..fitting.placement.density import density_ratio, nearest_center, scale_by_owner
 from ..fitting.redistribute import residual, squared_error
 from ..fitting.solvers.conjugate_gradient import solve
+from ..fitting.target import BRIGHT, WHITE, read_data, unit_of
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
 from ..image.pixels import ImageError
@@ -69,7 +68,7 @@ class Settings:
 class Surveyed(NamedTuple):
     """Result of `survey`: the integral of the density over the core, and the sums of its values.
 
-    Data have a unit too: 1, or the largest magnitude, see `eigengs_dr.fitting.pixels.unit_of`.
+    Data have a unit too: 1, or the largest magnitude, see `eigengs_dr.fitting.target.unit_of`.
     """
 
     mass: float

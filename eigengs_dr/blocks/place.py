@@ -19,8 +19,7 @@ from ..fitting.placement.adaptive import (
     shapes_from_hessian,
     stratify_along_hilbert,
 )
-from ..fitting.placement.density import scale_by_owner
-from ..fitting.placement.nearest import nearest_center
+from ..fitting.placement.density import nearest_center, scale_by_owner
 from ..image.color import LIGHT
 from .grid import Block
 

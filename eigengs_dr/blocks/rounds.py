@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from ..fitting.optimizers.schedule import Schedule, relocations
+from ..fitting.schedule import Schedule, relocations
 
 SHORT_ROUNDS, LAST_ROUNDS = 3, 5
 """Rounds of a descent without relocation, and rounds after the last relocation. More rounds lose

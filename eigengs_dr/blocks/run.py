@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.executor import ClusterError, Executor
-from ..fitting.optimizers.schedule import first_phase
 from ..fitting.options import FitOptions
+from ..fitting.schedule import first_phase
 from ..gaussian.file import SetData
 from ..storage.checkpoint import Checkpoint
 from .block import FitTask, PlaceTask, Settings, find_density, fit_block, place, survey

@@ -9,8 +9,7 @@ import click
 
 from ..backend.selection import select
 from ..fitting.initializers import INITIALIZERS
-from ..fitting.options import DEFAULT_BASIS, FitOptions, Levels
-from ..fitting.presets import PRESETS
+from ..fitting.options import DEFAULT_BASIS, PRESETS, FitOptions, Levels
 from ..image.color import SPACES
 from ..image.metrics import float_space, target_key
 from .cluster import open_cluster

@@ -85,7 +85,7 @@ def measure_fit(image: Any, result: Fit, space: str) -> dict[str, float]:
     """Compare a fit with its image; data are in the unit of the fit."""
     import eigengs_dr as eg
 
-    from ..fitting.pixels import unit_of
+    from ..fitting.target import unit_of
 
     unit = unit_of(image, space)
     seen, shown = image / unit, result.image / unit

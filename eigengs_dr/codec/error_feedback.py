@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
+from ..fitting.descent import descend
 from ..fitting.initializers import FitProblem
-from ..fitting.optimizers.descent import descend
-from ..fitting.optimizers.schedule import Schedule
-from ..fitting.presets import PRESETS
+from ..fitting.options import PRESETS
+from ..fitting.schedule import Schedule
 from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.gaussians import Gaussians
 from ..raster.render import render

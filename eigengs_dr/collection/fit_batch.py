@@ -23,14 +23,14 @@ from ..backend.arrays import types_of, upload
 from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
 from ..fitting.density_control import relocate
+from ..fitting.descent import descend
 from ..fitting.fit import Fit
 from ..fitting.initializers import PLACEMENTS, FitProblem, FitTarget, Placement, make_target
-from ..fitting.optimizers.descent import descend
-from ..fitting.optimizers.schedule import Relocation, Schedule
 from ..fitting.options import FitOptions
 from ..fitting.placement.adaptive import place_adaptive
 from ..fitting.redistribute import density_for_error, squared_error
 from ..fitting.refine import is_plateau, trace_steps
+from ..fitting.schedule import Relocation, Schedule
 from ..fitting.solvers.conjugate_gradient import solve_batch
 from ..gaussian.gaussians import Gaussians
 from ..gaussian.like import like

@@ -16,7 +16,7 @@ from ..backend.selection import select
 from ..fitting.fit import Fit, fit_image
 from ..fitting.levels import check_options, fit_levels
 from ..fitting.options import DEFAULT_BASIS, FitOptions, Levels, refuse_unknown
-from ..fitting.pixels import unit_of
+from ..fitting.target import unit_of
 from ..image.color import rendered_as
 from ..image.pixels import LinearImage
 from .fit_batch import MAX_SIDE, fit_batch, fits_in_batches

@@ -15,10 +15,9 @@ from ..gaussian.concatenate import concatenate
 from ..gaussian.gaussians import Gaussians
 from ..gaussian.like import like
 from ..image.resize import resample
-from .optimizers.schedule import Relocation
-from .perturbation import perturb
 from .placement.peaks import residual_peaks
 from .redistribute import residual
+from .schedule import Relocation
 from .solvers.conjugate_gradient import solve
 from .solvers.matrix_products import inner_products
 
@@ -136,7 +135,7 @@ def relocate(
     Without them, the colours of the others are solved for, see `prune`; then round Gaussians at the
     peaks of the error take their places in the order, except those that are dropped. For the other
     parameters see `removal_cost`, for the perturbation see
-    `eigengs_dr.fitting.perturbation.perturb`.
+    `eigengs_dr.fitting.density_control.perturb`.
 
     Parameters
     ----------
@@ -261,3 +260,48 @@ def _round(size: Array) -> Array:
 
 def _spacing(gaussians: Gaussians) -> float:
     return math.sqrt(gaussians.width * gaussians.height / len(gaussians))
+
+
+Array = NDArray[np.floating]
+
+SHAPE_SHARE = 0.5
+"""Noise of the logarithms of the sizes, relative to that of the mean in standard deviations."""
+
+MAX_NOISE = 1.0
+"""Largest noise of a mean, in standard deviations of its Gaussian."""
+
+
+def perturb(
+    arrays: dict[str, Array], own: NDArray[np.integer], error: float, strength: float, seed: int
+) -> None:
+    """Add noise to the mean and the factor of some Gaussians, in place.
+
+    The noise is normal: ``F dm = e z`` for the mean, with two numbers z, and
+    ``F' = [[exp(e u), e v], [0, exp(e w)]] F`` for the factor, with `SHAPE_SHARE` times such
+    numbers u, v and w. Each mean alone adds about ``strength^2`` times the mean error:
+    ``e = strength (error / (pi |A|^2))^(1/2)``, at most `MAX_NOISE`.
+
+    Parameters
+    ----------
+    arrays : dict of ndarray
+        mean (N, 2), factor (N, 3) and color (N, C), see `eigengs_dr.Gaussians`. Perturbed Gaussians
+        may leave the image.
+    own : ndarray of int, shape (n,)
+        The Gaussians that move.
+    error : float
+        Squared error of the image divided by the number of Gaussians.
+    strength : float
+    seed : int
+        Equal seeds give equal noise.
+    """
+    mean, factor, color = (arrays[k][own].astype(np.float64) for k in ("mean", "factor", "color"))
+    a, b, c = factor.T
+    amplitude = np.square(color).sum(axis=1) / (a * c)
+    most = np.pi * amplitude * MAX_NOISE**2 > strength**2 * error
+    ratio = np.divide(error, np.pi * amplitude, where=most, out=np.zeros_like(amplitude))
+    size = np.where(most, strength * np.sqrt(ratio), MAX_NOISE)
+    normal = np.random.default_rng(seed).standard_normal((5, len(own))) * size
+    x, y, (u, v, w) = normal[0], normal[1] / c, SHAPE_SHARE * normal[2:]
+    arrays["mean"][own] = mean + np.stack([(x - b * y) / a, y], axis=1)
+    wider = np.exp(u)
+    arrays["factor"][own] = np.stack([wider * a, wider * b + v * c, np.exp(w) * c], axis=1)

@@ -22,9 +22,9 @@ from ..image.metrics import float_space, target_key
 from ..raster.render import picture_of
 from .initializers import FitProblem, initialize
 from .options import FitOptions, named_options
-from .pixels import in_unit, read_pixels, unit_of
 from .refine import FitProgress, Refinement, measure, refine
 from .search import search_count
+from .target import in_unit, read_pixels, unit_of
 
 if TYPE_CHECKING:
     from ..eigenbasis.eigengs import EigenGS
@@ -44,7 +44,7 @@ class Fit:
         Gaussians adds the key gaussians. Row 0 shows the set before refinement. Seconds count from
         the call of `fit`; they include placement, upload, the colour solve and the measurements.
         A descent has more Gaussians than asked for in its first two thirds, see
-        `eigengs_dr.fitting.optimizers.schedule.surplus_for`; those sets have no rows.
+        `eigengs_dr.fitting.schedule.surplus_for`; those sets have no rows.
         With space "data" or "normal", psnr_rgb is the PSNR of the data after clamping and rounding
         to 8 bits, and psnr_ycbcr the PSNR of the unchanged data; for values above 1.5, the largest
         of them is the peak. With space "radiance" or "log", psnr_ycbcr is in PU21, see
@@ -149,7 +149,7 @@ def fit(
         or an `eigengs_dr.Eigenbasis`, to which a model is fitted first. By default
         "natural", which ships with the package.
     preset : {"default", "gaussianimage", "eigengs"}, optional
-        The method, see `eigengs_dr.fitting.presets`.
+        The method, see `eigengs_dr.fitting.options`.
     solve_steps : int, optional
         Steps of conjugate gradients in the colour solve. "eigen" uses them only if the image and
         the basis differ in size.

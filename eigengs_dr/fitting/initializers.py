@@ -19,12 +19,12 @@ from ..image.strips import by_strips
 
 if TYPE_CHECKING:
     from ..gaussian.gaussians import Gaussians
-    from .optimizers.schedule import Relocation
     from .options import FitOptions
+    from .schedule import Relocation
 
 PLACEMENTS = {
-    "random": "eigengs_dr.fitting.placement.random:place_random",
-    "grid": "eigengs_dr.fitting.placement.grid:place_grid",
+    "random": "eigengs_dr.fitting.placement.uniform:place_random",
+    "grid": "eigengs_dr.fitting.placement.uniform:place_grid",
     "adaptive": "eigengs_dr.fitting.placement.adaptive:place_adaptive",
 }
 """Placements by name; each entry is a `Placement`, which uses the image alone."""
@@ -98,7 +98,7 @@ class FitProblem(NamedTuple):
     relocate : callable, or None
         ``relocate(gaussians, how)`` returns as many Gaussians, less those that `how` drops. Some
         have moved to where the old set left most error, and all are perturbed; `how` is an
-        `eigengs_dr.fitting.optimizers.schedule.Relocation`. None where Gaussians must keep their
+        `eigengs_dr.fitting.schedule.Relocation`. None where Gaussians must keep their
         places.
     """
 

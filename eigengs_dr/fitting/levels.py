@@ -27,15 +27,15 @@ from ..backend.recording import exclusive
 from ..gaussian.concatenate import concatenate
 from ..gaussian.gaussians import Gaussians
 from .density_control import relocate_levels, removal_cost
+from .descent import descend
 from .fit import Fit, finish
 from .initializers import FitProblem, FitTarget, make_target
-from .optimizers.descent import descend
-from .optimizers.schedule import Schedule
 from .options import FitOptions, Levels, named_options
-from .pixels import in_unit, read_pixels, unit_of
 from .placement_initializer import start_from_placement
 from .redistribute import place_like, residual
 from .refine import FitProgress, Refinement, Score, measure, refine
+from .schedule import Schedule
+from .target import in_unit, read_pixels, unit_of
 
 LEVEL_RATIO = 4
 """Ratio of the numbers of Gaussians up to a level and up to the level before it; 4 halves their

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..image.strips import MAX_THREADS, STRIP_PIXELS, available_cores
-from .optimizers.schedule import MAX_SURPLUS, MAX_SURPLUS_DENSITY
+from .schedule import MAX_SURPLUS, MAX_SURPLUS_DENSITY
 
 BASE_BYTES = 130e6
 """Memory of Python, libLLVM and the compiled programs. This and the constants below follow the

@@ -17,9 +17,9 @@ from ..gaussian.gaussians import Gaussians
 from ..image.metrics import MAX_PSNR, float_space, psnrs_by_rows
 from ..raster.picture import picture_rows
 from .density_control import prune
+from .descent import descend
 from .initializers import FitProblem
-from .optimizers.descent import descend
-from .optimizers.schedule import Schedule
+from .schedule import Schedule
 
 FitProgress = Callable[[int, int, dict[str, Any]], None]
 Score = Callable[[Gaussians], dict[str, Any]]

@@ -20,11 +20,11 @@ import drjit as dr
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import MAX_PSNR
 from .density_control import densify, prune
+from .descent import descend
 from .initializers import FitProblem
-from .optimizers.descent import descend
-from .optimizers.schedule import Schedule, surplus_for
 from .options import SearchPolicy
 from .refine import FitProgress, Refinement
+from .schedule import Schedule, surplus_for
 
 DEFAULT_POLICY = SearchPolicy()
 

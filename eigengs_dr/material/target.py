@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..fitting.initializers import FitTarget, make_target
 from ..fitting.options import FitOptions
-from ..fitting.pixels import read_pixels, unit_of
+from ..fitting.target import read_pixels, unit_of
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
 from ..image.metrics import float_space, psnrs_by_rows, target_key

@@ -19,10 +19,10 @@ from scipy.ndimage import distance_transform_edt, zoom
 from skimage.transform import resize_local_mean
 
 from ..backend.recording import exclusive
+from ..fitting.descent import descend
 from ..fitting.initializers import FitProblem
-from ..fitting.optimizers.descent import descend
+from ..fitting.options import PRESETS
 from ..fitting.placement.adaptive import place_adaptive
-from ..fitting.presets import PRESETS
 from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.covariance import max_deviation
 from ..gaussian.file import CUTOFF

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from _helpers.sets import random_scene
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import picture_of

@@ -18,8 +18,8 @@ from _helpers.waves import default, picture, start
 from eigengs_dr.backend import recording
 from eigengs_dr.backend.recording import collector_off, exclusive, freeze_program
 from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.descent import descend
 from eigengs_dr.fitting.initializers import FitProblem
-from eigengs_dr.fitting.optimizers.descent import descend
 
 WAIT = 100
 """Seconds after which a thread that does not answer fails its test."""
@@ -150,7 +150,7 @@ DROP_WHILE_RECORDING = """
     from eigengs_dr.backend.recording import freeze_program
     from eigengs_dr.backend.selection import select
     from eigengs_dr.fitting.initializers import FitProblem
-    from eigengs_dr.fitting.optimizers.descent import descend
+    from eigengs_dr.fitting.descent import descend
 
     def half_read():
         gaussians, target = start({backend!r})  # arrays that share NumPy's memory

@@ -13,11 +13,10 @@ from eigengs_bench.experiments import budget
 from eigengs_bench.harness import datasets, store
 from eigengs_bench.report.frames import frame_of, smallest
 from eigengs_bench.report.sections import budget as budgets
+from eigengs_dr.fitting.descent import descend
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.initializers import initialize
-from eigengs_dr.fitting.optimizers.descent import descend
-from eigengs_dr.fitting.options import FitOptions, max_gaussians_for
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import PRESETS, FitOptions, max_gaussians_for
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import picture_of
 

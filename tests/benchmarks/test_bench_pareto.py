@@ -15,11 +15,10 @@ from eigengs_bench.report.frames import frame_of
 from eigengs_bench.report.sections.pareto import front, points_of, summarize
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.descent import descend
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.initializers import initialize
-from eigengs_dr.fitting.optimizers.descent import descend
-from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.reference import render_exact
 from eigengs_dr.raster.render import picture_of

@@ -6,8 +6,8 @@ import pytest
 from eigengs_dr.blocks.grid import divide
 from eigengs_dr.blocks.rounds import rounds
 from eigengs_dr.blocks.sets import BlockSets
-from eigengs_dr.fitting.optimizers.schedule import lr_factor, relocations
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import PRESETS
+from eigengs_dr.fitting.schedule import lr_factor, relocations
 
 SCHEDULE = PRESETS["default"].schedule
 

@@ -10,7 +10,7 @@ from _helpers.families import small_model
 from _helpers.waves import SIDE, SPLATS, check_sound, figures, picture, presets
 from eigengs_dr.fitting import initializers as starting
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.image.color import SPACES
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import render

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from eigengs_dr.fitting.perturbation import MAX_NOISE, SHAPE_SHARE, perturb
+from eigengs_dr.fitting.density_control import MAX_NOISE, SHAPE_SHARE, perturb
 
 COUNT, SIDE = 4000, 48
 

@@ -6,7 +6,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.errors import one_line
 from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.pixels import read_pixels
+from eigengs_dr.fitting.target import read_pixels
 from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.image.pixels import ImageError, LinearImage
 

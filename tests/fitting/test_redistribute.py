@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from _helpers.halves import SIDE, fitted, picture
+from eigengs_dr.fitting.descent import descend
 from eigengs_dr.fitting.initializers import initialize
-from eigengs_dr.fitting.optimizers.descent import descend
-from eigengs_dr.fitting.optimizers.schedule import MIN_PHASE_RATIO, first_phase
-from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.redistribute import redistribute
+from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO, first_phase
 from eigengs_dr.raster.render import render
 
 

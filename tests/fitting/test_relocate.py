@@ -9,11 +9,10 @@ import pytest
 import eigengs_dr as eg
 from _helpers.halves import SIDE, fitted, picture, squared_error
 from eigengs_dr.fitting.density_control import Part, relocate, relocate_levels, removal_cost
+from eigengs_dr.fitting.descent import descend
 from eigengs_dr.fitting.initializers import initialize
-from eigengs_dr.fitting.optimizers.descent import descend
-from eigengs_dr.fitting.optimizers.schedule import Relocation, relocations
-from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import PRESETS, FitOptions
+from eigengs_dr.fitting.schedule import Relocation, relocations
 
 SCHEDULE = PRESETS["default"].schedule
 

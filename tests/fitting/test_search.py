@@ -10,8 +10,7 @@ from eigengs_dr.fitting import search as budget
 from eigengs_dr.fitting.density_control import densify
 from eigengs_dr.fitting.fit import FitInterrupted, fit
 from eigengs_dr.fitting.initializers import initialize
-from eigengs_dr.fitting.options import FitOptions, max_gaussians_for
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import PRESETS, FitOptions, max_gaussians_for
 from eigengs_dr.fitting.search import search_count
 
 

@@ -16,8 +16,8 @@ from eigengs_bench.harness.store import Row, Task
 from eigengs_bench.harness.timing import Image, decibels, follow, score, warm_up
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.initializers import FitProblem, initialize
-from eigengs_dr.fitting.optimizers.schedule import MIN_PHASE_RATIO
 from eigengs_dr.fitting.options import FitOptions, max_gaussians_for
+from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO
 
 FILE = "budget.jsonl"
 

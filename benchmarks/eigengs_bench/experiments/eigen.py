@@ -12,7 +12,7 @@ from eigengs_bench.harness.timing import Image
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.initializers import FitProblem
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.fitting.refine import refine
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.gaussian.gaussians import Gaussians

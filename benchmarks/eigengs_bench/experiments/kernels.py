@@ -15,10 +15,10 @@ from eigengs_bench.harness.store import Progress
 from eigengs_bench.harness.timing import interleaved
 from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.descent import descend
 from eigengs_dr.fitting.initializers import FitProblem
-from eigengs_dr.fitting.optimizers.descent import descend
+from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
-from eigengs_dr.fitting.presets import PRESETS
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import rgb_to_ycbcr

@@ -24,8 +24,7 @@ from eigengs_dr.backend.selection import select
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.eigenbasis.registry import load_basis
 from eigengs_dr.fitting.initializers import FitProblem, initialize
-from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.raster.render import picture_of, render

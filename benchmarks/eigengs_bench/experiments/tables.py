@@ -15,9 +15,8 @@ from eigengs_bench.harness.timing import Image, follow, score, warm_up
 from eigengs_bench.names import NATURAL, SETS, TABLES
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting.initializers import FitProblem, initialize
-from eigengs_dr.fitting.optimizers.schedule import MIN_PHASE_RATIO
-from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import PRESETS, FitOptions
+from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO
 from eigengs_dr.image.metrics import psnr
 
 FILE = "tables.jsonl"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...backend.arrays import types_in, types_of, upload
 from ...backend.selection import select
-from ...fitting.optimizers.parameterization import CHOLESKY
+from ...fitting.parameterization import CHOLESKY
 from ...gaussian.gaussians import Gaussians
 from ...raster.parameters import NUM_SHAPE_PARAMS
 
@@ -34,7 +34,7 @@ class JointState(NamedTuple):
     counts : tuple of C ints
         Number of components of each channel.
     rows : ndarray of float32, shape (5, 5 + P, N)
-        Variables; then m, v, n and the last gradient of `eigengs_dr.fitting.optimizers.adan.Adan`.
+        Variables; then m, v, n and the last gradient of `eigengs_dr.fitting.optimizers.Adan`.
         The first 5 rows of each are the mean and the factor in `CHOLESKY` coordinates; each other
         row holds the scaled weights of one component.
     """

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from ...backend.arrays import ArrayTypes, types_in, upload
 from ...backend.recording import freeze_program
 from ...backend.selection import select
-from ...fitting.optimizers.adan import Adan
-from ...fitting.optimizers.parameterization import CHOLESKY
-from ...fitting.placement.random import place_random
+from ...fitting.optimizers import Adan
+from ...fitting.parameterization import CHOLESKY
+from ...fitting.placement.uniform import place_random
 from ...gaussian.file import CUTOFF
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint

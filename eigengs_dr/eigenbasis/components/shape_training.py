@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from ...backend.arrays import types_of
 from ...backend.recording import freeze_program
-from ...fitting.optimizers.descent import rate_table, step_program
-from ...fitting.optimizers.schedule import Schedule, lr_factor
-from ...fitting.optimizers.state import pack, start_descent
-from ...fitting.placement.grid import place_grid
+from ...fitting.descent import pack, rate_table, start_descent, step_program
+from ...fitting.placement.uniform import place_grid
+from ...fitting.schedule import Schedule, lr_factor
 from ...fitting.solvers.conjugate_gradient import solve
 from ...gaussian.gaussians import Gaussians
 from ...raster.binning.tiles import Grid

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ...image.strips import map_threads, strips
-from .nearest import nearest_center, sum_by_center
 
 Array = NDArray[np.floating]
 
@@ -106,3 +107,117 @@ def _average_neighbors(mean: Array, values: Array) -> Array:
         return np.stack([row[near].mean(axis=1) for row in values])
 
     return np.concatenate(map_threads(average, range(0, len(mean), QUERY)), axis=1)
+
+
+Array = NDArray[np.floating]
+
+BLOCK = 512
+"""Side of the blocks that are searched one by one, in pixels."""
+
+BORDER = 24
+"""Pixels around a block whose centres are searched too, at first. Three to six times the distance
+of neighbours at a usual density; blocks with a longer distance are searched again."""
+
+
+def center_pixels(mean: Array, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return column and row of the pixels of centres (N, 2), clipped to an image (H, W)."""
+    column = np.clip(mean[:, 0].astype(np.intp), 0, shape[1] - 1)
+    return column, np.clip(mean[:, 1].astype(np.intp), 0, shape[0] - 1)
+
+
+def nearest_center(mean: Array, shape: tuple[int, ...]) -> NDArray[np.int32]:
+    """Return the index of the centre nearest to each pixel.
+
+    A centre counts as the middle of its pixel. If several centres lie in one pixel, only the last
+    counts.
+
+    Parameters
+    ----------
+    mean : ndarray, shape (N, 2)
+        x, y in pixels; fewer than 2^31 centres.
+    shape : (int, int)
+        Height and width of the image.
+
+    Returns
+    -------
+    ndarray of int32, shape (H, W)
+    """
+    height, width = shape
+    column, row = center_pixels(mean, shape)
+    centers = np.full(shape, -1, np.int32)
+    centers[row, column] = np.arange(len(mean), dtype=np.int32)
+    owner = np.empty(shape, np.int32)
+
+    def search(block: tuple[slice, slice]) -> None:
+        owner[block] = _nearest_in(centers, *block)
+
+    map_threads(
+        search,
+        [
+            (slice(y, min(y + BLOCK, height)), slice(x, min(x + BLOCK, width)))
+            for y in range(0, height, BLOCK)
+            for x in range(0, width, BLOCK)
+        ],
+    )
+    return owner
+
+
+def _nearest_in(centers: NDArray[np.int32], rows: slice, columns: slice) -> NDArray[np.int32]:
+    """Return the centres nearest to the pixels of a block; -1 marks pixels without a centre."""
+    from scipy.ndimage import distance_transform_edt
+
+    height, width = centers.shape
+    border = BORDER
+    while True:
+        top, left = max(0, rows.start - border), max(0, columns.start - border)
+        around = centers[top : rows.stop + border, left : columns.stop + border]
+        whole = around.shape == (height, width)
+        block = (
+            slice(rows.start - top, rows.stop - top),
+            slice(columns.start - left, columns.stop - left),
+        )
+        empty = around < 0
+        if whole or not empty.all():
+            y, x = (
+                index[block]
+                for index in distance_transform_edt(
+                    empty, return_distances=False, return_indices=True
+                )
+            )
+            away = np.square(y - np.arange(block[0].start, block[0].stop, dtype=np.int32)[:, None])
+            away += np.square(x - np.arange(block[1].start, block[1].stop, dtype=np.int32))
+            # No centre outside is nearer than the border is wide.
+            if whole or away.max() <= border * border:
+                return np.asarray(around[y, x])
+        border *= 2
+
+
+def sum_by_center(
+    owner: NDArray[np.int32], count: int, maps: Sequence[Sequence[Array]]
+) -> list[NDArray[np.float64]]:
+    """Sum products of maps over the pixels of each centre.
+
+    Parameters
+    ----------
+    owner : ndarray of int32, shape (H, W)
+        See `nearest_center`.
+    count : int
+        Number of centres N.
+    maps : sequence of sequence of ndarray, shape (H, W), (H, 1) or (W,)
+        The factors of each product.
+
+    Returns
+    -------
+    list of ndarray of float64, shape (N,)
+        One array for each product.
+    """
+    sums = [np.zeros(count) for _ in maps]
+    factors = [[np.broadcast_to(factor, owner.shape) for factor in product] for product in maps]
+    for rows in strips(*owner.shape):
+        index = owner[rows].ravel().astype(np.intp)
+        for total, product in zip(sums, factors, strict=True):
+            values = np.array(product[0][rows], np.float64)
+            for factor in product[1:]:
+                values *= factor[rows]
+            np.add.at(total, index, values.ravel())
+    return sums

@@ -23,8 +23,18 @@ from ...raster.kernels import channel_moments, sum_lanes
 from ...raster.layout import gather_run
 from ...raster.parameters import detached_shape
 from ...raster.render import batch_to_tiles, bin_gaussians
-from .matrix_products import apply, apply_transposed, correlate, inverse_diagonal
-from .unknowns import Unknowns, add_multiple, dots, multiply, negate, spread
+from .matrix_products import (
+    Unknowns,
+    add_multiple,
+    apply,
+    apply_transposed,
+    correlate,
+    dots,
+    inverse_diagonal,
+    multiply,
+    negate,
+    spread,
+)
 
 RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}
 """Tolerance by the bits of a float: a channel stops if ``r^T z``, relative to its first value, is

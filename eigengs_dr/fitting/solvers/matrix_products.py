@@ -20,11 +20,11 @@ from ...gaussian.file import MAX_CUTOFF
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint
 from ...raster.binning.lists import TileLists
-from ...raster.kernels import channel_sums, residual
+from ...raster.binning.tiles import Grid
+from ...raster.kernels import channel_sums, residual, sum_by_image
 from ...raster.layout import pack_parameters
 from ...raster.parameters import NUM_SHAPE_PARAMS, detached_shape, kernel_radius
 from ...raster.render import bin_gaussians, to_tiles
-from .unknowns import Unknowns
 
 
 def inner_products(
@@ -97,3 +97,38 @@ def apply_squared(
     narrow = [*shape[:2], *[f * root for f in shape[2:NUM_SHAPE_PARAMS]]]
     reach = min(cutoff * root, MAX_CUTOFF)  # beyond, the squares are 0 in any precision
     return apply_transposed(narrow, delta, channels, replace(lists, steep=True), reach)
+
+
+Unknowns = tuple[list, list]
+"""Colours of all Gaussians and backgrounds of all images: a Float for each channel in both."""
+
+
+def negate(x: Unknowns) -> Unknowns:
+    """Return ``-x``."""
+    return [-v for v in x[0]], [-v for v in x[1]]
+
+
+def multiply(x: Unknowns, y: Unknowns) -> Unknowns:
+    """Return the products of all entries."""
+    color, background = (
+        [a * b for a, b in zip(u, v, strict=True)] for u, v in zip(x, y, strict=True)
+    )
+    return color, background
+
+
+def dots(x: Unknowns, y: Unknowns, grid: Grid) -> list:
+    """Return the inner products for each channel, Floats of shape (images,)."""
+    color, background = multiply(x, y)
+    dr.eval(color)
+    return [sum_by_image(c, grid) + b for c, b in zip(color, background, strict=True)]
+
+
+def add_multiple(x: Unknowns, factors: list, y: Unknowns, image: Any) -> Unknowns:
+    """Return ``x + factor y``; a factor has one value for each image, see `spread`."""
+    color = [dr.fma(spread(f, image), b, a) for a, f, b in zip(x[0], factors, y[0], strict=True)]
+    return color, [dr.fma(f, b, a) for a, f, b in zip(x[1], factors, y[1], strict=True)]
+
+
+def spread(values: Any, image: Any) -> Any:
+    """Return the value of the image of each entry; `image` is None if there is only one."""
+    return values if image is None else dr.gather(type(values), values, image)

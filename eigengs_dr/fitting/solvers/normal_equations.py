@@ -15,23 +15,22 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import diags_array
+from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
-from ...backend.arrays import types_of
+from ...backend.arrays import types_of, upload
 from ...backend.recording import freeze_program
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint
-from ...raster.layout import pack_parameters
-from ...raster.parameters import kernel_radius, kernel_shape
+from ...raster.evaluate import weights
+from ...raster.layout import pack_parameters, unpack_parameters
+from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ...raster.render import bin_gaussians, to_tiles
-from .block_inverse import BlockInverse, invert
-from .weight_matrix import weight_matrix
 
 GROUP = 3
 """Planes that one adjoint correlates: as many as an image has channels, so that all calls share one
@@ -284,3 +283,203 @@ class NormalEquations:
 def squared_norms(planes: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return ``|D|^2`` of every plane D: planes (M, H, W) give shape (M,)."""
     return np.einsum("nij,nij->n", planes, planes, dtype=np.float64)
+
+
+LEAF = 300
+"""Approximate number of unknowns of a leaf. 5,000 Gaussians on a grid then have 16 leaves of 160 to
+260, and a separator of 1,290, which needs the fewest products."""
+
+MAX_ENTRIES = 1 << 23
+"""Largest number of entries of the blocks, in 32 MiB; 5,000 Gaussians on a grid have 3 million."""
+
+Matrix = NDArray[np.float32]
+Indices = NDArray[np.int64]
+
+
+class Leaf(NamedTuple):
+    """Unknowns that couple only with each other and with the separator.
+
+    Attributes
+    ----------
+    rows : ndarray of int64, shape (n,)
+    inverse : ndarray of float32, shape (n, n)
+        ``D^-1``.
+    neighbours : ndarray of int64, shape (s,)
+        Places in the separator of the unknowns that couple with this leaf.
+    coupling : ndarray of float32, shape (n, s)
+        ``E`` without its zero columns.
+    """
+
+    rows: Indices
+    inverse: Matrix
+    neighbours: Indices
+    coupling: Matrix
+
+
+class BlockInverse(NamedTuple):
+    """The inverse of a sparse symmetric matrix; see the module.
+
+    Attributes
+    ----------
+    leaves : list of Leaf
+    separator : ndarray of int64, shape (s,)
+    schur_inverse : ndarray of float32, shape (s, s)
+        ``C^-1``.
+    """
+
+    leaves: list[Leaf]
+    separator: Indices
+    schur_inverse: Matrix
+
+    def solve(self, columns: Matrix) -> Matrix:
+        """Return ``A^-1`` times columns, both of shape (N, M)."""
+        result, sums = np.empty_like(columns), columns[self.separator]
+        for leaf in self.leaves:
+            sums[leaf.neighbours] -= leaf.coupling.T @ (leaf.inverse @ columns[leaf.rows])
+        shared = self.schur_inverse @ sums
+        result[self.separator] = shared
+        for leaf in self.leaves:
+            left = columns[leaf.rows] - leaf.coupling @ shared[leaf.neighbours]
+            result[leaf.rows] = leaf.inverse @ left
+        return result
+
+
+def invert(matrix: Any, positions: NDArray[np.floating]) -> BlockInverse | None:
+    """Invert a sparse symmetric matrix in double precision.
+
+    Parameters
+    ----------
+    matrix : csr_array of float64, shape (N, N)
+        Positive definite.
+    positions : ndarray, shape (N, 2)
+        Unknowns that are close to each other should have close positions.
+
+    Returns
+    -------
+    BlockInverse or None
+        None if the blocks have more than `MAX_ENTRIES` entries.
+    """
+    depth = max(0, round(np.log2(len(positions) / LEAF)))
+    parts, separator = _dissect(matrix, positions, np.arange(len(positions)), depth)
+    if sum(len(rows) ** 2 for rows in [*parts, separator]) > MAX_ENTRIES:
+        return None
+    schur = matrix[separator][:, separator].toarray()
+    leaves = []
+    for rows in parts:
+        own = matrix[rows]
+        inverse, edge = np.linalg.inv(own[:, rows].toarray()), own[:, separator]
+        neighbours = np.unique(edge.indices).astype(np.int64)
+        coupling = edge[:, neighbours].toarray()
+        schur[np.ix_(neighbours, neighbours)] -= coupling.T @ inverse @ coupling
+        single = inverse.astype(np.float32), coupling.astype(np.float32)
+        leaves.append(Leaf(rows, single[0], neighbours, single[1]))
+    return BlockInverse(leaves, separator, np.linalg.inv(schur).astype(np.float32))
+
+
+def _dissect(
+    matrix: Any, positions: NDArray[np.floating], rows: Indices, depth: int
+) -> tuple[list[Indices], Indices]:
+    """Halve unknowns along their longer axis `depth` times; return leaves and the separator.
+
+    The separator of two halves are the unknowns of the first that couple with the second.
+    """
+    if depth == 0 or len(rows) < 2:
+        return [rows], rows[:0]
+    axis = int(np.argmax(np.ptp(positions[rows], axis=0)))
+    order = rows[np.argsort(positions[rows, axis], kind="stable")]
+    first, second = order[: len(order) // 2], order[len(order) // 2 :]
+    touches = np.diff(matrix[first][:, second].indptr) > 0
+    separator, first = first[touches], first[~touches]
+    leaves = []
+    for half in (first, second):
+        inner, between = _dissect(matrix, positions, half, depth - 1)
+        leaves += [part for part in inner if len(part)]
+        separator = np.concatenate([separator, between])
+    return leaves, separator
+
+
+MAX_WEIGHTS = 1 << 28
+"""Largest number of weights of a matrix; the weights and their indices then take 6 GiB."""
+
+
+def weight_matrix(gaussians: Gaussians) -> csr_array:
+    """Return the weights of every Gaussian at every pixel of the native size: the transpose of A.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        N Gaussians; the colours are ignored.
+
+    Returns
+    -------
+    csr_array of float32, shape (N, H * W)
+        Row n holds the weights of Gaussian n, by `eigengs_dr.raster.evaluate.weights`. Each pixel
+        inside an ellipse takes 8 bytes in the result, and 30 bytes during the computation.
+
+    Raises
+    ------
+    ValueError
+        If the ellipses have more than `MAX_WEIGHTS` pixels in all.
+    """
+    arrays = gaussians.to_arrays()
+    splat, x, y = _pixels_inside(
+        arrays["mean"].astype(np.float64),
+        arrays["factor"].astype(np.float64),
+        gaussians.width,
+        gaussians.height,
+        gaussians.cutoff,
+    )
+    size = (len(gaussians), gaussians.width * gaussians.height)
+    if len(splat) == 0:  # Dr.Jit does not compute with no elements
+        return csr_array(size, dtype=np.float32)
+    types = types_of(gaussians.mean)
+    with dr.suspend_grad():
+        packed = pack_parameters(kernel_shape(gaussians))
+        shape = unpack_parameters(packed, upload(types.UInt, splat), NUM_SHAPE_PARAMS)
+        px, py = (upload(types.Float, (p + 0.5).astype(np.float32)) for p in (x, y))
+        [values] = weights(shape, px, py, (1, 1), kernel_radius(gaussians.cutoff))
+    columns = y * gaussians.width + x
+    starts = np.concatenate([[0], np.cumsum(np.bincount(splat, minlength=len(gaussians)))])
+    return csr_array((values.numpy(), columns, starts.astype(np.int32)), shape=size)
+
+
+def _pixels_inside(
+    mean: NDArray[np.float64],
+    factor: NDArray[np.float64],
+    width: int,
+    height: int,
+    cutoff: float,
+) -> tuple[NDArray[np.uint32], NDArray[np.int32], NDArray[np.int32]]:
+    """List (Gaussian, x, y) of the pixels inside each ellipse, row by row.
+
+    On the row at distance dy, ``|F (x - mu)| <= cutoff`` is
+    ``|a dx + b dy| <= sqrt(cutoff^2 - (c dy)^2)``.
+    """
+    a, b, c = factor.T
+    reach = cutoff / c
+    low = np.clip(np.ceil(mean[:, 1] - reach - 0.5), 0, height).astype(np.int32)
+    high = np.clip(np.floor(mean[:, 1] + reach - 0.5) + 1, low, height).astype(np.int32)
+    splat, y = _expand(low, high)
+    dy = y + 0.5 - mean[splat, 1]
+    half = np.sqrt(np.maximum(cutoff**2 - (c[splat] * dy) ** 2, 0)) / a[splat]
+    middle = mean[splat, 0] - b[splat] / a[splat] * dy
+    low = np.clip(np.ceil(middle - half - 0.5), 0, width).astype(np.int32)
+    high = np.clip(np.floor(middle + half - 0.5) + 1, low, width).astype(np.int32)
+    row, x = _expand(low, high)
+    return splat[row].astype(np.uint32), x, y[row]
+
+
+def _expand(
+    low: NDArray[np.int32], high: NDArray[np.int32]
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Return the integers of the ranges [low, high), each with the index of its range."""
+    count = high - low
+    total = int(count.sum(dtype=np.int64))
+    if total > MAX_WEIGHTS:
+        raise ValueError(
+            f"the Gaussians cover {total:,} pixels in all, over {MAX_WEIGHTS:,}; use fewer, or a "
+            "smaller size"
+        )
+    which = np.repeat(np.arange(len(low)), count)
+    before = np.repeat(np.cumsum(count) - count, count)
+    return which, (np.arange(len(which)) - before + low[which]).astype(np.int32)

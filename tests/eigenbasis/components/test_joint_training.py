@@ -11,7 +11,7 @@ from eigengs_dr.backend.selection import select
 from eigengs_dr.eigenbasis.components import joint_training as joint
 from eigengs_dr.eigenbasis.components.joint_state import JointState
 from eigengs_dr.eigenbasis.components.joint_training import RATE, train_jointly
-from eigengs_dr.fitting.optimizers.parameterization import CHOLESKY
+from eigengs_dr.fitting.parameterization import CHOLESKY
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.raster.reference import render_plain
 from eigengs_dr.raster.render import bin_gaussians, render

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from eigengs_dr.fitting.solvers import block_inverse
+from eigengs_dr.fitting.solvers import normal_equations as block_inverse
 
 
 def neighbours_on_a_grid(width, height, reach):

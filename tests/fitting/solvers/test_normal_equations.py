@@ -8,8 +8,7 @@ from hypothesis import given
 
 from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
-from eigengs_dr.fitting.solvers.normal_equations import RIDGE, NormalEquations
-from eigengs_dr.fitting.solvers.weight_matrix import weight_matrix
+from eigengs_dr.fitting.solvers.normal_equations import RIDGE, NormalEquations, weight_matrix
 from eigengs_dr.raster.render import render
 
 
@@ -172,7 +171,7 @@ def test_blocks_fit_what_is_left(backend):
 
 
 def test_a_matrix_too_large_is_refused(backend, monkeypatch):
-    monkeypatch.setattr("eigengs_dr.fitting.solvers.weight_matrix.MAX_WEIGHTS", 100)
+    monkeypatch.setattr("eigengs_dr.fitting.solvers.normal_equations.MAX_WEIGHTS", 100)
     with pytest.raises(ValueError, match=r"the Gaussians cover [\d,]+ pixels in all, over 100"):
         NormalEquations(random_scene().on(backend))
 

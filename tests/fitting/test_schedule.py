@@ -1,7 +1,7 @@
 """Schedules of a descent."""
 
-from eigengs_dr.fitting.optimizers.adam import Adam
-from eigengs_dr.fitting.optimizers.schedule import Schedule
+from eigengs_dr.fitting.optimizers import Adam
+from eigengs_dr.fitting.schedule import Schedule
 
 
 def test_schedules_are_plain_values():

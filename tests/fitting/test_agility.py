@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from _helpers.sets import random_scene
-from eigengs_dr.fitting.optimizers.schedule import MAX_AGILITY, agility_of
-from eigengs_dr.fitting.optimizers.state import start_descent
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.descent import start_descent
+from eigengs_dr.fitting.options import PRESETS
+from eigengs_dr.fitting.schedule import MAX_AGILITY, agility_of
 
 
 def test_rates_fall_with_the_root_of_the_colour():

@@ -7,24 +7,32 @@ of an image; the adjoint; and the optimiser, with one lane per Gaussian.
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from ...backend.arrays import ArrayTypes, types_of, upload
-from ...backend.recording import freeze_program, release_later
-from ...gaussian.gaussians import Gaussians
-from ...raster.adjoint import adjoint_pieces, sum_pieces
-from ...raster.binning.lists import TileLists
-from ...raster.kernels import residual, sum_lanes
-from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
-from ...raster.render import batch_to_tiles, bin_gaussians
-from ..initializers import FitProblem
+from ..backend.arrays import ArrayTypes, types_of, upload
+from ..backend.recording import freeze_program, release_later
+from ..gaussian.gaussians import Gaussians
+from ..raster.adjoint import adjoint_pieces, sum_pieces
+from ..raster.binning.lists import TileLists
+from ..raster.kernels import residual, sum_lanes
+from ..raster.layout import pack_parameters
+from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
+from ..raster.render import batch_to_tiles, bin_gaussians
+from .initializers import FitProblem
 from .parameterization import Parameterization
-from .schedule import Schedule, first_phase, lr_factor, next_build, relocations, surplus_for
-from .state import Descent, pack, start_descent
+from .schedule import (
+    Schedule,
+    agility_of,
+    first_phase,
+    lr_factor,
+    next_build,
+    relocations,
+    surplus_for,
+)
 
 MSE_EPSILON = 1e-10
 """Mean squared error added before the logarithm, which would diverge at an error of 0."""
@@ -46,7 +54,7 @@ def descend(
         is left, and the other steps start from redistributed Gaussians, see `first_phase`. If the
         problem can relocate, Gaussians move between steps, see `relocations`. If it can do both,
         there are more Gaussians until the last of these moves, see `surplus_for`. These functions
-        are in `eigengs_dr.fitting.optimizers.schedule`.
+        are in `eigengs_dr.fitting.schedule`.
     schedule : Schedule
     iterations : int
         Number of steps, with the first phase.
@@ -274,3 +282,48 @@ def prefix(gaussians: Gaussians, count: int) -> Gaussians:
         factor=take(gaussians.factor),
         color=take(gaussians.color),
     )
+
+
+@dataclass(frozen=True)
+class Descent:
+    """The state of a descent.
+
+    Attributes
+    ----------
+    variables : dict of str to arrays
+        The variables that the optimiser moves.
+    moments : dict of str to tuple
+        The state of the optimiser for each variable.
+    gaussians : Gaussians or None
+        The set of these variables. A step does not need it, and each array that a frozen program
+        gets costs a microsecond.
+    packed : Float
+        The parameters of this set for the kernels.
+    agility : Float or None
+        Factor of the learning rates of means and shapes, one for each Gaussian.
+    """
+
+    variables: dict[str, Any]
+    moments: dict[str, tuple]
+    gaussians: Any
+    packed: Any
+    agility: Any = None
+
+
+def start_descent(gaussians: Gaussians, schedule: Schedule, images: int = 1) -> Descent:
+    """Return the state before the first step, for the Gaussians of one image after another."""
+    encoded, optimizer = schedule.variables().encode(gaussians), schedule.make_optimizer()
+    variables = {name: dr.detach(encoded[name]) for name in schedule.rates}
+    dr.eval(variables)
+    moments = {name: optimizer.start(value) for name, value in variables.items()}
+    agility, Float = None, types_of(gaussians.mean).Float
+    if schedule.agility:
+        rows = [np.broadcast_to(row.numpy(), len(gaussians)) for row in gaussians.color]
+        color = np.stack(rows, axis=1).reshape(images, -1, len(rows))
+        agility = upload(Float, agility_of(color, schedule.agility).ravel())
+    return Descent(variables, moments, gaussians, pack(gaussians), agility)
+
+
+def pack(gaussians: Gaussians) -> Any:
+    """Return the parameters of a set for the kernels, in their layout in memory."""
+    return pack_parameters([*kernel_shape(gaussians), *gaussians.color])

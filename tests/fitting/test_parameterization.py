@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as hnp
 
 from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.optimizers.parameterization import (
+from eigengs_dr.fitting.parameterization import (
     CHOLESKY,
     CHOLESKY_BOUND,
     MIN_DIAGONAL,

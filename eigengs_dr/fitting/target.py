@@ -11,14 +11,7 @@ from numpy.typing import NDArray
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
 from ..image.io import read_image
-from ..image.pixels import (
-    MAX_PIXEL,
-    MIN_PIXEL,
-    ImageError,
-    check_data,
-    check_image,
-    encoding_of,
-)
+from ..image.pixels import MAX_PIXEL, MIN_PIXEL, ImageError, check_data, check_image, encoding_of
 from .options import FitOptions
 
 WHITE = 1.001

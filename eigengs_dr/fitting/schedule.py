@@ -16,18 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from .moments import Optimizer
+    from .optimizers import Optimizer
     from .parameterization import Parameterization
 
+
 OPTIMIZERS = {
-    "adam": "eigengs_dr.fitting.optimizers.adam:Adam",
-    "adan": "eigengs_dr.fitting.optimizers.adan:Adan",
+    "adam": "eigengs_dr.fitting.optimizers:Adam",
+    "adan": "eigengs_dr.fitting.optimizers:Adan",
 }
 """Optimisers by name: each entry makes an `Optimizer` by ``entry(**settings)``."""
 
 PARAMETERIZATIONS = {
-    "scale_relative": "eigengs_dr.fitting.optimizers.parameterization:SCALE_RELATIVE",
-    "cholesky": "eigengs_dr.fitting.optimizers.parameterization:CHOLESKY",
+    "scale_relative": "eigengs_dr.fitting.parameterization:SCALE_RELATIVE",
+    "cholesky": "eigengs_dr.fitting.parameterization:CHOLESKY",
 }
 """Parameterizations by name: the variables that an optimiser moves."""
 
@@ -75,7 +76,7 @@ class Schedule:
     relocate_share : float
         Share of the Gaussians that move in a round.
     noise : float
-        Strength of the perturbation in the first round, see `eigengs_dr.fitting.perturbation`.
+        Strength of the perturbation in the first round, see `eigengs_dr.fitting.density_control`.
     surplus : float
         Share of Gaussians that are placed in addition and leave again, see `surplus_for`.
     agility : float
@@ -191,7 +192,7 @@ class Relocation(NamedTuple):
     share : float
         Share of the Gaussians that leave their places, in [0, 1].
     noise : float
-        Strength of the perturbation of all Gaussians, see `eigengs_dr.fitting.perturbation`.
+        Strength of the perturbation of all Gaussians, see `eigengs_dr.fitting.density_control`.
     seed : int
         Seed of the perturbation.
     dropped : int

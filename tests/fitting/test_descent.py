@@ -12,12 +12,12 @@ from _helpers.sets import random_scene
 from _helpers.waves import SIDE, default, presets, start
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting import descent
+from eigengs_dr.fitting.descent import descend, prefix, rate_table, run_phase
 from eigengs_dr.fitting.initializers import FitProblem
-from eigengs_dr.fitting.optimizers import descent
-from eigengs_dr.fitting.optimizers.descent import descend, prefix, rate_table, run_phase
-from eigengs_dr.fitting.optimizers.schedule import lr_factor, next_build, relocations
-from eigengs_dr.fitting.presets import PRESETS
+from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.fitting.redistribute import residual
+from eigengs_dr.fitting.schedule import lr_factor, next_build, relocations
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import bin_gaussians, render
 

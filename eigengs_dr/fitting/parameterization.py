@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 
-from ...backend.arithmetic import rsqrt, tanh
-from ...backend.arrays import types_of
-from ...gaussian.covariance import cholesky_from_factor, factor_from_cholesky
-from ...gaussian.gaussians import Gaussians
+from ..backend.arithmetic import rsqrt, tanh
+from ..backend.arrays import types_of
+from ..gaussian.covariance import cholesky_from_factor, factor_from_cholesky
+from ..gaussian.gaussians import Gaussians
 
 
 class Parameterization(NamedTuple):
