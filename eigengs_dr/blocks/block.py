@@ -13,31 +13,28 @@ Gaussians that no longer move, and not at the same time.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.recording import exclusive, release_later
-from ..fitting.density_control import Part, relocate
-from ..fitting.descent import run_phase
-from ..fitting.initializers import FitProblem, FitTarget, make_target
+from ..backend.recording import exclusive
+from ..fitting.density_control import Part, PartControl
+from ..fitting.descent import FitProblem, run
 from ..fitting.options import FitOptions
 from ..fitting.placement.adaptive import density_from_hessian
 from ..fitting.placement.density import density_ratio, nearest_center, scale_by_owner
 from ..fitting.redistribute import residual, squared_error
 from ..fitting.solvers.conjugate_gradient import solve
-from ..fitting.target import BRIGHT, WHITE, read_data, unit_of
+from ..fitting.target import BRIGHT, WHITE, FitTarget, make_target, read_data, unit_of
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
 from ..image.pixels import ImageError
 from .draw import draw
 from .grid import Block
-from .place import OldSet, place_block, placement_image, window_density
+from .place import OldSet, place_block, window_density
 from .source import Window
 
 Array = NDArray[np.floating]
@@ -128,7 +125,7 @@ def survey(task: PlaceTask, settings: Settings) -> Surveyed:
     if options.space == "normal":
         read_data(pixels, options.space)  # no other range makes normals
     target = make_target(pixels, options.space)
-    density = window_density(placement_image(target, options.space), settings.spacing)
+    density = window_density(target.shown, settings.spacing)
     core = task.block.core
     return Surveyed(
         float(density[core].sum(dtype=np.float64)),
@@ -141,7 +138,7 @@ def place(task: PlaceTask, settings: Settings) -> tuple[Array, Array]:
     """Place the Gaussians of a block; see `eigengs_dr.blocks.place.place_block`."""
     options = settings.options
     target = make_target(task.window.read(), options.space)
-    image = placement_image(target, options.space)
+    image = target.shown
     return place_block(image, task.block, task.gaussians, settings.spacing, task.old)
 
 
@@ -163,7 +160,7 @@ def find_density(task: FitTask, settings: Settings, step_done: StepDone | None =
     problem = _start(task, target, settings)
     found = _descend(problem, task, settings, step_done)
     mean = found.to_arrays()["mean"]
-    density = density_from_hessian(placement_image(target, found.space), settings.spacing)
+    density = density_from_hessian(target.shown, settings.spacing)
     owner = nearest_center(mean, density.shape)
     ratio = density_ratio(mean, owner, _squared_error(found, problem), density)
     scale_by_owner(density, owner, ratio)
@@ -186,8 +183,8 @@ def fit_block(task: FitTask, settings: Settings, step_done: StepDone | None = No
     target = make_target(task.window.read(), settings.options.space)
     problem = _start(task, target, settings)
     part = Part(task.own, task.block.core)
-    move = partial(relocate, target=problem.target, weight=problem.weight, part=part)
-    found = _descend(problem._replace(relocate=move), task, settings, step_done)
+    control = PartControl(problem.target, problem.weight, target.shown, part=part)
+    found = _descend(problem._replace(control=control), task, settings, step_done)
     if task.part.stop == task.iterations:
         # The last steps may make a set worse that is nearly perfect; earlier ones, any set.
         before, after = (_squared_error(g, problem).sum() for g in (problem.gaussians, found))
@@ -223,14 +220,14 @@ def _start(task: FitTask, target: FitTarget, settings: Settings) -> FitProblem:
 def _descend(
     problem: FitProblem, task: FitTask, settings: Settings, step_done: StepDone | None
 ) -> Gaussians:
-    found, schedule = problem.gaussians, settings.options.method.schedule
-    sets = run_phase(problem, schedule, task.iterations, part=task.part)
-    with release_later(problem), closing(sets):  # the arrays of a task may be NumPy's
-        for taken, found in enumerate(sets, start=1):  # noqa: B007
-            if step_done and taken % 10 == 0:
-                dr.sync_thread()  # steps run asynchronously
-                step_done(taken)
-    return dr.detach(found)
+    def after(taken: int, found: Gaussians) -> bool:
+        if step_done and taken and taken % 10 == 0:
+            dr.sync_thread()  # steps run asynchronously
+            step_done(taken)
+        return False
+
+    schedule = settings.options.method.schedule
+    return run(problem, schedule, task.iterations, after, part=task.part)
 
 
 def _squared_error(found: Gaussians, problem: FitProblem) -> NDArray[np.float32]:

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fitting.initializers import FitTarget
 from ..fitting.placement.adaptive import (
     density_from_hessian,
     lloyd_step,
@@ -20,7 +19,6 @@ from ..fitting.placement.adaptive import (
     stratify_along_hilbert,
 )
 from ..fitting.placement.density import nearest_center, scale_by_owner
-from ..image.color import LIGHT
 from .grid import Block
 
 Array = NDArray[np.floating]
@@ -39,11 +37,6 @@ class OldSet(NamedTuple):
 
     mean: Array
     ratio: Array
-
-
-def placement_image(target: FitTarget, space: str) -> NDArray[np.float32]:
-    """Return the image that shapes the Gaussians: linear light would neglect dark parts."""
-    return target.pixels if space in LIGHT else target.values
 
 
 def window_density(image: Array, spacing: float, old: OldSet | None = None) -> NDArray[np.float32]:

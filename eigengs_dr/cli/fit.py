@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..backend.selection import select
-from ..fitting.initializers import INITIALIZERS
-from ..fitting.options import DEFAULT_BASIS, PRESETS, FitOptions, Levels
+from ..fitting.options import DEFAULT_BASIS, INITS, PRESETS, FitOptions, Levels
 from ..image.color import SPACES
 from ..image.metrics import float_space, target_key
 from .cluster import open_cluster
@@ -85,7 +84,7 @@ FAILED = 2
     show_default=True,
     help="Steps of optimisation.",
 )
-@choice("--init", ["auto", *INITIALIZERS], "Initial placement of the Gaussians.")
+@choice("--init", list(INITS), "Initial placement of the Gaussians.")
 @click.option(
     "--basis",
     metavar="NAME|FILE",

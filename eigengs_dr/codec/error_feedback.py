@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
-from ..fitting.descent import descend
-from ..fitting.initializers import FitProblem
+from ..fitting.descent import FitProblem, run
 from ..fitting.options import PRESETS
 from ..fitting.schedule import Schedule
 from ..fitting.solvers.conjugate_gradient import solve
@@ -75,7 +74,7 @@ def quantize_with_feedback(gaussians: Gaussians, target: Array, steps: Steps) ->
         rest = rest - _rendered(gaussians, dequantize(done[-1], steps))
         current = solve(current[np.flatnonzero(~now)], rest, 2, warm_start=True).gaussians
         if inside:  # descent would move means outside the image into it
-            *_, current = descend(FitProblem(current, rest), _slow_schedule(), STEPS)
+            current = run(FitProblem(current, rest), _slow_schedule(), STEPS)
     symbols = Symbols(*map(np.concatenate, zip(*done, strict=True)))
     return content_of(gaussians, [symbols], steps, current.to_arrays()["background"])
 

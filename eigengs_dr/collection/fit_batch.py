@@ -9,11 +9,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass, field, replace
-from functools import partial
-from pkgutil import resolve_name
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -23,18 +20,19 @@ from ..backend.arrays import types_of, upload
 from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
 from ..fitting.density_control import relocate
-from ..fitting.descent import descend
+from ..fitting.descent import FitProblem, run
 from ..fitting.fit import Fit
-from ..fitting.initializers import PLACEMENTS, FitProblem, FitTarget, Placement, make_target
 from ..fitting.options import FitOptions
 from ..fitting.placement.adaptive import place_adaptive
 from ..fitting.redistribute import density_for_error, squared_error
 from ..fitting.refine import is_plateau, trace_steps
 from ..fitting.schedule import Relocation, Schedule
 from ..fitting.solvers.conjugate_gradient import solve_batch
+from ..fitting.start import PLACEMENTS
+from ..fitting.target import make_target
 from ..gaussian.gaussians import Gaussians
 from ..gaussian.like import like
-from ..image.color import LIGHT, from_sum, to_picture
+from ..image.color import from_sum, to_picture
 from ..image.metrics import float_space, psnr
 from ..raster.kernels import forward
 from ..raster.layout import pack_parameters
@@ -101,28 +99,28 @@ def fit_batch(
     problem = _start(images, options)
     seconds_init = time.perf_counter() - started
     records = [_Record() for _ in images]
-    with (
-        defer_interrupts() as interrupted,
-        closing(descend(problem, schedule, options.iterations)) as sets,
-    ):
-        for step, reached in enumerate(sets):
-            # A set with more Gaussians than asked for does not compare, see `refine`.
-            if step in marks and len(reached) == len(problem.gaussians):
-                seconds = (time.perf_counter() - started) / len(images)
-                for record, shown, pixels in zip(
-                    records, _pictures(reached, len(images)), images, strict=True
-                ):
-                    if record.stopped != "plateau":
-                        record.judge(step, seconds, reached, shown, pixels)
-                        record.end_at_plateau(schedule, options.iterations)
-                if all(record.stopped == "plateau" for record in records):
-                    break
-            if step % 10 == 0:
-                dr.sync_thread()
-                if progress:
-                    progress(step / max(1, options.iterations))
-            if interrupted():
-                raise KeyboardInterrupt
+
+    def after(step: int, reached: Gaussians) -> bool:
+        # A set with more Gaussians than asked for does not compare, see `refine`.
+        if step in marks and len(reached) == len(problem.gaussians):
+            seconds = (time.perf_counter() - started) / len(images)
+            shown = _pictures(reached, len(images))
+            for record, picture, pixels in zip(records, shown, images, strict=True):
+                if record.stopped != "plateau":
+                    record.judge(step, seconds, reached, picture, pixels)
+                    record.end_at_plateau(schedule, options.iterations)
+            if all(record.stopped == "plateau" for record in records):
+                return True
+        if step % 10 == 0:
+            dr.sync_thread()
+            if progress:
+                progress(step / max(1, options.iterations))
+        if interrupted():
+            raise KeyboardInterrupt
+        return False
+
+    with defer_interrupts() as interrupted:
+        run(problem, schedule, options.iterations, after)
     share = (time.perf_counter() - started) / len(images)
     return _results(records, share, seconds_init / len(images))
 
@@ -166,9 +164,9 @@ class _Record:
 
 def _start(images: Images, options: FitOptions) -> FitProblem:
     """Place the Gaussians of every image, and solve for the colours of all of them."""
-    place: Placement = resolve_name(PLACEMENTS[options.initializer])
+    place = PLACEMENTS[options.initializer]
     targets = [make_target(pixels, options.space) for pixels in images]
-    shown = [_shown(t, options) for t in targets]
+    shown = [target.shown for target in targets]
     count = options.count_for(images[0])
     placed = [place(s, count, np.random.default_rng(options.seed)) for s in shown]
     values = np.stack([t.values for t in targets])
@@ -176,16 +174,9 @@ def _start(images: Images, options: FitOptions) -> FitProblem:
     weight = np.stack(weights) if weights else None
     like = _stack(placed, values.shape, options)
     start = solve_batch(like, values, options.solve_steps).gaussians
-    anew = partial(_redistribute, shown=shown, values=values, weight=weight, options=options)
-    moves = partial(_relocate, values=values, weight=weight)
-    if options.initializer != "adaptive":
-        return FitProblem(start, values, weight)
-    return FitProblem(start, values, weight, redistribute=anew, relocate=moves)
-
-
-def _shown(target: FitTarget, options: FitOptions) -> Images:
-    """Return the image that shapes the Gaussians; linear light would neglect dark parts."""
-    return target.pixels if options.space in LIGHT else target.values
+    control = _BatchControl(shown, values, weight, options)
+    adaptive = options.initializer == "adaptive"
+    return FitProblem(start, values, weight, control if adaptive else None)
 
 
 def _stack(placed: list, shape: tuple[int, ...], options: FitOptions) -> Gaussians:
@@ -202,41 +193,42 @@ def _stack(placed: list, shape: tuple[int, ...], options: FitOptions) -> Gaussia
     ).bounded()
 
 
-def _redistribute(
-    gaussians: Gaussians,
-    count: int,
-    *,
-    shown: list[Images],
-    values: Images,
-    weight: Images | None,
-    options: FitOptions,
-) -> Gaussians:
-    """Place all sets anew, as `eigengs_dr.fitting.redistribute.redistribute` does for one."""
-    missed = values - _sum(replace(gaussians, space="data"), len(values))
-    means = _numpy(gaussians.mean).reshape(len(values), -1, 2)
-    placed = []
-    for k, image in enumerate(shown):
-        error = squared_error(missed[k], None if weight is None else weight[k])
-        density = density_for_error(means[k], error)
-        placed.append(place_adaptive(image, count // len(values), density=density))
-    return solve_batch(_stack(placed, values.shape, options), values, options.solve_steps).gaussians
+class _BatchControl(NamedTuple):
+    """The density control of all images; see `eigengs_dr.fitting.descent.Control`."""
 
+    shown: list[Images]
+    values: Images
+    weight: Images | None
+    options: FitOptions
 
-def _relocate(
-    gaussians: Gaussians, how: Relocation, *, values: Images, weight: Images | None
-) -> Gaussians:
-    """Relocate the Gaussians of every image, as `eigengs_dr.fitting.density_control` does."""
-    weights = [None] * len(values) if weight is None else list(weight)
-    arrays = _arrays(gaussians)
-    moved = [
-        relocate(_cut(arrays, k, gaussians), how, values[k], weights[k]).to_arrays()
-        for k in range(len(values))
-    ]
-    mean, factor, color = (np.concatenate([m[name] for m in moved]) for name in _OWN)
-    stacked = like(gaussians, mean, factor, color)
-    types = types_of(gaussians.mean)
-    rows = np.stack([m["background"] for m in moved], axis=1)
-    return replace(stacked, background=types.FloatX([upload(types.Float, row) for row in rows]))
+    def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
+        """Place all sets anew, as `eigengs_dr.fitting.redistribute.redistribute` does for one."""
+        shown, values, weight, options = self
+        missed = values - _sum(replace(gaussians, space="data"), len(values))
+        means = _numpy(gaussians.mean).reshape(len(values), -1, 2)
+        placed = []
+        for k, image in enumerate(shown):
+            error = squared_error(missed[k], None if weight is None else weight[k])
+            density = density_for_error(means[k], error)
+            placed.append(place_adaptive(image, count // len(values), density=density))
+        return solve_batch(
+            _stack(placed, values.shape, options), values, options.solve_steps
+        ).gaussians
+
+    def relocate(self, gaussians: Gaussians, how: Relocation) -> Gaussians:
+        """Relocate in every image, as `eigengs_dr.fitting.density_control.relocate` does."""
+        _, values, weight, _ = self
+        weights = [None] * len(values) if weight is None else list(weight)
+        arrays = _arrays(gaussians)
+        moved = [
+            relocate(_cut(arrays, k, gaussians), how, values[k], weights[k]).to_arrays()
+            for k in range(len(values))
+        ]
+        mean, factor, color = (np.concatenate([m[name] for m in moved]) for name in _OWN)
+        stacked = like(gaussians, mean, factor, color)
+        types = types_of(gaussians.mean)
+        rows = np.stack([m["background"] for m in moved], axis=1)
+        return replace(stacked, background=types.FloatX([upload(types.Float, row) for row in rows]))
 
 
 _OWN = ("mean", "factor", "color")

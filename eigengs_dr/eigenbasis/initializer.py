@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fitting.initializers import FitProblem, FitTarget
+from ..fitting.descent import FitProblem
 from ..fitting.options import DEFAULT_BASIS, FitOptions
 from ..fitting.solvers.conjugate_gradient import solve
+from ..fitting.target import FitTarget
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode
 from ..image.planes import BASIS_SPACES
@@ -18,7 +19,7 @@ from .registry import load_basis
 
 
 def start_from_basis(target: FitTarget, options: FitOptions) -> FitProblem:
-    """Take shapes and colours from a model; an `eigengs_dr.fitting.initializers.Initializer`.
+    """Take shapes and colours from a model.
 
     Raises
     ------
@@ -32,7 +33,7 @@ def start_from_basis(target: FitTarget, options: FitOptions) -> FitProblem:
         return FitProblem(encoded, target.values, target.weight)
     dense = model.dense_mean(encoded.width, encoded.height)
     base_image = _picture(dense, options.space)
-    return FitProblem(encoded, target.values - dense, target.weight, base_image)
+    return FitProblem(encoded, target.values - dense, target.weight, base_image=base_image)
 
 
 def _encode(model: EigenGS, target: FitTarget, options: FitOptions) -> Gaussians:

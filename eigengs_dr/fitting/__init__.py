@@ -1,15 +1,16 @@
 """From an image to its Gaussians.
 
 - ``fit``: `fit`, from the image to the result
-- ``options``: the options of a fit, checked once
-- ``presets``: named methods
-- ``initializers``: the registry of starts
+- ``options``: the options of a fit, checked once, and the named methods
+- ``target``: the pixels, and the same in the space of the colours
+- ``start``: placement and colours
+- ``descent``: gradient descent: the problem, the driver and the program of one step
+- ``schedule``, ``parameterization``, ``optimizers``: rates and rounds, variables, Adam and Adan
+- ``density_control``: Gaussians that leave, move and are added
+- ``redistribute``: a placement by the error
 - ``refine``: a descent with a trace
-- ``redistribute``: placement and colours; placement again, by the error
-- ``density_control``: dropping and adding Gaussians
 - ``search``: the smallest number of Gaussians for a PSNR
 - ``levels``: levels of detail
 - ``placement``: where Gaussians start (NumPy)
 - ``solvers``: colours by linear least squares
-- ``optimizers``: variables, optimisers, schedules, steps
 """

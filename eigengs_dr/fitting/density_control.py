@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,12 +16,93 @@ from ..gaussian.gaussians import Gaussians
 from ..gaussian.like import like
 from ..image.resize import resample
 from .placement.peaks import residual_peaks
-from .redistribute import residual
+from .redistribute import redistribute, residual
 from .schedule import Relocation
 from .solvers.conjugate_gradient import solve
 from .solvers.matrix_products import inner_products
 
 Array = NDArray[np.floating]
+
+
+class Part(NamedTuple):
+    """A part of a picture, and of its Gaussians.
+
+    Attributes
+    ----------
+    own : slice
+        The Gaussians that may move.
+    core : (slice, slice)
+        The rows and columns to which they may move.
+    """
+
+    own: slice
+    core: tuple[slice, slice]
+
+
+@dataclass(frozen=True)
+class DensityControl:
+    """The density control of one image; see `eigengs_dr.fitting.descent.Control`.
+
+    Attributes
+    ----------
+    target : ndarray of float32, shape (H, W, C)
+        The image in the space of the set.
+    weight : ndarray of float32, shape (H, W, C), or None
+        Factor of the errors before squaring.
+    shown : ndarray of float32, shape (H, W, C)
+        The image that places Gaussians.
+    solve_steps : int
+        Steps of the colour solve after a placement.
+    """
+
+    target: NDArray[np.float32]
+    weight: NDArray[np.float32] | None
+    shown: NDArray[np.float32]
+    solve_steps: int = 10
+
+    def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
+        """Place `count` Gaussians anew; see `eigengs_dr.fitting.redistribute.redistribute`."""
+        return redistribute(
+            gaussians, count, self.shown, self.target, self.weight, self.solve_steps
+        )
+
+    def relocate(self, gaussians: Gaussians, how: Relocation) -> Gaussians:
+        """Move Gaussians; see the function `relocate`."""
+        return relocate(gaussians, how, self.target, self.weight)
+
+
+@dataclass(frozen=True)
+class PartControl(DensityControl):
+    """The density control of a part of a picture.
+
+    Attributes
+    ----------
+    part : Part
+        The Gaussians that may move, and where.
+    """
+
+    part: Part | None = None
+
+    def relocate(self, gaussians: Gaussians, how: Relocation) -> Gaussians:
+        """Move Gaussians of the part; see the function `relocate`."""
+        return relocate(gaussians, how, self.target, self.weight, self.part)
+
+
+@dataclass(frozen=True)
+class LevelControl(DensityControl):
+    """The density control of nested sets.
+
+    Attributes
+    ----------
+    counts : tuple of int
+        Numbers of Gaussians up to each level.
+    """
+
+    counts: tuple[int, ...] = ()
+
+    def relocate(self, gaussians: Gaussians, how: Relocation) -> Gaussians:
+        """Move the Gaussians of each level; see `relocate_levels`."""
+        return relocate_levels(gaussians, how, self.counts, self.target, self.weight)
 
 
 WORKING_SPACING = 3.0
@@ -106,21 +187,6 @@ def densify(
     if not len(mean):
         return gaussians
     return concatenate([gaussians, like(gaussians, mean, _round(size), color).bounded()])
-
-
-class Part(NamedTuple):
-    """A part of a picture, for `relocate`.
-
-    Attributes
-    ----------
-    own : slice
-        The Gaussians that may move.
-    core : (slice, slice)
-        The rows and columns to which they may move.
-    """
-
-    own: slice
-    core: tuple[slice, slice]
 
 
 def relocate(
@@ -262,8 +328,6 @@ def _spacing(gaussians: Gaussians) -> float:
     return math.sqrt(gaussians.width * gaussians.height / len(gaussians))
 
 
-Array = NDArray[np.floating]
-
 SHAPE_SHARE = 0.5
 """Noise of the logarithms of the sizes, relative to that of the mean in standard deviations."""
 
@@ -275,6 +339,14 @@ def perturb(
     arrays: dict[str, Array], own: NDArray[np.integer], error: float, strength: float, seed: int
 ) -> None:
     """Add noise to the mean and the factor of some Gaussians, in place.
+
+    A descent so leaves a poor local minimum. Kheradmand et al. ("3D Gaussian splatting as Markov
+    chain Monte Carlo", NeurIPS 2024) add noise to means. Here shapes get noise too, and each
+    Gaussian gets as much as the image can bear. A Gaussian with the factor F, the size s (the
+    geometric mean of its standard deviations) and the amplitude ``A = color s`` adds the squared
+    error ``pi/2 |A|^2 |F dm|^2`` if its mean moves by dm. So faint Gaussians move far, and those
+    that carry the image stay near their places; the nearer a fit is to its image, the smaller are
+    the moves.
 
     The noise is normal: ``F dm = e z`` for the mean, with two numbers z, and
     ``F' = [[exp(e u), e v], [0, exp(e w)]] F`` for the factor, with `SHAPE_SHARE` times such

@@ -6,12 +6,14 @@ of an image; the adjoint; and the optimiser, with one lane per Gaussian.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import drjit as dr
 import numpy as np
+from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, types_of, upload
 from ..backend.recording import freeze_program, release_later
@@ -22,9 +24,9 @@ from ..raster.kernels import residual, sum_lanes
 from ..raster.layout import pack_parameters
 from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
 from ..raster.render import batch_to_tiles, bin_gaussians
-from .initializers import FitProblem
 from .parameterization import Parameterization
 from .schedule import (
+    Relocation,
     Schedule,
     agility_of,
     first_phase,
@@ -38,23 +40,98 @@ MSE_EPSILON = 1e-10
 """Mean squared error added before the logarithm, which would diverge at an error of 0."""
 
 
+class Control(Protocol):
+    """The density control of a descent: Gaussians that are placed anew, move and leave.
+
+    `eigengs_dr.fitting.density_control` has those of one image and of levels.
+    """
+
+    def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
+        """Return a new set of `count` Gaussians, denser where the old set left more error."""
+
+    def relocate(self, gaussians: Gaussians, how: Relocation) -> Gaussians:
+        """Return as many Gaussians, less those that `how` drops.
+
+        Some have moved to where the old set left most error, and all are perturbed.
+        """
+
+
+class FitProblem(NamedTuple):
+    """The start and the target of a descent.
+
+    Attributes
+    ----------
+    gaussians : Gaussians
+        The set before the first step.
+    target : ndarray of float32, shape (H, W, C)
+        The image in the space of the set. For a batch, (M, H, W, C): the set holds the Gaussians of
+        all images, image after image, and its background has M values.
+    weight : ndarray of float32, shape (H, W, C), or None
+        Factor of the errors before squaring.
+    control : Control, or None
+        None where Gaussians must keep their places.
+    base_image : ndarray of float32, shape (H, W, 3), or None
+        RGB image to add to renderings of the set: the mean image, if it stays pixels.
+    """
+
+    gaussians: Gaussians
+    target: NDArray[np.float32]
+    weight: NDArray[np.float32] | None = None
+    control: Control | None = None
+    base_image: NDArray[np.float32] | None = None
+
+
+def run(
+    problem: FitProblem,
+    schedule: Schedule,
+    iterations: int,
+    after: Callable[[int, Gaussians], bool] | None = None,
+    *,
+    levels: Sequence[int] = (),
+    surplus: int = 0,
+    part: range | None = None,
+) -> Gaussians:
+    """Take the steps of `descend`, to the last one or until `after` ends it.
+
+    Parameters
+    ----------
+    problem, schedule, iterations, levels, surplus, part
+        See `descend`.
+    after : callable, optional
+        ``after(step, gaussians)`` with the set before the first step, as step 0, and after every
+        step. True ends the descent; it may raise an error to do so.
+
+    Returns
+    -------
+    Gaussians
+        The last set, without gradients.
+    """
+    sets = descend(problem, schedule, iterations, levels=levels, surplus=surplus, part=part)
+    with closing(sets):
+        for step, found in enumerate(sets):
+            if after and after(step, found):
+                break
+    return dr.detach(found)
+
+
 def descend(
     problem: FitProblem,
     schedule: Schedule,
     iterations: int,
+    *,
     levels: Sequence[int] = (),
     surplus: int = 0,
+    part: range | None = None,
 ) -> Generator[Gaussians, None, None]:
     """Yield the set before the first step and after every step of gradient descent.
 
     Parameters
     ----------
     problem : FitProblem
-        The start and the target. If the problem can redistribute, a first phase shows where error
-        is left, and the other steps start from redistributed Gaussians, see `first_phase`. If the
-        problem can relocate, Gaussians move between steps, see `relocations`. If it can do both,
-        there are more Gaussians until the last of these moves, see `surplus_for`. These functions
-        are in `eigengs_dr.fitting.schedule`.
+        The start and the target. With a control, a first phase shows where error is left, and the
+        other steps start from redistributed Gaussians, see `first_phase`; Gaussians move between
+        steps, see `relocations`; and there are more Gaussians until the last of these moves, see
+        `surplus_for`. These functions are in `eigengs_dr.fitting.schedule`.
     schedule : Schedule
     iterations : int
         Number of steps, with the first phase.
@@ -62,7 +139,12 @@ def descend(
         Numbers n. The first n Gaussians shall form the image too, as well as they can.
     surplus : int, optional
         Number of Gaussians of each image that relocations, if there are any, drop from the start.
-        A problem that can redistribute has none, and gets its own.
+        A descent that redistributes has none, and gets its own.
+    part : range, optional
+        The steps to take, some of ``range(iterations)``, without a first phase; by default all. A
+        part starts without the moments of the optimiser. It starts with a warm-up, unless Gaussians
+        relocate before its first step: without one, a stop in the middle of 100 steps costs 0.55
+        dB, with one 0.16 dB (1,024x1,024 pixels, one Gaussian for 20 pixels).
 
     Yields
     ------
@@ -72,17 +154,17 @@ def descend(
     """
     with release_later(problem):  # a set of the caller may share NumPy's memory
         yield problem.gaussians
-        first = first_phase(schedule, iterations)
-        if problem.redistribute and first:
-            for current in run_phase(problem, schedule, first):
+        first = 0 if part is not None else first_phase(schedule, iterations)
+        if problem.control and first:
+            for current in _run_phase(problem, schedule, range(first), first):
                 yield current
             iterations, images = iterations - first, number_of_images(problem)
             count, pixels = len(current) // images, current.width * current.height
-            may_drop = problem.relocate is not None
-            surplus = surplus_for(schedule, count, pixels, iterations) if may_drop else 0
-            anew = problem.redistribute(dr.detach(current), len(current) + images * surplus)
+            surplus = surplus_for(schedule, count, pixels, iterations)
+            anew = problem.control.redistribute(dr.detach(current), len(current) + images * surplus)
             problem = problem._replace(gaussians=anew)
-        yield from run_phase(problem, schedule, iterations, levels, surplus=surplus)
+        part = range(iterations) if part is None else part
+        yield from _run_phase(problem, schedule, part, iterations, levels, surplus)
 
 
 def number_of_images(problem: FitProblem) -> int:
@@ -90,46 +172,29 @@ def number_of_images(problem: FitProblem) -> int:
     return len(problem.target) if problem.target.ndim == 4 else 1
 
 
-def run_phase(
+def _run_phase(
     problem: FitProblem,
     schedule: Schedule,
+    part: range,
     iterations: int,
     levels: Sequence[int] = (),
-    part: range | None = None,
     surplus: int = 0,
 ) -> Generator[Gaussians, None, None]:
-    """Yield the set after every step of one phase of `descend`, or of a part of its steps.
-
-    A part starts without the moments of the optimiser. It starts with a warm-up, unless Gaussians
-    relocate before its first step: without one, a stop in the middle of 100 steps costs 0.55 dB,
-    with one 0.16 dB (1,024x1,024 pixels, one Gaussian for 20 pixels).
-
-    Parameters
-    ----------
-    problem, schedule, levels
-        See `descend`.
-    iterations : int
-        Number of steps of the phase.
-    part : range, optional
-        The steps to take, some of ``range(iterations)``; by default all.
-    surplus : int, optional
-        Number of Gaussians of each image that relocations drop.
-    """
-    part = range(iterations) if part is None else part
+    """Yield the set after every step of a part of a phase of so many iterations."""
     fixed = problem.gaussians
     types = types_of(fixed.mean)
     images = number_of_images(problem)
     state, variables = start_descent(fixed, schedule, images), schedule.variables()
     target = batch_to_tiles(types, problem.target)
     weight = None if problem.weight is None else batch_to_tiles(types, problem.weight)
-    moves_at = relocations(schedule, iterations, surplus) if problem.relocate else {}
+    moves_at = relocations(schedule, iterations, surplus) if problem.control else {}
     start = 0 if part.start in moves_at else part.start
     factors = [lr_factor(schedule, step, iterations, start) for step in range(iterations)]
     rates, stop = rate_table(types, schedule, factors), part.start
     with freeze_program(step_program(schedule, fixed, levels)) as take_step:
         for step in part:
-            if step in moves_at and problem.relocate:
-                fixed = problem.relocate(dr.detach(state.gaussians), moves_at[step])
+            if step in moves_at and problem.control:
+                fixed = problem.control.relocate(dr.detach(state.gaussians), moves_at[step])
                 state, stop = start_descent(fixed, schedule, images), step
             if step == stop:
                 end = min((s for s in moves_at if s > step), default=part.stop)

@@ -20,10 +20,11 @@ from ..gaussian.file import CUTOFF, FitFigures, write
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import float_space, target_key
 from ..raster.render import picture_of
-from .initializers import FitProblem, initialize
+from .descent import FitProblem
 from .options import FitOptions, named_options
 from .refine import FitProgress, Refinement, measure, refine
 from .search import search_count
+from .start import initialize
 from .target import in_unit, read_pixels, unit_of
 
 if TYPE_CHECKING:

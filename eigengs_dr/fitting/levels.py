@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
 
-import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -26,16 +24,15 @@ from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
 from ..gaussian.concatenate import concatenate
 from ..gaussian.gaussians import Gaussians
-from .density_control import relocate_levels, removal_cost
-from .descent import descend
+from .density_control import LevelControl, removal_cost
+from .descent import FitProblem, run
 from .fit import Fit, finish
-from .initializers import FitProblem, FitTarget, make_target
 from .options import FitOptions, Levels, named_options
-from .placement_initializer import start_from_placement
 from .redistribute import place_like, residual
 from .refine import FitProgress, Refinement, Score, measure, refine
 from .schedule import Schedule
-from .target import in_unit, read_pixels, unit_of
+from .start import start_from_placement
+from .target import FitTarget, in_unit, make_target, read_pixels, unit_of
 
 LEVEL_RATIO = 4
 """Ratio of the numbers of Gaussians up to a level and up to the level before it; 4 halves their
@@ -220,15 +217,15 @@ def refine_levels(
     """
     started = time.perf_counter()
     counts = level_counts(options.count_for(target.values), levels)
-    schedule = options.method.schedule
+    schedule = replace(options.method.schedule, redistribute_after=0)
     start = start_from_placement(target, replace(options, gaussians=counts[0]))
-    start = start._replace(redistribute=None, relocate=None)
+    start = start._replace(control=None)
     steps = min(STEPS_PER_LEVEL, options.iterations)
     placed = _place_levels(start, counts, schedule, steps, interrupted)
-    moves = partial(relocate_levels, counts=counts, target=start.target, weight=start.weight)
+    control = LevelControl(target.values, target.weight, target.shown, counts=tuple(counts))
     seconds_init = time.perf_counter() - started
     refined = refine(
-        start._replace(gaussians=placed, relocate=moves),
+        start._replace(gaussians=placed, control=control),
         target.pixels,
         schedule,
         options.iterations,
@@ -252,12 +249,7 @@ def _place_levels(
     for level, count in enumerate(counts[1:], 1):
         below = counts[: level - 1]
         problem = start._replace(gaussians=gaussians)
-        with closing(descend(problem, schedule, steps, levels=below)) as sets:
-            for current in sets:
-                gaussians = current
-                if interrupted():
-                    break
-        gaussians = dr.detach(gaussians)
+        gaussians = run(problem, schedule, steps, lambda *_: interrupted(), levels=below)
         left = residual(gaussians, start.target)
         added = place_like(gaussians, left, left, count - len(gaussians))
         # The background is one for all levels: a new one would change the earlier levels.

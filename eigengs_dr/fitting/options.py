@@ -18,7 +18,6 @@ from ..image.color import SPACES
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import check_encoding
 from ..raster.limits import check_index_range
-from .initializers import INITIALIZERS
 from .schedule import Schedule
 
 if TYPE_CHECKING:
@@ -28,6 +27,9 @@ if TYPE_CHECKING:
 
 DEFAULT_COUNT = 5000
 """Number of Gaussians by default."""
+
+INITS = ("auto", "random", "grid", "adaptive", "eigen")
+"""What ``init`` takes: "auto", the placements of `eigengs_dr.fitting.start`, and a basis."""
 
 DEFAULT_BASIS = "natural"
 """Name of the basis by default: the basis that ships with the package."""
@@ -95,7 +97,7 @@ class FitOptions:
         self._check_numbers()
         check_encoding(self.encoding)
         for name, value, known in (
-            ("init", self.init, ("auto", *INITIALIZERS)),
+            ("init", self.init, INITS),
             ("preset", self.preset, tuple(PRESETS)),
             ("space", self.space, SPACES),
             ("target_space", self.target_space, ("rgb", "ycbcr")),
@@ -194,90 +196,6 @@ class FitOptions:
             raise ValueError(
                 f"target_psnr is {self.target_psnr}; it must be above 0 and at most {MAX_PSNR:g}"
             )
-
-
-@dataclass(frozen=True)
-class SearchPolicy:
-    """The constants of a search, chosen on training photos of ImageNet classes.
-
-    With a surplus in the fit, a fit of 1.0 and a margin of 1.1 take 4.6 and 1.6 % fewer Gaussians
-    for 32 and 36 dB on 9 training photos, and 2.7 % fewer for 40 dB on 4 of them, than a fit of 0.7
-    with a margin of 1.35 and no surplus. With a margin of 1.05, one of the 9 photos takes twice as
-    many for 32 dB, because no set in between meets the goal.
-
-    Attributes
-    ----------
-    try_share, fit_share, polish_share : float
-        Steps of a try, of the fit and of a polish, as fractions of the iterations.
-    max_length : float
-        Steps of the search, at most, as a multiple of the iterations, if these exceed some ten and
-        one fit suffices; else up to a quarter as much again.
-    max_tries : int
-        Largest number of tries.
-    max_polishes : int
-        Number of polishes after which a search ends if a set meets the goal.
-    sure_polishes, sure_drops : int
-        Number of polishes that a search may take whatever its steps were before; and if the fit
-        met the goal, so that they drop Gaussians.
-    db_per_doubling : float
-        Gain of twice as many Gaussians, in dB, until two tries of the image measure it; see
-        `eigengs_dr.fitting.placement.density.ERROR_EXPONENT`.
-    doubling_range : (float, float)
-        Allowed range of the measured gain, in dB; training images gained 1.6 to 8.
-    min_octaves : float
-        Smallest distance of two tries that measures the gain, in doublings.
-    late_share : float
-        Gain of a fit after the steps of a try, as a fraction of the gain in these steps; measured
-        0.3 to 0.5 with 80 to 4,000 Gaussians.
-    margin : float
-        Gaussians of the fit over the estimated number; dropping some works better than adding some.
-    max_leap : float
-        Largest ratio of the numbers of Gaussians of two consecutive tries.
-    try_tolerance, fit_tolerance : float
-        Largest relative difference from the estimated number for the last try, and largest relative
-        lack of Gaussians for the fit; a surplus is for the polishes.
-    max_drop, drop_per_db, largest_drop : float
-        Largest fraction of the Gaussians that one polish drops near the goal, for each decibel
-        above it, and at all. A short search overshoots by decibels: 200 steps of a material fitted
-        11,122 Gaussians with 35.6 dB for 32 dB; a second fit of fewer, in the steps that were left,
-        missed the goal.
-    polish_rate : float
-        Learning rates of a polish, as a fraction of those of the schedule.
-    polish_gain : float
-        Expected gain of the first polish, in dB; training images gained 0.2.
-    gain_decay : float
-        Expected gain of the next polish, as a fraction of the gain of the last.
-    surplus : float
-        Decibels above the goal that do not justify another polish.
-    """
-
-    try_share: float = 0.1
-    fit_share: float = 1.0
-    polish_share: float = 0.15
-    max_length: float = 2
-    max_tries: int = 4
-    max_polishes: int = 7
-    sure_polishes: int = 3
-    sure_drops: int = 5
-    db_per_doubling: float = 4.0
-    doubling_range: tuple[float, float] = (2.0, 12.0)
-    min_octaves: float = 0.25
-    late_share: float = 0.37
-    margin: float = 1.1
-    max_leap: float = 16
-    try_tolerance: float = 0.1
-    fit_tolerance: float = 0.6
-    max_drop: float = 0.15
-    drop_per_db: float = 0.1
-    largest_drop: float = 0.3
-    polish_rate: float = 0.5
-    polish_gain: float = 0.1
-    gain_decay: float = 0.5
-    surplus: float = 0.02
-
-    def drop_for(self, above: float) -> float:
-        """Return the largest fraction of the Gaussians that one polish drops."""
-        return min(max(self.max_drop, self.drop_per_db * above), self.largest_drop)
 
 
 def default_count(pixels: int) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,8 +16,7 @@ from ..gaussian.gaussians import Gaussians
 from ..image.metrics import MAX_PSNR, float_space, psnrs_by_rows
 from ..raster.picture import picture_rows
 from .density_control import prune
-from .descent import descend
-from .initializers import FitProblem
+from .descent import FitProblem, run
 from .schedule import Schedule
 
 FitProgress = Callable[[int, int, dict[str, Any]], None]
@@ -76,7 +74,8 @@ def refine(
     started : float, optional
         Value of `time.perf_counter()` at which the seconds of the trace start; by default now.
     levels : sequence of int, optional
-        Sizes of the prefixes of the set that shall form the image too; see `descend`.
+        Sizes of the prefixes of the set that shall form the image too; see
+        `eigengs_dr.fitting.descent.descend`.
     progress : callable, optional
         Called every 10 steps as ``progress(iteration, iterations, row)`` with the last row of the
         trace, or that of a set with more Gaussians than the start. It may raise `KeyboardInterrupt`
@@ -114,20 +113,22 @@ def refine(
         if figure > highest:
             best, highest, row = gaussians, figure, latest
 
+    def after(done: int, gaussians: Gaussians) -> bool:
+        nonlocal step, current, stopped
+        step, current = done, gaussians
+        if step in marks:
+            judge(step, current)
+        if progress and (step in marks or step % 10 == 0):
+            dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
+            progress(step, iterations, latest)
+        if interrupted():
+            return True
+        if step in marks and is_plateau(trace, schedule, iterations):
+            stopped = "plateau"
+        return stopped == "plateau"
+
     try:
-        with closing(descend(problem, schedule, iterations, levels)) as sets:
-            for step, reached in enumerate(sets):
-                current = reached
-                if step in marks:
-                    judge(step, current)
-                if progress and (step in marks or step % 10 == 0):
-                    dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
-                    progress(step, iterations, latest)
-                if interrupted():
-                    break
-                if step in marks and is_plateau(trace, schedule, iterations):
-                    stopped = "plateau"
-                    break
+        run(problem, schedule, iterations, after, levels=levels)
         if interrupted():
             stopped = "interrupted"
     except KeyboardInterrupt:

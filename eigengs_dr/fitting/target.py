@@ -1,17 +1,19 @@
-"""The pixels of a fit: sRGB, whatever the image holds, or data in [-1, 1]."""
+"""The target of a fit: the pixels of an image, and the same in the space of the colours."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian.gaussians import Gaussians
-from ..image.color import rendered_as
+from ..image.color import LIGHT, rendered_as, rgb_to_ycbcr, to_linear
 from ..image.io import read_image
 from ..image.pixels import MAX_PIXEL, MIN_PIXEL, ImageError, check_data, check_image, encoding_of
+from ..image.radiance import to_log
+from ..image.strips import by_strips
 from .options import FitOptions
 
 WHITE = 1.001
@@ -87,3 +89,56 @@ def in_unit(gaussians: Gaussians, unit: float) -> Gaussians:
     if unit == 1:
         return gaussians
     return replace(gaussians, color=gaussians.color * unit, background=gaussians.background * unit)
+
+
+class FitTarget(NamedTuple):
+    """The image that a fit approximates.
+
+    Attributes
+    ----------
+    pixels : ndarray of float32, shape (H, W, C)
+        The image of the user: RGB, or data.
+    values : ndarray of float32, shape (H, W, C)
+        The image in the space of the colours.
+    shown : ndarray of float32, shape (H, W, C)
+        The image that places Gaussians: linear light would put too few of them into dark parts.
+    weight : ndarray of float32, shape (H, W, C), or None
+        Factor of the errors before squaring.
+    """
+
+    pixels: NDArray[np.float32]
+    values: NDArray[np.float32]
+    shown: NDArray[np.float32]
+    weight: NDArray[np.float32] | None = None
+
+
+DARKNESS, BLACK = 0.3, 0.003
+"""Exponent and smallest light I, with 1 for white, of the weight ``max(I, BLACK)^-DARKNESS`` of
+errors in linear light. The weight is about the square root of the slope of the sRGB curve, between
+errors of light, which neglect the dark, and errors of sRGB codes. With 5,000 Gaussians and 300
+steps it gains 0.7 dB of psnr_rgb over no weight, on 12 training images of ImageNet classes. It
+suits light above 1 too. Three made-up environments of 512x256 pixels, with a sun of 5,000, end at
+31.2 dB in PU21, at 29.6 without weights, at 31.5 with ``(I + 0.01)^-0.5``, at 29.9 and 25.5 dB
+with relative errors (0.1 and 0.01 added to I), and at 27.0 dB with the slope of PU21. Steep weights
+let bright spots vanish, which costs at most 1 a pixel, rather than spill on dark pixels."""
+
+
+def make_target(pixels: NDArray[np.float32], space: str) -> FitTarget:
+    """Convert pixels (H, W, C) to the space of the colours, and weigh the errors there."""
+    if space in LIGHT:
+        light = by_strips(to_linear, pixels)
+        return FitTarget(pixels, light, pixels, by_strips(dark_weight, light))
+    values = pixels
+    if space == "ycbcr":
+        values = by_strips(rgb_to_ycbcr, pixels)
+    if space == "log":
+        values = by_strips(lambda part: to_log(to_linear(part)), pixels)
+    return FitTarget(pixels, values, values)
+
+
+def dark_weight(light: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the factors of errors in linear light, an array of any shape with 1 for white.
+
+    The factors are ``max(light, BLACK)^-DARKNESS``.
+    """
+    return np.asarray(np.maximum(light, BLACK) ** -DARKNESS, np.float32)

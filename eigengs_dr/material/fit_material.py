@@ -16,13 +16,13 @@ from ..backend.display import shows_progress, to_html
 from ..backend.interrupt import defer_interrupts
 from ..backend.recording import exclusive
 from ..fitting.fit import FitInterrupted
-from ..fitting.initializers import FitTarget
 from ..fitting.levels import check_options, refine_levels
 from ..fitting.options import FitOptions, Levels, named_options
-from ..fitting.placement_initializer import start_from_placement
 from ..fitting.redistribute import residual
 from ..fitting.refine import FitProgress, Refinement, Score, refine
 from ..fitting.search import search_count
+from ..fitting.start import start_from_placement
+from ..fitting.target import FitTarget
 from ..gaussian.file import CUTOFF
 from .maps import TextureMap
 from .material import Material, scale_channels

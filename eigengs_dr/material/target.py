@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..fitting.initializers import FitTarget, make_target
 from ..fitting.options import FitOptions
-from ..fitting.target import read_pixels, unit_of
+from ..fitting.target import FitTarget, make_target, read_pixels, unit_of
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
 from ..image.metrics import float_space, psnrs_by_rows, target_key
@@ -109,12 +108,12 @@ def combine(images: Sequence[MapImage], weights: Sequence[float]) -> FitTarget:
     """
     targets = [make_target(image.pixels, image.space) for image in images]
     values = _join([t.values for t in targets], weights)
-    shown = _join([t.values if t.shown is None else t.shown for t in targets], weights)
+    shown = _join([t.shown for t in targets], weights)
     dark = None
     if any(t.weight is not None for t in targets):
         ones = [np.ones_like(t.values) if t.weight is None else t.weight for t in targets]
         dark = np.concatenate(ones, axis=2)
-    return FitTarget(values, values, dark, shown)
+    return FitTarget(values, values, shown, dark)
 
 
 def _join(parts: Sequence[Image], weights: Sequence[float]) -> Image:

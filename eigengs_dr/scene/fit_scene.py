@@ -7,7 +7,6 @@ which every camera sees the texture at a given PSNR.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -19,8 +18,7 @@ from scipy.ndimage import distance_transform_edt, zoom
 from skimage.transform import resize_local_mean
 
 from ..backend.recording import exclusive
-from ..fitting.descent import descend
-from ..fitting.initializers import FitProblem
+from ..fitting.descent import FitProblem, run
 from ..fitting.options import PRESETS
 from ..fitting.placement.adaptive import place_adaptive
 from ..fitting.solvers.conjugate_gradient import solve
@@ -227,9 +225,7 @@ def _fit(
     ).bounded()
     start = solve(start, target).gaussians
     schedule = PRESETS["default"].schedule
-    problem = FitProblem(start, target, weight)
-    (last,) = deque(descend(problem, schedule, iterations), maxlen=1)
-    return last
+    return run(FitProblem(start, target, weight), schedule, iterations)
 
 
 def _reaches_seen(

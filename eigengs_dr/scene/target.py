@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from ..fitting.initializers import dark_weight
+from ..fitting.target import dark_weight
 from ..image.color import to_coded
 from ..plugins.cone import PIXEL
 from .back_projection import back_project, extrapolate
@@ -82,7 +82,7 @@ def error_weights(found: Visibility, target: Image, space: str) -> Image:
     found : Visibility
     target : ndarray of float32, shape (H, W, C)
     space : {"linear", "data"}
-        In linear light dark texels weigh more, see `eigengs_dr.fitting.initializers.dark_weight`.
+        In linear light dark texels weigh more, see `eigengs_dr.fitting.target.dark_weight`.
 
     Returns
     -------

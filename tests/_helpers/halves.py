@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.redistribute import residual
+from eigengs_dr.fitting.start import initialize
 from eigengs_dr.image.color import rgb_to_ycbcr
 
 SIDE = 32

@@ -18,8 +18,7 @@ from _helpers.waves import default, picture, start
 from eigengs_dr.backend import recording
 from eigengs_dr.backend.recording import collector_off, exclusive, freeze_program
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.descent import descend
-from eigengs_dr.fitting.initializers import FitProblem
+from eigengs_dr.fitting.descent import FitProblem, descend
 
 WAIT = 100
 """Seconds after which a thread that does not answer fails its test."""
@@ -149,7 +148,7 @@ DROP_WHILE_RECORDING = """
     from _helpers.waves import default, start
     from eigengs_dr.backend.recording import freeze_program
     from eigengs_dr.backend.selection import select
-    from eigengs_dr.fitting.initializers import FitProblem
+    from eigengs_dr.fitting.descent import FitProblem
     from eigengs_dr.fitting.descent import descend
 
     def half_read():

@@ -15,8 +15,8 @@ from eigengs_bench.report.frames import frame_of, smallest
 from eigengs_bench.report.sections import budget as budgets
 from eigengs_dr.fitting.descent import descend
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.options import PRESETS, FitOptions, max_gaussians_for
+from eigengs_dr.fitting.start import initialize
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import picture_of
 
@@ -59,7 +59,7 @@ def test_placing_anew_makes_a_difference(backend, tmp_path):
     task = task_in(tmp_path, backend, iterations=200)
     once, anew = (budget._fit(task, image, 60, again) for again in (False, True))
     start = initialize(image, FitOptions(gaussians=60, backend=backend))
-    placed_once = start._replace(redistribute=None, relocate=None)
+    placed_once = start._replace(control=None)
     for row, problem in ((once, placed_once), (anew, start)):
         *_, last = descend(problem, method.schedule, 200)
         assert row["iteration"] == 200

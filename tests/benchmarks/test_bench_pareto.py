@@ -17,8 +17,8 @@ from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.descent import descend
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.options import PRESETS, FitOptions
+from eigengs_dr.fitting.start import initialize
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.reference import render_exact
 from eigengs_dr.raster.render import picture_of

@@ -20,8 +20,8 @@ from eigengs_bench.harness.datasets import images_of, model_for
 from eigengs_bench.report.sections import methods
 from eigengs_bench.report.sections.losses import where_default_loses
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.options import PRESETS, FitOptions
+from eigengs_dr.fitting.start import initialize
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import picture_of
 

@@ -11,8 +11,8 @@ from eigengs_bench.names import PRESETS as NAMES
 from eigengs_bench.names import SETS, ImageSet
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.options import PRESETS, FitOptions
+from eigengs_dr.fitting.start import initialize
 from eigengs_dr.image.io import ImageError, save_image
 
 

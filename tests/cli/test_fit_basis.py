@@ -11,8 +11,7 @@ from _helpers.command import assert_refused, previewed, run, succeeded
 from eigengs_dr.cli.main import main
 from eigengs_dr.eigenbasis import registry as bases
 from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.fitting.initializers import INITIALIZERS
-from eigengs_dr.fitting.options import DEFAULT_BASIS
+from eigengs_dr.fitting.options import DEFAULT_BASIS, INITS
 from eigengs_dr.image.color import SPACES, YCBCR_TO_RGB
 
 
@@ -70,7 +69,7 @@ def test_bases_that_do_not_fit(trained, fitted, photo, existing, tmp_path):
 
 def test_the_names_of_inits_and_bases():
     [option] = [p for p in main.commands["fit"].params if p.name == "init"]
-    assert tuple(option.type.choices) == ("auto", *INITIALIZERS)
+    assert tuple(option.type.choices) == INITS
     [option] = [p for p in main.commands["fit"].params if p.name == "space"]
     assert tuple(option.type.choices) == SPACES
     [option] = [p for p in main.commands["fit"].params if p.name == "basis"]

@@ -1,6 +1,7 @@
 """Descent: the steps, their rates and weights, on any image."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
@@ -13,8 +14,7 @@ from _helpers.waves import SIDE, default, presets, start
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting import descent
-from eigengs_dr.fitting.descent import descend, prefix, rate_table, run_phase
-from eigengs_dr.fitting.initializers import FitProblem
+from eigengs_dr.fitting.descent import FitProblem, descend, prefix, rate_table
 from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.fitting.redistribute import residual
 from eigengs_dr.fitting.schedule import lr_factor, next_build, relocations
@@ -163,9 +163,11 @@ def test_lists_are_for_steps_that_are_taken(backend, monkeypatch):
 
     monkeypatch.setattr(descent, "next_build", note)
     gaussians, target = start(backend)
-    problem = FitProblem(gaussians, target, relocate=lambda found, how: found)
+    problem = FitProblem(
+        gaussians, target, control=SimpleNamespace(relocate=lambda found, how: found)
+    )
     schedule = default(relocate_every=10)
-    list(run_phase(problem, schedule, 40, part=range(5, 37)))
+    list(descend(problem, schedule, 40, part=range(5, 37)))
     assert stops[-1] == 37
     assert set(relocations(schedule, 40)) <= set(stops)
 

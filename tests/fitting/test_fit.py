@@ -8,15 +8,14 @@ import pytest
 
 from _helpers.families import small_model
 from _helpers.waves import SIDE, SPLATS, check_sound, figures, picture, presets
-from eigengs_dr.fitting import initializers as starting
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.options import PRESETS
+from eigengs_dr.fitting.options import INITS, PRESETS
 from eigengs_dr.image.color import SPACES
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import render
 
 
-@pytest.mark.parametrize("init", ("auto", *starting.INITIALIZERS))
+@pytest.mark.parametrize("init", INITS)
 def test_fit_improves_on_its_start(backend, init):
     basis = small_model(backend) if init == "eigen" else None
     result = fit(picture(), SPLATS, 60, init=init, basis=basis, backend=backend)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from _helpers.waves import SPLATS, check_sound, figures, picture
-from eigengs_dr.fitting import initializers as starting
+from eigengs_dr.fitting import start as starting
 from eigengs_dr.fitting.fit import FitInterrupted, fit
 from eigengs_dr.fitting.placement.uniform import place_grid
 from eigengs_dr.image.metrics import psnr
@@ -75,7 +75,7 @@ def place_and_fail(image, count, generator):
 @pytest.mark.parametrize("iterations", [0, 1, 60])
 def test_ctrl_c_before_refinement(backend, iterations):
     """The start is kept, and the caller told."""
-    entry = {"grid": f"{__name__}:place_and_press"}
+    entry = {"grid": place_and_press}
     with patch.dict(starting.PLACEMENTS, entry), pytest.raises(FitInterrupted) as interruption:
         fit(picture(), SPLATS, iterations, init="grid", backend=backend)
     result = interruption.value.result
@@ -86,7 +86,7 @@ def test_ctrl_c_before_refinement(backend, iterations):
 
 def test_ctrl_c_is_the_callers_after_an_error(backend):
     before = signal.getsignal(signal.SIGINT)
-    entry = {"grid": f"{__name__}:place_and_fail"}
+    entry = {"grid": place_and_fail}
     with patch.dict(starting.PLACEMENTS, entry), pytest.raises(ZeroDivisionError):
         fit(picture(), SPLATS, 10, init="grid", backend=backend)
     assert signal.getsignal(signal.SIGINT) is before

@@ -5,9 +5,9 @@ import pytest
 
 from _helpers.families import small_model
 from _helpers.waves import SIDE, SPLATS, check_sound, figures, picture, presets
-from eigengs_dr.fitting import initializers as starting
+from eigengs_dr.fitting import target as targets
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.initializers import DARKNESS
+from eigengs_dr.fitting.target import DARKNESS
 from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.image.samples import sample
 from eigengs_dr.raster.render import render
@@ -59,7 +59,7 @@ def test_linear_light_weighs_errors_in_the_dark(backend, monkeypatch):
     for y, x in ((100, 100), (200, 300), (50, 400)):
         dark, shown = photo[y : y + SIDE, x : x + SIDE] * light, []
         for darkness in (DARKNESS, 0.0):
-            monkeypatch.setattr(starting, "DARKNESS", darkness)
+            monkeypatch.setattr(targets, "DARKNESS", darkness)
             image = fit(dark, SPLATS, 60, space="linear", backend=backend).image
             shown.append(np.square(image - dark)[: SIDE // 3].mean())
         logarithms.append(np.log(shown[0] / shown[1]))

@@ -6,8 +6,8 @@ import pytest
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, family, small_model
 from _helpers.halves import picture
-from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.options import FitOptions
+from eigengs_dr.fitting.start import initialize
 from eigengs_dr.image.planes import to_planes
 from eigengs_dr.image.resize import resample
 
@@ -16,7 +16,7 @@ from eigengs_dr.image.resize import resample
 def test_other_starts_are_not_rearranged(init):
     image = np.tile(picture(), (3, 3, 1)) if init == "eigen" else picture()
     count = None if init == "eigen" else 60
-    assert initialize(image, FitOptions(gaussians=count, init=init)).redistribute is None
+    assert initialize(image, FitOptions(gaussians=count, init=init)).control is None
 
 
 @pytest.fixture(scope="module")

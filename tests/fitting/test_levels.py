@@ -10,9 +10,9 @@ from _helpers.photos import coffee
 from eigengs_dr.codec.packing import MSE_WITHOUT_IMAGE
 from eigengs_dr.fitting import levels as levels_module
 from eigengs_dr.fitting.density_control import removal_cost
-from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.levels import fit_levels, level_counts
 from eigengs_dr.fitting.options import FitOptions
+from eigengs_dr.fitting.start import initialize
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import picture_of
 
@@ -74,7 +74,7 @@ def test_every_level_gains_by_relocation(monkeypatch):
     """Of few Gaussians, whose first places are poor: each level gains a decibel here."""
     image, counts = eg.sample("coffee")[200:264, 300:364], [100, 140, 180]
     found = fit_levels(image, levels=counts, iterations=300).gaussians
-    monkeypatch.setattr(levels_module, "relocate_levels", lambda gaussians, *_, **__: gaussians)
+    monkeypatch.setattr(levels_module.LevelControl, "relocate", lambda self, found, how: found)
     left = fit_levels(image, levels=counts, iterations=300).gaussians
     for count in counts:
         assert reached(found[:count], image) > reached(left[:count], image) + 0.3

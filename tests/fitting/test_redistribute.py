@@ -1,16 +1,17 @@
 """Splats that move to where the error is."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from _helpers.halves import SIDE, fitted, picture
 from eigengs_dr.fitting.descent import descend
-from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.redistribute import redistribute
 from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO, first_phase
+from eigengs_dr.fitting.start import initialize
 from eigengs_dr.raster.render import render
 
 
@@ -41,12 +42,13 @@ def test_fits_that_are_long_enough_rearrange_once():
 
     def rearrange(gaussians, count):
         calls.append(count)
-        return start.redistribute(gaussians, count)
+        return start.control.redistribute(gaussians, count)
 
     schedule = replace(PRESETS["default"].schedule, redistribute_after=2)
+    problem = start._replace(control=SimpleNamespace(redistribute=rearrange))
     for steps, times in ((2 * MIN_PHASE_RATIO - 1, 0), (2 * MIN_PHASE_RATIO, 1)):
         calls.clear()
-        sets = list(descend(start._replace(redistribute=rearrange), schedule, steps))
+        sets = list(descend(problem, schedule, steps))
         assert len(sets) == steps + 1
         assert calls == [60] * times
 

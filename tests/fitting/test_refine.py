@@ -5,7 +5,7 @@ import pytest
 
 from _helpers.sets import Scene
 from _helpers.waves import SIDE, SPLATS, default, figures, picture, presets, start
-from eigengs_dr.fitting.initializers import FitProblem
+from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.fitting.refine import is_plateau, refine, trace_steps
 from eigengs_dr.image.color import rgb_to_ycbcr

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +11,9 @@ import eigengs_dr as eg
 from _helpers.halves import SIDE, fitted, picture, squared_error
 from eigengs_dr.fitting.density_control import Part, relocate, relocate_levels, removal_cost
 from eigengs_dr.fitting.descent import descend
-from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.schedule import Relocation, relocations
+from eigengs_dr.fitting.start import initialize
 
 SCHEDULE = PRESETS["default"].schedule
 
@@ -126,10 +127,11 @@ def test_a_descent_relocates_and_goes_on():
 
     def move(gaussians, how):
         calls.append(how.share)
-        return start.relocate(gaussians, how)
+        return start.control.relocate(gaussians, how)
 
-    problem = start._replace(redistribute=None, relocate=move)
-    sets = list(descend(problem, replace(SCHEDULE, relocate_every=15), 75))
+    problem = start._replace(control=SimpleNamespace(relocate=move))
+    schedule = replace(SCHEDULE, relocate_every=15, redistribute_after=0)
+    sets = list(descend(problem, schedule, 75))
     assert (len(sets), calls) == (76, [SCHEDULE.relocate_share] * 3)
     error = [squared_error(s, start.target) for s in (sets[0], sets[-1])]
     assert error[1] < 0.7 * error[0]

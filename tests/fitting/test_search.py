@@ -9,9 +9,9 @@ from _helpers.photos import coffee
 from eigengs_dr.fitting import search as budget
 from eigengs_dr.fitting.density_control import densify
 from eigengs_dr.fitting.fit import FitInterrupted, fit
-from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.options import PRESETS, FitOptions, max_gaussians_for
 from eigengs_dr.fitting.search import search_count
+from eigengs_dr.fitting.start import initialize
 
 
 def test_a_constant_image_takes_one_splat():
@@ -174,15 +174,16 @@ def searched(monkeypatch, measure):
     start = initialize(picture(), FitOptions(gaussians=60, init="adaptive"))
     steps = []
 
-    def stand(problem, schedule, count, surplus):
+    def stand(problem, schedule, count, after, surplus):
         steps.append(count)
         left = problem.gaussians[: len(problem.gaussians) - surplus]
-        return (left for _ in range(count + 1))
+        after(count, left)
+        return left
 
     def judge(gaussians):
         return {"decibels": measure(gaussians, steps)}
 
-    monkeypatch.setattr(budget, "descend", stand)
+    monkeypatch.setattr(budget, "run", stand)
     result = search_count(start, judge, "decibels", 0.0, 1000, PRESETS["default"].schedule, 1000)
     assert result.stopped == "met"
     return result, steps

@@ -12,11 +12,11 @@ from _helpers.halves import SIDE, fitted, picture, squared_error
 from eigengs_dr.fitting import descent as module
 from eigengs_dr.fitting.density_control import relocate, removal_cost
 from eigengs_dr.fitting.descent import descend
-from eigengs_dr.fitting.initializers import initialize
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.refine import refine
 from eigengs_dr.fitting.schedule import Relocation, relocations, surplus_for
 from eigengs_dr.fitting.search import search_count
+from eigengs_dr.fitting.start import initialize
 from eigengs_dr.raster.render import picture_of
 
 SCHEDULE = replace(PRESETS["default"].schedule, relocate_every=15)

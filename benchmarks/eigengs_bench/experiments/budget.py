@@ -14,10 +14,11 @@ import numpy as np
 from eigengs_bench.harness.datasets import images_of, usual_count
 from eigengs_bench.harness.store import Row, Task
 from eigengs_bench.harness.timing import Image, decibels, follow, score, warm_up
+from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.initializers import FitProblem, initialize
 from eigengs_dr.fitting.options import FitOptions, max_gaussians_for
 from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO
+from eigengs_dr.fitting.start import initialize
 
 FILE = "budget.jsonl"
 
@@ -96,7 +97,7 @@ def _fit(task: Task, image: Image, count: int, rearranged: bool) -> Row:
 
     def start() -> FitProblem:
         begun = initialize(image, options)
-        return begun if rearranged else begun._replace(redistribute=None, relocate=None)
+        return begun if rearranged else begun._replace(control=None)
 
     warm_up(start, options.method.schedule, task.iterations)
     (moment,) = follow(start, options.method.schedule, task.iterations, (task.iterations,))

@@ -10,8 +10,8 @@ import numpy as np
 from eigengs_bench.harness.store import Progress
 from eigengs_bench.harness.timing import Image
 from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.initializers import FitProblem
 from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.fitting.refine import refine
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve

@@ -15,8 +15,7 @@ from eigengs_bench.harness.store import Progress
 from eigengs_bench.harness.timing import interleaved
 from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.descent import descend
-from eigengs_dr.fitting.initializers import FitProblem
+from eigengs_dr.fitting.descent import FitProblem, descend
 from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve

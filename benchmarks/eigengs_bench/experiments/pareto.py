@@ -23,8 +23,9 @@ from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.eigenbasis.registry import load_basis
-from eigengs_dr.fitting.initializers import FitProblem, initialize
+from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.options import PRESETS, FitOptions
+from eigengs_dr.fitting.start import initialize
 from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.raster.render import picture_of, render

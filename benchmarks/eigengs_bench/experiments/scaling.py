@@ -19,9 +19,8 @@ from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.timing import Image
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.descent import descend
+from eigengs_dr.fitting.descent import FitProblem, descend
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.initializers import FitProblem
 from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve

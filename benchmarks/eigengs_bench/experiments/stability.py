@@ -15,10 +15,11 @@ from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.tiling import tiling
 from eigengs_bench.harness.timing import Image, Moment, decibels, follow
 from eigengs_dr.eigenbasis.registry import load_basis
-from eigengs_dr.fitting.initializers import FitProblem, initialize
+from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.refine import is_plateau, trace_steps
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.start import initialize
 from eigengs_dr.gaussian.covariance import condition_number
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import rgb_to_ycbcr

@@ -14,9 +14,10 @@ from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.timing import Image, follow, score, warm_up
 from eigengs_bench.names import NATURAL, SETS, TABLES
 from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.fitting.initializers import FitProblem, initialize
+from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO
+from eigengs_dr.fitting.start import initialize
 from eigengs_dr.image.metrics import psnr
 
 FILE = "tables.jsonl"

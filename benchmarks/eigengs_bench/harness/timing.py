@@ -10,10 +10,10 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from eigengs_dr.fitting.descent import descend
-from eigengs_dr.fitting.initializers import FitProblem, initialize
+from eigengs_dr.fitting.descent import FitProblem, descend
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO, Schedule
+from eigengs_dr.fitting.start import initialize
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.metrics import MAX_PSNR, ms_ssim, psnr, ssim
 from eigengs_dr.raster.render import picture_of

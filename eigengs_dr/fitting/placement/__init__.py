@@ -1,10 +1,8 @@
-"""Where Gaussians start, and where they are added.
+"""Where Gaussians start, and where they are added; NumPy only.
 
-- ``random``: uniform, as GaussianImage does
-- ``grid``: a hexagonal grid
+- ``uniform``: on a hexagonal grid, and at random
 - ``adaptive``: by the second derivatives of the image
 - ``density``: the density that an error asks for
 - ``peaks``: the peaks of a residual
 - ``hilbert_scan``: pixels in the order of a Hilbert curve
-- ``nearest``: the centre nearest to each pixel
 """

@@ -109,8 +109,6 @@ def _average_neighbors(mean: Array, values: Array) -> Array:
     return np.concatenate(map_threads(average, range(0, len(mean), QUERY)), axis=1)
 
 
-Array = NDArray[np.floating]
-
 BLOCK = 512
 """Side of the blocks that are searched one by one, in pixels."""
 

@@ -4,9 +4,9 @@ import numpy as np
 
 import eigengs_dr as eg
 from _helpers.photos import coffee
-from eigengs_dr.fitting.initializers import make_target
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.target import make_target
 
 
 def test_background_stays(backend):
