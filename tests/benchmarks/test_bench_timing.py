@@ -1,6 +1,7 @@
 """Descents under observation, programs in turns, sets of images and their models."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -61,7 +62,8 @@ def test_programs_that_place_splats_anew_are_compiled_where_a_run_needs_them(
         return gaussians
 
     def start():
-        return placed._replace(redistribute=rearrange)
+        control = SimpleNamespace(redistribute=rearrange, relocate=placed.control.relocate)
+        return placed._replace(control=control)
 
     timing.warm_up(start, PRESETS["default"].schedule, iterations)
     assert counts == anew
