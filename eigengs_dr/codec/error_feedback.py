@@ -21,9 +21,9 @@ from ..fitting.optimizers.schedule import Schedule
 from ..fitting.presets import PRESETS
 from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.gaussians import Gaussians
+from ..image.hilbert import hilbert_encode
 from ..raster.render import render
 from .egs import EgsContent
-from .hilbert_index import hilbert_encode
 from .quantization import DEAD_ZONE, Steps, Symbols, dequantize, quantize
 
 Array = NDArray[np.floating]

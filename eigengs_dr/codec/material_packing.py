@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import NamedTuple
 
 import drjit as dr
@@ -17,12 +16,11 @@ from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
 from ..image.color import LIGHT
 from ..image.metrics import psnrs_by_rows
-from ..material.file import MaterialData
 from ..material.maps import TextureMap, show_sums, slices
 from ..material.material import Material, scale_channels
 from ..material.target import combine, read_maps
 from ..raster.render import render
-from .egs import MAPS_VERSION, EgsContent, read, to_bytes, write
+from .egs import channel_weights, to_bytes, write
 from .packing import BUDGET, MIN_MSE, MSE_WITHOUT_IMAGE, check_request, compress, section_rows
 from .quantization import Steps
 
@@ -119,7 +117,7 @@ def pack_material(
         for m, c in zip(maps, cuts, strict=True):
             if m.space in LIGHT:  # as `pack` keeps light near its own rendering
                 values[..., c] = own[..., c]
-    scale = np.array(_weights(maps), np.float32)
+    scale = np.array(channel_weights(maps), np.float32)
 
     def errors(found: Gaussians) -> list[float]:
         seen = _errors(_shown(render(found).numpy() / scale, maps), shown)
@@ -143,29 +141,6 @@ def pack_material(
         psnr_drop=drop,
         steps=packed.steps,
     )
-
-
-def read_material(path: Path) -> MaterialData:
-    """Read a packed material for `Material.load`; for errors see `eigengs_dr.codec.egs.read`."""
-    content: EgsContent = read(path)
-    if not content.maps:
-        raise ValueError(f"{path}: holds one image and no maps; load it by Gaussians.load")
-    weights = np.array(_weights(content.maps), np.float32)
-    arrays = content.arrays()
-    arrays["color"], arrays["background"] = (arrays[k] / weights for k in ("color", "background"))
-    return MaterialData(arrays, content.size, content.cutoff, content.maps)
-
-
-def holds_maps(path: str | os.PathLike[str]) -> bool:
-    """Return whether an ``.egs`` file holds a material, by its version."""
-    with open(path, "rb") as file:
-        start = file.read(5)
-    return len(start) == 5 and start[4] == MAPS_VERSION
-
-
-def _weights(maps: tuple[TextureMap, ...]) -> list[float]:
-    """Return the weight of each channel."""
-    return [m.weight for m in maps for _ in range(m.channels)]
 
 
 def _images_of(

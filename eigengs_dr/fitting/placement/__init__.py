@@ -5,6 +5,5 @@
 - ``adaptive``: by the second derivatives of the image
 - ``density``: the density that an error asks for
 - ``peaks``: the peaks of a residual
-- ``hilbert_scan``: pixels in the order of a Hilbert curve
 - ``nearest``: the centre nearest to each pixel
 """

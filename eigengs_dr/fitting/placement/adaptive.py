@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from ...gaussian.covariance import factor_from_covariance
 from ...image.blur import blur, gaussian_taps
+from ...image.hilbert import Square, hilbert_squares
 from ...image.resize import resample
 from ...image.strips import map_threads, strips, with_border
-from .hilbert_scan import Square, hilbert_squares
 from .nearest import center_pixels, nearest_center, sum_by_center
 
 Array = NDArray[np.floating]
