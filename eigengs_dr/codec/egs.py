@@ -124,16 +124,17 @@ def to_bytes(packed: EgsContent) -> bytes:
     return b"".join(parts)
 
 
-def write(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write the result of `to_bytes` to a file atomically.
+def write(path: str | os.PathLike[str], packed: EgsContent) -> int:
+    """Write a file atomically; return its number of bytes.
 
     Raises
     ------
     OSError
         If the file cannot be written; an existing file then stays unchanged.
     """
+    content = to_bytes(packed)
     with atomic_write(path) as temporary:
-        temporary.write_bytes(content)
+        return temporary.write_bytes(content)
 
 
 def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsContent:
@@ -202,27 +203,14 @@ def section_counts(path: str | os.PathLike[str]) -> list[int]:
     path = Path(path)
     with path.open("rb") as file:
         try:
-            header, size = _read_header(file), os.fstat(file.fileno()).st_size
-            return [read_body(file, size, k + 1)[1] for k in range(header.sections)]
+            (_, count, *_), size = _read_header(file), os.fstat(file.fileno()).st_size
+            return [read_body(file, size, k + 1)[1] for k in range(count)]
         except BadValue as error:
             raise ValueError(f"{path}: {error}") from None
 
 
-class _Header(NamedTuple):
-    """What a file says before its sections; the fields from `steps` on are of `EgsContent`."""
-
-    levels: int
-    sections: int
-    corner: IntArray
-    steps: Steps
-    background: NDArray[np.float32]
-    size: tuple[int, int]
-    space: str
-    cutoff: float
-    maps: tuple[TextureMap, ...]
-
-
-def _read_header(file: BinaryIO) -> _Header:
+def _read_header(file: BinaryIO) -> tuple[int, int, IntArray, EgsContent]:
+    """Return the levels, the number of sections, the first cell, and a content without sections."""
     head = exactly(file, 5)
     if head[:4] != MAGIC:
         raise BadValue("not a packed set of Gaussians; it may be damaged or something else")
@@ -244,22 +232,14 @@ def _read_header(file: BinaryIO) -> _Header:
         check_maps(maps, channels)
     corner, steps = np.array(rest[:2], np.int64), Steps(*rest[2:4])
     _check_header(space, channels, levels, count, steps)
-    return _Header(
-        levels,
-        count,
-        corner,
-        steps,
-        np.frombuffer(background, "<f4"),
-        (width, height),
-        SPACES[space],
-        rest[4],
-        maps,
-    )
+    values = np.frombuffer(background, "<f4")
+    content = EgsContent([], steps, values, (width, height), SPACES[space], rest[4], maps)
+    return levels, count, corner, content
 
 
 def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
-    header = _read_header(file)
-    count, channels = header.sections, len(header.background)
+    levels, count, corner, content = _read_header(file)
+    channels = len(content.background)
     if wanted is not None and not 1 <= wanted <= count:
         raise BadValue(f"the file has {count} sections, not {wanted}; ask for 1 to {count}")
     found: list[Symbols] = []
@@ -271,13 +251,13 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
                 f"section {number} claims {splats} Gaussians, but at most {room} more can be read"
             )
         try:
-            symbols = decode_body(body, splats, channels, header.levels, header.steps)
+            symbols = decode_body(body, splats, channels, levels, content.steps)
         except BadValue as error:
             raise BadValue(f"section {number}: {error}; copy the file again") from None
-        found.append(symbols._replace(cell=symbols.cell + header.corner))
+        found.append(symbols._replace(cell=symbols.cell + corner))
     if wanted is None and file.read(1):
         raise BadValue("data follow the last section; copy the file again")
-    return EgsContent(found, *header[3:])
+    return content._replace(sections=found)
 
 
 def _check_header(space: int, channels: int, levels: int, count: int, steps: Steps) -> None:

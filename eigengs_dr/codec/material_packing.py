@@ -20,8 +20,8 @@ from ..material.maps import TextureMap, show_sums, slices
 from ..material.material import Material, scale_channels
 from ..material.target import combine, read_maps
 from ..raster.render import render
-from .egs import channel_weights, to_bytes, write
-from .packing import BUDGET, MIN_MSE, MSE_WITHOUT_IMAGE, check_request, compress, section_rows
+from .egs import channel_weights
+from .packing import BUDGET, MIN_MSE, MSE_WITHOUT_IMAGE, check_request, section_rows, write_smallest
 from .quantization import Steps
 
 Array = NDArray[np.floating]
@@ -125,22 +125,15 @@ def pack_material(
 
     weighted = scale_channels(g, scale.tolist())
     rows = section_rows(len(g), None)
-    packed, drop = compress(weighted, values * scale, errors, max_psnr_drop, rows, unseen)
-    content = to_bytes(packed._replace(maps=maps))
-    write(output, content)
+    target = values * scale
+    figures = write_smallest(output, weighted, target, errors, max_psnr_drop, rows, unseen, maps)
     found = Material.load(output, types_of(g.mean).backend)
     pictures = found.pictures()
-    return MaterialPackResult(
-        material=found,
-        bytes=len(content),
-        bits_per_pixel=8 * len(content) / (g.width * g.height),
-        psnr={
-            m.name: psnrs_by_rows(pictures[m.name].__getitem__, image, ["rgb"])[0]
-            for m, image in zip(maps, shown, strict=True)
-        },
-        psnr_drop=drop,
-        steps=packed.steps,
-    )
+    figures["psnr"] = {
+        m.name: psnrs_by_rows(pictures[m.name].__getitem__, image, ["rgb"])[0]
+        for m, image in zip(maps, shown, strict=True)
+    }
+    return MaterialPackResult(material=found, **figures)
 
 
 def _images_of(

@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -27,8 +27,9 @@ from ..image.io import read_image
 from ..image.metrics import MAX_PSNR, psnr_from_mse
 from ..image.pixels import check_data, check_image
 from ..image.radiance import to_log, to_pu21
+from ..material.maps import TextureMap
 from ..raster.render import render
-from .egs import MAX_SECTIONS, SUFFIX, EgsContent, to_bytes, write
+from .egs import MAX_SECTIONS, SUFFIX, EgsContent, write
 from .error_feedback import quantize_sections, quantize_with_feedback, to_gaussians
 from .quantization import Steps
 
@@ -152,31 +153,26 @@ def pack(
         parts = [*(found[: r.stop] for r in rows[:-1]), found]
         return [_error(part, shown) for part in parts]
 
-    packed, drop = compress(whole, target, errors, max_psnr_drop, rows, unseen)
-    content = to_bytes(packed)
-    write(output, content)
-    return PackResult(
-        gaussians=Gaussians.load(output, types_of(whole.mean).backend),
-        bytes=len(content),
-        bits_per_pixel=8 * len(content) / (whole.width * whole.height),
-        psnr=psnr_from_mse(errors(to_gaussians(packed, whole))[-1]),
-        psnr_drop=drop,
-        steps=packed.steps,
-    )
+    figures = write_smallest(output, whole, target, errors, max_psnr_drop, rows, unseen)
+    found = Gaussians.load(output, types_of(whole.mean).backend)
+    return PackResult(gaussians=found, **figures)
 
 
-def compress(
+def write_smallest(
+    output: str | os.PathLike[str],
     gaussians: Gaussians,
     target: Array,
     errors: Callable[[Gaussians], list[float]],
     max_psnr_drop: float,
     rows: list[slice],
     unseen: float = 0.0,
-) -> tuple[EgsContent, float]:
-    """Round a set as coarsely as a budget allows.
+    maps: tuple[TextureMap, ...] = (),
+) -> dict[str, Any]:
+    """Round a set as coarsely as a budget allows, and write the file.
 
     Parameters
     ----------
+    output : path-like
     gaussians : Gaussians
         Set without gradients.
     target : ndarray, shape (H, W, C)
@@ -189,17 +185,20 @@ def compress(
         The sections.
     unseen : float, optional
         Mean squared error that `errors` does not see, and that adds to it.
+    maps : tuple of TextureMap, optional
+        The maps of a material, by whose weights the colours are multiplied.
 
     Returns
     -------
-    EgsContent
-    float
-        The loss of the whole set in dB.
+    dict
+        bytes, bits_per_pixel, psnr, psnr_drop and steps of the result, see `PackResult`.
 
     Raises
     ------
     ValueError
         If no rounding meets the budget.
+    OSError
+        If the file cannot be written; an existing file then stays unchanged.
     """
     before = [max(error + unseen, MIN_MSE) for error in errors(gaussians)]
     limits = [error * 10 ** (max_psnr_drop / 10) - unseen for error in before]
@@ -225,8 +224,15 @@ def compress(
     if found is None:
         raise ValueError(TOO_FINE)
     packed = found[1].packed
-    after = max(errors(to_gaussians(packed, gaussians))[-1] + unseen, MIN_MSE)
-    return packed, psnr_from_mse(before[-1]) - psnr_from_mse(after)
+    after = errors(to_gaussians(packed, gaussians))[-1]
+    size = write(output, packed._replace(maps=maps))
+    return {
+        "bytes": size,
+        "bits_per_pixel": 8 * size / (gaussians.width * gaussians.height),
+        "psnr": psnr_from_mse(after),
+        "psnr_drop": psnr_from_mse(before[-1]) - psnr_from_mse(max(after + unseen, MIN_MSE)),
+        "steps": packed.steps,
+    }
 
 
 def _steps(gaussians: Gaussians, octaves: float) -> Steps:
