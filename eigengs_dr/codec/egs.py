@@ -222,7 +222,8 @@ def _read_header(file: BinaryIO) -> tuple[int, int, IntArray, EgsContent]:
     head += exactly(file, _HEADER.size - len(head))
     _, _, space, channels, levels, count, width, height, *rest = _HEADER.unpack(head)
     background = exactly(file, 4 * channels)
-    table, maps = b"", tuple[TextureMap, ...]()
+    table = b""
+    maps: tuple[TextureMap, ...] = ()
     if head[4] == MAPS_VERSION:
         table, maps = read_maps(partial(exactly, file))
     (check,) = _CHECK.unpack(exactly(file, _CHECK.size))
