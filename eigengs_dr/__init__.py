@@ -13,6 +13,7 @@ from typing import Any
 import lazy_loader
 
 from .backend.libllvm import select_libllvm
+from .storage.readers import READERS, Readers
 
 __version__ = "0.1.0"
 
@@ -40,6 +41,14 @@ class _Checkout:
 
 
 sys.meta_path.append(_Checkout)  # type: ignore[arg-type]
+
+
+def _of_packed_sets(name: str) -> Any:
+    """Return a function of the codec, which is imported when a file needs it."""
+    return lambda *args: resolve_name(f"{__name__}.codec.egs:{name}")(*args)
+
+
+READERS[b"\x89EGS"] = Readers(*map(_of_packed_sets, ("read_set", "read_material", "holds_maps")))
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 

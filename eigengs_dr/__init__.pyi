@@ -4,8 +4,7 @@ from .backend.executor import ClusterError
 from .backend.recording import exclusive
 from .backend.selection import BackendError
 from .blocks.fit_large import LargeFit, fit_large
-from .codec.material_packing import MaterialPackResult, pack_material
-from .codec.packing import PackResult, pack
+from .codec.packing import MaterialPackResult, PackResult, pack, pack_material
 from .collection.fit_many import fit_many
 from .collection.row import ImageRow, RunInterrupted
 from .eigenbasis.eigengs import EigenGS

@@ -11,8 +11,7 @@ from ..fitting.options import Levels
 from .fit_material import MapFile, by_name, load_map
 
 if TYPE_CHECKING:
-    from ..codec.material_packing import MaterialPackResult
-    from ..codec.packing import PackResult
+    from ..codec.packing import MaterialPackResult, PackResult
     from ..gaussian.gaussians import Gaussians
 
 

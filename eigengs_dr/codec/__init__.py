@@ -1,12 +1,10 @@
 """Sets of Gaussians in few bytes.
 
 - ``quantization``: Gaussians as integers
-- ``hilbert_index``, ``neighbors``: what is near
 - ``exact_math``: functions with the same bits on every machine
 - ``range_coder``: integers with probabilities as bits
-- ``cells``, ``gaussian_model``, ``directions``, ``weights``: the probabilities
-- ``egs``, ``egs_section``, ``egs_maps``: the .egs file, its sections, and its table of maps
-- ``packing``: `pack`: the largest steps within a loss of PSNR
-- ``step_search``: the search of a step by few attempts
-- ``error_feedback``: rounding that later Gaussians compensate
+- ``gaussian_model``, ``weights``: the probabilities, from what is known of the neighbours
+- ``egs``, ``egs_section``: the .egs file with its table of maps, and its sections
+- ``packing``: `pack` and `pack_material`
+- ``rounding``: the largest steps within a loss, and rounding that later Gaussians compensate
 """

@@ -1,7 +1,8 @@
 """The ``.egs`` file format: Gaussians as integers, in sections that are read one by one.
 
 All numbers are little endian. The file starts with a header (`_HEADER`), the background and a
-checksum. The sections follow, see `eigengs_dr.codec.egs_section`.
+checksum; the header of a material is followed by a table of its maps. The sections follow, see
+`eigengs_dr.codec.egs_section`.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -18,12 +20,13 @@ from numpy.typing import NDArray
 
 from ..gaussian.file import CUTOFF, SetData
 from ..image.color import MAX_CHANNELS, SPACES
+from ..image.hilbert import MAX_LEVELS
+from ..material.file import MaterialData
+from ..material.maps import MAX_CHANNELS as MAX_MAPS
 from ..material.maps import TextureMap, check_maps
 from ..storage.atomic import atomic_write
 from ..storage.npz import MAX_ENTRIES, BadValue
-from .egs_maps import maps_to_bytes, read_maps
 from .egs_section import decode_body, exactly, read_body, section_to_bytes
-from .hilbert_index import MAX_LEVELS
 from .quantization import Steps, Symbols, dequantize
 
 IntArray = NDArray[np.int64]
@@ -44,6 +47,9 @@ _HEADER = struct.Struct("<4sBBBBHIIiiffd")
 and row of the first cell, the steps, and the cutoff."""
 
 _CHECK = struct.Struct("<I")
+
+_MAP = struct.Struct("<BBBd")
+"""A map in the table, before its name; see `maps_to_bytes`."""
 
 
 class EgsContent(NamedTuple):
@@ -118,16 +124,17 @@ def to_bytes(packed: EgsContent) -> bytes:
     return b"".join(parts)
 
 
-def write(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write the result of `to_bytes` to a file atomically.
+def write(path: str | os.PathLike[str], packed: EgsContent) -> int:
+    """Write a file atomically; return its number of bytes.
 
     Raises
     ------
     OSError
         If the file cannot be written; an existing file then stays unchanged.
     """
+    content = to_bytes(packed)
     with atomic_write(path) as temporary:
-        temporary.write_bytes(content)
+        return temporary.write_bytes(content)
 
 
 def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsContent:
@@ -168,32 +175,42 @@ def read_set(path: Path, sections: int | None = None) -> SetData:
     return content.set_data()
 
 
+def read_material(path: Path) -> MaterialData:
+    """Read a packed material for `Material.load`; for errors see `read`."""
+    content = read(path)
+    if not content.maps:
+        raise ValueError(f"{path}: holds one image and no maps; load it by Gaussians.load")
+    weights = np.array(channel_weights(content.maps), np.float32)
+    arrays = content.arrays()
+    arrays["color"], arrays["background"] = (arrays[k] / weights for k in ("color", "background"))
+    return MaterialData(arrays, content.size, content.cutoff, content.maps)
+
+
+def holds_maps(path: str | os.PathLike[str]) -> bool:
+    """Return whether an ``.egs`` file holds a material, by its version."""
+    with open(path, "rb") as file:
+        start = file.read(5)
+    return len(start) == 5 and start[4] == MAPS_VERSION
+
+
+def channel_weights(maps: tuple[TextureMap, ...]) -> list[float]:
+    """Return the weight of each channel."""
+    return [m.weight for m in maps for _ in range(m.channels)]
+
+
 def section_counts(path: str | os.PathLike[str]) -> list[int]:
     """Return the number of Gaussians of each section, without decoding them; errors as `read`."""
     path = Path(path)
     with path.open("rb") as file:
         try:
-            header, size = _read_header(file), os.fstat(file.fileno()).st_size
-            return [read_body(file, size, k + 1)[1] for k in range(header.sections)]
+            (_, count, *_), size = _read_header(file), os.fstat(file.fileno()).st_size
+            return [read_body(file, size, k + 1)[1] for k in range(count)]
         except BadValue as error:
             raise ValueError(f"{path}: {error}") from None
 
 
-class _Header(NamedTuple):
-    """What a file says before its sections; the fields from `steps` on are of `EgsContent`."""
-
-    levels: int
-    sections: int
-    corner: IntArray
-    steps: Steps
-    background: NDArray[np.float32]
-    size: tuple[int, int]
-    space: str
-    cutoff: float
-    maps: tuple[TextureMap, ...]
-
-
-def _read_header(file: BinaryIO) -> _Header:
+def _read_header(file: BinaryIO) -> tuple[int, int, IntArray, EgsContent]:
+    """Return the levels, the number of sections, the first cell, and a content without sections."""
     head = exactly(file, 5)
     if head[:4] != MAGIC:
         raise BadValue("not a packed set of Gaussians; it may be damaged or something else")
@@ -205,7 +222,8 @@ def _read_header(file: BinaryIO) -> _Header:
     head += exactly(file, _HEADER.size - len(head))
     _, _, space, channels, levels, count, width, height, *rest = _HEADER.unpack(head)
     background = exactly(file, 4 * channels)
-    table, maps = b"", tuple[TextureMap, ...]()
+    table = b""
+    maps: tuple[TextureMap, ...] = ()
     if head[4] == MAPS_VERSION:
         table, maps = read_maps(partial(exactly, file))
     (check,) = _CHECK.unpack(exactly(file, _CHECK.size))
@@ -215,22 +233,14 @@ def _read_header(file: BinaryIO) -> _Header:
         check_maps(maps, channels)
     corner, steps = np.array(rest[:2], np.int64), Steps(*rest[2:4])
     _check_header(space, channels, levels, count, steps)
-    return _Header(
-        levels,
-        count,
-        corner,
-        steps,
-        np.frombuffer(background, "<f4"),
-        (width, height),
-        SPACES[space],
-        rest[4],
-        maps,
-    )
+    values = np.frombuffer(background, "<f4")
+    content = EgsContent([], steps, values, (width, height), SPACES[space], rest[4], maps)
+    return levels, count, corner, content
 
 
 def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
-    header = _read_header(file)
-    count, channels = header.sections, len(header.background)
+    levels, count, corner, content = _read_header(file)
+    channels = len(content.background)
     if wanted is not None and not 1 <= wanted <= count:
         raise BadValue(f"the file has {count} sections, not {wanted}; ask for 1 to {count}")
     found: list[Symbols] = []
@@ -242,13 +252,13 @@ def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
                 f"section {number} claims {splats} Gaussians, but at most {room} more can be read"
             )
         try:
-            symbols = decode_body(body, splats, channels, header.levels, header.steps)
+            symbols = decode_body(body, splats, channels, levels, content.steps)
         except BadValue as error:
             raise BadValue(f"section {number}: {error}; copy the file again") from None
-        found.append(symbols._replace(cell=symbols.cell + header.corner))
+        found.append(symbols._replace(cell=symbols.cell + corner))
     if wanted is None and file.read(1):
         raise BadValue("data follow the last section; copy the file again")
-    return EgsContent(found, *header[3:])
+    return content._replace(sections=found)
 
 
 def _check_header(space: int, channels: int, levels: int, count: int, steps: Steps) -> None:
@@ -261,3 +271,42 @@ def _check_header(space: int, channels: int, levels: int, count: int, steps: Ste
         raise BadValue(f"the header claims {count} sections, expected 1 to {MAX_SECTIONS}")
     if not all(0 < step < np.inf for step in steps):
         raise BadValue(f"the steps are {tuple(steps)}, expected numbers above 0")
+
+
+def maps_to_bytes(maps: Sequence[TextureMap]) -> bytes:
+    """Return the table of maps; nothing for an image.
+
+    A byte holds the number of maps. Each map has the length of its name, the index of its space,
+    its number of channels (a byte each), its weight (float64), and its name in ASCII.
+    """
+    if not maps:
+        return b""
+    parts = [bytes([len(maps)])]
+    for m in maps:
+        name = m.name.encode("ascii")
+        parts += [_MAP.pack(len(name), SPACES.index(m.space), m.channels, m.weight), name]
+    return b"".join(parts)
+
+
+def read_maps(take: Callable[[int], bytes]) -> tuple[bytes, tuple[TextureMap, ...]]:
+    """Read a table; `take` returns the next bytes, or raises `BadValue`.
+
+    Returns
+    -------
+    bytes
+        The table as it is in the file.
+    tuple of TextureMap
+        `eigengs_dr.material.maps.check_maps` checks them.
+    """
+    table, maps = take(1), []
+    if not 1 <= table[0] <= MAX_MAPS:
+        raise BadValue(f"the header claims {table[0]} maps, expected 1 to {MAX_MAPS}")
+    for _ in range(table[0]):
+        entry = take(_MAP.size)
+        length, space, channels, weight = _MAP.unpack(entry)
+        name = take(length)
+        if space >= len(SPACES):
+            raise BadValue("the header holds unknown values; upgrade eigengs-dr")
+        maps.append(TextureMap(name.decode("ascii", "replace"), SPACES[space], channels, weight))
+        table += entry + name
+    return table, tuple(maps)

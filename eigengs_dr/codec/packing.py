@@ -1,13 +1,9 @@
-"""The function `pack`, which writes a set to the smallest file within a given loss of PSNR.
-
-All steps follow from one, see `eigengs_dr.codec.quantization`. `pack` searches the largest one that
-the loss allows, first without error feedback, which is fast, then with it.
-"""
+"""The functions `pack` and `pack_material`, which write the smallest file within a loss of PSNR."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -24,14 +20,16 @@ from ..gaussian.gaussians import Gaussians
 from ..gaussian.like import set_of
 from ..image.color import LIGHT, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_coded, to_linear
 from ..image.io import read_image
-from ..image.metrics import MAX_PSNR, psnr_from_mse
+from ..image.metrics import MAX_PSNR, psnrs_by_rows
 from ..image.pixels import check_data, check_image
 from ..image.radiance import to_log, to_pu21
+from ..material.maps import TextureMap, show_sums, slices
+from ..material.material import Material, scale_channels
+from ..material.target import combine, read_maps
 from ..raster.render import render
-from .egs import MAX_SECTIONS, SUFFIX, EgsContent, to_bytes, write
-from .error_feedback import quantize_sections, quantize_with_feedback, to_gaussians
+from .egs import MAX_SECTIONS, SUFFIX, channel_weights
 from .quantization import Steps
-from .step_search import MIN_OCTAVES, Attempt, largest_within
+from .rounding import MIN_MSE, write_smallest
 
 Array = NDArray[np.floating]
 
@@ -40,20 +38,6 @@ BUDGET = 0.5
 
 MSE_WITHOUT_IMAGE = 1e-4
 """Mean squared error that `pack` assumes for a set if it has no image: 40 dB."""
-
-MIN_MSE = 1e-9
-"""Smallest mean squared error that counts: 90 dB."""
-
-FIRST_STEP = 0.06
-"""Step of the colours at which the search starts."""
-
-CELLS = 4
-"""Cells for the mean distance of Gaussians: some lie in one cell, and few bits tell the rest."""
-
-FEEDBACK = 0.6
-"""Error that rounding adds with error feedback, relative to that without, on training photos."""
-
-TOO_FINE = "pack: no rounding is fine enough for the budget; allow more dB"
 
 
 class PackResult(NamedTuple):
@@ -153,88 +137,9 @@ def pack(
         parts = [*(found[: r.stop] for r in rows[:-1]), found]
         return [_error(part, shown) for part in parts]
 
-    packed, drop = compress(whole, target, errors, max_psnr_drop, rows, unseen)
-    content = to_bytes(packed)
-    write(output, content)
-    return PackResult(
-        gaussians=Gaussians.load(output, types_of(whole.mean).backend),
-        bytes=len(content),
-        bits_per_pixel=8 * len(content) / (whole.width * whole.height),
-        psnr=psnr_from_mse(errors(to_gaussians(packed, whole))[-1]),
-        psnr_drop=drop,
-        steps=packed.steps,
-    )
-
-
-def compress(
-    gaussians: Gaussians,
-    target: Array,
-    errors: Callable[[Gaussians], list[float]],
-    max_psnr_drop: float,
-    rows: list[slice],
-    unseen: float = 0.0,
-) -> tuple[EgsContent, float]:
-    """Round a set as coarsely as a budget allows.
-
-    Parameters
-    ----------
-    gaussians : Gaussians
-        Set without gradients.
-    target : ndarray, shape (H, W, C)
-        What compensation for the rounding aims at, in the space of the set.
-    errors : callable
-        ``errors(gaussians)`` returns the mean squared error of each prefix that `rows` end at.
-    max_psnr_drop : float
-        Allowed loss of each prefix in dB.
-    rows : list of slice
-        The sections.
-    unseen : float, optional
-        Mean squared error that `errors` does not see, and that adds to it.
-
-    Returns
-    -------
-    EgsContent
-    float
-        The loss of the whole set in dB.
-
-    Raises
-    ------
-    ValueError
-        If no rounding meets the budget.
-    """
-    before = [max(error + unseen, MIN_MSE) for error in errors(gaussians)]
-    limits = [error * 10 ** (max_psnr_drop / 10) - unseen for error in before]
-    if min(limits) <= 0:
-        raise ValueError(TOO_FINE)
-
-    def judge(packed: EgsContent) -> Attempt:
-        after = zip(errors(to_gaussians(packed, gaussians)), limits, before, strict=True)
-        # The worst prefix counts.
-        return Attempt(max((e + unseen - b) / (m + unseen - b) for e, m, b in after), packed)
-
-    def plain(octaves: float) -> Attempt:
-        return judge(quantize_sections(gaussians, _steps(gaussians, octaves), rows))
-
-    def compensated(octaves: float) -> Attempt:
-        return judge(quantize_with_feedback(gaussians, target, _steps(gaussians, octaves)))
-
-    found = largest_within(plain)
-    if len(rows) == 1:  # compensation for the whole set would harm its prefixes
-        least = MIN_OCTAVES if found is None else found[0]
-        start = least if found is None else least - 0.5 * np.log2(FEEDBACK)
-        found = largest_within(compensated, start, least) or found
-    if found is None:
-        raise ValueError(TOO_FINE)
-    packed = found[1].packed
-    after = max(errors(to_gaussians(packed, gaussians))[-1] + unseen, MIN_MSE)
-    return packed, psnr_from_mse(before[-1]) - psnr_from_mse(after)
-
-
-def _steps(gaussians: Gaussians, octaves: float) -> Steps:
-    """Return steps in single precision, as in the file."""
-    cell = (gaussians.width * gaussians.height / len(gaussians)) ** 0.5 / CELLS
-    values = np.array([FIRST_STEP * 2.0**octaves, cell], np.float32)
-    return Steps(*values.tolist())
+    figures = write_smallest(output, whole, target, errors, max_psnr_drop, rows, unseen)
+    found = Gaussians.load(output, types_of(whole.mean).backend)
+    return PackResult(gaussians=found, **figures)
 
 
 def check_request(output: str | os.PathLike[str], max_psnr_drop: float) -> None:
@@ -295,3 +200,153 @@ def _planes_of(gaussians: Gaussians) -> Array:
 
 def _error(gaussians: Gaussians, shown: Array) -> float:
     return float(np.mean(np.square(_shown(gaussians) - shown, dtype=np.float64)))
+
+
+SMALL = 1 / 255
+"""A small change of sums, to measure slopes by."""
+
+
+class MaterialPackResult(NamedTuple):
+    """Result of `pack_material`.
+
+    Attributes
+    ----------
+    material : Material
+        The rounded material in the order of the file.
+    bytes : int
+        Size of the file.
+    bits_per_pixel : float
+        Bits of the file per pixel of the native size, for all maps together.
+    psnr : dict of str to float
+        psnr_rgb in dB of each map against its image; without images, against the rendering before
+        rounding.
+    psnr_drop : float
+        Loss in dB, see max_psnr_drop of `pack_material`.
+    steps : Steps
+        Steps of the rounding.
+    """
+
+    material: Material
+    bytes: int
+    bits_per_pixel: float
+    psnr: dict[str, float]
+    psnr_drop: float
+    steps: Steps
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        return to_html(self)
+
+
+@exclusive()
+def pack_material(
+    material: Material,
+    output: str | os.PathLike[str],
+    images: Mapping[str, ArrayLike] | None = None,
+    max_psnr_drop: float = BUDGET,
+    encoding: str | None = None,
+) -> MaterialPackResult:
+    """Write a material to the smallest ``.egs`` file whose loss of PSNR stays within a budget.
+
+    All maps lose about as many decibels. Without images, they get errors in the ratio of their
+    weights in the fit.
+
+    Parameters
+    ----------
+    material : Material
+    output : path-like
+        File to write; an existing file is replaced atomically. `Material.load` reads it.
+    images : mapping of str to array_like, optional
+        The images of the fit, as `eigengs_dr.fit_material` takes them. By default the renderings.
+    max_psnr_drop : float, optional
+        Largest loss in dB, above 0 and at most 100: of the mean over the maps of the squared error
+        (of colours as sRGB) over that before. Without images, over that of weighted errors of 40
+        dB.
+    encoding : {"srgb", "linear"}, optional
+        What the pixels of colours are, see `eigengs_dr.fit`.
+
+    Returns
+    -------
+    MaterialPackResult
+
+    Raises
+    ------
+    ValueError
+        If the images do not fit the maps, the suffix is not ``.egs``, or no file meets the budget.
+    OSError
+        If the file cannot be written; an existing file then stays unchanged.
+    """
+    check_request(output, max_psnr_drop)
+    maps, g = material.maps, dr.detach(material.gaussians)
+    own = render(g).numpy()
+    shown, values = _shown_maps(own, maps), own
+    factors, unseen = [m.weight**2 for m in maps], MSE_WITHOUT_IMAGE
+    if images is not None:
+        rendered = shown
+        shown, values = _images_of(material, images, encoding)
+        factors = [1 / e for e in _errors(rendered, shown)]
+        # Equal steps of weighted colours then add to each map an error in the ratio of its own.
+        logs = 0.5 * np.log(np.multiply(factors, _slopes(own, rendered, maps)))
+        weights, cuts = np.exp(logs - logs.mean()), slices(maps)
+        maps = tuple(m._replace(weight=float(w)) for m, w in zip(maps, weights, strict=True))
+        unseen = 0.0
+        for m, c in zip(maps, cuts, strict=True):
+            if m.space in LIGHT:  # as `pack` keeps light near its own rendering
+                values[..., c] = own[..., c]
+    scale = np.array(channel_weights(maps), np.float32)
+
+    def errors(found: Gaussians) -> list[float]:
+        seen = _errors(_shown_maps(render(found).numpy() / scale, maps), shown)
+        return [float(np.mean(np.multiply(seen, factors)))]
+
+    weighted = scale_channels(g, scale.tolist())
+    rows = section_rows(len(g), None)
+    target = values * scale
+    figures = write_smallest(output, weighted, target, errors, max_psnr_drop, rows, unseen, maps)
+    found = Material.load(output, types_of(g.mean).backend)
+    pictures = found.pictures()
+    figures["psnr"] = {
+        m.name: psnrs_by_rows(pictures[m.name].__getitem__, image, ["rgb"])[0]
+        for m, image in zip(maps, shown, strict=True)
+    }
+    return MaterialPackResult(material=found, **figures)
+
+
+def _images_of(
+    material: Material, images: Mapping[str, ArrayLike], encoding: str | None
+) -> tuple[list[Array], Array]:
+    """Return the images in the order of the maps, and their values in the spaces of the maps."""
+    spaces = {m.name: m.space for m in material.maps}
+    if sorted(images) != sorted(spaces):
+        raise ValueError(
+            f"pack: images are of {', '.join(images)}; give one of each of {', '.join(spaces)}"
+        )
+    found = read_maps({name: images[name] for name in spaces}, spaces, encoding)
+    g = material.gaussians
+    for image, m in zip(found, material.maps, strict=True):
+        expected = (g.height, g.width, m.channels)
+        if image.pixels.shape != expected:
+            raise ValueError(
+                f"pack: map {m.name!r} has shape {image.pixels.shape}, the material needs "
+                f"{expected}"
+            )
+    units = [image.unit for image in found]
+    pixels: list[Array] = [i.pixels * np.float32(i.unit) for i in found]
+    return pixels, combine(found, units).values
+
+
+def _shown_maps(sums: Array, maps: tuple[TextureMap, ...]) -> list[Array]:
+    """Convert sums of all channels to what people look at, map by map."""
+    return [show_sums(m.space, sums[..., c]) for m, c in zip(maps, slices(maps), strict=True)]
+
+
+def _slopes(sums: Array, shown: list[Array], maps: tuple[TextureMap, ...]) -> list[float]:
+    """Return how much the squared error of what is seen exceeds that of the sums, map by map."""
+    moved = _errors(_shown_maps(sums + np.float32(SMALL), maps), shown)
+    return [error / SMALL**2 for error in moved]
+
+
+def _errors(a: list[Array], b: list[Array]) -> list[float]:
+    """Return the mean squared error of each map, of at least `MIN_MSE`."""
+    pairs = zip(a, b, strict=True)
+    return [max(float(np.mean(np.square(x - y, dtype=np.float64))), MIN_MSE) for x, y in pairs]

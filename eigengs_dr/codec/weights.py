@@ -21,7 +21,7 @@ WIDTHS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2)
 """Factors of the mean absolute error that are tried as width."""
 
 CLASSES = 15
-"""Classes of directions, see `eigengs_dr.codec.directions`."""
+"""Classes of directions, see `Directions` in `eigengs_dr.codec.gaussian_model`."""
 
 SMALL = 1500
 """Number of Gaussians below which the weights may take more bytes than they save."""

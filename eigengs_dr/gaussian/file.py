@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from ..image.color import MAX_CHANNELS, SPACES
 from ..storage import npz
 from ..storage.npz import BadValue, Field
+from ..storage.readers import readers_of
 
 FORMAT = "eigengs_dr.gaussians"
 MATERIAL = "eigengs_dr.material"
@@ -57,10 +57,6 @@ FIGURES: dict[str, Field] = {"figures": Field("f8", 1, 3), "source": Field("U", 
 
 MAX_SOURCE = 64
 """Characters of the name of an image that a file keeps: its last."""
-
-READERS = {b"\x89EGS": "eigengs_dr.codec.egs:read_set"}
-"""Readers of other formats, by the first bytes of a file: 'module:function'. The function takes
-(path, sections) and returns a `SetData`; its module is imported when a file needs it."""
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -184,13 +180,9 @@ def read(path: Path, sections: int | None = None) -> SetData:
 
 
 def _read(path: Path, sections: int | None) -> SetData:
-    with path.open("rb") as file:
-        start = file.read(max(map(len, READERS)))
-    for magic, reader in READERS.items():
-        if start.startswith(magic):
-            module, function = reader.split(":")
-            data: SetData = getattr(import_module(module), function)(path, sections)
-            return data
+    if readers := readers_of(path):
+        data: SetData = readers.read_set(path, sections)
+        return data
     if sections is not None:
         raise ValueError(f"{path}: has no sections; pass sections only for .egs files")
     if npz.format_of(path) == MATERIAL:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,13 +13,11 @@ from ..gaussian.file import MATERIAL, PLAIN_COUNT, Arrays, SetData, check, to_me
 from ..gaussian.file import read as read_image
 from ..storage import npz
 from ..storage.npz import BadValue, Field
+from ..storage.readers import readers_of
 from .maps import MAX_CHANNELS, TextureMap, check_maps, find_map, slices
 
 FORMAT = MATERIAL
 VERSION = 1
-
-READERS = {b"\x89EGS": "eigengs_dr.codec.material_packing:read_material"}
-"""Readers of other formats, by the first bytes of a file: 'module:function' of a path."""
 
 _MAPS: dict[str, Field] = {
     "names": Field("U", 1, MAX_CHANNELS),
@@ -149,11 +146,8 @@ def holds_material(path: str | os.PathLike[str]) -> bool:
     OSError
         If the file cannot be opened.
     """
-    for magic, reader in READERS.items():
-        with open(path, "rb") as file:
-            start = file.read(len(magic))
-        if start == magic:
-            return bool(import_module(reader.split(":")[0]).holds_maps(path))
+    if readers := readers_of(path):
+        return readers.holds_material(path)
     return npz.format_of(path) == FORMAT
 
 
@@ -189,13 +183,9 @@ def read_set(path: Path, name: str | None, option: str = "map") -> SetData:
 
 
 def _read(path: Path) -> MaterialData:
-    with path.open("rb") as file:
-        start = file.read(max(map(len, READERS)))
-    for magic, reader in READERS.items():
-        if start.startswith(magic):
-            module, function = reader.split(":")
-            data: MaterialData = getattr(import_module(module), function)(path)
-            return data
+    if readers := readers_of(path):
+        data: MaterialData = readers.read_material(path)
+        return data
     found = npz.read(path, FORMAT, VERSION, LAYOUT)
     maps = _maps_of(path, found)
     arrays = {name: found[name] for name in ("mean", "factor", "color", "background")}

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codec.material_packing import MaterialPackResult
-from ..codec.packing import PackResult
+from ..codec.packing import MaterialPackResult, PackResult
 from ..eigenbasis.eigengs import EigenGS
 from ..eigenbasis.pca.basis import Eigenbasis
 from ..fitting.fit import Fit

@@ -39,7 +39,7 @@ def rows_of(symbols):
 def test_files_come_back(tmp_path_factory, scene, sections):
     path = tmp_path_factory.mktemp("any") / "x.egs"
     before = content(scene, sections=sections)
-    packed.write(path, packed.to_bytes(before))
+    packed.write(path, before)
     for count in (None, *range(1, len(sections) + 1)):
         found = packed.read(path, count)
         assert len(found.sections) == (count or len(sections))
@@ -81,7 +81,7 @@ def test_files_of_many_and_of_few_gaussians_come_back(path):
 @pytest.mark.parametrize(("space", "channels"), SPACES)
 def test_sets_load_as_other_files_do(backend, tmp_path, space, channels):
     before = content(random_scene(channels=channels), space)
-    packed.write(tmp_path / "x.bin", packed.to_bytes(before))
+    packed.write(tmp_path / "x.bin", before)
     found = eg.Gaussians.load(tmp_path / "x.bin", backend)
     assert (found.width, found.height, found.space, found.channels) == (*SIZE, space, channels)
     for name, values in found.to_arrays().items():

@@ -10,7 +10,8 @@ import eigengs_dr as eg
 from _helpers.packed import SPACES, small_fit
 from _helpers.sets import COUNT, SIZE, random_scene
 from eigengs_dr.codec import egs as packed
-from eigengs_dr.codec import error_feedback, packing
+from eigengs_dr.codec import packing, rounding
+from eigengs_dr.codec.rounding import Attempt, largest_within
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import picture_of
 
@@ -91,7 +92,7 @@ def test_light_is_compared_as_it_is_shown(fitted, path):
 def test_later_gaussians_compensate_for_earlier_ones(fitted, receipts, path, monkeypatch):
     """Rounding all at once takes a larger file for the same loss."""
     gaussians, image = fitted
-    monkeypatch.setattr(error_feedback, "GROUPS", 1)
+    monkeypatch.setattr(rounding, "GROUPS", 1)
     assert eg.pack(gaussians, path, image).bytes > 1.04 * receipts[0.5][0].bytes
 
 
@@ -182,3 +183,45 @@ def test_a_set_without_error_loses_a_finite_number_of_decibels(tmp_path):
     assert eg.psnr(eg.picture_of(exact), image) == math.inf
     receipt = eg.pack(exact, tmp_path / "a.egs", image)
     assert 0 <= receipt.psnr_drop <= 0.5
+
+
+def noisy_attempts(crossing, noise=0.0, seed=0, first=0.0):
+    """An attempt whose error crosses the limit somewhere, and what was tried."""
+    tried = {}
+
+    def attempt(octaves):
+        luck = np.random.default_rng((seed, len(tried))).normal()
+        excess = first + (1 - first) * 4 ** (octaves - crossing) * math.exp(noise * luck)
+        tried[octaves] = excess
+        return Attempt(excess, None)
+
+    return attempt, tried
+
+
+@pytest.mark.parametrize("first", [0.0, -3.0, 0.5])
+@pytest.mark.parametrize("crossing", [-7.3, -0.5, -0.02, 0.0, 0.11, 1.3, 3.99])
+def test_without_noise_it_ends_at_the_limit(crossing, first):
+    attempt, tried = noisy_attempts(crossing, first=first)
+    octaves, best = largest_within(attempt)
+    assert crossing - 0.2 < octaves <= crossing + 1e-9
+    assert best.excess == tried[octaves] >= rounding.FAIR
+    assert len(tried) <= 7 + abs(crossing)
+
+
+@pytest.mark.parametrize(("noise", "least"), [(0.02, 0.95), (0.15, 0.85), (0.5, 0.7)])
+def test_with_noise_it_never_exceeds_the_limit(noise, least):
+    used = []
+    for seed in range(60):
+        attempt, tried = noisy_attempts(0.4 * math.sin(seed), noise, seed)
+        octaves, best = largest_within(attempt)
+        assert best.excess == tried[octaves] <= 1
+        assert octaves == max(k for k, excess in tried.items() if excess <= 1)
+        assert len(tried) <= rounding.MAX_ATTEMPTS + 4
+        used.append(best.excess)
+    assert np.mean(used) > least
+
+
+def test_an_error_that_no_step_changes():
+    assert largest_within(lambda octaves: Attempt(1.5, None)) is None
+    octaves, _ = largest_within(lambda octaves: Attempt(0.0, None))
+    assert octaves == rounding.MAX_OCTAVES

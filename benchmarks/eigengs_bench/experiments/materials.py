@@ -19,7 +19,7 @@ from PIL import Image as pillow
 from eigengs_bench.experiments.block_codecs import codecs, coded
 from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.timing import Image
-from eigengs_dr.codec.material_packing import pack_material
+from eigengs_dr.codec.packing import pack_material
 from eigengs_dr.image.color import rendered_as
 from eigengs_dr.image.folder import image_files
 from eigengs_dr.image.io import load_image, to_8bit

@@ -4,5 +4,4 @@
 - ``adaptive``: by the second derivatives of the image
 - ``density``: the density that an error asks for
 - ``peaks``: the peaks of a residual
-- ``hilbert_scan``: pixels in the order of a Hilbert curve
 """

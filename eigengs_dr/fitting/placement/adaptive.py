@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from ...gaussian.covariance import factor_from_covariance
 from ...image.blur import blur, gaussian_taps
+from ...image.hilbert import Square, hilbert_squares
 from ...image.resize import resample
 from ...image.strips import map_threads, strips, with_border
 from .density import center_pixels, nearest_center, sum_by_center
-from .hilbert_scan import Square, hilbert_squares
 
 Array = NDArray[np.floating]
 Density = Callable[[Array], Array]

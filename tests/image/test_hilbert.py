@@ -1,12 +1,30 @@
-"""The Hilbert curve over an image of any size."""
+"""The Hilbert curve: numbers of points along it, and images of any size."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from _helpers.sets import few
-from eigengs_dr.fitting.placement.hilbert_scan import SQUARE, hilbert_squares
+from eigengs_dr.image.hilbert import MAX_LEVELS, SQUARE, hilbert_encode, hilbert_squares
+
+
+@pytest.mark.parametrize("levels", [0, 1, 2, 5])
+def test_the_curve_visits_every_point_by_single_steps(levels):
+    side = 1 << levels
+    points = np.indices((side, side)).reshape(2, -1).T
+    places = hilbert_encode(points, levels)
+    assert sorted(places) == list(range(side * side))
+    path = points[np.argsort(places)]
+    assert (np.abs(np.diff(path, axis=0)).sum(axis=1) == 1).all()
+
+
+@given(hnp.arrays(np.int64, (7, 2), elements=st.integers(0, (1 << MAX_LEVELS) - 1)))
+def test_places_on_the_largest_curve_are_one_for_each_point(points):
+    places = hilbert_encode(points, MAX_LEVELS)
+    assert (places >> 2 * MAX_LEVELS == 0).all()
+    assert len(np.unique(places)) == len(np.unique(points, axis=0))
 
 
 def hilbert_order(height, width):

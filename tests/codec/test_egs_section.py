@@ -1,4 +1,4 @@
-"""Cells of a plane."""
+"""Sections of a file: the cells of a plane."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from eigengs_dr.codec.cells import EVENNESS, code_cells, morton_encode
+from eigengs_dr.codec.egs_section import EVENNESS, code_cells, morton_encode
 from eigengs_dr.codec.range_coder import Decoder, Encoder
 
 
