@@ -24,8 +24,7 @@ from .plugins import register_plugins
 from .raster.render import picture_of, render, tile_lists
 from .scene.convert import ConvertedScene, convert_scene
 from .scene.fit_scene import fit_for_scene
-from .viewer.page import Page
-from .viewer.view import view
+from .viewer.view import Page, view
 
 __version__: str
 

@@ -12,8 +12,7 @@ from eigengs_bench.names import SAMPLES, SETS
 from eigengs_dr.backend.selection import select
 from eigengs_dr.cli import options
 from eigengs_dr.cli.console import progress_bar, say
-from eigengs_dr.cli.outputs import check_outputs
-from eigengs_dr.cli.report import write_report
+from eigengs_dr.cli.outputs import check_outputs, write_report
 
 output_option = click.option(
     "-o",

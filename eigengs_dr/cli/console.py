@@ -1,4 +1,6 @@
-"""Messages of the command line: one line for an error or a note, a bar for progress."""
+"""Messages of the command line: one line for an error or a note, a bar for progress; a cluster."""
+
+from __future__ import annotations
 
 import sys
 import warnings
@@ -9,6 +11,7 @@ from typing import Any
 import click
 
 from ..backend.executor import ClusterError
+from ..backend.interrupt import terminate_as_interrupt
 from ..backend.selection import BackendError
 
 NAME = "eigengs-dr"
@@ -140,3 +143,37 @@ def _notes() -> Iterator[None]:
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = lambda message, *_: say(f"note: {message}")
         yield
+
+
+@contextmanager
+def open_cluster(cluster: str | None) -> Iterator[Any]:
+    """Connect to a cluster during a block.
+
+    Parameters
+    ----------
+    cluster : str or None
+        See `eigengs_dr.cluster.connect.connect`; None is this process.
+
+    Yields
+    ------
+    distributed.Client or None
+
+    Raises
+    ------
+    ClusterError
+        If Dask is missing, or the scheduler does not answer.
+    ValueError
+        If the word is unknown.
+    """
+    if cluster is None:
+        yield None
+        return
+    try:
+        from ..cluster.connect import connect
+    except ModuleNotFoundError as error:
+        raise ClusterError(
+            f"--cluster needs {error.name}; type: pip install 'eigengs-dr[cluster]'"
+        ) from None
+    # Schedulers of batch jobs send SIGTERM; the workers of ``local`` have to end too.
+    with terminate_as_interrupt(), connect(cluster) as client:
+        yield client

@@ -11,13 +11,10 @@ from ..backend.selection import select
 from ..fitting.options import DEFAULT_BASIS, INITS, PRESETS, FitOptions, Levels
 from ..image.color import SPACES
 from ..image.metrics import float_space, target_key
-from .cluster import open_cluster
-from .console import INTERRUPTED, say
-from .fit_large import block_side, check_large, fit_by_blocks
-from .fit_many import fit_several
+from .console import INTERRUPTED, open_cluster, say
+from .fit_images import fit_one, fit_several
+from .fit_large import announce_memory, block_side, check_large, fit_by_blocks
 from .fit_material import MapFile, MapOption, run_maps
-from .fit_one import fit_one
-from .memory import announce_memory
 from .options import (
     ANY_PATH,
     LEVEL_COUNTS,
@@ -30,8 +27,7 @@ from .options import (
     quiet_option,
     report_option,
 )
-from .outputs import check_outputs, keeps_result, name_outputs
-from .report import write_report
+from .outputs import check_outputs, keeps_result, name_outputs, write_report
 
 if TYPE_CHECKING:
     from ..fitting.fit import Fit

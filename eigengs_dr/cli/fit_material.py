@@ -12,10 +12,9 @@ import click
 from ..backend.selection import select
 from ..image.remote import is_url
 from .console import INTERRUPTED, progress_bar, say
-from .fit_one import course_of
+from .fit_images import course_of
 from .options import describe_run
-from .outputs import check_outputs, keeps_result, name_outputs
-from .report import write_report
+from .outputs import check_outputs, keeps_result, name_outputs, write_report
 
 if TYPE_CHECKING:
     from ..fitting.options import FitOptions, Levels

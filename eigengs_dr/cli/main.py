@@ -3,19 +3,74 @@
 Commands import heavy modules when they run, so that ``--help`` and mistakes answer at once.
 """
 
+import json
+from importlib.metadata import entry_points
+from typing import Any
+
 import click
 
-from .bench import bench
 from .console import Program
-from .convert import convert
-from .doctor import doctor
 from .fit import fit
 from .info import info
+from .options import json_option
 from .pack import pack
 from .render import render
-from .scene import scene
+from .scene import convert, scene
 from .train import train
 from .view import view
+
+
+class Benchmarks(click.Group):
+    """The commands of the benchmarks, loaded when one of them is used."""
+
+    def list_commands(self, context: click.Context) -> list[str]:
+        """Return the names of the commands."""
+        return _load().list_commands(context)
+
+    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+        """Return a command, or None if there is none of this name."""
+        return _load().get_command(context, name)
+
+
+HELP = """Measure speed and accuracy, and draw tables and charts.
+
+\b
+Examples:
+  eigengs-dr bench kernels
+  eigengs-dr bench tables data/ -o results/ --set natural256 --images 3
+"""
+
+bench = Benchmarks("bench", help=HELP)
+
+
+def _load() -> Any:
+    """Load the group of commands that the installed benchmarks offer."""
+    for entry in entry_points(group="eigengs_dr.commands", name="bench"):
+        return entry.load()
+    raise click.UsageError(
+        "the benchmarks are not installed; in a checkout of eigengs-dr, run: "
+        "pip install ./benchmarks"
+    )
+
+
+@click.command()
+@json_option
+@click.pass_context
+def doctor(context: click.Context, as_json: bool) -> None:
+    """Show what works on this machine and what to install.
+
+    The exit code is 1 if no backend works.
+
+    \b
+    Examples:
+      eigengs-dr doctor
+      eigengs-dr doctor --json
+    """
+    from ..backend import doctor as doctor_module
+
+    facts = doctor_module.report()
+    click.echo(json.dumps(facts, indent=2) if as_json else doctor_module.describe(facts))
+    context.exit(0 if facts["llvm"]["works"] or facts["cuda"]["works"] else 1)
 
 
 @click.group(cls=Program)

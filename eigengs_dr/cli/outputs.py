@@ -1,13 +1,16 @@
-"""Names of output files, checked before the work starts."""
+"""Names of output files, checked before the work starts, and reports of all figures as JSON."""
 
+import json
+import math
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from ..gaussian.file import FORMAT
 from ..image.remote import stem_of
 from ..storage import npz
-from ..storage.atomic import require_writable
+from ..storage.atomic import atomic_write, require_writable
 from .console import say
 
 
@@ -120,3 +123,37 @@ def keeps_result(
     if not overwrite and not quiet:
         say(f"{output}: exists and is kept; --overwrite fits it again")
     return not overwrite
+
+
+def write_report(path: str | os.PathLike[str], figures: dict[str, Any]) -> None:
+    """Write figures as JSON, all or nothing.
+
+    Parameters
+    ----------
+    path : str or os.PathLike
+        The file to write.
+    figures : dict
+        Strings, numbers (NumPy's too), lists and dictionaries. Infinity (the PSNR of two equal
+        images) and NaN become null, because JSON has neither.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written; an existing file is then unchanged.
+    """
+    text = json.dumps(plain(figures), indent=2, allow_nan=False)
+    with atomic_write(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def plain(value: Any) -> Any:
+    """Convert a value to types of JSON: arrays to lists, infinity and NaN to None."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

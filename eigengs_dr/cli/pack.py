@@ -1,12 +1,15 @@
-"""The command ``eigengs-dr pack``: compress a fitted image."""
+"""The command ``eigengs-dr pack``: compress a fitted image or a material."""
+
+from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..backend.selection import select
 from ..fitting.options import Levels
-from .fit_material import MapFile, MapOption
+from .fit_material import MapFile, MapOption, by_name, load_map
 from .options import (
     ANY_PATH,
     EXISTING,
@@ -18,9 +21,12 @@ from .options import (
     quiet_option,
     report_option,
 )
-from .outputs import check_outputs, name_outputs
-from .pack_material import pack_maps, packing_figures
-from .report import write_report
+from .outputs import check_outputs, name_outputs, write_report
+
+if TYPE_CHECKING:
+    from ..codec.packing import MaterialPackResult, PackResult
+    from ..gaussian.gaussians import Gaussians
+
 
 SUFFIX, BUDGET = ".egs", 0.5
 """Suffix of packed files and default loss in dB; copies, because `eigengs_dr.codec` imports
@@ -127,3 +133,68 @@ def pack(
             f"  lost {receipt.psnr_drop:.2f} dB: {receipt.psnr:.2f} dB in {space} "
             f"against {against}"
         )
+
+
+def pack_maps(
+    file: Path,
+    target: Path,
+    image: Path | None,
+    maps: tuple[MapFile, ...],
+    encoding: str | None,
+    max_psnr_drop: float,
+    levels: Levels,
+    backend: str | None,
+    quiet: bool,
+) -> dict[str, Any]:
+    """Pack a material, and return its figures."""
+    import eigengs_dr as eg
+
+    if image:
+        raise ValueError(f"{file}: holds a material; give its images by --map NAME=FILE")
+    if levels != 1:
+        raise ValueError(f"{file}: a material has no levels in .egs files; leave --levels out")
+    material = eg.Material.load(file, backend)
+    spaces = {m.name: m.space for m in material.maps}
+    named = {
+        name: item._replace(space=item.space or spaces.get(name))
+        for name, item in by_name(maps).items()
+    }
+    images = {name: load_map(item, encoding) for name, item in named.items()} or None
+    try:
+        packed = eg.pack_material(material, target, images, max_psnr_drop, encoding)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+    before = file.stat().st_size
+    if not quiet:
+        shown = ", ".join(f"{name} {psnr:.2f} dB" for name, psnr in packed.psnr.items())
+        against = "the images" if images else "the renderings of the input"
+        click.echo(
+            f"{file}: {len(material.gaussians):,} Gaussians, {before:,} bytes\n"
+            f"  wrote {target}: {packed.bytes:,} bytes, "
+            f"{packed.bits_per_pixel:.3f} bits per pixel for all maps\n"
+            f"  lost {packed.psnr_drop:.2f} dB; psnr_rgb against {against}: {shown}"
+        )
+    return packing_figures(file, target, material.gaussians, max_psnr_drop, packed, "psnr_rgb")
+
+
+def packing_figures(
+    file: Path,
+    target: Path,
+    gaussians: Gaussians,
+    max_psnr_drop: float,
+    packed: PackResult | MaterialPackResult,
+    psnr: str,
+) -> dict[str, Any]:
+    """Return the figures of a report, with the PSNR under a key of its kind."""
+    return {
+        "input": str(file),
+        "output": str(target),
+        "gaussians": len(gaussians),
+        "max_psnr_drop": max_psnr_drop,
+        "bytes_before": file.stat().st_size,
+        "bytes": packed.bytes,
+        "bits_per_pixel": packed.bits_per_pixel,
+        psnr: packed.psnr,
+        "lost": packed.psnr_drop,
+        "steps": packed.steps._asdict(),
+    }

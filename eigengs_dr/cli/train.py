@@ -6,8 +6,7 @@ from typing import Any
 import click
 
 from ..backend.selection import select
-from .cluster import open_cluster
-from .console import INTERRUPTED, progress_bar, say
+from .console import INTERRUPTED, open_cluster, progress_bar, say
 from .options import (
     ANY_PATH,
     COUNTS,
@@ -21,8 +20,7 @@ from .options import (
     report_option,
     seed_option,
 )
-from .outputs import check_outputs, name_outputs
-from .report import write_report
+from .outputs import check_outputs, name_outputs, write_report
 
 FREQUENCY_AWARE: dict[str, bool | str] = {"auto": "auto", "yes": True, "no": False}
 """Values of the option, by the word on the command line."""

@@ -125,7 +125,7 @@ def _load_set(file: Path, name: str | None, count: int, backend: str | None) -> 
     from ..gaussian import file as set_file
     from ..gaussian.gaussians import Gaussians
     from ..material import file as material_file
-    from ..viewer.set_facts import check_count
+    from ..viewer.facts import check_count
 
     try:
         if not count:

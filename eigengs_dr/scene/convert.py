@@ -16,8 +16,8 @@ from ..backend.warn import warn
 from ..gaussian.gaussians import Gaussians
 from ..storage.atomic import refuse_url
 from .bitmaps import KEPT, Parsed, Use, parse, read_pixels, uses_of
-from .compare_renderings import Progress, compare_renderings
 from .fit_scene import SceneFit, fit_for_scene
+from .renderings import Progress, compare_renderings
 
 # isort: split
 import mitsuba as mi

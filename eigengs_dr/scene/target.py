@@ -1,7 +1,15 @@
 """The target of a fit for cameras: the smoothest texture that looks like the image to them.
 
-A smooth texture needs few Gaussians. `eigengs_dr.scene.back_projection` makes it; here it is chosen
-by what the cameras see, and its errors are weighed by how much of a pixel a texel fills.
+Cameras see means over pixels (`eigengs_dr.scene.visibility`): ``R x`` of a texture x. Many textures
+look like the image to all cameras; a smooth one needs few Gaussians. The iteration starts from B x,
+the image blurred by a fraction of the footprint of each texel, and repeats
+
+    t <- t + B R+ (R x - R t).
+
+For each texel, R+ averages the residuals of the pixels that see it. This is a smoothed Landweber
+iteration; in super-resolution it is called back-projection (Irani and Peleg, 1991). The iteration
+restores the details that pixels see, and leaves out the details that no pixel sees. The blur is
+chosen by what the cameras see, and errors are weighed by how much of a pixel a texel fills.
 """
 
 from __future__ import annotations
@@ -16,8 +24,120 @@ from scipy.ndimage import gaussian_filter
 from ..fitting.target import dark_weight
 from ..image.color import to_coded
 from ..plugins.cone import PIXEL
-from .back_projection import back_project, extrapolate
 from .visibility import Visibility
+
+ITERATIONS = 20
+"""Steps of the back-projection."""
+
+Image = NDArray[np.float32]
+
+
+def extrapolate(values: Image, seen: NDArray[np.bool_]) -> Image:
+    """Replace unseen texels of an image by a smooth continuation of the seen ones.
+
+    Push and pull (Gortler et al., The Lumigraph, 1996): each level of a pyramid has the means of
+    the seen texels of the level below, and what is unseen there interpolates the level above. The
+    cost is linear in the texels.
+
+    Parameters
+    ----------
+    values : ndarray of float32, shape (H, W, C)
+    seen : ndarray of bool, shape (H, W)
+        True for at least one texel.
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W, C)
+        Equal to `values` at seen texels.
+    """
+    known = seen[..., None].astype(np.float32)
+    level = np.where(seen[..., None], values, np.float32(0)), known
+    levels = [level]
+    while max(levels[-1][1].shape) > 1:
+        levels.append(_pull(*levels[-1]))
+    filled = levels[-1][0]
+    for mean, share in reversed(levels[:-1]):
+        filled = share * mean + (1 - share) * _push(filled, mean.shape[:2])
+    return np.where(seen[..., None], values, filled)
+
+
+def _pull(mean: Image, share: Image) -> tuple[Image, Image]:
+    """Halve an image: means of its known parts, and how much of 2x2 texels is known, up to 1."""
+    height, width = share.shape[:2]
+    blocks = ((height + 1) // 2, 2, (width + 1) // 2, 2)
+    odd = ((0, height % 2), (0, width % 2), (0, 0))
+
+    def total(image: Image) -> Image:
+        result: Image = np.pad(image, odd).reshape(*blocks, -1).sum(axis=(1, 3))
+        return result
+
+    weight = total(share)
+    mean = (total(mean * share) / np.maximum(weight, 1e-9)).astype(np.float32)
+    return mean, np.minimum(weight, 1).astype(np.float32)
+
+
+def _push(image: Image, shape: tuple[int, ...]) -> Image:
+    """Double an image by linear interpolation between centres of texels, and crop it."""
+    for axis in (0, 1):
+        side = image.shape[axis]
+        at = (np.arange(shape[axis], dtype=np.float32) - 0.5) / 2
+        first = np.floor(at).astype(int)
+        part = (at - first).reshape([-1 if k == axis else 1 for k in range(3)])
+        low, high = (image.take(n.clip(0, side - 1), axis) for n in (first, first + 1))
+        image = low + part * (high - low)
+    return image
+
+
+def back_project(whole: Image, found: Visibility, share: float) -> Image:
+    """Blur an image by a fraction of its footprints, then restore the details that pixels see.
+
+    Parameters
+    ----------
+    whole : ndarray of float32, shape (H, W, C)
+        Image in [0, 1], with the unseen texels from `extrapolate`.
+    found : Visibility
+    share : float
+        Standard deviation of the blur B, as a fraction of that of the footprint.
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W, C)
+        Texture in [0, 1]. Every step clamps it to this range, as the plugin clamps its sums.
+    """
+    blur = _blur_by(np.where(found.seen, found.footprint, np.inf) * share)
+    flat = whole.reshape(-1, whole.shape[2])
+    rows = found.pixel_to_texel
+    goal = [r @ flat for r in rows]
+    weight = np.maximum(sum(np.asarray(r.sum(axis=0)) for r in rows), 1e-9)[:, None]
+    target = blur(whole)
+    for _ in range(ITERATIONS):
+        missed = [g - r @ target.reshape(flat.shape) for g, r in zip(goal, rows, strict=True)]
+        returned = sum(r.T @ m for m, r in zip(missed, rows, strict=True)) / weight
+        target = (target + blur(returned.reshape(whole.shape).astype(np.float32))).clip(0, 1)
+    return target
+
+
+def _blur_by(deviation: NDArray[np.floating]) -> Callable[[Image], Image]:
+    """Return a blur with a different standard deviation, in texels, at every texel.
+
+    The blur interpolates between uniform blurs whose standard deviations differ by sqrt(2). Texels
+    with an infinite deviation get the largest finite one.
+    """
+    finite = np.isfinite(deviation)
+    low, high = float(deviation[finite].min()), float(deviation[finite].max())
+    count = 1 + int(np.ceil(2 * np.log2(high / low) - 1e-3))
+    levels = low * np.sqrt(2) ** np.arange(count)
+    level = 2 * np.log2(np.where(finite, deviation, high) / low)
+
+    def blur(image: Image) -> Image:
+        result = np.zeros_like(image)
+        for number, sigma in enumerate(levels):
+            part = np.maximum(1 - np.abs(level - number), 0).astype(np.float32)[..., None]
+            result += part * gaussian_filter(image, (sigma, sigma, 0), mode="nearest")
+        return result
+
+    return blur
+
 
 BLURS = (0.4, 0.25, 0.15, 0.1)
 """Standard deviations in pixels of the blur of the back-projection. `smoothest_target` takes the
@@ -28,8 +148,6 @@ MARGIN = 6.0
 
 EVEN = 2.0
 """Standard deviation in texels of the blur of the weights, because rays hit texels unevenly."""
-
-Image = NDArray[np.float32]
 
 
 def seen_by(texels: Image, rows: Any, space: str) -> NDArray[Any]:

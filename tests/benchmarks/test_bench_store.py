@@ -183,7 +183,7 @@ except SystemExit:
 
 
 def test_what_to_install_is_said_where_the_benchmarks_are_missing(monkeypatch):
-    monkeypatch.setattr("eigengs_dr.cli.bench.entry_points", lambda **names: [])
+    monkeypatch.setattr("eigengs_dr.cli.main.entry_points", lambda **names: [])
     for arguments in (["bench"], ["bench", "kernels"], ["bench", "--help"]):
         told = run(*arguments)
         assert told.exit_code == 2

@@ -9,7 +9,7 @@ from PIL import Image
 
 from _helpers.command import assert_refused, run, succeeded
 from _helpers.mosaics import mosaic
-from eigengs_dr.cli import memory
+from eigengs_dr.cli import fit_large
 from eigengs_dr.fitting import memory as estimate
 from eigengs_dr.gaussian import file as setfile
 
@@ -37,7 +37,7 @@ def test_fit_by_blocks(photo, tmp_path):
 
 
 def test_blocks_are_chosen_where_memory_says_so(photo, tmp_path, monkeypatch):
-    for module in (memory, estimate):
+    for module in (fit_large, estimate):
         monkeypatch.setattr(module, "usable_memory", lambda: 200_000_000)
     result = succeeded(run("fit", photo, "-o", tmp_path / "x.npz", "--iterations", 2))
     assert "takes too much memory; it is fitted by blocks" in result.stderr

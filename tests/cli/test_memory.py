@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 from _helpers.command import assert_refused, run, succeeded
-from eigengs_dr.cli import memory as announced
-from eigengs_dr.cli.memory import announce_memory
+from eigengs_dr.cli import fit_large as announced
+from eigengs_dr.cli.fit_large import announce_memory
 from eigengs_dr.fitting import memory
 from eigengs_dr.fitting.options import FitOptions
 

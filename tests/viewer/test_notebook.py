@@ -13,7 +13,7 @@ import eigengs_dr as eg
 from _helpers.families import small_basis, small_model
 from _helpers.sets import random_scene
 from eigengs_dr.viewer import notebook
-from eigengs_dr.viewer.curve import draw_curve
+from eigengs_dr.viewer.notebook import draw_curve
 
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "notebook.ipynb"
 

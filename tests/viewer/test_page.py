@@ -7,7 +7,7 @@ import eigengs_dr as eg
 from _helpers.browser import PHONE
 from _helpers.families import family, small_model
 from _helpers.shown import COUNT, SIZE, codes, differ, make_set
-from eigengs_dr.viewer.page import Page
+from eigengs_dr.viewer.view import Page
 
 
 @pytest.mark.parametrize(

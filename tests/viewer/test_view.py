@@ -10,8 +10,8 @@ import eigengs_dr as eg
 from _helpers.families import small_basis, small_model
 from _helpers.sets import random_scene
 from eigengs_dr.fitting.fit import Fit
-from eigengs_dr.viewer import set_facts
-from eigengs_dr.viewer.model_facts import describe_share, kept_counts
+from eigengs_dr.viewer import facts
+from eigengs_dr.viewer.facts import describe_share, kept_counts
 
 
 def make_set(count=20, size=(32, 24)):
@@ -87,7 +87,7 @@ def test_refuses_values_that_are_not_finite():
 
 
 def test_refuses_too_many(monkeypatch):
-    monkeypatch.setattr(set_facts, "MAX_GAUSSIANS", 10)
+    monkeypatch.setattr(facts, "MAX_GAUSSIANS", 10)
     with pytest.raises(ValueError, match="20 Gaussians are too many for a page; the most is 10"):
         eg.view(make_set())
 
@@ -96,8 +96,8 @@ def test_a_page_has_the_components_of_largest_variance(monkeypatch):
     model = small_model("llvm")
     assert kept_counts(model) == [12, 6, 6]
     assert describe_share(model) == ""
-    monkeypatch.setattr("eigengs_dr.viewer.model_facts.FEWEST", 1)
-    monkeypatch.setattr("eigengs_dr.viewer.model_facts.MAX_BYTES", 2 * 101 * 10 + 5)
+    monkeypatch.setattr("eigengs_dr.viewer.facts.FEWEST", 1)
+    monkeypatch.setattr("eigengs_dr.viewer.facts.MAX_BYTES", 2 * 101 * 10 + 5)
     counts = kept_counts(model)
     assert sum(counts) == 10
     kept = np.concatenate([v[:n] for v, n in zip(model.eigenvalues, counts, strict=True)])

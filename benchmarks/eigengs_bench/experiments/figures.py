@@ -16,7 +16,7 @@ from eigengs_bench.harness.timing import Image
 from eigengs_bench.names import CATS, FIGURES, NATURAL
 from eigengs_bench.report.charts import curves_chart, radii_chart, save_figure
 from eigengs_bench.report.frames import remark
-from eigengs_dr.cli.report import write_report
+from eigengs_dr.cli.outputs import write_report
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.eigenbasis.registry import load_basis
 from eigengs_dr.gaussian.gaussians import Gaussians

@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from eigengs_dr.cli.report import plain
+from eigengs_dr.cli.outputs import plain
 
 Row = dict[str, Any]
 Job = tuple[Row, Callable[[], Row]]  # what names a measurement, its seed too, and what makes it

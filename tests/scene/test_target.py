@@ -11,7 +11,7 @@ from _helpers.sets import few
 pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
 
 from _helpers.poster import blocks, photo
-from eigengs_dr.scene.back_projection import _blur_by, back_project, extrapolate
+from eigengs_dr.scene.target import _blur_by, back_project, extrapolate
 from eigengs_dr.scene.visibility import Visibility
 
 pytestmark = pytest.mark.mitsuba

@@ -1,4 +1,4 @@
-"""Renderings of a scene by bitmaps and of the scene by Gaussians, and their difference."""
+"""Renderings of a scene in passes of samples, and pictures of a scene before and after."""
 
 from __future__ import annotations
 
@@ -6,13 +6,53 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from ..image.color import to_coded
 from ..image.io import save_image
 from ..image.metrics import psnr
-from .passes import render_in_passes
+
+SAMPLES_PER_PASS = 1 << 24
+"""Most samples in one pass. The state of a sample takes some 20 bytes; progress and Ctrl-C wait
+for the end of a pass."""
+
+
+def render_in_passes(
+    scene: Any, camera: int, spp: int | None, show: Callable[[int, int], None] = lambda *_: None
+) -> tuple[NDArray[np.float32], int]:
+    """Render a scene by one of its cameras; each pass has its own seed.
+
+    Parameters
+    ----------
+    scene : mitsuba.Scene
+    camera : int
+    spp : int or None
+        Samples per pixel, by default those of the camera.
+    show : callable, optional
+        ``show(done, total)`` after each pass, in samples per pixel.
+
+    Returns
+    -------
+    pixels : ndarray of float32, shape (H, W, C)
+        Linear light, and the channels of AOVs.
+    spp : int
+        Samples per pixel.
+    """
+    sensor = scene.sensors()[camera]
+    width, height = sensor.film().crop_size()
+    total = spp or sensor.sampler().sample_count()
+    most = max(1, SAMPLES_PER_PASS // (width * height))
+    pixels, done = np.zeros(()), 0
+    while done < total:
+        count = min(most, total - done)
+        part = mi.render(scene, sensor=camera, spp=count, seed=done)
+        pixels = pixels + count * np.array(part, np.float64)
+        done += count
+        show(done, total)
+    return (pixels / total).astype(np.float32), total
+
 
 LOUDER = 8.0
 """Factor of the differences in their pictures."""
