@@ -174,9 +174,7 @@ def _start(images: Images, options: FitOptions) -> FitProblem:
     weight = np.stack(weights) if weights else None
     like = _stack(placed, values.shape, options)
     start = solve_batch(like, values, options.solve_steps).gaussians
-    control = _BatchControl(shown, values, weight, options)
-    adaptive = options.initializer == "adaptive"
-    return FitProblem(start, values, weight, control if adaptive else None)
+    return FitProblem(start, values, weight, _BatchControl(shown, values, weight, options))
 
 
 def _stack(placed: list, shape: tuple[int, ...], options: FitOptions) -> Gaussians:
@@ -200,6 +198,11 @@ class _BatchControl(NamedTuple):
     values: Images
     weight: Images | None
     options: FitOptions
+
+    @property
+    def redistributes(self) -> bool:
+        """Whether all sets are placed anew after a first phase."""
+        return self.options.initializer == "adaptive"
 
     def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
         """Place all sets anew, as `eigengs_dr.fitting.redistribute.redistribute` does for one."""

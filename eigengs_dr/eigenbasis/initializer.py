@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..fitting.descent import FitProblem
 from ..fitting.options import DEFAULT_BASIS, FitOptions
 from ..fitting.solvers.conjugate_gradient import solve
+from ..fitting.start import control_for
 from ..fitting.target import FitTarget
 from ..gaussian.gaussians import Gaussians
 from ..image.color import decode
@@ -30,7 +31,7 @@ def start_from_basis(target: FitTarget, options: FitOptions) -> FitProblem:
     _check_basis(model, target.pixels, options.gaussians, options.space)
     encoded = _encode(model, target, options)
     if options.method.mean != "dense":
-        return FitProblem(encoded, target.values, target.weight)
+        return FitProblem(encoded, target.values, target.weight, control_for(target, options))
     dense = model.dense_mean(encoded.width, encoded.height)
     base_image = _picture(dense, options.space)
     return FitProblem(encoded, target.values - dense, target.weight, base_image=base_image)

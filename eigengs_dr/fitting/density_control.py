@@ -53,12 +53,15 @@ class DensityControl:
         The image that places Gaussians.
     solve_steps : int
         Steps of the colour solve after a placement.
+    redistributes : bool
+        Whether the descent may place all Gaussians anew: not where the start is a choice.
     """
 
     target: NDArray[np.float32]
     weight: NDArray[np.float32] | None
     shown: NDArray[np.float32]
     solve_steps: int = 10
+    redistributes: bool = True
 
     def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
         """Place `count` Gaussians anew; see `eigengs_dr.fitting.redistribute.redistribute`."""

@@ -46,6 +46,10 @@ class Control(Protocol):
     `eigengs_dr.fitting.density_control` has those of one image and of levels.
     """
 
+    @property
+    def redistributes(self) -> bool:
+        """Whether all Gaussians are placed anew after a first phase."""
+
     def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
         """Return a new set of `count` Gaussians, denser where the old set left more error."""
 
@@ -128,10 +132,10 @@ def descend(
     Parameters
     ----------
     problem : FitProblem
-        The start and the target. With a control, a first phase shows where error is left, and the
-        other steps start from redistributed Gaussians, see `first_phase`; Gaussians move between
-        steps, see `relocations`; and there are more Gaussians until the last of these moves, see
-        `surplus_for`. These functions are in `eigengs_dr.fitting.schedule`.
+        The start and the target. With a control, Gaussians move between steps, see `relocations`.
+        If it redistributes, a first phase shows where error is left, and the other steps start
+        from redistributed Gaussians, see `first_phase`; there are more Gaussians until the last of
+        the moves, see `surplus_for`. These functions are in `eigengs_dr.fitting.schedule`.
     schedule : Schedule
     iterations : int
         Number of steps, with the first phase.
@@ -155,7 +159,7 @@ def descend(
     with release_later(problem):  # a set of the caller may share NumPy's memory
         yield problem.gaussians
         first = 0 if part is not None else first_phase(schedule, iterations)
-        if problem.control and first:
+        if problem.control and problem.control.redistributes and first:
             for current in _run_phase(problem, schedule, range(first), first):
                 yield current
             iterations, images = iterations - first, number_of_images(problem)

@@ -243,6 +243,7 @@ _ONE_RATE = Schedule(
     decay=1.0,
     warm_up=0,
     drift=4e-3,
+    redistribute_after=0,
     patience=10_000,
 )
 

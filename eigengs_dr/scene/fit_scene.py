@@ -18,6 +18,7 @@ from scipy.ndimage import distance_transform_edt, zoom
 from skimage.transform import resize_local_mean
 
 from ..backend.recording import exclusive
+from ..fitting.density_control import DensityControl
 from ..fitting.descent import FitProblem, run
 from ..fitting.options import PRESETS
 from ..fitting.placement.adaptive import place_adaptive
@@ -225,7 +226,10 @@ def _fit(
     ).bounded()
     start = solve(start, target).gaussians
     schedule = PRESETS["default"].schedule
-    return run(FitProblem(start, target, weight), schedule, iterations)
+    control = DensityControl(target, weight, picture)
+    found = run(FitProblem(start, target, weight, control), schedule, iterations)
+    arrays = found.to_arrays()
+    return found[np.flatnonzero(_reaches_seen(arrays["mean"], arrays["factor"], seen))]
 
 
 def _reaches_seen(

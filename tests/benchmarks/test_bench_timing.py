@@ -62,7 +62,9 @@ def test_programs_that_place_splats_anew_are_compiled_where_a_run_needs_them(
         return gaussians
 
     def start():
-        control = SimpleNamespace(redistribute=rearrange, relocate=placed.control.relocate)
+        control = SimpleNamespace(
+            redistributes=True, redistribute=rearrange, relocate=placed.control.relocate
+        )
         return placed._replace(control=control)
 
     timing.warm_up(start, PRESETS["default"].schedule, iterations)

@@ -164,7 +164,9 @@ def test_lists_are_for_steps_that_are_taken(backend, monkeypatch):
     monkeypatch.setattr(descent, "next_build", note)
     gaussians, target = start(backend)
     problem = FitProblem(
-        gaussians, target, control=SimpleNamespace(relocate=lambda found, how: found)
+        gaussians,
+        target,
+        control=SimpleNamespace(redistributes=False, relocate=lambda found, how: found),
     )
     schedule = default(relocate_every=10)
     list(descend(problem, schedule, 40, part=range(5, 37)))

@@ -45,7 +45,11 @@ def test_fits_that_are_long_enough_rearrange_once():
         return start.control.redistribute(gaussians, count)
 
     schedule = replace(PRESETS["default"].schedule, redistribute_after=2)
-    problem = start._replace(control=SimpleNamespace(redistribute=rearrange))
+    problem = start._replace(
+        control=SimpleNamespace(
+            redistributes=True, redistribute=rearrange, relocate=start.control.relocate
+        )
+    )
     for steps, times in ((2 * MIN_PHASE_RATIO - 1, 0), (2 * MIN_PHASE_RATIO, 1)):
         calls.clear()
         sets = list(descend(problem, schedule, steps))

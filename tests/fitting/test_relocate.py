@@ -129,8 +129,8 @@ def test_a_descent_relocates_and_goes_on():
         calls.append(how.share)
         return start.control.relocate(gaussians, how)
 
-    problem = start._replace(control=SimpleNamespace(relocate=move))
-    schedule = replace(SCHEDULE, relocate_every=15, redistribute_after=0)
+    problem = start._replace(control=SimpleNamespace(redistributes=False, relocate=move))
+    schedule = replace(SCHEDULE, relocate_every=15)
     sets = list(descend(problem, schedule, 75))
     assert (len(sets), calls) == (76, [SCHEDULE.relocate_share] * 3)
     error = [squared_error(s, start.target) for s in (sets[0], sets[-1])]
