@@ -12,6 +12,7 @@ from typing import Any
 
 import lazy_loader
 
+from .backend.feedback import HTML
 from .backend.libllvm import select_libllvm
 from .storage.readers import READERS, Readers
 
@@ -43,16 +44,20 @@ class _Checkout:
 sys.meta_path.append(_Checkout)  # type: ignore[arg-type]
 
 
-def _of_packed_sets(name: str) -> Any:
-    """Return a function of the codec, which is imported when a file needs it."""
-    return lambda *args: resolve_name(f"{__name__}.codec.egs:{name}")(*args)
+def _later(name: str) -> Any:
+    """Return a function of the package, which is imported when it is called."""
+    return lambda *args: resolve_name(f"{__name__}.{name}")(*args)
 
 
-READERS[b"\x89EGS"] = Readers(*map(_of_packed_sets, ("read_set", "read_material", "holds_maps")))
+# Folders that know nothing of the codec and the viewer use them through these two names.
+READERS[b"\x89EGS"] = Readers(
+    *(_later(f"codec.egs:{name}") for name in ("read_set", "read_material", "holds_maps"))
+)
+HTML[:] = [_later("viewer.notebook:to_html")]
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def load_ipython_extension(shell: Any) -> None:
     """Shorten errors in a notebook: what ``%load_ext eigengs_dr`` calls."""
-    resolve_name("eigengs_dr.viewer.short_errors:install")(shell)
+    resolve_name("eigengs_dr.backend.feedback:install")(shell)

@@ -11,9 +11,7 @@ from .eigenbasis.eigengs import EigenGS
 from .eigenbasis.pca.basis import Eigenbasis
 from .fitting.fit import Fit, FitInterrupted, fit
 from .fitting.levels import fit_levels, level_counts
-from .gaussian.concatenate import concatenate
-from .gaussian.gaussians import Gaussians
-from .gaussian.tensors import from_tensors, to_tensors
+from .gaussian.gaussians import Gaussians, concatenate, from_tensors, to_tensors
 from .image.io import load_image, save_image
 from .image.metrics import ms_ssim, psnr, ssim
 from .image.pixels import ImageError, LinearImage

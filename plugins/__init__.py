@@ -11,8 +11,8 @@ except ImportError as error:
 
 from .cone import pixel_angle
 from .environment import bake_environment
+from .gaussian_texture import register_plugins
 from .parameters import gaussians_of, keep_in_bounds, texture_of
-from .registration import register_plugins
 
 __all__ = [
     "bake_environment",

@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from eigengs_dr.backend.arithmetic import rcp
+from eigengs_dr.backend.arrays import rcp
 
 from .versions import footprint_of, has_footprints
 

@@ -8,6 +8,7 @@ derivatives inside a virtual call. So the class below only passes arrays to the 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -15,8 +16,7 @@ import mitsuba as mi
 
 from eigengs_dr.backend.recording import guest, without_collector
 from eigengs_dr.image.color import rendered_as
-from eigengs_dr.raster.layout import pack_parameters
-from eigengs_dr.raster.lookup.coarsen import build_pyramid
+from eigengs_dr.raster.lookup.footprint import arrange
 from eigengs_dr.raster.lookup.points import (
     cell_side,
     fold,
@@ -25,23 +25,36 @@ from eigengs_dr.raster.lookup.points import (
     list_cells,
     sum_at_points,
 )
-from eigengs_dr.raster.lookup.pyramid import pyramid_mean
+from eigengs_dr.raster.lookup.pyramid import build_pyramid, pyramid_mean
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
-from eigengs_dr.raster.lookup.widened import arrange
-from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
+from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, pack_parameters
 from eigengs_dr.raster.render import decode_parameters
 
+from .color import (
+    STEP,
+    is_shown,
+    keep_finite,
+    luminance,
+    show_all,
+    slope_of,
+    upload_table,
+    upsample,
+)
 from .cone import footprint_inputs
-from .derived import derived
-from .emission import emission_of
-from .lookup import sum_here, sum_over_footprint
-from .properties import cutoff, file_name, prefilter, raw, source_of, wrap_mode
-from .reuse import reused
-from .spectrum import STEP, upload_table, upsample
-from .survey import make_survey, outside_of_recordings
-from .transform import prepare, read_transform
-from .values import is_shown, keep_finite, luminance, show_all, slope_of
-from .versions import texture_class
+from .emission import emission_of, make_survey, outside_of_recordings
+from .lookup import reused, sum_here, sum_over_footprint
+from .parameters import derived
+from .properties import (
+    cutoff,
+    file_name,
+    prefilter,
+    prepare,
+    raw,
+    read_transform,
+    source_of,
+    wrap_mode,
+)
+from .versions import register_texture, texture_class
 
 
 def gaussian_texture() -> type:
@@ -313,3 +326,34 @@ class _Refusal:
             f"gaussian_texture does not support the variant {mi.variant()}; "
             "use mi.set_variant('llvm_ad_rgb') or another llvm or cuda variant"
         )
+
+
+def register_plugins() -> None:
+    """Register ``gaussian_texture`` with the current variant of Mitsuba and with later ones.
+
+    Further calls change nothing. In scalar variants, a scene that uses the texture raises an error.
+
+    Raises
+    ------
+    ImportError
+        If Mitsuba is not installed.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg, mitsuba as mi
+    >>> mi.set_variant("llvm_ad_rgb")
+    >>> eg.register_plugins()
+    """
+    _follow()
+    if mi.variant():
+        _register(mi.variant())
+
+
+@cache
+def _follow() -> None:
+    mi.detail.add_variant_callback(lambda old, new: _register(new))
+
+
+@cache
+def _register(variant: str) -> None:
+    register_texture("gaussian_texture", gaussian_texture())

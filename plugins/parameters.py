@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
+from weakref import WeakValueDictionary
 
 import drjit as dr
 import mitsuba as mi
@@ -13,11 +15,11 @@ import numpy as np
 from eigengs_dr.backend.arrays import types_of, upload_tensor
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting.fit import Fit
-from eigengs_dr.gaussian.gaussians import Gaussians
-from eigengs_dr.gaussian.like import set_of
-from eigengs_dr.gaussian.tensors import FIELDS, from_tensors, to_tensors
+from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, from_tensors, set_of, to_tensors
+from eigengs_dr.material.file import holds_material
+from eigengs_dr.material.material import Material
 
-from .shared import SharedFile
+Arrays = dict[str, Any]
 
 
 def texture_of(gaussians: Gaussians | Fit, **properties: Any) -> dict[str, Any]:
@@ -102,6 +104,92 @@ def keep_in_bounds(parameters: Any, texture: str, like: Gaussians) -> None:
 def _found(parameters: Any, texture: str) -> dict[str, Any]:
     keys = {name: f"{texture}.{name}" for name in FIELDS}
     return {name: parameters[key] for name, key in keys.items() if key in parameters}
+
+
+# ---------------------------------------------------------------------------------------------
+#  Files that several textures of a scene use: read once, with one set of lists
+#
+#  Textures of the maps of a material have the same means and shapes. While no texture changes
+#  them, all textures of a file use one array of means, one of shapes, and the same lists.
+# ---------------------------------------------------------------------------------------------
+
+
+SHAPES = ("mean", "factor")
+"""Parameters that the maps of a material share."""
+
+
+class SharedFile:
+    """The content of a file, and what textures of it share.
+
+    Attributes
+    ----------
+    content : Gaussians or Material
+    tensors : dict of str to TensorXf
+        Mean (N, 2) and factor (N, 3).
+    lists : dict
+        Lists of Gaussians that a texture has made.
+    """
+
+    def __init__(self, path: str, backend: str, first: int | None) -> None:
+        self.path = path
+        self.content: Gaussians | Material
+        if holds_material(path):
+            self.content = Material.load(path, backend)
+            if first is not None:
+                self.content = self.content.first(first)
+        else:
+            self.content = Gaussians.load(path, backend)[:first]
+        shaped = self.content.gaussians if isinstance(self.content, Material) else self.content
+        self.tensors = {name: to_tensors(shaped)[name] for name in SHAPES}
+        self.lists: dict[Any, Any] = {}
+
+    def map(self, name: str | None) -> Gaussians:
+        """Return the set of a map, or of the whole file.
+
+        Raises
+        ------
+        ValueError
+            If the file holds maps and no name is given, has no such map, or holds no maps.
+        """
+        if isinstance(self.content, Material):
+            names = ", ".join(self.content)
+            if name is None or name not in list(self.content):
+                missing = "holds maps; say which by" if name is None else f"has no map {name!r};"
+                raise ValueError(f"gaussian_texture: {self.path} {missing} map = one of {names}")
+            return self.content[name]
+        if name is not None:
+            raise ValueError(
+                f"gaussian_texture: {self.path} holds one image and no map {name!r}; leave map out"
+            )
+        return self.content
+
+    def holds(self, tensors: dict[str, Any]) -> bool:
+        """Return whether tensors have the memory of the file: nobody has changed them."""
+        return all(tensors[k].array.index == self.tensors[k].array.index for k in SHAPES)
+
+    def listed(self, key: Any, build: Callable[[], Any]) -> Any:
+        """Return the lists of a kind; the first call makes them."""
+        if key not in self.lists:
+            self.lists[key] = build()
+        return self.lists[key]
+
+
+_files: WeakValueDictionary[tuple, SharedFile] = WeakValueDictionary()
+"""The files of living textures; the textures hold them."""
+
+
+def shared_file(path: str, backend: str, first: int | None) -> SharedFile:
+    """Return the content of a file; while a texture uses it, the file is not read again.
+
+    A file that has changed on disk counts as another one. For errors see `Gaussians.load`.
+    """
+    state = os.stat(path)
+    identity = (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns)
+    key = (*identity, mi.variant(), backend, first)
+    found = _files.get(key)
+    if found is None:
+        found = _files[key] = SharedFile(path, backend, first)
+    return found
 
 
 @dataclass(init=False)
@@ -223,3 +311,67 @@ class FromModel:
 
 def _run(row: int, length: int) -> Any:
     return dr.arange(mi.UInt32, length) + row * length
+
+
+# ---------------------------------------------------------------------------------------------
+#  What lookups read, one operation of the graph of derivatives
+#
+#  `mitsuba.render` differentiates the renderer as one operation whose inputs are the parameters.
+#  In forward mode, the derivatives of all that textures have computed from them must be known by
+#  then. Dr.Jit walks from the parameters to the operations in the order in which these were made.
+#  So one operation, made before the rendering, must lead from the parameters to all that lookups
+#  read: of a chain of several, only the first would come before the renderer, and the derivative
+#  be 0.
+# ---------------------------------------------------------------------------------------------
+
+
+def derived(inputs: Arrays, compute: Callable[[Arrays], Arrays]) -> Arrays:
+    """Return ``compute(inputs)``; derivatives flow through one operation, in both modes.
+
+    Parameters
+    ----------
+    inputs : dict of str to TensorXf
+    compute : callable
+        Returns a dict of arrays.
+    """
+    if not dr.grad_enabled(inputs):
+        return compute(inputs)
+    return dr.custom(_Derived, inputs, compute)
+
+
+class _Derived(dr.CustomOp):
+    """The operation of `derived`: it keeps the graph of its own and walks it in both modes."""
+
+    def eval(self, inputs: Arrays, compute: Callable[[Arrays], Arrays]) -> Arrays:
+        """Compute the arrays; `inputs` come without their derivatives."""
+        self.inputs = {name: type(value)(value) for name, value in inputs.items()}
+        with dr.resume_grad():
+            dr.enable_grad(self.inputs)
+            self.outputs = compute(self.inputs)
+        return dr.detach(self.outputs)
+
+    def forward(self) -> None:
+        """Push the derivatives of the parameters through the graph."""
+        if "values" in self.outputs:  # loops of a pyramid, which Dr.Jit 1.5 walks backward only
+            raise RuntimeError(
+                "gaussian_texture: no forward mode with a prefilter; use drjit.backward, or "
+                "prefilter = 0"
+            )
+        dr.set_grad(self.inputs, self.grad_in("inputs"))
+        self.set_grad_out(self._walk(dr.ADMode.Forward, self.inputs, self.outputs))
+
+    def backward(self) -> None:
+        """Pull the derivatives of the results back."""
+        dr.set_grad(self.outputs, self.grad_out())
+        self.set_grad_in("inputs", self._walk(dr.ADMode.Backward, self.outputs, self.inputs))
+
+    def _walk(self, mode: Any, source: Arrays, target: Arrays) -> Arrays:
+        dr.enqueue(mode, source)
+        dr.traverse(mode, dr.ADFlag.ClearInterior | dr.ADFlag.ClearInput)
+        found = dr.grad(target)
+        dr.clear_grad(target)
+        return found
+
+    def name(self) -> str:
+        """Return the name for graphs of Dr.Jit."""
+        return "gaussian_texture"

@@ -174,8 +174,8 @@ def test_names_are_where_the_manual_says():
     check = runpy.run_path(str(FOLDER / "check_names.py"))
     assert check["missing"]() == []
     assert check["exists"]("eigengs_dr.fitting.placement.density.target_density")
-    assert not check["exists"]("eigengs_dr.fitting.redistribute.target_density")
-    assert not check["exists"]("eigengs_dr.fitting.redistribute.nothing")
+    assert not check["exists"]("eigengs_dr.fitting.placement.adaptive.target_density")
+    assert not check["exists"]("eigengs_dr.fitting.placement.adaptive.nothing")
 
 
 def test_the_manual_counts_builds_of_lists():

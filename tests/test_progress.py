@@ -7,7 +7,7 @@ import time
 import pytest
 
 import eigengs_dr as eg
-from eigengs_dr.backend import display
+from eigengs_dr.backend import feedback as display
 
 QUICK = {"gaussians": 30, "iterations": 10}
 

@@ -1,11 +1,10 @@
-"""Dr.Jit on this machine.
+"""Dr.Jit on this machine, and the person in front of it.
 
 - ``libllvm``: finds a libLLVM that works, before Dr.Jit loads one
 - ``selection``: picks llvm or cuda
-- ``arithmetic``: functions that cuda approximates too coarsely
-- ``arrays``: array types that go together; copies of NumPy arrays
+- ``arrays``: array types that go together; copies of NumPy arrays; exact arithmetic on cuda
 - ``recording``: frozen programs; one thread at a time
-- ``interrupt``: Ctrl-C and SIGTERM between steps
+- ``feedback``: bars, warnings, Ctrl-C and SIGTERM between steps, pictures and errors in a notebook
 - ``executor``: where tasks run, in this process or on a cluster
 - ``doctor``: what works here and what to install
 """

@@ -12,8 +12,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from .feedback import warn
 from .libllvm import MIN_VERSION, advice, load_failure, loaded_path
-from .warn import warn
 
 UNTESTED_ON_GPU = "tested with a simulated driver only, not yet on a GPU"
 """State of the cuda backend, until the whole suite has passed on a GPU."""

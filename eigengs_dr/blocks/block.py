@@ -24,9 +24,8 @@ from ..backend.recording import exclusive
 from ..fitting.density_control import Part, PartControl
 from ..fitting.descent import FitProblem, run
 from ..fitting.options import FitOptions
-from ..fitting.placement.adaptive import density_from_hessian
+from ..fitting.placement.adaptive import density_from_hessian, residual, squared_error
 from ..fitting.placement.density import density_ratio, nearest_center, scale_by_owner
-from ..fitting.redistribute import residual, squared_error
 from ..fitting.solvers.conjugate_gradient import solve
 from ..fitting.target import BRIGHT, WHITE, FitTarget, make_target, read_data, unit_of
 from ..gaussian.file import SetData

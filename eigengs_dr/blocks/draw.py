@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian.crop import crop
-from ..gaussian.file import SetData
+from ..gaussian.file import SetData, crop
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
 from ..image.io import bits_of, dtype_of, to_file, write_pixels

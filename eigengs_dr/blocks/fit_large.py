@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..backend.display import shows_progress
 from ..backend.executor import executor_for
-from ..backend.interrupt import defer_interrupts
+from ..backend.feedback import defer_interrupts, shows_progress
 from ..backend.selection import select
 from ..fitting.options import FitOptions, named_options
 from ..gaussian.file import CUTOFF, SetData, check_suffix, write

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian.crop import crop, reaches
-from ..gaussian.file import CUTOFF, SetData
+from ..gaussian.file import CUTOFF, SetData, crop, reaches
 from .grid import Block, neighbors
 
 Arrays = dict[str, NDArray[Any]]

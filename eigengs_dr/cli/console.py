@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from ..backend.executor import ClusterError
-from ..backend.interrupt import terminate_as_interrupt
+from ..backend.feedback import terminate_as_interrupt
 from ..backend.selection import BackendError
 
 NAME = "eigengs-dr"

@@ -147,7 +147,7 @@ def _render(
     mi: Any, path: Path, spp: int | None, parameters: dict[str, str], show: Callable[..., None]
 ) -> tuple[Any, int]:
     """Render a scene in passes; return its pixels, shape (H, W, C), and the samples per pixel."""
-    from ..scene.renderings import render_in_passes
+    from ..scene.convert import render_in_passes
 
     scene = mi.load_file(str(path), **parameters)
     if not isinstance(scene, mi.Scene):

@@ -12,7 +12,7 @@ from pathlib import Path
 from distributed import Client, LocalCluster
 
 from ..backend.executor import ClusterError
-from ..backend.interrupt import defer_interrupts
+from ..backend.feedback import defer_interrupts
 
 CONNECT_SECONDS = 30.0
 """Time for the scheduler to answer."""

@@ -14,7 +14,7 @@ from distributed import Client, Future
 from distributed.scheduler import KilledWorker
 
 from ..backend.executor import ClusterError, Done, Function
-from ..backend.interrupt import terminate_as_interrupt
+from ..backend.feedback import terminate_as_interrupt
 from .worker import WorkerSetup, versions
 
 AHEAD = 2

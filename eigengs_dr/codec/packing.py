@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import types_of
-from ..backend.display import to_html
+from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..fitting.fit import Fit
-from ..gaussian.gaussians import Gaussians
-from ..gaussian.like import set_of
+from ..gaussian.gaussians import Gaussians, set_of
 from ..image.color import LIGHT, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_coded, to_linear
 from ..image.io import read_image
 from ..image.metrics import MAX_PSNR, psnrs_by_rows

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..backend.executor import Executor
+from ..backend.feedback import warn
 from ..backend.recording import exclusive
-from ..backend.warn import warn
 from ..fitting.fit import Fit
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians

@@ -17,26 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import types_of, upload
-from ..backend.interrupt import defer_interrupts
+from ..backend.feedback import defer_interrupts
 from ..backend.recording import exclusive
 from ..fitting.density_control import relocate
 from ..fitting.descent import FitProblem, run
 from ..fitting.fit import Fit
 from ..fitting.options import FitOptions
-from ..fitting.placement.adaptive import place_adaptive
-from ..fitting.redistribute import density_for_error, squared_error
+from ..fitting.placement.adaptive import density_for_error, place_adaptive, squared_error
 from ..fitting.refine import is_plateau, trace_steps
 from ..fitting.schedule import Relocation, Schedule
 from ..fitting.solvers.conjugate_gradient import solve_batch
 from ..fitting.start import PLACEMENTS
 from ..fitting.target import make_target
-from ..gaussian.gaussians import Gaussians
-from ..gaussian.like import like
+from ..gaussian.gaussians import Gaussians, like
 from ..image.color import from_sum, to_picture
 from ..image.metrics import float_space, psnr
 from ..raster.kernels import forward
-from ..raster.layout import pack_parameters
-from ..raster.parameters import kernel_parameters, kernel_radius
+from ..raster.parameters import kernel_parameters, kernel_radius, pack_parameters
 from ..raster.render import batch_from_tiles, bin_gaussians, decode_parameters
 
 Images = NDArray[np.float32]
@@ -205,7 +202,7 @@ class _BatchControl(NamedTuple):
         return self.options.initializer == "adaptive"
 
     def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
-        """Place all sets anew, as `eigengs_dr.fitting.redistribute.redistribute` does for one."""
+        """Place all sets anew, as `redistribute` does for one."""
         shown, values, weight, options = self
         missed = values - _sum(replace(gaussians, space="data"), len(values))
         means = _numpy(gaussians.mean).reshape(len(values), -1, 2)

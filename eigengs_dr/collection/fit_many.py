@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..backend.display import shows_progress
+from ..backend.feedback import shows_progress
 from ..backend.selection import select
 from ..fitting.fit import Fit, fit_image
 from ..fitting.levels import check_options, fit_levels

@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ..backend.interrupt import defer_interrupts
+from ..backend.feedback import defer_interrupts
 from ..gaussian.file import write
 from ..gaussian.gaussians import Gaussians
 from .read_ahead import Decoded, read_ahead

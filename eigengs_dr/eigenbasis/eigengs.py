@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.display import shows_progress, to_html
+from ..backend.feedback import shows_progress, to_html
 from ..backend.recording import exclusive
 from ..collection.row import ImageRow
 from ..collection.sources import Images

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.warn import warn
+from ..backend.feedback import warn
 from ..image.io import ImageError, check_image, load_image
 from ..image.metrics import psnr
 from ..image.resize import center_crop

@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..backend.executor import executor_for
-from ..backend.interrupt import defer_interrupts
-from ..backend.warn import warn
+from ..backend.feedback import defer_interrupts, warn
 from ..image.folder import list_images, read_blocks
 from ..image.io import ImageError
 from ..image.remote import is_url

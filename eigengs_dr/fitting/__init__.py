@@ -5,12 +5,12 @@
 - ``target``: the pixels, and the same in the space of the colours
 - ``start``: placement and colours
 - ``descent``: gradient descent: the problem, the driver and the program of one step
-- ``schedule``, ``parameterization``, ``optimizers``: rates and rounds, variables, Adam and Adan
+- ``schedule``: rates and rounds
+- ``parameterization``: the variables that are moved; Adam and Adan
 - ``density_control``: Gaussians that leave, move and are added
-- ``redistribute``: a placement by the error
 - ``refine``: a descent with a trace
 - ``search``: the smallest number of Gaussians for a PSNR
 - ``levels``: levels of detail
-- ``placement``: where Gaussians start (NumPy)
+- ``placement``: where Gaussians start, and start anew by the error of a fit
 - ``solvers``: colours by linear least squares
 """

@@ -11,12 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian.concatenate import concatenate
-from ..gaussian.gaussians import Gaussians
-from ..gaussian.like import like
+from ..gaussian.gaussians import Gaussians, concatenate, like
 from ..image.resize import resample
+from .placement.adaptive import redistribute, residual
 from .placement.peaks import residual_peaks
-from .redistribute import redistribute, residual
 from .schedule import Relocation
 from .solvers.conjugate_gradient import solve
 from .solvers.matrix_products import inner_products
@@ -64,7 +62,7 @@ class DensityControl:
     redistributes: bool = True
 
     def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
-        """Place `count` Gaussians anew; see `eigengs_dr.fitting.redistribute.redistribute`."""
+        """Place `count` Gaussians anew, see `redistribute`."""
         return redistribute(
             gaussians, count, self.shown, self.target, self.weight, self.solve_steps
         )

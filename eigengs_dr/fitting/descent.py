@@ -21,8 +21,7 @@ from ..gaussian.gaussians import Gaussians
 from ..raster.adjoint import adjoint_pieces, sum_pieces
 from ..raster.binning.lists import TileLists
 from ..raster.kernels import residual, sum_lanes
-from ..raster.layout import pack_parameters
-from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
+from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
 from ..raster.render import batch_to_tiles, bin_gaussians
 from .parameterization import Parameterization
 from .schedule import (

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.display import shows_progress, to_html
-from ..backend.interrupt import defer_interrupts
+from ..backend.feedback import defer_interrupts, shows_progress, to_html
 from ..backend.recording import exclusive
 from ..gaussian.file import CUTOFF, FitFigures, write
 from ..gaussian.gaussians import Gaussians

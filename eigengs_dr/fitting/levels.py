@@ -19,16 +19,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..backend.display import shows_progress
-from ..backend.interrupt import defer_interrupts
+from ..backend.feedback import defer_interrupts, shows_progress
 from ..backend.recording import exclusive
-from ..gaussian.concatenate import concatenate
-from ..gaussian.gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians, concatenate
 from .density_control import LevelControl, removal_cost
 from .descent import FitProblem, run
 from .fit import Fit, finish
 from .options import FitOptions, Levels, named_options
-from .redistribute import place_like, residual
+from .placement.adaptive import place_like, residual
 from .refine import FitProgress, Refinement, Score, measure, refine
 from .schedule import Schedule
 from .start import start_from_placement

@@ -17,7 +17,7 @@ from ..gaussian.file import CUTOFF, MAX_CUTOFF
 from ..image.color import SPACES
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import check_encoding
-from ..raster.limits import check_index_range
+from ..raster.binning.tiles import check_index_range
 from .schedule import Schedule
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import MAX_PSNR, float_space, psnrs_by_rows
-from ..raster.picture import picture_rows
+from ..raster.render import picture_rows
 from .density_control import prune
 from .descent import FitProblem, run
 from .schedule import Schedule
@@ -82,7 +82,7 @@ def refine(
         to end the refinement.
     interrupted : callable, optional
         Called before every step; True ends the refinement. See
-        `eigengs_dr.backend.interrupt.defer_interrupts`.
+        `eigengs_dr.backend.feedback.defer_interrupts`.
     score : callable, optional
         ``score(gaussians)`` returns a row of the trace without its iteration, by default that of
         `measure`. Its psnr_ycbcr decides which set is the best.

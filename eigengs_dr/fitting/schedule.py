@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from .optimizers import Optimizer
-    from .parameterization import Parameterization
+    from .parameterization import Optimizer, Parameterization
 
 
 OPTIMIZERS = {
-    "adam": "eigengs_dr.fitting.optimizers:Adam",
-    "adan": "eigengs_dr.fitting.optimizers:Adan",
+    "adam": "eigengs_dr.fitting.parameterization:Adam",
+    "adan": "eigengs_dr.fitting.parameterization:Adan",
 }
 """Optimisers by name: each entry makes an `Optimizer` by ``entry(**settings)``."""
 

@@ -2,7 +2,7 @@
 
 The search has three stages. *Estimate*: short descents with few Gaussians ("tries") estimate the
 number. Two tries measure the gain per doubling; each try shows where to place the Gaussians of the
-next one (`eigengs_dr.fitting.redistribute`). *Fit*: a longer descent with the estimated number.
+next one (`eigengs_dr.fitting.placement.adaptive`). *Fit*: a longer descent with the estimate.
 *Polish*: density control (`eigengs_dr.fitting.density_control`) drops Gaussians while the set meets
 the goal and adds Gaussians while it does not; each change ends with a short descent.
 """

@@ -1,9 +1,6 @@
 """The representation: sets of 2D Gaussians.
 
-- ``gaussians``: the set
-- ``bounds``: the bounds of its parameters
-- ``concatenate``: joining sets; ``like``: other Gaussians for the same image
+- ``gaussians``: the set, its bounds, its tensors; several sets as one
 - ``covariance``: factors, Cholesky factors, logarithms, eigenvalues
-- ``tensors``: sets as tensors
-- ``file``: the .npz file, and what makes a set valid
+- ``file``: the .npz file, what makes a set valid, and the part that a region shows
 """

@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arithmetic import rsqrt
+from ..backend.arrays import rsqrt
 
 Array = NDArray[np.floating]
 

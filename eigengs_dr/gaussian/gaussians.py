@@ -1,8 +1,12 @@
-"""Sets of 2D Gaussians: parameters, bounds, and operations on whole sets."""
+"""Sets of 2D Gaussians: parameters, bounds, and operations on whole sets.
+
+A set comes from NumPy arrays, a file, tensors of Dr.Jit, or several sets that are joined.
+"""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import index
 from pathlib import Path
@@ -13,12 +17,15 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..backend.arrays import types_in, types_of, upload, upload_rows
-from ..backend.display import to_html
+from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..backend.selection import select
 from ..storage.npz import BadValue
-from .bounds import clip_parameters
 from .file import CUTOFF, SetData, check, read, write
+
+MIN_DEVIATION = 0.25
+"""Smallest standard deviation along an axis of the factor, in pixels. A narrower Gaussian can fall
+between pixel centres, where it has no gradient."""
 
 
 @dataclass(repr=False, eq=False)
@@ -241,7 +248,7 @@ class Gaussians:
 
     @exclusive()
     def bounded(self, size: tuple[Any, Any] | None = None) -> Gaussians:
-        """Clip every parameter to its bounds, see `eigengs_dr.gaussian.bounds.clip_parameters`.
+        """Clip every parameter to its bounds, see `eigengs_dr.gaussian.gaussians.clip_parameters`.
 
         Parameters
         ----------
@@ -299,6 +306,43 @@ class Gaussians:
         return cls.from_data(read(Path(path), sections), backend, dtype)
 
 
+def clip_parameters(
+    mean: Any, factor: Any, color: Any, background: Any, width: Any, height: Any
+) -> tuple[Any, Any, Any, Any]:
+    """Return the parameters of Gaussians within their bounds.
+
+    A mean lies in the image. a and c lie between 1 / (twice the longer side) and
+    1 / `MIN_DEVIATION`, and b within +-1 / `MIN_DEVIATION`. A mean that is not finite becomes the
+    centre of the image, a and c become 1 / `MIN_DEVIATION`, b and colours become 0.
+
+    Parameters
+    ----------
+    mean, factor, color, background
+        See `eigengs_dr.Gaussians`.
+    width, height : Float, shape (1,)
+        Native size in pixels.
+    """
+    types = types_of(mean)
+    # In double precision, because cuda divides approximately in single.
+    longer = dr.float64_array_t(types.Float)(dr.maximum(width, height))
+    low, high = types.Float(0.5 / longer), 1 / MIN_DEVIATION
+
+    def inside(x: Any, low: Any, high: Any, otherwise: Any) -> Any:
+        return dr.select(dr.isfinite(x), dr.clip(x, low, high), otherwise)
+
+    a, b, c = factor
+    return (
+        types.Float2(
+            inside(mean[0], 0.0, width, 0.5 * width), inside(mean[1], 0.0, height, 0.5 * height)
+        ),
+        types.Float3(
+            inside(a, low, high, high), inside(b, -high, high, 0.0), inside(c, low, high, high)
+        ),
+        dr.select(dr.isfinite(color), color, 0),
+        dr.select(dr.isfinite(background), background, 0),
+    )
+
+
 def broadcast(row: Any, count: int) -> Any:
     """Repeat a row with a single entry `count` times."""
     return row + dr.zeros(type(row), count)
@@ -312,3 +356,187 @@ def _rows(rows: Any, count: int) -> NDArray[Any]:
     """Stack Dr.Jit rows, which may have a single entry, to an array of shape (count, rows)."""
     columns = [np.broadcast_to(dr.detach(row).numpy(), count) for row in rows]
     return np.stack(columns, axis=1)
+
+
+@exclusive()
+def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
+    """Join sets and add their backgrounds: the result renders as the sum of the sets.
+
+    Parameters
+    ----------
+    sets : sequence of Gaussians
+        At least one. All have the same native size, space, cutoff, channels and backend.
+
+    Returns
+    -------
+    Gaussians
+        The Gaussians of the first set, then those of the second, and so on. A single set is
+        returned as it is.
+
+    Raises
+    ------
+    ValueError
+        If there are no sets, or they differ in one of these properties.
+    """
+    if not sets:
+        raise ValueError("concatenate: no sets were given; pass at least one")
+    first = sets[0]
+    kinds = {(g.width, g.height, g.space, g.cutoff, g.channels, type(g.mean)) for g in sets}
+    if len(kinds) > 1:
+        raise ValueError(
+            "concatenate: sets differ in size, space, cutoff, channels or backend; "
+            "bring them to one size with scaled() first"
+        )
+    if len(sets) == 1:
+        return first
+
+    def join(name: str) -> Any:
+        parts = [getattr(g, name) for g in sets]
+        rows = [
+            dr.concat([broadcast(part[k], len(g)) for part, g in zip(parts, sets, strict=True)])
+            for k in range(len(parts[0]))
+        ]
+        return type(parts[0])(*rows) if name != "color" else type(parts[0])(rows)
+
+    return replace(
+        first,
+        mean=join("mean"),
+        factor=join("factor"),
+        color=join("color"),
+        background=sum((g.background for g in sets[1:]), first.background),
+    )
+
+
+def like(
+    gaussians: Gaussians,
+    mean: ArrayLike,
+    factor: ArrayLike,
+    color: ArrayLike,
+    background: ArrayLike | None = None,
+) -> Gaussians:
+    """Create a set from NumPy arrays, with the size, space, cutoff and backend of another set.
+
+    For the arrays and errors see `eigengs_dr.Gaussians.from_arrays`.
+    """
+    return Gaussians.from_arrays(
+        mean,
+        factor,
+        color,
+        background,
+        size=(gaussians.width, gaussians.height),
+        space=gaussians.space,
+        backend=types_of(gaussians.mean).backend,
+        cutoff=gaussians.cutoff,
+    )
+
+
+def set_of(source: Any) -> Gaussians:
+    """Return a set, or the set of a fit.
+
+    Raises
+    ------
+    TypeError
+        If the source is something else.
+    ValueError
+        If the fit has a mean image of pixels, which the set lacks.
+    """
+    if isinstance(source, Gaussians):
+        return source
+    if not hasattr(source, "trace") or not hasattr(source, "gaussians"):
+        raise TypeError(f"{type(source).__name__} is no set of Gaussians; pass Gaussians or a Fit")
+    if source.mean_image is not None:
+        raise ValueError("the fit has a mean image of pixels, which its set lacks; use .gaussians")
+    found: Gaussians = source.gaussians
+    return found
+
+
+FIELDS = {"mean": 2, "factor": 3, "color": 0, "background": 0}
+"""Parameters of a set, with their numbers of columns; 0 means the number of channels."""
+
+
+@exclusive()
+def to_tensors(gaussians: Gaussians) -> dict[str, Any]:
+    """Return the parameters of a set as tensors; differentiable.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+
+    Returns
+    -------
+    dict of str to TensorXf
+        mean (N, 2), factor (N, 3), color (N, C) and background (C,), as in
+        `Gaussians.from_arrays`.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg
+    >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
+    >>> {name: tensor.shape for name, tensor in eg.to_tensors(g).items()}
+    {'mean': (1, 2), 'factor': (1, 3), 'color': (1, 1), 'background': (1,)}
+    """
+    types = types_of(gaussians.mean)
+    tensors = {}
+    for name in FIELDS:
+        rows = getattr(gaussians, name)
+        count = 1 if name == "background" else len(gaussians)
+        whole = type(rows)([row + dr.zeros(types.Float, count) for row in rows])
+        tensors[name] = types.Tensor(dr.ravel(whole, order="F"), (count, len(rows)))
+    tensors["background"] = tensors["background"][0]
+    return tensors
+
+
+@exclusive()
+def from_tensors(tensors: Mapping[str, Any], like: Gaussians) -> Gaussians:
+    """Create a set from tensors; differentiable. The inverse of `to_tensors`.
+
+    Parameters
+    ----------
+    tensors : mapping of str to TensorXf
+        Any of mean, factor, color and background, with the shapes that `to_tensors` returns. Other
+        keys are ignored.
+    like : Gaussians
+        Set that gives the size, the space, the cutoff and the parameters that `tensors` lacks.
+
+    Returns
+    -------
+    Gaussians
+        Values are not checked; `Gaussians.bounded` clips them.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit each other.
+    TypeError
+        If a value is no tensor of Dr.Jit.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg
+    >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
+    >>> brighter = eg.from_tensors({"color": 2 * eg.to_tensors(g)["color"]}, like=g)
+    """
+    given = {name: tensors[name] for name in FIELDS if name in tensors}
+    counts = [given[name].shape[0] for name in ("mean", "factor", "color") if name in given]
+    # The number of Gaussians may only differ from `like` if all of its Gaussians are replaced.
+    count = max(counts) if len(counts) == 3 else len(like)
+    for name, tensor in given.items():
+        if not dr.is_tensor_v(tensor):
+            raise TypeError(
+                f"{name} is a {type(tensor).__module__}.{type(tensor).__name__}, expected a tensor "
+                "of Dr.Jit; drjit.wrap makes them for functions of PyTorch and JAX"
+            )
+        columns = FIELDS[name] or like.channels
+        expected = (columns,) if name == "background" else (count, columns)
+        if tuple(tensor.shape) != expected or not count:
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {expected}")
+    return replace(like, **{name: _columns_of(getattr(like, name), t) for name, t in given.items()})
+
+
+def _columns_of(like: Any, tensor: Any) -> Any:
+    """Return the columns of a tensor as a nested array with the type of `like`."""
+    types = types_of(like)
+    number = tensor.shape[-1]
+    values = types.Float(tensor.array)  # of another precision, perhaps
+    index = dr.arange(types.UInt, dr.width(values) // number) * number
+    return type(like)([dr.gather(types.Float, values, index + k) for k in range(number)])

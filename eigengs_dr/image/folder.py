@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.warn import warn
+from ..backend.feedback import warn
 from .io import SUFFIXES, ImageError, check_image, load_image
 from .planes import BASIS_SPACES, check_size, to_planes
 from .remote import is_url, list_urls

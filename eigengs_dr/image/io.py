@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.warn import warn
+from ..backend.feedback import warn
 from ..storage.atomic import atomic_write, refuse_url
 from .color import to_coded, to_linear
 from .formats.openimageio import ADVICE, is_installed

@@ -48,7 +48,7 @@ def unit_codes(channels: Sequence[Any]) -> list[Any]:
     else:
         import drjit as dr
 
-        from ..backend.arithmetic import rsqrt
+        from ..backend.arrays import rsqrt
 
         scale = 0.5 * rsqrt(dr.maximum(square, SHORTEST))
     return [v * scale + 0.5 for v in vector]

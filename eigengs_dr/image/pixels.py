@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.warn import warn
+from ..backend.feedback import warn
 from .color import to_coded
 from .strips import by_strips, map_threads, strips
 

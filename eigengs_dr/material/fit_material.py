@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.display import shows_progress, to_html
-from ..backend.interrupt import defer_interrupts
+from ..backend.feedback import defer_interrupts, shows_progress, to_html
 from ..backend.recording import exclusive
 from ..fitting.fit import FitInterrupted
 from ..fitting.levels import check_options, refine_levels
 from ..fitting.options import FitOptions, Levels, named_options
-from ..fitting.redistribute import residual
+from ..fitting.placement.adaptive import residual
 from ..fitting.refine import FitProgress, Refinement, Score, refine
 from ..fitting.search import search_count
 from ..fitting.start import start_from_placement

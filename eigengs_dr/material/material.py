@@ -12,7 +12,7 @@ import drjit as dr
 from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
-from ..backend.display import to_html
+from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
 from ..raster.render import render

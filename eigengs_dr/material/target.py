@@ -16,7 +16,7 @@ from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
 from ..image.metrics import float_space, psnrs_by_rows, target_key
 from ..image.pixels import ImageError
-from ..raster.picture import picture_rows
+from ..raster.render import picture_rows
 from ..storage.npz import BadValue
 from .maps import TextureMap, check_maps, check_name, show_sums, slices, usual_space
 

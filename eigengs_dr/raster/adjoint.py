@@ -10,8 +10,7 @@ from ..backend.arrays import types_of
 from .binning.lists import Pieces, TileLists
 from .evaluate import weights, weights_vjp
 from .kernels import shares_of
-from .layout import gather_index, gather_run, unpack_parameters
-from .parameters import NUM_SHAPE_PARAMS
+from .parameters import NUM_SHAPE_PARAMS, gather_index, gather_run, unpack_parameters
 
 
 def adjoint(

@@ -12,8 +12,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..backend.arithmetic import rcp, rsqrt
-from ..backend.arrays import types_of
+from ..backend.arrays import rcp, rsqrt, types_of
 
 LN2 = math.log(2)
 
@@ -163,7 +162,7 @@ def is_steep(shape: list, radius: float) -> Any:
     ``|u| <= radius + 2 a + 2 |b|`` in the row where the ratios start. The exponents of the weight
     there, ``u^2 + v^2``, and of the ratio, ``2 a u + a^2``, must stay below 126; `STEEP` leaves
     room for Gaussians that shrink until the next test. Gaussians within their bounds, see
-    `eigengs_dr.gaussian.bounds`, reach 121.2 at a cutoff of 3: a fit has no steep Gaussian.
+    `eigengs_dr.gaussian.gaussians`, reach 121.2 at a cutoff of 3: a fit has no steep Gaussian.
 
     Parameters
     ----------

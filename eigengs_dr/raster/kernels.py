@@ -14,12 +14,10 @@ from typing import Any, NamedTuple
 import drjit as dr
 
 from ..backend.arrays import ArrayTypes, types_of
-from .binning.granularity import granularity_of
 from .binning.lists import TileLists
-from .binning.tiles import Grid, GridArrays
+from .binning.tiles import Grid, GridArrays, granularity_of
 from .evaluate import weights
-from .layout import gather_index, gather_run, unpack_parameters
-from .parameters import NUM_SHAPE_PARAMS
+from .parameters import NUM_SHAPE_PARAMS, gather_index, gather_run, unpack_parameters
 
 
 class _Blocks(NamedTuple):

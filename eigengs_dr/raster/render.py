@@ -1,7 +1,12 @@
-"""Differentiable rendering of Gaussians, in forward and reverse mode."""
+"""Differentiable rendering of Gaussians, in forward and reverse mode.
+
+Kernels write an image in tile layout. `render` returns it as rows of pixels, a tensor;
+`picture_rows` reads it by strips of rows, so that a large picture is in memory once.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from operator import index
 from typing import TYPE_CHECKING, Any
@@ -10,20 +15,23 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import ArrayTypes
+from ..backend.arrays import ArrayTypes, make_divisor, types_of
 from ..backend.recording import exclusive
 from ..gaussian.file import MAX_CUTOFF
-from ..gaussian.gaussians import Gaussians
-from ..gaussian.like import set_of
+from ..gaussian.gaussians import Gaussians, set_of
 from ..image.color import decode, from_sum, to_picture
 from .adjoint import adjoint
 from .binning.lists import TileLists, build_lists
-from .binning.tiles import TILE, Grid
+from .binning.tiles import TILE, Grid, check_index_range
 from .kernels import channel_sums, forward
-from .layout import pack_parameters
-from .limits import check_index_range
-from .parameters import KernelParameters, detached_shape, kernel_radius, kernel_shape
-from .rows import to_tensor
+from .parameters import (
+    KernelParameters,
+    detached_shape,
+    gather_run,
+    kernel_radius,
+    kernel_shape,
+    pack_parameters,
+)
 
 if TYPE_CHECKING:
     from ..fitting.fit import Fit
@@ -374,3 +382,93 @@ def batch_from_tiles(image: Any, grid: Grid, channels: int) -> NDArray[Any]:
         grid.images, grid.ny * tile_height, grid.nx * tile_width, channels
     )
     return np.ascontiguousarray(whole[:, : grid.height, : grid.width])
+
+
+def to_tensor(image: Any, grid: Grid, channels: int) -> Any:
+    """Convert an image from tile layout to a tensor (height, width, channels); differentiable."""
+    types = types_of(image)
+    rows = dr.custom(_Rows, image, grid, channels)
+    if grid.overhangs:
+        rows = _crop(types, rows, grid, channels)
+    return types.Tensor(rows, (grid.height, grid.width, channels))
+
+
+def _crop(types: ArrayTypes, rows: Any, grid: Grid, channels: int) -> Any:
+    """Cut the image out of rows of whole tiles; differentiable.
+
+    Numbers are in arrays, as in `_Rows`: slices of tensors compile a program for every size.
+    """
+    index = dr.arange(types.UInt, grid.height * grid.width * channels)
+    length = dr.opaque(types.UInt, grid.width * channels)
+    over = dr.opaque(types.UInt, (grid.nx * grid.tile[0] - grid.width) * channels)
+    # The quotient of indices up to 2^32, exact in double precision.
+    Double = dr.float64_array_t(types.Float)
+    row = types.UInt((Double(index) + 0.5) / Double(length))
+    return dr.gather(types.Float, rows, index + row * over, mode=dr.ReduceMode.NoConflicts)
+
+
+class _Rows(dr.CustomOp):
+    """Permutation from tile layout to rows of pixels; the transpose permutes back."""
+
+    def eval(self, image: Any, grid: Grid, channels: int) -> Any:
+        types = types_of(image)
+        runs = dr.arange(types.UInt, grid.nx * grid.ny * grid.tile[1])
+        columns = make_divisor(types, grid.nx)  # in arrays, for programs that serve every size
+        row, column = columns.divmod(runs)
+        tile_row, inner = row // grid.tile[1], row % grid.tile[1]
+        self.by_row = runs
+        self.by_tile = (tile_row * columns.divisor + column) * grid.tile[1] + inner
+        self.run = grid.tile[0] * channels
+        return self._permute(image, self.by_tile, self.by_row)
+
+    def forward(self) -> None:
+        self.set_grad_out(self._permute(self.grad_in("image"), self.by_tile, self.by_row))
+
+    def backward(self) -> None:
+        self.set_grad_in("image", self._permute(self.grad_out(), self.by_row, self.by_tile))
+
+    def _permute(self, values: Any, source: Any, target: Any) -> Any:
+        types = types_of(values)
+        result = dr.empty(types.Float, self.run * dr.width(source))
+        dr.scatter(result, types.FloatX(gather_run(types, values, source, self.run, True)), target)
+        return result
+
+
+@exclusive()
+def picture_rows(gaussians: Gaussians) -> Callable[[slice], NDArray[np.floating]]:
+    """Render a set at its native size; return a function that reads rows of the picture.
+
+    The rendering stays in tile layout, so that no second image is in memory.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+
+    Returns
+    -------
+    callable
+        ``read(rows)`` for a slice of rows returns an array (rows, width, C): these rows of
+        `eigengs_dr.raster.render.picture_of`. Threads may read at the same time.
+
+    Raises
+    ------
+    ValueError
+        As `eigengs_dr.raster.render.render`.
+    """
+    gaussians = dr.detach(gaussians)
+    check_index_range(gaussians.width, gaussians.height, gaussians.channels, TILE)
+    lists = bin_gaussians(gaussians, adjoint=False)
+    image = rasterize(decode_parameters(gaussians), lists, gaussians.cutoff)
+    grid, channels = lists.grid, gaussians.channels
+    side = grid.tile[1]
+    # Pixels and channels share an axis: a row of a tile is then copied as one run.
+    tiles = image.numpy().reshape(grid.ny, grid.nx, side, grid.tile[0] * channels)
+
+    def read(rows: slice) -> NDArray[np.floating]:
+        first, last = rows.start // side, -(-rows.stop // side)
+        whole = tiles[first:last].transpose(0, 2, 1, 3)
+        whole = whole.reshape((last - first) * side, -1, channels)
+        part = whole[rows.start - first * side : rows.stop - first * side, : grid.width]
+        return to_picture(gaussians.space, from_sum(gaussians.space, part))
+
+    return read

@@ -4,8 +4,7 @@
 - ``target``: the smoothest texture that looks alike, and the weights of its errors
 - ``fit_scene``: the fewest Gaussians for a scene
 - ``bitmaps``: the bitmaps of a scene, and which of them must stay
-- ``convert``: a scene with Gaussians in the place of its bitmaps
-- ``renderings``: renderings in passes of samples, and pictures before and after
+- ``convert``: a scene with Gaussians in the place of its bitmaps; renderings before and after
 """
 
 from .. import plugins  # noqa: F401  without Mitsuba, its error says what to install

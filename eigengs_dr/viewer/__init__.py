@@ -5,5 +5,4 @@
 - ``pictures``: outlines of Gaussians, and the photo in a page
 - ``sheets``: components of a model or a basis
 - ``notebook``: what Jupyter shows of sets, fits, bases and models
-- ``short_errors``: errors in a notebook
 """

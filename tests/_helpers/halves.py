@@ -3,7 +3,7 @@
 import numpy as np
 
 from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.redistribute import residual
+from eigengs_dr.fitting.placement.adaptive import residual
 from eigengs_dr.fitting.start import initialize
 from eigengs_dr.image.color import rgb_to_ycbcr
 

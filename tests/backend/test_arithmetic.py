@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from _helpers.sets import few
-from eigengs_dr.backend.arithmetic import TANH_SMALL, make_divisor, rcp, rsqrt, tanh
+from eigengs_dr.backend.arrays import TANH_SMALL, make_divisor, rcp, rsqrt, tanh
 
 TOLERANCE = {32: 1e-6, 64: 1e-14}
 """Relative error by precision: Dr.Jit's own functions miss it on cuda in one of the two."""

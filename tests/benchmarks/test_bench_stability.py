@@ -14,8 +14,8 @@ from eigengs_bench.harness.tiling import smooth_regions, tiling
 from eigengs_bench.names import PRESETS as NAMES
 from eigengs_bench.report.sections.stability import defects, summarize
 from eigengs_dr.fitting.options import PRESETS
-from eigengs_dr.gaussian.bounds import MIN_DEVIATION
 from eigengs_dr.gaussian.covariance import condition_number
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
 from eigengs_dr.image.metrics import MAX_PSNR, psnr
 
 

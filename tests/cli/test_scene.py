@@ -78,7 +78,7 @@ def test_several_scenes_into_a_folder(scene, tmp_path):
 
 
 def test_passes_make_one_picture(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("eigengs_dr.scene.renderings.SAMPLES_PER_PASS", 8 * 6 * 2)
+    monkeypatch.setattr("eigengs_dr.scene.convert.SAMPLES_PER_PASS", 8 * 6 * 2)
     result = run(scene(), "-o", tmp_path / "x.exr", "--spp", 5)
     assert "samples per pixel: 5" in result.stdout
     assert np.allclose(mi.Bitmap(str(tmp_path / "x.exr")), 0.5)

@@ -8,8 +8,8 @@ from _helpers.waves import picture
 from eigengs_dr.collection import fit_batch as module
 from eigengs_dr.collection.fit_batch import MAX_CUTOFF, fit_batch, fits_in_batches
 from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.gaussian.bounds import MIN_DEVIATION
 from eigengs_dr.gaussian.file import CUTOFF
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
 from eigengs_dr.raster.evaluate import is_steep
 from eigengs_dr.raster.parameters import kernel_radius, kernel_shape
 

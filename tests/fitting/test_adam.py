@@ -6,7 +6,7 @@ import pytest
 
 from _helpers.optimizers import minimize
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.optimizers import Adam
+from eigengs_dr.fitting.parameterization import Adam
 
 
 def adam_by_hand(start, gradient, rate, steps, betas, epsilon):

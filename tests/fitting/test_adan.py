@@ -6,7 +6,7 @@ import pytest
 
 from _helpers.optimizers import minimize
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.optimizers import Adan
+from eigengs_dr.fitting.parameterization import Adan
 
 
 def adan_by_hand(start, gradient, rate, steps, betas=(0.98, 0.92, 0.99), epsilon=1e-8):

@@ -16,7 +16,7 @@ from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting import descent
 from eigengs_dr.fitting.descent import FitProblem, descend, prefix, rate_table
 from eigengs_dr.fitting.options import PRESETS
-from eigengs_dr.fitting.redistribute import residual
+from eigengs_dr.fitting.placement.adaptive import residual
 from eigengs_dr.fitting.schedule import lr_factor, next_build, relocations
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import bin_gaussians, render

@@ -10,7 +10,7 @@ import pytest
 from _helpers.waves import SPLATS, check_sound, figures, picture
 from eigengs_dr.fitting import start as starting
 from eigengs_dr.fitting.fit import FitInterrupted, fit
-from eigengs_dr.fitting.placement.uniform import place_grid
+from eigengs_dr.fitting.start import place_grid
 from eigengs_dr.image.metrics import psnr
 
 

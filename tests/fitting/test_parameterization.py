@@ -14,7 +14,7 @@ from eigengs_dr.fitting.parameterization import (
     MIN_DIAGONAL,
     SCALE_RELATIVE,
 )
-from eigengs_dr.gaussian.bounds import MIN_DEVIATION
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
 
 
 @few

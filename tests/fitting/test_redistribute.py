@@ -9,7 +9,7 @@ import pytest
 from _helpers.halves import SIDE, fitted, picture
 from eigengs_dr.fitting.descent import descend
 from eigengs_dr.fitting.options import PRESETS, FitOptions
-from eigengs_dr.fitting.redistribute import redistribute
+from eigengs_dr.fitting.placement.adaptive import redistribute
 from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO, first_phase
 from eigengs_dr.fitting.start import initialize
 from eigengs_dr.raster.render import render

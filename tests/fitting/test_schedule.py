@@ -1,6 +1,6 @@
 """Schedules of a descent."""
 
-from eigengs_dr.fitting.optimizers import Adam
+from eigengs_dr.fitting.parameterization import Adam
 from eigengs_dr.fitting.schedule import Schedule
 
 

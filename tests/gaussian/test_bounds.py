@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from _helpers.sets import COUNT, SIZE, arrays_of, check_equal, few, random_scene
-from eigengs_dr.gaussian.bounds import MIN_DEVIATION
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
 
 LOW, HIGH = 1 / (2 * max(SIZE)), 1 / MIN_DEVIATION
 """Bounds of the diagonal of a factor."""

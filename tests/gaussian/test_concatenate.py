@@ -7,7 +7,7 @@ import pytest
 
 from _helpers.sets import COUNT, NAMES, check_equal, random_scene
 from eigengs_dr.backend.selection import select
-from eigengs_dr.gaussian.concatenate import concatenate
+from eigengs_dr.gaussian.gaussians import concatenate
 
 
 def test_concatenation(backend):

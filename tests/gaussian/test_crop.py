@@ -5,8 +5,7 @@ import pytest
 
 import eigengs_dr as eg
 from eigengs_dr.blocks.draw import draw
-from eigengs_dr.gaussian.crop import crop, reaches, touches
-from eigengs_dr.gaussian.file import SetData
+from eigengs_dr.gaussian.file import SetData, crop, reaches, touches
 
 
 def random_set(count=200, size=(96, 64), space="ycbcr"):

@@ -11,7 +11,7 @@ from _helpers.sets import SIZE, random_scene
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 import eigengs_dr as eg  # noqa: E402
 from _helpers.texture import at, backend, gaussians, picture, small_scene, texel_centres, texture  # noqa: E402
-from eigengs_dr.gaussian.bounds import MIN_DEVIATION  # noqa: E402
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION  # noqa: E402
 from eigengs_dr.plugins import gaussians_of, keep_in_bounds, texture_of  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]

@@ -6,7 +6,8 @@ import pytest
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 from _helpers.texture import at, gaussians, small_scene, texture  # noqa: E402
-from eigengs_dr.plugins import gaussian_texture, reuse, texture_of  # noqa: E402
+from eigengs_dr.plugins import gaussian_texture, texture_of  # noqa: E402
+from eigengs_dr.plugins import lookup as reuse  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 

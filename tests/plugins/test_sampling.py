@@ -36,7 +36,7 @@ class TestMean:
 
     @pytest.mark.parametrize("most", [1 << 10, 1 << 13])
     def test_of_few_points_is_still_the_integral(self, monkeypatch, most):
-        monkeypatch.setattr("eigengs_dr.plugins.survey.MOST", most)
+        monkeypatch.setattr("eigengs_dr.plugins.emission.MOST", most)
         g, expected = lamps(2.0)
         assert np.array(texture(g).mean()).item() == pytest.approx(expected, rel=0.02)
 

@@ -10,7 +10,7 @@ mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
 from _helpers.variants import on_both  # noqa: E402
-from eigengs_dr.plugins import spectrum  # noqa: E402
+from eigengs_dr.plugins import color as spectrum  # noqa: E402
 
 pytestmark = [
     pytest.mark.mitsuba,
@@ -186,5 +186,5 @@ def test_inside_a_symbolic_call():
 
 
 def test_import_needs_no_variant():
-    code = "import eigengs_dr.plugins.spectrum as s; s.basis()"
+    code = "import eigengs_dr.plugins.color as s; s.basis()"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -9,8 +9,8 @@ from hypothesis import given
 
 from _helpers.sets import SIZE, few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_of
-from eigengs_dr.gaussian.concatenate import concatenate
 from eigengs_dr.gaussian.file import CUTOFF
+from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.color import ycbcr_to_rgb
 from eigengs_dr.raster.reference import render_plain
 from eigengs_dr.raster.render import bin_gaussians, render

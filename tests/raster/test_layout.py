@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from _helpers.sets import upload
-from eigengs_dr.raster.layout import gather_run, pack_parameters, unpack_parameters
+from eigengs_dr.raster.parameters import gather_run, pack_parameters, unpack_parameters
 
 
 @pytest.mark.parametrize("number", [1, 4, 6, 7, 8, 9])

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from _helpers.sets import random_scene
-from eigengs_dr.raster.picture import picture_rows
-from eigengs_dr.raster.render import picture_of
+from eigengs_dr.raster.render import picture_of, picture_rows
 
 
 @pytest.mark.parametrize("space", ["ycbcr", "rgb", "linear", "data"])

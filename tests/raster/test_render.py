@@ -37,9 +37,9 @@ from eigengs_dr.raster.render import (
     picture_of,
     rasterize,
     render,
+    to_tensor,
     to_tiles,
 )
-from eigengs_dr.raster.rows import to_tensor
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])

@@ -13,7 +13,7 @@ from _helpers.sets import (
     random_scene,
     scenes,
 )
-from eigengs_dr.gaussian.concatenate import concatenate
+from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.raster.render import (
     render,
 )

@@ -26,8 +26,7 @@ from eigengs_dr.raster.binning.lists import TileLists, build_lists
 from eigengs_dr.raster.binning.tiles import Grid
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, KernelParameters, kernel_radius
 from eigengs_dr.raster.reference import render_plain
-from eigengs_dr.raster.render import bin_gaussians, decode_parameters, rasterize
-from eigengs_dr.raster.rows import to_tensor
+from eigengs_dr.raster.render import bin_gaussians, decode_parameters, rasterize, to_tensor
 
 # The scene: Gaussians of equal size, spread evenly at random over a square picture.
 SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0

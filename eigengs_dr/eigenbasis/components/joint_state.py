@@ -34,7 +34,7 @@ class JointState(NamedTuple):
     counts : tuple of C ints
         Number of components of each channel.
     rows : ndarray of float32, shape (5, 5 + P, N)
-        Variables; then m, v, n and the last gradient of `eigengs_dr.fitting.optimizers.Adan`.
+        Variables; then m, v, n and the last gradient of `eigengs_dr.fitting.parameterization.Adan`.
         The first 5 rows of each are the mean and the factor in `CHOLESKY` coordinates; each other
         row holds the scaled weights of one component.
     """

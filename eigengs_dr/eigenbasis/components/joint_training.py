@@ -19,17 +19,15 @@ from numpy.typing import NDArray
 from ...backend.arrays import ArrayTypes, types_in, upload
 from ...backend.recording import freeze_program
 from ...backend.selection import select
-from ...fitting.optimizers import Adan
-from ...fitting.parameterization import CHOLESKY
-from ...fitting.placement.uniform import place_random
+from ...fitting.parameterization import CHOLESKY, Adan
+from ...fitting.start import place_random
 from ...gaussian.file import CUTOFF
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint
 from ...raster.binning.lists import TileLists
 from ...raster.binning.tiles import Grid
 from ...raster.kernels import residual, sum_lanes
-from ...raster.layout import pack_parameters
-from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
+from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
 from ...raster.render import bin_gaussians, to_tiles
 from .joint_state import JointState, decode_shapes
 
@@ -91,7 +89,7 @@ def train_jointly(
     JointState
         The state after every `ROUND` steps and after the last step; nothing if `state` has all
         steps. A state does not change later. Between two states, `KeyboardInterrupt` may become
-        another error, see `eigengs_dr.backend.interrupt.defer_interrupts`.
+        another error, see `eigengs_dr.backend.feedback.defer_interrupts`.
 
     Raises
     ------

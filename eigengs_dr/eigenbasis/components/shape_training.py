@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from ...backend.arrays import types_of
 from ...backend.recording import freeze_program
 from ...fitting.descent import pack, rate_table, start_descent, step_program
-from ...fitting.placement.uniform import place_grid
 from ...fitting.schedule import Schedule, lr_factor
 from ...fitting.solvers.conjugate_gradient import solve
+from ...fitting.start import place_grid
 from ...gaussian.gaussians import Gaussians
 from ...raster.binning.tiles import Grid
 from ...raster.render import bin_gaussians, to_tiles

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from ...backend.arrays import types_of, upload_rows
 from ...backend.executor import Executor, executor_for
-from ...gaussian.concatenate import concatenate
-from ...gaussian.gaussians import Gaussians
+from ...gaussian.gaussians import Gaussians, concatenate
 from ...image.metrics import psnr_from_mse
 from ..pca.basis import Eigenbasis
 from .joint_state import JointState

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...fitting.solvers.normal_equations import NormalEquations, squared_norms
-from ...gaussian.concatenate import concatenate
+from ...gaussian.gaussians import concatenate
 from ...image.metrics import psnr_from_mse
 from ...image.planes import to_planes
 from ..pca.basis import Eigenbasis

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...backend.display import shows_progress, to_html
-from ...backend.warn import warn
+from ...backend.feedback import shows_progress, to_html, warn
 from ...image.color import ycbcr_to_rgb
 from ...image.folder import Source
 from ...image.io import check_image, read_image

@@ -8,7 +8,7 @@ from operator import index
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.warn import warn
+from ...backend.feedback import warn
 from .basis_file import ENERGY_TOLERANCE
 
 CHANNELS = {"ycbcr": ("Y", "Cb", "Cr"), "rgb": ("R", "G", "B")}

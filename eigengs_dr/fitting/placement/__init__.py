@@ -1,7 +1,6 @@
-"""Where Gaussians start, and where they are added; NumPy only.
+"""Where Gaussians start, and where they are added.
 
-- ``uniform``: on a hexagonal grid, and at random
-- ``adaptive``: by the second derivatives of the image
+- ``adaptive``: by the second derivatives of the image; anew, by the error of a fit
 - ``density``: the density that an error asks for
 - ``peaks``: the peaks of a residual
 """

@@ -20,8 +20,7 @@ from ...backend.recording import freeze_program
 from ...gaussian.gaussians import Gaussians
 from ...raster.binning.lists import TileLists
 from ...raster.kernels import channel_moments, sum_lanes
-from ...raster.layout import gather_run
-from ...raster.parameters import detached_shape
+from ...raster.parameters import detached_shape, gather_run
 from ...raster.render import batch_to_tiles, bin_gaussians
 from .matrix_products import (
     Unknowns,

@@ -14,16 +14,14 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.arithmetic import rcp
-from ...backend.arrays import types_of
+from ...backend.arrays import rcp, types_of
 from ...gaussian.file import MAX_CUTOFF
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint
 from ...raster.binning.lists import TileLists
 from ...raster.binning.tiles import Grid
 from ...raster.kernels import channel_sums, residual, sum_by_image
-from ...raster.layout import pack_parameters
-from ...raster.parameters import NUM_SHAPE_PARAMS, detached_shape, kernel_radius
+from ...raster.parameters import NUM_SHAPE_PARAMS, detached_shape, kernel_radius, pack_parameters
 from ...raster.render import bin_gaussians, to_tiles
 
 

@@ -28,8 +28,13 @@ from ...backend.recording import freeze_program
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint
 from ...raster.evaluate import weights
-from ...raster.layout import pack_parameters, unpack_parameters
-from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape
+from ...raster.parameters import (
+    NUM_SHAPE_PARAMS,
+    kernel_radius,
+    kernel_shape,
+    pack_parameters,
+    unpack_parameters,
+)
 from ...raster.render import bin_gaussians, to_tiles
 
 GROUP = 3

@@ -13,13 +13,10 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ...backend.arithmetic import make_divisor
-from ...backend.arrays import ArrayTypes, types_of, upload
+from ...backend.arrays import ArrayTypes, make_divisor, types_of, upload
 from ..evaluate import is_steep
-from .granularity import granularity_of
-from .lanes import order_lanes
-from .tiles import TILE, Grid, GridArrays, for_each_row, for_each_tile
-from .transpose import transpose_by_counting, transpose_by_sorting
+from .order import order_lanes, transpose_by_counting, transpose_by_sorting
+from .tiles import TILE, Grid, GridArrays, for_each_row, for_each_tile, granularity_of
 
 MAX_LIST_ENTRIES = 1 << 28
 """Largest number of entries in the lists of all tiles; they take 4 GiB while they are built."""

@@ -1,20 +1,108 @@
-"""The tiles of an image, and the tiles that a Gaussian touches.
+"""The tiles of an image, the tiles that a Gaussian touches, and the share of a lane.
 
 A tile is a block of pixels. A closed form gives the tiles of each row that the cutoff ellipse of a
 Gaussian touches. An elongated Gaussian therefore visits only the tiles along its axis, not all
-tiles of its bounding box.
+tiles of its bounding box. `GRANULARITY` is the one place that chooses, by backend, how much work
+one lane of a kernel gets; `MAX_VALUES` is the largest image that 32-bit indices can number.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 
-from ...backend.arithmetic import Divisor, make_divisor, rcp, rsqrt
-from ...backend.arrays import ArrayTypes, types_of
+from ...backend.arrays import ArrayTypes, Divisor, make_divisor, rcp, rsqrt, types_of
+
+MAX_VALUES = (1 << 32) - 1
+"""Largest number of values of an image, channels included. Kernels index them by 32 bits, as Dr.Jit
+does its arrays: larger indices would wrap to the first pixels without an error."""
+
+
+def check_index_range(
+    width: int, height: int, channels: int, tile: tuple[int, int] = (1, 1)
+) -> None:
+    """Refuse an image with more values than 32-bit indices can number.
+
+    The limit is 37,837 pixels a side with three channels, and 8,191 with 64.
+
+    Parameters
+    ----------
+    width, height : int
+        Size in pixels.
+    channels : int
+    tile : (int, int), optional
+        Width and height of a tile: sides are rounded up to whole tiles.
+
+    Raises
+    ------
+    ValueError
+        If the image, in whole tiles, has more than `MAX_VALUES` values.
+    """
+    columns, rows = (
+        -(-side // unit) * unit for side, unit in zip((width, height), tile, strict=True)
+    )
+    values = columns * rows * channels
+    if values > MAX_VALUES:
+        raise ValueError(
+            f"an image of {width}x{height} pixels and {channels} channels has {values:,} values, "
+            f"the limit is {MAX_VALUES:,}: scale it down or work on parts of it"
+        )
+
+
+class Granularity(NamedTuple):
+    """The share of a lane.
+
+    Attributes
+    ----------
+    rows : int
+        Rows of a tile that one lane owns, of the sum over Gaussians and of the adjoint: 1, 2 or 4.
+    visits, long_visits : int
+        Largest number of tiles that one lane of the adjoint visits, and the number where lists are
+        long enough to keep `MIN_PIECES` lanes busy. A Gaussian that touches more tiles gets several
+        lanes, so that few large Gaussians fill many cores too; fewer lanes have fewer results to
+        store and to add.
+    ordered : bool
+        Whether lanes are ordered by their work. A SIMD packet of a CPU takes as long as its longest
+        lane, and ordering is cheap there; a GPU would need another sort.
+    products : bool
+        Whether weights along a row continue one exponential by products, where that is accurate. On
+        a GPU an exponential is one instruction, and products would cost more.
+    """
+
+    rows: int
+    visits: int
+    long_visits: int
+    ordered: bool
+    products: bool
+
+    def visits_for(self, entries: int, tiles: int) -> int:
+        """Return the largest number of tiles of a lane, for the lists of an image of some tiles."""
+        large = tiles > SMALL and entries >= MIN_PIECES * self.long_visits
+        return self.long_visits if large else self.visits
+
+
+MIN_PIECES = 1 << 15
+"""Pieces that keep all cores of a large CPU busy."""
+
+SMALL = 1 << 12
+"""Most tiles of an image, 256x256 pixels, that takes `Granularity.visits` whatever its lists. In a
+batch the number may not depend on the lists of other images: it decides in which order sums run."""
+
+GRANULARITY = {
+    "llvm": Granularity(rows=4, visits=16, long_visits=64, ordered=True, products=True),
+    "cuda": Granularity(rows=1, visits=16, long_visits=16, ordered=False, products=False),
+}
+"""Granularity by backend. On llvm a lane shares the parameters of a Gaussian among 16 pixels; on a
+GPU more lanes with fewer registers hide the latency of memory."""
+
+
+def granularity_of(types: ArrayTypes) -> Granularity:
+    """Return the granularity for the backend of some array types."""
+    return GRANULARITY[types.backend]
+
 
 TILE = (4, 4)
 """Width and height of a tile in pixels. Measured on 2 cores with AVX-512: 4x4 keeps the sums of 16

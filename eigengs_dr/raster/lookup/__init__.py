@@ -1,10 +1,8 @@
-"""The sum at scattered points and through footprints, as textures need it.
+"""The sum of Gaussians at scattered points, for textures.
 
-- ``points``: values and slopes at points
-- ``footprint``: the footprint of a pixel
-- ``prefilter``: the sum seen through a footprint, in closed form
-- ``size_classes``: the Gaussians that a footprint may see
-- ``widened``: the Gaussians that a footprint widens
-- ``pyramid``: wide footprints: coarse samples of the sum
-- ``coarsen``: the samples of a pyramid
+- ``points``: the sum at points, over lists of small cells
+- ``footprint``: the footprint of a pixel, and Gaussians that it widens
+- ``size_classes``: lists for footprints of several sizes
+- ``prefilter``: the sum over a footprint
+- ``pyramid``: coarser sums for wide footprints, and their construction
 """

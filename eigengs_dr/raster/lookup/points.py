@@ -19,8 +19,7 @@ from ...backend.arrays import types_of
 from ..binning.lists import build_lists
 from ..binning.tiles import Grid
 from ..evaluate import LN2, weights
-from ..layout import gather_index, pack_parameters, unpack_parameters
-from ..parameters import NUM_SHAPE_PARAMS
+from ..parameters import NUM_SHAPE_PARAMS, gather_index, pack_parameters, unpack_parameters
 
 
 @dataclass(frozen=True)
@@ -108,8 +107,8 @@ def in_list_order(splat: Any, rows: list) -> Any:
     Returns
     -------
     Float, or None
-        As from `eigengs_dr.raster.layout.pack_parameters`, an entry for each of the lists. None if
-        there are more than `MAX_ARRANGED`.
+        As from `eigengs_dr.raster.parameters.pack_parameters`, an entry for each of the lists.
+        None if there are more than `MAX_ARRANGED`.
     """
     if dr.width(splat) > MAX_ARRANGED:
         return None
@@ -185,7 +184,7 @@ def sum_at_points(
     ----------
     cells : Cells
     packed : Float
-        Parameters from `eigengs_dr.raster.layout.pack_parameters`; may carry gradients.
+        Parameters from `eigengs_dr.raster.parameters.pack_parameters`; may carry gradients.
     number : int
         Number of parameters of one Gaussian.
     x, y : Float

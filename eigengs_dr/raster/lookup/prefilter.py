@@ -14,15 +14,19 @@ from typing import Any
 
 import drjit as dr
 
-from ...backend.arithmetic import rcp, rsqrt
-from ...backend.arrays import types_of
+from ...backend.arrays import rcp, rsqrt, types_of
 from ..evaluate import weights, widen
-from ..layout import gather_index, gather_run, unpack_parameters
-from ..parameters import NUM_SHAPE_PARAMS, kernel_covariance, kernel_radius
-from .footprint import inside_share
+from ..parameters import (
+    NUM_SHAPE_PARAMS,
+    gather_index,
+    gather_run,
+    kernel_covariance,
+    kernel_radius,
+    unpack_parameters,
+)
+from .footprint import arranged_values, inside_share, widened_values
 from .points import cell_range, sum_range
 from .size_classes import FOOTPRINT_REACH, SizeClasses
-from .widened import arranged_values, widened_values
 
 
 def sum_prefiltered(

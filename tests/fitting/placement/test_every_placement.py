@@ -7,7 +7,7 @@ from hypothesis import given
 from _helpers.placements import check_placement, generator, images_and_counts
 from _helpers.sets import few
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
-from eigengs_dr.fitting.placement.uniform import place_grid, place_random
+from eigengs_dr.fitting.start import place_grid, place_random
 
 INITS = [place_random, place_grid, place_adaptive]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from _helpers.placements import generator
-from eigengs_dr.fitting.placement.uniform import DEVIATION, place_grid
+from eigengs_dr.fitting.start import DEVIATION, place_grid
 
 
 @pytest.mark.parametrize(("width", "height", "count"), [(40, 40, 100), (64, 16, 64), (30, 50, 97)])

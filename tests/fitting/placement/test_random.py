@@ -4,7 +4,7 @@ import numpy as np
 
 from _helpers.placements import covariances_of, generator
 from _helpers.sets import covariances
-from eigengs_dr.fitting.placement.uniform import place_random
+from eigengs_dr.fitting.start import place_random
 from eigengs_dr.gaussian.covariance import factor_from_covariance
 
 

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from _helpers.sets import few, random_scene, scenes
 from _helpers.tile_lists import GRID, RADIUS, upload
-from eigengs_dr.raster.binning import granularity
-from eigengs_dr.raster.binning.granularity import GRANULARITY
+from eigengs_dr.raster.binning import tiles as granularity
 from eigengs_dr.raster.binning.lists import build_lists
+from eigengs_dr.raster.binning.tiles import GRANULARITY
 
 
 def pairs_by_splat(lists):

@@ -13,9 +13,8 @@ from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, 
 from _helpers.tile_lists import GRID, RADIUS, upload
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.binning.granularity import GRANULARITY
 from eigengs_dr.raster.binning.lists import build_lists
-from eigengs_dr.raster.binning.tiles import TILE, Grid, for_each_tile
+from eigengs_dr.raster.binning.tiles import GRANULARITY, TILE, Grid, for_each_tile
 
 EDGE = 1e-3
 """Relative distance to the cutoff within which rounding may decide."""

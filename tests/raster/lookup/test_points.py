@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from _helpers.sets import SIZE, few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.layout import pack_parameters
 from eigengs_dr.raster.lookup.points import (
     cell_side,
     fold,
@@ -20,7 +19,7 @@ from eigengs_dr.raster.lookup.points import (
     sum_at_points,
     value_terms,
 )
-from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
+from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, pack_parameters
 from eigengs_dr.raster.render import decode_parameters, render
 
 POINTS = 400

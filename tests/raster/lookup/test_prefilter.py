@@ -9,12 +9,10 @@ from _helpers.sets import SIZE, covariances, random_scene
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.evaluate import widen
-from eigengs_dr.raster.layout import pack_parameters
-from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT
+from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, arrange
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
-from eigengs_dr.raster.lookup.widened import arrange
-from eigengs_dr.raster.parameters import EXP2_SCALE, NUM_SHAPE_PARAMS
+from eigengs_dr.raster.parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, pack_parameters
 from eigengs_dr.raster.render import decode_parameters
 
 FOOTPRINTS = [

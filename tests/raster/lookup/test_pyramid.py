@@ -9,12 +9,11 @@ import pytest
 from _helpers.footprints import CUTOFF, brute_force, some_points, stacked, tiled
 from _helpers.sets import SIZE, random_scene
 from eigengs_dr.backend.arrays import types_of
-from eigengs_dr.raster.layout import pack_parameters
-from eigengs_dr.raster.lookup import coarsen
+from eigengs_dr.raster.lookup import pyramid as coarsen
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
 from eigengs_dr.raster.lookup.pyramid import is_minified, pyramid_mean, sum_pyramid
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
-from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS
+from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, pack_parameters
 from eigengs_dr.raster.render import decode_parameters
 
 FOOTPRINTS = [

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....backend.executor import Executor, completed
-from ....backend.warn import warn
+from ....backend.feedback import warn
 from ....image.folder import ReadProgress, read_blocks
 from ....image.io import ImageError
 from ....storage.checkpoint import read_arrays, write_arrays

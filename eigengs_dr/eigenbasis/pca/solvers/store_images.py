@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ....backend.executor import Executor, completed
-from ....backend.warn import warn
+from ....backend.feedback import warn
 from ....image.folder import ReadProgress, read_blocks
 from ....image.io import ImageError
 from .parts import Images, absolute, collect_notes, is_countable, readable

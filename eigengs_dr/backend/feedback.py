@@ -1,0 +1,232 @@
+"""What a user sees and presses: pictures and errors in a notebook, bars, warnings, Ctrl-C."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from inspect import signature
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeVar
+
+HTML: list[Callable[[Any], str]] = []
+"""The function that makes HTML of objects; `eigengs_dr` puts that of the viewer here."""
+
+DELAY = 2.0
+"""Seconds before a bar appears."""
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def to_html(value: Any) -> str:
+    """Return what a notebook shows of an object of this package: pictures and figures."""
+    return HTML[0](value)
+
+
+def shows_progress(function: Function) -> Function:
+    """Decorate a function with an argument ``progress``, so that it shows a bar by itself.
+
+    None and True make a bar that appears after `DELAY` seconds, in a notebook or if standard error
+    is a terminal. False shows nothing. A function ``progress(done, total, row)`` is called.
+    """
+    arguments = signature(function)
+
+    @wraps(function)
+    def call(*values: Any, **options: Any) -> Any:
+        bound = arguments.bind(*values, **options)
+        with _reporter(bound.arguments.get("progress"), function.__name__) as show:
+            bound.arguments["progress"] = show
+            return function(*bound.args, **bound.kwargs)
+
+    return call  # type: ignore[return-value]
+
+
+@contextmanager
+def _reporter(progress: Any, name: str) -> Iterator[Callable[..., None] | None]:
+    """Return what reports progress: a function, or None."""
+    if callable(progress):
+        yield progress
+        return
+    if progress is False or not _is_watched():
+        yield None
+        return
+    from tqdm.auto import tqdm
+
+    with tqdm(desc=name, delay=DELAY, leave=False) as bar:
+
+        def show(*values: Any) -> None:
+            if isinstance(values[0], str):  # the name of a stage is first
+                bar.set_description_str(values[0], refresh=False)
+                values = values[1:]
+            done, total, *rest = values
+            row = rest[0] if rest else None
+            bar.total = total
+            psnr = row.get("psnr_rgb") if isinstance(row, dict) else getattr(row, "psnr_rgb", None)
+            if psnr is not None:
+                bar.set_postfix_str(f"psnr_rgb {psnr:.2f} dB", refresh=False)
+            bar.update(done - bar.n)
+
+        yield show
+
+
+def _is_watched() -> bool:
+    """Return whether somebody sees a bar: in a notebook, or in a terminal."""
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    if shell is not None and hasattr(shell, "kernel"):
+        return True
+    return sys.stderr is not None and sys.stderr.isatty()
+
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""Signals that ask a program to end: Ctrl-C sends SIGINT, schedulers and ``kill`` send SIGTERM."""
+
+
+@contextmanager
+def defer_interrupts() -> Iterator[Callable[[], bool]]:
+    """Record Ctrl-C and SIGTERM during a block, so that the block can stop between two steps.
+
+    Dr.Jit turns a `KeyboardInterrupt` inside a frozen function or a traced loop into a
+    `RuntimeError`. The first signal is only recorded; a second signal has its usual effect. Only
+    the main thread receives signals, so the block changes nothing in other threads.
+
+    Yields
+    ------
+    callable
+        ``pressed() -> bool``: whether the block has received a signal.
+
+    Examples
+    --------
+    >>> with defer_interrupts() as pressed:
+    ...     pressed()
+    False
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    handlers = {number: signal.getsignal(number) for number in SIGNALS}
+    # Python cannot restore a handler that is None; an ignored signal stays ignored.
+    handlers = {n: old for n, old in handlers.items() if old not in (None, signal.SIG_IGN)}
+    received = []
+
+    def remember(number: int, frame: Any) -> None:
+        received.append(number)
+        restore()
+
+    def restore() -> None:
+        for number, old in handlers.items():
+            signal.signal(number, old)
+
+    for number in handlers:
+        signal.signal(number, remember)
+    try:
+        yield lambda: bool(received)
+    finally:
+        restore()
+
+
+@contextmanager
+def terminate_as_interrupt() -> Iterator[None]:
+    """Turn SIGTERM into a `KeyboardInterrupt` during a block, so that the block cleans up.
+
+    A second SIGTERM ends the process. The block changes nothing in other threads than the main
+    thread, nor where something else handles SIGTERM, such as `defer_interrupts`.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        At SIGTERM.
+    """
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        yield
+        return
+
+    def interrupt(number: int, frame: Any) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+OWN = ("eigengs_dr", "contextlib", "functools")
+"""Modules between the fault and the user's line."""
+
+
+def warn(text: str) -> None:
+    """Warn of something in the line outside of this package that called it."""
+    frame, level = sys._getframe(), 1
+    while frame.f_globals.get("__name__", "").partition(".")[0] in OWN and frame.f_back:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(text, stacklevel=level)
+
+
+FOLDER = str(Path(__file__).parents[1])
+"""Code of this package; frames from here on are left out."""
+
+MISTAKES = (ValueError, TypeError, IndexError, OSError)
+"""Errors that tell what a caller did; errors of classes of this package count too."""
+
+
+def install(shell: Any) -> None:
+    """Shorten the errors of this package in an IPython shell; ``%tb`` still shows all of them.
+
+    Parameters
+    ----------
+    shell : IPython.core.interactiveshell.InteractiveShell
+    """
+    shell.set_custom_exc((Exception, KeyboardInterrupt), show_short)
+
+
+def show_short(
+    shell: Any,
+    kind: type[BaseException],
+    error: BaseException,
+    trace: TracebackType | None,
+    tb_offset: int | None = None,
+) -> None:
+    """Show an error; the handler of IPython's ``set_custom_exc``."""
+    own = type(error).__module__.startswith("eigengs_dr.")
+    outer = outside(trace) if own or isinstance(error, MISTAKES) else trace
+    if outer is trace:
+        shell.showtraceback((kind, error, trace), tb_offset=tb_offset)
+        return
+    # What %tb and %debug read.
+    sys.last_type, sys.last_value, sys.last_traceback = kind, error, trace
+    reasons = error.__cause__, error.__context__
+    error.__cause__ = error.__context__ = None  # the message tells what is worth knowing of them
+    lines = shell.InteractiveTB.structured_traceback(kind, error, outer, tb_offset=tb_offset)
+    error.__cause__, error.__context__ = reasons
+    shell._showtraceback(kind, error, lines)
+
+
+def outside(trace: TracebackType | None) -> TracebackType | None:
+    """Return the frames of a traceback before the first one in this package.
+
+    Returns
+    -------
+    traceback or None
+        The traceback itself if no frame is in this package, or the first one is.
+    """
+    frames = []
+    step = trace
+    while step is not None and not step.tb_frame.f_code.co_filename.startswith(FOLDER):
+        frames.append(step)
+        step = step.tb_next
+    while frames and frames[-1].tb_frame.f_code.co_filename == contextlib.__file__:
+        frames.pop()  # the lock around functions of this package
+    if step is None or not frames:
+        return trace
+    shown = None
+    for frame in reversed(frames):
+        shown = TracebackType(shown, frame.tb_frame, frame.tb_lasti, frame.tb_lineno)
+    return shown
