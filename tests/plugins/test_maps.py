@@ -14,7 +14,7 @@ mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 import eigengs_dr as eg  # noqa: E402
 from _helpers.texture import backend, picture, texel_centres  # noqa: E402
 from _helpers.variants import on_both  # noqa: E402
-from eigengs_dr.plugins import parameters  # noqa: E402
+from eigengs_dr.plugins import parameters as shared  # noqa: E402
 from eigengs_dr.plugins.properties import source_of  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
@@ -61,7 +61,7 @@ def test_textures_of_a_file_share_memory_until_one_changes(file):
     parts = [texture(file, m.name, prefilter=0.01) for m in MAPS]
     rows = [mi.traverse(part)["mean"].array.index for part in parts]
     assert len(set(rows)) == 1
-    [held] = parameters._files.values()
+    [held] = shared._files.values()
     assert [key[0] for key in held.lists] == ["sizes"]
     before = picture(parts[2].eval_3(texel_centres()))
     parameters = mi.traverse(parts[0])
@@ -98,7 +98,7 @@ def test_a_file_is_read_once_while_a_texture_lives(file, monkeypatch):
     assert second.shared is not first.shared
     del first, second
     gc.collect()
-    assert not parameters._files
+    assert not shared._files
 
 
 @pytest.mark.parametrize("variant", on_both("spectral"), indirect=True)
