@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import eigengs_dr as eg
-from eigengs_dr.eigenbasis.registry import load_basis
+from eigengs_dr.eigenbasis.eigengs import EigenGS
 
 FOLDER = Path(__file__).parent.parent / "build" / "docs" / "extra"
 """Sphinx copies what is in it beside the manual."""
@@ -19,5 +19,5 @@ def write_pages() -> None:
     counts = eg.level_counts(5000, 4)
     nested = eg.fit_levels(cat, 5000, 4)
     eg.view(nested, cat, levels=counts, title="Levels of detail").save(folder / "levels.html")
-    model = load_basis("natural")
+    model = EigenGS.load("natural")
     eg.view(model, coffee, title="An eigenbasis").save(folder / "model.html")

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.eigenbasis.registry import SHIPPED
+from eigengs_dr.eigenbasis.eigengs import SHIPPED
 from eigengs_dr.plugins import gaussians_of, keep_in_bounds, texture_of
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "build/examples")

@@ -11,7 +11,7 @@ SLACK = 0.2
 """Decibels by which a PSNR may lie below the recorded value."""
 
 COUNT = {"gaussians": 300, "iterations": 60}
-NATURAL = {"init": "eigen", "basis": "natural"}
+NATURAL = {"start": eg.EigenGS.load("natural", "llvm")}
 
 FITS = {
     "default": ("coffee", COUNT, 41.01, 47.03),

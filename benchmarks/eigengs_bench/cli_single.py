@@ -34,12 +34,12 @@ def kernels(show: Any, backend: str | None) -> Any:
 def eigen(show: Any, basis: str, folder: Path, images: int, iterations: int, backend: Any) -> Any:
     """Compare starts of a fit: by a model, and by the image alone."""
     from eigengs_bench.experiments.eigen import run
-    from eigengs_dr.eigenbasis.registry import load_basis
+    from eigengs_dr.eigenbasis.eigengs import EigenGS
     from eigengs_dr.image.folder import image_files
     from eigengs_dr.image.io import load_image
 
     pictures = [load_image(file) for file in image_files(folder)[:images]]
-    return run(load_basis(basis, backend), pictures, iterations, show), ""
+    return run(EigenGS.load(basis, backend), pictures, iterations, show), ""
 
 
 @click.command()

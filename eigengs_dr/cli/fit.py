@@ -1,14 +1,14 @@
 """The command ``eigengs-dr fit``: fit images by Gaussians."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..backend.selection import select
-from ..fitting.options import DEFAULT_BASIS, INITS, PRESETS, FitOptions, Levels
+from ..fitting.options import INITS, PRESETS, FitOptions, Levels
 from ..image.color import SPACES
 from ..image.metrics import float_space, target_key
 from .console import INTERRUPTED, open_cluster, say
@@ -30,7 +30,11 @@ from .options import (
 from .outputs import check_outputs, keeps_result, name_outputs, write_report
 
 if TYPE_CHECKING:
+    from ..eigenbasis.eigengs import EigenGS
     from ..fitting.fit import Fit
+
+DEFAULT_BASIS = "natural"
+"""Name of the model from which the preset "eigengs" starts by default."""
 
 MISSED = 1
 """Exit code if the target PSNR cannot be reached."""
@@ -84,7 +88,7 @@ FAILED = 2
 @click.option(
     "--basis",
     metavar="NAME|FILE",
-    help=f"Basis for --init eigen, which it implies.  [default: {DEFAULT_BASIS}]",
+    help="Start from a model: one of the package, such as natural, or its file.",
 )
 @choice("--preset", list(PRESETS), "Our method, or that of a paper.")
 @choice(
@@ -115,6 +119,7 @@ def fit(
     images: tuple[Path | str, ...],
     output: Path | None,
     maps: tuple[MapFile, ...],
+    basis: str | None,
     blocks: int | None,
     levels: Levels | None,
     preview: Path | None,
@@ -165,7 +170,7 @@ def fit(
     from ..fitting.levels import check_options
     from ..image.io import SAVE_OPTIONS
 
-    options = FitOptions(**settings)
+    options = FitOptions(**settings, start=_model(settings, basis))
     if levels is not None:
         options = check_options(options, levels)
     if maps:
@@ -179,7 +184,8 @@ def fit(
         raise ValueError("--cluster takes several images, or --blocks, and no --preview")
     outputs = name_outputs(paths, output, [".npz"], several)
     previews = name_outputs(paths, preview, list(SAVE_OPTIONS), several) if preview else []
-    check_outputs([*outputs, *previews, report], [*paths, *_basis_file(options)])
+    models = [Path(basis)] if basis and Path(basis).is_file() else []
+    check_outputs([*outputs, *previews, report], [*paths, *models])
     if not several and keeps_result(outputs[0], overwrite, quiet):
         return
     side = blocks or block_side(paths[0], several, options, levels, preview)
@@ -207,7 +213,7 @@ def fit(
         interrupted = records[0]["stopped"] == "interrupted"
     if report:
         figures = {"images": records} if several else records[0]
-        run_figures = describe_run(context, options.backend) | _decisive(options, levels)
+        run_figures = describe_run(context, options.backend) | _decisive(options, levels, basis)
         run_figures["block"] = side
         write_report(report, run_figures | figures)
     if interrupted and not several and not side:
@@ -217,12 +223,12 @@ def fit(
     _exit(context, records, options)
 
 
-def _decisive(options: FitOptions, levels: Levels | None) -> dict[str, Any]:
+def _decisive(options: FitOptions, levels: Levels | None, basis: str | None) -> dict[str, Any]:
     """Return the settings for a report."""
     settings = {field.name: getattr(options, field.name) for field in fields(options)}
-    del settings["backend"]  # the report names the backend that was used
-    if options.initializer == "eigen":
-        settings["basis"] = str(options.basis or DEFAULT_BASIS)
+    del settings["backend"], settings["start"]  # the report names the backend that was used
+    if options.start is not None:
+        settings["basis"] = basis or DEFAULT_BASIS
     return settings | {"levels": levels}
 
 
@@ -233,15 +239,19 @@ def _expand(source: Path | str) -> Sequence[Path | str]:
     return [source] if isinstance(source, Path) and source.is_file() else list_files(source)
 
 
-def _basis_file(options: FitOptions) -> list[Path]:
-    """Return the file of the basis, if there is one; no output may overwrite it."""
-    files = [Path(str(options.basis))] if options.basis else []
-    return [path for path in files if path.is_file()]
+def _model(settings: dict[str, Any], basis: str | None) -> "EigenGS | None":
+    """Return the model to start from: that of --basis, or what the preset of the paper needs."""
+    paper = PRESETS[settings["preset"]].mean == "dense"
+    if basis is None and not paper:
+        return None
+    from ..eigenbasis.eigengs import EigenGS
+
+    return EigenGS.load(basis or DEFAULT_BASIS, settings["backend"])
 
 
 def _note_mean(options: FitOptions) -> None:
     """Say that the mean image is not in the file, if the preset keeps it as pixels."""
-    if options.initializer == "eigen" and options.method.mean == "dense":
+    if options.method.mean == "dense":
         say("note: the file holds the Gaussians alone; the mean image stays in the basis")
 
 
@@ -254,11 +264,6 @@ def _fitter(options: FitOptions, levels: Levels | None) -> Callable[..., "Fit"]:
         names = ("gaussians", "iterations", "space", "seed", "backend", "encoding")
         common = {name: getattr(options, name) for name in names}
         return lambda image, progress: fit_levels(image, levels=levels, progress=progress, **common)
-    if options.initializer == "eigen":
-        from ..eigenbasis.registry import load_basis
-
-        model = load_basis(options.basis or DEFAULT_BASIS, options.backend)
-        options = replace(options, basis=model)
     return lambda image, progress: fit_image(image, options, progress)
 
 

@@ -43,7 +43,7 @@ def check_large(
     options: FitOptions, levels: Levels | None, preview: Path | None, several: bool = False
 ) -> None:
     """Raise ValueError for options that a fit by blocks does not have."""
-    if options.preset != "default" or options.initializer != "adaptive":
+    if options.preset != "default" or options.placement != "adaptive":
         raise ValueError("--blocks needs the preset and the init that are the default")
     if several:
         raise ValueError("--blocks fits one image; run the command for each image")

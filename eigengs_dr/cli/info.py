@@ -47,8 +47,7 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     select()
     from ..codec import egs as packed
     from ..eigenbasis import model_file as modelfile
-    from ..eigenbasis.eigengs import EigenGS
-    from ..eigenbasis.registry import SHIPPED
+    from ..eigenbasis.eigengs import SHIPPED, EigenGS
     from ..gaussian import file as setfile
     from ..gaussian.gaussians import Gaussians
     from ..material import file as materialfile

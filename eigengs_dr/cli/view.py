@@ -93,8 +93,7 @@ def _load(
 
     from ..codec import egs
     from ..eigenbasis import model_file
-    from ..eigenbasis.eigengs import EigenGS
-    from ..eigenbasis.registry import SHIPPED
+    from ..eigenbasis.eigengs import SHIPPED, EigenGS
     from ..fitting.levels import level_counts
     from ..material.file import holds_material
     from ..storage import npz

@@ -54,7 +54,7 @@ One steep Gaussian changes the arithmetic of all, so those of another image may 
 def fits_in_batches(options: FitOptions, pixels: NDArray[np.float32]) -> bool:
     """Return whether `fit_batch` fits images like `pixels` (H, W, C) bit for bit as alone."""
     return (
-        options.initializer in PLACEMENTS
+        options.placement in PLACEMENTS
         and options.method.solves
         and options.target_psnr is None
         and options.cutoff <= MAX_CUTOFF
@@ -161,7 +161,7 @@ class _Record:
 
 def _start(images: Images, options: FitOptions) -> FitProblem:
     """Place the Gaussians of every image, and solve for the colours of all of them."""
-    place = PLACEMENTS[options.initializer]
+    place = PLACEMENTS[str(options.placement)]
     targets = [make_target(pixels, options.space) for pixels in images]
     shown = [target.shown for target in targets]
     count = options.count_for(images[0])
@@ -199,7 +199,7 @@ class _BatchControl(NamedTuple):
     @property
     def redistributes(self) -> bool:
         """Whether all sets are placed anew after a first phase."""
-        return self.options.initializer == "adaptive"
+        return self.options.placement == "adaptive"
 
     def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
         """Place all sets anew, as `redistribute` does for one."""

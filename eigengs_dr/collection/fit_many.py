@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import fields, replace
 from functools import partial
-from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,8 @@ from ..backend.feedback import shows_progress
 from ..backend.selection import select
 from ..fitting.fit import Fit, fit_image
 from ..fitting.levels import check_options, fit_levels
-from ..fitting.options import DEFAULT_BASIS, FitOptions, Levels, refuse_unknown
+from ..fitting.options import FitOptions, Levels, refuse_unknown
+from ..fitting.start import load_start
 from ..fitting.target import unit_of
 from ..image.color import rendered_as
 from ..image.pixels import LinearImage
@@ -28,11 +28,6 @@ from .sources import Images
 MAX_GROUP_PIXELS = 1 << 18
 """Largest number of pixels of a group: 4 images of 256x256, or 64 of 64x64. Larger groups are not
 faster, and an interrupt loses the group under way."""
-
-LOAD_BASIS = "eigengs_dr.eigenbasis.registry:load_basis"
-PACK_BASIS = "eigengs_dr.eigenbasis.registry:pack_basis"
-"""The loader of bases, and the function that makes one travel, ``module:function``; their module is
-imported when a fit needs it."""
 
 Step = Callable[[float], None]
 """``step(share)``: which share of the current image is done, from 0 to 1."""
@@ -144,37 +139,23 @@ def fit_each(
     """
     if levels is not None:
         options = check_options(options, levels)
-    if client is not None and options.initializer == "eigen":
-        basis = resolve_name(PACK_BASIS)(
-            options.basis or DEFAULT_BASIS, options.backend, options.gaussians
-        )
-        options = replace(options, basis=basis)
+    if options.start is not None:
+        options = replace(options, start=load_start(options.start, options.backend))
     make_work = partial(fit_work, options, levels, None if client is not None else step)
     keep_grey = rendered_as(options.space) is None
     job = Job(make_work, _may_join, keep_grey, options.encoding, options.iterations)
     return run_images(images, output, overwrite, job, client)
 
 
-def _load(function: str, options: FitOptions) -> Any:
-    """Load or pack the basis of the options, see `eigengs_dr.eigenbasis.registry`."""
-    basis = options.basis or DEFAULT_BASIS
-    return resolve_name(function)(basis, options.backend, options.gaussians)
-
-
 def fit_work(options: FitOptions, levels: Levels | None = None, step: Step | None = None) -> Work:
-    """Return the `Work` of a fit of many images, with the basis loaded.
+    """Return the `Work` of a fit of many images.
 
     Raises
     ------
-    BackendError, ValueError
-        If the backend is not available, or the basis is not.
+    BackendError
+        If the backend is not available.
     """
     select(options.backend)
-    if options.initializer == "eigen":
-        model = resolve_name(LOAD_BASIS)(
-            options.basis or DEFAULT_BASIS, options.backend, options.gaussians
-        )
-        options = replace(options, basis=model)
     return partial(_fit_group, options=options, levels=levels, step=step)
 
 

@@ -10,7 +10,5 @@
 - ``model_fit``: an eigenbasis to a model
 - ``training``: a folder of images to a model
 - ``evaluation``: a model on images held out
-- ``initializer``: a model as the start of a fit
-- ``registry``: models by name
 - ``model_file``: the file of a model
 """

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,9 @@ from .pca.component_counts import name_components
 from .pca.truncation import TruncationCurve, curve_from_eigenvalues
 
 Planes = NDArray[np.float32]
+
+SHIPPED = {"natural": Path(__file__).parent / "data" / "natural.npz"}
+"""Files of the package's models, by name; see ``tools/train_natural.py``."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -290,16 +294,36 @@ class EigenGS:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], backend: str | None = None) -> EigenGS:
-        """Read a model that `save` wrote.
+        """Read a model that `save` wrote, or a model of this package.
+
+        Parameters
+        ----------
+        path : path-like
+            A file, or a name of `SHIPPED`, whose file is read once.
+        backend : {"llvm", "cuda"}, optional
 
         Raises
         ------
         ValueError, OSError
-            As `eigengs_dr.Gaussians.load`, for a model.
+            As `eigengs_dr.Gaussians.load`, for a model; also if there is no such file and name.
         """
+        if path in SHIPPED:
+            return _shipped(str(path), backend)
+        if not Path(path).is_file():
+            names = ", ".join(SHIPPED)
+            raise ValueError(f"model {str(path)!r} is neither a file nor one of: {names}")
         return cls(**read_members(path, backend))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the encoder here: what it has computed holds arrays of Dr.Jit."""
+        return {key: value for key, value in self.__dict__.items() if key != "encoder"}
 
     @cached_property
     def encoder(self) -> Encoder:
         """The functions of `eigengs_dr.eigenbasis.encoder`, with what they compute once."""
         return Encoder(self.gaussians, self.weights, self.mean_image, self.low)
+
+
+@cache
+def _shipped(name: str, backend: str | None) -> EigenGS:
+    return EigenGS(**read_members(SHIPPED[name], backend))

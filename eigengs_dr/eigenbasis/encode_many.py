@@ -6,14 +6,12 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.recording import exclusive
-from ..collection.fit_many import LOAD_BASIS, PACK_BASIS
 from ..collection.plan import run_images
 from ..collection.row import ImageRow, Outcome, RowProgress, collect
 from ..collection.run import FAILURES, Job, Work
@@ -23,7 +21,6 @@ from ..image.pixels import check_image
 
 if TYPE_CHECKING:
     from .eigengs import EigenGS
-    from .registry import PackedModel
 
 MAX_GROUP = 32
 """Largest number of images that are encoded together. With the basis "natural", groups of 8, 16 and
@@ -74,25 +71,21 @@ def encode_each(
         See there, also for results and errors.
     """
     check_encoding(*options)
-    basis = model if client is None else resolve_name(PACK_BASIS)(model)
-    job = Job(partial(encode_work, basis, *options), _may_join)
+    job = Job(partial(encode_work, model, *options), _may_join)
     total, finished = run_images(images, output, overwrite, job, client)
     return collect(total, finished, output is None, progress)
 
 
-def encode_work(
-    basis: EigenGS | str | PackedModel, colors: str, mean: str, target_psnr: float | None
-) -> Work:
+def encode_work(model: EigenGS, colors: str, mean: str, target_psnr: float | None) -> Work:
     """Return the work on groups of images, in this process or on a worker.
 
     Parameters
     ----------
-    basis : EigenGS, str or PackedModel
-        See `eigengs_dr.eigenbasis.registry.load_basis`.
+    model : EigenGS
     colors, mean, target_psnr
         See `eigengs_dr.EigenGS.encode`.
     """
-    encode = exclusive()(resolve_name(LOAD_BASIS)(basis).encoder.encode)
+    encode = exclusive()(model.encoder.encode)
     encode = partial(encode, colors=colors, mean=mean, target_psnr=target_psnr)
     return partial(_encode_group, encode=encode)
 

@@ -73,15 +73,12 @@ class FitProblem(NamedTuple):
         Factor of the errors before squaring.
     control : Control, or None
         None where Gaussians must keep their places.
-    base_image : ndarray of float32, shape (H, W, 3), or None
-        RGB image to add to renderings of the set: the mean image, if it stays pixels.
     """
 
     gaussians: Gaussians
     target: NDArray[np.float32]
     weight: NDArray[np.float32] | None = None
     control: Control | None = None
-    base_image: NDArray[np.float32] | None = None
 
 
 def run(

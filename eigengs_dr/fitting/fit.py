@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,15 +20,11 @@ from ..gaussian.gaussians import Gaussians
 from ..image.metrics import float_space, target_key
 from ..raster.render import picture_of
 from .descent import FitProblem
-from .options import FitOptions, named_options
+from .options import FitOptions, Start, named_options
 from .refine import FitProgress, Refinement, measure, refine
 from .search import search_count
-from .start import initialize
+from .start import initialize, load_start, mean_picture
 from .target import in_unit, read_pixels, unit_of
-
-if TYPE_CHECKING:
-    from ..eigenbasis.eigengs import EigenGS
-    from ..eigenbasis.pca.basis import Eigenbasis
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +55,8 @@ class Fit:
         Why the fit ended: "iterations", "plateau" or "interrupted"; a search for the number of
         Gaussians ends with "met", "out of reach" or "interrupted".
     mean_image : ndarray of float32, shape (H, W, 3), or None
-        RGB image to add to renderings of the set. The preset "eigengs" keeps the mean image of its
-        basis as pixels. The attribute `image` includes the mean image.
+        RGB image to add to renderings of the set. The preset "eigengs" keeps the mean image of the
+        model as pixels. The attribute `image` includes the mean image.
     psnr_ycbcr, psnr_rgb : float
         PSNR of the set in dB, from its row of the trace.
     source : str
@@ -117,7 +113,7 @@ def fit(
     gaussians: int | None = None,
     iterations: int = 1000,
     init: str = "auto",
-    basis: str | os.PathLike[str] | EigenGS | Eigenbasis | None = None,
+    start: Start | None = None,
     preset: str = "default",
     solve_steps: int = 10,
     space: str = "ycbcr",
@@ -138,21 +134,20 @@ def fit(
         A file, see `eigengs_dr.load_image`, or pixels, see `eigengs_dr.image.io.check_image`.
     gaussians : int, optional
         Number of Gaussians, at most one per pixel. By default 5000, or one per pixel for smaller
-        images; with an eigenbasis, the number of Gaussians of the basis.
+        images; with a start, the number of its Gaussians.
     iterations : int, optional
         Largest number of refinement steps; 0 keeps the colours of the solve.
-    init : {"auto", "adaptive", "grid", "random", "eigen"}, optional
-        Initialiser. "auto" is "eigen" if a basis is given, else the initialiser of the preset:
-        "adaptive" for "default".
-    basis : str, path-like, EigenGS or Eigenbasis, optional
-        Basis for "eigen": the name of a basis in this package, the path of a basis file, a model,
-        or an `eigengs_dr.Eigenbasis`, to which a model is fitted first. By default
-        "natural", which ships with the package.
+    init : {"auto", "adaptive", "grid", "random"}, optional
+        Placement by the image alone. "auto" is that of the preset: "adaptive" for "default".
+    start : Gaussians, Fit, path-like or EigenGS, optional
+        Instead of a placement, Gaussians to start from, scaled to the size of the image: the set of
+        the frame before of a film, a file, ``model.encode(image)``. A model stands for the set that
+        it makes of the image, which suits many images.
     preset : {"default", "gaussianimage", "eigengs"}, optional
-        The method, see `eigengs_dr.fitting.options`.
+        The method, see `eigengs_dr.fitting.options`; "eigengs" needs a model as the start.
     solve_steps : int, optional
-        Steps of conjugate gradients in the colour solve. "eigen" uses them only if the image and
-        the basis differ in size.
+        Steps of conjugate gradients in the colour solve. With a start they go on from its colours;
+        those of a model need none, unless the image and the model differ in size.
     space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, optional
         Space of the colours and of the squared error. "linear" decodes sRGB: the Gaussians sum to
         linear light, as textures need it, and errors weigh more in the dark. "data" uses one or
@@ -162,7 +157,7 @@ def fit(
         `eigengs_dr.image.radiance.to_log`. For an image of light above 1, "linear" becomes
         "radiance", and "ycbcr" and "rgb" become "log": a texture would clamp their sums.
     seed : int, optional
-        Seed of the random numbers. Only the initialiser "random" and presets without a colour
+        Seed of the random numbers. Only the placement "random" and presets without a colour
         solve use random numbers; the preset "default" gives one result for all seeds.
     backend : {"llvm", "cuda"}, optional
         By default "cuda" if there is a GPU.
@@ -214,7 +209,7 @@ def fit(
         gaussians=gaussians,
         iterations=iterations,
         init=init,
-        basis=basis,
+        start=start,
         preset=preset,
         solve_steps=solve_steps,
         space=space,
@@ -241,22 +236,28 @@ def fit_image(image: Any, options: FitOptions, progress: FitProgress | None = No
     unit = unit_of(pixels, options.space)
     if unit != 1:
         pixels = pixels / np.float32(unit)
+    if options.start is not None:
+        start = load_start(options.start, options.backend)
+        whole = in_unit(start, 1 / unit) if isinstance(start, Gaussians) else start
+        options = replace(options, start=whole)
+    mean_image = mean_picture(options, pixels.shape[1], pixels.shape[0])
     with defer_interrupts() as interrupted:
-        start = initialize(pixels, options.first_try(pixels))
+        problem = initialize(pixels, options.first_try(pixels))
         seconds_init = time.perf_counter() - started
         if options.target_psnr is None:
             found = refine(
-                start,
+                problem,
                 pixels,
                 options.method.schedule,
                 options.iterations,
                 started=started,
                 progress=progress,
                 interrupted=interrupted,
+                score=partial(measure, image=pixels, started=started, base_image=mean_image),
             )
         else:
-            found = _search(start, pixels, options, started, progress, interrupted)
-    return finish(found, in_unit(found.gaussians, unit), start.base_image, started, seconds_init)
+            found = _search(problem, pixels, options, started, progress, interrupted)
+    return finish(found, in_unit(found.gaussians, unit), mean_image, started, seconds_init)
 
 
 def _search(

@@ -101,7 +101,7 @@ def check_options(options: FitOptions, levels: Levels) -> FitOptions:
     """
     if options.target_psnr is not None:
         raise ValueError("levels and target_psnr exclude each other; give one of them")
-    if options.preset != "default" or options.initializer != "adaptive":
+    if options.preset != "default" or options.placement != "adaptive":
         raise ValueError("levels needs preset 'default' and init 'adaptive'; leave the others out")
     if isinstance(levels, (int, np.integer)):
         return options

@@ -8,31 +8,25 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import wraps
 from inspect import signature
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian.file import CUTOFF, MAX_CUTOFF
+from ..gaussian.file import CUTOFF, MAX_CUTOFF, check_index_range
 from ..image.color import SPACES
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import check_encoding
-from ..raster.binning.tiles import check_index_range
 from .schedule import Schedule
 
-if TYPE_CHECKING:
-    from ..eigenbasis.eigengs import EigenGS
-    from ..eigenbasis.pca.basis import Eigenbasis
-
+if TYPE_CHECKING:  # a set needs Dr.Jit, and the help of the command line none
+    from ..gaussian.gaussians import Gaussians
 
 DEFAULT_COUNT = 5000
 """Number of Gaussians by default."""
 
-INITS = ("auto", "random", "grid", "adaptive", "eigen")
-"""What ``init`` takes: "auto", the placements of `eigengs_dr.fitting.start`, and a basis."""
-
-DEFAULT_BASIS = "natural"
-"""Name of the basis by default: the basis that ships with the package."""
+INITS = ("auto", "random", "grid", "adaptive")
+"""What ``init`` takes: "auto" and the placements of `eigengs_dr.fitting.start`."""
 
 PIXELS_PER_FIRST_GAUSSIAN = 64
 """Pixels per Gaussian in the first try of a search for the number of Gaussians."""
@@ -68,6 +62,25 @@ def named_options(function: Function) -> Function:
     return call  # type: ignore[return-value]
 
 
+@runtime_checkable
+class Model(Protocol):
+    """What makes a set of an image at once, as `eigengs_dr.EigenGS` does."""
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """Gaussians at the native size of the model."""
+
+    def encode(self, image: Any, colors: str = "exact", mean: str = "gaussians") -> Gaussians:
+        """Return the set of an image at the size of the image."""
+
+    def dense_mean(self, width: int, height: int) -> NDArray[np.float32]:
+        """Return the pixels (height, width, C) that a set of the mean "dense" lacks."""
+
+
+Start: TypeAlias = "Gaussians | Model | str | os.PathLike[str]"
+"""What a fit starts from: a set, the file of a set, or a model."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
     """The options of `eigengs_dr.fit`, which describes each of them.
@@ -81,7 +94,7 @@ class FitOptions:
     gaussians: int | None = None
     iterations: int = 1000
     init: str = "auto"
-    basis: str | os.PathLike[str] | EigenGS | Eigenbasis | None = None
+    start: Start | None = None
     preset: str = "default"
     solve_steps: int = 10
     space: str = "ycbcr"
@@ -104,13 +117,12 @@ class FitOptions:
         ):
             if value not in known:
                 raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(known)}")
-        if self.method.mean == "dense" and self.init not in ("auto", "eigen"):
+        if self.start is not None and self.init != "auto":
+            raise ValueError(f"init {self.init!r} and a start exclude each other; give one of them")
+        if self.method.mean == "dense" and not isinstance(self.start, Model):
             raise ValueError(
-                f"preset {self.preset!r} starts from a basis; use init 'auto', not {self.init!r}"
-            )
-        if self.basis is not None and self.initializer != "eigen":
-            raise ValueError(
-                f"init {self.init!r} uses no basis; leave the basis out, or use init 'eigen'"
+                f"preset {self.preset!r} starts from a model; give one as the start, such as "
+                "EigenGS.load('natural')"
             )
         self._check_search()
 
@@ -120,11 +132,11 @@ class FitOptions:
         return PRESETS[self.preset]
 
     @property
-    def initializer(self) -> str:
-        """The name of the initialiser: with "auto", "eigen" for a basis, else the preset's."""
-        if self.init != "auto":
-            return self.init
-        return "eigen" if self.basis is not None else self.method.init
+    def placement(self) -> str | None:
+        """The name of the placement, by default the preset's; None if there is a start."""
+        if self.start is not None:
+            return None
+        return self.method.init if self.init == "auto" else self.init
 
     def check_image(self, pixels: NDArray[np.float32]) -> None:
         """Raise ValueError for more Gaussians than pixels, and for an image too large to index.
@@ -187,10 +199,10 @@ class FitOptions:
             return
         if self.gaussians is not None:
             raise ValueError("gaussians and target_psnr exclude each other; give one of them")
-        if self.preset != "default" or self.initializer != "adaptive":
+        if self.preset != "default" or self.placement != "adaptive":
             raise ValueError(
                 "target_psnr works with preset 'default' and init 'adaptive', not with "
-                f"{self.preset!r} and {self.initializer!r}"
+                f"{self.preset!r} and {self.placement or 'a start'!r}"
             )
         if not 0 < self.target_psnr <= MAX_PSNR:
             raise ValueError(
@@ -211,21 +223,21 @@ def max_gaussians_for(pixels: NDArray[np.float32]) -> int:
 
 @dataclass(frozen=True)
 class Preset:
-    """A method: the initialiser, the start of the colours and the schedule of the refinement.
+    """A method: the placement, the start of the colours and the schedule of the refinement.
 
     Attributes
     ----------
     init : str
-        Initialiser for ``init="auto"``.
+        Placement for ``init="auto"``.
     solves : bool
-        Whether a solve finds the best colours for the shapes before refinement. Without a solve,
-        an eigenbasis gives the colours by projection; other initialisers draw them from [0, 1] on
-        a black background.
+        Whether a solve finds the best colours for the shapes before refinement. Without a solve, a
+        start has its own colours, those of a model are projections on its components, and
+        placements draw them from [0, 1] on a black background.
     schedule : Schedule
         Schedule of the refinement.
     mean : {"gaussians", "dense"}
-        With an eigenbasis: "gaussians" if the Gaussians include the mean image, "dense" if the
-        mean image stays pixels.
+        With a model: "gaussians" if the Gaussians include the mean image, "dense" if the mean image
+        stays pixels.
     """
 
     init: str
@@ -261,6 +273,6 @@ PRESETS = {
     ),
     "gaussianimage": Preset(init="random", solves=False, schedule=_ONE_RATE),
     # EigenGS's paper descends as GaussianImage does, from the projection on the eigenbasis.
-    "eigengs": Preset(init="eigen", solves=False, schedule=_ONE_RATE, mean="dense"),
+    "eigengs": Preset(init="", solves=False, schedule=_ONE_RATE, mean="dense"),
 }
 """Presets by name."""

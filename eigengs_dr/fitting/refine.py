@@ -95,7 +95,7 @@ def refine(
     """
     started = time.perf_counter() if started is None else started
     if score is None:
-        score = partial(measure, image=image, started=started, base_image=problem.base_image)
+        score = partial(measure, image=image, started=started)
     marks, trace = trace_steps(iterations), list[dict[str, Any]]()
     best, current, highest = problem.gaussians, problem.gaussians, -math.inf
     stopped, step, latest, row = "iterations", 0, dict[str, Any](), dict[str, Any]()

@@ -131,7 +131,7 @@ def search_count(
     Parameters
     ----------
     start : FitProblem
-        A first guess by the initialiser "adaptive", which can redistribute.
+        A first guess by the placement "adaptive", which can redistribute.
     measure : callable
         ``measure(gaussians)`` returns a dict with a value in dB under the key `figure`.
     figure : str

@@ -1,23 +1,27 @@
-"""The start of a fit: Gaussians with colours, placed by the image alone or by a basis.
+"""The start of a fit: Gaussians with colours, placed by the image, of another set, or of a model.
 
-``INITS`` names the placements. Two of them see only the size of the image: a hexagonal grid of
+``PLACEMENTS`` names the placements. Two of them see only the size of the image: a hexagonal grid of
 round Gaussians, and random Gaussians.
 """
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
-from pkgutil import resolve_name
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.arrays import types_of
 from ..gaussian.covariance import factor_from_covariance
-from ..gaussian.gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians, set_of
+from ..image.color import decode
 from .density_control import DensityControl
 from .descent import FitProblem
-from .options import FitOptions
+from .options import FitOptions, Model
 from .placement.adaptive import place_adaptive
 from .solvers.conjugate_gradient import solve
 from .target import FitTarget, make_target
@@ -109,14 +113,91 @@ def initialize(pixels: NDArray[np.float32], options: FitOptions) -> FitProblem:
     Raises
     ------
     ValueError
-        If the basis contradicts another option.
+        If the start contradicts another option.
+    TypeError
+        If the start is something else.
     """
     target = make_target(pixels, options.space)
-    if options.initializer == "eigen":
-        start = resolve_name("eigengs_dr.eigenbasis.initializer:start_from_basis")
-        problem: FitProblem = start(target, options)
-        return problem
-    return start_from_placement(target, options)
+    if options.start is None:
+        return start_from_placement(target, options)
+    return start_from_set(target, options)
+
+
+def start_from_set(target: FitTarget, options: FitOptions) -> FitProblem:
+    """Take the Gaussians of a set or of a model, at the size of the image."""
+    method, source = options.method, load_start(options.start, options.backend)
+    height, width = target.values.shape[:2]
+    native = source if isinstance(source, Gaussians) else source.gaussians
+    check_start(native, width, height, options)
+    if isinstance(source, Gaussians):
+        start, exact = source.scaled(width, height), False
+    else:
+        colors = "exact" if method.solves else "projected"
+        start = source.encode(target.pixels, colors, method.mean)
+        # At another size or cutoff the colours of a model are not exact.
+        exact = (native.width, native.height, native.cutoff) == (width, height, options.cutoff)
+    start = replace(start.bounded(), cutoff=float(options.cutoff))
+    if method.solves and not exact:
+        start = solve(start, target.values, options.solve_steps, warm_start=True).gaussians
+    if method.mean != "dense":
+        return FitProblem(start, target.values, target.weight, control_for(target, options))
+    assert not isinstance(source, Gaussians)
+    return FitProblem(start, target.values - source.dense_mean(width, height), target.weight)
+
+
+def load_start(start: Any, backend: str | None) -> Gaussians | Model:
+    """Return the set or the model of a start.
+
+    Raises
+    ------
+    ValueError
+        If the set is on another backend, or its file is none.
+    TypeError
+        If the start is something else.
+    """
+    if isinstance(start, (str, os.PathLike)):
+        return Gaussians.load(start, backend)
+    found = start if isinstance(start, Model) else set_of(start)
+    current = types_of((found if isinstance(found, Gaussians) else found.gaussians).mean).backend
+    if backend not in (None, current):
+        raise ValueError(
+            f"the start is on backend {current!r}, not on {backend!r}; load it with "
+            f"backend={backend!r}, or leave the backend out"
+        )
+    return found
+
+
+def check_start(start: Gaussians, width: int, height: int, options: FitOptions) -> None:
+    """Raise ValueError unless a start fits the image and the options."""
+    count = len(start)
+    if options.gaussians not in (None, count):
+        raise ValueError(
+            f"gaussians is {options.gaussians}, but the start has {count}; leave the number or "
+            "the start out"
+        )
+    if count > width * height:
+        raise ValueError(
+            f"the start has {count} Gaussians, more than an image of {width}x{height} has pixels; "
+            "use init 'adaptive'"
+        )
+    if options.space != start.space:
+        raise ValueError(
+            f"space is {options.space!r}, but the start is in {start.space!r}; use space "
+            f"{start.space!r}, or another start"
+        )
+
+
+def mean_picture(options: FitOptions, width: int, height: int) -> NDArray[np.float32] | None:
+    """Return the RGB that a fit adds to renderings of its set, (height, width, 3), or None.
+
+    It is the mean image of the model, if the method keeps the mean image as pixels; a rendering
+    already holds the RGB of zeros.
+    """
+    if options.method.mean != "dense" or not isinstance(options.start, Model):
+        return None
+    planes = options.start.dense_mean(width, height)
+    rgb = np.stack(decode(options.space, list(np.moveaxis(planes, 2, 0))), axis=2)
+    return rgb - np.array(decode(options.space, [0.0] * planes.shape[2]), np.float32)
 
 
 def start_from_placement(target: FitTarget, options: FitOptions) -> FitProblem:
@@ -124,7 +205,7 @@ def start_from_placement(target: FitTarget, options: FitOptions) -> FitProblem:
     method, count = options.method, options.count_for(target.values)
     height, width, channels = target.values.shape
     generator = np.random.default_rng(options.seed)
-    mean, factor = PLACEMENTS[options.initializer](target.shown, count, generator)
+    mean, factor = PLACEMENTS[str(options.placement)](target.shown, count, generator)
     color: NDArray[np.floating] = np.zeros((count, channels), np.float32)
     if not method.solves:
         color = generator.uniform(0, 1, color.shape)
@@ -147,7 +228,7 @@ def control_for(target: FitTarget, options: FitOptions) -> DensityControl:
 
     Means over 6 training photos of 192 x 192 pixels after 1,000 steps, psnr_rgb without and with
     relocation: 28.3 and 31.3 dB from a grid, 27.1 and 31.2 dB from random places (1,800 Gaussians),
-    36.0 and 40.1 dB from an eigenbasis (5,000).
+    36.0 and 40.1 dB from a model (5,000).
     """
-    anew = options.initializer == "adaptive"
+    anew = options.placement == "adaptive"
     return DensityControl(target.values, target.weight, target.shown, options.solve_steps, anew)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import index
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import numpy as np
@@ -172,6 +172,12 @@ class Gaussians:
             "color": _rows(self.color, n),
             "background": _rows(self.background, 1)[0],
         }
+
+    def __reduce__(self) -> tuple:
+        """Travel to another process as NumPy arrays, without derivatives."""
+        types = types_of(self.mean)
+        kind = np.dtype(f"f{types.bits // 8}")
+        return Gaussians.from_data, (self.data(), types.backend, kind)
 
     def __repr__(self) -> str:
         size = f"{len(self)}, {self.width}x{self.height} pixels, {self.channels} channels"
@@ -430,7 +436,19 @@ def like(
     )
 
 
-def set_of(source: Any) -> Gaussians:
+class Fitted(Protocol):
+    """What holds the set of a fit, as `eigengs_dr.Fit` does."""
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The set."""
+
+    @property
+    def mean_image(self) -> NDArray[np.float32] | None:
+        """Pixels to add to renderings of the set."""
+
+
+def set_of(source: Gaussians | Fitted) -> Gaussians:
     """Return a set, or the set of a fit.
 
     Raises
@@ -446,8 +464,7 @@ def set_of(source: Any) -> Gaussians:
         raise TypeError(f"{type(source).__name__} is no set of Gaussians; pass Gaussians or a Fit")
     if source.mean_image is not None:
         raise ValueError("the fit has a mean image of pixels, which its set lacks; use .gaussians")
-    found: Gaussians = source.gaussians
-    return found
+    return source.gaussians
 
 
 FIELDS = {"mean": 2, "factor": 3, "color": 0, "background": 0}

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from operator import index
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, make_divisor, types_of
 from ..backend.recording import exclusive
-from ..gaussian.file import MAX_CUTOFF
-from ..gaussian.gaussians import Gaussians, set_of
+from ..gaussian.file import MAX_CUTOFF, check_index_range
+from ..gaussian.gaussians import Fitted, Gaussians, set_of
 from ..image.color import decode, from_sum, to_picture
 from .adjoint import adjoint
 from .binning.lists import TileLists, build_lists
-from .binning.tiles import TILE, Grid, check_index_range
+from .binning.tiles import TILE, Grid
 from .kernels import channel_sums, forward
 from .parameters import (
     KernelParameters,
@@ -33,13 +33,10 @@ from .parameters import (
     pack_parameters,
 )
 
-if TYPE_CHECKING:
-    from ..fitting.fit import Fit
-
 
 @exclusive()
 def render(
-    gaussians: Gaussians | Fit,
+    gaussians: Gaussians | Fitted,
     width: int | None = None,
     height: int | None = None,
     cutoff: float | None = None,
@@ -111,7 +108,7 @@ def render(
 
 @exclusive()
 def tile_lists(
-    gaussians: Gaussians | Fit,
+    gaussians: Gaussians | Fitted,
     width: int | None = None,
     height: int | None = None,
     cutoff: float | None = None,
@@ -160,7 +157,7 @@ def tile_lists(
 
 @exclusive()
 def picture_of(
-    gaussians: Gaussians | Fit,
+    gaussians: Gaussians | Fitted,
     width: int | None = None,
     height: int | None = None,
     cutoff: float | None = None,

@@ -43,8 +43,12 @@ def drawn(tmp_path_factory):
         patch.setattr(datasets, "MAX_COMPONENTS", 10)
         patch.setattr(figures, "EVERY", 2)
         patch.setattr(figure_strips, "COMPONENTS", 8)
-        for module in (figures, figure_strips):
-            patch.setattr(module, "load_basis", lambda name, backend: small_model("llvm"))
+        load = EigenGS.load
+        patch.setattr(
+            EigenGS,
+            "load",
+            lambda name, *a: small_model("llvm") if name == "natural" else load(name, *a),
+        )
 
         def spy(module, name):
             function = getattr(module, name)
@@ -78,8 +82,8 @@ def test_all_figures_are_drawn_listed_and_credited(drawn):
 
 def first_fit(drawn, image, preset):
     """Start a fit as a preset does."""
-    basis = model(drawn, "auto") if preset == "eigengs" else None
-    return fit(image, 60, 0, basis=basis, preset=preset, backend="llvm")
+    start = model(drawn, "auto") if preset == "eigengs" else None
+    return fit(image, 60, 0, start=start, preset=preset, backend="llvm")
 
 
 def test_iterations_are_those_of_the_presets(drawn):

@@ -15,6 +15,7 @@ from eigengs_bench.report.frames import frame_of
 from eigengs_bench.report.sections.pareto import front, points_of, summarize
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
+from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting.descent import descend
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.options import PRESETS, FitOptions
@@ -42,14 +43,14 @@ def test_variants_turn_one_setting_each(tmp_path, monkeypatch):
     fields = {"solve steps": "solve_steps", "init": "init", "cutoff": "cutoff"}
     for v in others:
         if v.knob in fields or v.knob == "gaussians":
-            assert getattr(v, fields.get(v.knob, "gaussians")) == v.value
             if v.value != "eigen":  # whose model sets their number
+                assert getattr(v, fields.get(v.knob, "gaussians")) == v.value
                 assert sum(a != b for a, b in zip(v[2:], base[2:], strict=True)) == 1
         else:
             assert v.preset == ("eigengs" if v.knob == "components" else v.value)
-    models = {v.basis for v in others if v.knob == "components"}
+    models = {v.start for v in others if v.knob == "components"}
     assert models == {"model 50", "model 100", "model 500"}
-    assert others[1].basis == "model 300" and {v.preset for v in others} == set(PRESETS)
+    assert others[1].start == "model 300" and {v.preset for v in others} == set(PRESETS)
 
 
 @pytest.fixture
@@ -72,11 +73,11 @@ def test_every_horizon_of_falling_rates_is_a_run_of_its_own(shorter, backend, tm
 def test_constant_rates_need_one_run(shorter, backend, monkeypatch, tmp_path):
     runs, model = [], small_model(backend)
     monkeypatch.setattr(pareto, "follow", lambda *a, **k: runs.append(a[2]) or follow(*a, **k))
-    variant = Variant("preset", "eigengs", None, "eigengs", basis=model)
+    variant = Variant("preset", "eigengs", None, "eigengs", start=model)
     row = pareto.trace(task_in(tmp_path, backend, iterations=5), variant, one_image())
     assert [figures["iteration"] for figures in row["trace"]] == [0, 2, 5]
     assert runs == [5]
-    start = fit(one_image(), iterations=0, preset="eigengs", basis=model, backend=backend)
+    start = fit(one_image(), iterations=0, preset="eigengs", start=model, backend=backend)
     assert row["trace"][0]["psnr_ycbcr"] == pytest.approx(start.trace[0]["psnr_ycbcr"], abs=1e-6)
 
 
@@ -187,7 +188,7 @@ def small(monkeypatch, shorter, small_kernels):
     monkeypatch.setattr("eigengs_bench.harness.datasets.SAMPLE_SIDE", 32)
     monkeypatch.setattr(pareto, "usual_count", lambda name: 100)
     monkeypatch.setattr(pareto, "CUTOFFS", (3.5,))
-    monkeypatch.setattr(pareto, "load_basis", lambda name, backend: small_model(backend or "llvm"))
+    monkeypatch.setattr(EigenGS, "load", lambda name, backend: small_model(backend or "llvm"))
     whole = pareto.variants
     monkeypatch.setattr(pareto, "variants", lambda *a: [whole(*a)[k] for k in (0, 2, 10)])
 

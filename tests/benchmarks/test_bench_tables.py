@@ -52,8 +52,8 @@ def test_every_method_is_measured_and_figures_are_those_of_fit(data, tmp_path, b
         assert [m["iteration"] for m in moments] == [0, 10, 12]
         assert moments[0]["seconds"] < moments[2]["seconds"]
         count = None if preset == "eigengs" else 60
-        basis = model if preset == "eigengs" else None
-        last = fit(image, count, 12, preset=preset, basis=basis, backend=backend).trace[-1]
+        start = model if preset == "eigengs" else None
+        last = fit(image, count, 12, preset=preset, start=start, backend=backend).trace[-1]
         assert moments[-1]["psnr_ycbcr"] == last["psnr_ycbcr"]
         assert moments[-1]["psnr_rgb"] == last["psnr_rgb"]
     rgb, ycbcr = (ends["eigengs", "faces256", 4, c, "whole"][-1] for c in ("rgb", "ycbcr"))

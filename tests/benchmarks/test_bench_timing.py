@@ -13,17 +13,18 @@ from eigengs_bench.names import SETS, ImageSet
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.options import PRESETS, FitOptions
-from eigengs_dr.fitting.start import initialize
+from eigengs_dr.fitting.start import initialize, mean_picture
 from eigengs_dr.image.io import ImageError, save_image
 
 
 @pytest.mark.parametrize("preset", NAMES)
 def test_pictures_and_figures_are_those_of_fit(backend, preset):
-    image, basis = one_image(3), small_model(backend) if preset == "eigengs" else None
-    options = FitOptions(gaussians=100, preset=preset, basis=basis, backend=backend)
+    image, model = one_image(3), small_model(backend) if preset == "eigengs" else None
+    options = FitOptions(gaussians=100, preset=preset, start=model, backend=backend)
     start, schedule = partial(initialize, image, options), options.method.schedule
-    moments = list(timing.follow(start, schedule, 20, {0, 10, 20}))
-    trace = fit(image, 100, 20, preset=preset, basis=basis, backend=backend).trace
+    mean_image = mean_picture(options, image.shape[1], image.shape[0])
+    moments = list(timing.follow(start, schedule, 20, {0, 10, 20}, mean_image))
+    trace = fit(image, 100, 20, preset=preset, start=model, backend=backend).trace
     assert [m.iteration for m in moments] == [row["iteration"] for row in trace] == [0, 10, 20]
     for moment, row in zip(moments, trace, strict=True):
         scored = timing.score(moment, image)

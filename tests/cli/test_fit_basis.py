@@ -8,16 +8,16 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.command import assert_refused, previewed, run, succeeded
+from eigengs_dr.cli.fit import DEFAULT_BASIS
 from eigengs_dr.cli.main import main
-from eigengs_dr.eigenbasis import registry as bases
-from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.fitting.options import DEFAULT_BASIS, INITS
+from eigengs_dr.eigenbasis.eigengs import SHIPPED, EigenGS
+from eigengs_dr.fitting.options import INITS
 from eigengs_dr.image.color import SPACES, YCBCR_TO_RGB
 
 
 def test_fit_from_an_eigenbasis(trained, photo, tmp_path):
     folder, _ = trained
-    start = ["--init", "eigen", "--basis", folder / "m.npz", "--report", tmp_path / "r.json"]
+    start = ["--basis", folder / "m.npz", "--report", tmp_path / "r.json"]
     succeeded(run("fit", photo, "-o", tmp_path / "x.npz", *start, "--iterations", 30))
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["gaussians"] == 60
@@ -34,7 +34,7 @@ def test_the_basis_is_read_once(trained, photo, tmp_path, monkeypatch):
     loaded = []
     load = EigenGS.load
     monkeypatch.setattr(EigenGS, "load", lambda *given: loaded.append(given) or load(*given))
-    start = ["--init", "eigen", "--basis", folder / "m.npz", "--iterations", 0]
+    start = ["--basis", folder / "m.npz", "--iterations", 0]
     shutil.copy(photo, tmp_path / "other.png")
     succeeded(run("fit", photo, tmp_path / "other.png", "-o", tmp_path / "fits", *start))
     assert len(loaded) == 1
@@ -58,11 +58,11 @@ def test_the_papers_form_lacks_the_mean_image(trained, photo, tmp_path):
 
 def test_bases_that_do_not_fit(trained, fitted, photo, existing, tmp_path):
     folder, _ = trained
-    eigen = ["fit", photo, "-o", existing, "--overwrite", "--init", "eigen"]
+    eigen = ["fit", photo, "-o", existing, "--overwrite"]
     model = folder / "m.npz"
     assert_refused(run(*eigen, "--basis", "nowhere"), "'nowhere'", "natural")
     assert_refused(run(*eigen, "--basis", fitted[0] / "fit.npz"), "eigengs_dr.gaussians")
-    assert_refused(run(*eigen, "--basis", tmp_path), "basis")
+    assert_refused(run(*eigen, "--basis", tmp_path), "neither a file")
     assert_refused(run(*eigen, "--basis", model, "--gaussians", 50), photo, "50", "60")
     assert_refused(run(*eigen, "--basis", model, "--space", "rgb"), photo, "'rgb'", "'ycbcr'")
 
@@ -73,7 +73,7 @@ def test_the_names_of_inits_and_bases():
     [option] = [p for p in main.commands["fit"].params if p.name == "space"]
     assert tuple(option.type.choices) == SPACES
     [option] = [p for p in main.commands["fit"].params if p.name == "basis"]
-    assert DEFAULT_BASIS in bases.SHIPPED and DEFAULT_BASIS in option.help
+    assert DEFAULT_BASIS in SHIPPED and DEFAULT_BASIS in option.help
 
 
 def test_a_basis_implies_its_start(trained, photo, tmp_path):
@@ -84,4 +84,4 @@ def test_a_basis_implies_its_start(trained, photo, tmp_path):
     told = json.loads(report.read_text())
     assert (told["gaussians"], told["basis"]) == (60, str(model))
     assert_refused(run("fit", photo, *output, "--basis", "nowhere.npz"), "nowhere.npz")
-    assert_refused(run("fit", photo, *output, "--basis", model, "--init", "grid"), "basis")
+    assert_refused(run("fit", photo, *output, "--basis", model, "--init", "grid"), "start")

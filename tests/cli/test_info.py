@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 from _helpers.command import assert_refused, run, succeeded
-from eigengs_dr.eigenbasis import registry as bases
+from eigengs_dr.eigenbasis.eigengs import SHIPPED
 
 
 def test_info(fitted):
@@ -43,7 +43,7 @@ def test_info_of_a_model(trained, tmp_path):
 
 def test_info_of_the_basis_that_ships(tmp_path):
     found = json.loads(succeeded(run("info", "natural", "--json")).stdout)
-    assert found["file"] == str(bases.SHIPPED["natural"])
+    assert found["file"] == str(SHIPPED["natural"])
     assert found["components"] == found["fall"][-1]["components"] == [230, 60, 60]
     assert found["split_reason"]
     assert_refused(run("info", tmp_path / "natural"), tmp_path / "natural", "No such file")

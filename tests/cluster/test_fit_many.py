@@ -74,8 +74,8 @@ def test_a_basis_and_results_travel(client):
 
 
 def test_mistakes_are_said_as_in_one_process(client, photos, output):
-    with pytest.raises(ValueError, match="neither a file nor one of"):
-        eg.fit_many(photos, output, client=client, basis="nothing")
+    with pytest.raises(ValueError, match="init 'nothing' is unknown"):
+        eg.fit_many(photos, output, client=client, init="nothing")
     (photos / "03.png").write_text("no image")
     rows = eg.fit_many(photos, output, client=client, **QUICK)
     assert [row.name for row in rows if row.status == "failed"] == ["03"]

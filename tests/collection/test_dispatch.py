@@ -119,20 +119,3 @@ def test_warnings_of_workers_are_said_here(tmp_path):
     Image.fromarray(pixels).save(tmp_path / "a.png")
     with pytest.warns(UserWarning, match="transparent pixels"):
         eg.fit_many([tmp_path / "a.png"], client=Here(), **QUICK)
-
-
-def test_a_basis_travels_as_arrays(photos):
-    import pickle
-
-    from _helpers.families import small_model
-    from eigengs_dr.eigenbasis.registry import load_basis, pack_basis
-
-    model = small_model("llvm")
-    packed = pack_basis(model, "llvm")
-    load_basis(packed)
-    again = load_basis(pickle.loads(pickle.dumps(packed)), "llvm")
-    for name, values in model.gaussians.to_arrays().items():
-        np.testing.assert_array_equal(again.gaussians.to_arrays()[name], values)
-    for first, second in zip(model.weights, again.weights, strict=True):
-        np.testing.assert_array_equal(first, second)
-    assert pack_basis("natural") == "natural"

@@ -159,7 +159,7 @@ def test_too_many_gaussians_are_refused(backend):
 @pytest.mark.parametrize(
     ("changed", "expected"),
     [({}, True), ({"init": "grid"}, True), ({"preset": "gaussianimage"}, False),
-     ({"target_psnr": 30.0, "gaussians": None}, False), ({"init": "eigen"}, False),
+     ({"target_psnr": 30.0, "gaussians": None}, False), ({"start": "set.npz"}, False),
      ({"cutoff": 4.0}, False), ({"gaussians": 33000}, False)],
 )  # fmt: skip
 def test_which_options_go_together(changed, expected):

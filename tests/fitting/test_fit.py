@@ -17,8 +17,7 @@ from eigengs_dr.raster.render import render
 
 @pytest.mark.parametrize("init", INITS)
 def test_fit_improves_on_its_start(backend, init):
-    basis = small_model(backend) if init == "eigen" else None
-    result = fit(picture(), SPLATS, 60, init=init, basis=basis, backend=backend)
+    result = fit(picture(), SPLATS, 60, init=init, backend=backend)
     check_sound(result, picture())
     assert figures(result)[-1] > figures(result)[0] + 1
     assert len(result.gaussians) == SPLATS
@@ -66,10 +65,10 @@ def test_more_solve_steps_start_better(backend):
 @presets
 def test_one_seed_gives_one_result(backend, preset):
     eigen = preset == "eigengs"  # which draws nothing
-    init, basis = ("auto", small_model(backend)) if eigen else ("random", None)
+    init, start = ("auto", small_model(backend)) if eigen else ("random", None)
 
     def run(iterations, seed):
-        return fit(picture(), SPLATS, iterations, init, basis, preset, seed=seed, backend=backend)
+        return fit(picture(), SPLATS, iterations, init, start, preset, seed=seed, backend=backend)
 
     first, second = run(30, 5), run(30, 5)
     assert figures(first) == figures(second)
@@ -91,8 +90,8 @@ def test_gaussianimage(backend):
 @pytest.mark.parametrize("value", [0.0, 0.3, 1.0])
 def test_constant_images(backend, preset, value):
     image = np.full((SIDE, SIDE, 3), value, np.float32)
-    basis = small_model(backend) if preset == "eigengs" else None
-    result = fit(image, SPLATS, 60, preset=preset, basis=basis, backend=backend)
+    start = small_model(backend) if preset == "eigengs" else None
+    result = fit(image, SPLATS, 60, preset=preset, start=start, backend=backend)
     check_sound(result, image)
     if preset == "default":
         assert figures(result)[0] > 100
@@ -157,8 +156,8 @@ def test_rates_far_too_high(backend, preset, factor):
     rates = {name: rate * factor for name, rate in method.schedule.rates.items()}
     wild = replace(method, schedule=replace(method.schedule, rates=rates))
     with patch.dict(PRESETS, {preset: wild}):
-        basis = small_model(backend) if preset == "eigengs" else None
-        result = fit(picture(), SPLATS, 100, preset=preset, basis=basis, backend=backend)
+        start = small_model(backend) if preset == "eigengs" else None
+        result = fit(picture(), SPLATS, 100, preset=preset, start=start, backend=backend)
     assert np.isfinite(figures(result)).all()
     check_sound(result, picture())
 

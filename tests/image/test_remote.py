@@ -96,7 +96,7 @@ def test_images_of_a_basis_and_a_model(place, photos, tmp_path):
     model = eg.EigenGS.fit(basis, gaussians=60)
     assert model.encode(each[0]).width == 32
     assert [len(basis.project(each[0])[0])] == [2]
-    result = eg.fit(each[0], basis=basis, gaussians=60, iterations=0)
+    result = eg.fit(each[0], start=model, iterations=0)
     np.testing.assert_allclose(result.image, eg.picture_of(model.encode(each[0])), atol=1e-4)
 
 

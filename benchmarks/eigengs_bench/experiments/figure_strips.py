@@ -16,7 +16,6 @@ from eigengs_bench.harness.timing import Image, Moment, descent
 from eigengs_bench.names import CATS, NATURAL, SETS
 from eigengs_bench.report.charts import CELL, Cell, save_strip, strip
 from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.eigenbasis.registry import load_basis
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.image.resize import center_crop
@@ -61,9 +60,9 @@ def preset_descent(
     task: Task, image: Image, model: EigenGS, preset: str, marks: Sequence[int], **options: Any
 ) -> Iterator[Moment]:
     """Fit by a preset with the number of Gaussians of a model; "eigengs" starts from it."""
-    basis, count = model if preset == "eigengs" else None, len(model.gaussians)
+    start, count = model if preset == "eigengs" else None, len(model.gaussians)
     shared = {"gaussians": count, "seed": task.seed, "backend": task.backend}
-    return descent(image, task.iterations, marks, preset=preset, basis=basis, **shared, **options)
+    return descent(image, task.iterations, marks, preset=preset, start=start, **shared, **options)
 
 
 def to_size(image: Image, model: EigenGS) -> Image:
@@ -92,7 +91,7 @@ def iterations(task: Task) -> Iterator[Figure]:
 
 def _subjects(task: Task) -> Iterator[tuple[str, Image, EigenGS, str, str]]:
     """Files, images, models, words and credits of what `iterations` shows."""
-    shipped = load_basis("natural", task.backend)
+    shipped = EigenGS.load("natural", task.backend)
     photos = [("A photo of scikit-image", PHOTO, sample(PHOTO))]
     if is_present(task, "kodak"):
         [(file, image)] = images_of(task, "kodak", 1)
@@ -108,7 +107,7 @@ def _subjects(task: Task) -> Iterator[tuple[str, Image, EigenGS, str, str]]:
 
 def colors(task: Task) -> Iterator[Figure]:
     """Compare fits in YCbCr and in RGB: the paper's figures of colour spaces."""
-    model = load_basis("natural", task.backend)
+    model = EigenGS.load("natural", task.backend)
     image = to_size(sample(PHOTO), model)
     marks, rows = sorted({min(10, task.iterations), task.iterations}), []
     for done, (color, heading) in enumerate({"ycbcr": "YCbCr", "rgb": "RGB"}.items()):
@@ -157,7 +156,7 @@ def cross(task: Task) -> Iterator[Figure]:
     bases = {
         "cats": _cats(task),
         "ImageNet": model_for(task, NATURAL, NATURAL, COMPONENTS),
-        '"natural"': load_basis("natural", task.backend),
+        '"natural"': EigenGS.load("natural", task.backend),
     }
     heading = "photos, and at iteration 0 from bases of cats, of ImageNet, and the one that ships"
     rows = list[tuple[str, list[Cell]]]()

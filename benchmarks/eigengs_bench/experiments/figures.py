@@ -18,7 +18,6 @@ from eigengs_bench.report.charts import curves_chart, radii_chart, save_figure
 from eigengs_bench.report.frames import remark
 from eigengs_dr.cli.outputs import write_report
 from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.eigenbasis.registry import load_basis
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.metrics import psnr
 
@@ -103,7 +102,7 @@ def curves(task: Task) -> Iterator[Figure]:
 def _curve_jobs(task: Task, name: str, marks: Sequence[int]) -> Iterator[Job]:
     settings = {"iterations": task.iterations, "every": EVERY, "seed": task.seed}
     if name == "kodak":
-        model = load_basis("natural", task.backend)
+        model = EigenGS.load("natural", task.backend)
     else:
         model = model_for(task, name, name, strips.COMPONENTS)
     for file, image in images_of(task, name):

@@ -22,7 +22,7 @@ from eigengs_bench.experiments.inverse_scene import (
 from eigengs_bench.harness.store import Progress, Row
 from eigengs_bench.harness.timing import Image
 from eigengs_dr.backend.selection import select
-from eigengs_dr.eigenbasis.registry import SHIPPED, load_basis
+from eigengs_dr.eigenbasis.eigengs import SHIPPED, EigenGS
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.image.resize import center_crop
 from eigengs_dr.plugins import register_plugins
@@ -63,12 +63,12 @@ def run(
 ) -> dict[str, Result]:
     """Recover the largest square of an image by every method, in at least 2 steps.
 
-    Sets Mitsuba's variant. `basis` is a name of `eigengs_dr.eigenbasis.registry.SHIPPED` or a file.
+    Sets Mitsuba's variant. `basis` is a name of `eigengs_dr.eigenbasis.eigengs.SHIPPED` or a file.
     """
     module = select(backend)
     mi.set_variant("cuda_ad_rgb" if "cuda" in module.__name__ else "llvm_ad_rgb")
     register_plugins()
-    model = load_basis(basis, backend)
+    model = EigenGS.load(basis, backend)
     file = SHIPPED.get(str(basis), basis)
     size = model.gaussians.width, model.gaussians.height
     square = center_crop(image, *2 * [min(image.shape[:2])])

@@ -22,10 +22,9 @@ from eigengs_bench.harness.timing import Image, decibels, follow, interleaved, s
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.eigenbasis.registry import load_basis
 from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.options import PRESETS, FitOptions
-from eigengs_dr.fitting.start import initialize
+from eigengs_dr.fitting.start import initialize, mean_picture
 from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.raster.render import picture_of, render
@@ -57,7 +56,7 @@ class Variant(NamedTuple):
     gaussians: int | None = None
     preset: str = "default"
     init: str = "auto"
-    basis: EigenGS | None = None
+    start: EigenGS | None = None
     solve_steps: int = 10
     cutoff: float = CUTOFF
 
@@ -79,18 +78,18 @@ def variants(task: Task, name: str) -> list[Variant]:
     count, models = usual_count(name), dict[int, EigenGS]()
     if is_trained(task.data, name):
         models = {k: model_for(task, name, name, k) for k in (DEFAULT_COMPONENTS, *COMPONENTS)}
-    basis = models.pop(DEFAULT_COMPONENTS, None) or load_basis("natural", task.backend)
+    basis = models.pop(DEFAULT_COMPONENTS, None) or EigenGS.load("natural", task.backend)
     return [
         Variant("preset", "default", count),
         Variant("preset", "gaussianimage", count, "gaussianimage"),
-        Variant("preset", "eigengs", None, "eigengs", basis=basis),
+        Variant("preset", "eigengs", None, "eigengs", start=basis),
         Variant("init", "grid", count, init="grid"),
         Variant("init", "random", count, init="random"),
-        Variant("init", "eigen", None, init="eigen", basis=basis),
+        Variant("init", "eigen", None, start=basis),
         *(Variant("solve steps", k, count, solve_steps=k) for k in (0, 2, 5, 30)),
         *(Variant("cutoff", k, count, cutoff=k) for k in (2.5, 3.5, 4.0, 5.0)),
         *(Variant("gaussians", round(k * count), round(k * count)) for k in (0.25, 0.5, 2, 4)),
-        *(Variant("components", k, None, "eigengs", basis=model) for k, model in models.items()),
+        *(Variant("components", k, None, "eigengs", start=model) for k, model in models.items()),
     ]
 
 
@@ -110,9 +109,10 @@ def trace(task: Task, fit: Variant, image: Image) -> Row:
     falls = schedule.decay < 1
     marks = sorted({n for n in (HORIZONS if falls else MARKS) if n < iterations} | {iterations})
     runs = [(n, (n,)) for n in marks] if falls else [(iterations, tuple(marks))]
+    mean_image = mean_picture(_options(task, fit), image.shape[1], image.shape[0])
     found, count = [], 0
     for steps, shown in runs:
-        for moment in follow(_start(task, fit, image), schedule, steps, shown):
+        for moment in follow(_start(task, fit, image), schedule, steps, shown, mean_image):
             count = len(moment.gaussians)
             # The mean image may be in the picture, and not among the Gaussians.
             wide, cut = (picture_of(moment.gaussians, cutoff=k) for k in (WIDE, fit.cutoff))
@@ -122,8 +122,12 @@ def trace(task: Task, fit: Variant, image: Image) -> Row:
 
 
 def _start(task: Task, fit: Variant, image: Image) -> Callable[[], FitProblem]:
+    return partial(initialize, image, _options(task, fit))
+
+
+def _options(task: Task, fit: Variant) -> FitOptions:
     settings = {key: value for key, value in fit._asdict().items() if key not in ("knob", "value")}
-    return partial(initialize, image, FitOptions(seed=task.seed, backend=task.backend, **settings))
+    return FitOptions(seed=task.seed, backend=task.backend, **settings)
 
 
 def _stored(task: Task, fit: Variant, image: Image) -> Row:

@@ -14,12 +14,12 @@ from eigengs_bench.harness.alone import measure_alone, peak_gib
 from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.tiling import tiling
 from eigengs_bench.harness.timing import Image, Moment, decibels, follow
-from eigengs_dr.eigenbasis.registry import load_basis
+from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.refine import is_plateau, trace_steps
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
-from eigengs_dr.fitting.start import initialize
+from eigengs_dr.fitting.start import initialize, mean_picture
 from eigengs_dr.gaussian.covariance import condition_number
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import rgb_to_ycbcr
@@ -69,8 +69,8 @@ def measure_cell(case: Case, preset: str, seed: int, backend: str | None) -> Row
     """
     image = case.image()
     most = image.shape[0] * image.shape[1]
-    encodes = PRESETS[preset].init == "eigen" and case.place is None
-    if encodes and len(load_basis(BASIS, backend).gaussians) > most:
+    encodes = PRESETS[preset].mean == "dense" and case.place is None
+    if encodes and len(EigenGS.load(BASIS, backend).gaussians) > most:
         return {"needs": f"a basis with at most {most} Gaussians"}
     followed = moments(case, image, preset, seed, backend)
     memory = {"peak_gib": peak_gib()} if case.alone else {}  # before the judgement takes its own
@@ -93,7 +93,12 @@ def moments(
     schedule = replace(method.schedule, rates=rates)
     start = partial(_start, case, image, preset, seed, backend)
     followed, trace = list[Moment](), list[Row]()
-    for moment in follow(start, schedule, case.iterations, trace_steps(case.iterations)):
+    mean_image = None
+    if case.place is None:
+        options = _options(case, preset, seed, backend)
+        mean_image = mean_picture(options, image.shape[1], image.shape[0])
+    marks = trace_steps(case.iterations)
+    for moment in follow(start, schedule, case.iterations, marks, mean_image):
         followed.append(moment)
         reached = psnr(moment.picture, image, "ycbcr")
         trace.append({"iteration": moment.iteration, "psnr_ycbcr": reached})
@@ -102,13 +107,18 @@ def moments(
     return followed
 
 
+def _options(case: Case, preset: str, seed: int, backend: str | None) -> FitOptions:
+    """Return the options of a preset without the shapes of a case."""
+    encodes = PRESETS[preset].mean == "dense"
+    model, count = (EigenGS.load(BASIS, backend), None) if encodes else (None, case.gaussians)
+    return FitOptions(gaussians=count, start=model, preset=preset, seed=seed, backend=backend)
+
+
 def _start(case: Case, image: Image, preset: str, seed: int, backend: str | None) -> FitProblem:
     """Start as the preset does, or in its way from the shapes of the case."""
     method = PRESETS[preset]
     if case.place is None:
-        count = None if method.init == "eigen" else case.gaussians
-        options = FitOptions(gaussians=count, preset=preset, seed=seed, backend=backend)
-        return initialize(image, options)
+        return initialize(image, _options(case, preset, seed, backend))
     target, generator = rgb_to_ycbcr(image), np.random.default_rng(seed)
     mean, factor = case.place(image, case.gaussians, generator)
     size, shape = (image.shape[1], image.shape[0]), (case.gaussians, 3)

@@ -17,7 +17,7 @@ from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO
-from eigengs_dr.fitting.start import initialize
+from eigengs_dr.fitting.start import initialize, mean_picture
 from eigengs_dr.image.metrics import psnr
 
 FILE = "tables.jsonl"
@@ -40,7 +40,7 @@ class Method(NamedTuple):
     split: str = "auto"  # or "split" or "whole": frequency_aware of EigenGS.fit
 
 
-Ready = Callable[[Method], Callable[..., FitProblem]]
+Ready = Callable[[Method], tuple[Callable[..., FitProblem], Image | None]]
 Pictures = Sequence[tuple[str, Image]]
 
 
@@ -77,23 +77,26 @@ def run(task: Task, names: Sequence[str], tables: Sequence[str] = TABLES) -> lis
 
 
 def _preparation(task: Task, name: str, picture: Image) -> Ready:
-    """Function that returns how a method starts; its first call trains and compiles, untimed."""
+    """Function that returns how a method starts, and the mean image that it keeps as pixels.
+
+    Its first call trains and compiles, untimed.
+    """
 
     @cache
-    def ready(method: Method) -> Callable[..., FitProblem]:
+    def ready(method: Method) -> tuple[Callable[..., FitProblem], Image | None]:
         model: EigenGS | None = None
         if method.source:
             split = {"split": True, "whole": False}.get(method.split, "auto")
             model = model_for(task, name, method.source, method.components, method.space, split)
         count = None if method.source else SETS[name].gaussians
         chosen: Any = {"preset": method.preset, "space": method.space, "backend": task.backend}
-        options = FitOptions(gaussians=count, basis=model, **chosen)
+        options = FitOptions(gaussians=count, start=model, **chosen)
 
         def start(image: Image, seed: int, depth: int = 10) -> FitProblem:
             return initialize(image, replace(options, seed=seed, solve_steps=depth))
 
         warm_up(lambda: start(picture, 0), options.method.schedule, MIN_PHASE_RATIO)
-        return start
+        return start, mean_picture(options, picture.shape[1], picture.shape[0])
 
     return ready
 
@@ -109,8 +112,9 @@ def _jobs(
     marks = {mark for mark in ITERATIONS if mark < task.iterations} | {task.iterations}
 
     def work(method: Method, image: Image) -> Row:
-        start, schedule = ready(method), PRESETS[method.preset].schedule
-        moments = follow(lambda: start(image, task.seed), schedule, task.iterations, marks)
+        (start, mean_image), schedule = ready(method), PRESETS[method.preset].schedule
+        begin = partial(start, image, task.seed)
+        moments = follow(begin, schedule, task.iterations, marks, mean_image)
         return {"moments": [score(moment, image) for moment in moments]}
 
     for file, image in pictures:
@@ -122,7 +126,7 @@ def _reach_jobs(
     task: Task, name: str, pictures: Pictures, goals: dict[str, Row], ready: Ready
 ) -> Iterator[Job]:
     def work(image: Image, goal: Row) -> Row:
-        return _reach(partial(ready(Method("default")), image, task.seed), image, goal)
+        return _reach(partial(ready(Method("default"))[0], image, task.seed), image, goal)
 
     for file, image in pictures:
         label = {**_name(task, name, file), "reach": "gaussianimage"}

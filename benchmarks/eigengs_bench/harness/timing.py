@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from eigengs_dr.fitting.descent import FitProblem, descend
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO, Schedule
-from eigengs_dr.fitting.start import initialize
+from eigengs_dr.fitting.start import initialize, mean_picture
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.metrics import MAX_PSNR, ms_ssim, psnr, ssim
 from eigengs_dr.raster.render import picture_of
@@ -31,13 +31,17 @@ class Moment(NamedTuple):
 
 
 def follow(
-    begin: Callable[[], FitProblem], schedule: Schedule, iterations: int, marks: Collection[int]
+    begin: Callable[[], FitProblem],
+    schedule: Schedule,
+    iterations: int,
+    marks: Collection[int],
+    mean_image: Image | None = None,
 ) -> Iterator[Moment]:
     """Run a descent to its last step and yield its state after the steps in `marks`.
 
     It takes all steps, and shows the set as it is, where `eigengs_dr.fit` stops and keeps the best.
     Sets with more Gaussians than the first one, which a descent has on its way, are left out.
-    The time of `begin` counts; the clock stops between moments.
+    Pictures include `mean_image`. The time of `begin` counts; the clock stops between moments.
     """
     spent, resumed = 0.0, time.perf_counter()
     start = begin()
@@ -49,8 +53,8 @@ def follow(
         dr.sync_thread()  # steps run asynchronously
         spent += time.perf_counter() - resumed
         picture = picture_of(current)
-        if start.base_image is not None:
-            picture = picture + start.base_image
+        if mean_image is not None:
+            picture = picture + mean_image
         yield Moment(iteration, spent, current, picture)
         resumed = time.perf_counter()
 
@@ -60,7 +64,9 @@ def descent(
 ) -> Iterator[Moment]:
     """Follow the descent of a fit; `options` are those of `FitOptions`."""
     chosen = FitOptions(**options)
-    return follow(partial(initialize, image, chosen), chosen.method.schedule, iterations, marks)
+    begin = partial(initialize, image, chosen)
+    mean_image = mean_picture(chosen, image.shape[1], image.shape[0])
+    return follow(begin, chosen.method.schedule, iterations, marks, mean_image)
 
 
 def warm_up(begin: Callable[[], FitProblem], schedule: Schedule, iterations: int) -> None:

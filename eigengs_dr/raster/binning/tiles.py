@@ -3,7 +3,7 @@
 A tile is a block of pixels. A closed form gives the tiles of each row that the cutoff ellipse of a
 Gaussian touches. An elongated Gaussian therefore visits only the tiles along its axis, not all
 tiles of its bounding box. `GRANULARITY` is the one place that chooses, by backend, how much work
-one lane of a kernel gets; `MAX_VALUES` is the largest image that 32-bit indices can number.
+one lane of a kernel gets.
 """
 
 from __future__ import annotations
@@ -15,41 +15,6 @@ from typing import Any, NamedTuple
 import drjit as dr
 
 from ...backend.arrays import ArrayTypes, Divisor, make_divisor, rcp, rsqrt, types_of
-
-MAX_VALUES = (1 << 32) - 1
-"""Largest number of values of an image, channels included. Kernels index them by 32 bits, as Dr.Jit
-does its arrays: larger indices would wrap to the first pixels without an error."""
-
-
-def check_index_range(
-    width: int, height: int, channels: int, tile: tuple[int, int] = (1, 1)
-) -> None:
-    """Refuse an image with more values than 32-bit indices can number.
-
-    The limit is 37,837 pixels a side with three channels, and 8,191 with 64.
-
-    Parameters
-    ----------
-    width, height : int
-        Size in pixels.
-    channels : int
-    tile : (int, int), optional
-        Width and height of a tile: sides are rounded up to whole tiles.
-
-    Raises
-    ------
-    ValueError
-        If the image, in whole tiles, has more than `MAX_VALUES` values.
-    """
-    columns, rows = (
-        -(-side // unit) * unit for side, unit in zip((width, height), tile, strict=True)
-    )
-    values = columns * rows * channels
-    if values > MAX_VALUES:
-        raise ValueError(
-            f"an image of {width}x{height} pixels and {channels} channels has {values:,} values, "
-            f"the limit is {MAX_VALUES:,}: scale it down or work on parts of it"
-        )
 
 
 class Granularity(NamedTuple):

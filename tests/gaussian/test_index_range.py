@@ -2,7 +2,7 @@
 
 import pytest
 
-from eigengs_dr.raster.binning.tiles import check_index_range
+from eigengs_dr.gaussian.file import check_index_range
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,13 @@ from eigengs_dr.image.planes import to_planes
 from eigengs_dr.image.resize import resample
 
 
-@pytest.mark.parametrize("init", ["grid", "random", "eigen"])
+@pytest.mark.parametrize("init", ["grid", "random", "model"])
 def test_other_starts_stay_where_they_were_put(init):
     """They are not placed anew, but they relocate in a long descent."""
-    image = np.tile(picture(), (3, 3, 1)) if init == "eigen" else picture()
-    count = None if init == "eigen" else 60
-    control = initialize(image, FitOptions(gaussians=count, init=init)).control
+    options = {"gaussians": 60, "init": init}
+    if init == "model":
+        options = {"start": small_model("llvm")}
+    control = initialize(picture(), FitOptions(backend="llvm", **options)).control
     assert control is not None and not control.redistributes
 
 
@@ -41,7 +42,7 @@ def others():
 
 def test_fit_starts_from_the_exact_colours(backend, others):
     model = small_model(backend)
-    result = eg.fit(others[0], iterations=0, init="eigen", basis=model, backend=backend)
+    result = eg.fit(others[0], iterations=0, start=model, backend=backend)
     expected = eg.render(model.encode(others[0])).numpy()
     assert eg.psnr(result.image, others[0]) == pytest.approx(eg.psnr(expected, others[0]), abs=0.02)
     assert len(result.gaussians) == SPLATS
@@ -50,7 +51,7 @@ def test_fit_starts_from_the_exact_colours(backend, others):
 
 def test_fit_at_another_size_solves_again(backend, others):
     model, image = small_model(backend), resample(others[0], 60, 44).clip(0, 1)
-    result = eg.fit(image, iterations=0, init="eigen", basis=model, backend=backend)
+    result = eg.fit(image, iterations=0, start=model, backend=backend)
     encoded = eg.psnr(eg.render(model.encode(image)), image, "ycbcr")
     assert result.trace[0]["psnr_ycbcr"] >= encoded - 1e-3
 
@@ -58,7 +59,7 @@ def test_fit_at_another_size_solves_again(backend, others):
 def test_fit_by_the_paper(backend, others):
     """Projected colours beside the dense mean image, refined from there."""
     model = small_model(backend)
-    result = eg.fit(others[0], iterations=100, preset="eigengs", basis=model, backend=backend)
+    result = eg.fit(others[0], iterations=100, preset="eigengs", start=model, backend=backend)
     shown = model.encode(others[0], "projected", "dense")
     start = (
         to_planes(eg.render(shown).numpy(), "ycbcr") + model.dense_mean(SIDE, SIDE).reshape(-1, 3).T
@@ -71,17 +72,47 @@ def test_fit_by_the_paper(backend, others):
     assert eg.psnr(result.image, others[0], "ycbcr") == max(r["psnr_ycbcr"] for r in result.trace)
 
 
+def test_a_fit_goes_on_from_a_set(backend, others, tmp_path):
+    """From a set, a fit, a file, or the set of another size."""
+    first = eg.fit(others[0], SPLATS, 20, backend=backend)
+    first.save(tmp_path / "set.npz")
+    kept = {"iterations": 0, "solve_steps": 0, "backend": backend}
+    for start in (first.gaussians, first, tmp_path / "set.npz", first.gaussians.scaled(64, 64)):
+        again = eg.fit(others[0], start=start, **kept)
+        np.testing.assert_allclose(again.image, first.image, atol=1e-4)
+    film = eg.fit(others[1], start=first, iterations=60, backend=backend)
+    assert film.psnr_ycbcr > eg.fit(others[1], start=first, **kept).psnr_ycbcr + 3
+    [row] = eg.fit_many([others[0]], start=first, **kept)
+    np.testing.assert_allclose(row.result.image, first.image, atol=1e-4)
+
+
+def test_data_above_1_start_in_their_own_unit(backend):
+    data = 50 * picture()[..., :1]
+    first = eg.fit(data, SPLATS, 20, space="data", backend=backend)
+    again = eg.fit(data, start=first, iterations=0, solve_steps=0, space="data", backend=backend)
+    np.testing.assert_allclose(again.image, first.image, atol=0.01)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"gaussians": 50}, "gaussians is 50, but the basis has 100"),
-        ({"space": "rgb"}, "space is 'rgb', but the basis is in 'ycbcr'"),
-        ({"basis": "nothing"}, "basis 'nothing' is neither a file nor one of: natural"),
-        ({"basis": "natural"}, "more than an image of 32x32 has pixels"),
-        ({"preset": "eigengs", "init": "grid"}, "preset 'eigengs' starts from a basis"),
+        ({"gaussians": 50}, "gaussians is 50, but the start has 100"),
+        ({"space": "rgb"}, "space is 'rgb', but the start is in 'ycbcr'"),
+        ({"init": "grid"}, "init 'grid' and a start exclude each other"),
+        ({"preset": "eigengs", "start": None}, "preset 'eigengs' starts from a model"),
+        ({"target_psnr": 30.0}, "target_psnr works with .* not with 'default' and 'a start'"),
     ],
 )
-def test_fit_refuses_another_basis(backend, options, words, others):
-    options = {"basis": small_model(backend), "init": "eigen", **options}
+def test_fit_refuses_a_start(backend, options, words, others):
+    options = {"start": small_model(backend), **options}
     with pytest.raises(ValueError, match=words):
         eg.fit(others[0], backend=backend, **options)
+
+
+def test_fit_refuses_what_is_no_start(others):
+    with pytest.raises(TypeError, match="list is no set of Gaussians"):
+        eg.fit(others[0], start=[1, 2])
+    with pytest.raises(ValueError, match="100 Gaussians, more than an image of 8x8 has pixels"):
+        eg.fit(others[0][:8, :8], start=small_model("llvm"), backend="llvm")
+    with pytest.raises(ValueError, match="the start is on backend 'llvm', not on 'cuda'"):
+        eg.fit(others[0], start=small_model("llvm"), backend="cuda")

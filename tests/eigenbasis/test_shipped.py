@@ -1,0 +1,45 @@
+"""Models by name, by file and in another process."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.families import SPLATS, small_model
+from eigengs_dr.eigenbasis.eigengs import SHIPPED, EigenGS
+from train_natural import DEMO
+
+
+def test_shipped_basis(backend):
+    """ "natural" is there, small, and encodes the photo that it was not trained on."""
+    model = EigenGS.load("natural", backend)
+    assert model is EigenGS.load("natural", backend)
+    assert len(model.gaussians) == 5000
+    image = eg.sample(DEMO)
+    projected, exact = (eg.render(model.encode(image, c)).numpy() for c in ("projected", "exact"))
+    assert eg.psnr(projected, image, "ycbcr") > 22
+    assert eg.psnr(exact, image, "ycbcr") > 27
+
+
+def test_shipped_basis_is_small():
+    assert SHIPPED["natural"].stat().st_size <= 4_000_000
+
+
+def test_bases_by_name_and_file(backend, tmp_path):
+    model = small_model(backend)
+    model.save(tmp_path / "small.npz")
+    assert len(EigenGS.load(tmp_path / "small.npz", backend).gaussians) == SPLATS
+    with pytest.raises(ValueError, match="model 'nature' is neither a file nor one of: natural"):
+        EigenGS.load("nature")
+
+
+def test_a_model_travels_as_arrays(backend):
+    """A worker of a cluster gets the same bits."""
+    model = small_model(backend)
+    assert model.encoder
+    again = pickle.loads(pickle.dumps(model))
+    for name, values in model.gaussians.to_arrays().items():
+        np.testing.assert_array_equal(again.gaussians.to_arrays()[name], values)
+    for first, second in zip(model.weights, again.weights, strict=True):
+        np.testing.assert_array_equal(first, second)
