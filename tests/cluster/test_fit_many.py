@@ -66,7 +66,7 @@ def test_the_bits_of_one_process(client, photos, output, expected):
 def test_a_basis_and_results_travel(client):
     model = small_model("llvm")
     images = [np.full((32, 32, 3), value, np.float32) for value in (0.3, 0.6)]
-    options = {"basis": model, "iterations": 2, "backend": "llvm"}
+    options = {"start": model, "iterations": 2, "backend": "llvm"}
     here = eg.fit_many(images, **options)
     for row, other in zip(eg.fit_many(images, client=client, **options), here, strict=True):
         for name, values in other.result.gaussians.to_arrays().items():
