@@ -10,7 +10,9 @@ from types import ModuleType
 FOLDER = Path(__file__).parent
 NAME = re.compile(r"`(eigengs_dr(?:\.\w+)+)`(?:, `(\w+)` \|)?")
 
-FORMATS = {f"eigengs_dr.{kind}" for kind in ("gaussians", "eigenbasis", "model", "checkpoint")}
+FORMATS = {
+    f"eigengs_dr.{kind}" for kind in ("gaussians", "material", "eigenbasis", "model", "checkpoint")
+}
 """Names of file formats, not of Python."""
 
 

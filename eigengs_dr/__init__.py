@@ -14,7 +14,7 @@ import lazy_loader
 
 from .backend.feedback import HTML
 from .backend.libllvm import select_libllvm
-from .storage.readers import READERS, Readers
+from .storage.readers import READERS, Reader
 
 __version__ = "0.1.0"
 
@@ -50,9 +50,7 @@ def _later(name: str) -> Any:
 
 
 # Folders that know nothing of the codec and the viewer use them through these two names.
-READERS[b"\x89EGS"] = Readers(
-    *(_later(f"codec.egs:{name}") for name in ("read_set", "read_material", "holds_maps"))
-)
+READERS[b"\x89EGS"] = Reader(_later("codec.egs:read_set"), _later("codec.egs:maps_of"))
 HTML[:] = [_later("viewer.notebook:to_html")]
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

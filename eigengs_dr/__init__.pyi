@@ -4,20 +4,18 @@ from .backend.executor import ClusterError
 from .backend.recording import exclusive
 from .backend.selection import BackendError
 from .blocks.fit_large import LargeFit, fit_large
-from .codec.packing import MaterialPackResult, PackResult, pack, pack_material
+from .codec.packing import PackResult, pack
 from .collection.fit_many import fit_many
 from .collection.row import ImageRow, RunInterrupted
 from .eigenbasis.eigengs import EigenGS
 from .eigenbasis.pca.basis import Eigenbasis
 from .fitting.fit import Fit, FitInterrupted, fit
-from .fitting.levels import fit_levels, level_counts
+from .fitting.options import level_counts
 from .gaussian.gaussians import Gaussians, concatenate, from_tensors, to_tensors
 from .image.io import load_image, save_image
 from .image.metrics import ms_ssim, psnr, ssim
 from .image.pixels import ImageError, LinearImage
 from .image.samples import sample
-from .material.fit_material import MaterialFit, fit_material
-from .material.material import Material
 from .plugins import register_plugins
 from .raster.render import picture_of, render, tile_lists
 from .scene.convert import ConvertedScene, convert_scene
@@ -39,9 +37,6 @@ __all__ = [
     "ImageRow",
     "LargeFit",
     "LinearImage",
-    "Material",
-    "MaterialFit",
-    "MaterialPackResult",
     "PackResult",
     "Page",
     "RunInterrupted",
@@ -51,15 +46,12 @@ __all__ = [
     "fit",
     "fit_for_scene",
     "fit_large",
-    "fit_levels",
     "fit_many",
-    "fit_material",
     "from_tensors",
     "level_counts",
     "load_image",
     "ms_ssim",
     "pack",
-    "pack_material",
     "picture_of",
     "psnr",
     "register_plugins",

@@ -15,9 +15,14 @@ import numpy as np
 from eigengs_dr.backend.arrays import types_of, upload_tensor
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting.fit import Fit
-from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, from_tensors, set_of, to_tensors
-from eigengs_dr.material.file import holds_material
-from eigengs_dr.material.material import Material
+from eigengs_dr.gaussian.gaussians import (
+    FIELDS,
+    Gaussians,
+    from_tensors,
+    one_image,
+    set_of,
+    to_tensors,
+)
 
 Arrays = dict[str, Any]
 
@@ -44,7 +49,7 @@ def texture_of(gaussians: Gaussians | Fit, **properties: Any) -> dict[str, Any]:
     >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
     >>> bsdf = mi.load_dict({"type": "diffuse", "reflectance": texture_of(g, wrap_mode="clamp")})
     """
-    gaussians = set_of(gaussians)
+    gaussians = one_image(set_of(gaussians))
     tensors = to_tensors(gaussians)
     # Mitsuba would try to read a flat tensor of three numbers as a colour, and fail.
     tensors["background"] = tensors["background"][None]
@@ -123,7 +128,8 @@ class SharedFile:
 
     Attributes
     ----------
-    content : Gaussians or Material
+    gaussians : Gaussians
+        The set, perhaps with maps.
     tensors : dict of str to TensorXf
         Mean (N, 2) and factor (N, 3).
     lists : dict
@@ -132,15 +138,9 @@ class SharedFile:
 
     def __init__(self, path: str, backend: str, first: int | None) -> None:
         self.path = path
-        self.content: Gaussians | Material
-        if holds_material(path):
-            self.content = Material.load(path, backend)
-            if first is not None:
-                self.content = self.content.first(first)
-        else:
-            self.content = Gaussians.load(path, backend)[:first]
-        shaped = self.content.gaussians if isinstance(self.content, Material) else self.content
-        self.tensors = {name: to_tensors(shaped)[name] for name in SHAPES}
+        whole = Gaussians.load(path, backend)
+        self.gaussians = whole if first is None else whole[:first]
+        self.tensors = {name: to_tensors(self.gaussians)[name] for name in SHAPES}
         self.lists: dict[Any, Any] = {}
 
     def map(self, name: str | None) -> Gaussians:
@@ -151,17 +151,17 @@ class SharedFile:
         ValueError
             If the file holds maps and no name is given, has no such map, or holds no maps.
         """
-        if isinstance(self.content, Material):
-            names = ", ".join(self.content)
-            if name is None or name not in list(self.content):
-                missing = "holds maps; say which by" if name is None else f"has no map {name!r};"
-                raise ValueError(f"gaussian_texture: {self.path} {missing} map = one of {names}")
-            return self.content[name]
-        if name is not None:
+        names = [m.name for m in self.gaussians.maps]
+        if not names and name is not None:
             raise ValueError(
                 f"gaussian_texture: {self.path} holds one image and no map {name!r}; leave map out"
             )
-        return self.content
+        if names and name not in names:
+            missing = "holds maps; say which by" if name is None else f"has no map {name!r};"
+            raise ValueError(
+                f"gaussian_texture: {self.path} {missing} map = one of {', '.join(names)}"
+            )
+        return self.gaussians if name is None else self.gaussians[name]
 
     def holds(self, tensors: dict[str, Any]) -> bool:
         """Return whether tensors have the memory of the file: nobody has changed them."""

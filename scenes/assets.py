@@ -55,7 +55,7 @@ def fitted_material(folder, name, maps, gaussians):
     folder, name
         As for `fitted`.
     maps : dict of str to ndarray
-        As for `eigengs_dr.fit_material`.
+        As for `eigengs_dr.fit`.
     gaussians : int
         Number of Gaussians.
 
@@ -64,7 +64,7 @@ def fitted_material(folder, name, maps, gaussians):
     Path
         The file.
     """
-    return _kept(folder, name, lambda: eg.fit_material(maps, gaussians, 300).material)
+    return _kept(folder, name, lambda: eg.fit(maps, gaussians, 300).gaussians)
 
 
 def _kept(folder, name, fit):

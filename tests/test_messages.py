@@ -14,7 +14,7 @@ def photo():
     return eg.sample("coffee")[:32, :32]
 
 
-@pytest.mark.parametrize("name", ["fit", "fit_many", "fit_levels", "fit_large", "fit_material"])
+@pytest.mark.parametrize("name", ["fit", "fit_many", "fit_large"])
 def test_a_mistyped_option_says_the_right_one(name, photo):
     text = "^unknown option 'itertions'; did you mean 'iterations'\\?$"
     with pytest.raises(TypeError, match=text):

@@ -66,21 +66,21 @@ def test_every_long_function_takes_a_bar_or_a_function(progress, monkeypatch, ph
         progress = lambda *row: calls.append(row)  # noqa: E731
     eg.fit(photo, progress=progress, **QUICK)
     eg.fit_many([photo], progress=progress, **QUICK)
-    eg.fit_levels(photo, levels=2, progress=progress, **QUICK)
-    eg.fit_material({"albedo": photo}, progress=progress, **QUICK)
+    eg.fit(photo, levels=2, progress=progress, **QUICK)
+    eg.fit({"albedo": photo}, progress=progress, **QUICK)
     basis = eg.Eigenbasis.from_images([photo] * 3, size=(32, 32), components=1, progress=progress)
     model = eg.EigenGS.fit(basis, gaussians=30, progress=progress)
     model.encode_many([photo], progress=progress)
     assert bool(calls) == callable(progress)
-    names = ("fit", "fit_many", "fit_levels", "fit_material", "from_images")
+    names = ("fit", "fit_many", "from_images")
     assert callable(progress) or all(f"{name}:" in terminal.getvalue() for name in names)
 
 
 def test_materials_and_packed_sets_have_pictures(photo, tmp_path):
-    found = eg.fit_material({"albedo": photo, "roughness": photo[..., 0]}, **QUICK)
+    found = eg.fit({"albedo": photo, "roughness": photo[..., 0]}, **QUICK)
     assert found._repr_html_().count("<img") == 2 and "roughness" in found._repr_html_()
-    assert found.material._repr_html_().count("<img") == 2
-    packed = eg.pack_material(found.material, tmp_path / "m.egs")
+    assert found.gaussians._repr_html_().count("<img") == 2
+    packed = eg.pack(found.gaussians, tmp_path / "m.egs")
     assert packed._repr_html_().count("<img") == 2
     result = eg.fit(photo, **QUICK)
     assert eg.pack(result, tmp_path / "a.egs")._repr_html_().count("<img") == 1

@@ -58,7 +58,7 @@ def test_search():
 
 def test_levels():
     image = photo("face")
-    gaussians = eg.fit_levels(image, 300, 2, iterations=60, backend="llvm").gaussians
+    gaussians = eg.fit(image, 300, levels=2, iterations=60, backend="llvm").gaussians
     check(image, eg.picture_of(gaussians[:75]), 28.86, 35.06)
     check(image, eg.picture_of(gaussians), 35.16, 41.39)
 

@@ -1,6 +1,6 @@
 """The command ``eigengs-dr fit``: fit images by Gaussians."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..backend.selection import select
-from ..fitting.options import INITS, PRESETS, FitOptions, Levels
+from ..fitting.options import INITS, PRESETS, FitOptions
 from ..image.color import SPACES
 from ..image.metrics import float_space, target_key
 from .console import INTERRUPTED, open_cluster, say
@@ -31,7 +31,6 @@ from .outputs import check_outputs, keeps_result, name_outputs, write_report
 
 if TYPE_CHECKING:
     from ..eigenbasis.eigengs import EigenGS
-    from ..fitting.fit import Fit
 
 DEFAULT_BASIS = "natural"
 """Name of the model from which the preset "eigengs" starts by default."""
@@ -121,7 +120,6 @@ def fit(
     maps: tuple[MapFile, ...],
     basis: str | None,
     blocks: int | None,
-    levels: Levels | None,
     preview: Path | None,
     overwrite: bool,
     cluster: str | None,
@@ -167,15 +165,12 @@ def fit(
       eigengs-dr fit huge.tif -o huge.npz --blocks 1024
       eigengs-dr fit --map albedo=a.jpg --map roughness=r.jpg --map normal=n.jpg -o bark.npz
     """
-    from ..fitting.levels import check_options
     from ..image.io import SAVE_OPTIONS
 
     options = FitOptions(**settings, start=_model(settings, basis))
-    if levels is not None:
-        options = check_options(options, levels)
     if maps:
         files = (output, preview, report)
-        context.exit(run_maps(context, images, maps, files, options, levels, overwrite, quiet))
+        context.exit(run_maps(context, images, maps, files, options, overwrite, quiet))
     if not images:
         raise click.UsageError("no image is given; name image files, or maps with --map")
     paths = [file for source in images for file in _expand(source)]
@@ -188,9 +183,9 @@ def fit(
     check_outputs([*outputs, *previews, report], [*paths, *models])
     if not several and keeps_result(outputs[0], overwrite, quiet):
         return
-    side = blocks or block_side(paths[0], several, options, levels, preview)
+    side = blocks or block_side(paths[0], several, options, preview)
     if side:
-        check_large(options, levels, preview, several)
+        check_large(options, preview, several)
     elif not several:
         announce_memory(paths[0], options, quiet)
     if not cluster:
@@ -204,16 +199,15 @@ def fit(
         folder, measured = outputs[0].parent, report is not None
         with open_cluster(cluster) as client:
             records, interrupted = fit_several(
-                paths, folder, previews, options, levels, overwrite, quiet, measured, client
+                paths, folder, previews, options, overwrite, quiet, measured, client
             )
     else:
         picture = previews[0] if previews else None
-        fitter = _fitter(options, levels)
-        records = [fit_one(paths[0], outputs[0], picture, quiet, options, fitter)]
+        records = [fit_one(paths[0], outputs[0], picture, quiet, options)]
         interrupted = records[0]["stopped"] == "interrupted"
     if report:
         figures = {"images": records} if several else records[0]
-        run_figures = describe_run(context, options.backend) | _decisive(options, levels, basis)
+        run_figures = describe_run(context, options.backend) | _decisive(options, basis)
         run_figures["block"] = side
         write_report(report, run_figures | figures)
     if interrupted and not several and not side:
@@ -223,13 +217,13 @@ def fit(
     _exit(context, records, options)
 
 
-def _decisive(options: FitOptions, levels: Levels | None, basis: str | None) -> dict[str, Any]:
+def _decisive(options: FitOptions, basis: str | None) -> dict[str, Any]:
     """Return the settings for a report."""
     settings = {field.name: getattr(options, field.name) for field in fields(options)}
     del settings["backend"], settings["start"]  # the report names the backend that was used
     if options.start is not None:
         settings["basis"] = basis or DEFAULT_BASIS
-    return settings | {"levels": levels}
+    return settings
 
 
 def _expand(source: Path | str) -> Sequence[Path | str]:
@@ -253,18 +247,6 @@ def _note_mean(options: FitOptions) -> None:
     """Say that the mean image is not in the file, if the preset keeps it as pixels."""
     if options.method.mean == "dense":
         say("note: the file holds the Gaussians alone; the mean image stays in the basis")
-
-
-def _fitter(options: FitOptions, levels: Levels | None) -> Callable[..., "Fit"]:
-    """Return ``run(image, progress)``, which fits one image."""
-    from ..fitting.fit import fit_image
-    from ..fitting.levels import fit_levels
-
-    if levels is not None:
-        names = ("gaussians", "iterations", "space", "seed", "backend", "encoding")
-        common = {name: getattr(options, name) for name in names}
-        return lambda image, progress: fit_levels(image, levels=levels, progress=progress, **common)
-    return lambda image, progress: fit_image(image, options, progress)
 
 
 def _exit(context: click.Context, records: list[dict[str, Any]], options: FitOptions) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -20,8 +19,7 @@ from .console import images_bar, progress_bar, say
 if TYPE_CHECKING:
     from ..collection.row import Finished
     from ..fitting.fit import Fit
-    from ..fitting.options import FitOptions, Levels
-    from ..material.fit_material import MaterialFit
+    from ..fitting.options import FitOptions
 
 
 def fit_one(
@@ -30,12 +28,11 @@ def fit_one(
     preview: Path | None,
     quiet: bool,
     options: FitOptions,
-    run: Callable[..., Fit],
 ) -> dict[str, Any]:
     """Fit one image, write its files, and return its figures."""
     import eigengs_dr as eg
 
-    from ..fitting.fit import FitInterrupted
+    from ..fitting.fit import FitInterrupted, fit_image
     from ..viewer.pictures import comparison, displayed
 
     started = time.perf_counter()
@@ -45,7 +42,7 @@ def fit_one(
         image = eg.load_image(path, rendered_as(options.space) is None, options.encoding)
         loaded = time.perf_counter()
         try:
-            result = run(image, progress=partial(show, name))
+            result = fit_image(image, options, partial(show, name))
         except FitInterrupted as interrupt:
             result = interrupt.result
         except ValueError as error:
@@ -73,7 +70,7 @@ def fit_one(
     return record
 
 
-def course_of(result: Fit | MaterialFit, started: float, loaded: float) -> dict[str, Any]:
+def course_of(result: Fit, started: float, loaded: float) -> dict[str, Any]:
     """Return how a fit went, for a report; `loaded` is the time when the images were there."""
     return {
         "iterations": result.iterations,
@@ -122,7 +119,6 @@ def fit_several(
     folder: Path,
     previews: list[Path],
     options: FitOptions,
-    levels: Levels | None,
     overwrite: bool,
     quiet: bool,
     measure: bool,
@@ -138,7 +134,7 @@ def fit_several(
         Folder of the results.
     previews : list of Path
         A picture for each image, or none.
-    options, levels, overwrite
+    options, overwrite
         See `eigengs_dr.fit_many`.
     quiet : bool
         Show no bar and no summary.
@@ -165,7 +161,7 @@ def fit_several(
         def step(share: float) -> None:
             show(len(records) + min(share, 1), label)
 
-        _, images = fit_each(paths, folder, overwrite, options, levels, step, client)
+        _, images = fit_each(paths, folder, overwrite, options, step, client)
         try:
             with closing(images):
                 for finished in images:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -13,9 +13,6 @@ from ..fitting.memory import check_memory, estimate_memory, usable_memory
 from ..fitting.options import PIXELS_PER_FIRST_GAUSSIAN, FitOptions, default_count
 from ..image.color import rendered_as
 from .console import progress_bar, say
-
-if TYPE_CHECKING:
-    from ..fitting.options import Levels
 
 NOTABLE = 1_000_000_000
 """Bytes from which on a fit says its memory."""
@@ -39,9 +36,7 @@ WORDS = {
 """What the bar says in each stage."""
 
 
-def check_large(
-    options: FitOptions, levels: Levels | None, preview: Path | None, several: bool = False
-) -> None:
+def check_large(options: FitOptions, preview: Path | None, several: bool = False) -> None:
     """Raise ValueError for options that a fit by blocks does not have."""
     if options.preset != "default" or options.placement != "adaptive":
         raise ValueError("--blocks needs the preset and the init that are the default")
@@ -49,7 +44,7 @@ def check_large(
         raise ValueError("--blocks fits one image; run the command for each image")
     for name, value in (
         ("--target-psnr", options.target_psnr),
-        ("--levels", levels),
+        ("--levels", options.levels),
         ("--preview", preview),
     ):
         if value is not None:
@@ -60,14 +55,13 @@ def block_side(
     path: Path | str,
     several: bool,
     options: FitOptions,
-    levels: Levels | None,
     preview: Path | None,
 ) -> int | None:
     """Return the side of the blocks, if a whole image would take too much memory."""
     if several or not needs_blocks(path, options):
         return None
     try:
-        check_large(options, levels, preview)
+        check_large(options, preview)
     except ValueError:
         return None
     from ..blocks.fit_large import BLOCK_SIDE

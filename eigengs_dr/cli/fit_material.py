@@ -17,8 +17,8 @@ from .options import describe_run
 from .outputs import check_outputs, keeps_result, name_outputs, write_report
 
 if TYPE_CHECKING:
-    from ..fitting.options import FitOptions, Levels
-    from ..material.fit_material import MaterialFit
+    from ..fitting.fit import Fit
+    from ..fitting.options import FitOptions
 
 Record = dict[str, Any]
 
@@ -44,8 +44,8 @@ class MapOption(click.ParamType):
 
     def convert(self, value: Any, parameter: Any, context: Any) -> MapFile:
         """Parse the text of an option."""
+        from ..gaussian.maps import NAME
         from ..image.color import SPACES
-        from ..material.maps import NAME
 
         left, sign, file = value.partition("=")
         name, colon, space = left.partition(":")
@@ -65,7 +65,6 @@ def run_maps(
     maps: tuple[MapFile, ...],
     files: tuple[Path | None, Path | None, Path | None],
     options: FitOptions,
-    levels: Levels | None,
     overwrite: bool,
     quiet: bool,
 ) -> int:
@@ -85,9 +84,11 @@ def run_maps(
     if keeps_result(output, overwrite, quiet, MATERIAL, "material"):
         return 0
     select(options.backend)
-    record = fit_maps(named, output, preview, quiet, options, levels)
+    record = fit_maps(named, output, preview, quiet, options)
     if report:
-        write_report(report, describe_run(context, options.backend) | {"levels": levels} | record)
+        write_report(
+            report, describe_run(context, options.backend) | {"levels": options.levels} | record
+        )
     if record["stopped"] == "interrupted":
         say(f"interrupted; the best fit so far is in {output}")
         return INTERRUPTED
@@ -134,13 +135,11 @@ def fit_maps(
     preview: Path | None,
     quiet: bool,
     options: FitOptions,
-    levels: Levels | None,
 ) -> Record:
     """Fit the maps of a material, write its files, and return its figures."""
     import eigengs_dr as eg
 
     from ..fitting.fit import FitInterrupted
-    from ..material.fit_material import fit_material
 
     started = time.perf_counter()
     with progress_bar(quiet) as show:
@@ -148,7 +147,7 @@ def fit_maps(
         images = {name: load_map(item, options.encoding) for name, item in maps.items()}
         loaded = time.perf_counter()
         try:
-            result = fit_material(
+            result = eg.fit(
                 images,
                 gaussians=options.gaussians,
                 iterations=options.iterations,
@@ -156,7 +155,7 @@ def fit_maps(
                 target_psnr=options.target_psnr,
                 target_space=options.target_space,
                 max_gaussians=options.max_gaussians,
-                levels=levels,
+                levels=options.levels,
                 backend=options.backend,
                 cutoff=options.cutoff,
                 encoding=options.encoding,
@@ -164,22 +163,22 @@ def fit_maps(
             )
         except FitInterrupted as interrupt:
             result = interrupt.result
-        result.material.save(output)
+        result.save(output)
         if preview:
             eg.save_image(preview, _preview(images, result))
-    width, height = result.material.gaussians.width, result.material.gaussians.height
+    width, height = result.gaussians.width, result.gaussians.height
     record = {
         "input": {name: str(item.path) for name, item in maps.items()},
         "output": str(output),
         "width": width,
         "height": height,
-        "gaussians": len(result.material.gaussians),
+        "gaussians": len(result.gaussians),
         **course_of(result, started, loaded),
         "psnr_ycbcr": result.psnr_ycbcr,
         "psnr_rgb": result.psnr_rgb,
         "maps": [
             {"name": m.name, "space": m.space, "channels": m.channels, **result.maps[m.name]}
-            for m in result.material.maps
+            for m in result.gaussians.maps
         ],
         "trace": result.trace,
     }
@@ -192,23 +191,23 @@ def load_map(item: MapFile, encoding: str | None) -> Any:
     """Read the image of a map; grey data keep one channel."""
     import eigengs_dr as eg
 
+    from ..gaussian.maps import usual_space
     from ..image.color import rendered_as
-    from ..material.maps import usual_space
 
     data = rendered_as(item.space or usual_space(item.name)) is None
     return eg.load_image(item.path, data, None if data else encoding)
 
 
-def _preview(images: dict[str, Any], result: MaterialFit) -> Any:
+def _preview(images: dict[str, Any], result: Fit) -> Any:
     """Show a row of image, fit and outlines for each map."""
     import numpy as np
 
     from ..viewer.pictures import comparison, displayed
 
     rows = []
-    for m in result.material.maps:
+    for m in result.gaussians.maps:
         image = displayed(images[m.name], m.space)[..., : m.channels]
-        rows.append(comparison(image, result.images[m.name], result.material[m.name]))
+        rows.append(comparison(image, result.image[m.name], result.gaussians[m.name]))
     return np.concatenate(rows)
 
 

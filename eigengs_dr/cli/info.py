@@ -50,18 +50,16 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     from ..eigenbasis.eigengs import SHIPPED, EigenGS
     from ..gaussian import file as setfile
     from ..gaussian.gaussians import Gaussians
-    from ..material import file as materialfile
     from ..storage import npz
 
     kinds: dict[str, tuple[str, Any, Any, Any]] = {
-        setfile.FORMAT: ("image", Gaussians.load, _describe_image, _draw_image),
-        materialfile.FORMAT: ("material", materialfile.read, _describe_material, _draw_material),
+        setfile.FORMAT: ("image", Gaussians.load, _describe_set, _draw_image),
+        setfile.MATERIAL: ("material", Gaussians.load, _describe_set, _draw_maps),
         modelfile.FORMAT: ("model", EigenGS.load, _describe_model, _draw_model),
     }
     file = SHIPPED.get(str(file), file)
     if packed.is_egs(file):
-        maps = materialfile.holds_material(file)
-        file_format = materialfile.FORMAT if maps else setfile.FORMAT
+        file_format = setfile.MATERIAL if setfile.maps_of(file) else setfile.FORMAT
     else:
         file_format = npz.format_of(file)
     if file_format not in kinds:
@@ -70,12 +68,10 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
         )
     kind, load, describe, draw = kinds[file_format]
     facts: dict[str, Any] = {"file": str(file), "kind": kind, "bytes": file.stat().st_size}
-    if kind == "image" and not packed.is_egs(file):
+    if kind != "model" and not packed.is_egs(file):
         facts |= _describe_head(setfile.read_head(file))
-        figures = setfile.read_figures(file)
+        figures = setfile.read_figures(file) if kind == "image" else None
         facts |= _describe_figures(figures) if figures else {}
-    elif kind == "material" and not packed.is_egs(file):
-        facts |= _describe_material(materialfile.read_head(file))
     else:
         facts |= describe(load(file))
     if kind != "model":
@@ -89,27 +85,22 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     click.echo(json.dumps(facts, indent=2) if as_json else _text(**facts))
 
 
-def _describe_image(gaussians: Any) -> dict[str, Any]:
-    return {
-        "gaussians": len(gaussians),
-        "width": gaussians.width,
-        "height": gaussians.height,
-        "channels": gaussians.channels,
-        "space": gaussians.space,
-        "cutoff": gaussians.cutoff,
-    }
+def _describe_set(gaussians: Any) -> dict[str, Any]:
+    size = gaussians.width, gaussians.height
+    return _facts_of(gaussians, len(gaussians), *size)
 
 
 def _describe_head(head: Any) -> dict[str, Any]:
     """Describe a set that is not read: a large one takes gigabytes."""
-    return {
-        "gaussians": head.gaussians,
-        "width": head.size[0],
-        "height": head.size[1],
-        "channels": head.channels,
-        "space": head.space,
-        "cutoff": head.cutoff,
-    }
+    return _facts_of(head, head.gaussians, *head.size)
+
+
+def _facts_of(found: Any, count: int, width: int, height: int) -> dict[str, Any]:
+    """Describe a set, or the head of its file; maps have spaces of their own."""
+    kind: dict[str, Any] = {} if found.maps else {"space": found.space}
+    facts = {"gaussians": count, "width": width, "height": height, "channels": found.channels}
+    maps = {"maps": [m._asdict() for m in found.maps]} if found.maps else {}
+    return facts | kind | {"cutoff": found.cutoff} | maps
 
 
 def _describe_figures(figures: Any) -> dict[str, Any]:
@@ -117,19 +108,6 @@ def _describe_figures(figures: Any) -> dict[str, Any]:
     psnr = {"psnr_ycbcr": figures.psnr_ycbcr, "psnr_rgb": figures.psnr_rgb}
     shown = {name: round(v, 2) if isfinite(v) else str(v) for name, v in psnr.items()}
     return {**shown, "iterations": figures.iterations, "source": figures.source}
-
-
-def _describe_material(found: Any) -> dict[str, Any]:
-    """Describe a material by the head of its file, or by its content."""
-    count = len(found.arrays["mean"]) if hasattr(found, "arrays") else found.gaussians
-    return {
-        "gaussians": count,
-        "width": found.size[0],
-        "height": found.size[1],
-        "channels": sum(m.channels for m in found.maps),
-        "cutoff": found.cutoff,
-        "maps": [m._asdict() for m in found.maps],
-    }
 
 
 def _describe_packed(content: Any) -> dict[str, Any]:
@@ -141,7 +119,7 @@ def _describe_packed(content: Any) -> dict[str, Any]:
 
 
 def _describe_model(model: Any) -> dict[str, Any]:
-    facts = _describe_image(model.gaussians) | {
+    facts = _describe_set(model.gaussians) | {
         "components": list(model.components),
         "frequency_aware": model.low > 0,
     }
@@ -206,12 +184,13 @@ def _draw_image(file: Path, picture: Path) -> None:
     save_region(picture, data, (0, 0, *data.size), data.size)
 
 
-def _draw_material(file: Path, picture: Path) -> None:
+def _draw_maps(file: Path, picture: Path) -> None:
+    from ..gaussian.gaussians import Gaussians
     from ..image.io import save_image
     from ..image.montage import join_pictures
-    from ..material.material import Material
+    from ..raster.render import picture_of
 
-    shown = Material.load(file).pictures().values()
+    shown = picture_of(Gaussians.load(file)).values()
     save_image(picture, join_pictures([_as_rgb(image) for image in shown], 1))
 
 

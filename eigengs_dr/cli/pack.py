@@ -24,7 +24,7 @@ from .options import (
 from .outputs import check_outputs, name_outputs, write_report
 
 if TYPE_CHECKING:
-    from ..codec.packing import MaterialPackResult, PackResult
+    from ..codec.packing import PackResult
     from ..gaussian.gaussians import Gaussians
 
 
@@ -98,9 +98,9 @@ def pack(
     select(backend)
     import eigengs_dr as eg
 
-    from ..material.file import holds_material
+    from ..gaussian.file import maps_of
 
-    if holds_material(file):
+    if maps_of(file):
         figures = pack_maps(
             file, target, image, maps, encoding, max_psnr_drop, levels, backend, quiet
         )
@@ -153,28 +153,28 @@ def pack_maps(
         raise ValueError(f"{file}: holds a material; give its images by --map NAME=FILE")
     if levels != 1:
         raise ValueError(f"{file}: a material has no levels in .egs files; leave --levels out")
-    material = eg.Material.load(file, backend)
-    spaces = {m.name: m.space for m in material.maps}
+    gaussians = eg.Gaussians.load(file, backend)
+    spaces = {m.name: m.space for m in gaussians.maps}
     named = {
         name: item._replace(space=item.space or spaces.get(name))
         for name, item in by_name(maps).items()
     }
     images = {name: load_map(item, encoding) for name, item in named.items()} or None
     try:
-        packed = eg.pack_material(material, target, images, max_psnr_drop, encoding)
+        packed = eg.pack(gaussians, target, images, max_psnr_drop, encoding=encoding)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
     before = file.stat().st_size
-    if not quiet:
+    if not quiet and isinstance(packed.psnr, dict):
         shown = ", ".join(f"{name} {psnr:.2f} dB" for name, psnr in packed.psnr.items())
         against = "the images" if images else "the renderings of the input"
         click.echo(
-            f"{file}: {len(material.gaussians):,} Gaussians, {before:,} bytes\n"
+            f"{file}: {len(gaussians):,} Gaussians, {before:,} bytes\n"
             f"  wrote {target}: {packed.bytes:,} bytes, "
             f"{packed.bits_per_pixel:.3f} bits per pixel for all maps\n"
             f"  lost {packed.psnr_drop:.2f} dB; psnr_rgb against {against}: {shown}"
         )
-    return packing_figures(file, target, material.gaussians, max_psnr_drop, packed, "psnr_rgb")
+    return packing_figures(file, target, gaussians, max_psnr_drop, packed, "psnr_rgb")
 
 
 def packing_figures(
@@ -182,7 +182,7 @@ def packing_figures(
     target: Path,
     gaussians: Gaussians,
     max_psnr_drop: float,
-    packed: PackResult | MaterialPackResult,
+    packed: PackResult,
     psnr: str,
 ) -> dict[str, Any]:
     """Return the figures of a report, with the PSNR under a key of its kind."""

@@ -81,9 +81,9 @@ def render(
     check_outputs([output], [file])
     select(backend)
     from ..blocks.draw import save_region
-    from ..material.file import read_set
+    from ..gaussian.file import read_map
 
-    data = read_set(file, name, "--map")
+    data = read_map(file, name, "--map")
     count = len(data.arrays["mean"])
     if first is not None:
         if first > count:

@@ -94,8 +94,8 @@ def _load(
     from ..codec import egs
     from ..eigenbasis import model_file
     from ..eigenbasis.eigengs import SHIPPED, EigenGS
-    from ..fitting.levels import level_counts
-    from ..material.file import holds_material
+    from ..fitting.options import level_counts
+    from ..gaussian.file import maps_of
     from ..storage import npz
 
     file = SHIPPED.get(str(file), file)
@@ -111,7 +111,7 @@ def _load(
             return gaussians, level_counts(len(gaussians), levels)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
-    if len(sections) < 2 or holds_material(file):
+    if len(sections) < 2 or maps_of(file):
         return gaussians, []
     return gaussians, list(accumulate(sections))
 
@@ -123,15 +123,13 @@ def _load_set(file: Path, name: str | None, count: int, backend: str | None) -> 
     """
     from ..gaussian import file as set_file
     from ..gaussian.gaussians import Gaussians
-    from ..material import file as material_file
     from ..viewer.facts import check_count
 
     try:
         if not count:
-            material = material_file.holds_material(file)
-            count = (material_file if material else set_file).read_head(file).gaussians
+            count = set_file.read_head(file).gaussians
         check_count(count)
-        data = material_file.read_set(file, name, "--map")
+        data = set_file.read_map(file, name, "--map")
     except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(str(file)) else f"{file}: {error}") from None

@@ -5,6 +5,6 @@
 - ``range_coder``: integers with probabilities as bits
 - ``gaussian_model``, ``weights``: the probabilities, from what is known of the neighbours
 - ``egs``, ``egs_section``: the .egs file with its table of maps, and its sections
-- ``packing``: `pack` and `pack_material`
+- ``packing``: `pack`
 - ``rounding``: the largest steps within a loss, and rounding that later Gaussians compensate
 """

@@ -1,7 +1,7 @@
 """The ``.egs`` file format: Gaussians as integers, in sections that are read one by one.
 
 All numbers are little endian. The file starts with a header (`_HEADER`), the background and a
-checksum; the header of a material is followed by a table of its maps. The sections follow, see
+checksum; the header of a set with maps is followed by their table. The sections follow, see
 `eigengs_dr.codec.egs_section`.
 """
 
@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian.file import CUTOFF, SetData
+from ..gaussian.maps import MAX_CHANNELS as MAX_MAPS
+from ..gaussian.maps import TextureMap, channel_weights, check_maps
 from ..image.color import MAX_CHANNELS, SPACES
 from ..image.hilbert import MAX_LEVELS
-from ..material.file import MaterialData
-from ..material.maps import MAX_CHANNELS as MAX_MAPS
-from ..material.maps import TextureMap, check_maps
 from ..storage.atomic import atomic_write
 from ..storage.npz import MAX_ENTRIES, BadValue
 from .egs_section import decode_body, exactly, read_body, section_to_bytes
@@ -37,7 +36,7 @@ MAGIC = b"\x89EGS"
 """First bytes of a file. The first byte is no ASCII character, so no text file starts with it."""
 
 VERSION, MAPS_VERSION = 3, 4
-"""Versions of the format, for an image and for a material, which has a table of maps. Versions 1
+"""Versions of the format, for a set without maps and with a table of maps. Versions 1
 and 2, of packages before release, are not read."""
 
 MAX_SECTIONS = 1 << 12
@@ -68,7 +67,7 @@ class EgsContent(NamedTuple):
     cutoff : float
         Radius of a Gaussian in standard deviations.
     maps : tuple of TextureMap
-        The maps of a material, whose colours and background are multiplied by their weights; empty
+        The maps of a set, whose colours and background are multiplied by their weights; empty
         for an image.
     """
 
@@ -87,8 +86,12 @@ class EgsContent(NamedTuple):
             return {name: value.astype(np.float32) for name, value in values.items()}
 
     def set_data(self) -> SetData:
-        """Return the set; a material has the channels of all maps."""
-        return SetData(self.arrays(), self.size, self.space, self.cutoff)
+        """Return the set."""
+        arrays = self.arrays()
+        if self.maps:
+            weights = np.array(channel_weights(self.maps), np.float32)
+            arrays |= {name: arrays[name] / weights for name in ("color", "background")}
+        return SetData(arrays, self.size, self.space, self.cutoff, self.maps)
 
     def whole(self) -> Symbols:
         """Return the Gaussians of all sections."""
@@ -168,34 +171,17 @@ def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsConten
 
 def read_set(path: Path, sections: int | None = None) -> SetData:
     """Read a packed set for `eigengs_dr.Gaussians.load`; for parameters and errors see `read`."""
-    content = read(path, sections)
-    if content.maps:
-        names = ", ".join(m.name for m in content.maps)
-        raise ValueError(f"{path}: holds the maps {names}; load it by Material.load, take one")
-    return content.set_data()
+    return read(path, sections).set_data()
 
 
-def read_material(path: Path) -> MaterialData:
-    """Read a packed material for `Material.load`; for errors see `read`."""
-    content = read(path)
-    if not content.maps:
-        raise ValueError(f"{path}: holds one image and no maps; load it by Gaussians.load")
-    weights = np.array(channel_weights(content.maps), np.float32)
-    arrays = content.arrays()
-    arrays["color"], arrays["background"] = (arrays[k] / weights for k in ("color", "background"))
-    return MaterialData(arrays, content.size, content.cutoff, content.maps)
-
-
-def holds_maps(path: str | os.PathLike[str]) -> bool:
-    """Return whether an ``.egs`` file holds a material, by its version."""
-    with open(path, "rb") as file:
-        start = file.read(5)
-    return len(start) == 5 and start[4] == MAPS_VERSION
-
-
-def channel_weights(maps: tuple[TextureMap, ...]) -> list[float]:
-    """Return the weight of each channel."""
-    return [m.weight for m in maps for _ in range(m.channels)]
+def maps_of(path: str | os.PathLike[str]) -> tuple[TextureMap, ...]:
+    """Return the maps of a packed set, without its Gaussians; errors as `read`."""
+    path = Path(path)
+    with path.open("rb") as file:
+        try:
+            return _read_header(file)[3].maps
+        except BadValue as error:
+            raise ValueError(f"{path}: {error}") from None
 
 
 def section_counts(path: str | os.PathLike[str]) -> list[int]:
@@ -296,7 +282,7 @@ def read_maps(take: Callable[[int], bytes]) -> tuple[bytes, tuple[TextureMap, ..
     bytes
         The table as it is in the file.
     tuple of TextureMap
-        `eigengs_dr.material.maps.check_maps` checks them.
+        `eigengs_dr.gaussian.maps.check_maps` checks them.
     """
     table, maps = take(1), []
     if not 1 <= table[0] <= MAX_MAPS:

@@ -1,4 +1,4 @@
-"""The functions `pack` and `pack_material`, which write the smallest file within a loss of PSNR."""
+"""The function `pack`, which writes the smallest file within a loss of PSNR."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -16,17 +16,16 @@ from ..backend.arrays import types_of
 from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..fitting.fit import Fit
-from ..gaussian.gaussians import Gaussians, set_of
+from ..fitting.maps import combine, read_maps
+from ..gaussian.gaussians import Gaussians, scale_channels, set_of
+from ..gaussian.maps import TextureMap, channel_weights, show_sums, slices
 from ..image.color import LIGHT, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_coded, to_linear
 from ..image.io import read_image
 from ..image.metrics import MAX_PSNR, psnrs_by_rows
 from ..image.pixels import check_data, check_image
 from ..image.radiance import to_log, to_pu21
-from ..material.maps import TextureMap, show_sums, slices
-from ..material.material import Material, scale_channels
-from ..material.target import combine, read_maps
-from ..raster.render import render
-from .egs import MAX_SECTIONS, SUFFIX, channel_weights
+from ..raster.render import picture_of, render
+from .egs import MAX_SECTIONS, SUFFIX
 from .quantization import Steps
 from .rounding import MIN_MSE, write_smallest
 
@@ -50,9 +49,10 @@ class PackResult(NamedTuple):
         Size of the file.
     bits_per_pixel : float
         Bits of the file per pixel of the native size.
-    psnr : float
+    psnr : float, or dict of str to float
         PSNR of the rendering of the rounded set in dB, in the space of the budget, against the
-        image; without an image, against the rendering of the set before rounding.
+        image; without an image, against the rendering of the set before rounding. For maps, the
+        psnr_rgb of each by its name.
     psnr_drop : float
         Loss of PSNR in dB; without an image, from 40 dB.
     steps : Steps
@@ -62,7 +62,7 @@ class PackResult(NamedTuple):
     gaussians: Gaussians
     bytes: int
     bits_per_pixel: float
-    psnr: float
+    psnr: float | dict[str, float]
     psnr_drop: float
     steps: Steps
 
@@ -75,7 +75,7 @@ class PackResult(NamedTuple):
 def pack(
     gaussians: Gaussians | Fit,
     output: str | os.PathLike[str],
-    image: ArrayLike | None = None,
+    image: ArrayLike | Mapping[str, ArrayLike] | None = None,
     max_psnr_drop: float = BUDGET,
     sections: Sequence[int] | None = None,
     cutoff: float | None = None,
@@ -89,12 +89,16 @@ def pack(
     output : path-like
         File to write; `pack` replaces an existing file atomically. `Gaussians.load` reads it.
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W), optional
-        The image of the fit, as `fit` takes it. By default the rendering of the set.
+        The image of the fit, as `fit` takes it; for a set with maps, the images by name. By default
+        the rendering of the set.
     max_psnr_drop : float, optional
         Largest loss of PSNR in dB, above 0 and at most 100: against the image, at the native size
         and in the space of the set (psnr_ycbcr for YCbCr; `pack` compares linear light as sRGB, and
         radiance in PU21).
-        Without an image, the loss of a set of 40 dB if the errors add.
+        Without an image, the loss of a set of 40 dB if the errors add. For maps, the loss is that
+        of the mean over the maps of the squared error (of colours as sRGB) over that before: all
+        maps lose about as many decibels. Without images, their errors are in the ratio of their
+        weights in the fit.
     sections : sequence of int, optional
         Number of Gaussians in each section of the file, in the order of the set. A reader may stop
         after any section; the budget holds for each of these prefixes. By default one section.
@@ -122,9 +126,15 @@ def pack(
     """
     check_request(output, max_psnr_drop)
     whole: Gaussians = dr.detach(set_of(gaussians))
-    rows = section_rows(len(whole), sections)
     if cutoff is not None:
         whole = replace(whole, cutoff=float(cutoff))
+    rows = section_rows(len(whole), sections)
+    if whole.maps:
+        if len(rows) > 1:
+            raise ValueError("pack: a set with maps has one section; leave the sections out")
+        return _pack_maps(whole, output, image, max_psnr_drop, encoding)
+    if isinstance(image, Mapping):
+        raise ValueError("pack: the set has no maps; give its image alone")
     shown = _shown(whole) if image is None else _compared(whole, image, encoding)
     # The best linear light is not the best sRGB picture. So compensation keeps a set in linear
     # light near its own rendering, not near the image.
@@ -205,84 +215,21 @@ SMALL = 1 / 255
 """A small change of sums, to measure slopes by."""
 
 
-class MaterialPackResult(NamedTuple):
-    """Result of `pack_material`.
-
-    Attributes
-    ----------
-    material : Material
-        The rounded material in the order of the file.
-    bytes : int
-        Size of the file.
-    bits_per_pixel : float
-        Bits of the file per pixel of the native size, for all maps together.
-    psnr : dict of str to float
-        psnr_rgb in dB of each map against its image; without images, against the rendering before
-        rounding.
-    psnr_drop : float
-        Loss in dB, see max_psnr_drop of `pack_material`.
-    steps : Steps
-        Steps of the rounding.
-    """
-
-    material: Material
-    bytes: int
-    bits_per_pixel: float
-    psnr: dict[str, float]
-    psnr_drop: float
-    steps: Steps
-
-    def _repr_html_(self) -> str:
-        """Return what a notebook shows."""
-        return to_html(self)
-
-
-@exclusive()
-def pack_material(
-    material: Material,
+def _pack_maps(
+    g: Gaussians,
     output: str | os.PathLike[str],
-    images: Mapping[str, ArrayLike] | None = None,
-    max_psnr_drop: float = BUDGET,
-    encoding: str | None = None,
-) -> MaterialPackResult:
-    """Write a material to the smallest ``.egs`` file whose loss of PSNR stays within a budget.
-
-    All maps lose about as many decibels. Without images, they get errors in the ratio of their
-    weights in the fit.
-
-    Parameters
-    ----------
-    material : Material
-    output : path-like
-        File to write; an existing file is replaced atomically. `Material.load` reads it.
-    images : mapping of str to array_like, optional
-        The images of the fit, as `eigengs_dr.fit_material` takes them. By default the renderings.
-    max_psnr_drop : float, optional
-        Largest loss in dB, above 0 and at most 100: of the mean over the maps of the squared error
-        (of colours as sRGB) over that before. Without images, over that of weighted errors of 40
-        dB.
-    encoding : {"srgb", "linear"}, optional
-        What the pixels of colours are, see `eigengs_dr.fit`.
-
-    Returns
-    -------
-    MaterialPackResult
-
-    Raises
-    ------
-    ValueError
-        If the images do not fit the maps, the suffix is not ``.egs``, or no file meets the budget.
-    OSError
-        If the file cannot be written; an existing file then stays unchanged.
-    """
-    check_request(output, max_psnr_drop)
-    maps, g = material.maps, dr.detach(material.gaussians)
+    images: Any,
+    max_psnr_drop: float,
+    encoding: str | None,
+) -> PackResult:
+    """Pack a set with maps; see `pack`."""
+    maps = g.maps
     own = render(g).numpy()
     shown, values = _shown_maps(own, maps), own
     factors, unseen = [m.weight**2 for m in maps], MSE_WITHOUT_IMAGE
     if images is not None:
         rendered = shown
-        shown, values = _images_of(material, images, encoding)
+        shown, values = _images_of(g, images, encoding)
         factors = [1 / e for e in _errors(rendered, shown)]
         # Equal steps of weighted colours then add to each map an error in the ratio of its own.
         logs = 0.5 * np.log(np.multiply(factors, _slopes(own, rendered, maps)))
@@ -298,36 +245,34 @@ def pack_material(
         seen = _errors(_shown_maps(render(found).numpy() / scale, maps), shown)
         return [float(np.mean(np.multiply(seen, factors)))]
 
-    weighted = scale_channels(g, scale.tolist())
+    weighted = replace(scale_channels(g, scale.tolist()), maps=())
     rows = section_rows(len(g), None)
     target = values * scale
     figures = write_smallest(output, weighted, target, errors, max_psnr_drop, rows, unseen, maps)
-    found = Material.load(output, types_of(g.mean).backend)
-    pictures = found.pictures()
+    found = Gaussians.load(output, types_of(g.mean).backend)
+    pictures = picture_of(found)
     figures["psnr"] = {
         m.name: psnrs_by_rows(pictures[m.name].__getitem__, image, ["rgb"])[0]
         for m, image in zip(maps, shown, strict=True)
     }
-    return MaterialPackResult(material=found, **figures)
+    return PackResult(gaussians=found, **figures)
 
 
-def _images_of(
-    material: Material, images: Mapping[str, ArrayLike], encoding: str | None
-) -> tuple[list[Array], Array]:
+def _images_of(g: Gaussians, images: Any, encoding: str | None) -> tuple[list[Array], Array]:
     """Return the images in the order of the maps, and their values in the spaces of the maps."""
-    spaces = {m.name: m.space for m in material.maps}
+    spaces = {m.name: m.space for m in g.maps}
+    if not isinstance(images, Mapping):
+        raise ValueError(f"pack: the set has maps; give the images of {', '.join(spaces)} by name")
     if sorted(images) != sorted(spaces):
         raise ValueError(
             f"pack: images are of {', '.join(images)}; give one of each of {', '.join(spaces)}"
         )
     found = read_maps({name: images[name] for name in spaces}, spaces, encoding)
-    g = material.gaussians
-    for image, m in zip(found, material.maps, strict=True):
+    for image, m in zip(found, g.maps, strict=True):
         expected = (g.height, g.width, m.channels)
         if image.pixels.shape != expected:
             raise ValueError(
-                f"pack: map {m.name!r} has shape {image.pixels.shape}, the material needs "
-                f"{expected}"
+                f"pack: map {m.name!r} has shape {image.pixels.shape}, the set needs {expected}"
             )
     units = [image.unit for image in found]
     pixels: list[Array] = [i.pixels * np.float32(i.unit) for i in found]

@@ -25,10 +25,11 @@ from ..fitting.descent import FitProblem, run
 from ..fitting.options import PRESETS
 from ..fitting.schedule import Schedule
 from ..fitting.solvers.conjugate_gradient import solve
+from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
+from ..gaussian.maps import TextureMap
 from ..image.hilbert import hilbert_encode
 from ..image.metrics import psnr_from_mse
-from ..material.maps import TextureMap
 from ..raster.render import render
 from .egs import EgsContent, write
 from .quantization import DEAD_ZONE, Steps, Symbols, dequantize, quantize
@@ -78,7 +79,7 @@ def write_smallest(
     unseen : float, optional
         Mean squared error that `errors` does not see, and that adds to it.
     maps : tuple of TextureMap, optional
-        The maps of a material, by whose weights the colours are multiplied.
+        The maps of the set, by whose weights the colours are multiplied.
 
     Returns
     -------
@@ -302,19 +303,14 @@ def content_of(
 
 
 def to_gaussians(packed: EgsContent, like: Gaussians) -> Gaussians:
-    """Return the Gaussians of a content, on the backend of another set."""
-    return Gaussians.from_data(packed.set_data(), types_of(like.mean).backend)
+    """Return the Gaussians of a content, on the backend of another set; maps stay weighted."""
+    return Gaussians.from_data(packed._replace(maps=()).set_data(), types_of(like.mean).backend)
 
 
 def _rendered(like: Gaussians, arrays: dict[str, Array]) -> NDArray[np.float32]:
     """Render Gaussians without background, in the space and size of a set."""
-    found = Gaussians.from_arrays(
-        **arrays,
-        size=(like.width, like.height),
-        space="data",
-        backend=types_of(like.mean).backend,
-        cutoff=like.cutoff,
-    )
+    data = SetData(arrays, (like.width, like.height), "data", like.cutoff)
+    found = Gaussians.from_data(data, types_of(like.mean).backend)
     return np.asarray(render(found).numpy(), np.float32)
 
 

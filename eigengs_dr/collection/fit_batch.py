@@ -57,6 +57,7 @@ def fits_in_batches(options: FitOptions, pixels: NDArray[np.float32]) -> bool:
         options.placement in PLACEMENTS
         and options.method.solves
         and options.target_psnr is None
+        and options.levels is None
         and options.cutoff <= MAX_CUTOFF
         and max(pixels.shape[:2]) <= MAX_SIDE
         and options.count_for(pixels) <= MAX_GAUSSIANS

@@ -13,8 +13,7 @@ import numpy as np
 from ..backend.feedback import shows_progress
 from ..backend.selection import select
 from ..fitting.fit import Fit, fit_image
-from ..fitting.levels import check_options, fit_levels
-from ..fitting.options import FitOptions, Levels, refuse_unknown
+from ..fitting.options import FitOptions, refuse_unknown
 from ..fitting.start import load_start
 from ..fitting.target import unit_of
 from ..image.color import rendered_as
@@ -39,7 +38,6 @@ def fit_many(
     output: str | os.PathLike[str] | None = None,
     *,
     overwrite: bool = False,
-    levels: Levels | None = None,
     progress: Any = None,
     client: Any = None,
     **options: Any,
@@ -64,8 +62,6 @@ def fit_many(
         Fit images whose output exists. By default such images are skipped, whatever the options of
         the earlier run were: a run that was interrupted continues if it is repeated. A file that
         is no set of Gaussians is never replaced.
-    levels : int or sequence of int, optional
-        Levels of detail; see `eigengs_dr.fit_levels`, whose options alone then apply.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         ``progress(done, total, row)`` after every image, with its `ImageRow`; `total` is None for
@@ -116,10 +112,10 @@ def fit_many(
     >>> [(row.name, row.status, row.gaussians) for row in rows]
     [('000000', 'done', 200), ('000001', 'done', 200)]
     """
-    own = ("images", "output", "overwrite", "levels", "progress", "client")
+    own = ("images", "output", "overwrite", "progress", "client")
     refuse_unknown(options, [*(field.name for field in fields(FitOptions)), *own])
     settings = FitOptions(**options)
-    total, finished = fit_each(images, output, overwrite, settings, levels, client=client)
+    total, finished = fit_each(images, output, overwrite, settings, client=client)
     return collect(total, finished, output is None, progress)
 
 
@@ -128,7 +124,6 @@ def fit_each(
     output: str | os.PathLike[str] | None,
     overwrite: bool,
     options: FitOptions,
-    levels: Levels | None = None,
     step: Step | None = None,
     client: Any = None,
 ) -> tuple[int | None, Generator[Finished, None, None]]:
@@ -137,17 +132,15 @@ def fit_each(
     Arguments and errors as for `fit_many`. In this process, each `Finished` image has its pixels
     and its `Fit`, they come in order, and `step` is called. On a cluster they come as they end.
     """
-    if levels is not None:
-        options = check_options(options, levels)
     if options.start is not None:
         options = replace(options, start=load_start(options.start, options.backend))
-    make_work = partial(fit_work, options, levels, None if client is not None else step)
+    make_work = partial(fit_work, options, None if client is not None else step)
     keep_grey = rendered_as(options.space) is None
     job = Job(make_work, _may_join, keep_grey, options.encoding, options.iterations)
     return run_images(images, output, overwrite, job, client)
 
 
-def fit_work(options: FitOptions, levels: Levels | None = None, step: Step | None = None) -> Work:
+def fit_work(options: FitOptions, step: Step | None = None) -> Work:
     """Return the `Work` of a fit of many images.
 
     Raises
@@ -156,7 +149,7 @@ def fit_work(options: FitOptions, levels: Levels | None = None, step: Step | Non
         If the backend is not available.
     """
     select(options.backend)
-    return partial(_fit_group, options=options, levels=levels, step=step)
+    return partial(_fit_group, options=options, step=step)
 
 
 def _may_join(group: list[Pixels], pixels: Pixels) -> bool:
@@ -170,9 +163,7 @@ def _is_small(pixels: Pixels) -> bool:
     return max(pixels.shape[:2]) <= MAX_SIDE
 
 
-def _fit_group(
-    images: list[Pixels], options: FitOptions, levels: Levels | None, step: Step | None
-) -> Iterator[Outcome]:
+def _fit_group(images: list[Pixels], options: FitOptions, step: Step | None) -> Iterator[Outcome]:
     """Fit images of one size, together if they are small."""
 
     def progress(iteration: int, iterations: int, row: dict[str, Any]) -> None:
@@ -181,7 +172,7 @@ def _fit_group(
 
     plain = not isinstance(images[0], LinearImage)
     plain &= all(unit_of(image, options.space) == 1 for image in images)
-    if levels is None and plain and fits_in_batches(options, images[0]):
+    if plain and fits_in_batches(options, images[0]):
         try:
             results = fit_batch(np.stack(images), options, step)
         except FAILURES:
@@ -192,21 +183,11 @@ def _fit_group(
             return
     for pixels in images:
         try:
-            result = _fit_one(pixels, options, levels, progress)
+            result = fit_image(pixels, options, progress)
         except FAILURES as error:
             yield Outcome(None, None, {"error": str(error) or type(error).__name__})
         else:
             yield Outcome(result.gaussians, result, _figures(result))
-
-
-def _fit_one(
-    pixels: Pixels, options: FitOptions, levels: Levels | None, progress: Callable[..., None]
-) -> Fit:
-    if levels is None:
-        return fit_image(pixels, options, progress)
-    names = ("gaussians", "iterations", "space", "seed", "backend", "encoding")
-    common = {name: getattr(options, name) for name in names}
-    return fit_levels(pixels, levels=levels, progress=progress, **common)
 
 
 def _figures(result: Fit) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 - ``fit``: `fit`, from the image to the result
 - ``options``: the options of a fit, checked once, and the named methods
 - ``target``: the pixels, and the same in the space of the colours
+- ``maps``: several maps as one image of many channels
 - ``start``: placement and colours
 - ``descent``: gradient descent: the problem, the driver and the program of one step
 - ``schedule``: rates and rounds

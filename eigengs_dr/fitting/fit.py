@@ -1,11 +1,11 @@
-"""The function `fit`, which fits Gaussians to one image."""
+"""The function `fit`: from an image, or several maps, to Gaussians."""
 
 from __future__ import annotations
 
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -16,15 +16,17 @@ from numpy.typing import ArrayLike, NDArray
 from ..backend.feedback import defer_interrupts, shows_progress, to_html
 from ..backend.recording import exclusive
 from ..gaussian.file import CUTOFF, FitFigures, write
-from ..gaussian.gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians, scale_channels
+from ..gaussian.maps import channel_weights
 from ..image.metrics import float_space, target_key
 from ..raster.render import picture_of
-from .descent import FitProblem
-from .options import FitOptions, Start, named_options
-from .refine import FitProgress, Refinement, measure, refine
+from .levels import refine_levels
+from .maps import MapImage, balance, combine, read_maps, score_maps, shape_of
+from .options import FitOptions, Levels, Start, named_options
+from .refine import FitProgress, Refinement, Score, measure, refine
 from .search import search_count
-from .start import initialize, load_start, mean_picture
-from .target import in_unit, read_pixels, unit_of
+from .start import load_start, mean_picture, start_for
+from .target import FitTarget, in_unit, make_target, read_pixels, unit_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,16 +39,19 @@ class Fit:
         The fitted set.
     trace : list of dict
         Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb. A search for the number of
-        Gaussians adds the key gaussians. Row 0 shows the set before refinement. Seconds count from
-        the call of `fit`; they include placement, upload, the colour solve and the measurements.
+        Gaussians adds the key gaussians. Maps add the key maps, with both PSNR of each, and with
+        goals the key margin: the decibels above its goal of the map that is farthest from it. Row 0
+        shows the set before refinement. Seconds count from the call of `fit`; they include
+        placement, upload, the colour solve and the measurements.
         A descent has more Gaussians than asked for in its first two thirds, see
         `eigengs_dr.fitting.schedule.surplus_for`; those sets have no rows.
         With space "data" or "normal", psnr_rgb is the PSNR of the data after clamping and rounding
         to 8 bits, and psnr_ycbcr the PSNR of the unchanged data; for values above 1.5, the largest
         of them is the peak. With space "radiance" or "log", psnr_ycbcr is in PU21, see
         `eigengs_dr.psnr`.
-    image : ndarray of float32, shape (H, W, 3), or (H, W, 1) for data of one channel
+    image : ndarray of float32, shape (H, W, 3), or (H, W, 1) for data of one channel; or dict
         The rendering of the set: RGB without clamping; for light, sRGB clamped at 0; or the data.
+        For maps, the rendering of each by its name.
     seconds, seconds_init : float
         The whole time, and the time before refinement.
     iterations : int
@@ -58,14 +63,16 @@ class Fit:
         RGB image to add to renderings of the set. The preset "eigengs" keeps the mean image of the
         model as pixels. The attribute `image` includes the mean image.
     psnr_ycbcr, psnr_rgb : float
-        PSNR of the set in dB, from its row of the trace.
+        PSNR of the set in dB, from its row of the trace; for maps, the means over the maps.
     source : str
         Name of the image, if it was a file or a URL.
+    maps : dict of str to dict
+        For maps, psnr_ycbcr and psnr_rgb of each, from the same row.
     """
 
     gaussians: Gaussians
     trace: list[dict[str, Any]] = field(repr=False)
-    image: NDArray[np.float32] = field(repr=False)
+    image: Any = field(repr=False)
     seconds: float
     seconds_init: float = field(repr=False)
     iterations: int
@@ -74,12 +81,14 @@ class Fit:
     psnr_ycbcr: float = math.nan
     psnr_rgb: float = math.nan
     source: str = field(default="", repr=False)
+    maps: dict[str, dict[str, float]] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
-        space = float_space(self.gaussians.space)
+        g, space = self.gaussians, "ycbcr" if self.maps else float_space(self.gaussians.space)
+        maps = f"maps {', '.join(self.maps)}, " if self.maps else ""
         return (
-            f"Fit({len(self.gaussians)} Gaussians, "
-            f"{self.image.shape[1]}x{self.image.shape[0]} pixels, {self.iterations} iterations, "
+            f"Fit({len(g)} Gaussians, "
+            f"{g.width}x{g.height} pixels, {maps}{self.iterations} iterations, "
             f"psnr_{space}={self.psnr_ycbcr:.2f}, psnr_rgb={self.psnr_rgb:.2f}, "
             f"seconds={self.seconds:.2f}, stopped={self.stopped!r})"
         )
@@ -97,7 +106,7 @@ class FitInterrupted(KeyboardInterrupt):
 
     Attributes
     ----------
-    result : Fit or MaterialFit
+    result : Fit
         The best set so far.
     """
 
@@ -109,29 +118,36 @@ class FitInterrupted(KeyboardInterrupt):
 @named_options
 @shows_progress
 def fit(
-    image: ArrayLike | os.PathLike[str],
+    image: ArrayLike | os.PathLike[str] | Mapping[str, ArrayLike],
     gaussians: int | None = None,
     iterations: int = 1000,
     init: str = "auto",
     start: Start | None = None,
     preset: str = "default",
     solve_steps: int = 10,
-    space: str = "ycbcr",
+    space: str | Mapping[str, str] | None = None,
     seed: int = 0,
     backend: str | None = None,
     progress: Any = None,
-    target_psnr: float | None = None,
+    target_psnr: float | Mapping[str, float] | None = None,
     target_space: str = "rgb",
     max_gaussians: int | None = None,
+    levels: Levels | None = None,
+    weights: Mapping[str, float] | None = None,
     cutoff: float = CUTOFF,
     encoding: str | None = None,
 ) -> Fit:
     """Fit an image by a given number of Gaussians, or by as few as a target PSNR needs.
 
+    Several maps of one size, such as those of a material, share the means and shapes of one set:
+    ``result.gaussians["albedo"]`` is the set of one map.
+
     Parameters
     ----------
-    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like or URL
-        A file, see `eigengs_dr.load_image`, or pixels, see `eigengs_dr.image.io.check_image`.
+    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like or URL; or a mapping
+        A file, see `eigengs_dr.load_image`, or pixels, see `eigengs_dr.image.io.check_image`. A
+        mapping holds the images of maps by name, with at most 16 channels together. Data whose
+        three channels are equal count as one channel.
     gaussians : int, optional
         Number of Gaussians, at most one per pixel. By default 5000, or one per pixel for smaller
         images; with a start, the number of its Gaussians.
@@ -148,9 +164,12 @@ def fit(
     solve_steps : int, optional
         Steps of conjugate gradients in the colour solve. With a start they go on from its colours;
         those of a model need none, unless the image and the model differ in size.
-    space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, optional
-        Space of the colours and of the squared error. "linear" decodes sRGB: the Gaussians sum to
-        linear light, as textures need it, and errors weigh more in the dark. "data" uses one or
+    space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, or mapping; optional
+        Space of the colours and of the squared error, by default "ycbcr". For maps, the space of a
+        map by its name; by default "linear" for albedo, color and the like, "normal" for normals,
+        and "data" for other names, see `eigengs_dr.gaussian.maps.usual_space`.
+        "linear" decodes sRGB: the Gaussians sum to linear light, as textures need it, and errors
+        weigh more in the dark. "data" uses one or
         three channels unchanged (roughness, heights). "normal" uses the codes ``(n + 1) / 2`` of a
         normal map; renderings have normals of length 1. "radiance" is "linear" without an
         upper bound. "log" suits light above 1 best: the Gaussians sum to logarithms of light, see
@@ -165,8 +184,9 @@ def fit(
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         Called every 10 steps as ``progress(iteration, iterations, row)`` with the last row of the
         trace, or a row of a set with more Gaussians than asked for.
-    target_psnr : float, optional
-        PSNR in dB to reach with as few Gaussians as possible; excludes `gaussians`. The search
+    target_psnr : float or mapping, optional
+        PSNR in dB to reach with as few Gaussians as possible; excludes `gaussians`. Each map shall
+        reach it, or its own, if a mapping names every map. The search
         takes up to about twice `iterations` steps, see `eigengs_dr.fitting.search`.
     target_space : {"rgb", "ycbcr"}, optional
         Whether `target_psnr` is a psnr_rgb or a psnr_ycbcr of an image. Data, normals and light
@@ -174,6 +194,16 @@ def fit(
     max_gaussians : int, optional
         Largest number of Gaussians for `target_psnr`. By default the Gaussians have at most as
         many parameters as the image has numbers: 3 Gaussians for 8 pixels in colour.
+    levels : int or sequence of int, optional
+        Levels of detail: the first Gaussians form the image too. Either the number of Gaussians up
+        to each level, such as ``[5000, 7000, 9000]``; or the number of levels, of which each has 4
+        times as many Gaussians as the one before, see `level_counts`. ``result.gaussians[:n]`` is a
+        level. Inside a level, Gaussians with a larger removal cost come first, so that every prefix
+        forms an image.
+    weights : mapping of str to float, optional
+        For maps, factors of their errors, by default 1. They multiply the weights that the function
+        finds: one over the root mean square error after a first colour solve, so that all maps gain
+        alike in decibels; or with `target_psnr`, one over the error of the goal.
     cutoff : float, optional
         Radius of a Gaussian in standard deviations, in (0, 12]; the set keeps it.
     encoding : {"srgb", "linear"}, optional
@@ -188,7 +218,8 @@ def fit(
     Raises
     ------
     ValueError
-        If the image is unusable or an argument is out of range.
+        If the image is unusable or an argument is out of range; if maps differ in size, or an
+        argument names a map that is not there.
     BackendError
         If the backend is not available.
     FitInterrupted
@@ -204,7 +235,18 @@ def fit(
     >>> result = eg.fit(eg.sample("coffee")[:64, :64], gaussians=300, iterations=20)
     >>> len(result.gaussians), result.image.shape
     (300, (64, 64, 3))
+    >>> photo = eg.sample("coffee")[:32, :32]
+    >>> result = eg.fit({"albedo": photo, "roughness": photo[..., 0]}, 100, iterations=10)
+    >>> result.gaussians
+    Gaussians(100, 32x32 pixels, maps albedo, roughness, cutoff=3)
     """
+    started = time.perf_counter()
+    maps: list[MapImage] = []
+    if isinstance(image, Mapping):
+        maps = _maps_alone(image, space, start, preset, encoding, weights, target_psnr)
+        space, target_psnr = "data", max((m.goal for m in maps if m.goal is not None), default=None)
+    elif weights is not None or isinstance(space, Mapping) or isinstance(target_psnr, Mapping):
+        raise ValueError("weights, and a space or target_psnr by name, are for a mapping of images")
     options = FitOptions(
         gaussians=gaussians,
         iterations=iterations,
@@ -212,19 +254,39 @@ def fit(
         start=start,
         preset=preset,
         solve_steps=solve_steps,
-        space=space,
+        space=space or "ycbcr",
         seed=seed,
         backend=backend,
         cutoff=cutoff,
         target_psnr=target_psnr,
         target_space=target_space,
         max_gaussians=max_gaussians,
+        levels=levels,
         encoding=encoding,
     )
+    if maps:
+        return fit_maps(maps, options, started, progress)
     result = fit_image(image, options, progress)
     if not isinstance(image, (str, os.PathLike)):
         return result
     return replace(result, source=os.path.basename(image))
+
+
+def _maps_alone(
+    images: Mapping[str, ArrayLike],
+    space: str | Mapping[str, str] | None,
+    start: Start | None,
+    preset: str,
+    encoding: str | None,
+    weights: Mapping[str, float] | None,
+    target_psnr: float | Mapping[str, float] | None,
+) -> list[MapImage]:
+    """Read maps; refuse what they do not take."""
+    if start is not None or preset != "default":
+        raise ValueError("maps need preset 'default' and no start; leave them out")
+    if isinstance(space, str):
+        raise ValueError(f"space is {space!r}; for maps give the space of each by its name")
+    return read_maps(images, space, encoding, weights, target_psnr)
 
 
 @exclusive()
@@ -241,46 +303,74 @@ def fit_image(image: Any, options: FitOptions, progress: FitProgress | None = No
         whole = in_unit(start, 1 / unit) if isinstance(start, Gaussians) else start
         options = replace(options, start=whole)
     mean_image = mean_picture(options, pixels.shape[1], pixels.shape[0])
+    score = partial(measure, image=pixels, started=started, base_image=mean_image)
+    goal = target_key(options.space, options.target_space), options.target_psnr or 0.0
     with defer_interrupts() as interrupted:
-        problem = initialize(pixels, options.first_try(pixels))
-        seconds_init = time.perf_counter() - started
-        if options.target_psnr is None:
-            found = refine(
-                problem,
-                pixels,
-                options.method.schedule,
-                options.iterations,
-                started=started,
-                progress=progress,
-                interrupted=interrupted,
-                score=partial(measure, image=pixels, started=started, base_image=mean_image),
-            )
-        else:
-            found = _search(problem, pixels, options, started, progress, interrupted)
+        target = make_target(pixels, options.space)
+        found, seconds_init = _refine(target, options, score, goal, started, progress, interrupted)
     return finish(found, in_unit(found.gaussians, unit), mean_image, started, seconds_init)
 
 
-def _search(
-    start: FitProblem,
-    pixels: NDArray[np.float32],
+@exclusive()
+def fit_maps(
+    images: list[MapImage],
     options: FitOptions,
+    started: float,
+    progress: FitProgress | None = None,
+) -> Fit:
+    """Fit maps from `read_maps` by one set; see `fit` for results and errors."""
+    options.check_image(shape_of(images))
+    with defer_interrupts() as interrupted:
+        weights = balance(images, options)
+        score = partial(
+            score_maps,
+            images=images,
+            weights=weights,
+            started=started,
+            space=options.target_space,
+        )
+        target, goal = combine(images, weights), ("margin", 0.0)
+        found, seconds_init = _refine(target, options, score, goal, started, progress, interrupted)
+    maps = tuple(image.map(weight) for image, weight in zip(images, weights, strict=True))
+    whole = scale_channels(found.gaussians, [1 / w for w in channel_weights(maps)])
+    return finish(found, replace(whole, maps=maps), None, started, seconds_init)
+
+
+def _refine(
+    target: FitTarget,
+    options: FitOptions,
+    score: Score,
+    goal: tuple[str, float],
     started: float,
     progress: FitProgress | None,
     interrupted: Callable[[], bool],
-) -> Refinement:
-    """Search for the smallest number of Gaussians that reaches the target PSNR."""
-    assert options.target_psnr is not None
-    return search_count(
-        start,
-        partial(measure, image=pixels, started=started),
-        target_key(start.gaussians.space, options.target_space),
-        options.target_psnr,
-        options.most_for(pixels),
-        options.method.schedule,
-        options.iterations,
-        progress=progress,
-        interrupted=interrupted,
-    )
+) -> tuple[Refinement, float]:
+    """Fit a target as the options say: in levels, by a given number, or by the fewest for a goal.
+
+    `goal` is a key of the rows of `score` and the least value in dB. Return the seconds before
+    refinement too.
+    """
+    if options.levels is not None:
+        return refine_levels(target, options, score, started, progress, interrupted)
+    schedule, iterations = options.method.schedule, options.iterations
+    problem = start_for(target, options.first_try(target.values))
+    seconds_init = time.perf_counter() - started
+    if options.target_psnr is None:
+        found = refine(
+            problem,
+            target.pixels,
+            schedule,
+            iterations,
+            progress=progress,
+            interrupted=interrupted,
+            score=score,
+        )
+    else:
+        most = options.most_for(target.values)
+        found = search_count(
+            problem, score, *goal, most, schedule, iterations, progress, interrupted
+        )
+    return found, seconds_init
 
 
 def finish(
@@ -309,6 +399,7 @@ def finish(
         mean_image=base_image,
         psnr_ycbcr=found.row["psnr_ycbcr"],
         psnr_rgb=found.row["psnr_rgb"],
+        maps=found.row.get("maps", {}),
     )
     if found.stopped == "interrupted":
         raise FitInterrupted(result)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import wraps
 from inspect import signature
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import numpy as np
@@ -36,6 +37,10 @@ COLOR_PARAMETERS = 5
 
 Levels = int | Sequence[int]
 """A number of levels of detail, or the number of Gaussians up to each level in ascending order."""
+
+LEVEL_RATIO = 4
+"""Ratio of the numbers of Gaussians up to a level and up to the level before it; 4 halves their
+spacing."""
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -104,9 +109,12 @@ class FitOptions:
     target_psnr: float | None = None
     target_space: str = "rgb"
     max_gaussians: int | None = None
+    levels: Levels | None = None
     encoding: str | None = None
 
     def __post_init__(self) -> None:
+        if self.levels is not None and not isinstance(self.levels, (int, np.integer)):
+            object.__setattr__(self, "gaussians", _check_counts(self.gaussians, self.levels)[-1])
         self._check_numbers()
         check_encoding(self.encoding)
         for name, value, known in (
@@ -125,6 +133,10 @@ class FitOptions:
                 "EigenGS.load('natural')"
             )
         self._check_search()
+        if self.levels is not None and (self.preset, self.placement) != ("default", "adaptive"):
+            raise ValueError(
+                "levels needs preset 'default' and init 'adaptive'; leave the others out"
+            )
 
     @property
     def method(self) -> Preset:
@@ -197,8 +209,9 @@ class FitOptions:
                     "max_gaussians and target_space belong to target_psnr; give target_psnr too"
                 )
             return
-        if self.gaussians is not None:
-            raise ValueError("gaussians and target_psnr exclude each other; give one of them")
+        for name in ("levels", "gaussians"):
+            if getattr(self, name) is not None:
+                raise ValueError(f"{name} and target_psnr exclude each other; give one of them")
         if self.preset != "default" or self.placement != "adaptive":
             raise ValueError(
                 "target_psnr works with preset 'default' and init 'adaptive', not with "
@@ -219,6 +232,57 @@ def max_gaussians_for(pixels: NDArray[np.float32]) -> int:
     """Return the number of Gaussians with as many parameters as an image (H, W, C) has numbers."""
     channels = pixels.shape[2]
     return max(1, pixels.size // (COLOR_PARAMETERS + channels))
+
+
+def level_counts(count: int, levels: Levels) -> list[int]:
+    """Return the number of Gaussians up to each level.
+
+    Parameters
+    ----------
+    count : int
+        Number of Gaussians of the whole set.
+    levels : int or sequence of int
+        Number of levels, with the whole set: each level has `LEVEL_RATIO` times as many Gaussians
+        as the one before. Or the number of Gaussians up to each level; the last is `count`.
+
+    Returns
+    -------
+    list of int
+        In ascending order; the last is `count`.
+
+    Raises
+    ------
+    ValueError
+        If the first level would have no Gaussian, levels is not positive, or numbers of Gaussians
+        do not rise up to `count`.
+
+    Examples
+    --------
+    >>> level_counts(5000, 4)
+    [78, 312, 1250, 5000]
+    >>> level_counts(9000, [5000, 7000, 9000])
+    [5000, 7000, 9000]
+    """
+    if not isinstance(levels, (int, np.integer)):
+        return _check_counts(count, levels)
+    most = 1
+    while count >= LEVEL_RATIO**most:
+        most += 1
+    if not 1 <= levels <= most:
+        raise ValueError(f"levels is {levels}; {count} Gaussians make 1 to {most}")
+    return [count // LEVEL_RATIO**k for k in reversed(range(levels))]
+
+
+def _check_counts(count: int | None, levels: Sequence[int]) -> list[int]:
+    """Return numbers of Gaussians that rise up to `count`, if that is known."""
+    counts, written = list(levels), ", ".join(map(str, levels))
+    if not all(isinstance(n, (int, np.integer)) for n in counts):
+        raise ValueError(f"levels {written}: numbers of Gaussians must be whole")
+    if not counts or not all(a < b for a, b in pairwise([0, *counts])):
+        raise ValueError(f"levels {written}: numbers of Gaussians must rise, from 1 or more")
+    if count is not None and counts[-1] != count:
+        raise ValueError(f"levels {written}: the last must be the number of Gaussians, {count}")
+    return [int(n) for n in counts]
 
 
 @dataclass(frozen=True)

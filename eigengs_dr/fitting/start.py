@@ -117,7 +117,11 @@ def initialize(pixels: NDArray[np.float32], options: FitOptions) -> FitProblem:
     TypeError
         If the start is something else.
     """
-    target = make_target(pixels, options.space)
+    return start_for(make_target(pixels, options.space), options)
+
+
+def start_for(target: FitTarget, options: FitOptions) -> FitProblem:
+    """Place Gaussians for a target and find their colours; see `initialize`."""
     if options.start is None:
         return start_from_placement(target, options)
     return start_from_set(target, options)

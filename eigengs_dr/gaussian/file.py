@@ -1,4 +1,4 @@
-"""The file format of a set of Gaussians, the checks of a set, and the part that a region shows."""
+"""The file of a set of Gaussians, the checks of a set, its maps, and the part of a region."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 from ..image.color import MAX_CHANNELS, SPACES
 from ..storage import npz
 from ..storage.npz import BadValue, Field
-from ..storage.readers import readers_of
+from ..storage.readers import reader_of
+from .maps import MAX_CHANNELS as MAX_MAPS
+from .maps import TextureMap, check_maps, find_map, slices
 
 FORMAT = "eigengs_dr.gaussians"
 MATERIAL = "eigengs_dr.material"
-"""Format of files of several maps, which `eigengs_dr.material.file` reads."""
+"""Formats of a file without maps and with maps."""
 
-VERSION = 2
-"""Version of the format; version 2 added the cutoff."""
+VERSIONS = {FORMAT: 2, MATERIAL: 1}
+"""Versions of the formats; version 2 of sets without maps added the cutoff."""
 
 CUTOFF = 3.0
 """Default cutoff, in standard deviations. At the cutoff a Gaussian has ``exp(-cutoff^2 / 2)`` of
@@ -52,6 +54,14 @@ LAYOUT: dict[str, Field] = {
 CUTOFF_FIELD = Field("f8", 0)
 """The array that version 2 added; sets of version 1 have the cutoff `CUTOFF`."""
 
+MAPS: dict[str, Field] = {
+    "names": Field("U", 1, MAX_MAPS),
+    "spaces": Field("U", 1, MAX_MAPS),
+    "channels": Field("i8", 1, MAX_MAPS),
+    "weights": Field("f8", 1, MAX_MAPS),
+}
+"""Arrays of a file with maps, in the place of the space."""
+
 FIGURES: dict[str, Field] = {"figures": Field("f8", 1, 3), "source": Field("U", 0)}
 """Arrays that a file may have besides: what the fit of the set reached; see `FitFigures`."""
 
@@ -74,12 +84,28 @@ class SetData(NamedTuple):
         One of `eigengs_dr.image.color.SPACES`.
     cutoff : float
         Standard deviations.
+    maps : tuple of TextureMap
+        The groups of channels, in order, if the set has several maps; its space is then "data".
     """
 
     arrays: Arrays
     size: tuple[int, int]
     space: str
     cutoff: float = CUTOFF
+    maps: tuple[TextureMap, ...] = ()
+
+    def map_data(self, name: str) -> SetData:
+        """Return the set of one map; it shares mean and factor.
+
+        Raises
+        ------
+        BadValue
+            If there is no such map.
+        """
+        number = find_map(self.maps, name)
+        own = slices(self.maps)[number]
+        parts = {k: self.arrays[k][..., own] for k in ("color", "background")}
+        return self._replace(arrays=self.arrays | parts, space=self.maps[number].space, maps=())
 
 
 class FitFigures(NamedTuple):
@@ -111,20 +137,20 @@ def write(path: str | os.PathLike[str], data: SetData, figures: FitFigures | Non
         If the file cannot be written; an existing file does not change.
     """
     check_suffix(path)
-    members = to_members(data.arrays, data.size, data.cutoff) | {"space": np.array(data.space)}
-    if figures is not None:
+    kind = MATERIAL if data.maps else FORMAT
+    members: Arrays = {name: np.asarray(array, np.float32) for name, array in data.arrays.items()}
+    members["size"] = np.array(data.size, np.int64)
+    members["cutoff"] = np.array(data.cutoff, np.float64)
+    if data.maps:
+        columns = zip(*data.maps, strict=True)
+        members |= {name: np.array(column) for name, column in zip(MAPS, columns, strict=True)}
+    else:
+        members["space"] = np.array(data.space)
+    if figures is not None and not data.maps:
         members["figures"] = np.array(figures[:3], np.float64)
         members["source"] = np.array(figures.source[-MAX_SOURCE:])
-    npz.write(path, FORMAT, VERSION, members, compressed=len(members["mean"]) < PLAIN_COUNT)
-
-
-def to_members(arrays: Arrays, size: tuple[int, int], cutoff: float) -> Arrays:
-    """Return what files of sets and of materials store alike, in the types of `LAYOUT`."""
-    members: Arrays = {name: np.asarray(array, np.float32) for name, array in arrays.items()}
-    return members | {
-        "size": np.array(size, np.int64),
-        "cutoff": np.array(cutoff, np.float64),
-    }
+    few = len(members["mean"]) < PLAIN_COUNT
+    npz.write(path, kind, VERSIONS[kind], members, compressed=few)
 
 
 class SetHead(NamedTuple):
@@ -135,6 +161,7 @@ class SetHead(NamedTuple):
     size: tuple[int, int]
     space: str
     cutoff: float
+    maps: tuple[TextureMap, ...]
 
 
 def read_head(path: Path) -> SetHead:
@@ -147,21 +174,90 @@ def read_head(path: Path) -> SetHead:
     OSError
         If the file cannot be opened.
     """
-    version = npz.read_version(path, FORMAT, VERSION)
-    small = {name: LAYOUT[name] for name in ("size", "space")}
-    small |= {} if version < 2 else {"cutoff": CUTOFF_FIELD}
-    found = npz.read(path, FORMAT, VERSION, small)
-    count, channels = npz.read_shapes(path, FORMAT, VERSION, {"color": LAYOUT["color"]})["color"]
-    width, height = found["size"].tolist()
-    cutoff = float(found.get("cutoff", np.array(CUTOFF)))
-    return SetHead(count, channels, (width, height), str(found["space"]), cutoff)
+    kind, version, layout = _layout_of(path)
+    small = {name: field for name, field in layout.items() if name not in _LARGE}
+    found = npz.read(path, kind, version, small)
+    shape = npz.read_shapes(path, kind, version, {"color": LAYOUT["color"]})["color"]
+    size, space, cutoff, maps = _properties(path, found)
+    if maps:
+        try:
+            check_maps(maps, shape[1])
+        except BadValue as error:
+            raise ValueError(f"{path}: {error}") from None
+    return SetHead(shape[0], shape[1], size, space, cutoff, maps)
+
+
+_LARGE = ("mean", "factor", "color", "background")
+
+
+def _layout_of(path: Path) -> tuple[str, int, dict[str, Field]]:
+    """Return the format of an ``.npz`` file, its highest version, and its arrays."""
+    if npz.format_of(path) == MATERIAL:
+        shared = {name: field for name, field in LAYOUT.items() if name != "space"}
+        return MATERIAL, VERSIONS[MATERIAL], shared | {"cutoff": CUTOFF_FIELD} | MAPS
+    first = npz.read_version(path, FORMAT, VERSIONS[FORMAT]) < 2
+    return FORMAT, VERSIONS[FORMAT], LAYOUT if first else LAYOUT | {"cutoff": CUTOFF_FIELD}
+
+
+def _properties(
+    path: Path, found: Arrays
+) -> tuple[tuple[int, int], str, float, tuple[TextureMap, ...]]:
+    """Return the size, the space, the cutoff and the maps of what was read."""
+    size, cutoff = tuple(found["size"].tolist()), float(found.get("cutoff", np.array(CUTOFF)))
+    if "names" not in found:
+        return size, str(found["space"]), cutoff, ()
+    columns = [found[name].tolist() for name in MAPS]
+    if len({len(column) for column in columns}) > 1:
+        raise ValueError(f"{path}: names, spaces, channels and weights differ in length")
+    maps = tuple(TextureMap(*row) for row in zip(*columns, strict=True))
+    if not maps:
+        raise ValueError(f"{path}: maps are none; give each name once")
+    return size, "data", cutoff, maps
+
+
+def maps_of(path: Path) -> tuple[TextureMap, ...]:
+    """Return the maps of a file, ``.npz`` or ``.egs``; none for one image. Errors as `read`."""
+    if reader := reader_of(path):
+        maps: tuple[TextureMap, ...] = reader.read_maps(path)
+        return maps
+    return read_head(path).maps
+
+
+def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
+    """Read the set of one image, or of one map of a file.
+
+    Parameters
+    ----------
+    path : Path
+    name : str or None
+        The map; None for the set of one image.
+    option : str, optional
+        What messages call `name`.
+
+    Raises
+    ------
+    ValueError
+        As `read`; if a file of maps is read without a name, or another one with a name; or if there
+        is no such map. The message lists the maps.
+    """
+    maps = maps_of(path)
+    if not maps and name is not None:
+        raise ValueError(f"{path}: holds one image and no maps; leave {option} out")
+    if maps and name is None:
+        names = ", ".join(m.name for m in maps)
+        raise ValueError(f"{path}: holds the maps {names}; choose one with {option}")
+    data = read(path)
+    try:
+        return data if name is None else data.map_data(name)
+    except BadValue as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def read_figures(path: Path) -> FitFigures | None:
     """Return what the fit of a set reached, if its ``.npz`` file says it; errors as `read_head`."""
     if not set(FIGURES) <= set(npz.sizes_of(path)):
         return None
-    found = npz.read(path, FORMAT, VERSION, FIGURES)
+    found = npz.read(path, FORMAT, VERSIONS[FORMAT], FIGURES)
     values, source = found["figures"], str(found["source"])
     if values.shape != (3,) or not (np.isfinite(values[2]) and 0 <= values[2] < 1 << 53):
         raise ValueError(f"{path}: figures are {values.tolist()}, expected two PSNR and the steps")
@@ -180,28 +276,23 @@ def read(path: Path, sections: int | None = None) -> SetData:
 
 
 def _read(path: Path, sections: int | None) -> SetData:
-    if readers := readers_of(path):
-        data: SetData = readers.read_set(path, sections)
+    if reader := reader_of(path):
+        data: SetData = reader.read_set(path, sections)
         return data
     if sections is not None:
         raise ValueError(f"{path}: has no sections; pass sections only for .egs files")
-    if npz.format_of(path) == MATERIAL:
-        raise ValueError(f"{path}: holds a material; load it by Material.load, and take one map")
-    version = npz.read_version(path, FORMAT, VERSION)
-    layout = LAYOUT if version < 2 else LAYOUT | {"cutoff": CUTOFF_FIELD}
-    arrays = npz.read(path, FORMAT, VERSION, layout)
-    size, space = tuple(arrays.pop("size").tolist()), str(arrays.pop("space"))
-    cutoff = float(arrays.pop("cutoff", np.array(CUTOFF)))
-    return SetData(arrays, size, space, cutoff)
+    kind, version, layout = _layout_of(path)
+    found = npz.read(path, kind, version, layout)
+    return SetData({name: found[name] for name in _LARGE}, *_properties(path, found))
 
 
 def check(data: SetData) -> None:
     """Raise `BadValue` if a part of a set is invalid.
 
-    Shapes must fit each other and the space. Values must be finite, a and c positive, sides from 1
-    to 65536 pixels, and the cutoff in (0, `MAX_CUTOFF`].
+    Shapes must fit each other, the space and the maps. Values must be finite, a and c positive,
+    sides from 1 to 65536 pixels, and the cutoff in (0, `MAX_CUTOFF`].
     """
-    arrays, size, space, cutoff = data
+    arrays, size, space, cutoff, maps = data
     mean, factor, color = arrays["mean"], arrays["factor"], arrays["color"]
     if mean.ndim != 2 or mean.shape[1] != 2 or len(mean) == 0:
         raise BadValue(f"mean has shape {mean.shape}, expected (N, 2) with N >= 1")
@@ -224,6 +315,10 @@ def check(data: SetData) -> None:
         raise BadValue(f"size is {size}, expected two sides from 1 to 65536")
     if not 0 < cutoff <= MAX_CUTOFF:
         raise BadValue(f"cutoff is {cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}")
+    if maps:
+        check_maps(maps, channels)
+        if space != "data":
+            raise BadValue(f"space is {space!r}, expected 'data' for a set with maps")
     if space not in SPACES:
         raise BadValue(f"space is {space!r}, expected one of {', '.join(SPACES)}")
     if space != "data" and color.shape[1] not in (1, 3, 4):

@@ -1,6 +1,7 @@
 """Sets of 2D Gaussians: parameters, bounds, and operations on whole sets.
 
-A set comes from NumPy arrays, a file, tensors of Dr.Jit, or several sets that are joined.
+A set comes from NumPy arrays, a file, tensors of Dr.Jit, or several sets that are joined. It forms
+one image, or several maps that share means and shapes.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from ..backend.recording import exclusive
 from ..backend.selection import select
 from ..storage.npz import BadValue
 from .file import CUTOFF, SetData, check, read, write
+from .maps import TextureMap, find_map, slices
 
 MIN_DEVIATION = 0.25
 """Smallest standard deviation along an axis of the factor, in pixels. A narrower Gaussian can fall
@@ -55,6 +57,10 @@ class Gaussians:
         Standard deviations at which a Gaussian ends, in (0, 12]. The error at a point is at most
         ``exp(-cutoff^2 / 2)`` times the sum of the absolute colours of the Gaussians that end
         before it.
+    maps : tuple of TextureMap
+        Groups of channels, if the set has several maps, such as those of a material; see
+        `eigengs_dr.gaussian.maps.TextureMap`. ``gaussians["albedo"]`` is then the set of one map,
+        and the space is "data": each map in its own units. They have at most 16 channels together.
 
     Examples
     --------
@@ -72,6 +78,7 @@ class Gaussians:
     height: int
     space: str = "ycbcr"
     cutoff: float = CUTOFF
+    maps: tuple[TextureMap, ...] = ()
 
     @classmethod
     @exclusive()
@@ -87,6 +94,7 @@ class Gaussians:
         backend: str | None = None,
         cutoff: float = CUTOFF,
         dtype: DTypeLike = np.float32,
+        maps: Sequence[TextureMap] = (),
     ) -> Gaussians:
         """Create a set from NumPy arrays.
 
@@ -101,7 +109,7 @@ class Gaussians:
             Zero by default.
         size : (int, int)
             Native width and height in pixels.
-        space, cutoff : optional
+        space, cutoff, maps : optional
             See `Gaussians`.
         backend : {"llvm", "cuda"}, optional
             By default "cuda" if the machine has a CUDA GPU, else "llvm".
@@ -128,7 +136,7 @@ class Gaussians:
                 f"Gaussians: size is {size}; give whole pixels, as (640, 480)"
             ) from None
         try:
-            check(SetData(checked, size, space, cutoff))
+            check(SetData(checked, size, space, cutoff, tuple(maps)))
         except BadValue as error:
             raise ValueError(f"Gaussians: {error}") from None
         types = types_in(select(backend), 8 * kind.itemsize)
@@ -141,6 +149,7 @@ class Gaussians:
             height=size[1],
             space=space,
             cutoff=float(cutoff),  # a NumPy scalar would promote Dr.Jit arrays to float64
+            maps=tuple(maps),
         )
 
     @classmethod
@@ -156,11 +165,13 @@ class Gaussians:
             backend=backend,
             cutoff=data.cutoff,
             dtype=dtype,
+            maps=data.maps,
         )
 
     def data(self) -> SetData:
         """Return the content for a file."""
-        return SetData(self.to_arrays(), (self.width, self.height), self.space, self.cutoff)
+        size = self.width, self.height
+        return SetData(self.to_arrays(), size, self.space, self.cutoff, self.maps)
 
     @exclusive()
     def to_arrays(self) -> dict[str, NDArray[Any]]:
@@ -180,8 +191,11 @@ class Gaussians:
         return Gaussians.from_data, (self.data(), types.backend, kind)
 
     def __repr__(self) -> str:
-        size = f"{len(self)}, {self.width}x{self.height} pixels, {self.channels} channels"
-        return f"Gaussians({size}, {self.space!r}, cutoff={self.cutoff:g})"
+        size = f"{len(self)}, {self.width}x{self.height} pixels"
+        kind = f"{self.channels} channels, {self.space!r}"
+        if self.maps:
+            kind = f"maps {', '.join(m.name for m in self.maps)}"
+        return f"Gaussians({size}, {kind}, cutoff={self.cutoff:g})"
 
     _repr_html_ = to_html  # what a notebook shows
 
@@ -196,9 +210,10 @@ class Gaussians:
 
     @exclusive()
     def __getitem__(self, selection: Any) -> Gaussians:
-        """Select Gaussians by a slice, an integer array or a boolean mask; differentiable.
+        """Select Gaussians by a slice, an integer array or a boolean mask, or a map by its name.
 
-        The result has the same background.
+        Differentiable. Selected Gaussians have the background of the set. The set of a map has all
+        Gaussians, and shares the memory of their means and shapes.
 
         Raises
         ------
@@ -206,7 +221,11 @@ class Gaussians:
             If the index is out of range or has another type.
         ValueError
             If the selection is empty.
+        KeyError
+            If there is no such map; the message lists the names.
         """
+        if isinstance(selection, str):
+            return self._map(selection)
         types = types_of(self.mean)
         kept = np.atleast_1d(np.arange(len(self), dtype=np.uint32)[selection])
         if not kept.size:
@@ -218,6 +237,20 @@ class Gaussians:
             return type(rows)([dr.gather(types.Float, row, chosen) for row in whole])
 
         return replace(self, mean=pick(self.mean), factor=pick(self.factor), color=pick(self.color))
+
+    def _map(self, name: str) -> Gaussians:
+        try:
+            number = find_map(self.maps, name)
+        except BadValue as error:
+            raise KeyError(f"Gaussians: {error}") from None
+        own = slices(self.maps)[number]
+
+        def take(rows: Any) -> Any:
+            return type(rows)([rows[k] for k in range(own.start, own.stop)])
+
+        color, background = take(self.color), take(self.background)
+        space = self.maps[number].space
+        return replace(self, color=color, background=background, space=space, maps=())
 
     @exclusive()
     def scaled(self, width: int, height: int) -> Gaussians:
@@ -371,7 +404,7 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     Parameters
     ----------
     sets : sequence of Gaussians
-        At least one. All have the same native size, space, cutoff, channels and backend.
+        At least one. All have the same native size, space, cutoff, channels, maps and backend.
 
     Returns
     -------
@@ -387,7 +420,7 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     if not sets:
         raise ValueError("concatenate: no sets were given; pass at least one")
     first = sets[0]
-    kinds = {(g.width, g.height, g.space, g.cutoff, g.channels, type(g.mean)) for g in sets}
+    kinds = {(g.width, g.height, g.space, g.cutoff, g.channels, g.maps, type(g.mean)) for g in sets}
     if len(kinds) > 1:
         raise ValueError(
             "concatenate: sets differ in size, space, cutoff, channels or backend; "
@@ -557,3 +590,28 @@ def _columns_of(like: Any, tensor: Any) -> Any:
     values = types.Float(tensor.array)  # of another precision, perhaps
     index = dr.arange(types.UInt, dr.width(values) // number) * number
     return type(like)([dr.gather(types.Float, values, index + k) for k in range(number)])
+
+
+def scale_channels(gaussians: Gaussians, factors: Sequence[float]) -> Gaussians:
+    """Multiply colours and background by a factor for each channel."""
+    FloatX = types_of(gaussians.mean).FloatX
+
+    def scale(rows: Any) -> Any:
+        return FloatX([row * float(f) for row, f in zip(rows, factors, strict=True)])
+
+    return replace(gaussians, color=scale(gaussians.color), background=scale(gaussians.background))
+
+
+def one_image(gaussians: Gaussians) -> Gaussians:
+    """Return a set of one image as it is.
+
+    Raises
+    ------
+    ValueError
+        If the set has maps; the message lists them.
+    """
+    if gaussians.maps:
+        names = ", ".join(m.name for m in gaussians.maps)
+        first = gaussians.maps[0].name
+        raise ValueError(f"the set has the maps {names}; choose one, as gaussians[{first!r}]")
+    return gaussians

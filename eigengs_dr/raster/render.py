@@ -19,6 +19,7 @@ from ..backend.arrays import ArrayTypes, make_divisor, types_of
 from ..backend.recording import exclusive
 from ..gaussian.file import MAX_CUTOFF, check_index_range
 from ..gaussian.gaussians import Fitted, Gaussians, set_of
+from ..gaussian.maps import show_sums, slices
 from ..image.color import decode, from_sum, to_picture
 from .adjoint import adjoint
 from .binning.lists import TileLists, build_lists
@@ -161,7 +162,7 @@ def picture_of(
     width: int | None = None,
     height: int | None = None,
     cutoff: float | None = None,
-) -> NDArray[Any]:
+) -> Any:
     """Render a set for display and comparison: like `render`, but linear light becomes sRGB.
 
     Parameters
@@ -174,11 +175,15 @@ def picture_of(
 
     Returns
     -------
-    ndarray, shape (height, width, C)
-        1 is white. Negative linear light becomes 0; other values are not clamped.
+    ndarray, shape (height, width, C); or dict of str to ndarray
+        1 is white. Negative linear light becomes 0; other values are not clamped. A set with maps
+        has a picture of each, by its name.
     """
     gaussians = set_of(gaussians)
     image = render(dr.detach(gaussians), width, height, cutoff).numpy()
+    if gaussians.maps:
+        cuts = zip(gaussians.maps, slices(gaussians.maps), strict=True)
+        return {m.name: show_sums(m.space, image[..., own]) for m, own in cuts}
     return to_picture(gaussians.space, image)
 
 

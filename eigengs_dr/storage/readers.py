@@ -7,31 +7,28 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 
-class Readers(NamedTuple):
-    """The readers of one format.
+class Reader(NamedTuple):
+    """The reader of one format.
 
     Attributes
     ----------
     read_set : callable
         ``read_set(path, sections)`` returns the set as `Gaussians.load` takes it; `sections` is a
         number, or None for all.
-    read_material : callable
-        ``read_material(path)`` returns the material as `Material.load` takes it.
-    holds_material : callable
-        ``holds_material(path)`` returns whether a file holds a material.
+    read_maps : callable
+        ``read_maps(path)`` returns the maps of the set, without its Gaussians.
     """
 
     read_set: Callable[..., Any]
-    read_material: Callable[..., Any]
-    holds_material: Callable[..., bool]
+    read_maps: Callable[..., Any]
 
 
-READERS: dict[bytes, Readers] = {}
-"""Readers of formats by their first bytes. `eigengs_dr` registers those of packed sets."""
+READERS: dict[bytes, Reader] = {}
+"""Readers by the first bytes of a file. `eigengs_dr` registers that of packed sets."""
 
 
-def readers_of(path: str | os.PathLike[str]) -> Readers | None:
-    """Return the readers of a file, None for ``.npz``; `OSError` if it cannot be opened."""
+def reader_of(path: str | os.PathLike[str]) -> Reader | None:
+    """Return the reader of a file, None for ``.npz``; `OSError` if it cannot be opened."""
     with open(path, "rb") as file:
         start = file.read(max(map(len, READERS), default=0))
-    return next((readers for magic, readers in READERS.items() if start.startswith(magic)), None)
+    return next((reader for magic, reader in READERS.items() if start.startswith(magic)), None)

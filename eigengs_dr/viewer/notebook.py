@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codec.packing import MaterialPackResult, PackResult
+from ..codec.packing import PackResult
 from ..eigenbasis.eigengs import EigenGS
 from ..eigenbasis.pca.basis import Eigenbasis
 from ..fitting.fit import Fit
 from ..gaussian.gaussians import Gaussians
-from ..material.fit_material import MaterialFit
-from ..material.material import Material
 from ..raster.render import picture_of
 from .facts import MAX_GAUSSIANS
 from .pictures import photo_uri
@@ -97,50 +95,28 @@ def _show_set(gaussians: Gaussians) -> str:
         return _block(repr(gaussians))
     scale = min(1.0, MAX_SIDE / max(gaussians.width, gaussians.height))
     width, height = (max(1, round(scale * s)) for s in (gaussians.width, gaussians.height))
-    return _block(repr(gaussians), _image(picture_of(gaussians, width, height)))
+    shown = picture_of(gaussians, width, height)
+    return _block(repr(gaussians), *(_maps(shown) if gaussians.maps else [_image(shown)]))
 
 
 @to_html.register
 def _show_fit(fit: Fit) -> str:
-    scale = -(-max(fit.image.shape[:2]) // MAX_SIDE)
+    scale = -(-max(fit.gaussians.width, fit.gaussians.height) // MAX_SIDE)
     curve = [(row["seconds"], row["psnr_rgb"]) for row in fit.trace]
-    picture = _image(fit.image[::scale, ::scale])
-    return _block(repr(fit), picture, draw_curve(curve, "seconds", "PSNR in RGB, dB"))
-
-
-@to_html.register
-def _show_material(material: Material) -> str:
-    if len(material.gaussians) > MAX_GAUSSIANS:
-        return _block(repr(material))
-    g = material.gaussians
-    scale = min(1.0, MAX_SIDE / max(g.width, g.height))
-    size = [max(1, round(scale * side)) for side in (g.width, g.height)]
-    return _block(repr(material), *_maps(material.pictures(*size)))
-
-
-@to_html.register
-def _show_material_fit(fit: MaterialFit) -> str:
-    scale = -(-max(next(iter(fit.images.values())).shape[:2]) // MAX_SIDE)
-    curve = [(row["seconds"], row["psnr_rgb"]) for row in fit.trace]
-    text = (
-        f"{fit.material!r}: psnr_ycbcr={fit.psnr_ycbcr:.2f}, psnr_rgb={fit.psnr_rgb:.2f}, "
-        f"seconds={fit.seconds:.2f}, stopped={fit.stopped!r}"
-    )
-    pictures = _maps({name: image[::scale, ::scale] for name, image in fit.images.items()})
-    return _block(text, *pictures, draw_curve(curve, "seconds", "PSNR in RGB, dB"))
+    if isinstance(fit.image, Mapping):
+        pictures = _maps({name: image[::scale, ::scale] for name, image in fit.image.items()})
+    else:
+        pictures = [_image(fit.image[::scale, ::scale])]
+    return _block(repr(fit), *pictures, draw_curve(curve, "seconds", "PSNR in RGB, dB"))
 
 
 @to_html.register
 def _show_packed(packed: PackResult) -> str:
-    text = f"{packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bpp, psnr={packed.psnr:.2f}"
+    psnr = f"psnr={packed.psnr:.2f}" if isinstance(packed.psnr, float) else "psnr_rgb: "
+    if isinstance(packed.psnr, Mapping):
+        psnr += ", ".join(f"{name} {value:.2f}" for name, value in packed.psnr.items())
+    text = f"{packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bpp, {psnr}"
     return _block(text) + _show_set(packed.gaussians)
-
-
-@to_html.register
-def _show_packed_material(packed: MaterialPackResult) -> str:
-    psnr = ", ".join(f"{name} {value:.2f}" for name, value in packed.psnr.items())
-    text = f"{packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bpp, psnr_rgb: {psnr}"
-    return _block(text) + _show_material(packed.material)
 
 
 def _maps(pictures: Mapping[str, NDArray[Any]]) -> list[str]:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..backend.recording import exclusive
 from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
-from ..gaussian.gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians, one_image
 from ..image.color import UNBOUNDED, rendered_as
 from ..image.io import read_image
 from ..image.pixels import check_data, check_image
@@ -163,6 +163,8 @@ def view(
         if source.mean_image is not None:
             raise ValueError("the fit has a mean image of pixels, which a page cannot draw")
         source = source.gaussians
+    if isinstance(source, Gaussians):
+        one_image(source)
     if not isinstance(source, Gaussians | EigenGS):
         raise TypeError(
             f"{type(source).__name__} cannot be shown; expected Gaussians, Fit or EigenGS"

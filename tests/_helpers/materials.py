@@ -3,8 +3,7 @@
 import numpy as np
 
 from eigengs_dr.gaussian.gaussians import Gaussians
-from eigengs_dr.material.maps import TextureMap
-from eigengs_dr.material.material import Material
+from eigengs_dr.gaussian.maps import TextureMap
 
 MAPS = (
     TextureMap("albedo", "linear", 3, 0.5),
@@ -19,7 +18,7 @@ def material(count=24, size=(22, 17), maps=MAPS, backend=None, seed=0):
     channels = sum(m.channels for m in maps)
     factor = np.zeros((count, 3))
     factor[:, [0, 2]] = random.uniform(0.2, 0.5, (count, 2))
-    gaussians = Gaussians.from_arrays(
+    return Gaussians.from_arrays(
         random.uniform(0, 1, (count, 2)) * size,
         factor,
         random.uniform(-0.1, 0.1, (count, channels)),
@@ -27,8 +26,8 @@ def material(count=24, size=(22, 17), maps=MAPS, backend=None, seed=0):
         size=size,
         space="data",
         backend=backend,
+        maps=maps,
     )
-    return Material(gaussians, tuple(maps))
 
 
 def images(side=32):

@@ -1,7 +1,9 @@
 """Sets for the scenes."""
 
+from dataclasses import replace
+
 import eigengs_dr as eg
-from eigengs_dr.material.maps import TextureMap
+from eigengs_dr.gaussian.maps import TextureMap
 
 
 def save_halves(folder):
@@ -16,7 +18,7 @@ def save_halves(folder):
     save("roughness", [0.2], [0.6], "data")
     maps = [("albedo", "linear", 3), ("roughness", "data", 1), ("normal", "normal", 3)]
     both = halves([*red, 0.2, 0.5, 0.5, 1], [*blue, 0.6, 0.6, 0.4, 0.9], "data")
-    eg.Material(both, tuple(TextureMap(*m) for m in maps)).save(folder / "tiles.npz")
+    replace(both, maps=tuple(TextureMap(*m) for m in maps)).save(folder / "tiles.npz")
     return folder
 
 

@@ -50,9 +50,9 @@ def test_fit(fitted, folder):
     report = json.loads((folder / "r.json").read_text())
     assert [m["name"] for m in report["maps"]] == ["albedo", "roughness", "normal"]
     assert report["gaussians"] == 8 and report["trace"][0]["maps"]["normal"]["psnr_rgb"] > 10
-    material = eg.Material.load(fitted)
+    material = eg.Gaussians.load(fitted)
     for m in report["maps"]:
-        psnr = eg.psnr(images(24)[m["name"]], material.pictures()[m["name"]])
+        psnr = eg.psnr(images(24)[m["name"]], eg.picture_of(material)[m["name"]])
         assert psnr == pytest.approx(m["psnr_rgb"], abs=0.3)  # the files have 8 bits
     assert eg.load_image(folder / "p.png").shape == (3 * 528, 3 * 528, 3)
 
@@ -61,7 +61,7 @@ def test_render(fitted, tmp_path):
     result = run("render", fitted, "-o", tmp_path / "r.png", "--map", "roughness", "--quiet")
     assert result.exit_code == 0, result.output
     found = eg.load_image(tmp_path / "r.png", keep_grey=True)
-    expected = eg.Material.load(fitted).pictures()["roughness"]
+    expected = eg.picture_of(eg.Gaussians.load(fitted))["roughness"]
     np.testing.assert_allclose(found, np.clip(expected, 0, 1), atol=1 / 255)
 
 
@@ -90,23 +90,23 @@ def test_pack(fitted, folder, tmp_path):
 
 
 def test_an_interrupted_fit_is_kept(folder, tmp_path, monkeypatch):
-    result = replace(eg.fit_material(images(24), 5, iterations=0), stopped="interrupted")
+    result = replace(eg.fit(images(24), 5, iterations=0), stopped="interrupted")
 
     def pressed(*arguments, **settings):
         raise FitInterrupted(result)
 
-    monkeypatch.setattr("eigengs_dr.material.fit_material.fit_material", pressed)
+    monkeypatch.setattr("eigengs_dr.fit", pressed)
     result_of_run = run("fit", *maps(folder), "-o", tmp_path / "m.npz", "--gaussians", 9)
     assert result_of_run.exit_code == 130
     assert "interrupted; the best fit so far" in result_of_run.output
-    assert len(eg.Material.load(tmp_path / "m.npz").gaussians) == 5
+    assert len(eg.Gaussians.load(tmp_path / "m.npz")) == 5
 
 
 def test_a_result_is_kept(fitted, folder, tmp_path):
     """A material, as a set, and what is no material is never replaced."""
     file, set_file = tmp_path / "m.npz", tmp_path / "set.npz"
     file.write_bytes(fitted.read_bytes())
-    eg.Material.load(fitted)["albedo"].save(set_file)
+    eg.Gaussians.load(fitted)["albedo"].save(set_file)
     command = ["fit", *maps(folder), "--gaussians", 9, "--iterations", 1, "-o"]
     again = run(*command, file)
     assert again.exit_code == 0 and file.read_bytes() == fitted.read_bytes()
@@ -116,7 +116,7 @@ def test_a_result_is_kept(fitted, folder, tmp_path):
     assert other.exit_code == 2 and set_file.read_bytes() == before
     assert "set.npz: exists and is no material; choose another name with -o" in other.stderr
     assert run(*command, file, "--overwrite").exit_code == 0
-    assert len(eg.Material.load(file).gaussians) == 9
+    assert len(eg.Gaussians.load(file)) == 9
 
 
 def test_out_of_reach(folder, tmp_path):

@@ -87,7 +87,7 @@ def test_numbers_of_gaussians_are_levels(photos):
 
 def test_levels_of_detail(photos, output):
     [row, *_] = eg.fit_many(photos, output, levels=2, **QUICK)
-    alone = eg.fit_levels(eg.load_image(row.input), levels=2, **QUICK)
+    alone = eg.fit(eg.load_image(row.input), levels=2, **QUICK)
     assert same(eg.Gaussians.load(row.output), alone.gaussians)
 
 

@@ -10,8 +10,8 @@ from _helpers.photos import coffee
 from eigengs_dr.codec.packing import MSE_WITHOUT_IMAGE
 from eigengs_dr.fitting import levels as levels_module
 from eigengs_dr.fitting.density_control import removal_cost
-from eigengs_dr.fitting.levels import fit_levels, level_counts
-from eigengs_dr.fitting.options import FitOptions
+from eigengs_dr.fitting.fit import fit
+from eigengs_dr.fitting.options import FitOptions, level_counts
 from eigengs_dr.fitting.start import initialize
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import picture_of
@@ -24,7 +24,7 @@ def image():
 
 @pytest.fixture(scope="module")
 def result(image):
-    return fit_levels(image, 256, levels=3, iterations=150)
+    return fit(image, 256, levels=3, iterations=150)
 
 
 def reached(gaussians, image):
@@ -54,7 +54,7 @@ def test_numbers_of_gaussians_are_counts():
     ],
 )
 def test_bad_numbers_of_gaussians_are_refused(image, levels, message):
-    for call in (lambda: level_counts(9, levels), lambda: fit_levels(image, 9, levels)):
+    for call in (lambda: level_counts(9, levels), lambda: fit(image, 9, levels=levels)):
         with pytest.raises(ValueError, match=message) as caught:
             call()
         assert "\n" not in str(caught.value)
@@ -63,7 +63,7 @@ def test_bad_numbers_of_gaussians_are_refused(image, levels, message):
 def test_every_number_asked_makes_the_image(image):
     """Numbers that are close together cost little: each prefix is near a fit of its own."""
     counts = [150, 200, 256]
-    gaussians = fit_levels(image, levels=counts, iterations=150).gaussians
+    gaussians = fit(image, levels=counts, iterations=150).gaussians
     assert len(gaussians) == 256
     for count in counts:
         own = reached(eg.fit(image, count, iterations=150).gaussians, image)
@@ -73,9 +73,9 @@ def test_every_number_asked_makes_the_image(image):
 def test_every_level_gains_by_relocation(monkeypatch):
     """Of few Gaussians, whose first places are poor: each level gains a decibel here."""
     image, counts = eg.sample("coffee")[200:264, 300:364], [100, 140, 180]
-    found = fit_levels(image, levels=counts, iterations=300).gaussians
+    found = fit(image, levels=counts, iterations=300).gaussians
     monkeypatch.setattr(levels_module.LevelControl, "relocate", lambda self, found, how: found)
-    left = fit_levels(image, levels=counts, iterations=300).gaussians
+    left = fit(image, levels=counts, iterations=300).gaussians
     for count in counts:
         assert reached(found[:count], image) > reached(left[:count], image) + 0.3
 
@@ -121,17 +121,17 @@ def test_the_picture_is_that_of_the_whole_set(image, result):
 
 
 def test_one_seed_gives_one_result(image):
-    a, b = (fit_levels(image, 64, 2, iterations=5) for _ in range(2))
+    a, b = (fit(image, 64, levels=2, iterations=5) for _ in range(2))
     np.testing.assert_array_equal(a.image, b.image)
 
 
 def test_one_level_is_a_set_like_any(image):
-    assert len(fit_levels(image, 10, 1, iterations=2).gaussians) == 10
+    assert len(fit(image, 10, levels=1, iterations=2).gaussians) == 10
 
 
 @pytest.mark.parametrize("color", ["linear", "rgb", "data"])
 def test_other_colours(image, color):
-    found = fit_levels(image, 64, 2, iterations=5, space=color)
+    found = fit(image, 64, levels=2, iterations=5, space=color)
     assert found.gaussians.space == color
     assert np.isfinite(picture_of(found.gaussians[:16])).all()
 
@@ -166,7 +166,7 @@ def test_packed_levels_without_an_image_keep_what_they_have_of_the_whole(result,
 
 def test_levels_keep_the_background(image):
     """What is added later does not change the levels before: one background serves all."""
-    found = fit_levels(image, 64, 2, iterations=0).gaussians
+    found = fit(image, 64, levels=2, iterations=0).gaussians
     alone = initialize(image, FitOptions(gaussians=16, init="auto")).gaussians
     np.testing.assert_allclose(
         found.to_arrays()["background"], alone.to_arrays()["background"], atol=1e-6
@@ -175,4 +175,4 @@ def test_levels_keep_the_background(image):
 
 def test_as_many_as_fit_takes_by_default(image):
     small = image[:4, :4]
-    assert len(fit_levels(small, levels=2, iterations=0).gaussians) == 16
+    assert len(fit(small, levels=2, iterations=0).gaussians) == 16

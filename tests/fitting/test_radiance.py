@@ -83,7 +83,7 @@ def test_data_of_any_range():
     error = np.sqrt(np.mean((eg.render(result.gaussians).numpy()[..., 0] - heights) ** 2))
     assert error < 3
     np.testing.assert_allclose(result.image[..., 0], heights, atol=30)
-    levels = eg.fit_levels(heights, levels=2, space="data", **SMALL)
+    levels = eg.fit(heights, levels=2, space="data", **SMALL)
     np.testing.assert_allclose(levels.image[..., 0], heights, atol=60)
 
 

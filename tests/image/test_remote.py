@@ -70,10 +70,10 @@ def test_an_image_may_be_a_file_or_a_url(place, photos, tmp_path):
     np.testing.assert_array_equal(eg.load_image(url), pixels)
     want = eg.fit(pixels, **QUICK).image
     np.testing.assert_array_equal(eg.fit(url, **QUICK).image, want)
-    eg.fit_levels(url, levels=2, **QUICK)
+    eg.fit(url, levels=2, **QUICK)
     assert eg.fit(url, space="data", **QUICK).gaussians.channels == 3
-    found = eg.fit_material({"albedo": url, "roughness": url}, **QUICK)
-    assert list(found.material) == ["albedo", "roughness"]
+    found = eg.fit({"albedo": url, "roughness": url}, **QUICK)
+    assert list(found.maps) == ["albedo", "roughness"]
     large = eg.fit_large(url, tmp_path / "large.npz", block=32, **QUICK)
     assert len(large.gaussians) == 60
 
@@ -156,7 +156,7 @@ def test_figures_are_those_of_the_set_of_a_search(photos):
     assert result.psnr_ycbcr == pytest.approx(
         eg.psnr(pixels, result.image, space="ycbcr"), abs=1e-4
     )
-    found = eg.fit_material({"roughness": pixels[..., 0]}, 60, iterations=20)
+    found = eg.fit({"roughness": pixels[..., 0]}, 60, iterations=20)
     assert found.psnr_rgb == found.trace[-1]["psnr_rgb"]
 
 

@@ -44,8 +44,8 @@ def source(path, name):
 
 @pytest.mark.parametrize("prefilter", [0.0, 0.01])
 def test_values_are_those_of_the_map_alone(file, prefilter):
-    m = eg.Material.load(file, backend())
-    for name in m:
+    m = eg.Gaussians.load(file, backend())
+    for name in [part.name for part in m.maps]:
         found = texture(file, name, prefilter=prefilter)
         alone = mi.load_dict(eg.plugins.texture_of(m[name], prefilter=prefilter))
         si = texel_centres()
@@ -68,7 +68,7 @@ def test_textures_of_a_file_share_memory_until_one_changes(file):
     parameters["mean"] = parameters["mean"] + 3
     parameters.update()
     np.testing.assert_array_equal(picture(parts[2].eval_3(texel_centres())), before)
-    m = eg.Material.load(file, backend())
+    m = eg.Gaussians.load(file, backend())
     moved = replace(m["albedo"], mean=m["albedo"].mean + 3)
     alone = mi.load_dict(eg.plugins.texture_of(moved, prefilter=0.01))
     found = picture(parts[0].eval_3(texel_centres()))
@@ -115,9 +115,9 @@ def test_mistakes(file, tmp_path):
         texture(file, "rough")
     with pytest.raises(RuntimeError, match="map is 3; it must be the name of a map"):
         texture(file, 3)
-    eg.Material.load(file, backend())["albedo"].save(tmp_path / "g.npz")
+    eg.Gaussians.load(file, backend())["albedo"].save(tmp_path / "g.npz")
     with pytest.raises(RuntimeError, match="holds one image and no map 'albedo'; leave map out"):
         texture(tmp_path / "g.npz", "albedo")
     packed = tmp_path / "m.egs"
-    eg.pack_material(eg.Material.load(file, backend()).first(2), packed)
+    eg.pack(eg.Gaussians.load(file, backend())[:2], packed)
     assert texture(packed, "roughness", first=1).resolution().x == SIZE[0]

@@ -11,8 +11,7 @@ from eigengs_bench.harness.store import Progress
 from eigengs_bench.harness.timing import Image
 from eigengs_dr.fitting.density_control import removal_cost
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.levels import fit_levels, level_counts
-from eigengs_dr.fitting.options import Levels
+from eigengs_dr.fitting.options import Levels, level_counts
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import picture_of
@@ -38,7 +37,7 @@ def run(
     between = (round(math.sqrt(low * high)) for low, high in pairwise(ends))
     counts = sorted({*ends, *between})
     progress("fits", 0, len(counts) + 1)
-    nested = fit_levels(image, gaussians, levels, **settings).gaussians
+    nested = fit(image, gaussians, levels=levels, **settings).gaussians
     alone = {}
     for done, count in enumerate(counts, 1):
         progress("fits", done, len(counts) + 1)

@@ -19,13 +19,13 @@ from PIL import Image as pillow
 from eigengs_bench.experiments.block_codecs import codecs, coded
 from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.timing import Image
-from eigengs_dr.codec.packing import pack_material
+from eigengs_dr.codec.packing import pack
+from eigengs_dr.fitting.fit import fit
+from eigengs_dr.gaussian.maps import usual_space
 from eigengs_dr.image.color import rendered_as
 from eigengs_dr.image.folder import image_files
 from eigengs_dr.image.io import load_image, to_8bit
 from eigengs_dr.image.metrics import psnr
-from eigengs_dr.material.fit_material import fit_material
-from eigengs_dr.material.maps import usual_space
 
 FILE = "materials.jsonl"
 SHARED, SEPARATE = "shared shapes", "a set for each map"
@@ -68,17 +68,17 @@ def _load(folder: Path) -> Maps:
 
 
 def _fit(task: Task, maps: Maps, count: int) -> Row:
-    fitted = fit_material(maps, count, task.iterations, backend=task.backend)
+    fitted = fit(maps, count, task.iterations, backend=task.backend)
     with TemporaryDirectory() as folder:
         plain, packed = Path(folder) / "m.npz", Path(folder) / "m.egs"
-        fitted.material.save(plain)
-        receipt = pack_material(fitted.material, packed, maps, BUDGET)
+        fitted.save(plain)
+        receipt = pack(fitted, packed, maps, BUDGET)
         size = plain.stat().st_size
     return {
         "bytes": receipt.bytes,
         "psnr": receipt.psnr,
         "npz_bytes": size,
-        "npz_psnr": {name: psnr(image, fitted.images[name]) for name, image in maps.items()},
+        "npz_psnr": {name: psnr(image, fitted.image[name]) for name, image in maps.items()},
         "seconds": fitted.seconds,
     }
 

@@ -7,8 +7,8 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.materials import MAPS, material
-from eigengs_dr.material.file import read_head, read_set
-from eigengs_dr.material.maps import TextureMap, check_maps, slices, usual_space
+from eigengs_dr.gaussian.file import maps_of, read_head, read_map
+from eigengs_dr.gaussian.maps import TextureMap, check_maps, slices, usual_space
 from eigengs_dr.raster.reference import render_exact
 from eigengs_dr.storage import npz
 from eigengs_dr.storage.npz import BadValue
@@ -17,7 +17,7 @@ from eigengs_dr.storage.npz import BadValue
 def test_the_set_of_a_map_renders_its_channels(backend):
     """The oracle renders each map alone, in double precision."""
     m = material(backend=backend)
-    arrays, pictures = m.gaussians.to_arrays(), m.pictures()
+    arrays, pictures = m.to_arrays(), eg.picture_of(m)
     for own, part in zip(m.maps, slices(m.maps), strict=True):
         view = m[own.name]
         assert (view.space, view.channels) == (own.space, own.channels)
@@ -28,18 +28,18 @@ def test_the_set_of_a_map_renders_its_channels(backend):
             arrays["background"][part],
             22,
             17,
-            m.gaussians.cutoff,
+            m.cutoff,
         )
         summed = eg.render(replace(view, space="data")).numpy()
         np.testing.assert_allclose(summed, exact, atol=2e-3)  # a Gaussian ends at its cutoff
         np.testing.assert_allclose(pictures[own.name], eg.picture_of(view), atol=2e-6)
-        assert view.mean[0].index == m.gaussians.mean[0].index  # one memory
+        assert view.mean[0].index == m.mean[0].index  # one memory
 
 
 def test_derivatives_of_a_map_are_those_of_its_channels(backend):
     dr = pytest.importorskip("drjit")
     m = material(backend=backend)
-    g = m.gaussians
+    g = m
     gradients = []
     for view in (m["roughness"], replace(m["roughness"], space="data")):
         view = dr.detach(view)
@@ -58,11 +58,13 @@ def test_derivatives_of_a_map_are_those_of_its_channels(backend):
 
 def test_names():
     m = material()
-    assert (list(m), len(m)) == (["albedo", "roughness", "normal"], 3)
+    assert repr(m) == "Gaussians(24, 22x17 pixels, maps albedo, roughness, normal, cutoff=3)"
     with pytest.raises(KeyError, match="'height' is not in it; it has albedo, roughness, normal"):
         m["height"]
     assert [usual_space(n) for n in ("Base_Color", "NORMAL", "ao")] == ["linear", "normal", "data"]
-    assert len(m.first(7).gaussians) == 7
+    assert (len(m[:7]), len(m[:7]["normal"]), m[:7].maps) == (7, 7, MAPS)
+    with pytest.raises(KeyError, match="it has no maps"):
+        m["normal"]["normal"]
 
 
 @pytest.mark.parametrize(
@@ -87,13 +89,14 @@ def test_invalid_maps(maps, words):
 def test_a_file_holds_it_all(tmp_path):
     m = material()
     m.save(tmp_path / "m.npz")
-    again = eg.Material.load(tmp_path / "m.npz")
+    again = eg.Gaussians.load(tmp_path / "m.npz")
     assert again.maps == m.maps
-    for name, values in m.gaussians.to_arrays().items():
-        np.testing.assert_array_equal(again.gaussians.to_arrays()[name], values)
+    for name, values in m.to_arrays().items():
+        np.testing.assert_array_equal(again.to_arrays()[name], values)
     head = read_head(tmp_path / "m.npz")
     assert (head.gaussians, head.size, head.maps) == (24, (22, 17), MAPS)
-    data = read_set(tmp_path / "m.npz", "normal")
+    assert maps_of(tmp_path / "m.npz") == MAPS
+    data = read_map(tmp_path / "m.npz", "normal")
     assert (data.space, data.arrays["color"].shape) == ("normal", (24, 3))
 
 
@@ -101,15 +104,11 @@ def test_the_wrong_kind_of_file(tmp_path):
     m = material()
     m.save(tmp_path / "m.npz")
     m["albedo"].save(tmp_path / "g.npz")
-    with pytest.raises(ValueError, match=r"holds a material; load it by Material\.load"):
-        eg.Gaussians.load(tmp_path / "m.npz")
-    with pytest.raises(ValueError, match=r"expected 'eigengs_dr\.material'"):
-        eg.Material.load(tmp_path / "g.npz")
     with pytest.raises(ValueError, match="maps albedo, roughness, normal; choose one with map"):
-        read_set(tmp_path / "m.npz", None)
+        read_map(tmp_path / "m.npz", None)
     with pytest.raises(ValueError, match="holds one image and no maps; leave map out"):
-        read_set(tmp_path / "g.npz", "albedo")
-    with pytest.raises(ValueError, match=r"only eigengs_dr\.pack_material writes \.egs"):
+        read_map(tmp_path / "g.npz", "albedo")
+    with pytest.raises(ValueError, match=r"only eigengs_dr\.pack writes \.egs"):
         m.save(tmp_path / "m.egs")
 
 
@@ -139,5 +138,5 @@ def test_hostile_files(tmp_path, case):
     members = {k: v for k, v in members.items() if v is not None}
     npz.write(path, "eigengs_dr.material", 1, members)
     with pytest.raises(ValueError, match=words) as error:
-        eg.Material.load(path)
+        eg.Gaussians.load(path)
     assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)

@@ -1,4 +1,4 @@
-"""The maps of a material: their names, spaces and channels."""
+"""The maps of a set: groups of channels with a name and a space, such as those of a material."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NORMALS = ("normal", "normals", "normalmap")
 
 
 class TextureMap(NamedTuple):
-    """One map of a material.
+    """One map of a set.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ def find_map(maps: Sequence[TextureMap], name: str) -> int:
     """
     names = [m.name for m in maps]
     if name not in names:
-        raise BadValue(f"map {name!r} is not in it; it has {', '.join(names)}")
+        raise BadValue(f"map {name!r} is not in it; it has {', '.join(names) or 'no maps'}")
     return names.index(name)
 
 
@@ -134,3 +134,8 @@ def show_sums(space: str, sums: NDArray[Any]) -> NDArray[Any]:
     if space == "ycbcr":
         sums = np.stack(decode(space, list(np.moveaxis(sums, -1, 0))), axis=-1)
     return to_picture(space, from_sum(space, sums))
+
+
+def channel_weights(maps: Sequence[TextureMap]) -> list[float]:
+    """Return the weight of each channel."""
+    return [m.weight for m in maps for _ in range(m.channels)]

@@ -1,4 +1,8 @@
-"""The images of all maps as one image of many channels, each in units of its error."""
+"""Several maps on one set of shapes: their images as one image of many channels.
+
+Each map is multiplied by a weight, so that all gain alike in decibels: by one over the root mean
+square error after a first colour solve, or, where each map has a goal, over the error of its goal.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +14,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..fitting.options import FitOptions
-from ..fitting.target import FitTarget, make_target, read_pixels, unit_of
 from ..gaussian.gaussians import Gaussians
+from ..gaussian.maps import TextureMap, check_maps, check_name, show_sums, slices, usual_space
 from ..image.color import rendered_as
 from ..image.metrics import float_space, psnrs_by_rows, target_key
 from ..image.pixels import ImageError
 from ..raster.render import picture_rows
 from ..storage.npz import BadValue
-from .maps import TextureMap, check_maps, check_name, show_sums, slices, usual_space
+from .options import FitOptions
+from .placement.adaptive import residual
+from .start import start_from_placement
+from .target import FitTarget, make_target, read_pixels, unit_of
 
 Image = NDArray[np.float32]
+
+MIN_MSE = (1 / 255) ** 2 / 12
+"""Mean squared error of rounding to 8 bits: maps below it do not get more weight."""
 
 
 class MapImage(NamedTuple):
@@ -35,21 +44,36 @@ class MapImage(NamedTuple):
         sRGB, normals or data, in units of `unit`.
     unit : float
         1, or the largest value of data above 1.5.
+    factor : float
+        The user's factor of its errors.
+    goal : float or None
+        The PSNR in dB that it shall reach.
     """
 
     name: str
     space: str
     pixels: Image
     unit: float
+    factor: float = 1.0
+    goal: float | None = None
+
+    def map(self, weight: float) -> TextureMap:
+        """Return the map for a weight of its errors in the fit, in the unit of the image."""
+        return TextureMap(self.name, self.space, self.pixels.shape[2], weight / self.unit)
 
 
 def read_maps(
-    maps: Mapping[str, ArrayLike], spaces: Mapping[str, str], encoding: str | None = None
+    maps: Mapping[str, ArrayLike],
+    spaces: Mapping[str, str] | None = None,
+    encoding: str | None = None,
+    weights: Mapping[str, float] | None = None,
+    target_psnr: float | Mapping[str, float] | None = None,
 ) -> list[MapImage]:
-    """Check the images of a material, and convert them to sRGB, normals or data.
+    """Check the images of maps, and convert them to sRGB, normals or data.
 
-    For parameters and errors see `eigengs_dr.fit_material`.
+    For parameters and errors see `eigengs_dr.fit`.
     """
+    spaces = spaces or {}
     if unknown := [name for name in spaces if name not in maps]:
         raise ValueError(f"space names {unknown[0]!r}, which is no map; maps are {_list(maps)}")
     images = [_read_map(name, image, spaces.get(name), encoding) for name, image in maps.items()]
@@ -62,7 +86,11 @@ def read_maps(
         check_maps(found, sum(m.channels for m in found))
     except BadValue as error:
         raise ValueError(str(error)) from None
-    return images
+    goals, factors = _goals(images, target_psnr), _factors(images, weights or {})
+    return [
+        image._replace(factor=factor, goal=goal)
+        for image, factor, goal in zip(images, factors, goals, strict=True)
+    ]
 
 
 def _read_map(name: str, image: ArrayLike, space: str | None, encoding: str | None) -> MapImage:
@@ -90,12 +118,38 @@ def _without_copies(pixels: Image) -> Image:
     return pixels
 
 
-def maps_of(images: Sequence[MapImage], weights: Sequence[float]) -> tuple[TextureMap, ...]:
-    """Return the maps of images whose errors have some weights, in the units of the images."""
-    return tuple(
-        TextureMap(image.name, image.space, image.pixels.shape[2], weight / image.unit)
-        for image, weight in zip(images, weights, strict=True)
-    )
+def _goals(
+    images: Sequence[MapImage], target: float | Mapping[str, float] | None
+) -> list[float | None]:
+    """Return the goal of each map in dB, if there are goals; check their names."""
+    if target is None:
+        return [None] * len(images)
+    if not isinstance(target, Mapping):
+        return [float(target)] * len(images)
+    names = [image.name for image in images]
+    if sorted(target) != sorted(names):
+        raise ValueError(
+            f"target_psnr names {', '.join(target)}; give one number, or one for each of "
+            f"{', '.join(names)}"
+        )
+    return [float(target[name]) for name in names]
+
+
+def _factors(images: Sequence[MapImage], weights: Mapping[str, float]) -> list[float]:
+    """Return the factor of the errors of each map; check the names."""
+    names = [image.name for image in images]
+    for name, weight in weights.items():
+        if name not in names:
+            raise ValueError(f"weights names {name!r}, which is no map; maps are {names}")
+        if not (np.isfinite(weight) and weight > 0):
+            raise ValueError(f"weights: {name!r} has {weight}; it must be above 0")
+    return [float(weights.get(name, 1.0)) for name in names]
+
+
+def shape_of(images: Sequence[MapImage]) -> NDArray[np.float32]:
+    """Return an image without memory that has the shape of all maps."""
+    channels = sum(image.pixels.shape[2] for image in images)
+    return np.broadcast_to(np.float32(0), (*images[0].pixels.shape[:2], channels))
 
 
 def combine(images: Sequence[MapImage], weights: Sequence[float]) -> FitTarget:
@@ -122,12 +176,41 @@ def _join(parts: Sequence[Image], weights: Sequence[float]) -> Image:
     )
 
 
+def balance(images: Sequence[MapImage], options: FitOptions) -> list[float]:
+    """Return the weights of the maps, with the geometric mean 1 but for the user's factors.
+
+    At its goal each map has the same weighted error. Without goals, the sum of the logarithms of
+    the errors counts: its derivative weighs squared errors by one over their mean.
+    """
+    goals = [image.goal for image in images if image.goal is not None]
+    if goals:
+        logs = np.array(goals) / 20 * np.log(10)
+    else:
+        errors = _first_errors(images, options)
+        logs = -0.5 * np.log(np.maximum(errors, MIN_MSE))
+    weights = np.exp(logs - logs.mean()).tolist()
+    return [image.factor * weight for image, weight in zip(images, weights, strict=True)]
+
+
+def _first_errors(images: Sequence[MapImage], options: FitOptions) -> list[float]:
+    """Return the mean squared error of each map after a first colour solve."""
+    if len(images) == 1:
+        return [1.0]
+    target = combine(images, [1.0] * len(images))
+    start = start_from_placement(target, options).gaussians
+    missed = residual(start, target.values)
+    if target.weight is not None:
+        missed *= target.weight
+    squares = np.square(missed).mean(axis=(0, 1), dtype=np.float64)
+    ends = np.cumsum([image.pixels.shape[2] for image in images])
+    return [float(part.mean()) for part in np.split(squares, ends[:-1])]
+
+
 def score_maps(
     gaussians: Gaussians,
     images: Sequence[MapImage],
     weights: Sequence[float],
     started: float,
-    goals: Sequence[float] | None = None,
     space: str = "rgb",
 ) -> dict[str, Any]:
     """Measure a set of all channels, each times the weight of its map.
@@ -136,12 +219,12 @@ def score_maps(
     -------
     dict
         seconds; psnr_ycbcr and psnr_rgb, means over the maps; maps, with both of each map; and with
-        goals, spare: how far the map that is farthest from its goal is above it, in dB.
+        goals, margin: how far the map that is farthest from its goal is above it, in dB.
     """
     read = picture_rows(gaussians)
     seconds = time.perf_counter() - started
     found = {}
-    for image, weight, own in zip(images, weights, slices(maps_of(images, weights)), strict=True):
+    for image, weight, own in zip(images, weights, slices([i.map(1) for i in images]), strict=True):
         spaces = [float_space(image.space), "rgb"]
         shown: Callable[[slice], Any] = partial(_shown, read, own, weight, image.space)
         ycbcr, rgb = psnrs_by_rows(shown, image.pixels, spaces)
@@ -151,9 +234,10 @@ def score_maps(
         **{key: float(np.mean([f[key] for f in found.values()])) for key in _FIGURES},
         "maps": found,
     }
-    if goals is not None:
+    goals = [image.goal for image in images if image.goal is not None]
+    if goals:
         levels = [found[image.name][target_key(image.space, space)] for image in images]
-        row["spare"] = min(level - goal for level, goal in zip(levels, goals, strict=True))
+        row["margin"] = min(level - goal for level, goal in zip(levels, goals, strict=True))
     return row
 
 
