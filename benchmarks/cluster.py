@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 import eigengs_dr as eg
 from eigengs_dr.backend.executor import executor_for
 from eigengs_dr.backend.selection import select
-from eigengs_dr.cluster.connect import connect
-from eigengs_dr.cluster.worker import limit_threads
+from eigengs_dr.cluster.executor import connect, limit_threads
 
 PHOTOS = ("coffee", "astronaut", "chelsea", "rocket")
 FIT = {"gaussians": 5000, "iterations": 100, "backend": "llvm"}

@@ -14,7 +14,7 @@ import lazy_loader
 
 from .backend.feedback import HTML
 from .backend.libllvm import select_libllvm
-from .storage.readers import READERS, Reader
+from .storage.atomic import READERS, Reader
 
 __version__ = "0.1.0"
 

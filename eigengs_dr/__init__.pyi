@@ -6,16 +6,15 @@ from .backend.selection import BackendError
 from .blocks.fit_large import LargeFit, fit_large
 from .codec.packing import PackResult, pack
 from .collection.fit_many import fit_many
-from .collection.row import ImageRow, RunInterrupted
+from .collection.manifest import ImageRow, RunInterrupted
 from .eigenbasis.eigengs import EigenGS
 from .eigenbasis.pca.basis import Eigenbasis
 from .fitting.fit import Fit, FitInterrupted, fit
 from .fitting.options import level_counts
 from .gaussian.gaussians import Gaussians, concatenate, from_tensors, to_tensors
-from .image.io import load_image, save_image
+from .image.io import load_image, sample, save_image
 from .image.metrics import ms_ssim, psnr, ssim
 from .image.pixels import ImageError, LinearImage
-from .image.samples import sample
 from .plugins import register_plugins
 from .raster.render import picture_of, render, tile_lists
 from .scene.convert import ConvertedScene, convert_scene

@@ -28,9 +28,14 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from eigengs_dr.backend.arrays import upload
-from eigengs_dr.image.color import UNBOUNDED, rendered_as, to_linear
-from eigengs_dr.image.normals import unit_codes
-from eigengs_dr.image.radiance import LOG_SLOPE, from_log
+from eigengs_dr.image.color import (
+    LOG_SLOPE,
+    UNBOUNDED,
+    from_log,
+    rendered_as,
+    to_linear,
+    unit_codes,
+)
 
 STEP = 5.0
 """Distance of the samples in nm, as in Mitsuba's tables of D65 and the matching functions. Products

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eigengs_dr.image.io import SAMPLES, sample
 from eigengs_dr.image.resize import resample
-from eigengs_dr.image.samples import SAMPLES, sample
 
 DEMO = "coffee"
 """The photo of ``make demo``. It is no training image, so the demo shows a typical result."""

@@ -66,8 +66,7 @@ def prefilter(show: Any, images: tuple[str, ...]) -> Any:
         raise ValueError(f"bench prefilter: {error}; pip install 'eigengs-dr[plugins]'") from error
     from eigengs_bench.report.frames import as_text
     from eigengs_bench.report.sections.prefilter import psnr_table
-    from eigengs_dr.image.io import load_image
-    from eigengs_dr.image.samples import sample
+    from eigengs_dr.image.io import load_image, sample
 
     squares = {path: load_image(path) for path in images}
     rows = run(squares or {name: sample(name) for name in TEXTURES}, show)
@@ -151,9 +150,8 @@ def levels(image: Path | None, output: Path, quiet: bool, **settings: Any) -> No
     select(settings["backend"])
     from eigengs_bench.experiments.levels import SAMPLE, SIDE, run
     from eigengs_bench.report.sections.levels import summarize
-    from eigengs_dr.image.io import load_image
+    from eigengs_dr.image.io import load_image, sample
     from eigengs_dr.image.resize import center_crop
-    from eigengs_dr.image.samples import sample
 
     pixels = load_image(image) if image else center_crop(sample(SAMPLE), SIDE, SIDE)
     with progress_bar(quiet) as show:

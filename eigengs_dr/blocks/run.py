@@ -16,12 +16,19 @@ from ..fitting.options import FitOptions
 from ..fitting.schedule import first_phase
 from ..gaussian.file import SetData
 from ..storage.checkpoint import Checkpoint
-from .block import FitTask, PlaceTask, Settings, find_density, fit_block, place, survey
+from .block import (
+    FitTask,
+    OldSet,
+    PlaceTask,
+    Settings,
+    find_density,
+    fit_block,
+    place,
+    rounds,
+    survey,
+)
 from .draw import compare, compare_tasks
-from .grid import Block, deal
-from .place import OldSet
-from .rounds import rounds
-from .sets import Arrays, BlockSets
+from .grid import Arrays, Block, BlockSets, deal
 from .source import Source, Window
 
 Progress = Callable[[int, int, dict[str, Any]], None]

@@ -152,7 +152,7 @@ def open_cluster(cluster: str | None) -> Iterator[Any]:
     Parameters
     ----------
     cluster : str or None
-        See `eigengs_dr.cluster.connect.connect`; None is this process.
+        See `eigengs_dr.cluster.executor.connect`; None is this process.
 
     Yields
     ------
@@ -169,7 +169,7 @@ def open_cluster(cluster: str | None) -> Iterator[Any]:
         yield None
         return
     try:
-        from ..cluster.connect import connect
+        from ..cluster.executor import connect
     except ModuleNotFoundError as error:
         raise ClusterError(
             f"--cluster needs {error.name}; type: pip install 'eigengs-dr[cluster]'"

@@ -17,7 +17,7 @@ from ..image.metrics import float_space
 from .console import images_bar, progress_bar, say
 
 if TYPE_CHECKING:
-    from ..collection.row import Finished
+    from ..collection.manifest import Finished
     from ..fitting.fit import Fit
     from ..fitting.options import FitOptions
 

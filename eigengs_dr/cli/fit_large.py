@@ -197,9 +197,8 @@ def _problem(path: Path | str, options: FitOptions) -> tuple[int, int, int, int]
 
 def _image_size(path: Path | str) -> tuple[int, int, bool] | None:
     """Return width, height and whether an image file is grey, or None if it cannot be opened."""
-    from ..blocks.source import GREY
-    from ..blocks.tiff import TIFF_SUFFIXES, window_shape
-    from ..image.formats.pillow import open_header
+    from ..blocks.source import GREY, TIFF_SUFFIXES, window_shape
+    from ..image.formats import open_header
 
     if isinstance(path, str):  # a URL, which is read once
         return None

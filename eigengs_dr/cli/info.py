@@ -187,7 +187,7 @@ def _draw_image(file: Path, picture: Path) -> None:
 def _draw_maps(file: Path, picture: Path) -> None:
     from ..gaussian.gaussians import Gaussians
     from ..image.io import save_image
-    from ..image.montage import join_pictures
+    from ..image.resize import join_pictures
     from ..raster.render import picture_of
 
     shown = picture_of(Gaussians.load(file)).values()

@@ -1,21 +1,114 @@
-"""The executor of a Dask client: tasks drawn as workers become free, and what may go wrong."""
+"""Dask: a client from words, the executor of a client, and what a worker needs.
+
+Tasks are drawn as workers become free. Before its first task a worker needs threads, a GPU, a
+kernel cache and a warm backend: Dr.Jit's pool ignores OMP variables and takes every core, so two
+workers would use each core twice.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import getpass
+import logging
+import os
 import queue
+import re
+import signal
+import stat
+import tempfile
+import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import dask
-from distributed import Client, Future
+from distributed import Client, Future, LocalCluster, Worker, WorkerPlugin
 from distributed.scheduler import KilledWorker
 
 from ..backend.executor import ClusterError, Done, Function
-from ..backend.feedback import terminate_as_interrupt
-from .worker import WorkerSetup, versions
+from ..backend.feedback import defer_interrupts, terminate_as_interrupt
+
+CONNECT_SECONDS = 30.0
+"""Time for the scheduler to answer."""
+
+
+@contextmanager
+def connect(cluster: str) -> Iterator[Client]:
+    """Connect to a cluster during a block.
+
+    Parameters
+    ----------
+    cluster : str
+        ``local`` or ``local:N``: N processes of one thread on this machine, by default one for each
+        core. ``tcp://HOST:PORT``: the address of a scheduler. Else the file of a scheduler, which
+        ``dask scheduler --scheduler-file FILE`` writes.
+
+    Yields
+    ------
+    distributed.Client
+        It is closed after the block; so are the workers of ``local``.
+
+    Raises
+    ------
+    ClusterError
+        If the scheduler does not answer.
+    ValueError
+        If the word is none of these.
+    KeyboardInterrupt
+        After Ctrl-C or SIGTERM while the workers start.
+    """
+    # The lines that Dask writes about lost connections come on top of ours.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    match = re.fullmatch(r"local(?::([1-9]\d*))?", cluster)
+    if match:
+        with ExitStack() as stack:
+            with defer_interrupts() as interrupted:  # Dask does not end what begins to start
+                count = int(match[1] or 0) or _cores()
+                client = stack.enter_context(Client(stack.enter_context(local_cluster(count))))
+            if interrupted():
+                raise KeyboardInterrupt
+            yield client
+        return
+    try:
+        client = _client(cluster)
+    except OSError as error:
+        raise ClusterError(f"{cluster}: no scheduler answers; start it first") from error
+    with client:
+        yield client
+
+
+def local_cluster(workers: int, **settings: object) -> LocalCluster:
+    """Start worker processes of one thread on this machine.
+
+    Parameters
+    ----------
+    workers : int
+        Number of processes. They are spawned, never forked: Dr.Jit's threads do not survive that.
+    settings : object
+        More arguments of `distributed.LocalCluster`.
+    """
+    options = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL, **settings}
+    return LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, **options)
+
+
+def _client(cluster: str) -> Client:
+    if "://" in cluster:
+        return Client(cluster, timeout=CONNECT_SECONDS)
+    if not Path(cluster).is_file():
+        raise ValueError(
+            f"cluster {cluster!r} is unknown; use local, local:N, tcp://HOST:PORT, or the file of "
+            "a scheduler"
+        )
+    return Client(scheduler_file=cluster, timeout=CONNECT_SECONDS)
+
+
+def _cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
 
 AHEAD = 2
 """Tasks under way for each worker: one that runs, and one that waits there."""
@@ -45,7 +138,7 @@ class ClusterExecutor:
     Parameters
     ----------
     client : distributed.Client
-        Its workers are set up by `eigengs_dr.cluster.worker.WorkerSetup`.
+        Its workers are set up by `eigengs_dr.cluster.executor.WorkerSetup`.
 
     Attributes
     ----------
@@ -186,3 +279,130 @@ def _check_versions(client: Client) -> None:
                     f"worker {address} has {name} {there[name]}, but this process has {version}; "
                     "install equal versions"
                 )
+
+
+VERSIONS = ("eigengs_dr", "drjit", "numpy")
+"""Packages whose versions must be equal everywhere, for equal bits."""
+
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""Parameters of glibc's ``mallopt``."""
+
+
+class WorkerSetup(WorkerPlugin):
+    """Set up a worker process for this package.
+
+    Parameters
+    ----------
+    local : bool
+        Whether the workers run on the machine of the client, and end with it. They then leave
+        Ctrl-C to the client, and share its kernel cache.
+    """
+
+    name = "eigengs-dr"
+
+    def __init__(self, local: bool) -> None:
+        self.local = local
+
+    def setup(self, worker: Worker) -> None:
+        """Set the process up; Dask calls this function once in every worker."""
+        if self.local and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all processes
+        if not self.local:
+            use_own_kernel_cache()
+        choose_gpu(worker.name)
+        # Dr.Jit keeps memory for reuse, so a worker that Dask pauses at 80 % would never go on.
+        worker.memory_manager.memory_pause_fraction = False
+        worker.memory_manager.memory_spill_fraction = False
+        worker.memory_manager.memory_target_fraction = False
+        limit_threads(worker.state.nthreads)
+        keep_freed_memory()
+        warm_up()
+
+
+def versions() -> dict[str, str | None]:
+    """Return the versions of `VERSIONS` in this process."""
+    from importlib.metadata import version
+
+    import eigengs_dr
+
+    found = {name: version(name) for name in VERSIONS[1:]}
+    return {"eigengs_dr": eigengs_dr.__version__, **found}
+
+
+def limit_threads(count: int) -> None:
+    """Let Dr.Jit and BLAS of this process use some threads.
+
+    Parameters
+    ----------
+    count : int
+        The number of threads of the Dask worker.
+    """
+    import drjit as dr
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(count)
+    if dr.has_backend(dr.JitBackend.LLVM):
+        dr.set_thread_count(count)
+
+
+def keep_freed_memory() -> None:
+    """Let the C library reuse freed memory, where it is glibc.
+
+    Dask starts workers with ``MALLOC_TRIM_THRESHOLD_=65536``. Every large array then gets new pages
+    from the kernel, and a fit of 256x256 pixels takes a tenth longer.
+    """
+    with suppress(OSError, AttributeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(M_MMAP_THRESHOLD, 1 << 25)
+        mallopt(M_TRIM_THRESHOLD, 1 << 27)
+
+
+def use_own_kernel_cache(temporary: Path | None = None) -> None:
+    """Keep compiled kernels on the disk of this machine: home folders of clusters are remote.
+
+    A variable ``DRJIT_CACHE_DIR`` that is set stays. The folder outlives the worker.
+
+    Parameters
+    ----------
+    temporary : Path, optional
+        Where the folder is made; by default the folder of the system for temporary files. There
+        other users may have made one of its name, with code that Dr.Jit would run: a folder that
+        others own or may write is left alone, and this worker gets a new one.
+    """
+    if "DRJIT_CACHE_DIR" in os.environ:
+        return
+    user = os.getuid() if hasattr(os, "getuid") else getpass.getuser()
+    folder = Path(temporary or tempfile.gettempdir()) / f"eigengs-dr-kernels-{user}"
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    found = folder.lstat()
+    private = stat.S_ISDIR(found.st_mode)
+    if hasattr(os, "getuid"):  # on Windows each user has an own folder of temporary files
+        private &= found.st_uid == os.getuid() and not found.st_mode & 0o022
+    if not private:
+        folder = Path(tempfile.mkdtemp(prefix="eigengs-dr-kernels-", dir=temporary))
+    os.environ["DRJIT_CACHE_DIR"] = str(folder)
+
+
+def choose_gpu(name: Any) -> None:
+    """Give each worker of a machine one of its GPUs, unless CUDA_VISIBLE_DEVICES is set.
+
+    Parameters
+    ----------
+    name : Any
+        Name of the worker. Workers of a `distributed.LocalCluster` are called 0, 1, 2.
+    """
+    count = len(list(Path("/proc/driver/nvidia/gpus").glob("*")))
+    if count > 1 and isinstance(name, int):
+        os.environ.setdefault("CUDA_VISIBLE_DEVICES", str(name % count))
+
+
+def warm_up() -> None:
+    """Import what fits import, and start the backend, before the first task is timed."""
+    from eigengs_dr.backend.selection import BackendError, select
+    from eigengs_dr.collection import fit_many  # noqa: F401
+
+    with suppress(BackendError):  # the first task says what is missing
+        types = select()
+        types.Float(1.0).numpy()

@@ -19,11 +19,19 @@ from ..fitting.fit import Fit
 from ..fitting.maps import combine, read_maps
 from ..gaussian.gaussians import Gaussians, scale_channels, set_of
 from ..gaussian.maps import TextureMap, channel_weights, show_sums, slices
-from ..image.color import LIGHT, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_coded, to_linear
+from ..image.color import (
+    LIGHT,
+    UNBOUNDED,
+    rendered_as,
+    rgb_to_ycbcr,
+    to_coded,
+    to_linear,
+    to_log,
+    to_pu21,
+)
 from ..image.io import read_image
 from ..image.metrics import MAX_PSNR, psnrs_by_rows
 from ..image.pixels import check_data, check_image
-from ..image.radiance import to_log, to_pu21
 from ..raster.render import picture_of, render
 from .egs import MAX_SECTIONS, SUFFIX
 from .quantization import Steps

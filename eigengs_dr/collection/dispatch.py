@@ -13,20 +13,21 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..backend.executor import Executor
+from ..backend.executor import Executor, executor_for
 from ..backend.feedback import warn
 from ..backend.recording import exclusive
 from ..fitting.fit import Fit
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
-from .row import Finished
+from .manifest import Finished, Manifest
 from .run import Job, row_of, run_job
-from .sources import Source
+from .sources import Images, Source, list_sources, make_folder, plan_output
 
 MAX_CHUNK_WORK = 1 << 27
 """Pixels times steps of a chunk, for some seconds; the bytes of a file stand for its pixels. A task
@@ -271,3 +272,49 @@ def _from_arrays(result: Any) -> Any:
     if isinstance(result, SetData):
         return Gaussians.from_data(result)
     return result
+
+
+Loop = Callable[..., Generator[Finished, None, None]]
+"""``loop(sources, job, start=start)`` yields an entry for each source."""
+
+
+def run_images(
+    images: Images,
+    output: str | os.PathLike[str] | None,
+    overwrite: bool,
+    job: Job,
+    client: Any = None,
+) -> tuple[int | None, Generator[Finished, None, None]]:
+    """Prepare a run; see `eigengs_dr.fit_many` for arguments and errors.
+
+    Returns
+    -------
+    total : int or None
+        Number of images, if it is known.
+    finished : generator of Finished
+        One for each image, whose result is written before. In this process they are in order.
+    """
+    sources = list_sources(images)
+    total = len(sources) if isinstance(sources, list) else None
+    loop: Loop = run_job
+    if client is None:
+        _ = job.work  # what is wrong with the options is said before the work
+    else:
+        loop = partial(
+            dispatch, executor=executor_for(client), total=total, keep_results=output is None
+        )
+    if output is None:
+        return total, loop(sources, job, start=lambda names: None)
+    return total, _recorded(sources, job, make_folder(output), overwrite, loop)
+
+
+def _recorded(
+    sources: Iterable[Source], job: Job, output: Path, overwrite: bool, loop: Loop
+) -> Generator[Finished, None, None]:
+    """Leave out what the manifest says is done, and record the rest in it."""
+    with Manifest(output) as manifest:
+        planned = (plan_output(source, manifest, overwrite) for source in sources)
+        with closing(loop(planned, job, start=manifest.start)) as finished:
+            for entry in finished:
+                manifest.add(entry.row)
+                yield entry

@@ -18,9 +18,9 @@ from ..fitting.start import load_start
 from ..fitting.target import unit_of
 from ..image.color import rendered_as
 from ..image.pixels import LinearImage
+from .dispatch import run_images
 from .fit_batch import MAX_SIDE, fit_batch, fits_in_batches
-from .plan import run_images
-from .row import Finished, ImageRow, Outcome, Pixels, collect
+from .manifest import Finished, ImageRow, Outcome, Pixels, collect
 from .run import FAILURES, Job, Work
 from .sources import Images
 

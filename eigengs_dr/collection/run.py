@@ -14,9 +14,8 @@ from typing import Any
 from ..backend.feedback import defer_interrupts
 from ..gaussian.file import write
 from ..gaussian.gaussians import Gaussians
-from .read_ahead import Decoded, read_ahead
-from .row import Finished, ImageRow, Outcome, Pixels
-from .sources import Source
+from .manifest import Finished, ImageRow, Outcome, Pixels
+from .sources import Decoded, Source, read_ahead
 
 WRITERS = 2
 """Threads that compress and write results: 5,000 Gaussians take 6 ms."""

@@ -3,12 +3,9 @@
 - ``pca``: the principal components
 - ``components``: shared Gaussians for all components: shapes and weights
 - ``eigengs``: the model `EigenGS`
-- ``encoder``: an image to Gaussians of the model
+- ``encoder``: an image to Gaussians of the model, or to coefficients
 - ``encode_many``: many images, in groups
-- ``projection``: coefficients of an image
-- ``options``: the options of a training, checked once
-- ``model_fit``: an eigenbasis to a model
-- ``training``: a folder of images to a model
-- ``evaluation``: a model on images held out
+- ``options``: the options of a training; an eigenbasis to a model
+- ``training``: a folder of images to a model, and its figures on images held out
 - ``model_file``: the file of a model
 """

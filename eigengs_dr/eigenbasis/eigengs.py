@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..backend.feedback import shows_progress, to_html
 from ..backend.recording import exclusive
-from ..collection.row import ImageRow
+from ..collection.manifest import ImageRow
 from ..collection.sources import Images
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import Source
@@ -27,8 +27,7 @@ from ..image.resize import resample
 from .encode_many import check_encoding, encode_each
 from .encoder import Encoder
 from .model_file import read_members, write_model
-from .model_fit import fit_model
-from .options import TrainOptions
+from .options import TrainOptions, fit_model
 from .pca.basis import Eigenbasis
 from .pca.component_counts import name_components
 from .pca.truncation import TruncationCurve, curve_from_eigenvalues
@@ -104,7 +103,7 @@ class EigenGS:
             Number of Gaussians, at most one per pixel.
         frequency_aware : {"auto", True, False}, optional
             Whether a tenth of the Gaussians serve the first 50 components alone, and the others
-            the rest; for "auto" see `eigengs_dr.eigenbasis.components.split.wants_split`.
+            the rest; for "auto" see `eigengs_dr.eigenbasis.components.solve.wants_split`.
         seed : int, optional
         preset : {"default", "eigengs"}, optional
             "default" places Gaussians on a grid and solves for all weights by one factorisation.
@@ -118,7 +117,7 @@ class EigenGS:
             ``progress(step, steps, {})`` after every round of training.
         client : distributed.Client, optional
             Solve for the weights on the workers of this Dask cluster; their number does not change
-            the result, see `eigengs_dr.eigenbasis.components.weights.find_weights`.
+            the result, see `eigengs_dr.eigenbasis.components.solve.find_weights`.
 
         Raises
         ------

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.recording import exclusive
-from ..collection.plan import run_images
-from ..collection.row import ImageRow, Outcome, RowProgress, collect
+from ..collection.dispatch import run_images
+from ..collection.manifest import ImageRow, Outcome, RowProgress, collect
 from ..collection.run import FAILURES, Job, Work
 from ..collection.sources import Images
 from ..gaussian.gaussians import Gaussians

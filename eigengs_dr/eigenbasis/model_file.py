@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
-from ..image.planes import BASIS_SPACES
+from ..image.color import BASIS_SPACES
 from ..storage import npz
 from ..storage.npz import Field
 from .pca.basis_file import ENERGY_TOLERANCE, require_descending

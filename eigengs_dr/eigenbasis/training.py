@@ -6,31 +6,117 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..backend.executor import executor_for
 from ..backend.feedback import defer_interrupts, warn
 from ..image.folder import list_images, read_blocks
-from ..image.io import ImageError
+from ..image.io import ImageError, check_image, load_image
+from ..image.metrics import psnr
 from ..image.remote import is_url
+from ..image.resize import center_crop
+from ..raster.render import render
 from ..storage.checkpoint import Checkpoint
 from .components.solve import State
 from .eigengs import EigenGS
-from .evaluation import evaluate, truncation_curve_on
-from .model_fit import fit_model
-from .options import TrainOptions
+from .options import TrainOptions, fit_model
 from .pca.basis import Eigenbasis
 from .pca.component_counts import check_components
 from .pca.solvers.incremental_pca import EigenState, block_length, empty_state, merge, rank_for
 from .pca.solvers.shards import ShardOptions, is_large, shard_block_length, shard_states
 from .pca.truncation import TruncationCurve
+
+OnImage = Callable[[int], None]
+"""``watch(i)`` runs before image number i; an error that it raises ends the work."""
+
+
+def truncation_curve_on(
+    basis: Eigenbasis, files: Sequence[Path | str], watch: OnImage
+) -> TruncationCurve | None:
+    """Measure the truncation curve of images; see `Eigenbasis.truncation_curve`.
+
+    Parameters
+    ----------
+    basis : Eigenbasis
+    files : sequence of Path
+        Images of any size; unreadable files are skipped.
+    watch : callable
+        See `OnImage`.
+
+    Returns
+    -------
+    TruncationCurve or None
+        None if no file can be read.
+    """
+    readable = _readable(files, basis, watch, [])
+    first = next(readable, None)
+    return None if first is None else basis.truncation_curve(chain([first], readable))
+
+
+def evaluate(
+    model: EigenGS, basis: Eigenbasis, files: Sequence[Path | str], watch: OnImage
+) -> dict[str, float]:
+    """Measure the PSNR of PCA, of projected colours and of exact colours.
+
+    Parameters
+    ----------
+    model : EigenGS
+    basis : Eigenbasis
+        The basis that the model renders.
+    files : sequence of Path
+        Images of any size.
+    watch : callable
+        See `OnImage`.
+
+    Returns
+    -------
+    dict of str to float
+        Mean psnr_ycbcr over the images, in dB: "psnr_pca" of the basis, "psnr_init" of projected
+        and "psnr_solved" of exact colours. Empty if no file can be read.
+
+    Warns
+    -----
+    UserWarning
+        If a file cannot be read.
+    """
+    rows, bad = [], list[str]()
+    for image in _readable(files, basis, watch, bad):
+        pictures = {
+            "psnr_pca": basis.reconstruct(basis.project(image)),
+            "psnr_init": render(model.encode(image, "projected")).numpy(),
+            "psnr_solved": render(model.encode(image, "exact")).numpy(),
+        }
+        rows.append({name: psnr(image, picture, "ycbcr") for name, picture in pictures.items()})
+    if bad:
+        message = f"{len(bad)} of {len(files)} images held out were skipped, as {bad[0]}"
+        warn(message)
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]} if rows else {}
+
+
+def _readable(
+    files: Sequence[Path | str], basis: Eigenbasis, watch: OnImage, bad: list[str]
+) -> Iterator[NDArray[np.float32]]:
+    """Read images and crop them to the size of a basis; append errors to `bad`."""
+    for i, path in enumerate(files):
+        watch(i)
+        try:
+            image = center_crop(
+                check_image(load_image(path), copy=False), basis.width, basis.height
+            )
+        except (ImageError, OSError) as error:
+            bad.append(str(error))
+        else:
+            yield image
+
 
 HELD_OUT = 10
 """Every tenth image is held out of the training and measured."""
@@ -55,7 +141,7 @@ class Training(NamedTuple):
     run alone if ``resumed``), ``peak_rss_mb``, ``images``, ``iterations``, ``components`` (of each
     channel), ``gaussians``, ``frequency_aware``, ``split_reason``, ``psnr_held_out`` (`held_out` of
     the model), and those of `eigengs_dr.eigenbasis.components.solve.ComponentFit` and
-    `eigengs_dr.eigenbasis.evaluation.evaluate`.
+    `eigengs_dr.eigenbasis.training.evaluate`.
     """
 
     model: EigenGS

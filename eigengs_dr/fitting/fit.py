@@ -173,7 +173,7 @@ def fit(
         three channels unchanged (roughness, heights). "normal" uses the codes ``(n + 1) / 2`` of a
         normal map; renderings have normals of length 1. "radiance" is "linear" without an
         upper bound. "log" suits light above 1 best: the Gaussians sum to logarithms of light, see
-        `eigengs_dr.image.radiance.to_log`. For an image of light above 1, "linear" becomes
+        `eigengs_dr.image.color.to_log`. For an image of light above 1, "linear" becomes
         "radiance", and "ycbcr" and "rgb" become "log": a texture would clamp their sums.
     seed : int, optional
         Seed of the random numbers. Only the placement "random" and presets without a colour

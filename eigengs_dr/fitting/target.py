@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian.gaussians import Gaussians
-from ..image.color import LIGHT, rendered_as, rgb_to_ycbcr, to_linear
+from ..image.color import LIGHT, rendered_as, rgb_to_ycbcr, to_linear, to_log
 from ..image.io import read_image
 from ..image.pixels import MAX_PIXEL, MIN_PIXEL, ImageError, check_data, check_image, encoding_of
-from ..image.radiance import to_log
 from ..image.strips import by_strips
 from .options import FitOptions
 

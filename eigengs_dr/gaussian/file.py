@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ..image.color import MAX_CHANNELS, SPACES
 from ..storage import npz
+from ..storage.atomic import reader_of
 from ..storage.npz import BadValue, Field
-from ..storage.readers import reader_of
 from .maps import MAX_CHANNELS as MAX_MAPS
 from .maps import TextureMap, check_maps, find_map, slices
 

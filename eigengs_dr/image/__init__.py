@@ -1,12 +1,13 @@
 """Pixels: no Gaussians here.
 
-- ``io``: image files; ``formats``: those that Pillow does not keep
+- ``io``: image files, and photos of scikit-image
+- ``formats``: files of more than 8 bits; ``openimageio``: EXR and HDR
+- ``remote``: images behind URLs
 - ``pixels``: what pixels are, sRGB or light, and the checks of an image
-- ``samples``: photos of scikit-image
-- ``folder``: many images, in blocks; ``planes``: their size and channels
-- ``color``: YCbCr, linear light, sRGB
-- ``radiance``: codes of light above 1
-- ``resize``: other sizes
-- ``metrics``: PSNR, SSIM, MS-SSIM; ``structure``: the sums of the last two
-- ``montage``: pictures side by side
+- ``folder``: many images, in blocks
+- ``color``: YCbCr, linear light, sRGB, codes of light above 1, normals, images of a family
+- ``resize``: other sizes, and pictures side by side
+- ``metrics``: PSNR, SSIM, MS-SSIM
+- ``strips``: rows of an image by threads
+- ``hilbert``: a curve through the cells of a square
 """

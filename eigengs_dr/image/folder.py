@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.feedback import warn
-from .io import SUFFIXES, ImageError, check_image, load_image
-from .planes import BASIS_SPACES, check_size, to_planes
+from .color import BASIS_SPACES, check_size, to_planes
+from .io import SUFFIXES, check_image, load_image
+from .pixels import ImageError
 from .remote import is_url, list_urls
 from .resize import center_crop
 

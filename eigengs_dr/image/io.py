@@ -1,7 +1,8 @@
-"""Image files: load and save."""
+"""Image files: load and save; photos of scikit-image."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,19 @@ from numpy.typing import ArrayLike, NDArray
 from ..backend.feedback import warn
 from ..storage.atomic import atomic_write, refuse_url
 from .color import to_coded, to_linear
-from .formats.openimageio import ADVICE, is_installed
-from .formats.pillow import SAVE_OPTIONS, image_errors, open_picture, picture_pixels
-from .formats.registry import BITS, FLOAT_SUFFIXES, kind_of, read_deep, turn, write_deep
+from .formats import (
+    BITS,
+    FLOAT_SUFFIXES,
+    SAVE_OPTIONS,
+    image_errors,
+    kind_of,
+    open_picture,
+    picture_pixels,
+    read_deep,
+    turn,
+    write_deep,
+)
+from .openimageio import ADVICE, is_installed
 from .pixels import (
     MAX_PIXEL,
     ImageError,
@@ -314,3 +325,48 @@ def to_8bit(image: NDArray[Any], out: NDArray[Any] | None = None) -> NDArray[Any
     clipped = np.clip(image, 0, 1, out=out)
     clipped *= 255
     return np.rint(clipped, out=clipped)
+
+
+SAMPLES = {
+    "astronaut": "astronaut.png",
+    "brick": "brick.png",
+    "camera": "camera.png",
+    "chelsea": "chelsea.png",
+    "coffee": "coffee.png",
+    "coins": "coins.png",
+    "grass": "grass.png",
+    "gravel": "gravel.png",
+    "hubble": "hubble_deep_field.jpg",
+    "moon": "moon.png",
+    "motorcycle": "motorcycle_left.png",
+    "retina": "retina.jpg",
+    "rocket": "rocket.jpg",
+}
+"""Files inside the scikit-image wheel, by name; its other photos need a download."""
+
+
+def sample(name: str) -> NDArray[np.float32]:
+    """Load a photo that is part of scikit-image, without a download.
+
+    Parameters
+    ----------
+    name : str
+        One of `SAMPLES`, for instance ``"astronaut"``, ``"chelsea"`` (a cat) or ``"coffee"``.
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W, 3)
+        RGB in [0, 1]; grey photos have three equal channels.
+
+    Raises
+    ------
+    ImageError
+        If the name is unknown, or scikit-image is not installed.
+    """
+    if name not in SAMPLES:
+        raise ImageError(f"sample {name!r} is unknown; use one of {', '.join(SAMPLES)}")
+    # find_spec finds the folder without the slow import of scikit-image.
+    package = importlib.util.find_spec("skimage")
+    if package is None or package.origin is None:
+        raise ImageError("scikit-image, which holds the samples, is missing; install scikit-image")
+    return load_image(Path(package.origin).parent / "data" / SAMPLES[name])

@@ -1,4 +1,11 @@
-"""Similarity of two images: PSNR in RGB and YCbCr, SSIM and MS-SSIM."""
+"""Similarity of two images: PSNR in RGB and YCbCr, SSIM and MS-SSIM, strip by strip.
+
+The sums of SSIM are this package's own. Its blur, sums of shifted planes, takes a quarter of the
+time of `scipy.ndimage.correlate1d`, which converts every row and column to double precision: 2.4
+and 11 ns a pixel of float32 with 7 taps along both axes.
+"""
+
+from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
@@ -7,12 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .color import RGB_TO_YCBCR, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_linear
+from .color import RGB_TO_YCBCR, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_linear, to_pu21
 from .io import to_8bit
 from .pixels import LinearImage, check_image
-from .radiance import to_pu21
 from .strips import map_threads, strips
-from .structure import WINDOW, Convert, halve, similarity, window_radius
 
 MAX_PSNR = 100.0
 """Upper bound of reported PSNRs, in dB: above it, only rounding errors differ."""
@@ -33,7 +38,7 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     higher numbers than ``"rgb"``: 4.94 dB more for white noise, 6.09 dB more for an error in grey.
     ``"data"`` compares the channels with peak 1 and neither clamps nor rounds.
     ``"pu21"`` compares light, also above 1, as the eye does: it decodes sRGB and compares codes of
-    `eigengs_dr.image.radiance.to_pu21`, whose peak, 1, is white. Light above 100 counts as 100.
+    `eigengs_dr.image.color.to_pu21`, whose peak, 1, is white. Light above 100 counts as 100.
 
     Parameters
     ----------
@@ -277,3 +282,124 @@ def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
         )
     shape = (*x.shape[:2], 3)
     return np.broadcast_to(x, shape), np.broadcast_to(y, shape)
+
+
+WINDOW = 11
+"""Side of the Gaussian window of SSIM and MS-SSIM, in pixels."""
+
+SIGMA = 1.5
+"""Standard deviation of that window, in pixels."""
+
+Convert = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Changes the values of some rows of an image, in double precision."""
+
+
+def window_radius(sides: tuple[int, ...]) -> int:
+    """Return the radius of the window: that of `WINDOW`, or the largest that fits the image."""
+    return min(WINDOW // 2, (min(sides) - 1) // 2)
+
+
+def similarity(
+    x: NDArray[Any], y: NDArray[Any], convert: Convert
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return mean SSIM and mean contrast-structure term per channel of two (H, W, 3) images.
+
+    The images are converted and compared strip by strip: large ones need no copy in double
+    precision. Only pixels whose window lies inside the image count.
+    """
+    height, width = x.shape[:2]
+    radius = window_radius((height, width))
+    taps = gaussian_taps(SIGMA, radius / SIGMA)
+    rows, columns = height - 2 * radius, width - 2 * radius
+
+    def sums(strip: slice) -> NDArray[np.float64]:
+        inside = slice(strip.start, strip.stop + 2 * radius)
+        p, q = (convert(image[inside].astype(np.float64)) for image in (x, y))
+        return np.array([_similarity_sums(p[..., k], q[..., k], taps) for k in range(3)])
+
+    whole, structure = (sum(map_threads(sums, strips(rows, width))) / (rows * columns)).T
+    return whole, structure
+
+
+def _similarity_sums(
+    x: NDArray[np.float64], y: NDArray[np.float64], taps: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Return the sums of SSIM and of its contrast-structure term over two planes (H, W)."""
+    c1, c2 = 0.01**2, 0.03**2
+    x, y = np.ascontiguousarray(x), np.ascontiguousarray(y)
+    mean_x, mean_y = blur(x, taps), blur(y, taps)
+    product, squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
+    covariance, variances = blur(x * y, taps) - product, blur(x * x + y * y, taps) - squares
+    structure = (2 * covariance + c2) / (variances + c2)
+    luminance = (2 * product + c1) / (squares + c1)
+    return float((luminance * structure).sum()), float(structure.sum())
+
+
+def halve(image: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the means of the 2x2 blocks of an image (H, W, 3); drop an odd last row or column."""
+    height, width = image.shape[0] // 2, image.shape[1] // 2
+    result = np.empty((height, width, 3))
+
+    def fill(rows: slice) -> None:
+        part = image[2 * rows.start : 2 * rows.stop, : 2 * width].astype(np.float64)
+        np.mean(part.reshape(-1, 2, width, 2, 3), axis=(1, 3), out=result[rows])
+
+    map_threads(fill, strips(height, 2 * width))
+    return result
+
+
+TRUNCATION = 4.0
+"""Default radius of a blur in standard deviations, as in SciPy."""
+
+
+def gaussian_taps(deviation: float, truncation: float = TRUNCATION) -> NDArray[np.float64]:
+    """Return one half of the weights of a Gaussian blur.
+
+    Parameters
+    ----------
+    deviation : float
+        Standard deviation in pixels; 0 gives no blur.
+    truncation : float, optional
+        Radius in standard deviations, rounded to pixels as in `scipy.ndimage.gaussian_filter`.
+
+    Returns
+    -------
+    ndarray of float64, shape (radius + 1,)
+        The weights at distances 0, 1, ..., radius; all ``2 radius + 1`` weights sum to 1.
+    """
+    radius = int(truncation * deviation + 0.5)
+    half = np.exp(-0.5 * np.square(np.arange(radius + 1) / max(deviation, 1e-9)))
+    return np.asarray(half / (2 * half.sum() - half[0]))
+
+
+def blur(plane: NDArray[Any], taps: NDArray[np.float64]) -> NDArray[Any]:
+    """Blur the last two axes of an array; return only the pixels whose window lies inside.
+
+    Parameters
+    ----------
+    plane : ndarray of float32 or float64, shape (..., H, W)
+    taps : ndarray of float64, shape (radius + 1,)
+        See `gaussian_taps`.
+
+    Returns
+    -------
+    ndarray, shape (..., H - 2 radius, W - 2 radius)
+        In the precision of `plane`, as are all sums.
+    """
+    taps = taps.astype(plane.dtype)
+    across = np.moveaxis(_along_rows(np.moveaxis(plane, -1, -2), taps), -2, -1)
+    return _along_rows(across, taps)
+
+
+def _along_rows(plane: NDArray[Any], taps: NDArray[Any]) -> NDArray[Any]:
+    """Blur the axis before the last; a view with swapped axes blurs the other one."""
+    radius = len(taps) - 1
+    height = plane.shape[-2] - 2 * radius
+    total = plane[..., radius : radius + height, :] * taps[0]
+    pair = np.empty_like(total)  # with the order of the axes of `total` in memory
+    for k in range(1, radius + 1):
+        low, high = radius - k, radius + k
+        np.add(plane[..., low : low + height, :], plane[..., high : high + height, :], out=pair)
+        np.multiply(pair, taps[k], out=pair)
+        np.add(total, pair, out=total)
+    return total

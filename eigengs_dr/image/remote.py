@@ -14,8 +14,7 @@ from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Any
 
-from .formats.pillow import SAVE_OPTIONS
-from .formats.registry import FLOAT_SUFFIXES
+from .formats import FLOAT_SUFFIXES, SAVE_OPTIONS
 from .pixels import ImageError
 
 

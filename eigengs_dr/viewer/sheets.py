@@ -10,8 +10,7 @@ from ..eigenbasis.eigengs import EigenGS
 from ..eigenbasis.pca.basis import Eigenbasis
 from ..eigenbasis.pca.component_counts import CHANNELS
 from ..image.color import decode
-from ..image.montage import join_pictures, text_line
-from ..image.resize import resample
+from ..image.resize import join_pictures, resample, text_line
 from ..raster.render import render
 from .pictures import Picture, ellipses, within
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from _helpers.benchmarks import run
-from eigengs_dr.image.io import save_image
-from eigengs_dr.image.samples import sample
+from eigengs_dr.image.io import sample, save_image
 
 pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from eigengs_dr.blocks.grid import divide
-from eigengs_dr.blocks.rounds import rounds
-from eigengs_dr.blocks.sets import BlockSets
+from eigengs_dr.blocks.block import rounds
+from eigengs_dr.blocks.grid import BlockSets, divide
 from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.fitting.schedule import lr_factor, relocations
 

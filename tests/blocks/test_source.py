@@ -9,8 +9,7 @@ import tifffile
 from PIL import Image
 
 from _helpers.mosaics import Sliced, mosaic
-from eigengs_dr.blocks.source import forget_pictures, open_source
-from eigengs_dr.blocks.tiff import window_shape, write_tiles
+from eigengs_dr.blocks.source import forget_pictures, open_source, window_shape, write_tiles
 from eigengs_dr.image.color import to_coded
 from eigengs_dr.image.io import ImageError, load_image, save_image
 

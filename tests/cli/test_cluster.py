@@ -108,7 +108,7 @@ def test_sigterm_while_workers_start(tmp_path):
 
 
 def test_without_dask_one_line_says_what_to_install(photos, tmp_path, monkeypatch):
-    monkeypatch.delitem(sys.modules, "eigengs_dr.cluster.connect", raising=False)
+    monkeypatch.delitem(sys.modules, "eigengs_dr.cluster.executor", raising=False)
     monkeypatch.setitem(sys.modules, "distributed", None)
     result = run("fit", photos, "-o", tmp_path / "fits", *QUICK, "--cluster", "local")
     assert_refused(result, "distributed", "pip install 'eigengs-dr[cluster]'")
@@ -119,7 +119,7 @@ def test_without_dask_one_line_says_what_to_install(photos, tmp_path, monkeypatc
     [("nowhere", "is unknown; use"), ("local:0", "is unknown"), ("tcp://127.0.0.1:1", "start")],
 )  # fmt: skip
 def test_clusters_that_are_none(photos, tmp_path, cluster, said, monkeypatch):
-    connect = pytest.importorskip("eigengs_dr.cluster.connect")
+    connect = pytest.importorskip("eigengs_dr.cluster.executor")
     monkeypatch.setattr(connect, "CONNECT_SECONDS", 0.3)
     assert_refused(run("fit", photos, "-o", tmp_path / "x", *QUICK, "--cluster", cluster), said)
 

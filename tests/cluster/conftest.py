@@ -7,8 +7,7 @@ pytest.importorskip("distributed")
 import dask
 from distributed import Client
 
-from eigengs_dr.cluster.connect import local_cluster
-from eigengs_dr.cluster.executor import PATIENCE
+from eigengs_dr.cluster.executor import PATIENCE, local_cluster
 
 RESTART_SECONDS = 120.0
 """Time for workers that the test before has ended."""

@@ -6,7 +6,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.families import SPLATS, small_basis
 from eigengs_dr.backend.executor import ClusterError, Done
-from eigengs_dr.eigenbasis.components import weights
+from eigengs_dr.eigenbasis.components import solve as weights
 
 
 @pytest.mark.parametrize("options", [{}, {"frequency_aware": True}, {"iterations": 1}])

@@ -12,8 +12,7 @@ from distributed import Client
 from _helpers import clusters
 from eigengs_dr.backend.executor import ClusterError, Done, executor_for
 from eigengs_dr.cluster import executor as module
-from eigengs_dr.cluster.connect import local_cluster
-from eigengs_dr.cluster.worker import versions
+from eigengs_dr.cluster.executor import local_cluster, versions
 
 
 @pytest.fixture

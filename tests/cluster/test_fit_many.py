@@ -23,7 +23,7 @@ from _helpers.clusters import (
     slow_writes,
 )
 from _helpers.families import small_model
-from eigengs_dr.cluster.connect import connect, local_cluster
+from eigengs_dr.cluster.executor import connect, local_cluster
 from eigengs_dr.collection.manifest import NAME, read_manifest
 
 

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from eigengs_dr.cluster.worker import use_own_kernel_cache
+from eigengs_dr.cluster.executor import use_own_kernel_cache
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="Windows has no modes")
 

@@ -10,7 +10,8 @@ from PIL import Image
 import eigengs_dr as eg
 from _helpers.command import smooth_pixels
 from eigengs_dr.collection import fit_many as fit_many_module
-from eigengs_dr.collection import read_ahead, run
+from eigengs_dr.collection import run
+from eigengs_dr.collection import sources as read_ahead
 from eigengs_dr.image import io
 
 QUICK = {"gaussians": 20, "iterations": 2}

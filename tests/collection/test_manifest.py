@@ -10,7 +10,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.clusters import QUICK, files_of, folder_of_photos
 from eigengs_dr.collection.manifest import KEYS, NAME, Manifest, read_manifest
-from eigengs_dr.storage.lock import lock_folder
+from eigengs_dr.storage.atomic import lock_folder
 
 
 @pytest.fixture
@@ -142,7 +142,7 @@ def test_two_runs_into_one_folder(photos, output):
 def test_a_run_that_was_killed_holds_no_lock(photos, output):
     output.mkdir()
     code = (
-        "import os, sys, pathlib; from eigengs_dr.storage.lock import lock_folder\n"
+        "import os, sys, pathlib; from eigengs_dr.storage.atomic import lock_folder\n"
         "with lock_folder(pathlib.Path(sys.argv[1])): os.kill(os.getpid(), 9)"
     )
     subprocess.run([sys.executable, "-c", code, output], check=False, timeout=60)
@@ -154,7 +154,7 @@ def test_a_system_without_locks_makes_no_file(tmp_path):
     """Windows deletes no file that is open."""
     code = (
         "import os, sys, pathlib; sys.modules['fcntl'] = None\n"
-        "from eigengs_dr.storage.lock import lock_folder\n"
+        "from eigengs_dr.storage.atomic import lock_folder\n"
         "with lock_folder(pathlib.Path(sys.argv[1])): print(os.listdir(sys.argv[1]))"
     )
     command = [sys.executable, "-c", code, tmp_path]

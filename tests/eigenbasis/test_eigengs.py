@@ -17,8 +17,8 @@ from _helpers.families import (
     splits,
 )
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.image.color import to_planes
 from eigengs_dr.image.io import ImageError
-from eigengs_dr.image.planes import to_planes
 from eigengs_dr.image.resize import resample
 
 

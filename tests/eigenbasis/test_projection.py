@@ -6,8 +6,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 import eigengs_dr as eg
 from _helpers.families import family, small_model, splits
-from eigengs_dr.image.color import RGB_TO_YCBCR, YCBCR_OFFSET
-from eigengs_dr.image.planes import to_planes
+from eigengs_dr.image.color import RGB_TO_YCBCR, YCBCR_OFFSET, to_planes
 
 
 @pytest.fixture(scope="module")

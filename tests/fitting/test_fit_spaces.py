@@ -9,7 +9,7 @@ from eigengs_dr.fitting import target as targets
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.target import DARKNESS
 from eigengs_dr.image.color import to_coded, to_linear
-from eigengs_dr.image.samples import sample
+from eigengs_dr.image.io import sample
 from eigengs_dr.raster.render import render
 
 

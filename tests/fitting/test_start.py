@@ -9,7 +9,7 @@ from _helpers.halves import picture
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.refine import refine
 from eigengs_dr.fitting.start import initialize
-from eigengs_dr.image.planes import to_planes
+from eigengs_dr.image.color import to_planes
 from eigengs_dr.image.resize import resample
 
 

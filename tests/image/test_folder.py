@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 
 import eigengs_dr.image.folder as stream
 from _helpers.errors import one_line
-from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.image.color import check_size, rgb_to_ycbcr, to_planes
 from eigengs_dr.image.folder import image_files, read_blocks
 from eigengs_dr.image.io import ImageError, check_image, load_image, save_image
-from eigengs_dr.image.planes import check_size, to_planes
 from eigengs_dr.image.resize import center_crop
 
 WIDTH, HEIGHT = SIZE = (6, 5)

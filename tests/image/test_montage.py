@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from eigengs_dr.image.montage import join_pictures, text_line
+from eigengs_dr.image.resize import join_pictures, text_line
 
 
 def test_pictures_are_joined_on_white():

@@ -8,7 +8,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.sets import random_scene
 from eigengs_dr.backend.selection import select
-from eigengs_dr.image.normals import renormalize
+from eigengs_dr.image.color import renormalize
 from eigengs_dr.image.pixels import ImageError
 
 

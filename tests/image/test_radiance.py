@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from eigengs_dr.image.color import to_coded, to_picture
+from eigengs_dr.image.color import from_log, to_coded, to_log, to_picture, to_pu21
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.image.pixels import LinearImage
-from eigengs_dr.image.radiance import from_log, to_log, to_pu21
 
 LIGHT = np.array([-0.005, 0, 1e-4, 0.01, 0.18, 1, 12, 5e3, 1e6])
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from _helpers.errors import one_line
-from eigengs_dr.image.io import ImageError
-from eigengs_dr.image.samples import SAMPLES, sample
+from eigengs_dr.image.io import SAMPLES, ImageError, sample
 
 
 @pytest.mark.parametrize("name", SAMPLES)

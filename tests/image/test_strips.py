@@ -6,8 +6,7 @@ from scipy.ndimage import gaussian_filter
 
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
 from eigengs_dr.image import strips as module
-from eigengs_dr.image.blur import blur, gaussian_taps
-from eigengs_dr.image.metrics import psnr
+from eigengs_dr.image.metrics import blur, gaussian_taps, psnr
 from eigengs_dr.image.strips import map_threads, strips, with_border
 
 

@@ -7,8 +7,7 @@ mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 import eigengs_dr as eg  # noqa: E402
 from _helpers.errors import one_line  # noqa: E402
 from _helpers.texture import small_scene  # noqa: E402
-from eigengs_dr.image.color import to_coded  # noqa: E402
-from eigengs_dr.image.radiance import to_log  # noqa: E402
+from eigengs_dr.image.color import to_coded, to_log  # noqa: E402
 from eigengs_dr.plugins import bake_environment, texture_of  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]

@@ -7,8 +7,7 @@ from _helpers.photos import SMALL, random_fields
 from eigengs_dr.eigenbasis.options import TrainOptions
 from eigengs_dr.eigenbasis.training import train
 from eigengs_dr.gaussian.gaussians import Gaussians
-from eigengs_dr.image.montage import GAP
-from eigengs_dr.image.resize import resample
+from eigengs_dr.image.resize import GAP, resample
 from eigengs_dr.raster.render import render
 from eigengs_dr.viewer import pictures
 from eigengs_dr.viewer.pictures import LIGHTER, comparison, ellipses, overlay

@@ -17,9 +17,9 @@ from eigengs_bench.names import CATS, NATURAL, SETS
 from eigengs_bench.report.charts import CELL, Cell, save_strip, strip
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.image.io import sample
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.image.resize import center_crop
-from eigengs_dr.image.samples import sample
 from eigengs_dr.raster.render import picture_of
 from eigengs_dr.viewer.pictures import overlay
 

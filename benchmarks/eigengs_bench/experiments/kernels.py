@@ -21,7 +21,7 @@ from eigengs_dr.fitting.placement.adaptive import place_adaptive
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import rgb_to_ycbcr
-from eigengs_dr.image.samples import sample
+from eigengs_dr.image.io import sample
 from eigengs_dr.raster.binning.lists import TileLists, build_lists
 from eigengs_dr.raster.binning.tiles import Grid
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, KernelParameters, kernel_radius

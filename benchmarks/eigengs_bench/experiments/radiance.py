@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from eigengs_bench.harness.environment import environment
 from eigengs_bench.harness.store import Progress
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.image.color import to_coded, to_linear
+from eigengs_dr.image.color import to_coded, to_linear, to_pu21
 from eigengs_dr.image.io import to_8bit
-from eigengs_dr.image.montage import join_pictures, text_line
 from eigengs_dr.image.pixels import LinearImage
-from eigengs_dr.image.radiance import to_pu21
+from eigengs_dr.image.resize import join_pictures, text_line
 
 Light = NDArray[np.float32]
 

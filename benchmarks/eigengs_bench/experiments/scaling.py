@@ -26,8 +26,8 @@ from eigengs_dr.fitting.placement.adaptive import place_adaptive
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.image.io import sample
 from eigengs_dr.image.resize import center_crop
-from eigengs_dr.image.samples import sample
 
 FILE = "scaling.jsonl"
 

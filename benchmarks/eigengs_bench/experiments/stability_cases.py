@@ -11,8 +11,8 @@ from PIL import ImageDraw
 
 from eigengs_bench.harness.timing import Image
 from eigengs_dr.gaussian.covariance import factor_from_covariance
+from eigengs_dr.image.io import sample
 from eigengs_dr.image.resize import center_crop
-from eigengs_dr.image.samples import sample
 
 Shapes = tuple[NDArray[np.float64], NDArray[np.float64]]
 

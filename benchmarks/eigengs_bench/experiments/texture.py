@@ -11,7 +11,7 @@ from eigengs_bench.harness.store import Progress
 from eigengs_bench.harness.timing import interleaved
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.image.color import to_linear
-from eigengs_dr.image.samples import sample
+from eigengs_dr.image.io import sample
 from eigengs_dr.raster.render import picture_of, render
 
 SIDE, TEXELS, SPP = 512, 1024, 16  # of the picture, of the bitmap, and samples a pixel

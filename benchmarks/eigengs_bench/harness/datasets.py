@@ -13,9 +13,8 @@ from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 from eigengs_dr.fitting.options import DEFAULT_COUNT
 from eigengs_dr.image.folder import image_files
-from eigengs_dr.image.io import load_image
+from eigengs_dr.image.io import load_image, sample
 from eigengs_dr.image.resize import center_crop
-from eigengs_dr.image.samples import sample
 
 SAMPLE_NAMES, SAMPLE_SIDE = ("chelsea", "coffee", "astronaut"), 256
 MAX_COMPONENTS = 500  # of the basis of a set: models of fewer take the first of them

@@ -16,8 +16,7 @@ from PIL import Image as pillow
 from eigengs_bench.harness.tiling import tiling
 from eigengs_bench.harness.timing import Image
 from eigengs_dr.image.io import to_8bit
-from eigengs_dr.image.montage import GAP, join_pictures, text_line
-from eigengs_dr.image.resize import resample
+from eigengs_dr.image.resize import GAP, join_pictures, resample, text_line
 from eigengs_dr.storage.atomic import atomic_write
 
 # Lines of the presets, which differ in lightness too, for readers who confuse red and green.

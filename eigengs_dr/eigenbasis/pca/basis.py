@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...backend.feedback import shows_progress, to_html, warn
-from ...image.color import ycbcr_to_rgb
+from ...image.color import check_size, to_planes, ycbcr_to_rgb
 from ...image.folder import Source
 from ...image.io import check_image, read_image
-from ...image.planes import check_size, to_planes
 from ...image.resize import resample
 from .accumulate import PCAOptions, accumulate
 from .basis_file import read_basis, write_basis

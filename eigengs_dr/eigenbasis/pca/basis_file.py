@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...image.planes import BASIS_SPACES
+from ...image.color import BASIS_SPACES
 from ...storage import npz
 from .solvers.incremental_pca import EXAMPLES
 

@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 
 from ...gaussian.covariance import factor_from_covariance
 from ...gaussian.gaussians import Gaussians, like
-from ...image.blur import blur, gaussian_taps
 from ...image.hilbert import Square, hilbert_squares
+from ...image.metrics import blur, gaussian_taps
 from ...image.resize import resample
 from ...image.strips import map_threads, strips, with_border
 from ...raster.render import render

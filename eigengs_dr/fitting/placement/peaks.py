@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...image.blur import blur, gaussian_taps
+from ...image.metrics import blur, gaussian_taps
 from ...image.strips import map_threads, strips, with_border
 
 Array = NDArray[np.floating]

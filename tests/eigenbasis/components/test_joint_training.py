@@ -9,8 +9,7 @@ import pytest
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.backend.selection import select
 from eigengs_dr.eigenbasis.components import joint_training as joint
-from eigengs_dr.eigenbasis.components.joint_state import JointState
-from eigengs_dr.eigenbasis.components.joint_training import RATE, train_jointly
+from eigengs_dr.eigenbasis.components.joint_training import RATE, JointState, train_jointly
 from eigengs_dr.fitting.parameterization import CHOLESKY
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.raster.reference import render_plain

@@ -6,8 +6,12 @@ import pytest
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, small_basis, small_model, splits
 from eigengs_dr.backend.executor import executor_for
-from eigengs_dr.eigenbasis.components.solve import fit_components, psnr_components
-from eigengs_dr.eigenbasis.components.weights import SharedShapes, find_weights
+from eigengs_dr.eigenbasis.components.solve import (
+    SharedShapes,
+    find_weights,
+    fit_components,
+    psnr_components,
+)
 from eigengs_dr.fitting.solvers.normal_equations import NormalEquations
 
 

@@ -5,8 +5,8 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, rendered, small_basis, small_model, splits
-from eigengs_dr.eigenbasis.components.split import SPLIT_COST, split_reason, wants_split
-from eigengs_dr.image.planes import to_planes
+from eigengs_dr.eigenbasis.components.solve import SPLIT_COST, split_reason, wants_split
+from eigengs_dr.image.color import to_planes
 
 
 @splits
@@ -25,7 +25,7 @@ def test_split_keeps_sides_apart(backend, split):
 
 def test_auto_splits_large_images_alone(backend, monkeypatch):
     assert wants_split(small_basis(), SPLATS, "auto", backend) == (False, {})
-    monkeypatch.setattr("eigengs_dr.eigenbasis.components.split.SPLIT_FROM", SIDE)
+    monkeypatch.setattr("eigengs_dr.eigenbasis.components.solve.SPLIT_FROM", SIDE)
     decision, figures = wants_split(small_basis(), SPLATS, "auto", backend)
     assert set(figures) == {"psnr_whole", "psnr_split"}
     assert decision == (figures["psnr_split"] > figures["psnr_whole"] - 0.2)
@@ -47,9 +47,9 @@ def test_a_tenth_of_the_splats_is_low(backend):
 @pytest.mark.parametrize(("split", "expected"), [(30.0, True), (29.9, True), (29.7, False)])
 def test_what_the_split_may_cost(backend, monkeypatch, split, expected):
     figures = iter([30.0, split])
-    monkeypatch.setattr("eigengs_dr.eigenbasis.components.split.SPLIT_FROM", SIDE)
+    monkeypatch.setattr("eigengs_dr.eigenbasis.components.solve.SPLIT_FROM", SIDE)
     monkeypatch.setattr(
-        "eigengs_dr.eigenbasis.components.split.psnr_from_mse", lambda mse: next(figures)
+        "eigengs_dr.eigenbasis.components.solve.psnr_from_mse", lambda mse: next(figures)
     )
     assert wants_split(small_basis(), SPLATS, "auto", backend)[0] == expected
 
@@ -67,7 +67,7 @@ def test_the_split_tells_why(backend, monkeypatch):
     assert reason(100, False) == (False, "frequency_aware is set")
     assert reason(1, True) == (False, "too few Gaussians or components to split")
     assert reason(100, "auto") == (False, "32 pixels a side; auto measures from 512 on")
-    monkeypatch.setattr("eigengs_dr.eigenbasis.components.split.SPLIT_FROM", 32)
+    monkeypatch.setattr("eigengs_dr.eigenbasis.components.solve.SPLIT_FROM", 32)
     decision, text = reason(100, "auto")
     whole, split = (float(text.split(word)[1].split(" dB")[0]) for word in ("whole ", "split "))
     assert decision == (split > whole - SPLIT_COST)

@@ -17,7 +17,7 @@ from eigengs_dr.eigenbasis.pca.truncation import (
     min_ranks_per_channel,
     residual_energy,
 )
-from eigengs_dr.image.planes import to_planes
+from eigengs_dr.image.color import to_planes
 
 SIDE, RANKS = 16, (5, 3, 1)
 
