@@ -4,7 +4,7 @@
 - ``overhead``: one worker of one thread against one process of one thread
 - ``tasks``: seconds of a task that does nothing, by the bytes that it takes and returns
 - ``pca``: the eigenbasis of crops on one worker and on two, with the memory of each; of the images
-  in a folder with ``--images``, by the exact solver with ``--solver gram``
+  in a folder with ``--images``
 - ``weights``: a model of 20,000 Gaussians, and that many components of 512x512, here and by workers
 
 Each part prints JSON. Compile the kernels by a first run, and take the median of several.
@@ -118,7 +118,7 @@ def pca(folder: Path, count: int) -> dict[str, Any]:
     bases = []
     for workers in (1, 2):
         (states := folder / f"states{workers}").mkdir()
-        options = {"checkpoint": states, "solver": ARGUMENTS.solver}
+        options = {"checkpoint": states}
         with connect(f"local:{workers}") as client:
             executor_for(client)
 
@@ -155,7 +155,6 @@ if __name__ == "__main__":
     parser.add_argument("part")
     parser.add_argument("count", type=int, nargs="?", default=64)
     parser.add_argument("--images", type=Path)
-    parser.add_argument("--solver", default="incremental")
     ARGUMENTS = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         result = globals()[ARGUMENTS.part](Path(folder), ARGUMENTS.count)

@@ -12,6 +12,7 @@ from typing import Any
 
 import lazy_loader
 
+from .backend.executor import EXECUTORS
 from .backend.feedback import HTML
 from .backend.libllvm import select_libllvm
 from .storage.atomic import READERS, Reader
@@ -49,9 +50,10 @@ def _later(name: str) -> Any:
     return lambda *args: resolve_name(f"{__name__}.{name}")(*args)
 
 
-# Folders that know nothing of the codec and the viewer use them through these two names.
+# Folders that know nothing of the codec, the viewer and Dask use them through these names.
 READERS[b"\x89EGS"] = Reader(_later("codec.egs:read_set"), _later("codec.egs:maps_of"))
 HTML[:] = [_later("viewer.notebook:to_html")]
+EXECUTORS["distributed"] = _later("cluster.executor:ClusterExecutor")
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 

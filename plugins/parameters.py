@@ -14,9 +14,9 @@ import numpy as np
 
 from eigengs_dr.backend.arrays import types_of, upload_tensor
 from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.fitting.fit import Fit
 from eigengs_dr.gaussian.gaussians import (
     FIELDS,
+    Fitted,
     Gaussians,
     from_tensors,
     one_image,
@@ -27,7 +27,7 @@ from eigengs_dr.gaussian.gaussians import (
 Arrays = dict[str, Any]
 
 
-def texture_of(gaussians: Gaussians | Fit, **properties: Any) -> dict[str, Any]:
+def texture_of(gaussians: Gaussians | Fitted, **properties: Any) -> dict[str, Any]:
     """Return a set as the dictionary of a ``gaussian_texture``, for `mitsuba.load_dict`.
 
     Parameters

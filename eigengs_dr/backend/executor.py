@@ -1,19 +1,14 @@
 """Where tasks run: in this process, or on the workers of a cluster.
 
 Functions that take ``client`` ask `executor_for` for an `Executor`. This module knows no cluster:
-`EXECUTORS` names the module that does, and the first client of that kind imports it.
+who does puts its executor into `EXECUTORS`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
-from pkgutil import resolve_name
 from typing import Any, NamedTuple, Protocol, runtime_checkable
-
-EXECUTORS = {"distributed": "eigengs_dr.cluster.executor:ClusterExecutor"}
-"""Executors by the package that defines the class of the client; each entry, ``module:class``,
-makes an `Executor` of a client."""
 
 Function = Callable[[Any, Any], Any]
 """``function(task, shared)``, a function of a module."""
@@ -90,6 +85,11 @@ class Executor(Protocol):
         """
 
 
+EXECUTORS: dict[str, Callable[[Any], Executor]] = {}
+"""What makes an `Executor` of a client, by the package that defines the class of the client;
+`eigengs_dr` puts that of Dask here."""
+
+
 class LocalExecutor:
     """The `Executor` of this process: one task after the other, without copies."""
 
@@ -162,8 +162,7 @@ def executor_for(client: Any = None) -> Executor:
     if _package(client) not in EXECUTORS:
         kind = f"{type(client).__module__}.{type(client).__name__}"
         raise TypeError(f"client is a {kind}; pass a distributed.Client, or None")
-    executor: Executor = resolve_name(EXECUTORS[_package(client)])(client)
-    return executor
+    return EXECUTORS[_package(client)](client)
 
 
 def _package(client: Any) -> str:

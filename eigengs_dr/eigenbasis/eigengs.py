@@ -11,26 +11,25 @@ import os
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.feedback import shows_progress, to_html
 from ..backend.recording import exclusive
-from ..collection.manifest import ImageRow
-from ..collection.sources import Images
 from ..gaussian.gaussians import Gaussians
-from ..image.folder import Source
 from ..image.io import check_image, read_image
 from ..image.resize import resample
-from .encode_many import check_encoding, encode_each
-from .encoder import Encoder
+from .encoder import Encoder, check_encoding
 from .model_file import read_members, write_model
-from .options import TrainOptions, fit_model
-from .pca.basis import Eigenbasis
-from .pca.component_counts import name_components
-from .pca.truncation import TruncationCurve, curve_from_eigenvalues
+from .pca.truncation import TruncationCurve, curve_from_eigenvalues, name_components
+
+if TYPE_CHECKING:  # training and runs over many images are imported where they are called
+    from ..collection.manifest import ImageRow
+    from ..collection.sources import Images
+    from ..image.folder import Source
+    from .pca.basis import Eigenbasis
 
 Planes = NDArray[np.float32]
 
@@ -128,6 +127,9 @@ class EigenGS:
         ClusterError
             If the cluster cannot be used, or is lost.
         """
+        from .options import TrainOptions, fit_model
+        from .pca.basis import Eigenbasis
+
         if not isinstance(basis, Eigenbasis):
             basis = Eigenbasis.from_images(basis, seed=seed, client=client, progress=False)
         options = TrainOptions(
@@ -280,6 +282,8 @@ class EigenGS:
         ValueError, OSError, RunInterrupted
             See `encode` and `eigengs_dr.fit_many`.
         """
+        from .encode_many import encode_each
+
         options = (colors, mean, target_psnr)
         return encode_each(self, options, images, output, overwrite, progress, client)
 

@@ -18,6 +18,7 @@ from ..collection.run import FAILURES, Job, Work
 from ..collection.sources import Images
 from ..gaussian.gaussians import Gaussians
 from ..image.pixels import check_image
+from .encoder import check_encoding
 
 if TYPE_CHECKING:
     from .eigengs import EigenGS
@@ -31,24 +32,6 @@ MAX_GROUP_PIXELS = 1 << 22
 
 Pixels = NDArray[np.float32]
 EncodeGroup = Callable[[list[Pixels]], list[Gaussians]]
-
-
-def check_encoding(colors: str, mean: str, target_psnr: float | None) -> None:
-    """Raise ValueError for options of `eigengs_dr.EigenGS.encode` that are unknown or contradict.
-
-    Parameters
-    ----------
-    colors, mean, target_psnr
-        See `eigengs_dr.EigenGS.encode`.
-    """
-    for name, value, valid in (
-        ("colors", colors, ("exact", "projected")),
-        ("mean", mean, ("gaussians", "dense")),
-    ):
-        if value not in valid:
-            raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(valid)}")
-    if colors == "exact" and target_psnr is not None:
-        raise ValueError("target_psnr chooses components; use it with colors 'projected'")
 
 
 def encode_each(

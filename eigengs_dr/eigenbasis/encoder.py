@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from ..fitting.solvers.normal_equations import NormalEquations, squared_norms
-from ..gaussian.gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.color import RGB_TO_YCBCR, YCBCR_OFFSET, to_planes
 from ..image.resize import resample
-from .components.solve import with_colors
 from .pca.truncation import min_ranks_per_channel, residual_energy
 
 Coefficients = tuple[NDArray[np.float32], ...]
@@ -187,7 +186,7 @@ class Encoder:
         ----------
         images : list of ndarray of float32, shape (H, W, 3)
         colors, mean, target_psnr
-            Checked by `eigengs_dr.eigenbasis.encode_many.check_encoding`.
+            Checked by `eigengs_dr.eigenbasis.encoder.check_encoding`.
         """
         sizes = [(pixels.shape[1], pixels.shape[0]) for pixels in images]
         resized = [self.resized(pixels) for pixels in images]
@@ -301,3 +300,21 @@ class Encoder:
                 np.einsum("j,jn->n", values, weights[: len(values)], out=column)
             columns.append(column)
         return np.stack(columns, axis=1).astype(np.float64)
+
+
+def check_encoding(colors: str, mean: str, target_psnr: float | None) -> None:
+    """Raise ValueError for options of `eigengs_dr.EigenGS.encode` that are unknown or contradict.
+
+    Parameters
+    ----------
+    colors, mean, target_psnr
+        See `eigengs_dr.EigenGS.encode`.
+    """
+    for name, value, valid in (
+        ("colors", colors, ("exact", "projected")),
+        ("mean", mean, ("gaussians", "dense")),
+    ):
+        if value not in valid:
+            raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(valid)}")
+    if colors == "exact" and target_psnr is not None:
+        raise ValueError("target_psnr chooses components; use it with colors 'projected'")

@@ -11,8 +11,7 @@ import numpy as np
 from ..backend.executor import executor_for
 from ..image.color import BASIS_SPACES, check_size
 from .components.solve import State, fit_components, split_reason, wants_split
-from .pca.basis import Eigenbasis
-from .pca.component_counts import check_components
+from .pca.basis import Eigenbasis, check_components
 from .pca.truncation import check_target
 
 STEPS = {"default": 0, "eigengs": 15_000}

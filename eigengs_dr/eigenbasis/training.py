@@ -7,7 +7,6 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from dataclasses import asdict
 from functools import partial
 from itertools import chain
@@ -17,9 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.executor import executor_for
 from ..backend.feedback import defer_interrupts, warn
-from ..image.folder import list_images, read_blocks
+from ..image.folder import list_images
 from ..image.io import ImageError, check_image, load_image
 from ..image.metrics import psnr
 from ..image.remote import is_url
@@ -29,10 +27,8 @@ from ..storage.checkpoint import Checkpoint
 from .components.solve import State
 from .eigengs import EigenGS
 from .options import TrainOptions, fit_model
-from .pca.basis import Eigenbasis
-from .pca.component_counts import check_components
-from .pca.solvers.incremental_pca import EigenState, block_length, empty_state, merge, rank_for
-from .pca.solvers.shards import ShardOptions, is_large, shard_block_length, shard_states
+from .pca.basis import Eigenbasis, check_components
+from .pca.stream import PCAOptions, find_state
 from .pca.truncation import TruncationCurve
 
 OnImage = Callable[[int], None]
@@ -259,13 +255,18 @@ class Run(NamedTuple):
 
 
 def _basis(files: list[Path | str], held_out: list[Path | str], run: Run) -> Eigenbasis:
-    """Find the components block by block, or read them from the checkpoint."""
+    """Find the components, or read them from the checkpoint, which keeps the states of shards."""
     settings, checkpoint = run.settings, run.checkpoint
     if (path := checkpoint.folder / "basis.npz").exists():
         return Eigenbasis.load(path)
-    ranks = tuple(rank_for(k) for k in check_components(settings.components))
-    large = run.client is not None or is_large(files)
-    state = (_state_of_shards if large else _state)(files, ranks, run)
+
+    def advance(done: int, total: int | None, row: dict[str, Any]) -> None:
+        run.progress("components", done, len(files))
+        run.stop_if_pressed()
+
+    most = check_components(settings.components)
+    options = PCAOptions(settings.size, settings.space, most, settings.seed)
+    state = find_state(files, options, advance, run.client, checkpoint.folder)
     basis = Eigenbasis.from_state(
         state, settings.size, settings.components, settings.energy, settings.space
     )
@@ -279,53 +280,6 @@ def _basis(files: list[Path | str], held_out: list[Path | str], run: Run) -> Eig
     basis.save(path)
     checkpoint.remove("pca*")
     return basis
-
-
-def _state(files: list[Path | str], ranks: tuple[int, ...], run: Run) -> EigenState:
-    """Merge the images block by block; the checkpoint holds the state after each block."""
-    settings, checkpoint = run.settings, run.checkpoint
-    arrays = checkpoint.load("pca")
-    state = EigenState.from_arrays(arrays) if arrays else empty_state(settings.size, settings.seed)
-    first = int(arrays["next"]) if arrays else 0
-    length = block_length(settings.size)
-
-    def advance(done: int, total: int | None, row: dict[str, Any]) -> None:
-        run.progress("components", first + done, len(files))
-        run.stop_if_pressed()
-
-    source = read_blocks(files[first:], settings.size, settings.space, length, advance)
-    try:
-        with closing(source) as blocks:
-            for number, block in enumerate(blocks, 1):
-                state = merge(state, block, ranks)
-                del block  # before the next is read
-                if (done := first + number * length) < len(files):
-                    checkpoint.save("pca", state.arrays() | {"next": np.array(done)})
-    except ImageError as error:
-        if not state.count:  # else an earlier run has read some images, and only the rest is bad
-            raise
-        warn(f"the remaining images were skipped: {error}")
-    return state
-
-
-def _state_of_shards(files: list[Path | str], ranks: tuple[int, ...], run: Run) -> EigenState:
-    """Merge the images in shards; the checkpoint holds the states of shards."""
-    settings = run.settings
-
-    def report(done: int, total: int) -> None:
-        run.progress("components", done, total)
-        run.stop_if_pressed()
-
-    options = ShardOptions(
-        settings.size,
-        settings.space,
-        ranks,
-        settings.seed,
-        shard_block_length(settings.size, len(files)),
-        run.checkpoint.folder,
-        advance=None if run.client is not None else run.stop_if_pressed,
-    )
-    return shard_states(files, options, executor_for(run.client), report)
 
 
 def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS:

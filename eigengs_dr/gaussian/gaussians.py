@@ -615,3 +615,25 @@ def one_image(gaussians: Gaussians) -> Gaussians:
         first = gaussians.maps[0].name
         raise ValueError(f"the set has the maps {names}; choose one, as gaussians[{first!r}]")
     return gaussians
+
+
+def with_colors(gaussians: Gaussians, coefficients: NDArray[np.float64], space: str) -> Gaussians:
+    """Return Gaussians of the same shapes with other colours.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    coefficients : ndarray, shape (N + 1, C)
+        Colours of the Gaussians; the last row is the background.
+    space : str
+        Colour space of the channels.
+    """
+    types = types_of(gaussians.mean)
+    rows = coefficients.astype(np.float32).T
+    uploaded = upload_rows(types.Float, [*rows[:, :-1], *rows[:, -1:]])
+    return replace(
+        gaussians,
+        color=types.FloatX(uploaded[: len(rows)]),
+        background=types.FloatX(uploaded[len(rows) :]),
+        space=space,
+    )

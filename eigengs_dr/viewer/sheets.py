@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..eigenbasis.components.solve import with_colors
 from ..eigenbasis.eigengs import EigenGS
 from ..eigenbasis.pca.basis import Eigenbasis
-from ..eigenbasis.pca.component_counts import CHANNELS
+from ..eigenbasis.pca.truncation import CHANNELS
+from ..gaussian.gaussians import with_colors
 from ..image.color import decode
 from ..image.resize import join_pictures, resample, text_line
 from ..raster.render import render

@@ -8,15 +8,15 @@ import pytest
 from _helpers.low_rank import SIZE, assert_same, family
 from eigengs_dr.eigenbasis import training
 from eigengs_dr.eigenbasis.options import TrainOptions
+from eigengs_dr.eigenbasis.pca import stream
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
-from eigengs_dr.eigenbasis.pca.solvers import gram, plane_store, shards
 from eigengs_dr.image.io import save_image
 
 
 @pytest.fixture
 def images(monkeypatch):
     """Images for four shards; workers take the sizes from the tasks."""
-    monkeypatch.setattr(shards, "SHARD", 16)
+    monkeypatch.setattr(stream, "SHARD", 16)
     return family(60)
 
 
@@ -43,14 +43,6 @@ def test_a_worker_that_is_killed(client, images, tmp_path):
 def test_iterators_are_refused(client, images):
     with pytest.raises(ValueError, match="a cluster needs a list"):
         Eigenbasis.from_images(iter(images), SIZE, 8, client=client)
-
-
-def test_the_exact_solver_has_the_bits_of_one_process(client, images, tmp_path, monkeypatch):
-    monkeypatch.setattr(plane_store, "FILE_IMAGES", 7)  # workers cut no files
-    monkeypatch.setattr(gram, "TILE_IMAGES", 14)
-    options = {"solver": "gram", "components": 8, "size": SIZE}
-    found = Eigenbasis.from_images(images, **options, client=client, checkpoint=tmp_path)
-    assert_same(found, Eigenbasis.from_images(images, **options))
 
 
 def test_training(client, tmp_path, images):

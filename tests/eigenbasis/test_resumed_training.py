@@ -12,13 +12,14 @@ import pytest
 from _helpers.photos import random_fields
 from _helpers.trainings import checkpoint_of, settings
 from eigengs_dr.eigenbasis import training
+from eigengs_dr.eigenbasis.pca import stream
 from eigengs_dr.eigenbasis.training import Interrupted, train
 
 
 @pytest.fixture
 def in_pieces(monkeypatch):
-    """Blocks of five images, and a checkpoint of every state of the shapes."""
-    monkeypatch.setattr(training, "block_length", lambda size: 5)
+    """Shards of five images, and a checkpoint of every state of the shapes."""
+    monkeypatch.setattr(stream, "SHARD", 5)
     monkeypatch.setattr(training, "SAVE_SECONDS", 0)
 
 
@@ -88,7 +89,8 @@ def test_killed_by_the_system(folder, output, tmp_path, in_pieces):
     script = f"""
 import os, signal
 from eigengs_dr.eigenbasis import training
-training.block_length, training.SAVE_SECONDS = lambda size: 5, 0
+from eigengs_dr.eigenbasis.pca import stream
+stream.SHARD, training.SAVE_SECONDS = 5, 0
 seen = []
 def progress(stage, done, total):
     seen.append(stage)
@@ -155,7 +157,7 @@ def test_a_folder_that_grew_meanwhile(folder, output, tmp_path, in_pieces):
     ("stage", "call", "name"),
     [
         ("components", 8, "run.json"),
-        ("components", 8, "pca.npz"),
+        ("components", 8, "pca-sum-0.npz"),
         ("weights", 1, "basis.npz"),
         ("shapes", 3, "shapes.npz"),
     ],

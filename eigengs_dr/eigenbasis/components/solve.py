@@ -9,19 +9,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.arrays import types_of, upload_rows
 from ...backend.executor import Executor, completed, executor_for
 from ...backend.recording import exclusive
 from ...fitting.solvers.normal_equations import BATCH, NormalEquations, squared_norms
 from ...gaussian.file import SetData
-from ...gaussian.gaussians import Gaussians, concatenate
+from ...gaussian.gaussians import Gaussians, concatenate, with_colors
 from ...image.color import to_planes
 from ...image.metrics import psnr_from_mse
 from ..pca.basis import Eigenbasis
@@ -216,28 +215,6 @@ def _join_weights(first: tuple[Planes, ...], second: tuple[Planes, ...]) -> tupl
         below = np.hstack([np.zeros((len(high), left), np.float32), high])
         result.append(np.vstack([above, below]))
     return tuple(result)
-
-
-def with_colors(gaussians: Gaussians, coefficients: NDArray[np.float64], space: str) -> Gaussians:
-    """Return Gaussians of the same shapes with other colours.
-
-    Parameters
-    ----------
-    gaussians : Gaussians
-    coefficients : ndarray, shape (N + 1, C)
-        Colours of the Gaussians; the last row is the background.
-    space : str
-        Colour space of the channels.
-    """
-    types = types_of(gaussians.mean)
-    rows = coefficients.astype(np.float32).T
-    uploaded = upload_rows(types.Float, [*rows[:, :-1], *rows[:, -1:]])
-    return replace(
-        gaussians,
-        color=types.FloatX(uploaded[: len(rows)]),
-        background=types.FloatX(uploaded[len(rows) :]),
-        space=space,
-    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,8 @@
 """The principal components of a family of images.
 
-- ``basis``: the result, `Eigenbasis`
-- ``accumulate``: all images of a source, by one of ``solvers``
-- ``component_counts``: how many components are allowed, and how many an energy needs
-- ``lazy_images``: images of an array that is computed part by part
+- ``incremental``: one block of images, or another state, into a state
+- ``stream``: all images of a source, in shards by workers
+- ``basis``: the result, `Eigenbasis`, and how many components it has
 - ``truncation``: the error against the number of components
 - ``basis_file``: the file of a basis
 """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from operator import index
 from typing import Any
 
 import numpy as np
@@ -15,20 +16,15 @@ from ...image.color import check_size, to_planes, ycbcr_to_rgb
 from ...image.folder import Source
 from ...image.io import check_image, read_image
 from ...image.resize import resample
-from .accumulate import PCAOptions, accumulate
-from .basis_file import read_basis, write_basis
-from .component_counts import (
-    check_components,
-    cumulative_share,
-    name_components,
-    ranks_for_energy,
-)
-from .solvers.eigenpairs import orient
-from .solvers.incremental_pca import EigenState
+from .basis_file import ENERGY_TOLERANCE, read_basis, write_basis
+from .incremental import EigenState, orient
+from .stream import PCAOptions, find_state
 from .truncation import (
+    CHANNELS,
     TruncationCurve,
     curve_from_eigenvalues,
     curve_from_residuals,
+    name_components,
     residual_energy,
 )
 
@@ -80,17 +76,20 @@ class Eigenbasis:
         progress: Any = None,
         client: Any = None,
         checkpoint: str | os.PathLike[str] | None = None,
-        solver: str = "incremental",
     ) -> Eigenbasis:
         """Find the eigenbasis of a family of images in one pass.
 
-        The number of workers does not change a bit of the result.
+        The number of workers does not change a bit of the result. Blocks of up to 1,024 images are
+        merged, so memory does not grow with their number: it is a block (805 MB), and ``5 k d``
+        numbers for k components of d pixels in 3 channels. The result is exact for one block; with
+        more, the last components lose some variance: of 4,096 crops of 256x256 and 300 components,
+        0.09 dB on the crops and 0.01 dB on 200 others.
 
         Parameters
         ----------
         images : path, array or iterable
-            See `eigengs_dr.image.folder.read_blocks`; or a dask.array of images (n, H, W, 3), or of
-            rows of RGB (n, 3 H W), see `eigengs_dr.eigenbasis.pca.lazy_images.LazyImages`.
+            See `eigengs_dr.image.folder.read_blocks`. Of an array that is computed part by part,
+            pass the parts: ``(block.compute() for block in array.blocks)`` for a dask.array.
         size : (int, int)
             Width and height of the basis.
         components : int or sequence of 3 ints
@@ -112,13 +111,6 @@ class Eigenbasis:
             An existing folder that all workers see, for this call alone. It keeps what tasks have
             found, so that the same call continues after a break; the caller deletes it. Without
             it, states travel through this process: 295 MB a shard, for 300 components of 256x256.
-        solver : {"incremental", "gram"}, optional
-            "incremental" merges blocks of up to 1,024 images. Its memory does not grow with their
-            number: a block (805 MB) and ``5 k d`` numbers for k components of d pixels in 3
-            channels. It is exact for one block; with more, the last components lose some variance.
-            "gram" is exact for up to 16,384 images. Of n images it holds ``n^2`` numbers of 8
-            bytes, and keeps all pixels, 12 bytes each, in `checkpoint` (needed with a client) or
-            in the folder of temporary files.
 
         Raises
         ------
@@ -134,8 +126,8 @@ class Eigenbasis:
             If images are skipped, cropped or too few, or `components` is too low for the energy.
         """
         size, most = check_size(size), check_components(components, energy)
-        options = PCAOptions(size, space, most, seed, solver)
-        state = accumulate(images, options, progress, client, checkpoint)
+        options = PCAOptions(size, space, most, seed)
+        state = find_state(images, options, progress, client, checkpoint)
         return cls.from_state(state, size, components, energy, space)
 
     @classmethod
@@ -296,3 +288,62 @@ def _rgb(planes: NDArray[np.float32], space: str) -> NDArray[np.float32]:
     """Convert planes (C, H, W) of a colour space to RGB (H, W, 3)."""
     image = np.ascontiguousarray(np.moveaxis(planes, 0, 2))
     return ycbcr_to_rgb(image) if space == "ycbcr" else image
+
+
+def check_components(
+    components: int | Sequence[int], energy: float | None = None
+) -> tuple[int, int, int]:
+    """Return the most components of each channel; raise ValueError for bad numbers or energy."""
+    if energy is not None and not 0 < energy <= 1:
+        raise ValueError(f"energy is {energy}; expected a share of the variance in (0, 1]")
+    try:
+        each = components if isinstance(components, Iterable) else (components,) * 3
+        y, cb, cr = map(index, each)
+    except (TypeError, ValueError):
+        raise ValueError(f"components is {components!r}; expected a number, or three") from None
+    if min(y, cb, cr) < 0:
+        raise ValueError(f"components is {components!r}; expected no negative number")
+    return y, cb, cr
+
+
+def ranks_for_energy(
+    energies: Sequence[NDArray[np.float64]],
+    variance: NDArray[np.float64],
+    most: Sequence[int],
+    energy: float,
+    space: str,
+) -> list[int]:
+    """Return the fewest components of each channel that hold a share of its variance.
+
+    Parameters
+    ----------
+    energies : sequence of C ndarrays, shape (k_c,)
+        See `cumulative_share`.
+    variance : ndarray, shape (C,)
+        Total variance of each channel.
+    most : sequence of C ints
+        Components that the caller allows.
+    energy : float
+        The share, in (0, 1].
+    space : {"ycbcr", "rgb"}
+
+    Warns
+    -----
+    UserWarning
+        If `most` is too low for the share.
+    """
+    ranks = []
+    for name, shares, cap, total in zip(CHANNELS[space], energies, most, variance, strict=True):
+        ranks.append(int(np.searchsorted(shares, energy)) + 1)
+        share = shares[-1] if len(shares) else 0.0
+        if total > 0 and len(shares) == cap and share < energy - ENERGY_TOLERANCE:
+            warn(
+                f"channel {name}: {cap} components hold {share:.2%} of the variance, "
+                f"less than {energy:.2%}; raise components"
+            )
+    return ranks
+
+
+def cumulative_share(eigenvalues: NDArray[np.float64], variance: float) -> NDArray[np.float64]:
+    """Return the share of a variance that the first 1, 2, ... eigenvalues hold; shape (k,)."""
+    return np.minimum(np.cumsum(eigenvalues) / (variance or 1), 1)

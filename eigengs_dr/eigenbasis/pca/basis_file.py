@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...image.color import BASIS_SPACES
 from ...storage import npz
-from .solvers.incremental_pca import EXAMPLES
+from .incremental import EXAMPLES
 
 FORMAT, VERSION = "eigengs_dr.eigenbasis", 1
 

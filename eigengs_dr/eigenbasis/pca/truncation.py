@@ -188,3 +188,12 @@ def _decibels(error: NDArray[np.float64] | float) -> Values:
 def _warn_out_of_reach(target_psnr: float, counts: Iterable[int], reached: float) -> None:
     every = "+".join(map(str, counts))
     warn(f"{target_psnr:g} dB are out of reach: all {every} components have {reached:.2f}")
+
+
+CHANNELS = {"ycbcr": ("Y", "Cb", "Cr"), "rgb": ("R", "G", "B")}
+"""Names of the channels of a space, for warnings."""
+
+
+def name_components(space: str, counts: Iterable[int]) -> str:
+    """Return how many components each channel has, as in "230 Y, 60 Cb, 60 Cr"."""
+    return ", ".join(f"{n} {name}" for n, name in zip(counts, CHANNELS[space], strict=True))

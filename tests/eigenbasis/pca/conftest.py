@@ -2,7 +2,7 @@
 
 import pytest
 
-from eigengs_dr.eigenbasis.pca.solvers import incremental_pca as incremental
+from eigengs_dr.eigenbasis.pca import incremental
 
 
 @pytest.fixture

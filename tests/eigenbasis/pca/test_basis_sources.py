@@ -7,7 +7,7 @@ import pytest
 
 from _helpers.errors import one_line
 from _helpers.low_rank import HEIGHT, SIZE, WIDTH, assert_same, family
-from eigengs_dr.eigenbasis.pca import accumulate
+from eigengs_dr.eigenbasis.pca import stream
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 from eigengs_dr.image.folder import image_files
 from eigengs_dr.image.io import ImageError, save_image
@@ -62,7 +62,7 @@ def test_interruption_of_a_merge_leaves_no_thread(tmp_path, monkeypatch, blocks_
         raise KeyboardInterrupt
 
     blocks_of(4)
-    monkeypatch.setattr(accumulate, "merge", interrupted)
+    monkeypatch.setattr(stream, "merge", interrupted)
     with pytest.raises(KeyboardInterrupt) as caught:  # its traceback keeps the frames alive
         Eigenbasis.from_images(tmp_path, SIZE, 2)
     assert not [t for t in threading.enumerate() if t.name.startswith("decode")]

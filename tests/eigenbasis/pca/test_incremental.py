@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from _helpers.low_rank import PIXELS, SIZE, assert_same, family, planes
+from eigengs_dr.eigenbasis.pca import incremental
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
-from eigengs_dr.eigenbasis.pca.solvers import incremental_pca as incremental
-from eigengs_dr.eigenbasis.pca.solvers.incremental_pca import EigenState, empty_state, merge
+from eigengs_dr.eigenbasis.pca.incremental import EigenState, empty_state, merge
 from eigengs_dr.image.folder import read_blocks
 
 
@@ -71,3 +71,14 @@ def test_block_length_keeps_to_its_memory():
     assert incremental.block_length((64, 64)) == 1024
     assert incremental.block_length((1 << 14, 1 << 14)) == 1
     assert [incremental.rank_for(k) for k in (0, 1, 300)] == [0, 2, 375]
+
+
+def test_few_eigenvalues_are_those_of_all():
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(80, 100)) * 0.9 ** np.arange(100)
+    all_values = np.linalg.eigvalsh(rows @ rows.T)[::-1]
+    for most in (5, 40):
+        values, weights, dropped = incremental.largest_eigenpairs(rows @ rows.T, most, 0)
+        np.testing.assert_allclose(values, all_values[:most])
+        np.testing.assert_allclose(dropped, all_values[most])
+        np.testing.assert_allclose(weights.T @ rows @ rows.T @ weights, np.eye(most), atol=1e-9)
