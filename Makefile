@@ -27,7 +27,7 @@ APT_INSTALL := apt_install() { \
 	{ $$get install $$1 || { $$get update && $$get install $$1; }; } </dev/null >/dev/null 2>&1 \
 	|| { echo "make setup: $$2" >&2; exit 1; }; }
 
-.PHONY: help setup demo scenes test test-slow test-cuda-sim docs bench report basis clean
+.PHONY: help setup demo scenes test layers test-slow test-cuda-sim docs bench report basis clean
 
 help:
 	@echo "make demo       fit a photo; shows PSNR, time and the pictures it wrote"
@@ -66,7 +66,7 @@ demo: $(READY)
 		--preview build/demo/coffee.png --report build/demo/coffee.json
 	@echo "The same photo from the basis that ships, without a step. A basis pays for many images"
 	@echo "on one set of shapes, or for a scene that has few unknowns; never for a photo at hand:"
-	@$(BIN)/eigengs-dr fit $(PHOTO) --init eigen --basis natural --iterations 0 \
+	@$(BIN)/eigengs-dr fit $(PHOTO) --basis natural --iterations 0 \
 		-o build/demo/instant.npz --preview build/demo/instant.png
 
 scenes: $(READY)
@@ -77,8 +77,14 @@ test: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/lint-imports
+	@$(MAKE) --no-print-directory layers
 	$(BIN)/python -m pytest -q
+
+# In the installed layout: in a checkout the plugins lie beside the package.
+layers: $(READY)
+	@rm -rf build/layout && mkdir -p build/layout && cp -r eigengs_dr build/layout \
+		&& cp -r plugins build/layout/eigengs_dr/plugins
+	cd build/layout && ../../$(BIN)/lint-imports --config ../../pyproject.toml
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -q -m slow
