@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from eigengs_dr.backend.arrays import upload
+from eigengs_dr.backend.arrays import Float, upload
 from eigengs_dr.image.color import (
     LOG_SLOPE,
     UNBOUNDED,
@@ -36,6 +36,8 @@ from eigengs_dr.image.color import (
     to_linear,
     unit_codes,
 )
+
+from .versions import Texture
 
 STEP = 5.0
 """Distance of the samples in nm, as in Mitsuba's tables of D65 and the matching functions. Products
@@ -165,7 +167,7 @@ def upsample(rgb: Any, wavelengths: Any, table: Any) -> Any:
     return type(wavelengths)(result)
 
 
-def show(texture: Any, value: Any) -> Any:
+def show(texture: Texture, value: Float) -> Any:
     """Clamp and decode a channel, unless raw.
 
     The clamp conserves energy; light that may exceed 1 has no upper bound. Gradients ignore the
@@ -180,14 +182,14 @@ def show(texture: Any, value: Any) -> Any:
     return to_linear(value) if texture.space in ("ycbcr", "rgb") else value
 
 
-def show_all(texture: Any, values: list) -> list:
+def show_all(texture: Texture, values: list) -> list:
     """Apply `show` to all channels; normals get the length 1 instead, unless raw."""
     if texture.space == "normal" and not texture.raw:
         return unit_codes(values)
     return [show(texture, value) for value in values]
 
 
-def slope_of(texture: Any, value: Any) -> Any:
+def slope_of(texture: Texture, value: Float) -> Any:
     """Return the derivative of `show` for a channel that it does not clamp."""
     if texture.space == "log" and not texture.raw:
         return (from_log(value) + 1 / LOG_SLOPE) * math.log1p(LOG_SLOPE)
@@ -197,7 +199,7 @@ def slope_of(texture: Any, value: Any) -> Any:
     return dr.select(value <= 0.04045, 1 / 12.92, curved)
 
 
-def is_shown(texture: Any, value: Any) -> Any:
+def is_shown(texture: Texture, value: Float) -> Any:
     """Return whether `show` does not clamp a channel."""
     if texture.raw:
         return type(value)(0) == 0
@@ -209,7 +211,7 @@ def luminance(color: list) -> Any:
     return color[0] if len(color) == 1 else mi.luminance(mi.Color3f(*color))
 
 
-def brightness(texture: Any, color: list) -> Any:
+def brightness(texture: Texture, color: list) -> Any:
     """Return what the texture reflects or emits in the mean: of wavelengths, where it has spectra.
 
     Parameters
@@ -229,6 +231,6 @@ def brightness(texture: Any, color: list) -> Any:
     return luminance(color)
 
 
-def keep_finite(x: Any) -> Any:
+def keep_finite(x: Float) -> Any:
     """Replace values that are not finite, which an optimiser may leave, by 0."""
     return dr.select(dr.isfinite(x), x, 0)

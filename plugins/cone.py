@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from eigengs_dr.backend.arrays import rcp
 
-from .versions import footprint_of, has_footprints
+from .versions import Interaction, footprint_of, has_footprints
 
 PIXEL = 0.4
 """Standard deviation of a footprint in pixels. The random positions of samples in a pixel already
@@ -57,7 +57,7 @@ def footprint_inputs() -> tuple[str, ...]:
     return ("t", "wi", "sh_frame", "dp_du", "dp_dv", *own)
 
 
-def seen_metric(si: Any, inverse: tuple, angle: float) -> tuple[list, Any]:
+def seen_metric(si: Interaction, inverse: tuple, angle: float) -> tuple[list, Any]:
     """Return the metric of the renderer's footprint, or where there is none, of the cone's.
 
     Parameters
@@ -110,7 +110,7 @@ def footprint_metric(footprint: tuple, inverse: tuple) -> tuple[list, Any]:
     return [n00 * n00 + n10 * n10, n00 * n01 + n10 * n11, n01 * n01 + n11 * n11], present
 
 
-def metric(si: Any, inverse: tuple, angle: float) -> tuple[list, Any]:
+def metric(si: Interaction, inverse: tuple, angle: float) -> tuple[list, Any]:
     """Return the metric of the texture plane in which the footprint of a pixel is the unit circle.
 
     At the distance t along the ray direction d, the cone of a pixel has the radius

@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.backend.arrays import Bool, types_of
 from eigengs_dr.raster.evaluate import widen
 from eigengs_dr.raster.lookup.points import cell_side, fold, list_cells, sum_at_points, value_terms
 from eigengs_dr.raster.parameters import (
@@ -34,6 +34,7 @@ from eigengs_dr.raster.parameters import (
 )
 
 from .color import brightness, show_all
+from .versions import Texture
 
 RESOLVED = 0.65
 """Standard deviation of a Gaussian, in spacings of the points, that the points resolve."""
@@ -64,7 +65,7 @@ class Survey:
     largest: Any
 
 
-def make_survey(texture: Any) -> Survey:
+def make_survey(texture: Texture) -> Survey:
     """Evaluate the brightness of a ``gaussian_texture`` in cells.
 
     Cells are as large as texels, or smaller if a Gaussian needs it. If `MOST` or `FINEST` forbids
@@ -119,7 +120,7 @@ def _smallest_deviation(rows: list) -> float:
     return EXP2_SCALE * float(dr.rsqrt(dr.maximum(dr.max(dr.select(drawn, steepest, 0)), 1e-12))[0])
 
 
-def _grid(texture: Any, smallest: float) -> tuple[int, int, float]:
+def _grid(texture: Texture, smallest: float) -> tuple[int, int, float]:
     """Return the number of columns and rows of points, and their spacing in texels."""
     size = np.array([[texture.width], [texture.height]])
     linear = np.array(texture.to_uv.matrix, np.float64)[:2, :2] * size
@@ -130,7 +131,7 @@ def _grid(texture: Any, smallest: float) -> tuple[int, int, float]:
     return columns, rows, float((spans / (columns, rows)).max())
 
 
-def _widened(texture: Any, rows: list, deviation: float) -> tuple[Any, Any]:
+def _widened(texture: Texture, rows: list, deviation: float) -> tuple[Any, Any]:
     """Return the Gaussians convolved with a round one: their parameters and their cells."""
     types = types_of(texture.packed)
     variance, zero = dr.opaque(types.Float, deviation**2), types.Float(0)
@@ -197,7 +198,7 @@ class Emission:
     rows: int
     cells: Any
 
-    def sample(self, sample: Any, active: Any) -> tuple[Any, Any]:
+    def sample(self, sample: Any, active: Bool) -> tuple[Any, Any]:
         """Return positions (Point2f) and their densities for samples of the unit square."""
         cell, _, rest = self.cells.sample(sample, active)
         p = mi.Point2f(cell) + 0.5 + mi.warp.square_to_tent(rest)
@@ -206,7 +207,7 @@ class Emission:
         p = dr.minimum(p, 2 - p)
         return p, self.density(p, active)
 
-    def density(self, p: Any, active: Any) -> Any:
+    def density(self, p: Any, active: Bool) -> Any:
         """Return the density at positions; 0 outside of the unit square."""
         inside = (p.x >= 0) & (p.x <= 1) & (p.y >= 0) & (p.y <= 1)
         x, y = (

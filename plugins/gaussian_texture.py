@@ -14,6 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from eigengs_dr.backend.arrays import Bool
 from eigengs_dr.backend.recording import guest, without_collector
 from eigengs_dr.image.color import rendered_as
 from eigengs_dr.raster.lookup.footprint import arrange
@@ -54,7 +55,7 @@ from .properties import (
     source_of,
     wrap_mode,
 )
-from .versions import register_texture, texture_class
+from .versions import Interaction, Properties, Texture, register_texture, texture_class
 
 
 def gaussian_texture() -> type:
@@ -96,7 +97,7 @@ def gaussian_texture() -> type:
         """
 
         @guest()  # a thread of Mitsuba, whose caller may hold the lock
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: Properties) -> None:
             super().__init__(props)
             self.source = source_of(props)
             self.file = file_name(props)
@@ -177,7 +178,7 @@ def gaussian_texture() -> type:
         # --- Lookups -----------------------------------------------------------------------------
 
         @without_collector
-        def eval(self, si: Any, active: Any = True) -> Any:
+        def eval(self, si: Interaction, active: Bool = True) -> Any:
             color = self._color(si, active)
             if len(color) == 1 or mi.is_monochromatic:
                 return mi.UnpolarizedSpectrum(luminance(color))
@@ -191,11 +192,11 @@ def gaussian_texture() -> type:
             return upsample(mi.Color3f(*color), si.wavelengths, self.spectra)
 
         @without_collector
-        def eval_1(self, si: Any, active: Any = True) -> Any:
+        def eval_1(self, si: Interaction, active: Bool = True) -> Any:
             return luminance(self._color(si, active))
 
         @without_collector
-        def eval_3(self, si: Any, active: Any = True) -> Any:
+        def eval_3(self, si: Interaction, active: Bool = True) -> Any:
             if self.channels != 3:
                 raise ValueError(
                     f"{_name(self)}: a lookup of three channels, such as a normal map, needs a set "
@@ -204,7 +205,7 @@ def gaussian_texture() -> type:
             return mi.Color3f(*self._color(si, active))
 
         @without_collector
-        def eval_1_grad(self, si: Any, active: Any = True) -> Any:
+        def eval_1_grad(self, si: Interaction, active: Bool = True) -> Any:
             (x, sx), (y, sy), active = self._point(si, active)
             terms = gradient_terms(kernel_radius(self.cutoff))
             number = NUM_SHAPE_PARAMS + self.channels
@@ -217,12 +218,12 @@ def gaussian_texture() -> type:
             du, dv = du * sx * self.width, dv * sy * self.height
             return mi.Vector2f(*self.transform.pull_back(du, dv))
 
-        def _color(self, si: Any, active: Any) -> list:
+        def _color(self, si: Interaction, active: Bool) -> list:
             """Look up the channels, decoded and clamped unless `raw`."""
             color = reused(self, si, self.inputs, lambda: self._look_up(si))
             return [dr.select(active, c, 0) for c in color]
 
-        def _look_up(self, si: Any) -> list:
+        def _look_up(self, si: Interaction) -> list:
             """Look up the channels in all lanes; 0 where uv is not finite."""
             (x, sx), (y, sy), valid = self._point(si, True)
             if self.filtered():
@@ -232,7 +233,7 @@ def gaussian_texture() -> type:
             sums = [s + b for s, b in zip(sums, self.background, strict=True)]
             return [dr.select(valid, s, 0) for s in show_all(self, sums)]
 
-        def _point(self, si: Any, active: Any) -> tuple:
+        def _point(self, si: Interaction, active: Bool) -> tuple:
             """Fold uv into the image: x, y in pixels with their slopes, active if uv is finite."""
             u, v = self.transform.apply(si.uv)
             active = mi.Bool(active) & dr.isfinite(u) & dr.isfinite(v)
@@ -243,15 +244,15 @@ def gaussian_texture() -> type:
         # --- Sampling ----------------------------------------------------------------------------
 
         @without_collector
-        def sample_position(self, sample: Any, active: Any = True) -> tuple:
+        def sample_position(self, sample: Any, active: Bool = True) -> tuple:
             return self._emission().sample(sample, active)
 
         @without_collector
-        def pdf_position(self, p: Any, active: Any = True) -> Any:
+        def pdf_position(self, p: Any, active: Bool = True) -> Any:
             return self._emission().density(p, active)
 
         @without_collector
-        def sample_spectrum(self, si: Any, sample: Any, active: Any = True) -> tuple:
+        def sample_spectrum(self, si: Interaction, sample: Any, active: Bool = True) -> tuple:
             if not mi.is_spectral:
                 return mi.Color0f(), self.eval(si, active)
             width = mi.MI_CIE_MAX - mi.MI_CIE_MIN
@@ -259,7 +260,7 @@ def gaussian_texture() -> type:
             si.wavelengths = mi.MI_CIE_MIN + width * sample
             return si.wavelengths, self.eval(si, active) * width
 
-        def pdf_spectrum(self, si: Any, active: Any = True) -> Any:
+        def pdf_spectrum(self, si: Interaction, active: Bool = True) -> Any:
             if not mi.is_spectral:
                 return mi.Color0f()
             inside = (si.wavelengths >= mi.MI_CIE_MIN) & (si.wavelengths <= mi.MI_CIE_MAX)
@@ -314,14 +315,14 @@ def gaussian_texture() -> type:
     return GaussianTexture
 
 
-def _name(texture: Any) -> str:
+def _name(texture: Texture) -> str:
     return f"gaussian_texture {texture.id()!r}" if texture.id() else "gaussian_texture"
 
 
 class _Refusal:
     """The class for scalar variants, which raises an error."""
 
-    def __init__(self, props: Any) -> None:
+    def __init__(self, props: Properties) -> None:
         raise RuntimeError(
             f"gaussian_texture does not support the variant {mi.variant()}; "
             "use mi.set_variant('llvm_ad_rgb') or another llvm or cuda variant"

@@ -18,6 +18,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from eigengs_dr.backend.arrays import Bool, Float
 from eigengs_dr.raster.lookup.footprint import bound_covariance
 from eigengs_dr.raster.lookup.points import sum_at_points, value_terms
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered, where_any
@@ -25,6 +26,7 @@ from eigengs_dr.raster.lookup.pyramid import is_minified, sum_pyramid
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
 
 from .cone import seen_metric
+from .versions import Interaction, Texture
 
 
 class _Lookups(threading.local):
@@ -43,7 +45,7 @@ class _Lookups(threading.local):
 _lookups = _Lookups()
 
 
-def reused(texture: Any, si: Any, inputs: tuple, look_up: Callable[[], list]) -> list:
+def reused(texture: Texture, si: Interaction, inputs: tuple, look_up: Callable[[], list]) -> list:
     """Return the result of a lookup, from an earlier one with the same inputs if there is one.
 
     Parameters
@@ -85,7 +87,7 @@ def _is_traced() -> bool:
     return dr.flag(dr.JitFlag.SymbolicScope) and not dr.flag(dr.JitFlag.FreezingScope)
 
 
-def sum_here(texture: Any, x: Any, y: Any, active: Any) -> list:
+def sum_here(texture: Texture, x: Float, y: Float, active: Bool) -> list:
     """Sum the Gaussians at a point.
 
     Parameters
@@ -104,7 +106,7 @@ def sum_here(texture: Any, x: Any, y: Any, active: Any) -> list:
     count, terms = texture.channels, value_terms(kernel_radius(texture.cutoff))
     number = NUM_SHAPE_PARAMS + count
 
-    def look_up(packed: Any, x: Any, y: Any, arranged: Any) -> list:
+    def look_up(packed: Float, x: Float, y: Float, arranged: Float) -> list:
         return sum_at_points(texture.cells, packed, number, x, y, active, terms, count, arranged)
 
     if not dr.grad_enabled(texture.packed):
@@ -114,7 +116,9 @@ def sum_here(texture: Any, x: Any, y: Any, active: Any) -> list:
     return _with_gradient(value, look_up(texture.packed, x, y, None))
 
 
-def sum_over_footprint(texture: Any, si: Any, column: tuple, row: tuple, active: Any) -> list:
+def sum_over_footprint(
+    texture: Texture, si: Interaction, column: tuple, row: tuple, active: Bool
+) -> list:
     """Average the sum of Gaussians over the footprint around a point.
 
     Parameters
@@ -145,7 +149,7 @@ def sum_over_footprint(texture: Any, si: Any, column: tuple, row: tuple, active:
     count, cutoff = texture.channels, texture.cutoff
     number = NUM_SHAPE_PARAMS + count
 
-    def look_up(source: tuple, x: Any, y: Any, arranged: Any) -> list:
+    def look_up(source: tuple, x: Float, y: Float, arranged: Float) -> list:
         packed, pyramid, average = source
         sharp = sum_prefiltered(
             texture.sizes, packed, number, x, y, footprint, near, cutoff, arranged

@@ -16,7 +16,7 @@ from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians
 from eigengs_dr.image.color import SPACES
 
 from .parameters import FromModel, FromSet, shared_file
-from .versions import has_footprints
+from .versions import Properties, has_footprints
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class UvTransform:
         return a * du + c * dv, b * du + d * dv
 
 
-def read_transform(props: Any) -> Any:
+def read_transform(props: Properties) -> Any:
     """Read ``to_uv``, by default the identity.
 
     Parameters
@@ -112,7 +112,7 @@ WRAPS = ("repeat", "mirror", "clamp")
 """Names of the ways to continue an image outside of its borders."""
 
 
-def source_of(props: Any) -> FromSet | FromModel:
+def source_of(props: Properties) -> FromSet | FromModel:
     """Read the Gaussians from the properties ``filename``, ``model`` or ``mean``, ...
 
     Raises
@@ -144,7 +144,7 @@ def source_of(props: Any) -> FromSet | FromModel:
     return FromSet(gaussians, shared)
 
 
-def _first(props: Any) -> int | None:
+def _first(props: Properties) -> int | None:
     """Read ``first``, the number of Gaussians to use from a file; None for all."""
     value = props.get("first", 0)
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
@@ -152,7 +152,7 @@ def _first(props: Any) -> int | None:
     return value or None
 
 
-def _map(props: Any) -> str | None:
+def _map(props: Properties) -> str | None:
     """Read ``map``, the name of a map of a material; None without this property."""
     value = props.get("map", None)
     if value is not None and not isinstance(value, str):
@@ -160,7 +160,7 @@ def _map(props: Any) -> str | None:
     return value
 
 
-def _coefficients(props: Any) -> Any:
+def _coefficients(props: Properties) -> Any:
     """Read ``coefficients``; None, without this property, stands for the mean image."""
     if "coefficients" not in props:
         return None
@@ -170,7 +170,7 @@ def _coefficients(props: Any) -> Any:
     return found.astype(np.float32)
 
 
-def _from_arrays(props: Any, backend: str) -> Gaussians:
+def _from_arrays(props: Properties, backend: str) -> Gaussians:
     """Read a set from the properties of `texture_of`."""
     missing = [key for key in (*FIELDS, "width", "height", "space") if key not in props]
     if missing:
@@ -192,17 +192,17 @@ def _from_arrays(props: Any, backend: str) -> Gaussians:
     )
 
 
-def _path(props: Any, key: str) -> str:
+def _path(props: Properties, key: str) -> str:
     """Return the path of a file by Mitsuba's resolver, which also looks beside the scene."""
     return str(mi.file_resolver().resolve(props[key]))
 
 
-def file_name(props: Any) -> str:
+def file_name(props: Properties) -> str:
     """Return the name of the file of the Gaussians, without folders; "" if there is no file."""
     return next((Path(props[key]).name for key in ("filename", "model") if key in props), "")
 
 
-def raw(props: Any) -> bool:
+def raw(props: Properties) -> bool:
     """Read ``raw``: whether lookups skip decoding and clamping."""
     value = props.get("raw", False)
     if not isinstance(value, bool):
@@ -210,14 +210,14 @@ def raw(props: Any) -> bool:
     return value
 
 
-def _number(props: Any, key: str, default: float) -> float:
+def _number(props: Properties, key: str, default: float) -> float:
     value = props.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"gaussian_texture: {key} is {value!r}; it must be a number")
     return float(value)
 
 
-def cutoff(props: Any, default: float) -> float:
+def cutoff(props: Properties, default: float) -> float:
     """Read ``cutoff`` in standard deviations; by default the cutoff of the set."""
     value = _number(props, "cutoff", default)
     if not 0 < value <= MAX_CUTOFF:
@@ -227,7 +227,7 @@ def cutoff(props: Any, default: float) -> float:
     return value
 
 
-def prefilter(props: Any) -> tuple[float, bool]:
+def prefilter(props: Properties) -> tuple[float, bool]:
     """Read ``prefilter``: the angle of a pixel in radians, or 0 for lookups at points.
 
     Returns
@@ -252,7 +252,7 @@ def prefilter(props: Any) -> tuple[float, bool]:
     return value, False
 
 
-def wrap_mode(props: Any) -> str:
+def wrap_mode(props: Properties) -> str:
     """Read ``wrap_mode``, one of `WRAPS`."""
     wrap = str(props.get("wrap_mode", "repeat"))
     if wrap not in WRAPS:

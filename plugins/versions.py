@@ -7,6 +7,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+Texture = Any
+"""A ``mitsuba.Texture`` of the current variant."""
+
+Interaction = Any
+"""A ``mitsuba.SurfaceInteraction3f`` of the current variant."""
+
+Properties = Any
+"""``mitsuba.Properties``."""
+
 
 def texture_class() -> Any:
     """Return the base class of textures: `mitsuba.Texture`, perhaps `mitsuba.Field` after 3.9."""
@@ -32,7 +41,7 @@ def has_footprints() -> bool:
     return hasattr(mi.SurfaceInteraction3f, "footprint")
 
 
-def footprint_of(si: Any) -> tuple | None:
+def footprint_of(si: Interaction) -> tuple | None:
     """Return the footprint that the renderer found, without gradients.
 
     Parameters

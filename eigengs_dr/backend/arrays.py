@@ -17,6 +17,15 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+Float = Any
+"""Floats of Dr.Jit, of the backend and precision of the caller: no static type can name them."""
+
+UInt = Any
+"""Integers of 32 bits of Dr.Jit."""
+
+Bool = Any
+"""A mask of Dr.Jit."""
+
 
 class ArrayTypes(NamedTuple):
     """The array types of one backend and one float precision."""

@@ -15,7 +15,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import ArrayTypes, types_of, upload
+from ..backend.arrays import ArrayTypes, Float, UInt, types_of, upload
 from ..backend.recording import freeze_program, release_later
 from ..gaussian.gaussians import Gaussians
 from ..raster.adjoint import adjoint_pieces, sum_pieces
@@ -247,11 +247,11 @@ def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()
     def step(
         state: Descent,
         fixed: Gaussians,
-        target: Any,
-        weight: Any,
+        target: Float,
+        weight: Float,
         lists: list[TileLists],
-        rates: Any,
-        index: Any,
+        rates: Float,
+        index: UInt,
     ) -> Descent:
         radius = kernel_radius(fixed.cutoff)
         gradient: list = []
@@ -274,7 +274,7 @@ def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()
         return _move(state, fixed, gradient, rates, index, (sizes.width, sizes.height))
 
     def _move(
-        state: Descent, fixed: Gaussians, gradient: Any, rates: Any, index: Any, size: tuple
+        state: Descent, fixed: Gaussians, gradient: Float, rates: Float, index: UInt, size: tuple
     ) -> Descent:
         """Take the step of the optimiser; all of it is one kernel with a lane per Gaussian."""
         Float = type(state.packed)
@@ -294,7 +294,7 @@ def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()
     return step
 
 
-def _sum_level(parts: Any, lists: TileLists, channels: int, count: int) -> list:
+def _sum_level(parts: Float, lists: TileLists, channels: int, count: int) -> list:
     """Return the gradient of `count` Gaussians; it is 0 for those that the lists do not hold."""
     assert lists.pieces is not None
     splat = None
@@ -324,7 +324,7 @@ def _pull_back(
         return {name: dr.grad(value) for name, value in traced.items()}
 
 
-def _prefix(pad: Any, count: int) -> Any:
+def _prefix(pad: Float, count: int) -> Any:
     """Return the first `count` entries of an array, or a number as it is."""
     if isinstance(pad, float) or dr.width(pad) in (1, count):
         return pad

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 import drjit as dr
 
-from ..backend.arrays import rsqrt, tanh, types_of
+from ..backend.arrays import Float, rsqrt, tanh, types_of
 from ..gaussian.covariance import cholesky_from_factor, factor_from_cholesky
 from ..gaussian.gaussians import Gaussians
 
@@ -163,7 +163,7 @@ class Optimizer(Protocol):
     def start(self, value: Any) -> tuple:
         """Return the moments of a variable before the first step, evaluated."""
 
-    def step(self, value: Any, gradient: Any, moments: tuple, rate: Any, time: Any) -> tuple:
+    def step(self, value: Any, gradient: Float, moments: tuple, rate: Float, time: Float) -> tuple:
         """Return the value of a variable and its moments after a step.
 
         Parameters
@@ -186,7 +186,7 @@ def zeros_like(value: Any) -> Any:
     return zeros
 
 
-def debias(beta: float, time: Any) -> Any:
+def debias(beta: float, time: Float) -> Any:
     """Return ``1 - beta^time``, the weight of all gradients in a moving average so far.
 
     Parameters
@@ -237,7 +237,7 @@ class Adam:
         """Return the moments before the first step; see `Optimizer`."""
         return zeros_like(value), zeros_like(value)
 
-    def step(self, value: Any, gradient: Any, moments: tuple, rate: Any, time: Any) -> tuple:
+    def step(self, value: Any, gradient: Float, moments: tuple, rate: Float, time: Float) -> tuple:
         """Return the value and the moments after a step; see `Optimizer`."""
         m, v = moments
         m = dr.lerp(gradient, m, self.beta_1)
@@ -285,7 +285,7 @@ class Adan:
         """Return the moments and the gradient before the first step; see `Optimizer`."""
         return tuple(zeros_like(value) for _ in range(4))
 
-    def step(self, value: Any, gradient: Any, moments: tuple, rate: Any, time: Any) -> tuple:
+    def step(self, value: Any, gradient: Float, moments: tuple, rate: Float, time: Float) -> tuple:
         """Return the value, the moments and the gradient after a step; see `Optimizer`."""
         m, v, n, previous = moments
         beta_1, beta_2, beta_3 = self.betas

@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import rsqrt
+from ..backend.arrays import Float, rsqrt
 
 Array = NDArray[np.floating]
 
@@ -133,7 +133,7 @@ def log_shapes(factor: Array) -> NDArray[np.float64]:
 # ---------------------------------------------------------------------------------------------
 
 
-def cholesky_from_factor(a: Any, b: Any, c: Any) -> tuple[Any, Any, Any]:
+def cholesky_from_factor(a: Float, b: Float, c: Float) -> tuple[Any, Any, Any]:
     """Return l1, l2, l3 of ``L = [[l1, 0], [l2, l3]]`` with ``Sigma = L L^T``.
 
     Parameters
@@ -150,7 +150,7 @@ def cholesky_from_factor(a: Any, b: Any, c: Any) -> tuple[Any, Any, Any]:
     return l1, -b / (a * c * c * l1), 1 / (a * c * l1)
 
 
-def factor_from_cholesky(l1: Any, l2: Any, l3: Any) -> tuple[Any, Any, Any]:
+def factor_from_cholesky(l1: Float, l2: Float, l3: Float) -> tuple[Any, Any, Any]:
     """Return a, b, c with ``F^T F = (L L^T)^-1``; inverse of `cholesky_from_factor`.
 
     Parameters

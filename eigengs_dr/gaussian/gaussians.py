@@ -17,7 +17,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..backend.arrays import types_in, types_of, upload, upload_rows
+from ..backend.arrays import Float, types_in, types_of, upload, upload_rows
 from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..backend.selection import select
@@ -346,7 +346,7 @@ class Gaussians:
 
 
 def clip_parameters(
-    mean: Any, factor: Any, color: Any, background: Any, width: Any, height: Any
+    mean: Any, factor: Any, color: Any, background: Any, width: Float, height: Float
 ) -> tuple[Any, Any, Any, Any]:
     """Return the parameters of Gaussians within their bounds.
 
@@ -366,7 +366,7 @@ def clip_parameters(
     longer = dr.float64_array_t(types.Float)(dr.maximum(width, height))
     low, high = types.Float(0.5 / longer), 1 / MIN_DEVIATION
 
-    def inside(x: Any, low: Any, high: Any, otherwise: Any) -> Any:
+    def inside(x: Float, low: Any, high: Any, otherwise: Any) -> Any:
         return dr.select(dr.isfinite(x), dr.clip(x, low, high), otherwise)
 
     a, b, c = factor

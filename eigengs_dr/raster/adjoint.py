@@ -6,7 +6,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..backend.arrays import types_of
+from ..backend.arrays import Float, UInt, types_of
 from .binning.lists import Pieces, TileLists
 from .evaluate import weights, weights_vjp
 from .kernels import shares_of
@@ -14,8 +14,8 @@ from .parameters import NUM_SHAPE_PARAMS, gather_index, gather_run, unpack_param
 
 
 def adjoint(
-    packed: Any,
-    delta: Any,
+    packed: Float,
+    delta: Float,
     channels: int,
     lists: TileLists,
     radius: float,
@@ -52,8 +52,8 @@ def adjoint(
 
 
 def adjoint_pieces(
-    packed: Any,
-    delta: Any,
+    packed: Float,
+    delta: Float,
     channels: int,
     lists: TileLists,
     radius: float,
@@ -81,7 +81,7 @@ def adjoint_pieces(
     shape, block = splat[:NUM_SHAPE_PARAMS], (tile_size[0], rows)
     length = block[0] * rows * channels
 
-    def add_tile(i: Any, sums: list) -> tuple:
+    def add_tile(i: UInt, sums: list) -> tuple:
         active = i < end
         tile = gather_index(types, pieces.tile, i, active)
         d = gather_run(types, delta, tile * shares + part, length, active)
@@ -89,7 +89,7 @@ def adjoint_pieces(
         x, y = types.Float(column) + 0.5, types.Float(row + part * rows) + 0.5
         color = sums[-channels:]
 
-        def cotangent(k: int, w: Any) -> Any:
+        def cotangent(k: int, w: Float) -> Any:
             g = type(w)(0)
             for c in range(channels):
                 color[c] = dr.fma(w, d[k * channels + c], color[c])
@@ -118,7 +118,7 @@ def adjoint_pieces(
     return parts
 
 
-def sum_pieces(parts: Any, pieces: Pieces, number: int, splat: Any = None) -> list:
+def sum_pieces(parts: Float, pieces: Pieces, number: int, splat: UInt = None) -> list:
     """Add the results of the pieces of every Gaussian, in the order of the pieces.
 
     Parameters
@@ -147,7 +147,7 @@ def sum_pieces(parts: Any, pieces: Pieces, number: int, splat: Any = None) -> li
     length = dr.width(parts) // dr.width(pieces.slot)  # of the shares of all lanes of a piece
     stride = -(-number // 4) * 4
 
-    def add(i: Any, sums: list) -> tuple:
+    def add(i: UInt, sums: list) -> tuple:
         values = gather_run(types, parts, i, length, i < end)
         return i + 1, [sum(values[k::stride], s) for k, s in enumerate(sums)]
 

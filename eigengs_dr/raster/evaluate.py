@@ -12,7 +12,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..backend.arrays import rcp, rsqrt, types_of
+from ..backend.arrays import Float, rcp, rsqrt, types_of
 
 LN2 = math.log(2)
 
@@ -20,7 +20,7 @@ STEEP = 122.0
 """Largest exponent of the products of `weights` before a Gaussian is steep, see `is_steep`."""
 
 
-def exp2_neg(q: Any) -> Any:
+def exp2_neg(q: Float) -> Any:
     """Return ``2^-q`` for ``-126 <= q <= 126``: relative error < 3e-7, on cuda < 5e-7.
 
     On llvm, single precision costs half of `drjit.exp2`: split ``q = n - f`` into an integer n and
@@ -47,7 +47,7 @@ def exp2_neg(q: Any) -> Any:
     return dr.reinterpret_array(types.Float, dr.reinterpret_array(types.UInt, power) + exponent)
 
 
-def falloff(q: Any, limit: float) -> Any:
+def falloff(q: Float, limit: float) -> Any:
     """Return ``2^-q`` for ``q <= limit``, else 0; the derivative is ``-ln(2)`` times the value."""
     exact = dr.detach(q)
     value = dr.select(exact <= limit, exp2_neg(exact), 0)
@@ -57,7 +57,7 @@ def falloff(q: Any, limit: float) -> Any:
 
 
 def weights(
-    shape: list, x: Any, y: Any, tile: tuple[int, int], radius: float, steep: bool = True
+    shape: list, x: Float, y: Float, tile: tuple[int, int], radius: float, steep: bool = True
 ) -> list:
     """Evaluate one Gaussian at a block of pixels: ``2^-|F (x - mu)|^2`` in the units of kernels.
 
@@ -89,7 +89,7 @@ def weights(
 
 
 def _rows(
-    shape: list, x: Any, y: Any, tile: tuple[int, int], radius: float, steep: bool
+    shape: list, x: Float, y: Float, tile: tuple[int, int], radius: float, steep: bool
 ) -> list[tuple[list, Any, Any]]:
     """Return for each row of a block its weights, and (u, v) = F (x - mu) at its column `_column`.
 
@@ -115,7 +115,7 @@ def _column(tile: tuple[int, int]) -> int:
     return min(1, tile[0] - 1)
 
 
-def _chained(a: Any, b: Any, points: list, radius: float) -> list[tuple[list, Any, Any]]:
+def _chained(a: Float, b: Float, points: list, radius: float) -> list[tuple[list, Any, Any]]:
     """Return the rows of `_rows` of 4 pixels by products, from the weights w_1 of the second pixel.
 
     With (u, v) there, ``w_2 = w_1 M`` and ``w_3 = w_2 M K`` and ``w_0 = w_1 K / M``, where
@@ -145,7 +145,7 @@ def _chained(a: Any, b: Any, points: list, radius: float) -> list[tuple[list, An
     return rows
 
 
-def _powers(value: Any, up: Any, down: Any, start: int, count: int) -> list:
+def _powers(value: Float, up: Float, down: Float, start: int, count: int) -> list:
     """Return `count` values, `value` at `start`, times `up` before it and times `down` after it."""
     values = [value]
     for _ in range(start):
@@ -184,8 +184,8 @@ def is_steep(shape: list, radius: float) -> Any:
 
 def weights_vjp(
     shape: list,
-    x: Any,
-    y: Any,
+    x: Float,
+    y: Float,
     tile: tuple[int, int],
     radius: float,
     cotangent: Callable[[int, Any], Any],

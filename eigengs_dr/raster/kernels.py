@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 
-from ..backend.arrays import ArrayTypes, types_of
+from ..backend.arrays import ArrayTypes, Float, UInt, types_of
 from .binning.lists import TileLists
 from .binning.tiles import Grid, GridArrays, granularity_of
 from .evaluate import weights
@@ -71,7 +71,12 @@ def shares_of(types: ArrayTypes, grid: Grid) -> tuple[int, int]:
 
 
 def _sum_blocks(
-    packed: Any, start: list, lists: TileLists, blocks: _Blocks, radius: float, tangent: Any = None
+    packed: Float,
+    start: list,
+    lists: TileLists,
+    blocks: _Blocks,
+    radius: float,
+    tangent: Float = None,
 ) -> list:
     """Sum the Gaussians of every block; return a list of Float, pixels times channels.
 
@@ -89,14 +94,14 @@ def _sum_blocks(
         spread = weights(shape, blocks.x, blocks.y, blocks.size, radius, steep)
         return [(w, c) for w in spread for c in color]
 
-    def add(i: Any, sums: list) -> tuple:
+    def add(i: UInt, sums: list) -> tuple:
         active = i < blocks.end
         n = gather_index(types, lists.splat, i, active)
         p = unpack_parameters(packed, n, number, active)
         terms = contributions(p, lists.steep)
         return i + 1, [dr.fma(w, c, s) for (w, c), s in zip(terms, sums, strict=True)]
 
-    def add_tangent(i: Any, sums: list) -> tuple:
+    def add_tangent(i: UInt, sums: list) -> tuple:
         active = i < blocks.end
         n = gather_index(types, lists.splat, i, active)
         p = unpack_parameters(packed, n, number, active)
@@ -118,7 +123,9 @@ def _sum_blocks(
     return sums
 
 
-def forward(packed: Any, start: list, lists: TileLists, radius: float, tangent: Any = None) -> Any:
+def forward(
+    packed: Float, start: list, lists: TileLists, radius: float, tangent: Float = None
+) -> Any:
     """Sum the Gaussians of every tile: the image, or its derivative along `tangent`.
 
     ``I_pc = start_c + sum_n w_n(p) c_nc``.
@@ -150,12 +157,12 @@ def forward(packed: Any, start: list, lists: TileLists, radius: float, tangent: 
 
 
 def residual(
-    packed: Any,
+    packed: Float,
     start: list,
     lists: TileLists,
     radius: float,
-    target: Any,
-    weight: Any = None,
+    target: Float,
+    weight: Float = None,
 ) -> tuple[Any, list]:
     """Sum the Gaussians of every tile, and compare them with an image, in one pass over memory.
 
@@ -185,7 +192,7 @@ def residual(
     sums = _sum_blocks(packed, start, lists, blocks, radius)
     length = blocks.pixels * channels
 
-    def load(image: Any) -> list:
+    def load(image: Float) -> list:
         return gather_run(types, image, blocks.run, length, True)
 
     errors = sums if target is None else [s - t for s, t in zip(sums, load(target), strict=True)]
@@ -224,21 +231,21 @@ def sum_lanes(values: list, lists: TileLists) -> list:
     return [sum_by_image(row, lists.grid) for row in rows]
 
 
-def sum_by_image(values: Any, grid: Grid) -> Any:
+def sum_by_image(values: Float, grid: Grid) -> Any:
     """Add values of all images, image after image; return a Float of shape (images,)."""
     if grid.images == 1:
         return dr.sum(values)
     return dr.block_sum(values, dr.width(values) // grid.images)
 
 
-def channel_sums(image: Any, channels: int, grid: Grid) -> list:
+def channel_sums(image: Float, channels: int, grid: Grid) -> list:
     """Sum each channel of images in tile layout; return a list of Float, shape (images,)."""
     sums = sum_channels(_pixels(image, channels, grid), channels)
     dr.eval(sums)  # one kernel for all channels
     return [sum_by_image(s, grid) for s in sums]
 
 
-def channel_moments(image: Any, channels: int, grid: Grid) -> tuple[list, list]:
+def channel_moments(image: Float, channels: int, grid: Grid) -> tuple[list, list]:
     """Sum the values and the squares of each channel, as `channel_sums`, in one pass."""
     values = _pixels(image, channels, grid)
     sums = sum_channels(values, channels)
@@ -247,7 +254,7 @@ def channel_moments(image: Any, channels: int, grid: Grid) -> tuple[list, list]:
     return [sum_by_image(s, grid) for s in sums], [sum_by_image(s, grid) for s in squares]
 
 
-def _pixels(image: Any, channels: int, grid: Grid) -> list:
+def _pixels(image: Float, channels: int, grid: Grid) -> list:
     """Read the values of each tile of images in tile layout."""
     types = types_of(image)
     return gather_run(types, image, dr.arange(types.UInt, grid.tiles), grid.pixels * channels, True)

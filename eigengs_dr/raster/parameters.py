@@ -14,7 +14,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..backend.arrays import ArrayTypes, types_of
+from ..backend.arrays import ArrayTypes, Bool, Float, UInt, types_of
 from ..gaussian.gaussians import Gaussians
 
 EXP2_SCALE = math.sqrt(0.5 / math.log(2))
@@ -106,7 +106,7 @@ def pack_parameters(values: list) -> Any:
     return packed
 
 
-def gather_run(types: ArrayTypes, source: Any, index: Any, length: int, active: Any) -> list:
+def gather_run(types: ArrayTypes, source: Any, index: UInt, length: int, active: Bool) -> list:
     """Gather ``source[index * length : (index + 1) * length]``, in packets if the length is even.
 
     Return a list of `length` Float.
@@ -115,12 +115,12 @@ def gather_run(types: ArrayTypes, source: Any, index: Any, length: int, active: 
     return list(dr.gather(types.FloatX, source, index, active, shape=shape))
 
 
-def unpack_parameters(packed: Any, index: Any, number: int, active: Any = True) -> list:
+def unpack_parameters(packed: Float, index: UInt, number: int, active: Bool = True) -> list:
     """Gather the first `number` parameters of the Gaussians `index`; undo `pack_parameters`."""
     return gather_run(types_of(packed), packed, index, -(-number // 4) * 4, active)[:number]
 
 
-def gather_index(types: ArrayTypes, splat: Any, i: Any, active: Any) -> Any:
+def gather_index(types: ArrayTypes, splat: UInt, i: UInt, active: Bool) -> Any:
     """Return ``splat[i]``, on the CPU by the gather of a pair: 8 times as fast as a single gather.
 
     `splat` must have an even length.

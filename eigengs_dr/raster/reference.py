@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..backend.arrays import types_of
+from ..backend.arrays import UInt, types_of
 from .binning.lists import TileLists
 from .evaluate import weights
 from .parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_radius
@@ -46,7 +46,7 @@ def render_plain(values: list, background: list, lists: TileLists, cutoff: float
         *values[NUM_SHAPE_PARAMS:],
     ]
 
-    def add(i: Any, sums: list) -> tuple:
+    def add(i: UInt, sums: list) -> tuple:
         active = i < end
         n = dr.gather(types.UInt, lists.splat, i, active)
         p = [dr.gather(types.Float, v, n, active) for v in scaled]
@@ -63,7 +63,7 @@ def render_plain(values: list, background: list, lists: TileLists, cutoff: float
     return dr.ravel(types.FloatX([s + b for s, b in zip(sums, background, strict=True)]), order="F")
 
 
-def _slots(lists: TileLists, UInt: Any, tile: Any) -> Any:
+def _slots(lists: TileLists, UInt: Any, tile: UInt) -> Any:
     """Return the positions of tiles in `TileLists.order`."""
     slot = dr.empty(UInt, lists.grid.tiles)
     dr.scatter(slot, dr.arange(UInt, lists.grid.tiles), lists.order)

@@ -15,7 +15,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import ArrayTypes, make_divisor, types_of
+from ..backend.arrays import ArrayTypes, Float, UInt, make_divisor, types_of
 from ..backend.recording import exclusive
 from ..gaussian.file import MAX_CUTOFF, check_index_range
 from ..gaussian.gaussians import Fitted, Gaussians, set_of
@@ -252,7 +252,7 @@ def decode_parameters(gaussians: Gaussians) -> KernelParameters:
 
 def bin_gaussians(
     gaussians: Gaussians,
-    pad: Any = 0.0,
+    pad: Float = 0.0,
     growth: float = 1.0,
     adjoint: bool = True,
     images: int = 1,
@@ -376,7 +376,7 @@ def batch_to_tiles(types: ArrayTypes, images: NDArray[Any]) -> Any:
     return result
 
 
-def batch_from_tiles(image: Any, grid: Grid, channels: int) -> NDArray[Any]:
+def batch_from_tiles(image: Float, grid: Grid, channels: int) -> NDArray[Any]:
     """Copy a batch of images from tile layout to an array (M, height, width, channels)."""
     tile_width, tile_height = grid.tile
     tiles = image.numpy().reshape(grid.images, grid.ny, grid.nx, tile_height, tile_width, channels)
@@ -386,7 +386,7 @@ def batch_from_tiles(image: Any, grid: Grid, channels: int) -> NDArray[Any]:
     return np.ascontiguousarray(whole[:, : grid.height, : grid.width])
 
 
-def to_tensor(image: Any, grid: Grid, channels: int) -> Any:
+def to_tensor(image: Float, grid: Grid, channels: int) -> Any:
     """Convert an image from tile layout to a tensor (height, width, channels); differentiable."""
     types = types_of(image)
     rows = dr.custom(_Rows, image, grid, channels)
@@ -412,7 +412,7 @@ def _crop(types: ArrayTypes, rows: Any, grid: Grid, channels: int) -> Any:
 class _Rows(dr.CustomOp):
     """Permutation from tile layout to rows of pixels; the transpose permutes back."""
 
-    def eval(self, image: Any, grid: Grid, channels: int) -> Any:
+    def eval(self, image: Float, grid: Grid, channels: int) -> Any:
         types = types_of(image)
         runs = dr.arange(types.UInt, grid.nx * grid.ny * grid.tile[1])
         columns = make_divisor(types, grid.nx)  # in arrays, for programs that serve every size
@@ -429,7 +429,7 @@ class _Rows(dr.CustomOp):
     def backward(self) -> None:
         self.set_grad_in("image", self._permute(self.grad_out(), self.by_row, self.by_tile))
 
-    def _permute(self, values: Any, source: Any, target: Any) -> Any:
+    def _permute(self, values: Float, source: UInt, target: UInt) -> Any:
         types = types_of(values)
         result = dr.empty(types.Float, self.run * dr.width(source))
         dr.scatter(result, types.FloatX(gather_run(types, values, source, self.run, True)), target)

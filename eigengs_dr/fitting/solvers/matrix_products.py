@@ -14,7 +14,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.arrays import rcp, types_of
+from ...backend.arrays import Float, rcp, types_of
 from ...gaussian.file import MAX_CUTOFF
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint
@@ -55,7 +55,7 @@ def inner_products(
 
 
 def apply(
-    shape: list, x: Unknowns, lists: TileLists, cutoff: float, target: Any = None
+    shape: list, x: Unknowns, lists: TileLists, cutoff: float, target: Float = None
 ) -> tuple[Any, list]:
     """Return ``A x - D``, and for each lane the sums of its squares."""
     packed = pack_parameters([*shape, *x[0]])
@@ -63,14 +63,14 @@ def apply(
 
 
 def apply_transposed(
-    shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float
+    shape: list, delta: Float, channels: int, lists: TileLists, cutoff: float
 ) -> Unknowns:
     """Return ``A^T d``: correlations with every Gaussian, and the sum of every channel."""
     color = correlate(shape, delta, channels, lists, cutoff)
     return color, channel_sums(delta, channels, lists.grid)
 
 
-def correlate(shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float) -> list:
+def correlate(shape: list, delta: Float, channels: int, lists: TileLists, cutoff: float) -> list:
     """Return for each channel the correlations of an image with every Gaussian."""
     packed = pack_parameters([*shape, *[type(delta)(0)] * channels])
     return adjoint(packed, delta, channels, lists, kernel_radius(cutoff), color_only=True)
@@ -88,7 +88,7 @@ def inverse_diagonal(shape: list, channels: int, lists: TileLists, cutoff: float
 
 
 def apply_squared(
-    shape: list, delta: Any, channels: int, lists: TileLists, cutoff: float
+    shape: list, delta: Float, channels: int, lists: TileLists, cutoff: float
 ) -> Unknowns:
     """Apply `apply_transposed` with ``w^2``, the weight of a Gaussian narrower by sqrt 2."""
     root = math.sqrt(2)
@@ -127,6 +127,6 @@ def add_multiple(x: Unknowns, factors: list, y: Unknowns, image: Any) -> Unknown
     return color, [dr.fma(f, b, a) for a, f, b in zip(x[1], factors, y[1], strict=True)]
 
 
-def spread(values: Any, image: Any) -> Any:
+def spread(values: Float, image: Any) -> Any:
     """Return the value of the image of each entry; `image` is None if there is only one."""
     return values if image is None else dr.gather(type(values), values, image)

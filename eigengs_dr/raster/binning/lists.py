@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ...backend.arrays import ArrayTypes, make_divisor, types_of, upload
+from ...backend.arrays import ArrayTypes, Bool, Float, UInt, make_divisor, types_of, upload
 from ..evaluate import is_steep
 from .order import order_lanes, transpose_by_counting, transpose_by_sorting
 from .tiles import TILE, Grid, GridArrays, for_each_row, for_each_tile, granularity_of
@@ -100,7 +100,7 @@ def build_lists(
     shape: list,
     radius: float,
     grid: Grid,
-    pad: Any = 0.0,
+    pad: Float = 0.0,
     growth: float = 1.0,
     adjoint: bool = True,
 ) -> TileLists:
@@ -192,16 +192,16 @@ def _padded(count: int) -> int:
     return (count // step + 1) * step
 
 
-def _count_tiles(types: ArrayTypes, shape: list, radius: Any, grid: GridArrays, pad: Any) -> Any:
+def _count_tiles(types: ArrayTypes, shape: list, radius: Any, grid: GridArrays, pad: Float) -> Any:
     """Return the number of tiles that each Gaussian touches, UInt32 of shape (N,)."""
 
-    def add(row: Any, first: Any, last: Any, total: Any) -> Any:
+    def add(row: UInt, first: UInt, last: UInt, total: UInt) -> Any:
         return total + types.UInt(dr.maximum(last - first, 0))
 
     return for_each_row(shape, radius, grid, add, types.UInt(0), pad=pad, label="count tiles")
 
 
-def _read_totals(types: ArrayTypes, touched: Any, steep: Any) -> tuple[int, bool]:
+def _read_totals(types: ArrayTypes, touched: Bool, steep: Any) -> tuple[int, bool]:
     """Read the number of all entries, and whether a Gaussian is steep, in one copy."""
     UInt64 = dr.uint64_array_t(types.UInt)
     # The sum of both needs one reduction: the flags count in the bits above all entries.
@@ -214,8 +214,8 @@ def _emit_tiles(
     shape: list,
     radius: Any,
     grid: GridArrays,
-    pad: Any,
-    image: Any,
+    pad: Float,
+    image: Float,
     slots: tuple,
     capacity: int,
 ) -> Any:
@@ -226,7 +226,7 @@ def _emit_tiles(
     dr.make_opaque(tiles)
     first = types.UInt(0) if grid.image is None else image * grid.image.divisor
 
-    def emit(tile: Any, column: Any, row: Any, active: Any, slot: Any) -> Any:
+    def emit(tile: UInt, column: UInt, row: UInt, active: Bool, slot: UInt) -> Any:
         tile = types.UInt(tile) + first
         dr.scatter(tiles, tile, slot, active & (slot < last))
         return slot + dr.select(active, types.UInt(1), 0)
@@ -235,7 +235,7 @@ def _emit_tiles(
     return tiles
 
 
-def _lanes(types: ArrayTypes, grid: Grid, starts: Any) -> tuple[Any, Any, Any]:
+def _lanes(types: ArrayTypes, grid: Grid, starts: UInt) -> tuple[Any, Any, Any]:
     """Return the order of the tiles, and the ranges of their lists in this order."""
     tile = dr.arange(types.UInt, grid.tiles)
     if granularity_of(types).ordered:
@@ -248,7 +248,7 @@ def _lanes(types: ArrayTypes, grid: Grid, starts: Any) -> tuple[Any, Any, Any]:
     return tile, dr.gather(types.UInt, starts, tile), dr.gather(types.UInt, starts, tile + 1)
 
 
-def _cut(types: ArrayTypes, tile: Any, tiles: tuple, slots: tuple, capacity: int) -> Pieces:
+def _cut(types: ArrayTypes, tile: UInt, tiles: tuple, slots: tuple, capacity: int) -> Pieces:
     """Cut the tiles of every Gaussian into pieces of like length, at most the granularity.
 
     Parameters
@@ -270,7 +270,7 @@ def _cut(types: ArrayTypes, tile: Any, tiles: tuple, slots: tuple, capacity: int
     # In integers: a quotient of floats on cuda may round up to one more.
     length = (last - start + number - 1) // dr.maximum(number, 1)
 
-    def write(i: Any, at: Any) -> tuple:
+    def write(i: UInt, at: UInt) -> tuple:
         active = i < stop
         dr.scatter(splat, owner, i, active)
         dr.scatter(begin, at, i, active)

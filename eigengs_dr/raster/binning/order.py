@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from ...backend.arrays import ArrayTypes, upload
+from ...backend.arrays import ArrayTypes, UInt, upload
 
 RADIX_BITS = 8
 """Largest number of bits of one pass of the radix sort. A pass of Dr.Jit keeps the order of equal
@@ -23,7 +23,7 @@ keys up to 9 bits on cuda, where its counts fit into shared memory."""
 
 
 def transpose_by_counting(
-    types: ArrayTypes, number: int, tile: Any, last: Any, entries: int, capacity: int
+    types: ArrayTypes, number: int, tile: UInt, last: UInt, entries: int, capacity: int
 ) -> tuple[Any, Any]:
     """Transpose by SciPy's counting sort: one pass over the entries, on the host.
 
@@ -65,7 +65,7 @@ def transpose_pattern(columns: NDArray[np.int32], starts: NDArray[np.int32], num
 
 
 def transpose_by_sorting(
-    types: ArrayTypes, number: int, tile: Any, last: Any, entries: int, capacity: int
+    types: ArrayTypes, number: int, tile: UInt, last: UInt, entries: int, capacity: int
 ) -> tuple[Any, Any]:
     """Transpose by a stable radix sort of the bits that tiles need, on the device.
 
@@ -99,7 +99,7 @@ def _sort_stably(key: Any, value: Any, bits: int) -> tuple[Any, Any]:
     return key, value
 
 
-def _search(size: Any, values: Any, bound: Any) -> Any:
+def _search(size: Any, values: UInt, bound: UInt) -> Any:
     """Return how many of the first `size` values, which ascend, are below each bound.
 
     The steps depend on the number of bits of the width only, so that few programs serve all sizes;

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 
-from ...backend.arrays import ArrayTypes, Divisor, make_divisor, rcp, rsqrt, types_of
+from ...backend.arrays import ArrayTypes, Divisor, Float, UInt, make_divisor, rcp, rsqrt, types_of
 
 
 class Granularity(NamedTuple):
@@ -149,11 +149,11 @@ class GridArrays:
         """Number of columns of tiles, as Int32."""
         return dr.int32_array_t(self.row.divisor)(self.row.divisor)
 
-    def image_of(self, tile: Any) -> Any:
+    def image_of(self, tile: UInt) -> Any:
         """Return the image of a tile, by its index among all tiles; None for a single image."""
         return None if self.image is None else self.image.divmod(tile)[0]
 
-    def first_pixel(self, tile: Any) -> tuple[Any, Any]:
+    def first_pixel(self, tile: UInt) -> tuple[Any, Any]:
         """Return the column and the row of the first pixel of a tile in its image, as integers."""
         if self.image is not None:
             tile = self.image.divmod(tile)[1]
@@ -162,7 +162,7 @@ class GridArrays:
 
 
 def tile_columns(
-    shape: list, radius: Any, grid: GridArrays, row: Any, pad: Any = 0.0
+    shape: list, radius: Any, grid: GridArrays, row: UInt, pad: Float = 0.0
 ) -> tuple[Any, Any]:
     """Return the columns `[first, last)` that the ellipse of a Gaussian touches in a row of tiles.
 
@@ -198,7 +198,7 @@ def tile_columns(
     b1, c1 = b * larger, c * larger
     peak = -radius * b1 * rsqrt(dr.fma(b1, b1, c1 * c1)) * rcp(c)
 
-    def half_width(dy: Any) -> Any:
+    def half_width(dy: Float) -> Any:
         return dr.safe_sqrt(radius * radius - dr.square(c * dy))
 
     inverse = rcp(a)
@@ -214,7 +214,7 @@ def tile_columns(
     return dr.select(hit, Int(first), 0), dr.select(hit, Int(last), 0)
 
 
-def tile_rows(shape: list, radius: Any, grid: GridArrays, pad: Any = 0.0) -> tuple[Any, Any]:
+def tile_rows(shape: list, radius: Any, grid: GridArrays, pad: Float = 0.0) -> tuple[Any, Any]:
     """Return the rows of tiles `[first, last)` that the ellipse may touch; see `tile_columns`."""
     Int = types_of(shape[0]).Int
     my, c = shape[1], shape[4]
@@ -234,7 +234,7 @@ def for_each_row(
     visit: Callable[..., Any],
     state: Any,
     *,
-    pad: Any = 0.0,
+    pad: Float = 0.0,
     label: str,
 ) -> Any:
     """Call `visit` for every Gaussian and every row of tiles that its ellipse may touch.
@@ -253,7 +253,7 @@ def for_each_row(
     """
     row, stop = tile_rows(shape, radius, grid, pad)
 
-    def body(row: Any, state: Any) -> tuple:
+    def body(row: UInt, state: Any) -> tuple:
         first, last = tile_columns(shape, radius, grid, row, pad)
         return row + 1, visit(row, first, last, state)
 
@@ -269,7 +269,7 @@ def for_each_tile(
     visit: Callable[..., Any],
     state: Any,
     *,
-    pad: Any = 0.0,
+    pad: Float = 0.0,
     label: str,
 ) -> Any:
     """Call `visit` for every Gaussian and every tile that its ellipse touches, row by row.
@@ -296,8 +296,8 @@ def for_each_tile(
         The final `state`.
     """
 
-    def visit_row(row: Any, first: Any, last: Any, state: Any) -> Any:
-        def body(column: Any, state: Any) -> tuple:
+    def visit_row(row: UInt, first: Float, last: UInt, state: Any) -> Any:
+        def body(column: UInt, state: Any) -> tuple:
             tile = row * grid.nx + column
             return column + 1, visit(tile, column, row, column < last, state)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import drjit as dr
 
-from ...backend.arrays import rcp, rsqrt
+from ...backend.arrays import Float, UInt, rcp, rsqrt
 from ..evaluate import falloff, weights, widen
 from ..parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_covariance
 from .points import in_list_order
@@ -51,7 +51,7 @@ def bound_covariance(metric: list) -> tuple[list, Any]:
     return covariance, blind
 
 
-def inside_share(shape: list, footprint: list, x: Any, y: Any, width: int, height: int) -> Any:
+def inside_share(shape: list, footprint: list, x: Float, y: Float, width: int, height: int) -> Any:
     """Return the part of the product of a footprint and a Gaussian that lies in the image.
 
     The product is a Gaussian with the mean ``x - Sigma_f Sigma'^-1 (x - mu)`` and the covariance
@@ -80,7 +80,9 @@ def inside_share(shape: list, footprint: list, x: Any, y: Any, width: int, heigh
     u, v = dr.fma(a, dx, b * dy), c * dy
     gx, gy = a * u, dr.fma(b, u, c * v)
 
-    def strip(center: Any, along: Any, across: Any, other: Any, variance: Any, side: int) -> Any:
+    def strip(
+        center: Float, along: Float, across: Float, other: Float, variance: Float, side: int
+    ) -> Any:
         left = dr.fma(a, along, b * across), c * across
         rest = dr.maximum(variance - dr.fma(left[0], left[0], left[1] * left[1]), 1e-6)
         steep = rsqrt(rest) * (math.sqrt(0.5) / EXP2_SCALE)
@@ -91,7 +93,7 @@ def inside_share(shape: list, footprint: list, x: Any, y: Any, width: int, heigh
     return strip(x, fxx, fxy, shift_x, fxx, width) * strip(y, fxy, fyy, shift_y, fyy, height)
 
 
-def quick_erf(x: Any) -> Any:
+def quick_erf(x: Float) -> Any:
     """Return the error function to 0.005 at a fifth of its cost.
 
     The odd polynomial of degree 7 has the slope 0 at both ends of [-2, 2].
@@ -106,7 +108,7 @@ def widened_values(footprint: list, radius: float) -> Any:
     """Return the `terms` of `sum_at_points` for the filtered sum, without borders."""
     scaled = kernel_covariance(footprint)
 
-    def terms(splat: list, x: Any, y: Any) -> list:
+    def terms(splat: list, x: Float, y: Float) -> list:
         shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], scaled)
         (w,) = weights(shape, x, y, (1, 1), radius)
         w = w * amplitude
@@ -115,7 +117,7 @@ def widened_values(footprint: list, radius: float) -> Any:
     return terms
 
 
-def arrange(splat: Any, shape: list, color: list) -> Any:
+def arrange(splat: UInt, shape: list, color: list) -> Any:
     """Copy the parameters of a set to the order of lists, for `arranged_values`.
 
     Parameters
@@ -146,7 +148,7 @@ def arranged_values(footprint: list, radius: float) -> Any:
     fxx, fxy, fyy = kernel_covariance(footprint)
     own = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0)
 
-    def terms(splat: list, x: Any, y: Any) -> list:
+    def terms(splat: list, x: Float, y: Float) -> list:
         mean_x, mean_y, p, t, r = splat[:NUM_SHAPE_PARAMS]
         dx, dy = x - mean_x, y - mean_y
         xy, yy = dr.fma(t, r, fxy), dr.fma(r, r, fyy)

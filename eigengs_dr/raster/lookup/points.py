@@ -15,7 +15,7 @@ from typing import Any
 
 import drjit as dr
 
-from ...backend.arrays import types_of
+from ...backend.arrays import Bool, Float, UInt, types_of
 from ..binning.lists import build_lists
 from ..binning.tiles import Grid
 from ..evaluate import LN2, weights
@@ -91,7 +91,7 @@ MAX_ARRANGED = 1 << 20
 """Largest number of entries of lists whose parameters are copied; the copies take 32 MiB."""
 
 
-def in_list_order(splat: Any, rows: list) -> Any:
+def in_list_order(splat: UInt, rows: list) -> Any:
     """Copy parameters to the order of the lists, for lookups without gradients.
 
     A lookup then reads neighbours in memory and needs no index. The adjoint would be slower, since
@@ -116,7 +116,7 @@ def in_list_order(splat: Any, rows: list) -> Any:
     return pack_parameters(unpack_parameters(packed, splat, len(rows)))
 
 
-def fold(x: Any, side: int, wrap: str) -> tuple[Any, Any]:
+def fold(x: Float, side: int, wrap: str) -> tuple[Any, Any]:
     """Move a coordinate into the image.
 
     Parameters
@@ -150,7 +150,7 @@ def fold(x: Any, side: int, wrap: str) -> tuple[Any, Any]:
     return dr.select(odd, side - local, local), dr.select(odd, -one, one)
 
 
-def cell_range(cells: Cells, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
+def cell_range(cells: Cells, x: Float, y: Float, active: Bool) -> tuple[Any, Any]:
     """Return begin and end of the list of the cell at a point; both are 0 outside the cells."""
     types = types_of(x)
     grid = cells.grid
@@ -166,14 +166,14 @@ def cell_range(cells: Cells, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
 
 def sum_at_points(
     cells: Cells,
-    packed: Any,
+    packed: Float,
     number: int,
-    x: Any,
-    y: Any,
-    active: Any,
+    x: Float,
+    y: Float,
+    active: Bool,
     terms: Callable[[list, Any, Any], list],
     count: int,
-    arranged: Any = None,
+    arranged: Float = None,
 ) -> list:
     """Sum the contributions of the Gaussians near a point.
 
@@ -206,15 +206,15 @@ def sum_at_points(
 
 
 def sum_range(
-    splat: Any,
+    splat: UInt,
     ends: tuple[Any, Any],
-    packed: Any,
+    packed: Float,
     number: int,
-    x: Any,
-    y: Any,
+    x: Float,
+    y: Float,
     terms: Callable[[list, Any, Any], list],
     count: int,
-    arranged: Any = None,
+    arranged: Float = None,
 ) -> list:
     """Sum the contributions of the Gaussians ``splat[begin:end]``, as `sum_at_points` does.
 
@@ -228,7 +228,7 @@ def sum_range(
     """
     types = types_of(packed)
 
-    def add(i: Any, end: Any, x: Any, y: Any, sums: list) -> tuple:
+    def add(i: UInt, end: Any, x: Float, y: Float, sums: list) -> tuple:
         here = i < end
         if arranged is None:
             source, index = packed, gather_index(types, splat, i, here)
@@ -251,7 +251,7 @@ def sum_range(
 def value_terms(radius: float) -> Callable[[list, Any, Any], list]:
     """Return the `terms` of `sum_at_points` for the values ``c_n w_n(x)``."""
 
-    def terms(splat: list, x: Any, y: Any) -> list:
+    def terms(splat: list, x: Float, y: Float) -> list:
         (w,) = weights(splat[:NUM_SHAPE_PARAMS], x, y, (1, 1), radius)
         return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
 
@@ -265,7 +265,7 @@ def gradient_terms(radius: float) -> Callable[[list, Any, Any], list]:
     kernels, see `eigengs_dr.raster.parameters.EXP2_SCALE`.
     """
 
-    def terms(splat: list, x: Any, y: Any) -> list:
+    def terms(splat: list, x: Float, y: Float) -> list:
         mean_x, mean_y, a, b, c = splat[:NUM_SHAPE_PARAMS]
         (w,) = weights(splat[:NUM_SHAPE_PARAMS], x, y, (1, 1), radius)
         dx, dy = x - mean_x, y - mean_y

@@ -14,7 +14,7 @@ from typing import Any
 
 import drjit as dr
 
-from ...backend.arrays import rcp, rsqrt, types_of
+from ...backend.arrays import Bool, Float, UInt, rcp, rsqrt, types_of
 from ..evaluate import weights, widen
 from ..parameters import (
     NUM_SHAPE_PARAMS,
@@ -31,14 +31,14 @@ from .size_classes import FOOTPRINT_REACH, SizeClasses
 
 def sum_prefiltered(
     sizes: SizeClasses,
-    packed: Any,
+    packed: Float,
     number: int,
-    x: Any,
-    y: Any,
+    x: Float,
+    y: Float,
     footprint: list,
-    active: Any,
+    active: Bool,
     cutoff: float,
-    arranged: Any = None,
+    arranged: Float = None,
 ) -> list:
     """Sum the Gaussians under a footprint.
 
@@ -96,7 +96,7 @@ def sum_prefiltered(
     return total
 
 
-def _ends(sizes: SizeClasses, x: Any, y: Any, widest: Any, active: Any) -> tuple[Any, Any]:
+def _ends(sizes: SizeClasses, x: Float, y: Float, widest: Any, active: Bool) -> tuple[Any, Any]:
     """Return begin and end of the shortest list that serves a footprint."""
     types = types_of(x)
     begin, end = types.UInt(0), types.UInt(0)
@@ -108,7 +108,7 @@ def _ends(sizes: SizeClasses, x: Any, y: Any, widest: Any, active: Any) -> tuple
     return begin, end
 
 
-def where_any(active: Any, compute: Callable[[], list], count: int, packed: Any) -> list:
+def where_any(active: Bool, compute: Callable[[], list], count: int, packed: Float) -> list:
     """Return sums that few points need, and skip the work for packets of lanes without one.
 
     Parameters
@@ -147,7 +147,7 @@ class _Lookup:
     footprint: list
 
 
-def _local(sizes: SizeClasses, i: Any, j: Any, x: Any, y: Any) -> tuple:
+def _local(sizes: SizeClasses, i: UInt, j: UInt, x: Float, y: Float) -> tuple:
     """Return the point in the copy (i, j), and the sign of the footprint's xy in this copy."""
     types = types_of(x)
     x, y = x - types.Float(i) * sizes.width, y - types.Float(j) * sizes.height
@@ -158,7 +158,9 @@ def _local(sizes: SizeClasses, i: Any, j: Any, x: Any, y: Any) -> tuple:
     return x, y, dr.select(odd_x == odd_y, types.Float(1), -1)
 
 
-def _sum_border(lookup: _Lookup, x: Any, y: Any, copies: list, widest: Any, active: Any) -> list:
+def _sum_border(
+    lookup: _Lookup, x: Float, y: Float, copies: list, widest: Any, active: Bool
+) -> list:
     """Sum over the lists of up to 2 x 2 copies of the image, for small footprints."""
     sizes, packed = lookup.sizes, lookup.packed
     types, channels = types_of(packed), lookup.number - NUM_SHAPE_PARAMS
@@ -174,7 +176,7 @@ def _sum_border(lookup: _Lookup, x: Any, y: Any, copies: list, widest: Any, acti
         px, py, sign = _local(sizes, i, j, x, y)
         seen = [scaled[0], scaled[1] * sign, scaled[2]]
 
-        def terms(splat: list, x: Any, y: Any, seen: list = seen) -> list:
+        def terms(splat: list, x: Float, y: Float, seen: list = seen) -> list:
             shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], seen)
             (w,) = weights(shape, x, y, (1, 1), radius)
             w = w * amplitude * inside_share(shape, seen, x, y, sizes.width, sizes.height)
@@ -187,7 +189,7 @@ def _sum_border(lookup: _Lookup, x: Any, y: Any, copies: list, widest: Any, acti
     return total
 
 
-def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> list:
+def _sum_copies(lookup: _Lookup, x: Float, y: Float, copies: list, active: Bool) -> list:
     """Sum over the copies of the image from ``copies[:2]`` to ``copies[2:]``.
 
     One loop covers the copies, the size classes, the rows of cells and the Gaussians of a row:
@@ -200,7 +202,7 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
     left, top, right, bottom = copies
     bottom = dr.select(active, bottom, top - 1)
 
-    def rows(i: Any, j: Any, k: Any) -> tuple:
+    def rows(i: UInt, j: UInt, k: UInt) -> tuple:
         """Return the rows of cells [first, last] of the size class k under the footprint."""
         square, _, _, ny, inverse, origin = _row_of(types, sizes, k)
         _, y0, _ = _local(sizes, i, j, dr.detach(x), dr.detach(y))
@@ -209,7 +211,7 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
         last = dr.minimum(dr.floor((y0 + reach - origin) * inverse), ny - 1)
         return types.Int(first), types.Int(last)
 
-    def run(i: Any, j: Any, k: Any, row: Any, valid: Any) -> tuple:
+    def run(i: UInt, j: UInt, k: UInt, row: UInt, valid: Bool) -> tuple:
         """Return the range [begin, end) in `splat` of a row of cells in the widened ellipse."""
         square, first, nx, _, inverse, origin = _row_of(types, sizes, k)
         x0, y0, sign = _local(sizes, i, j, dr.detach(x), dr.detach(y))
@@ -223,7 +225,7 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
         free = dr.fma(-xy, lean, xx)
         peak = xy * rsqrt(xx) * lookup.cutoff  # dy of the rightmost point
 
-        def half(dy: Any) -> Any:
+        def half(dy: Float) -> Any:
             return dr.safe_sqrt(free * (lookup.cutoff**2 - dy * dy * ratio))
 
         at_right, at_left = dr.clip(peak, low, high), dr.clip(-peak, low, high)
@@ -239,7 +241,16 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
         )
 
     def add(
-        n: Any, end: Any, row: Any, stop: Any, k: Any, i: Any, j: Any, x: Any, y: Any, sums: list
+        n: Any,
+        end: Any,
+        row: UInt,
+        stop: Any,
+        k: UInt,
+        i: UInt,
+        j: UInt,
+        x: Float,
+        y: Float,
+        sums: list,
     ) -> tuple:
         here = (n < end) & (j <= bottom)
         index = gather_index(types, sizes.splat, n, here)
@@ -279,7 +290,7 @@ def _sum_copies(lookup: _Lookup, x: Any, y: Any, copies: list, active: Any) -> l
     )[-1]
 
 
-def _advance(go: Any, k: Any, i: Any, j: Any, sizes: int, left: Any, right: Any) -> tuple:
+def _advance(go: Any, k: UInt, i: UInt, j: UInt, sizes: int, left: Any, right: Any) -> tuple:
     """Step to the next size class; after the last class to the next copy or row of copies."""
     k = dr.select(go, k + 1, k)
     over = k >= sizes
@@ -288,7 +299,7 @@ def _advance(go: Any, k: Any, i: Any, j: Any, sizes: int, left: Any, right: Any)
     return k, dr.select(over, left, i), dr.select(over, j + 1, j)
 
 
-def _row_of(types: Any, sizes: SizeClasses, k: Any) -> list:
+def _row_of(types: Any, sizes: SizeClasses, k: UInt) -> list:
     """Gather row k of `SizeClasses.table`."""
     row = gather_run(types, sizes.table, types.UInt(k), 8, True)  # packets need a power of two
     return row[:6]

@@ -19,7 +19,7 @@ from typing import Any
 
 import drjit as dr
 
-from ...backend.arrays import ArrayTypes, rcp, rsqrt, types_of
+from ...backend.arrays import ArrayTypes, Bool, Float, UInt, rcp, rsqrt, types_of
 from ..binning.lists import build_lists
 from ..binning.tiles import Grid
 from ..evaluate import falloff, widen
@@ -131,7 +131,9 @@ def _min_variance(level: Level) -> float:
     return 2 * (SAMPLE_DEVIATION * max(level.dx, level.dy)) ** 2
 
 
-def sum_pyramid(lattice: GaussianPyramid, x: Any, y: Any, footprint: list, active: Any) -> list:
+def sum_pyramid(
+    lattice: GaussianPyramid, x: Float, y: Float, footprint: list, active: Bool
+) -> list:
     """Filter the sum by a footprint, on the coarsest level that is fine enough.
 
     Cost: one weight and one gather for each point inside the ellipse of `SAMPLE_REACH` standard
@@ -167,14 +169,14 @@ def sum_pyramid(lattice: GaussianPyramid, x: Any, y: Any, footprint: list, activ
     reach = SAMPLE_REACH * dr.sqrt(yy)
     scale = rsqrt(determinant) * (1 / (2 * math.pi * -math.expm1(-0.5 * SAMPLE_REACH**2)))
 
-    def row_of(j: Any) -> tuple:
+    def row_of(j: UInt) -> tuple:
         """Return the columns [i, stop] of the ellipse in one row of points."""
         down = types.Float(j) - dr.detach(v)
         half = dr.safe_sqrt(free * (SAMPLE_REACH**2 - down * down * rcp(yy)))
         middle = dr.fma(lean, down, dr.detach(u))
         return types.Int(dr.ceil(middle - half)), types.Int(dr.floor(middle + half))
 
-    def add(i: Any, stop: Any, j: Any, u: Any, v: Any, sums: list) -> tuple:
+    def add(i: UInt, stop: Any, j: UInt, u: Float, v: Any, sums: list) -> tuple:
         here = i <= stop
         across, down = types.Float(i) - u, types.Float(j) - v
         q = inverse[0] * across * across + (inverse[1] * across + inverse[2] * down) * down
@@ -215,7 +217,7 @@ def _pick(types: ArrayTypes, levels: tuple[Level, ...], smallest: Any) -> list:
     return picked
 
 
-def _fold(types: ArrayTypes, index: Any, count: Any, wrap: str) -> Any:
+def _fold(types: ArrayTypes, index: UInt, count: Any, wrap: str) -> Any:
     """Move the index of a point into the level; points lie half a spacing inside the borders."""
     k = types.Float(index)
     if wrap == "repeat":
@@ -229,7 +231,7 @@ FINEST, FEWEST = 1, 8
 number of points along the shorter side of the coarsest level."""
 
 
-def build_pyramid(sizes: SizeClasses, packed: Any, number: int, cutoff: float) -> GaussianPyramid:
+def build_pyramid(sizes: SizeClasses, packed: Float, number: int, cutoff: float) -> GaussianPyramid:
     """Evaluate a sum of Gaussians at the points of all levels; differentiable.
 
     Cost: a rendering of the blurred Gaussians for the finest level, and one
@@ -272,7 +274,7 @@ def build_pyramid(sizes: SizeClasses, packed: Any, number: int, cutoff: float) -
 
 
 def _finest(
-    sizes: SizeClasses, packed: Any, number: int, points: tuple, blur: list, cutoff: float
+    sizes: SizeClasses, packed: Float, number: int, points: tuple, blur: list, cutoff: float
 ) -> list:
     """Return the blurred sum at all pixels: widen all Gaussians once, and render them.
 
