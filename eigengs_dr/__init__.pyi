@@ -4,7 +4,7 @@ from .backend.executor import ClusterError
 from .backend.recording import exclusive
 from .backend.selection import BackendError
 from .blocks.fit_large import LargeFit, fit_large
-from .codec.packing import PackResult, pack
+from .codec.packing import pack
 from .collection.fit_many import fit_many
 from .collection.manifest import ImageRow, RunInterrupted
 from .eigenbasis.eigengs import EigenGS
@@ -17,16 +17,15 @@ from .image.metrics import ms_ssim, psnr, ssim
 from .image.pixels import ImageError, LinearImage
 from .plugins import register_plugins
 from .raster.render import picture_of, render, tile_lists
-from .scene.convert import ConvertedScene, convert_scene
+from .scene.convert import convert_scene
 from .scene.fit_scene import fit_for_scene
-from .viewer.view import Page, view
+from .viewer.view import view
 
 __version__: str
 
 __all__ = [
     "BackendError",
     "ClusterError",
-    "ConvertedScene",
     "EigenGS",
     "Eigenbasis",
     "Fit",
@@ -36,8 +35,6 @@ __all__ = [
     "ImageRow",
     "LargeFit",
     "LinearImage",
-    "PackResult",
-    "Page",
     "RunInterrupted",
     "concatenate",
     "convert_scene",

@@ -98,12 +98,12 @@ def defer_interrupts() -> Iterator[Callable[[], bool]]:
     Yields
     ------
     callable
-        ``pressed() -> bool``: whether the block has received a signal.
+        ``interrupted() -> bool``: whether the block has received a signal.
 
     Examples
     --------
-    >>> with defer_interrupts() as pressed:
-    ...     pressed()
+    >>> with defer_interrupts() as interrupted:
+    ...     interrupted()
     False
     """
     if threading.current_thread() is not threading.main_thread():

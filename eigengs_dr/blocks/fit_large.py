@@ -167,8 +167,13 @@ def fit_large(
         require_writable(output)
         keep = Checkpoint(output, source.identity | _decisive(options, block), [])
     try:
-        with keep as checkpoint, defer_interrupts() if client is None else nullcontext() as pressed:
-            run = Run(source, blocks, options, executor_for(client), checkpoint, progress, pressed)
+        with (
+            keep as checkpoint,
+            defer_interrupts() if client is None else nullcontext() as interrupted,
+        ):
+            run = Run(
+                source, blocks, options, executor_for(client), checkpoint, progress, interrupted
+            )
             data = run.fit()
             errors = run.measure(data)
             data = _in_unit(data, run.image.unit)

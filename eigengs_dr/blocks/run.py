@@ -48,8 +48,8 @@ class Run:
         Where blocks that are done wait for the end of the run.
     progress : callable, optional
         See `eigengs_dr.fit_large`.
-    pressed : callable, optional
-        ``pressed()``: whether the run shall end; None on a cluster.
+    interrupted : callable, optional
+        ``interrupted()``: whether the run shall end; None on a cluster.
 
     Attributes
     ----------
@@ -67,11 +67,11 @@ class Run:
         executor: Executor,
         checkpoint: Checkpoint | None = None,
         progress: Progress | None = None,
-        pressed: Callable[[], bool] | None = None,
+        interrupted: Callable[[], bool] | None = None,
     ) -> None:
         assert options.gaussians is not None
         self.image, self.blocks, self.options, self.executor = image, blocks, options, executor
-        self.checkpoint, self.progress, self.pressed = checkpoint, progress, pressed
+        self.checkpoint, self.progress, self.interrupted = checkpoint, progress, interrupted
         spacing = (image.width * image.height / options.gaussians) ** 0.5
         self.settings = Settings(options, (image.width, image.height), spacing)
         self.resumed, self.stage, self.done, self.total = 0, "", 0, 0
@@ -212,7 +212,7 @@ class Run:
             self.resumed += 1
             self._advance(steps)
             yield part, found
-        if self.pressed is not None:
+        if self.interrupted is not None:
             function = partial(function, step_done=self._step_done)
         for part, found in self._map(function, map(make_task, waiting), waiting, steps):
             if self.checkpoint is not None:
@@ -229,7 +229,7 @@ class Run:
                     raise ClusterError(f"{self.image.name}: {done.lost}")
                 yield parts[done.index], done.value
                 self._advance(steps)  # the caller has kept the result: `progress` may raise
-                self._stop_if_pressed()
+                self._stop_if_interrupted()
 
     def _window(self, block: Block) -> Window:
         return self.image.window(block.window_rows, block.window_columns)
@@ -244,15 +244,15 @@ class Run:
 
     def _step_done(self, step: int) -> None:
         self._show(step)
-        self._stop_if_pressed()
+        self._stop_if_interrupted()
 
     def _show(self, step: int) -> None:
         if self.progress:
             row = {"stage": self.stage, "blocks": len(self.blocks)}
             self.progress(self.done + step, self.total, row)
 
-    def _stop_if_pressed(self) -> None:
-        if self.pressed is not None and self.pressed():
+    def _stop_if_interrupted(self) -> None:
+        if self.interrupted is not None and self.interrupted():
             raise KeyboardInterrupt
 
 

@@ -24,14 +24,14 @@ from ..fitting.descent import FitProblem, run
 from ..fitting.fit import Fit
 from ..fitting.options import FitOptions
 from ..fitting.placement.adaptive import density_for_error, place_adaptive, squared_error
-from ..fitting.refine import is_plateau, trace_steps
-from ..fitting.schedule import Relocation, Schedule
+from ..fitting.refine import trace_steps
+from ..fitting.schedule import Relocation
 from ..fitting.solvers.conjugate_gradient import solve_batch
 from ..fitting.start import PLACEMENTS
 from ..fitting.target import make_target
 from ..gaussian.gaussians import Gaussians, like
 from ..image.color import from_sum, to_picture
-from ..image.metrics import float_space, psnr
+from ..image.metrics import MAX_PSNR, float_space, psnr
 from ..raster.kernels import forward
 from ..raster.parameters import kernel_parameters, kernel_radius, pack_parameters
 from ..raster.render import batch_from_tiles, bin_gaussians, decode_parameters
@@ -104,10 +104,9 @@ def fit_batch(
             seconds = (time.perf_counter() - started) / len(images)
             shown = _pictures(reached, len(images))
             for record, picture, pixels in zip(records, shown, images, strict=True):
-                if record.stopped != "plateau":
+                if record.stopped != "exact":
                     record.judge(step, seconds, reached, picture, pixels)
-                    record.end_at_plateau(schedule, options.iterations)
-            if all(record.stopped == "plateau" for record in records):
+            if all(record.stopped == "exact" for record in records):
                 return True
         if step % 10 == 0:
             dr.sync_thread()
@@ -153,11 +152,8 @@ class _Record:
         if figures["psnr_ycbcr"] > self.highest:
             self.best, self.highest, self.picture = reached, figures["psnr_ycbcr"], shown
             self.psnr_rgb = figures["psnr_rgb"]
-
-    def end_at_plateau(self, schedule: Schedule, iterations: int) -> None:
-        """Notice a plateau of a run with some steps."""
-        if is_plateau(self.trace, schedule, iterations):
-            self.stopped = "plateau"
+        if figures["psnr_ycbcr"] > MAX_PSNR:
+            self.stopped = "exact"
 
 
 def _start(images: Images, options: FitOptions) -> FitProblem:

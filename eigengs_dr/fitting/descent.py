@@ -27,10 +27,10 @@ from .parameterization import Parameterization
 from .schedule import (
     Relocation,
     Schedule,
-    agility_of,
     first_phase,
     lr_factor,
     next_build,
+    rate_scale_of,
     relocations,
     surplus_for,
 )
@@ -200,7 +200,7 @@ def _run_phase(
                 end = min((s for s in moves_at if s > step), default=part.stop)
                 stop, moves = next_build(schedule, step, iterations, min(end, part.stop))
                 pad, growth = variables.reach(fixed, moves)
-                pad = pad if state.agility is None else pad * state.agility
+                pad = pad if state.rate_scale is None else pad * state.rate_scale
                 counts, lists = (*levels, len(fixed)), []  # old lists make room for new ones
                 lists = [
                     bin_gaussians(
@@ -282,14 +282,14 @@ def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()
         variables, moments = {}, {}
         for k, name in enumerate(schedule.rates):
             rate = dr.gather(Float, rates, index * len(schedule.rates) + k)
-            if state.agility is not None and name != "color":
-                rate *= state.agility
+            if state.rate_scale is not None and name != "color":
+                rate *= state.rate_scale
             variables[name], moments[name] = optimizer.step(
                 state.variables[name], slopes[name], state.moments[name], rate, Float(index) + 1
             )
         variables = coordinates.project(fixed, variables, size)
         moved = coordinates.decode(fixed, variables, size)
-        return Descent(variables, moments, moved, pack(moved), state.agility)
+        return Descent(variables, moments, moved, pack(moved), state.rate_scale)
 
     return step
 
@@ -364,7 +364,7 @@ class Descent:
         gets costs a microsecond.
     packed : Float
         The parameters of this set for the kernels.
-    agility : Float or None
+    rate_scale : Float or None
         Factor of the learning rates of means and shapes, one for each Gaussian.
     """
 
@@ -372,7 +372,7 @@ class Descent:
     moments: dict[str, tuple]
     gaussians: Any
     packed: Any
-    agility: Any = None
+    rate_scale: Any = None
 
 
 def start_descent(gaussians: Gaussians, schedule: Schedule, images: int = 1) -> Descent:
@@ -381,12 +381,12 @@ def start_descent(gaussians: Gaussians, schedule: Schedule, images: int = 1) -> 
     variables = {name: dr.detach(encoded[name]) for name in schedule.rates}
     dr.eval(variables)
     moments = {name: optimizer.start(value) for name, value in variables.items()}
-    agility, Float = None, types_of(gaussians.mean).Float
-    if schedule.agility:
+    rate_scale, Float = None, types_of(gaussians.mean).Float
+    if schedule.rate_exponent:
         rows = [np.broadcast_to(row.numpy(), len(gaussians)) for row in gaussians.color]
         color = np.stack(rows, axis=1).reshape(images, -1, len(rows))
-        agility = upload(Float, agility_of(color, schedule.agility).ravel())
-    return Descent(variables, moments, gaussians, pack(gaussians), agility)
+        rate_scale = upload(Float, rate_scale_of(color, schedule.rate_exponent).ravel())
+    return Descent(variables, moments, gaussians, pack(gaussians), rate_scale)
 
 
 def pack(gaussians: Gaussians) -> Any:

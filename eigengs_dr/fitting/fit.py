@@ -57,7 +57,7 @@ class Fit:
     iterations : int
         Number of refinement steps.
     stopped : str
-        Why the fit ended: "iterations", "plateau" or "interrupted"; a search for the number of
+        Why the fit ended: "iterations", "exact" or "interrupted"; a search for the number of
         Gaussians ends with "met", "out of reach" or "interrupted".
     mean_image : ndarray of float32, shape (H, W, 3), or None
         RGB image to add to renderings of the set. The preset "eigengs" keeps the mean image of the

@@ -320,7 +320,6 @@ _ONE_RATE = Schedule(
     warm_up=0,
     drift=4e-3,
     redistribute_after=0,
-    patience=10_000,
 )
 
 PRESETS = {
@@ -332,7 +331,7 @@ PRESETS = {
             settings={"beta_1": 0.9, "beta_2": 0.9, "epsilon": 1e-12},
             rates={"mean": 0.28, "factor": 0.22, "color": 0.0115},
             relocate_every=45,
-            agility=0.5,
+            rate_exponent=0.5,
         ),
     ),
     "gaussianimage": Preset(init="random", solves=False, schedule=_ONE_RATE),

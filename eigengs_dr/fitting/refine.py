@@ -1,4 +1,4 @@
-"""Refinement: a descent that records a trace, keeps the best set and stops at a plateau."""
+"""Refinement: a descent that records a trace and keeps the best set."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Refinement(NamedTuple):
     iterations : int
         Number of steps.
     stopped : str
-        "iterations", "plateau" or "interrupted"; see also `eigengs_dr.fitting.search.search_count`.
+        "iterations", "exact" or "interrupted"; see also `eigengs_dr.fitting.search.search_count`.
     row : dict
         The row of the trace that measures the set.
     """
@@ -123,9 +123,9 @@ def refine(
             progress(step, iterations, latest)
         if interrupted():
             return True
-        if step in marks and is_plateau(trace, schedule, iterations):
-            stopped = "plateau"
-        return stopped == "plateau"
+        if trace and trace[-1]["psnr_ycbcr"] > MAX_PSNR:
+            stopped = "exact"
+        return stopped == "exact"
 
     try:
         run(problem, schedule, iterations, after, levels=levels)
@@ -155,30 +155,6 @@ def measure(
 
     ycbcr, rgb = psnrs_by_rows(shown, image, [float_space(gaussians.space), "rgb"])
     return {"seconds": seconds, "psnr_ycbcr": ycbcr, "psnr_rgb": rgb}
-
-
-PLATEAU_AFTER = 0.75
-"""Share of the steps before which no run ends. The rates have fallen to 0.17 of the highest there.
-Earlier, steps as long as these make the PSNR jump by decibels from one row of the trace to the
-next, so that nothing can be said of gains. A run of 5,000 steps that could end after half of them
-was 1 dB worse than one of 2,000."""
-
-
-def is_plateau(trace: list[dict[str, Any]], schedule: Schedule, iterations: int) -> bool:
-    """Return whether the last `patience` steps gained less than `least_gain` decibels.
-
-    The gain is that of the best row of these steps over the best row before them, from
-    `PLATEAU_AFTER` of the run on. While rates are high, a run that gains nothing gains once they
-    fall.
-    """
-    last = trace[-1]
-    if last["psnr_ycbcr"] > MAX_PSNR:
-        return True
-    begin = last["iteration"] - schedule.patience
-    late = [row for row in trace if row["iteration"] >= PLATEAU_AFTER * iterations]
-    old = [row["psnr_ycbcr"] for row in late if row["iteration"] <= begin]
-    new = [row["psnr_ycbcr"] for row in late if row["iteration"] > begin]
-    return bool(old) and not max(new) - max(old) >= schedule.least_gain
 
 
 def trace_steps(iterations: int) -> set[int]:

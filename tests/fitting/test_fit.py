@@ -97,9 +97,9 @@ def test_constant_images(backend, preset, value):
         assert figures(result)[0] > 100
 
 
-def test_black_ends_by_plateau(backend):
+def test_black_is_exact(backend):
     result = fit(np.zeros((SIDE, SIDE, 3)), SPLATS, 1000, backend=backend)
-    assert result.stopped == "plateau"
+    assert result.stopped == "exact"
     assert result.iterations < 1000
 
 

@@ -7,7 +7,7 @@ from _helpers.sets import Scene
 from _helpers.waves import SIDE, SPLATS, default, figures, picture, presets, start
 from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.options import PRESETS
-from eigengs_dr.fitting.refine import is_plateau, refine, trace_steps
+from eigengs_dr.fitting.refine import refine, trace_steps
 from eigengs_dr.image.color import rgb_to_ycbcr
 
 
@@ -52,38 +52,6 @@ def test_all_splats_on_one_pixel(backend, seed):
     assert np.isfinite(figures(result)).all()
     assert all(np.isfinite(v).all() for v in result.gaussians.to_arrays().values())
     assert figures(result)[-1] > figures(result)[0] + 1
-
-
-def test_plateau(backend):
-    """Ten steps that gain less than a thousand decibels are one, in the last quarter of a run."""
-    gaussians, target = start(backend)
-    schedule = default(patience=10, least_gain=1000.0)
-    result = refine(FitProblem(gaussians, target), picture(), schedule, 900)
-    assert (result.iterations, result.stopped) == (800, "plateau")
-    assert result.trace[-1]["iteration"] == 800
-
-
-def rows_of(decibels, every=100):
-    return [{"iteration": every * k, "psnr_ycbcr": d} for k, d in enumerate(decibels)]
-
-
-def ends_of(rows, iterations):
-    """The steps at which a run with such a trace could end."""
-    known = [rows[: n + 1] for n in range(len(rows))]
-    schedule = default(patience=300)
-    return [t[-1]["iteration"] for t in known if is_plateau(t, schedule, iterations)]
-
-
-def test_no_plateau_while_rates_are_high():
-    """More steps asked for are more steps taken, also where three quarters gain nothing."""
-    assert ends_of(rows_of([30.0] * 11), 1000) == []
-    assert ends_of(rows_of([30.0] * 21), 2000) == [1800, 1900, 2000]
-
-
-def test_no_plateau_where_the_psnr_jumps():
-    """The best row of each time counts, not that at its end."""
-    assert ends_of(rows_of([30.0] * 15 + [31, 30, 32, 31, 33, 32]), 2000) == []
-    assert ends_of(rows_of([30.0] * 15 + [33, 30, 32, 31, 33, 32]), 2000) == [1800, 1900, 2000]
 
 
 @pytest.mark.parametrize("iterations", [0, 1, 10, 55, 100, 250])

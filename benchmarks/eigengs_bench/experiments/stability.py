@@ -17,13 +17,12 @@ from eigengs_bench.harness.timing import Image, Moment, decibels, follow
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.options import PRESETS, FitOptions
-from eigengs_dr.fitting.refine import is_plateau, trace_steps
+from eigengs_dr.fitting.refine import trace_steps
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.fitting.start import initialize, mean_picture
 from eigengs_dr.gaussian.covariance import condition_number
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import rgb_to_ycbcr
-from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import picture_of
 
 FILE = "stability.jsonl"
@@ -84,27 +83,17 @@ def measure_cell(case: Case, preset: str, seed: int, backend: str | None) -> Row
 def moments(
     case: Case, image: Image, preset: str, seed: int, backend: str | None = None
 ) -> list[Moment]:
-    """Follow the descent of a preset on the image of a case, at the marks of `trace_steps`.
-
-    A case that is compared with a shorter run ends at a plateau.
-    """
+    """Follow the descent of a preset on the image of a case, at the marks of `trace_steps`."""
     method = PRESETS[preset]
     rates = {name: case.rates * rate for name, rate in method.schedule.rates.items()}
     schedule = replace(method.schedule, rates=rates)
     start = partial(_start, case, image, preset, seed, backend)
-    followed, trace = list[Moment](), list[Row]()
     mean_image = None
     if case.place is None:
         options = _options(case, preset, seed, backend)
         mean_image = mean_picture(options, image.shape[1], image.shape[0])
     marks = trace_steps(case.iterations)
-    for moment in follow(start, schedule, case.iterations, marks, mean_image):
-        followed.append(moment)
-        reached = psnr(moment.picture, image, "ycbcr")
-        trace.append({"iteration": moment.iteration, "psnr_ycbcr": reached})
-        if case.shorter and is_plateau(trace, schedule, case.iterations):
-            break
-    return followed
+    return list(follow(start, schedule, case.iterations, marks, mean_image))
 
 
 def _options(case: Case, preset: str, seed: int, backend: str | None) -> FitOptions:

@@ -27,8 +27,8 @@ class Case(NamedTuple):
 
     ``image()`` makes the image. `place`, a `Placement`, returns means and factors to start from;
     None for the start of the preset. `rates` multiplies the rates of the preset. A case `alone`
-    runs in a process of its own, for its memory. With `shorter`, the run may end at a plateau, as
-    in `fit`, and is compared with a run that was asked for as many steps.
+    runs in a process of its own, for its memory. With `shorter`, the run is compared with a
+    run that was asked for as many steps.
     """
 
     name: str
@@ -157,7 +157,7 @@ _ALL = (
     Case("fast", photo, rates=10.0),
     Case("long", photo, iterations=10_000),
     # Few Gaussians gain little early, while rates are high.
-    Case("plateau", photo, 800, 5000, shorter=1000),
+    Case("steps", photo, 800, 5000, shorter=1000),
 )
 
 CASES = {case.name: case for case in _ALL}
