@@ -84,7 +84,8 @@ def evaluate(
     UserWarning
         If a file cannot be read.
     """
-    rows, bad = [], list[str]()
+    rows: list[dict[str, float]] = []
+    bad: list[str] = []
     for image in _readable(files, basis, watch, bad):
         pictures = {
             "psnr_pca": basis.reconstruct(basis.project(image)),
@@ -198,14 +199,14 @@ def train(
         files = [name if is_url(name) else Path(folder) / name for name in checkpoint.files]
         held_out = files[HELD_OUT - 1 :: HELD_OUT]
         training = [path for i, path in enumerate(files) if i % HELD_OUT != HELD_OUT - 1]
-        with defer_interrupts() as pressed:
-            run = Run(checkpoint, settings, backend, progress, pressed, client)
+        with defer_interrupts() as interrupted:
+            run = Run(checkpoint, settings, backend, progress, interrupted, client)
             try:
                 held_out = held_out[:MAX_HELD_OUT]
                 basis = _basis(training, held_out, run)
                 pca_seconds = time.perf_counter() - started
                 model = _model(
-                    basis, truncation_curve_on(basis, held_out, run.stop_if_pressed), run
+                    basis, truncation_curve_on(basis, held_out, run.stop_if_interrupted), run
                 )
                 scores = evaluate(model, basis, held_out, partial(run.measure, total=len(held_out)))
             except ValueError as error:
@@ -239,19 +240,19 @@ class Run(NamedTuple):
     settings: TrainOptions
     backend: str | None
     progress: StageProgress
-    pressed: Callable[[], bool]
+    interrupted: Callable[[], bool]
     client: Any = None
 
-    def stop_if_pressed(self, *done: Any) -> None:
+    def stop_if_interrupted(self, *done: Any) -> None:
         """Raise `Interrupted` after Ctrl-C."""
-        if self.pressed():
+        if self.interrupted():
             kept = self.checkpoint.holds_work
             raise Interrupted("the same command goes on from here" if kept else "nothing is saved")
 
     def measure(self, done: int, total: int) -> None:
         """Report progress before an image is measured."""
         self.progress("measure", done, total)
-        self.stop_if_pressed()
+        self.stop_if_interrupted()
 
 
 def _basis(files: list[Path | str], held_out: list[Path | str], run: Run) -> Eigenbasis:
@@ -262,7 +263,7 @@ def _basis(files: list[Path | str], held_out: list[Path | str], run: Run) -> Eig
 
     def advance(done: int, total: int | None, row: dict[str, Any]) -> None:
         run.progress("components", done, len(files))
-        run.stop_if_pressed()
+        run.stop_if_interrupted()
 
     most = check_components(settings.components)
     options = PCAOptions(settings.size, settings.space, most, settings.seed)
@@ -271,21 +272,21 @@ def _basis(files: list[Path | str], held_out: list[Path | str], run: Run) -> Eig
         state, settings.size, settings.components, settings.energy, settings.space
     )
     if settings.target_psnr is not None:
-        if (fall := truncation_curve_on(basis, held_out, run.stop_if_pressed)) is None:
+        if (curve := truncation_curve_on(basis, held_out, run.stop_if_interrupted)) is None:
             raise ValueError(
                 f"target_psnr needs images that are held out, one in {HELD_OUT}, and none can be "
                 "read; give more images, or use energy"
             )
-        basis = basis.truncated(fall.rank_for_psnr(settings.target_psnr))
+        basis = basis.truncated(curve.rank_for_psnr(settings.target_psnr))
     basis.save(path)
     checkpoint.remove("pca*")
     return basis
 
 
-def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS:
+def _model(basis: Eigenbasis, curve: TruncationCurve | None, run: Run) -> EigenGS:
     """Fit Gaussians to the components, and save checkpoints."""
     checkpoint = run.checkpoint
-    run.stop_if_pressed()
+    run.stop_if_interrupted()
     run.progress("weights", 0, 1)
     saved = time.perf_counter()
 
@@ -296,15 +297,15 @@ def _model(basis: Eigenbasis, fall: TruncationCurve | None, run: Run) -> EigenGS
     def save(states: list[State]) -> None:
         nonlocal saved
         trains = run.settings.training_steps > 0
-        if trains and (run.pressed() or time.perf_counter() - saved > SAVE_SECONDS):
+        if trains and (run.interrupted() or time.perf_counter() - saved > SAVE_SECONDS):
             saved = time.perf_counter()
             flat = {f"{i}.{k}": v for i, state in enumerate(states) for k, v in state.items()}
             checkpoint.save("shapes", flat)
-        run.stop_if_pressed()
+        run.stop_if_interrupted()
 
     states = _states(checkpoint.load("shapes") or {})
     members = fit_model(basis, run.settings, run.backend, advance, states, save, run.client)
-    return EigenGS(**members, held_out=np.zeros(0) if fall is None else fall.psnr)
+    return EigenGS(**members, held_out=np.zeros(0) if curve is None else curve.psnr)
 
 
 def _states(flat: dict[str, Any]) -> list[State]:

@@ -257,17 +257,17 @@ def _move_group(
     radius: float,
     scale: Any,
     sums: list,
-    told: bool,
+    with_error: bool,
     rate: Any,
     time: Any,
 ) -> tuple[list, list]:
-    """Move the weights of a group; add gradients of shapes, and errors if `told`, to `sums`."""
+    """Move the weights of a group; add gradients of shapes (and errors, if wanted) to `sums`."""
     rows, *moments = group
     packed = pack_parameters([*shape, *rows])
     delta, squares = residual(packed, [type(target)(0)] * GROUP, lists, radius, target)
     gradient = [g * scale for g in adjoint(packed, delta, GROUP, lists, radius)]
     error = type(target)(0)
-    if told:
+    if with_error:
         error = sum(sum_lanes(squares, lists))
     added = [s + g for s, g in zip(sums, [*gradient[:NUM_SHAPE_PARAMS], error], strict=True)]
     slopes = type(rows)(gradient[NUM_SHAPE_PARAMS:])

@@ -120,13 +120,13 @@ def fit_components(
     }
     if method == "default" and steps:
         size = (basis.width, basis.height)
-        grids = [on_grid(size, side.splats) for side in sides]
+        grids = [on_grid(size, side.number) for side in sides]
         _, untrained = _assemble(basis, grids, sides, result, backend, executor)
         figures["psnr_untrained"] = psnr_components(basis, untrained.errors)
     return ComponentFit(
         gaussians=with_colors(gaussians, weighted.weights[-1].T, basis.space),
         weights=weighted.weights[:-1],
-        low=sides[0].splats if split else 0,
+        low=sides[0].number if split else 0,
         low_components=low_component_count(basis) if split else 0,
         figures=figures,
     )
@@ -149,7 +149,7 @@ def _assemble(
             shapes = SharedShapes.of(band.gaussians, backend=backend)
             alone = band.weights or find_weights(shapes, side.components, executor).weights
             weights.append(alone)
-        known, low = _join_weights(*weights), sides[0].splats
+        known, low = _join_weights(*weights), sides[0].number
         gaussians = concatenate([band.gaussians for band in bands])
     shapes = SharedShapes.of(gaussians, low, backend)
     return gaussians, find_weights(shapes, (*basis.components, basis.mean), executor, known)
@@ -172,7 +172,7 @@ def _train_shapes(
     side: FrequencyBand, seed: int, steps: int, backend: str | None, state: State | None
 ) -> Iterator[State]:
     return train_shapes(
-        side.components, side.eigenvalues, side.splats, seed, steps, backend=backend, state=state
+        side.components, side.eigenvalues, side.number, seed, steps, backend=backend, state=state
     )
 
 
@@ -187,7 +187,7 @@ def _train_jointly(
 ) -> Iterator[State]:
     start = JointState.from_arrays(state) if state else None
     for current in train_jointly(
-        side.components, side.splats, seed, steps, backend=backend, state=start
+        side.components, side.number, seed, steps, backend=backend, state=start
     ):
         yield current.arrays()
 
@@ -195,7 +195,7 @@ def _train_jointly(
 def _weights_of(state: State, side: FrequencyBand, backend: str | None) -> Band:
     """Return the shapes and weights of a state; colours are 0, with all channels."""
     joint = JointState.from_arrays(state)
-    blank = np.zeros((side.splats + 1, len(side.components)))
+    blank = np.zeros((side.number + 1, len(side.components)))
     return Band(with_colors(joint.gaussians(backend), blank, "data"), joint.weights())
 
 
@@ -348,7 +348,7 @@ SPLIT_COST = 0.2
 class FrequencyBand(NamedTuple):
     """A number of Gaussians and the components that they serve: all, or one side of the split."""
 
-    splats: int
+    number: int
     components: tuple[Planes, ...]
     eigenvalues: tuple[NDArray[np.float64], ...]
 
@@ -379,7 +379,7 @@ def wants_split(
     planes = images.reshape(-1, basis.height, basis.width)
     figures = {}
     for name, split in (("psnr_whole", False), ("psnr_split", True)):
-        counts = [side.splats for side in frequency_bands(basis, count, split)]
+        counts = [side.number for side in frequency_bands(basis, count, split)]
         size = (basis.width, basis.height)
         sets = [shapes_of(on_grid(size, n), size, 1, backend) for n in counts]
         equations = NormalEquations(concatenate(sets), counts[0] if split else 0)
