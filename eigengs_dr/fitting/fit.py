@@ -169,12 +169,12 @@ def fit(
         map by its name; by default "linear" for albedo, color and the like, "normal" for normals,
         and "data" for other names, see `eigengs_dr.gaussian.maps.usual_space`.
         "linear" decodes sRGB: the Gaussians sum to linear light, as textures need it, and errors
-        weigh more in the dark. "data" uses one or
-        three channels unchanged (roughness, heights). "normal" uses the codes ``(n + 1) / 2`` of a
-        normal map; renderings have normals of length 1. "radiance" is "linear" without an
-        upper bound. "log" suits light above 1 best: the Gaussians sum to logarithms of light, see
-        `eigengs_dr.image.color.to_log`. For an image of light above 1, "linear" becomes
-        "radiance", and "ycbcr" and "rgb" become "log": a texture would clamp their sums.
+        weigh more in the dark. "data" uses one or three channels unchanged (roughness, heights).
+        "normal" uses the codes ``(n + 1) / 2`` of a normal map; renderings have normals of length
+        1. "radiance" is "linear" without an upper bound. "log" suits light above 1 best: the
+        Gaussians sum to logarithms of light, see `eigengs_dr.image.color.to_log`. For an image of
+        light above 1, "linear" becomes "radiance", and "ycbcr" and "rgb" become "log": a texture
+        would clamp their sums.
     seed : int, optional
         Seed of the random numbers. Only the placement "random" and presets without a colour
         solve use random numbers; the preset "default" gives one result for all seeds.
@@ -186,8 +186,8 @@ def fit(
         trace, or a row of a set with more Gaussians than asked for.
     target_psnr : float or mapping, optional
         PSNR in dB to reach with as few Gaussians as possible; excludes `gaussians`. Each map shall
-        reach it, or its own, if a mapping names every map. The search
-        takes up to about twice `iterations` steps, see `eigengs_dr.fitting.search`.
+        reach it, or its own, if a mapping names every map. The search takes up to about twice
+        `iterations` steps, see `eigengs_dr.fitting.search`.
     target_space : {"rgb", "ycbcr"}, optional
         Whether `target_psnr` is a psnr_rgb or a psnr_ycbcr of an image. Data, normals and light
         above 1 have one PSNR alone, see `eigengs_dr.image.metrics.float_space`.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
 from ..gaussian.covariance import factor_from_covariance
-from ..gaussian.gaussians import Gaussians, set_of
+from ..gaussian.gaussians import Gaussians, one_image, set_of
 from ..image.color import decode
 from .density_control import DensityControl
 from .descent import FitProblem
@@ -132,7 +132,7 @@ def start_from_set(target: FitTarget, options: FitOptions) -> FitProblem:
     method, source = options.method, load_start(options.start, options.backend)
     height, width = target.values.shape[:2]
     native = source if isinstance(source, Gaussians) else source.gaussians
-    check_start(native, width, height, options)
+    check_start(native, target.values, options)
     if isinstance(source, Gaussians):
         start, exact = source.scaled(width, height), False
     else:
@@ -160,8 +160,8 @@ def load_start(start: Any, backend: str | None) -> Gaussians | Model:
         If the start is something else.
     """
     if isinstance(start, (str, os.PathLike)):
-        return Gaussians.load(start, backend)
-    found = start if isinstance(start, Model) else set_of(start)
+        return one_image(Gaussians.load(start, backend))
+    found = start if isinstance(start, Model) else one_image(set_of(start))
     current = types_of((found if isinstance(found, Gaussians) else found.gaussians).mean).backend
     if backend not in (None, current):
         raise ValueError(
@@ -171,9 +171,9 @@ def load_start(start: Any, backend: str | None) -> Gaussians | Model:
     return found
 
 
-def check_start(start: Gaussians, width: int, height: int, options: FitOptions) -> None:
-    """Raise ValueError unless a start fits the image and the options."""
-    count = len(start)
+def check_start(start: Gaussians, values: NDArray[np.float32], options: FitOptions) -> None:
+    """Raise ValueError unless a start fits the image (H, W, C) and the options."""
+    count, (height, width, channels) = len(start), values.shape
     if options.gaussians not in (None, count):
         raise ValueError(
             f"gaussians is {options.gaussians}, but the start has {count}; leave the number or "
@@ -188,6 +188,11 @@ def check_start(start: Gaussians, width: int, height: int, options: FitOptions) 
         raise ValueError(
             f"space is {options.space!r}, but the start is in {start.space!r}; use space "
             f"{start.space!r}, or another start"
+        )
+    if channels != start.channels:
+        raise ValueError(
+            f"the image has {channels} channels, but the start has {start.channels}; use another "
+            "start"
         )
 
 
