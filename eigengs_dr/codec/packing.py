@@ -47,7 +47,7 @@ MSE_WITHOUT_IMAGE = 1e-4
 
 
 class PackResult(NamedTuple):
-    """Result of `pack`.
+    """Result of `eigengs_dr.pack`.
 
     Attributes
     ----------

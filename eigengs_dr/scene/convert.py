@@ -60,7 +60,7 @@ class ConvertedTexture(NamedTuple):
 
 @dataclass(frozen=True)
 class ConvertedScene:
-    """Result of `convert_scene`.
+    """Result of `eigengs_dr.convert_scene`.
 
     Attributes
     ----------
