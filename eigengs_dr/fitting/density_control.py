@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from ..gaussian.gaussians import Gaussians, concatenate, like
 from ..image.resize import resample
 from .placement.adaptive import redistribute, residual
-from .placement.peaks import residual_peaks
+from .placement.density import residual_peaks
 from .schedule import Relocation
-from .solvers.conjugate_gradient import solve
-from .solvers.matrix_products import inner_products
+from .solvers.conjugate_gradient import inner_products, solve
 
 Array = NDArray[np.floating]
 

@@ -34,7 +34,7 @@ def programs_of(call, *arguments):
 
 MORE = {"llvm": 0, "cuda": 5}
 """Programs that a size may add. On cuda, two searches, the keys and the two passes of the sort of
-`eigengs_dr.raster.binning.order` depend on the number of bits of a size."""
+`eigengs_dr.raster.binning.lists` depend on the number of bits of a size."""
 
 
 def check_sharing(backend, call, sizes):

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eigengs_dr.fitting.placement import peaks
-from eigengs_dr.fitting.placement.peaks import SUPPRESSION_RADIUS, residual_peaks
+from eigengs_dr.fitting.placement import density as peaks
+from eigengs_dr.fitting.placement.density import SUPPRESSION_RADIUS, residual_peaks
 
 
 @pytest.mark.parametrize("deviation", [6.0, 1.5, 0.6])

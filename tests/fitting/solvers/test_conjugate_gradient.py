@@ -11,8 +11,7 @@ from hypothesis import given
 from _helpers.halves import SIDE, fitted
 from _helpers.sets import SIZE, Scene, few, random_scene, scenes
 from _helpers.solves import matrix, noise, rms, roomy, true_residual
-from eigengs_dr.fitting.solvers.conjugate_gradient import solve
-from eigengs_dr.fitting.solvers.matrix_products import inner_products
+from eigengs_dr.fitting.solvers.conjugate_gradient import inner_products, solve
 from eigengs_dr.raster.render import render
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from eigengs_dr.raster.binning.order import PACKET, order_lanes
+from eigengs_dr.raster.binning.lists import PACKET, order_lanes
 
 
 def test_windows_keep_neighbours_together():
