@@ -62,11 +62,11 @@ def crops(count: int = CROPS, seed: int = 0) -> Iterator[NDArray[np.float32]]:
 
 def main(path: str) -> None:
     """Train the basis in about a minute and write it to a file."""
-    from eigengs_dr.cli.console import progress_bar
+    from eigengs_dr.cli.console import bar
     from eigengs_dr.eigenbasis.eigengs import EigenGS
     from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 
-    with progress_bar(False) as show:
+    with bar(False) as show:
 
         def advance(done: int, total: int | None, row: dict[str, Any]) -> None:
             show("natural", done, CROPS)

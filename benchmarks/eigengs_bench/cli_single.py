@@ -9,7 +9,7 @@ from eigengs_bench.names import CONDITIONS
 from eigengs_bench.options import count_option, many_option, output_option, prints_figures, save
 from eigengs_dr.backend.selection import select
 from eigengs_dr.cli import options
-from eigengs_dr.cli.console import progress_bar
+from eigengs_dr.cli.console import bar
 from eigengs_dr.cli.options import ANY_PATH, EXISTING, FOLDER, backend_option, quiet_option
 from eigengs_dr.cli.outputs import check_outputs
 
@@ -154,7 +154,7 @@ def levels(image: Path | None, output: Path, quiet: bool, **settings: Any) -> No
     from eigengs_dr.image.resize import center_crop
 
     pixels = load_image(image) if image else center_crop(sample(SAMPLE), SIDE, SIDE)
-    with progress_bar(quiet) as show:
+    with bar(quiet) as show:
         points = run(pixels, progress=show, **settings)
     points.to_csv(output / "levels.csv", index=False)
     save(summarize(points, image.name if image else SAMPLE), output, quiet)

@@ -11,8 +11,8 @@ from eigengs_bench.harness.store import Row, Task, code_state, other_code
 from eigengs_bench.names import SAMPLES, SETS
 from eigengs_dr.backend.selection import select
 from eigengs_dr.cli import options
-from eigengs_dr.cli.console import progress_bar, say
-from eigengs_dr.cli.outputs import check_outputs, write_report
+from eigengs_dr.cli.console import bar, say
+from eigengs_dr.cli.outputs import check_outputs, describe_run, write_report
 
 output_option = click.option(
     "-o",
@@ -64,7 +64,7 @@ def set_options(images: int, usual: str = SAMPLES) -> Any:
 
 def about(context: click.Context, backend: str | None) -> Row:
     """Describe a run for rows and reports: command, machine, versions, commit of the code."""
-    return {**options.describe_run(context, backend), **code_state()}
+    return {**describe_run(context, backend), **code_state()}
 
 
 def measures_rows(file: str, iterations: int | None = 1000, least: int = 1) -> Any:
@@ -96,7 +96,7 @@ def measures_rows(file: str, iterations: int | None = 1000, least: int = 1) -> A
             run = about(context, shared["backend"])
             if note := other_code(output / file, run):
                 say(f"note: {note}")
-            with progress_bar(quiet) as show:
+            with bar(quiet) as show:
                 task = Task(output, run, progress=show, **shared)
                 section = command(task, **settings)
             save(section, output, quiet)
@@ -121,7 +121,7 @@ def save(section: Any, output: Path, quiet: bool) -> None:
 def prints_figures(command: Callable[..., Any]) -> Any:
     """Make a function into a command that prints the figures that it returns, and reports them.
 
-    The command calls it with ``show``, see `progress_bar`. A text beside the figures replaces them.
+    The command calls it with ``show``, see `bar`. A text beside the figures replaces them.
     """
 
     @options.report_option
@@ -132,11 +132,10 @@ def prints_figures(command: Callable[..., Any]) -> Any:
         check_outputs([report], [])
         backend = settings.get("backend", settings.get("variant", "").split("_")[0] or None)
         select(backend)
-        with progress_bar(quiet) as show:
+        with bar(quiet) as show:
             figures, text = command(show=show, **settings)
-        if report:
-            choices = {k: str(v) if isinstance(v, Path) else v for k, v in settings.items()}
-            write_report(report, {**about(context, backend), **choices, **figures})
+        choices = {k: str(v) if isinstance(v, Path) else v for k, v in settings.items()}
+        write_report(report, {**about(context, backend), **choices, **figures})
         if not quiet:
             click.echo(text or "\n".join(f"{k:24} {value:.4g}" for k, value in figures.items()))
 

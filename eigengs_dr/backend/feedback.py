@@ -40,7 +40,7 @@ def shows_progress(function: Function) -> Function:
     @wraps(function)
     def call(*values: Any, **options: Any) -> Any:
         bound = arguments.bind(*values, **options)
-        with _reporter(bound.arguments.get("progress"), function.__name__) as show:
+        with progress_bar(bound.arguments.get("progress"), function.__name__) as show:
             bound.arguments["progress"] = show
             return function(*bound.args, **bound.kwargs)
 
@@ -48,8 +48,22 @@ def shows_progress(function: Function) -> Function:
 
 
 @contextmanager
-def _reporter(progress: Any, name: str) -> Iterator[Callable[..., None] | None]:
-    """Return what reports progress: a function, or None."""
+def progress_bar(progress: Any = None, name: str = "") -> Iterator[Callable[..., None] | None]:
+    """Show a bar during a block, and return what reports progress.
+
+    Parameters
+    ----------
+    progress : bool or callable, optional
+        See `shows_progress`.
+    name : str, optional
+        What stands before the bar.
+
+    Yields
+    ------
+    callable or None
+        ``show(done, total, row)``, or with a label before these; a new label restarts the bar. The
+        bar shows ``psnr_rgb`` of the row, which may be left out. None if nobody sees a bar.
+    """
     if callable(progress):
         yield progress
         return
@@ -59,10 +73,16 @@ def _reporter(progress: Any, name: str) -> Iterator[Callable[..., None] | None]:
     from tqdm.auto import tqdm
 
     with tqdm(desc=name, delay=DELAY, leave=False) as bar:
+        label = name
 
         def show(*values: Any) -> None:
-            if isinstance(values[0], str):  # the name of a stage is first
-                bar.set_description_str(values[0], refresh=False)
+            nonlocal label
+            if isinstance(values[0], str):
+                if values[0] != label:
+                    label = values[0]
+                    bar.set_description_str(label, refresh=False)
+                    if bar.n:  # else it would be shown at once
+                        bar.reset()
                 values = values[1:]
             done, total, *rest = values
             row = rest[0] if rest else None

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..image.formats import kind_of
+from ..image.formats import kind_of, open_header
 from ..image.io import ImageError, load_image, open_picture, picture_pixels
 from ..image.pixels import LinearImage, check_data, check_image, encoding_of
 from ..image.remote import is_url
@@ -291,6 +291,33 @@ def window_shape(path: str) -> tuple[int, int, int] | None:
     except Exception:  # tifffile raises many types; Pillow reads what it does not, or says why not
         return None
     return height, width, channels
+
+
+TURNED = range(5, 9)
+"""EXIF orientations that swap width and height."""
+
+ORIENTATION = 0x0112
+"""EXIF tag of the orientation."""
+
+
+def image_size(path: Path | str) -> tuple[int, int, int] | None:
+    """Return height, width and channels, 1 or 3, from the header of an image file.
+
+    None for a URL, which is read once, and for a file that is no image.
+    """
+    if isinstance(path, str):
+        return None
+    if path.suffix.lower() in TIFF_SUFFIXES and (shape := window_shape(str(path))):
+        return shape
+    try:
+        with open_header(path) as file:
+            width, height = file.size
+            # Pillow decodes a PNG file to find its EXIF data; they seldom turn it.
+            turned = file.format != "PNG" and file.getexif().get(ORIENTATION) in TURNED
+            channels = 1 if file.mode in GREY else 3
+    except Exception:  # Pillow's decoders raise many types
+        return None
+    return (width, height, channels) if turned else (height, width, channels)
 
 
 def holds_floats(path: str) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from ..backend.executor import ClusterError
-from ..backend.feedback import terminate_as_interrupt
+from ..backend.feedback import progress_bar, terminate_as_interrupt
 from ..backend.selection import BackendError
 
 NAME = "eigengs-dr"
@@ -19,6 +19,12 @@ NAME = "eigengs-dr"
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells define it."""
+
+MISSED = 1
+"""Exit code if the target PSNR cannot be reached."""
+
+FAILED = 2
+"""Exit code after an error, also of one of several images."""
 
 
 class Program(click.Group):
@@ -52,17 +58,11 @@ class Program(click.Group):
                 raise
             say("interrupted")
             sys.exit(INTERRUPTED)
-        sys.exit(2)
+        sys.exit(FAILED)
 
 
 def say(text: str) -> None:
-    """Write one line to standard error.
-
-    Parameters
-    ----------
-    text : str
-        Several lines are joined to one.
-    """
+    """Write one line to standard error, above a bar; several lines are joined to one."""
     from tqdm import tqdm
 
     with tqdm.external_write_mode(file=sys.stderr, nolock=True):
@@ -70,13 +70,8 @@ def say(text: str) -> None:
 
 
 @contextmanager
-def progress_bar(quiet: bool) -> Iterator[Callable[..., None]]:
-    """Show a bar while a block runs, if standard error is a terminal.
-
-    Parameters
-    ----------
-    quiet : bool
-        Show nothing.
+def bar(quiet: bool) -> Iterator[Callable[..., None]]:
+    """Show a bar while a block runs for long, if somebody sees standard error.
 
     Yields
     ------
@@ -85,55 +80,17 @@ def progress_bar(quiet: bool) -> Iterator[Callable[..., None]]:
         all steps and, optionally, a row of figures. The bar shows ``psnr_rgb`` of the row. A new
         label restarts the bar.
     """
-    from tqdm import tqdm
-
-    silent = quiet or sys.stderr is None  # Python's value if standard error is closed
-    with tqdm(unit="it", leave=False, disable=True if silent else None) as bar:
-        current = ""
-
-        def show(label: str, done: int, total: int, row: dict[str, Any] | None = None) -> None:
-            nonlocal current
-            if label != current:
-                current = label
-                bar.set_description_str(label, refresh=False)
-                bar.reset(total)
-            bar.total = total
-            if row and "psnr_rgb" in row:
-                bar.set_postfix_str(f"{row['psnr_rgb']:.2f} dB", refresh=False)
-            bar.update(done - bar.n)
-
-        yield show
+    with progress_bar(False if quiet else None) as show:
+        yield show or (lambda *values: None)
 
 
-@contextmanager
-def images_bar(quiet: bool, total: int) -> Iterator[Callable[[float, str], None]]:
-    """Show a bar of many images, with images per second, if standard error is a terminal.
-
-    Parameters
-    ----------
-    quiet : bool
-        Show nothing.
-    total : int
-        Number of images.
-
-    Yields
-    ------
-    callable
-        ``show(done, label)``: the number of images that are done, which need not be whole, and a
-        label such as the PSNR of the last image. Inside the block `say` writes above the bar.
-    """
-    from tqdm import tqdm
-
-    silent = quiet or sys.stderr is None
-    layout = "{bar} {n:.0f} of {total} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
-    options = {"unit": " images", "leave": False, "bar_format": layout}
-    with tqdm(total=total, disable=True if silent else None, **options) as bar:
-
-        def show(done: float, label: str) -> None:
-            bar.set_postfix_str(label, refresh=False)
-            bar.update(done - bar.n)
-
-        yield show
+def table(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows of cells as lines, with the first column to the left and others to the right."""
+    first, *others = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        f"{row[0]:{first}}" + "".join(f"  {c:>{w}}" for c, w in zip(row[1:], others, strict=True))
+        for row in rows
+    ]
 
 
 @contextmanager

@@ -8,14 +8,15 @@ from typing import Any
 import click
 
 from ..backend.selection import select
-from .options import ANY_PATH, check_pixels, json_option
-from .outputs import check_outputs, name_outputs
+from . import options
+from .console import table
+from .outputs import check_outputs, name_pictures
 
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path), metavar="NAME|FILE")
-@json_option
-@click.option("--preview", type=ANY_PATH, help="Picture of the contents.")
+@options.json_option
+@click.option("--preview", type=options.ANY_PATH, help="Picture of the contents.")
 def info(file: Path, as_json: bool, preview: Path | None) -> None:
     """Show the contents of a fitted image, a material or a model.
 
@@ -40,67 +41,56 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
       eigengs-dr info natural
       eigengs-dr info model.npz --preview components.png
     """
-    from ..image.io import SAVE_OPTIONS
-
-    [picture] = name_outputs([file], preview, list(SAVE_OPTIONS)) if preview else [None]
+    [picture] = name_pictures([file], preview)
     check_outputs([picture], [file])
     select()
-    from ..codec import egs as packed
-    from ..eigenbasis import model_file as modelfile
+    from ..codec import egs
+    from ..eigenbasis import model_file
     from ..eigenbasis.eigengs import SHIPPED, EigenGS
-    from ..gaussian import file as setfile
+    from ..gaussian import file as set_file
     from ..gaussian.gaussians import Gaussians
     from ..storage import npz
 
-    kinds: dict[str, tuple[str, Any, Any, Any]] = {
-        setfile.FORMAT: ("image", Gaussians.load, _describe_set, _draw_image),
-        setfile.MATERIAL: ("material", Gaussians.load, _describe_set, _draw_maps),
-        modelfile.FORMAT: ("model", EigenGS.load, _describe_model, _draw_model),
-    }
     file = SHIPPED.get(str(file), file)
-    if packed.is_egs(file):
-        file_format = setfile.MATERIAL if setfile.maps_of(file) else setfile.FORMAT
-    else:
-        file_format = npz.format_of(file)
-    if file_format not in kinds:
-        raise ValueError(
-            f"{file}: format is {file_format[:40]!r}, expected one of {', '.join(kinds)}"
-        )
-    kind, load, describe, draw = kinds[file_format]
+    packed = egs.is_egs(file)
+    kinds = {
+        set_file.FORMAT: "image",
+        set_file.MATERIAL: "material",
+        model_file.FORMAT: "model",
+    }
+    found = set_file.FORMAT if packed else npz.format_of(file)
+    if found not in kinds:
+        raise ValueError(f"{file}: format is {found[:40]!r}, expected one of {', '.join(kinds)}")
+    kind = "material" if packed and set_file.maps_of(file) else kinds[found]
     facts: dict[str, Any] = {"file": str(file), "kind": kind, "bytes": file.stat().st_size}
-    if kind != "model" and not packed.is_egs(file):
-        facts |= _describe_head(setfile.read_head(file))
-        figures = setfile.read_figures(file) if kind == "image" else None
-        facts |= _describe_figures(figures) if figures else {}
-    else:
-        facts |= describe(load(file))
+    if kind == "model":
+        facts |= _describe_model(EigenGS.load(file))
+    elif packed:
+        gaussians = Gaussians.load(file)
+        size = gaussians.width, gaussians.height
+        facts |= _describe_set(gaussians, len(gaussians), size)
+    else:  # the head alone: a large set takes gigabytes
+        head = set_file.read_head(file)
+        facts |= _describe_set(head, head.gaussians, head.size)
+        if kind == "image" and (figures := set_file.read_figures(file)):
+            facts |= _describe_figures(figures)
     if kind != "model":
         facts["bpp"] = round(8 * facts["bytes"] / (facts["width"] * facts["height"]), 4)
-    if packed.is_egs(file):
-        facts |= _describe_packed(packed.read(file))
+    if packed:
+        facts |= _describe_packed(egs.read(file))
     else:
         facts["ledger"] = npz.sizes_of(file)
     if picture:
-        draw(file, picture)
+        _draw(file, kind, picture)
     click.echo(json.dumps(facts, indent=2) if as_json else _text(**facts))
 
 
-def _describe_set(gaussians: Any) -> dict[str, Any]:
-    size = gaussians.width, gaussians.height
-    return _facts_of(gaussians, len(gaussians), *size)
-
-
-def _describe_head(head: Any) -> dict[str, Any]:
-    """Describe a set that is not read: a large one takes gigabytes."""
-    return _facts_of(head, head.gaussians, *head.size)
-
-
-def _facts_of(found: Any, count: int, width: int, height: int) -> dict[str, Any]:
+def _describe_set(found: Any, count: int, size: tuple[int, int]) -> dict[str, Any]:
     """Describe a set, or the head of its file; maps have spaces of their own."""
-    kind: dict[str, Any] = {} if found.maps else {"space": found.space}
-    facts = {"gaussians": count, "width": width, "height": height, "channels": found.channels}
-    maps = {"maps": [m._asdict() for m in found.maps]} if found.maps else {}
-    return facts | kind | {"cutoff": found.cutoff} | maps
+    facts = {"gaussians": count, "width": size[0], "height": size[1], "channels": found.channels}
+    if found.maps:
+        return facts | {"cutoff": found.cutoff, "maps": [m._asdict() for m in found.maps]}
+    return facts | {"space": found.space, "cutoff": found.cutoff}
 
 
 def _describe_figures(figures: Any) -> dict[str, Any]:
@@ -112,95 +102,83 @@ def _describe_figures(figures: Any) -> dict[str, Any]:
 
 def _describe_packed(content: Any) -> dict[str, Any]:
     """Return the Gaussians of each section and the quantisation steps."""
-    return {
-        "sections": [len(section.cell) for section in content.sections],
-        **{f"{name}_step": float(f"{step:.4g}") for name, step in content.steps._asdict().items()},
-    }
+    steps = {f"{name}_step": float(f"{x:.4g}") for name, x in content.steps._asdict().items()}
+    return {"sections": [len(section.cell) for section in content.sections], **steps}
 
 
 def _describe_model(model: Any) -> dict[str, Any]:
-    facts = _describe_set(model.gaussians) | {
-        "components": list(model.components),
-        "frequency_aware": model.low > 0,
-    }
+    size = model.gaussians.width, model.gaussians.height
+    facts = _describe_set(model.gaussians, len(model.gaussians), size)
+    facts |= {"components": list(model.components), "frequency_aware": model.low > 0}
     if model.split_reason:
         facts["split_reason"] = model.split_reason
     if model.low:
         facts["low_gaussians"] = model.low
         facts["high_gaussians"] = len(model.gaussians) - model.low
         facts["low_components"] = model.low_components
-    if fall := model.truncation_curve():
-        facts["fall"] = _rows(fall, model.held_out)
+    if curve := model.truncation_curve():
+        facts["truncation"] = _rows(curve, model.held_out)
     return facts
 
 
-def _rows(fall: Any, held_out: Any) -> list[dict[str, Any]]:
+def _rows(curve: Any, held_out: Any) -> list[dict[str, Any]]:
     """Return the truncation curve at 0, 1, 2, 5, 10, ... and all components."""
-    last = len(fall.psnr) - 1
+    last = len(curve.psnr) - 1
     round_numbers = [m * 10**e for e in range(len(str(last))) for m in (1, 2, 5)]
-    rows = []
-    for n in sorted({0, *(n for n in round_numbers if n < last), last}):
-        row = {
-            "components": fall.counts[n].tolist(),
-            "variance": round(float(fall.explained_variance_ratio()[n]), 6),
-            "psnr_training": round(float(fall.psnr[n]), 3),
+    share = curve.explained_variance_ratio()
+    return [
+        {
+            "components": curve.counts[n].tolist(),
+            "variance": round(float(share[n]), 6),
+            "psnr_training": round(float(curve.psnr[n]), 3),
         }
-        if len(held_out):
-            row["psnr_held_out"] = round(float(held_out[n]), 3)
-        rows.append(row)
-    return rows
+        | ({"psnr_held_out": round(float(held_out[n]), 3)} if len(held_out) else {})
+        for n in sorted({0, *(n for n in round_numbers if n < last), last})
+    ]
 
 
-def _text(fall: Any = (), maps: Any = (), ledger: Any = (), **facts: Any) -> str:
-    """Format facts as lines, and maps and the truncation curve as tables below."""
+def _text(truncation: Any = (), maps: Any = (), ledger: Any = (), **facts: Any) -> str:
+    """Format facts as lines, and maps, arrays and the truncation curve as tables below."""
     width = max(map(len, facts)) + 1
     lines = [f"{key:{width}} {value}" for key, value in facts.items()]
     if maps:
-        lines += ["", f"{'map':16} {'channels':>8} {'space':>9} {'weight':>8}"]
-    for m in maps:
-        row = "{name:16} {channels:8} {space:>9} {weight:8.3g}"
-        lines.append(row.format(**m))
+        rows = [(m["name"], str(m["channels"]), m["space"], f"{m['weight']:.3g}") for m in maps]
+        lines += ["", *table([("map", "channels", "space", "weight"), *rows])]
     if ledger:
-        lines += ["", f"{'array':16} {'bytes':>12}"]
-        lines += [f"{name[:16]:16} {size:12,}" for name, size in ledger.items()]
-    if fall:
-        lines += ["", f"components{'':16} {'variance':>8} {'training':>9} {'held out':>9}"]
-    for row in fall:
-        each = "+".join(map(str, row["components"]))
-        held_out = f"{row['psnr_held_out']:6.2f} dB" if "psnr_held_out" in row else "-"
-        lines.append(
-            f"{sum(row['components']):10} = {each:13} {row['variance']:8.2%} "
-            f"{row['psnr_training']:6.2f} dB {held_out:>9}"
-        )
+        sizes = [(name[:16], f"{size:,}") for name, size in ledger.items()]
+        lines += ["", *table([("array", "bytes"), *sizes])]
+    if truncation:
+        rows = [
+            (
+                f"{sum(row['components'])} = {'+'.join(map(str, row['components']))}",
+                f"{row['variance']:.2%}",
+                f"{row['psnr_training']:.2f} dB",
+                f"{row['psnr_held_out']:.2f} dB" if "psnr_held_out" in row else "-",
+            )
+            for row in truncation
+        ]
+        lines += ["", *table([("components", "variance", "training", "held out"), *rows])]
     return "\n".join(lines)
 
 
-def _draw_image(file: Path, picture: Path) -> None:
+def _draw(file: Path, kind: str, picture: Path) -> None:
+    """Write the picture of a set, of its maps side by side, or of a model."""
     from ..blocks.draw import save_region
+    from ..eigenbasis.eigengs import EigenGS
     from ..gaussian.file import read
-
-    data = read(file)
-    check_pixels(*data.size)
-    save_region(picture, data, (0, 0, *data.size), data.size)
-
-
-def _draw_maps(file: Path, picture: Path) -> None:
     from ..gaussian.gaussians import Gaussians
     from ..image.io import save_image
     from ..image.resize import join_pictures
     from ..raster.render import picture_of
-
-    shown = picture_of(Gaussians.load(file)).values()
-    save_image(picture, join_pictures([_as_rgb(image) for image in shown], 1))
-
-
-def _as_rgb(image: Any) -> Any:
-    return image.repeat(3 // image.shape[2], axis=2)
-
-
-def _draw_model(file: Path, picture: Path) -> None:
-    from ..eigenbasis.eigengs import EigenGS
-    from ..image.io import save_image
     from ..viewer.sheets import component_sheet
 
-    save_image(picture, component_sheet(EigenGS.load(file)))
+    if kind == "image":
+        data = read(file)
+        options.check_pixels(*data.size)
+        save_region(picture, data, (0, 0, *data.size), data.size)
+    elif kind == "model":
+        save_image(picture, component_sheet(EigenGS.load(file)))
+    else:
+        shown = picture_of(Gaussians.load(file)).values()
+        in_rgb = [image.repeat(3 // image.shape[2], axis=2) for image in shown]
+        save_image(picture, join_pictures(in_rgb, 1))

@@ -9,10 +9,10 @@ from typing import Any
 
 import click
 
+from . import options
 from .console import Program
 from .fit import fit
 from .info import info
-from .options import json_option
 from .pack import pack
 from .render import render
 from .scene import convert, scene
@@ -54,7 +54,7 @@ def _load() -> Any:
 
 
 @click.command()
-@json_option
+@options.json_option
 @click.pass_context
 def doctor(context: click.Context, as_json: bool) -> None:
     """Show what works on this machine and what to install.
@@ -73,7 +73,7 @@ def doctor(context: click.Context, as_json: bool) -> None:
     context.exit(0 if facts["llvm"]["works"] or facts["cuda"]["works"] else 1)
 
 
-@click.group(cls=Program)
+@click.group(cls=Program, context_settings={"show_default": True})
 @click.version_option(package_name="eigengs-dr")
 def main() -> None:
     """Fit images with 2D Gaussians and render them at any size.

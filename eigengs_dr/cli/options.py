@@ -1,32 +1,41 @@
-"""Options of several commands, and the record of a run in a report."""
+"""Options of several commands, and what their texts may be."""
 
 import glob
 import re
-import shlex
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 
-from ..backend.selection import describe
+from ..image.color import SPACES
 from ..image.pixels import ENCODINGS
 from ..image.remote import is_url
 from ..storage.atomic import refuse_url
-from .console import NAME
 
 EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+MAX_PIXELS = 1 << 29
+"""Pixels of the largest picture to render, except into TIFF files; it takes 3 bytes a pixel."""
+
+MAX_SIDE = 1 << 17
+"""Longest side of a picture to render into a TIFF file."""
 
 
 class PathOrUrl(click.Path):
     """A path, or a URL, which is passed as text."""
 
-    def convert(self, value: Any, param: Any, context: Any) -> Any:
+    def convert(self, value: Any, parameter: Any, context: Any) -> Any:
         """Return a `Path`, or the text of a URL."""
-        return value if is_url(value) else super().convert(value, param, context)
+        return value if is_url(value) else super().convert(value, parameter, context)
 
 
-IMAGE = PathOrUrl(exists=True, dir_okay=False, path_type=Path)
-FOLDER = PathOrUrl(exists=True, file_okay=False, path_type=Path)
+class ImageSource(PathOrUrl):
+    """An image file, a folder of images, a pattern such as "a/*.png", or a URL of one of them."""
+
+    def convert(self, value: Any, parameter: Any, context: Any) -> Any:
+        """Return a `Path`, or the text of a URL; a pattern need not exist."""
+        pattern = glob.has_magic(str(value)) and not (is_url(value) or Path(value).exists())
+        return Path(value) if pattern else super().convert(value, parameter, context)
 
 
 class OutputPath(click.Path):
@@ -41,85 +50,37 @@ class OutputPath(click.Path):
         return super().convert(value, parameter, context)
 
 
+IMAGE = PathOrUrl(exists=True, dir_okay=False, path_type=Path)
+IMAGES = ImageSource(exists=True, path_type=Path)
+FOLDER = PathOrUrl(exists=True, file_okay=False, path_type=Path)
 ANY_PATH = OutputPath(path_type=Path)
-
-MAX_PIXELS = 1 << 29
-"""Pixels of the largest picture to render, except into TIFF files; it takes 3 bytes a pixel."""
-
-MAX_SIDE = 1 << 17
-"""Longest side of a picture to render into a TIFF file."""
-
-backend_option = click.option(
-    "--backend",
-    type=click.Choice(["llvm", "cuda"]),
-    help="Processor.  [default: cuda if present]",
-)
-seed_option = click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    metavar="N",
-    default=0,
-    show_default=True,
-    help="Seed of random numbers.",
-)
-report_option = click.option("--report", type=ANY_PATH, help="JSON file of all figures.")
-quiet_option = click.option("--quiet", is_flag=True, help="Show no progress and no summary.")
-json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-
-
-cluster_option = click.option(
-    "--cluster",
-    metavar="local[:N]|tcp://HOST:PORT|FILE",
-    help="Work on N processes here, or on a Dask cluster.",
-)
-
-
-encoding_option = click.option(
-    "--encoding",
-    type=click.Choice(ENCODINGS),
-    help="What the pixels are.  [default: linear in files of floats, else srgb]",
-)
-
-
-class Size(click.ParamType):
-    """Width and height in pixels, as in "1024x768"."""
-
-    name = "WxH"
-
-    def convert(self, value: Any, param: Any, context: Any) -> tuple[int, int]:
-        """Parse the text of an option as two numbers."""
-        match = re.fullmatch(r"(\d+)x(\d+)", value)
-        if not match:
-            self.fail(f"{value}: expected width and height, such as 1024x768", param, context)
-        return check_pixels(int(match[1]), int(match[2]))
-
-
-class ImageSource(PathOrUrl):
-    """An image file, a folder of images, a pattern such as "a/*.png", or a URL of one of them."""
-
-    def __init__(self) -> None:
-        super().__init__(exists=True, path_type=Path)
-
-    def convert(self, value: Any, param: Any, context: Any) -> Any:
-        """Return a `Path`, or the text of a URL; a pattern need not exist."""
-        pattern = glob.has_magic(str(value)) and not (is_url(value) or Path(value).exists())
-        return Path(value) if pattern else super().convert(value, param, context)
 
 
 class Numbers(click.ParamType):
-    """One number, or several with commas, whose text matches a pattern."""
+    """Whole numbers with a sign between them, whose text matches a pattern."""
 
     def __init__(self, name: str, pattern: str, expected: str) -> None:
         self.name, self._pattern, self._expected = name, pattern, expected
 
-    def convert(self, value: Any, param: Any, context: Any) -> int | tuple[int, ...]:
+    def convert(self, value: Any, parameter: Any, context: Any) -> Any:
         """Parse the text of an option as one number or several."""
-        if isinstance(value, int):  # the default
+        if not isinstance(value, str):  # the default
             return value
         if not re.fullmatch(self._pattern, value):
-            self.fail(f"{value}: expected {self._expected}", param)
-        numbers = tuple(map(int, value.split(",")))
+            self.fail(f"{value}: expected {self._expected}", parameter)
+        numbers = tuple(map(int, re.split("[,x]", value)))
         return numbers if len(numbers) > 1 else numbers[0]
+
+
+class Size(Numbers):
+    """Width and height in pixels, as in "1024x768"."""
+
+    def __init__(self) -> None:
+        super().__init__("WxH", r"\d+x\d+", "width and height, such as 1024x768")
+
+    def convert(self, value: Any, parameter: Any, context: Any) -> tuple[int, int]:
+        """Parse the text of an option as two numbers."""
+        return check_pixels(*super().convert(value, parameter, context))
 
 
 COUNTS = Numbers("K", r"(?=.*[1-9])\d+(,\d+,\d+)?", "a number above 0, or three such as 230,60,60")
@@ -130,23 +91,51 @@ LEVEL_COUNTS = Numbers(
 )
 """A number of levels, or the numbers of Gaussians up to each."""
 
+REGION = Numbers(
+    "X,Y,W,H",
+    r"\d+,\d+,0*[1-9]\d*,0*[1-9]\d*",
+    "left, top, width and height, such as 100,50,640,480",
+)
+"""A part of an image, in pixels."""
 
-class Region(click.ParamType):
-    """Left, top, width and height in pixels, as in "100,50,640,480"."""
 
-    name = "X,Y,W,H"
+class MapFile(NamedTuple):
+    """The image file of a map, and its space if it is not the usual one."""
 
-    def convert(self, value: Any, param: Any, context: Any) -> tuple[int, int, int, int]:
-        """Parse the text of an option as four numbers."""
-        match = re.fullmatch(r"(\d+),(\d+),(\d+),(\d+)", value)
-        if not match or not int(match[3]) or not int(match[4]):
-            self.fail(
-                f"{value}: expected left, top, width and height, such as 100,50,640,480",
-                param,
-                context,
-            )
-        left, top, width, height = (int(number) for number in match.groups())
-        return left, top, width, height
+    name: str
+    path: Path | str
+    space: str | None
+
+
+class MapOption(click.ParamType):
+    """A name and a file, as in "albedo=bark.jpg", or a name, a space and a file."""
+
+    name = "NAME[:SPACE]=FILE"
+
+    def convert(self, value: Any, parameter: Any, context: Any) -> MapFile:
+        """Parse the text of an option."""
+        from ..gaussian.maps import NAME
+
+        left, sign, file = value.partition("=")
+        name, colon, space = left.partition(":")
+        if not (sign and file and NAME.fullmatch(name)):
+            self.fail(f"{value}: expected a name and a file, such as albedo=bark.jpg", parameter)
+        if colon and space not in SPACES:
+            self.fail(f"{value}: space {space!r} is not in {', '.join(SPACES)}", parameter)
+        if not is_url(file) and not Path(file).is_file():
+            self.fail(f"{file}: no such file", parameter)
+        return MapFile(name, file if is_url(file) else Path(file), space or None)
+
+
+def by_name(
+    context: click.Context, parameter: click.Parameter, maps: tuple[MapFile, ...]
+) -> dict[str, MapFile]:
+    """Return maps by their names; a name may occur once."""
+    found = {item.name: item for item in maps}
+    names = [item.name for item in maps]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise click.UsageError(f"--map {twice} is given twice; give each name once")
+    return found
 
 
 def check_pixels(width: int, height: int, by_parts: bool = False) -> tuple[int, int]:
@@ -166,10 +155,44 @@ def check_pixels(width: int, height: int, by_parts: bool = False) -> tuple[int, 
 
 def choice(name: str, values: list[str], text: str) -> Any:
     """Make an option that takes one of several words; the first is the default."""
-    kind = click.Choice(values)
-    return click.option(name, type=kind, default=values[0], show_default=True, help=text)
+    return click.option(name, type=click.Choice(values), default=values[0], help=text)
 
 
-def describe_run(context: click.Context, backend: str | None) -> dict[str, Any]:
-    """Return the command as typed and the machine, for a report."""
-    return {"command": shlex.join([NAME, *context.obj]), **describe(backend)}
+def number(name: str, text: str, default: float | None = None, least: int | None = None) -> Any:
+    """Make an option that takes a whole number, from `least` on if that is given."""
+    kind = int if least is None else click.IntRange(min=least)
+    return click.option(name, type=kind, metavar="N", default=default, help=text)
+
+
+def output(text: str, metavar: str | None = None) -> Any:
+    """Make the option of the file or folder to write."""
+    kind: Any = {"type": ANY_PATH, "metavar": metavar, "help": text}
+    return click.option("-o", "--output", required=True, **kind)
+
+
+backend_option = click.option(
+    "--backend",
+    type=click.Choice(["llvm", "cuda"]),
+    help="Processor.  [default: cuda if present]",
+)
+seed_option = number("--seed", "Seed of random numbers.", 0, 0)
+report_option = click.option("--report", type=ANY_PATH, help="JSON file of all figures.")
+quiet_option = click.option("--quiet", is_flag=True, help="Show no progress and no summary.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+cluster_option = click.option(
+    "--cluster",
+    metavar="local[:N]|tcp://HOST:PORT|FILE",
+    help="Work on N processes here, or on a Dask cluster.",
+)
+encoding_option = click.option(
+    "--encoding",
+    type=click.Choice(ENCODINGS),
+    help="What the pixels are.  [default: linear in files of floats, else srgb]",
+)
+
+
+def maps_option(text: str) -> Any:
+    """Make the option that names image files of maps."""
+    return click.option(
+        "--map", "maps", multiple=True, type=MapOption(), callback=by_name, help=text
+    )

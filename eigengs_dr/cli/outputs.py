@@ -3,15 +3,19 @@
 import json
 import math
 import os
+import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..gaussian.file import FORMAT
+import click
+
+from ..backend.selection import describe
+from ..gaussian.file import FORMAT, MATERIAL
 from ..image.remote import stem_of
 from ..storage import npz
 from ..storage.atomic import atomic_write, require_writable
-from .console import say
+from .console import NAME, say
 
 
 def name_outputs(
@@ -63,6 +67,17 @@ def name_outputs(
     return [output / name for name in names]
 
 
+def name_pictures(
+    inputs: Sequence[Path | str], output: Path | None, folder: bool = False
+) -> list[Path | None]:
+    """Name a picture for each input, as `name_outputs`; None for each without an output."""
+    from ..image.io import SAVE_OPTIONS
+
+    if output is None:
+        return [None for _ in inputs]
+    return list(name_outputs(inputs, output, list(SAVE_OPTIONS), folder))
+
+
 def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | str]) -> None:
     """Check that every output can be written and overwrites neither an input nor another output.
 
@@ -91,26 +106,13 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | str]) 
         require_writable(output)
 
 
-def keeps_result(
-    output: Path, overwrite: bool, quiet: bool, kind: str = FORMAT, name: str = "set of Gaussians"
-) -> bool:
-    """Return whether the result of a fit exists and stays; say so in one line.
-
-    Parameters
-    ----------
-    output : Path
-        The file of the result.
-    overwrite : bool
-        Whether a result is replaced.
-    quiet : bool
-        Say nothing.
-    kind, name : str, optional
-        The format of results, and what it is called.
+def keeps_result(output: Path, overwrite: bool, quiet: bool, maps: bool) -> bool:
+    """Return whether the result of a fit, of maps or of one image, exists and stays; say so.
 
     Raises
     ------
     ValueError
-        If the file is something else than a result. It is never replaced.
+        If the file is something else than such a result. It is never replaced.
     """
     if not output.exists():
         return False
@@ -118,20 +120,26 @@ def keeps_result(
         found = npz.format_of(output)
     except ValueError:
         found = ""
-    if found != kind:
+    if found != (MATERIAL if maps else FORMAT):
+        name = "material" if maps else "set of Gaussians"
         raise ValueError(f"{output}: exists and is no {name}; choose another name with -o")
     if not overwrite and not quiet:
         say(f"{output}: exists and is kept; --overwrite fits it again")
     return not overwrite
 
 
-def write_report(path: str | os.PathLike[str], figures: dict[str, Any]) -> None:
+def describe_run(context: click.Context, backend: str | None) -> dict[str, Any]:
+    """Return the command as typed and the machine, for a report."""
+    return {"command": shlex.join([NAME, *context.obj]), **describe(backend)}
+
+
+def write_report(path: str | os.PathLike[str] | None, figures: dict[str, Any]) -> None:
     """Write figures as JSON, all or nothing.
 
     Parameters
     ----------
-    path : str or os.PathLike
-        The file to write.
+    path : str, os.PathLike or None
+        The file to write; None writes nothing.
     figures : dict
         Strings, numbers (NumPy's too), lists and dictionaries. Infinity (the PSNR of two equal
         images) and NaN become null, because JSON has neither.
@@ -141,6 +149,8 @@ def write_report(path: str | os.PathLike[str], figures: dict[str, Any]) -> None:
     OSError
         If the file cannot be written; an existing file is then unchanged.
     """
+    if path is None:
+        return
     text = json.dumps(plain(figures), indent=2, allow_nan=False)
     with atomic_write(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")

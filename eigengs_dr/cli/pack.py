@@ -3,78 +3,52 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from ..backend.selection import select
-from ..fitting.options import Levels
-from .fit_material import MapFile, MapOption, by_name, load_map
-from .options import (
-    ANY_PATH,
-    EXISTING,
-    IMAGE,
-    LEVEL_COUNTS,
-    backend_option,
-    describe_run,
-    encoding_option,
-    quiet_option,
-    report_option,
-)
-from .outputs import check_outputs, name_outputs, write_report
-
-if TYPE_CHECKING:
-    from ..codec.packing import PackResult
-    from ..gaussian.gaussians import Gaussians
-
+from . import options
+from .fit import load_maps
+from .outputs import check_outputs, describe_run, name_outputs, write_report
 
 SUFFIX, BUDGET = ".egs", 0.5
 """Suffix of packed files and default loss in dB; copies, because `eigengs_dr.codec` imports
 Dr.Jit."""
 
+COMPARED_IN = {"linear": "sRGB", "radiance": "PU21"}
+"""What the PSNR of a set of light compares; of other sets, their space."""
+
 
 @click.command()
-@click.argument("file", type=EXISTING, metavar="X.npz")
+@click.argument("file", type=options.EXISTING, metavar="X.npz")
+@options.output("File to write.", "Y.egs")
+@click.option("--image", type=options.IMAGE, help="The original image, to measure the loss with.")
+@options.maps_option("The image of a map of a material; repeat for all of them.")
+@options.encoding_option
 @click.option(
-    "-o", "--output", required=True, type=ANY_PATH, metavar="Y.egs", help="File to write."
-)
-@click.option("--image", type=IMAGE, help="The original image, to measure the loss with.")
-@click.option(
-    "--map",
-    "maps",
-    multiple=True,
-    type=MapOption(),
-    help="The image of a map of a material; repeat for all of them.",
-)
-@encoding_option
-@click.option(
-    "--max-psnr-drop",
-    type=float,
-    default=BUDGET,
-    show_default=True,
-    metavar="DB",
-    help="Allowed loss of PSNR.",
+    "--max-psnr-drop", type=float, default=BUDGET, metavar="DB", help="Allowed loss of PSNR."
 )
 @click.option(
     "--levels",
-    type=LEVEL_COUNTS,
-    default=1,
+    type=options.LEVEL_COUNTS,
     help="Levels of the fit, as for fit. Readers may stop after any level and have a picture. "
     "Without this option, the order of the levels is lost.",
 )
-@backend_option
-@report_option
-@quiet_option
+@options.backend_option
+@options.report_option
+@options.quiet_option
 @click.pass_context
 def pack(
     context: click.Context,
+    /,
     file: Path,
     output: Path,
     image: Path | None,
-    maps: tuple[MapFile, ...],
+    maps: dict[str, options.MapFile],
     encoding: str | None,
     max_psnr_drop: float,
-    levels: Levels,
+    levels: Any,
     backend: str | None,
     report: Path | None,
     quiet: bool,
@@ -93,108 +67,53 @@ def pack(
       eigengs-dr pack bark.npz -o bark.egs --map albedo=a.jpg --map normal=n.jpg
     """
     [target] = name_outputs([file], output, [SUFFIX])
-    inputs = [file, *([image] if image else []), *(item.path for item in maps)]
+    inputs = [file, *([image] if image else []), *(m.path for m in maps.values())]
     check_outputs([target, report], inputs)
     select(backend)
     import eigengs_dr as eg
 
-    from ..gaussian.file import maps_of
-
-    if maps_of(file):
-        figures = pack_maps(
-            file, target, image, maps, encoding, max_psnr_drop, levels, backend, quiet
-        )
-        if report:
-            write_report(report, {**describe_run(context, backend), **figures})
-        return
-    if maps:
-        raise ValueError(f"{file}: holds one image and no maps; give --image instead of --map")
-
-    gaussians = eg.Gaussians.load(file, backend=backend)
-    grey = gaussians.channels == 1
-    pixels = eg.load_image(image, grey, encoding) if image else None
-    try:
-        counts = eg.level_counts(len(gaussians), levels)
-        sections = [n - before for before, n in zip([0, *counts], counts, strict=False)]
-        receipt = eg.pack(gaussians, target, pixels, max_psnr_drop, sections)
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from None
-    if report:
-        figures = packing_figures(file, target, receipt.gaussians, max_psnr_drop, receipt, "psnr")
-        write_report(report, {**describe_run(context, backend), **figures})
-    if not quiet:
-        against = "the image" if image else "the rendering of the input"
-        spaces = {"linear": "sRGB", "radiance": "PU21"}
-        space = spaces.get(gaussians.space, gaussians.space)
-        click.echo(
-            f"{file}: {len(gaussians):,} Gaussians, {file.stat().st_size:,} bytes\n"
-            f"  wrote {target}: {receipt.bytes:,} bytes, "
-            f"{receipt.bits_per_pixel:.3f} bits per pixel\n"
-            f"  lost {receipt.psnr_drop:.2f} dB: {receipt.psnr:.2f} dB in {space} "
-            f"against {against}"
-        )
-
-
-def pack_maps(
-    file: Path,
-    target: Path,
-    image: Path | None,
-    maps: tuple[MapFile, ...],
-    encoding: str | None,
-    max_psnr_drop: float,
-    levels: Levels,
-    backend: str | None,
-    quiet: bool,
-) -> dict[str, Any]:
-    """Pack a material, and return its figures."""
-    import eigengs_dr as eg
-
-    if image:
-        raise ValueError(f"{file}: holds a material; give its images by --map NAME=FILE")
-    if levels != 1:
-        raise ValueError(f"{file}: a material has no levels in .egs files; leave --levels out")
     gaussians = eg.Gaussians.load(file, backend)
     spaces = {m.name: m.space for m in gaussians.maps}
-    named = {
-        name: item._replace(space=item.space or spaces.get(name))
-        for name, item in by_name(maps).items()
-    }
-    images = {name: load_map(item, encoding) for name, item in named.items()} or None
+    if maps and not spaces:
+        raise ValueError(f"{file}: holds one image and no maps; give --image instead of --map")
+    if image and spaces:
+        raise ValueError(f"{file}: holds a material; give its images by --map NAME=FILE")
+    if levels is not None and spaces:
+        raise ValueError(f"{file}: a material has no levels in .egs files; leave --levels out")
+    images: Any = eg.load_image(image, gaussians.channels == 1, encoding) if image else None
+    if maps:
+        known = {k: m._replace(space=m.space or spaces.get(k)) for k, m in maps.items()}
+        images = load_maps(known, encoding)
     try:
-        packed = eg.pack(gaussians, target, images, max_psnr_drop, encoding=encoding)
+        counts = eg.level_counts(len(gaussians), 1 if levels is None else levels)
+        sections = [n - before for before, n in zip([0, *counts], counts, strict=False)]
+        given = None if spaces else sections
+        packed = eg.pack(gaussians, target, images, max_psnr_drop, given, encoding=encoding)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
-    before = file.stat().st_size
-    if not quiet and isinstance(packed.psnr, dict):
-        shown = ", ".join(f"{name} {psnr:.2f} dB" for name, psnr in packed.psnr.items())
-        against = "the images" if images else "the renderings of the input"
-        click.echo(
-            f"{file}: {len(gaussians):,} Gaussians, {before:,} bytes\n"
-            f"  wrote {target}: {packed.bytes:,} bytes, "
-            f"{packed.bits_per_pixel:.3f} bits per pixel for all maps\n"
-            f"  lost {packed.psnr_drop:.2f} dB; psnr_rgb against {against}: {shown}"
-        )
-    return packing_figures(file, target, gaussians, max_psnr_drop, packed, "psnr_rgb")
-
-
-def packing_figures(
-    file: Path,
-    target: Path,
-    gaussians: Gaussians,
-    max_psnr_drop: float,
-    packed: PackResult,
-    psnr: str,
-) -> dict[str, Any]:
-    """Return the figures of a report, with the PSNR under a key of its kind."""
-    return {
+    figures = {
         "input": str(file),
         "output": str(target),
-        "gaussians": len(gaussians),
+        "gaussians": len(packed.gaussians),
         "max_psnr_drop": max_psnr_drop,
         "bytes_before": file.stat().st_size,
         "bytes": packed.bytes,
         "bits_per_pixel": packed.bits_per_pixel,
-        psnr: packed.psnr,
-        "lost": packed.psnr_drop,
+        "psnr": packed.psnr,
+        "psnr_drop": packed.psnr_drop,
         "steps": packed.steps._asdict(),
     }
+    write_report(report, describe_run(context, backend) | figures)
+    if not quiet:
+        against = "the original" if images is not None else "the rendering of the input"
+        psnr = packed.psnr if isinstance(packed.psnr, dict) else {"": packed.psnr}
+        shown = ", ".join(f"{name} {value:.2f} dB".strip() for name, value in psnr.items())
+        figure = (
+            "psnr_rgb" if spaces else COMPARED_IN.get(gaussians.space, f"psnr in {gaussians.space}")
+        )
+        click.echo(
+            f"{file}: {len(gaussians):,} Gaussians, {file.stat().st_size:,} bytes\n"
+            f"  wrote {target}: {packed.bytes:,} bytes, "
+            f"{packed.bits_per_pixel:.3f} bits per pixel\n"
+            f"  lost {packed.psnr_drop:.2f} dB; {figure} against {against}: {shown}"
+        )

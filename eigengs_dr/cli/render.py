@@ -1,47 +1,34 @@
 """The command ``eigengs-dr render``: render Gaussians to a picture."""
 
 import math
+from functools import partial
 from pathlib import Path
 
 import click
 
 from ..backend.selection import select
-from .console import progress_bar
-from .options import (
-    ANY_PATH,
-    EXISTING,
-    MAX_PIXELS,
-    Region,
-    Size,
-    backend_option,
-    check_pixels,
-    quiet_option,
-)
+from . import options
+from .console import bar
 from .outputs import check_outputs, name_outputs
 
 
 @click.command()
-@click.argument("file", type=EXISTING, metavar="X.npz")
-@click.option(
-    "-o", "--output", required=True, type=ANY_PATH, metavar="Y.png", help="Picture to write."
-)
+@click.argument("file", type=options.EXISTING, metavar="X.npz")
+@options.output("Picture to write.", "Y.png")
 @click.option("--map", "name", metavar="NAME", help="The map of a material to draw.")
-@click.option("--region", type=Region(), help="Left, top, width, height: a part of the image.")
-@click.option("--scale", type=float, metavar="S", help="Factor on the native size, such as 0.5.")
-@click.option("--size", type=Size(), help="Width and height in pixels, such as 1024x768.")
 @click.option(
-    "--first",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Draw the first N Gaussians alone; for fits with --levels.",
+    "--region", type=options.REGION, help="Left, top, width, height: a part of the image."
 )
+@click.option("--scale", type=float, metavar="S", help="Factor on the native size, such as 0.5.")
+@click.option("--size", type=options.Size(), help="Width and height in pixels, such as 1024x768.")
+@options.number("--first", "Draw the first N Gaussians alone; for fits with --levels.", least=1)
 @click.option(
     "--bits",
     type=click.Choice(["8", "16", "32"]),
     help="Bits of a value; 32 are floats.  [default: 32 in .exr, .hdr and .pfm, else 8]",
 )
-@backend_option
-@quiet_option
+@options.backend_option
+@options.quiet_option
 def render(
     file: Path,
     output: Path,
@@ -98,17 +85,9 @@ def render(
             f"{data.size[0]}x{data.size[1]} pixels"
         )
     by_parts = output.suffix.lower() in TIFF_SUFFIXES
-    size = check_pixels(*(size or _scaled(width, height, scale)), by_parts)
-    with progress_bar(quiet) as show:
-        save_region(
-            output,
-            data,
-            region,
-            size,
-            backend,
-            lambda done, total: show(f"{output.name}: draw", done, total),
-            depth,
-        )
+    size = options.check_pixels(*(size or _scaled(width, height, scale)), by_parts)
+    with bar(quiet) as show:
+        save_region(output, data, region, size, backend, partial(show, output.name), depth)
     if not quiet:
         click.echo(f"{file}: {count:,} Gaussians\n  wrote {output} ({size[0]}x{size[1]})")
 
@@ -118,5 +97,5 @@ def _scaled(width: int, height: int, scale: float | None) -> tuple[int, int]:
     scale = 1.0 if scale is None else scale
     if not (math.isfinite(scale) and scale > 0):
         raise click.UsageError(f"--scale {scale}: expected a number above 0, such as 2 or 0.5")
-    scale = min(scale, MAX_PIXELS)
+    scale = min(scale, options.MAX_PIXELS)
     return max(1, round(width * scale)), max(1, round(height * scale))

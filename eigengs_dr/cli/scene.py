@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,10 +18,9 @@ import click
 
 from ..backend.selection import select
 from ..storage.atomic import atomic_write
-from .console import progress_bar
-from .fit import MISSED
-from .options import ANY_PATH, EXISTING, describe_run, quiet_option, report_option
-from .outputs import check_outputs, name_outputs, write_report
+from . import options
+from .console import MISSED, bar, table
+from .outputs import check_outputs, describe_run, name_outputs, write_report
 
 if TYPE_CHECKING:
     from ..scene.convert import ConvertedScene
@@ -61,23 +61,16 @@ definitions_option = click.option(
 
 
 @click.command()
-@click.argument("scenes", nargs=-1, required=True, type=EXISTING, metavar="SCENE.xml...")
-@click.option(
-    "-o", "--output", required=True, type=ANY_PATH, help=".png or .exr file, or a folder."
-)
+@click.argument("scenes", nargs=-1, required=True, type=options.EXISTING, metavar="SCENE.xml...")
+@options.output(".png or .exr file, or a folder.")
 @click.option(
     "--variant",
     metavar="NAME",
     help="Mitsuba variant.  [default: cuda_ad_rgb if there is a GPU, else llvm_ad_rgb]",
 )
-@click.option(
-    "--spp",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Samples per pixel.  [default: from the scene]",
-)
+@options.number("--spp", "Samples per pixel.  [default: from the scene]", least=1)
 @definitions_option
-@quiet_option
+@options.quiet_option
 def scene(
     scenes: tuple[Path, ...],
     output: Path,
@@ -104,14 +97,8 @@ def scene(
     mi = load_mitsuba(variant, quiet)
     for path, target in zip(scenes, outputs, strict=True):
         started = time.perf_counter()
-        try:
-            with progress_bar(quiet) as show:
-                pixels, samples = _render(
-                    mi, path, spp, dict(definitions), partial(show, str(path))
-                )
-        # Mitsuba raises many types for mistakes in a scene; only the message says what is wrong.
-        except Exception as error:
-            raise explain(path, error) from error
+        with explained(path), bar(quiet) as show:
+            pixels, samples = _render(mi, path, spp, dict(definitions), partial(show, str(path)))
         _write(mi, target, pixels)
         if not quiet:
             height, width = pixels.shape[:2]
@@ -169,55 +156,52 @@ def _write(mi: Any, path: Path, pixels: Any) -> None:
         bitmap.write(str(temporary))
 
 
-def explain(path: Path, error: BaseException) -> Exception:
-    """Reduce an error of Mitsuba to one line that says what is wrong."""
-    while error.__cause__:  # the outer error of Dr.Jit only says "see above"
-        error = error.__cause__
-    if isinstance(error, KeyboardInterrupt):
-        return click.Abort()
-    text = re.sub(r"\[\w+\.cpp:\d+\] ", "", str(error))
-    # For an error in a plugin, Mitsuba prints the whole traceback; the last line is the message.
-    where, _, trace = text.partition("Traceback (most recent call last):")
-    if trace:
-        text = where + re.sub(r"^\w+: (\[Errno \d+\] )?", "", trace.strip().splitlines()[-1])
-    if MADE in text:
-        text += "; run 'make scenes' first, which makes the sets of these scenes"
-    return ValueError(f"{path}: {text or type(error).__name__}")
+@contextmanager
+def explained(path: Path) -> Iterator[None]:
+    """Reduce an error of Mitsuba in a block to one line that says what is wrong.
+
+    Mitsuba raises many types for mistakes in a scene; only the message tells them apart.
+    """
+    try:
+        yield
+    except OSError:
+        raise
+    except Exception as error:
+        cause: BaseException = error
+        while cause.__cause__:  # the outer error of Dr.Jit only says "see above"
+            cause = cause.__cause__
+        if isinstance(cause, KeyboardInterrupt):
+            raise click.Abort from error
+        text = re.sub(r"\[\w+\.cpp:\d+\] ", "", str(cause))
+        # For an error in a plugin, Mitsuba prints the whole traceback; its last line says why.
+        where, _, trace = text.partition("Traceback (most recent call last):")
+        if trace:
+            text = where + re.sub(r"^\w+: (\[Errno \d+\] )?", "", trace.strip().splitlines()[-1])
+        if MADE in text:
+            text += "; run 'make scenes' first, which makes the sets of these scenes"
+        raise ValueError(f"{path}: {text or type(cause).__name__}") from error
 
 
 @click.command()
-@click.argument("scene", type=EXISTING, metavar="SCENE.xml")
-@click.option(
-    "-o", "--output", required=True, type=ANY_PATH, metavar="FOLDER", help="New or empty folder."
-)
+@click.argument("scene", type=options.EXISTING, metavar="SCENE.xml")
+@options.output("New or empty folder.", "FOLDER")
 @click.option(
     "--target-psnr",
     "--psnr",
     "target_psnr",
     type=float,
     default=40.0,
-    show_default=True,
     metavar="DB",
     help="With which each camera sees each texture.",
 )
-@click.option(
-    "--iterations",
-    type=click.IntRange(min=0),
-    default=100,
-    show_default=True,
-    metavar="N",
-    help="Steps of optimisation for each number of Gaussians.",
-)
-@click.option(
-    "--spp",
-    type=click.IntRange(min=0),
-    metavar="N",
-    help="Samples per pixel of the renderings; 0 renders nothing.  [default: from the scene]",
+@options.number("--iterations", "Steps of optimisation for each number of Gaussians.", 100, 0)
+@options.number(
+    "--spp", "Samples per pixel; 0 renders nothing.  [default: from the scene]", least=0
 )
 @click.option("--variant", metavar="NAME", help="Mitsuba variant, as for eigengs-dr scene.")
 @definitions_option
-@report_option
-@quiet_option
+@options.report_option
+@options.quiet_option
 @click.pass_context
 def convert(
     context: click.Context,
@@ -237,7 +221,7 @@ def convert(
     after, and 8 times their difference. If a rendering misses the PSNR, the command says so and
     exits with code 1. Environment maps, alpha masks, bump maps, images of two values, values above
     1 and images that no camera sees stay as they are; the command says why. Other files stay where
-    they are, and the new scene names them relative to FOLDER.
+    they are, and the new scene names them relative to options.FOLDER.
 
     \b
     Examples:
@@ -250,19 +234,12 @@ def convert(
     from ..scene.convert import convert_scene
 
     started = time.perf_counter()
-    try:
-        with progress_bar(quiet) as show:
-            found = convert_scene(
-                scene, output, target_psnr, iterations, spp, dict(definitions), progress=show
-            )
-    except OSError:
-        raise
-    # Mitsuba raises many types for mistakes in a scene; only the message says what is wrong.
-    except Exception as error:
-        raise explain(scene, error) from error
-    if report:
-        run = describe_run(context, mi.variant().partition("_")[0])
-        write_report(report, run | _figures(found))
+    with explained(scene), bar(quiet) as show:
+        found = convert_scene(
+            scene, output, target_psnr, iterations, spp, dict(definitions), progress=show
+        )
+    run = describe_run(context, mi.variant().partition("_")[0])
+    write_report(report, run | _figures(found))
     if not quiet:
         click.echo(_table(found))
         click.echo(f"wrote {found.scene} in {time.perf_counter() - started:.1f} s")
@@ -283,19 +260,13 @@ def _figures(found: ConvertedScene) -> dict[str, Any]:
 
 def _table(found: ConvertedScene) -> str:
     """Lay out the textures, what stayed, and how close the renderings are."""
-    widest = max([7, *(len(name) for t in found.textures for name in t.names)])
-    head = ("texels", "bytes", "Gaussians", "bytes", "PSNR seen")
-    lines = [f"{'texture':{widest}}  " + "".join(f"{text:>11}" for text in head)]
+    rows = [("texture", "texels", "bytes", "Gaussians", "bytes", "PSNR seen")]
     for t in found.textures:
-        cells = (
-            f"{t.width}x{t.height}",
-            f"{t.bytes:,}",
-            f"{t.gaussians:,}",
-            f"{t.gaussian_bytes:,}",
-            f"{t.psnr:.1f} dB",
-        )
-        lines.append(f"{t.names[0]:{widest}}  " + "".join(f"{cell:>11}" for cell in cells))
-        lines += [f"{name:{widest}}  (the same set)" for name in t.names[1:]]
+        size, psnr = f"{t.width}x{t.height}", f"{t.psnr:.1f} dB"
+        cells = size, f"{t.bytes:,}", f"{t.gaussians:,}", f"{t.gaussian_bytes:,}", psnr
+        rows.append((t.names[0], *cells))
+        rows += [(name, "(the same set)", "", "", "", "") for name in t.names[1:]]
+    lines = table(rows)
     if found.textures:
         before = sum(t.bytes for t in found.textures)
         after = sum(t.gaussian_bytes for t in found.textures)

@@ -6,21 +6,9 @@ from typing import Any
 import click
 
 from ..backend.selection import select
-from .console import INTERRUPTED, open_cluster, progress_bar, say
-from .options import (
-    ANY_PATH,
-    COUNTS,
-    FOLDER,
-    Size,
-    backend_option,
-    choice,
-    cluster_option,
-    describe_run,
-    quiet_option,
-    report_option,
-    seed_option,
-)
-from .outputs import check_outputs, name_outputs, write_report
+from . import options
+from .console import INTERRUPTED, bar, open_cluster, say
+from .outputs import check_outputs, describe_run, name_outputs, name_pictures, write_report
 
 FREQUENCY_AWARE: dict[str, bool | str] = {"auto": "auto", "yes": True, "no": False}
 """Values of the option, by the word on the command line."""
@@ -30,24 +18,10 @@ MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
 
 
 @click.command()
-@click.argument("folder", type=FOLDER, metavar="FOLDER")
-@click.option(
-    "-o", "--output", required=True, type=ANY_PATH, metavar="MODEL.npz", help="Model to write."
-)
-@click.option(
-    "--size",
-    type=Size(),
-    default="256x256",
-    show_default=True,
-    help="Crop and resize to this.",
-)
-@click.option(
-    "--components",
-    type=COUNTS,
-    default=300,
-    show_default=True,
-    help="Limit, or one per channel.",
-)
+@click.argument("folder", type=options.FOLDER, metavar="FOLDER")
+@options.output("Model to write.", "MODEL.npz")
+@click.option("--size", type=options.Size(), default="256x256", help="Crop and resize to this.")
+@click.option("--components", type=options.COUNTS, default=300, help="Limit, or one per channel.")
 @click.option(
     "--energy",
     type=click.FloatRange(0, 1, min_open=True),
@@ -60,27 +34,19 @@ MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
     metavar="DB",
     help="Keep the fewest for this mean PSNR.",
 )
-@click.option(
-    "--gaussians",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Up to one per pixel. [default: 5000]",
+@options.number("--gaussians", "Up to one per pixel.  [default: 5000]", least=1)
+@options.choice(
+    "--frequency-aware", list(FREQUENCY_AWARE), "Reserve a tenth for the first components."
 )
-@choice("--frequency-aware", list(FREQUENCY_AWARE), "Reserve a tenth for the first components.")
-@choice("--preset", ["default", "eigengs"], "Solve, or train (paper).")
-@click.option(
-    "--iterations",
-    type=click.IntRange(min=0),
-    metavar="N",
-    help="Training steps.  [default: 0; eigengs: 15000]",
-)
-@choice("--space", ["ycbcr", "rgb"], "Space of the components.")
-@seed_option
-@click.option("--preview", type=ANY_PATH, help="Picture of the components.")
-@cluster_option
-@backend_option
-@report_option
-@quiet_option
+@options.choice("--preset", ["default", "eigengs"], "Solve, or train (paper).")
+@options.number("--iterations", "Training steps.  [default: 0; eigengs: 15000]", least=0)
+@options.choice("--space", ["ycbcr", "rgb"], "Space of the components.")
+@options.seed_option
+@click.option("--preview", type=options.ANY_PATH, help="Picture of the components.")
+@options.cluster_option
+@options.backend_option
+@options.report_option
+@options.quiet_option
 @click.pass_context
 def train(
     context: click.Context,
@@ -92,7 +58,7 @@ def train(
     preview: Path | None,
     report: Path | None,
     quiet: bool,
-    **options: Any,
+    **settings: Any,
 ) -> None:
     """Train a model on a folder of images, or on its URL.
 
@@ -110,55 +76,35 @@ def train(
       eigengs-dr train /shared/faces/ -o /shared/faces.npz --cluster tcp://node1:8786
       eigengs-dr fit photo.jpg --basis photos.npz
     """
+    from ..eigenbasis import training
+    from ..eigenbasis.options import TrainOptions
+    from ..fitting.options import default_count
     from ..image.folder import list_images
-    from ..image.io import SAVE_OPTIONS
+    from ..image.io import save_image
+    from ..viewer.sheets import component_sheet
 
     [output] = name_outputs([folder], output, [".npz"])
-    [picture] = name_outputs([folder], preview, list(SAVE_OPTIONS)) if preview else [None]
+    [picture] = name_pictures([folder], preview)
     check_outputs([output, picture, report], list_images(folder))
     select(backend)
-    from ..eigenbasis import training
-
-    settings = _settings(**options)
+    width, height = settings["size"]
+    settings["gaussians"] = settings["gaussians"] or default_count(width * height)
+    settings["frequency_aware"] = FREQUENCY_AWARE[settings["frequency_aware"]]
+    chosen = TrainOptions(**settings)
     try:
-        with open_cluster(cluster) as client, progress_bar(quiet) as show:
-            result = training.train(folder, output, settings, backend, show, client)
+        with open_cluster(cluster) as client, bar(quiet) as show:
+            result = training.train(folder, output, chosen, backend, show, client)
     except training.Interrupted as error:
         say(f"interrupted; {error}")
         context.exit(INTERRUPTED)
     if picture:
-        _save_sheet(picture, result)
-    record = {"input": str(folder), "output": str(output), **_figures(result.figures)}
-    if report:
-        choices = {**vars(settings), "most_components": settings.components}
-        write_report(report, {**describe_run(context, backend), **choices, **record})
+        save_image(picture, component_sheet(result.model, result.basis))
+    record = {"input": str(folder), "output": str(output), **dict.fromkeys(MEASURED)}
+    record |= result.figures
+    choices = vars(chosen) | {"most_components": chosen.components}
+    write_report(report, describe_run(context, backend) | choices | record)
     if not quiet:
         click.echo(_summary(record, picture))
-
-
-def _settings(gaussians: int | None, frequency_aware: str, **options: Any) -> Any:
-    """Turn the options of the command into `TrainOptions`."""
-    from ..eigenbasis.options import TrainOptions
-    from ..fitting.options import default_count
-
-    width, height = options["size"]
-    return TrainOptions(
-        gaussians=gaussians or default_count(width * height),
-        frequency_aware=FREQUENCY_AWARE[frequency_aware],
-        **options,
-    )
-
-
-def _figures(figures: dict[str, Any]) -> dict[str, Any]:
-    """Return all figures of a report; None for a figure that was not measured."""
-    return {**dict.fromkeys(MEASURED), **figures}
-
-
-def _save_sheet(path: Path, trained: Any) -> None:
-    from ..image.io import save_image
-    from ..viewer.sheets import component_sheet
-
-    save_image(path, component_sheet(trained.model, trained.basis))
 
 
 def _summary(record: dict[str, Any], preview: Path | None) -> str:

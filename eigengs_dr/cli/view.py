@@ -7,14 +7,7 @@ import click
 
 from ..backend.selection import select
 from ..fitting.options import Levels
-from .options import (
-    ANY_PATH,
-    IMAGE,
-    LEVEL_COUNTS,
-    backend_option,
-    encoding_option,
-    quiet_option,
-)
+from . import options
 from .outputs import check_outputs, name_outputs
 
 SUFFIXES = (".html", ".htm")
@@ -23,21 +16,27 @@ SUFFIXES = (".html", ".htm")
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path), metavar="NAME|FILE")
 @click.option(
-    "-o", "--output", type=ANY_PATH, metavar="PAGE.html", help="Page.  [default: in this folder]"
+    "-o",
+    "--output",
+    type=options.ANY_PATH,
+    metavar="PAGE.html",
+    help="Page.  [default: in this folder]",
 )
 @click.option(
-    "--image", type=IMAGE, help="The photo, to compare with; a model encodes it and moves it."
+    "--image",
+    type=options.IMAGE,
+    help="The photo, to compare with; a model encodes it and moves it.",
 )
-@encoding_option
+@options.encoding_option
 @click.option("--map", "name", metavar="NAME", help="The map of a material to show.")
 @click.option(
     "--levels",
-    type=LEVEL_COUNTS,
+    type=options.LEVEL_COUNTS,
     help="Levels of the fit, as for fit.  [default: the sections of an .egs file]",
 )
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
-@backend_option
-@quiet_option
+@options.backend_option
+@options.quiet_option
 def view(
     file: Path,
     output: Path | None,
@@ -88,15 +87,20 @@ def view(
 def _load(
     file: Path, name: str | None, levels: Levels | None, backend: str | None
 ) -> tuple[Any, list[int]]:
-    """Return the set or the model of a file or a name, and the Gaussians up to each level."""
+    """Return the set or the model of a file or a name, and the Gaussians up to each level.
+
+    The file may be hostile: a set is counted before it is read.
+    """
     from itertools import accumulate
 
     from ..codec import egs
     from ..eigenbasis import model_file
     from ..eigenbasis.eigengs import SHIPPED, EigenGS
     from ..fitting.options import level_counts
-    from ..gaussian.file import maps_of
+    from ..gaussian import file as set_file
+    from ..gaussian.gaussians import Gaussians
     from ..storage import npz
+    from ..viewer.facts import check_count
 
     file = SHIPPED.get(str(file), file)
     sections = egs.section_counts(file) if egs.is_egs(file) else []
@@ -105,32 +109,13 @@ def _load(
             if value is not None:
                 raise ValueError(f"{file}: is a model; leave {option} out")
         return EigenGS.load(file, backend), []
-    gaussians = _load_set(file, name, sum(sections), backend)
     try:
+        check_count(sum(sections) or set_file.read_head(file).gaussians)
+        gaussians = Gaussians.from_data(set_file.read_map(file, name, "--map"), backend)
         if levels is not None:
             return gaussians, level_counts(len(gaussians), levels)
     except ValueError as error:
-        raise ValueError(f"{file}: {error}") from None
-    if len(sections) < 2 or maps_of(file):
-        return gaussians, []
-    return gaussians, list(accumulate(sections))
-
-
-def _load_set(file: Path, name: str | None, count: int, backend: str | None) -> Any:
-    """Return the set of an image, or of one map of a material; the file may be hostile.
-
-    A count of 0 is not known yet: the head of an ``.npz`` file tells it.
-    """
-    from ..gaussian import file as set_file
-    from ..gaussian.gaussians import Gaussians
-    from ..viewer.facts import check_count
-
-    try:
-        if not count:
-            count = set_file.read_head(file).gaussians
-        check_count(count)
-        data = set_file.read_map(file, name, "--map")
-    except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(str(file)) else f"{file}: {error}") from None
-    return Gaussians.from_data(data, backend)
+    is_whole = len(sections) < 2 or set_file.maps_of(file)
+    return gaussians, [] if is_whole else list(accumulate(sections))

@@ -64,8 +64,9 @@ def fit_many(
         is no set of Gaussians is never replaced.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
-        ``progress(done, total, row)`` after every image, with its `ImageRow`; `total` is None for
-        an iterator. It may raise `KeyboardInterrupt` to end the run.
+        ``progress(done, total, row)`` after every image, with its `ImageRow`, which in this process
+        has the `Fit`; `total` is None for an iterator. It may raise `KeyboardInterrupt` to end the
+        run.
     client : distributed.Client, optional
         Fit on the workers of this Dask cluster; None is this process. Workers read the files and
         write the results, so they need the same file system, or URLs. On llvm the results have

@@ -151,7 +151,7 @@ def collect(
             for row, _, place, _ in finished:
                 rows[place] = row if keep_results else replace(row, result=None)
                 if progress:
-                    progress(len(rows), total, rows[place])
+                    progress(len(rows), total, row)
     except KeyboardInterrupt:
         raise RunInterrupted(_in_order(rows)) from None
     return _in_order(rows)

@@ -9,8 +9,7 @@ from PIL import Image
 
 from _helpers.command import assert_refused, run, succeeded
 from _helpers.mosaics import mosaic
-from eigengs_dr.cli import fit_large
-from eigengs_dr.fitting import memory as estimate
+from eigengs_dr.fitting import memory
 from eigengs_dr.gaussian import file as setfile
 
 FEW = ["--gaussians", 700, "--iterations", 5]
@@ -37,8 +36,7 @@ def test_fit_by_blocks(photo, tmp_path):
 
 
 def test_blocks_are_chosen_where_memory_says_so(photo, tmp_path, monkeypatch):
-    for module in (fit_large, estimate):
-        monkeypatch.setattr(module, "usable_memory", lambda: 200_000_000)
+    monkeypatch.setattr(memory, "usable_memory", lambda: 200_000_000)
     result = succeeded(run("fit", photo, "-o", tmp_path / "x.npz", "--iterations", 2))
     assert "takes too much memory; it is fitted by blocks" in result.stderr
     assert f"{128 * 128 // 20} Gaussians" in result.stdout
@@ -70,12 +68,10 @@ def test_blocks_take_one_image(photo, tmp_path):
 
 
 def test_interrupt(photo, tmp_path, monkeypatch):
-    from eigengs_dr.blocks import fit_large
-
     def interrupted(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fit_large, "fit_large", interrupted)
+    monkeypatch.setattr("eigengs_dr.fit_large", interrupted)
     result = run("fit", photo, "-o", tmp_path / "x.npz", "--blocks", 64, *FEW)
     assert result.exit_code == 130
     assert "the same command goes on" in result.stderr

@@ -7,6 +7,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.command import run, succeeded
+from eigengs_dr.backend import feedback
 from eigengs_dr.cli import console
 from eigengs_dr.collection import fit_many as fit_many_module
 
@@ -77,12 +78,11 @@ def test_a_basis_is_no_output(trained, photos):
     assert model.read_bytes() == before
 
 
-def test_the_bar_shows_images_per_second(monkeypatch, capsys):
+def test_a_line_stands_above_the_bar(monkeypatch, capsys):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
-    with console.images_bar(False, 4) as show:
-        show(1.5, "")
-        show(3, "31.20 dB")
+    monkeypatch.setattr(feedback, "DELAY", 0)
+    with console.bar(False) as show:
+        show("photos", 3, 4, {"psnr_rgb": 31.2})
         console.say("error: x.png: no image")
     said = capsys.readouterr().err
-    assert "images/s" in said and "31.20 dB" in said
-    assert "eigengs-dr: error: x.png: no image\n" in said
+    assert "photos" in said and "eigengs-dr: error: x.png: no image\n" in said

@@ -122,7 +122,10 @@ def test_a_result_is_kept(fitted, folder, tmp_path):
 def test_out_of_reach(folder, tmp_path):
     settings = ("--target-psnr", 90, "--max-gaussians", 20, "--iterations", 5)
     result = run("fit", *maps(folder, "albedo"), "-o", tmp_path / "m.npz", *settings)
-    assert result.exit_code == 1 and "90 dB are out of reach: with " in result.output
+    assert (
+        result.exit_code == 1
+        and "90 dB psnr_rgb are out of reach: 20 Gaussians have" in result.output
+    )
     assert (tmp_path / "m.npz").exists()
 
 

@@ -7,10 +7,8 @@ import pytest
 from PIL import Image
 
 from _helpers.command import assert_refused, run, succeeded
-from eigengs_dr.cli import fit_large as announced
-from eigengs_dr.cli.fit_large import announce_memory
+from eigengs_dr.blocks.source import ORIENTATION, image_size
 from eigengs_dr.fitting import memory
-from eigengs_dr.fitting.options import FitOptions
 
 
 def header(path, width, height, grey=False):
@@ -28,19 +26,20 @@ def header(path, width, height, grey=False):
 def test_fit_that_does_not_fit_is_refused_before_the_image_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(memory, "usable_memory", lambda: 2_000_000_000)
     photo, output = header(tmp_path / "large.png", 8192, 8192), tmp_path / "x.npz"
-    result = run("fit", photo, "-o", output, "--gaussians", 5_000_000)
+    preview = ["--preview", tmp_path / "p.png"]  # blocks have none
+    result = run("fit", photo, "-o", output, "--gaussians", 5_000_000, *preview)
     count = "5,000,000 Gaussians on 8192x8192 pixels"
     assert_refused(result, photo, count, "this process may use 2.0 GB", "scale the image down")
     assert not output.exists()
 
 
-def test_large_fit_says_its_memory(photo, tmp_path, monkeypatch):
-    monkeypatch.setattr(memory, "usable_memory", lambda: None)
-    monkeypatch.setattr(announced, "NOTABLE", 1)
-    arguments = ["fit", photo, "-o", tmp_path / "x.npz", "--gaussians", 9, "--iterations", 1]
-    line = "eigengs-dr: 9 Gaussians on 32x32 pixels take about 0.1 GB of memory\n"
-    assert succeeded(run(*arguments)).stderr == line
-    assert succeeded(run(*arguments, "--quiet")).stderr == ""
+def test_large_fit_says_its_memory(tmp_path):
+    """Before it finds that no pixels follow the header."""
+    photo, output = header(tmp_path / "large.png", 8000, 8000), tmp_path / "x.npz"
+    command = ["fit", photo, "-o", output, "--preview", tmp_path / "p.png"]
+    line = "eigengs-dr: 5,000 Gaussians on 8000x8000 pixels take about 4."
+    assert run(*command).stderr.startswith(line)
+    assert not run(*command, "--quiet").stderr.startswith(line)
 
 
 def test_small_fit_says_nothing(photo, tmp_path):
@@ -51,32 +50,31 @@ def test_small_fit_says_nothing(photo, tmp_path):
 @pytest.mark.parametrize(
     ("grey", "options", "expected"),
     [
-        (False, {}, (8000, 4000, 3, 5000)),
-        (False, {"gaussians": 70}, (8000, 4000, 3, 70)),
-        (False, {"target_psnr": 30.0}, (8000, 4000, 3, 500_000)),
-        (True, {}, (8000, 4000, 3, 5000)),
-        (True, {"space": "data"}, (8000, 4000, 1, 5000)),
+        (False, [], (3, "5,000")),
+        (False, ["--gaussians", 70], (3, "70")),
+        (False, ["--target-psnr", 30], (3, "500,000")),
+        (True, [], (3, "5,000")),
+        (True, ["--space", "data"], (1, "5,000")),
     ],
 )
 def test_size_and_count(tmp_path, monkeypatch, grey, options, expected):
     """Grey becomes RGB, and a search starts with one Gaussian for 64 pixels."""
-    asked = []
-    monkeypatch.setattr(announced, "check_memory", lambda *size: asked.append(size) or "")
+    monkeypatch.setattr(memory, "usable_memory", lambda: 1)
     path = header(tmp_path / "large.png", 8000, 4000, grey)
-    announce_memory(path, FitOptions(**options), quiet=True)
-    assert asked == [expected]
+    outputs = ["-o", tmp_path / "x.npz", "--preview", tmp_path / "p.png"]
+    channels, count = expected
+    needed = memory.estimate_memory(8000, 4000, channels, int(count.replace(",", "")))
+    words = f"{count} Gaussians on 8000x4000 pixels take about {needed / 1e9:.1f} GB"
+    assert_refused(run("fit", path, *outputs, *options), words)
 
 
-def test_photo_that_its_header_turns(tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr(announced, "check_memory", lambda *size: asked.append(size) or "")
+def test_photo_that_its_header_turns(tmp_path):
     exif = Image.Exif()
-    exif[announced.ORIENTATION] = 6
+    exif[ORIENTATION] = 6
     Image.new("RGB", (40, 30)).save(tmp_path / "photo.jpg", exif=exif)
-    announce_memory(tmp_path / "photo.jpg", FitOptions(), quiet=True)
-    assert asked == [(30, 40, 3, 1200)]
+    assert image_size(tmp_path / "photo.jpg") == (40, 30, 3)
 
 
-def test_file_that_is_no_image_is_left_to_the_loader(tmp_path):
+def test_file_that_is_no_image_has_no_size(tmp_path):
     (tmp_path / "text.png").write_text("no image")
-    announce_memory(tmp_path / "text.png", FitOptions(), quiet=False)
+    assert image_size(tmp_path / "text.png") is None

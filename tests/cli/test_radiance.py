@@ -119,7 +119,7 @@ def test_data_beyond_1_have_one_psnr(tmp_path):
 def test_pack_and_several_images_of_light(sky, tmp_path):
     folder, _ = sky
     command = ["pack", folder / "sky.npz", "-o", tmp_path / "y.egs", "--image", folder / "sky.exr"]
-    assert "dB in log" in said(*command)
+    assert "psnr in log" in said(*command)
     save_image(tmp_path / "a.pfm", load_image(folder / "sky.exr"))
     options = ["--space", "linear", *FEW]
     succeeded(run("fit", tmp_path / "a.pfm", folder / "sky.exr", "-o", tmp_path / "out", *options))

@@ -27,7 +27,7 @@ def test_target_psnr(tmp_path):
     figures = json.loads(report.read_text())
     assert (figures["target_psnr"], figures["split_reason"][:2]) == (21, "32")
     assert figures["psnr_held_out"][-1] >= 21 > figures["psnr_held_out"][-2]
-    rows = json.loads(said("info", model, "--json"))["fall"]
+    rows = json.loads(said("info", model, "--json"))["truncation"]
     assert rows[0]["components"] == [0, 0, 0] and rows[0]["variance"] == 0
     assert rows[-1]["components"] == figures["components"]
     assert rows[-1]["psnr_held_out"] == pytest.approx(figures["psnr_held_out"][-1], abs=1e-3)
@@ -122,7 +122,7 @@ def test_train_interrupted_goes_on(trained, tmp_path, monkeypatch):
 
     command = ["train", folder / "photos", "-o", tmp_path / "m.npz", *SMALL]
     with monkeypatch.context() as patched:
-        patched.setattr(cli_train, "progress_bar", presses)
+        patched.setattr(cli_train, "bar", presses)
         result = run(*command)
     assert result.exit_code == 130
     assert result.stderr == "eigengs-dr: interrupted; the same command goes on from here\n"
