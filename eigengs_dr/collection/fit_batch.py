@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -65,9 +64,7 @@ def fits_in_batches(options: FitOptions, pixels: NDArray[np.float32]) -> bool:
 
 
 @exclusive()
-def fit_batch(
-    images: Images, options: FitOptions, progress: Callable[[float], None] | None = None
-) -> list[Fit]:
+def fit_batch(images: Images, options: FitOptions) -> list[Fit]:
     """Fit several images of one size together.
 
     Parameters
@@ -75,8 +72,6 @@ def fit_batch(
     images : ndarray of float32, shape (M, H, W, C)
         Images from `eigengs_dr.image.io.check_image`, of which `fits_in_batches` is true.
     options : FitOptions
-    progress : callable, optional
-        ``progress(share)`` every 10 steps, with the share of the steps that are done.
 
     Returns
     -------
@@ -110,8 +105,6 @@ def fit_batch(
                 return True
         if step % 10 == 0:
             dr.sync_thread()
-            if progress:
-                progress(step / max(1, options.iterations))
         if interrupted():
             raise KeyboardInterrupt
         return False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from functools import partial
 from typing import Any
@@ -18,18 +18,14 @@ from ..fitting.start import load_start
 from ..fitting.target import unit_of
 from ..image.color import rendered_as
 from ..image.pixels import LinearImage
-from .dispatch import run_images
 from .fit_batch import MAX_SIDE, fit_batch, fits_in_batches
-from .manifest import Finished, ImageRow, Outcome, Pixels, collect
-from .run import FAILURES, Job, Work
+from .manifest import ImageRow
+from .run import FAILURES, Job, Outcome, Pixels, Work, run_images
 from .sources import Images
 
 MAX_GROUP_PIXELS = 1 << 18
 """Largest number of pixels of a group: 4 images of 256x256, or 64 of 64x64. Larger groups are not
 faster, and an interrupt loses the group under way."""
-
-Step = Callable[[float], None]
-"""``step(share)``: which share of the current image is done, from 0 to 1."""
 
 
 @shows_progress
@@ -116,32 +112,15 @@ def fit_many(
     own = ("images", "output", "overwrite", "progress", "client")
     refuse_unknown(options, [*(field.name for field in fields(FitOptions)), *own])
     settings = FitOptions(**options)
-    total, finished = fit_each(images, output, overwrite, settings, client=client)
-    return collect(total, finished, output is None, progress)
+    if settings.start is not None:
+        settings = replace(settings, start=load_start(settings.start, settings.backend))
+    keep_grey = rendered_as(settings.space) is None
+    make_work = partial(fit_work, settings)
+    job = Job(make_work, _may_join, keep_grey, settings.encoding, settings.iterations)
+    return run_images(images, output, overwrite, job, progress, client)
 
 
-def fit_each(
-    images: Images,
-    output: str | os.PathLike[str] | None,
-    overwrite: bool,
-    options: FitOptions,
-    step: Step | None = None,
-    client: Any = None,
-) -> tuple[int | None, Generator[Finished, None, None]]:
-    """Return the number of images, if it is known, and a generator that fits them.
-
-    Arguments and errors as for `fit_many`. In this process, each `Finished` image has its pixels
-    and its `Fit`, they come in order, and `step` is called. On a cluster they come as they end.
-    """
-    if options.start is not None:
-        options = replace(options, start=load_start(options.start, options.backend))
-    make_work = partial(fit_work, options, None if client is not None else step)
-    keep_grey = rendered_as(options.space) is None
-    job = Job(make_work, _may_join, keep_grey, options.encoding, options.iterations)
-    return run_images(images, output, overwrite, job, client)
-
-
-def fit_work(options: FitOptions, step: Step | None = None) -> Work:
+def fit_work(options: FitOptions) -> Work:
     """Return the `Work` of a fit of many images.
 
     Raises
@@ -150,7 +129,7 @@ def fit_work(options: FitOptions, step: Step | None = None) -> Work:
         If the backend is not available.
     """
     select(options.backend)
-    return partial(_fit_group, options=options, step=step)
+    return partial(_fit_group, options=options)
 
 
 def _may_join(group: list[Pixels], pixels: Pixels) -> bool:
@@ -164,18 +143,13 @@ def _is_small(pixels: Pixels) -> bool:
     return max(pixels.shape[:2]) <= MAX_SIDE
 
 
-def _fit_group(images: list[Pixels], options: FitOptions, step: Step | None) -> Iterator[Outcome]:
+def _fit_group(images: list[Pixels], options: FitOptions) -> Iterator[Outcome]:
     """Fit images of one size, together if they are small."""
-
-    def progress(iteration: int, iterations: int, row: dict[str, Any]) -> None:
-        if step:
-            step(iteration / max(1, iterations))
-
     plain = not isinstance(images[0], LinearImage)
     plain &= all(unit_of(image, options.space) == 1 for image in images)
     if plain and fits_in_batches(options, images[0]):
         try:
-            results = fit_batch(np.stack(images), options, step)
+            results = fit_batch(np.stack(images), options)
         except FAILURES:
             pass  # below, each image says what is wrong with it
         else:
@@ -184,7 +158,7 @@ def _fit_group(images: list[Pixels], options: FitOptions, step: Step | None) -> 
             return
     for pixels in images:
         try:
-            result = fit_image(pixels, options, progress)
+            result = fit_image(pixels, options)
         except FAILURES as error:
             yield Outcome(None, None, {"error": str(error) or type(error).__name__})
         else:

@@ -1,10 +1,8 @@
-"""What becomes of an image, and the manifest of an output folder, from which a run continues.
+"""What becomes of an image, and the manifest of an output folder: a row for each image.
 
-``manifest.jsonl`` holds one JSON object a line. During a run it is a journal: an image that begins
-has a line with the status "started", and its last line says what became of it. Files of results
-are whole or not there, so an image whose run ended between its file and its row is done, too: its
-file is not the one that the line "started" saw. A result that no run began belongs to somebody
-else, and is kept. The end of a run leaves one line an image, sorted by name.
+The files of results are whole or not there, so they say what a run need not do again. During a run
+``manifest.jsonl`` grows by a line for each image, a JSON object; the last line of an image counts.
+The end of a run leaves one line an image, sorted by name.
 """
 
 from __future__ import annotations
@@ -12,19 +10,13 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Generator, Iterable
-from contextlib import ExitStack, closing, suppress
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from ..gaussian.gaussians import Gaussians
 from ..storage.atomic import atomic_write, lock_folder, remove_stale
-
-Pixels = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -93,81 +85,10 @@ class RunInterrupted(KeyboardInterrupt):
         self.rows = rows
 
 
-class Outcome(NamedTuple):
-    """Result of the work on one image.
-
-    Attributes
-    ----------
-    gaussians : Gaussians or None
-        None if the image failed.
-    result : Any
-        What `ImageRow.result` holds.
-    figures : dict
-        Other attributes of the `ImageRow`.
-    """
-
-    gaussians: Gaussians | None
-    result: Any
-    figures: dict[str, Any]
-
-
-class Finished(NamedTuple):
-    """An image whose result, if any, is written.
-
-    Attributes
-    ----------
-    row : ImageRow
-        In this process with the result, whether or not there is an output folder.
-    pixels : ndarray of float32, shape (H, W, C), or None
-        None if nothing was done, or if a worker of a cluster did it.
-    place : int
-        Place of the image among the images of the run, from 0.
-    may_pass : bool
-        Whether a failure may pass by itself: a full disk, a network.
-    """
-
-    row: ImageRow
-    pixels: Pixels | None = None
-    place: int = 0
-    may_pass: bool = False
-
-
-def collect(
-    total: int | None,
-    finished: Generator[Finished, None, None],
-    keep_results: bool,
-    progress: RowProgress | None,
-) -> list[ImageRow]:
-    """Return the rows of a run, in the order of the images.
-
-    Raises
-    ------
-    RunInterrupted
-        If the run, or `progress`, raises `KeyboardInterrupt`.
-    """
-    rows = dict[int, ImageRow]()
-    try:
-        with closing(finished):
-            for row, _, place, _ in finished:
-                rows[place] = row if keep_results else replace(row, result=None)
-                if progress:
-                    progress(len(rows), total, row)
-    except KeyboardInterrupt:
-        raise RunInterrupted(_in_order(rows)) from None
-    return _in_order(rows)
-
-
-def _in_order(rows: dict[int, ImageRow]) -> list[ImageRow]:
-    return [rows[place] for place in sorted(rows)]
-
-
 NAME = "manifest.jsonl"
 """Name of the file in the output folder."""
 
-STARTED = "started"
-"""Status of an image whose work has begun."""
-
-STATUSES = ("done", "skipped", "failed", STARTED)
+STATUSES = ("done", "skipped", "failed")
 
 KEYS = [field.name for field in fields(ImageRow) if field.name != "result"]
 """Keys of a row."""
@@ -215,51 +136,31 @@ class Manifest:
         """Leave one row an image, and free the folder."""
         with self._stack:
             os.close(self._file)  # Windows replaces no file that is open
-            # If the disk is too full for a second file, the journal holds the same rows.
+            # If the disk is too full for a second file, the longer one holds the same rows.
             with suppress(OSError):
                 self._rewrite()
                 remove_stale(self.path.parent)
 
-    def start(self, names: Iterable[str]) -> None:
-        """Record that the work on some images begins, and which results they had before."""
-        self._append(
-            [{"name": k, "status": STARTED, "before": stamp(self.output(k))} for k in names]
-        )
-
     def add(self, row: ImageRow) -> None:
         """Record what became of an image. A skipped image keeps the row of its result."""
-        if row.status == "skipped" and row.name in self.rows:
-            if self.rows[row.name]["status"] != STARTED:
-                return
-            row = replace(row, status="done")  # by a run that ended before it wrote the row
-        self._append([_to_json(row)])
-
-    def output(self, name: str) -> Path:
-        """Return the file of the result of an image."""
-        return self.path.with_name(f"{name}.npz")
-
-    def _append(self, rows: list[Row]) -> None:
-        """Write lines at the end of the file."""
-        text = "".join(json.dumps(row) + "\n" for row in rows).encode()
+        if row.status == "skipped" and self.rows.get(row.name, {}).get("status") == "done":
+            return
+        self.rows[row.name] = _to_json(row)
+        text = (json.dumps(self.rows[row.name]) + "\n").encode()
         try:
             while text:  # a disk that is nearly full takes a part of it
                 text = text[os.write(self._file, text) :]
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(self.path)) from error
-        self.rows.update({row["name"]: row for row in rows})
+
+    def output(self, name: str) -> Path:
+        """Return the file of the result of an image."""
+        return self.path.with_name(f"{name}.npz")
 
     def _rewrite(self) -> None:
         with atomic_write(self.path) as temporary:
             lines = (json.dumps(self.rows[name]) + "\n" for name in sorted(self.rows))
             temporary.write_text("".join(lines), encoding="utf-8")
-
-
-def stamp(path: Path) -> int | None:
-    """Return the time of the last change of a file in nanoseconds, or None if there is no file."""
-    try:
-        return path.stat().st_mtime_ns
-    except FileNotFoundError:
-        return None
 
 
 def read_manifest(path: Path) -> tuple[dict[str, Row], bool]:

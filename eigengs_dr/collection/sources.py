@@ -1,12 +1,10 @@
-"""The images of a run: their names and outputs, decoded by threads before they are needed."""
+"""The images of a run: their names, their outputs and their pixels."""
 
 from __future__ import annotations
 
 import glob
 import os
-from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +17,7 @@ from ..image import io
 from ..image.folder import image_files
 from ..image.remote import is_url, list_urls, stem_of
 from ..storage.atomic import refuse_url, require_writable
-from .manifest import STARTED, Manifest, stamp
+from .manifest import ImageRow, Manifest
 
 Images = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | ArrayLike]
 """A folder, a glob, a URL of one of them, or any iterable of image files, their URLs and arrays."""
@@ -58,6 +56,12 @@ class Source(NamedTuple):
     def path(self) -> Path | str | None:
         """The file or the URL of the image; None for an array."""
         return self.image if isinstance(self.image, (Path, str)) else None
+
+    @property
+    def row(self) -> ImageRow:
+        """The row of the image before the work."""
+        known = self.name, self.status, self.path, self.output
+        return ImageRow(*known, error=self.error, **self.figures)
 
 
 def list_sources(images: Images) -> Iterable[Source]:
@@ -162,8 +166,7 @@ def plan_output(source: Source, manifest: Manifest, overwrite: bool) -> Source:
     ----------
     source : Source
     manifest : Manifest
-        The manifest of the output folder. If it says that a run began the image, the file is its
-        result only if it has changed since.
+        The manifest of the output folder.
     overwrite : bool
         Do images again whose result exists. A file that holds something else, such as a basis, is
         never replaced.
@@ -182,8 +185,7 @@ def plan_output(source: Source, manifest: Manifest, overwrite: bool) -> Source:
     except (ValueError, OSError):
         error = f"{output}: exists and is no set of Gaussians; move it, or use another folder"
         return planned._replace(status="failed", error=error)
-    unfinished = row.get("status") == STARTED and row.get("before") == stamp(output)
-    if overwrite or unfinished or row.get("status") == "failed":
+    if overwrite or row.get("status") == "failed":
         return planned
     width, height = head.size
     figures = {"width": width, "height": height, "gaussians": head.gaussians}
@@ -194,17 +196,6 @@ def _figures(row: dict[str, Any]) -> dict[str, Any]:
     """Return the figures of a row of a manifest, which may come from another version."""
     names = ("width", "height", "gaussians", "psnr_ycbcr", "psnr_rgb", "seconds", "iterations")
     return {name: row.get(name) for name in names}
-
-
-THREADS = 2
-"""Threads that decode. A 256x256 JPEG takes 1.2 ms to decode, far less than any fit."""
-
-MAX_WAITING = 512
-"""Largest number of images that wait in memory."""
-
-MAX_WAITING_BYTES = 1 << 26
-"""Bytes of the images that wait in memory, as far as the largest image until then tells. One image
-may wait whatever its size."""
 
 
 class Decoded(NamedTuple):
@@ -225,64 +216,20 @@ class Decoded(NamedTuple):
     may_pass: bool = False
 
 
-def read_ahead(
-    sources: Iterable[Source], keep_grey: bool, encoding: str | None = None
-) -> Generator[Decoded, None, None]:
-    """Decode images in threads while the caller works on earlier ones.
+def decode(source: Source, keep_grey: bool, encoding: str | None) -> Decoded:
+    """Read one image, or note why it cannot be read.
 
     Parameters
     ----------
-    sources : iterable of Source
-        Files are read in threads. Arrays are copied at once: their owner may overwrite an array
-        when the next one is requested.
+    source : Source
+        An array is copied: its owner may overwrite it.
     keep_grey : bool
         Whether the images are data, which keep one channel.
-    encoding : {"srgb", "linear"}, optional
+    encoding : {"srgb", "linear"} or None
         What the pixels are, see `eigengs_dr.image.io.load_image`.
-
-    Yields
-    ------
-    Decoded
-        In the order of the sources. At most `MAX_WAITING` images and about `MAX_WAITING_BYTES` are
-        read ahead.
     """
-    pool = ThreadPoolExecutor(THREADS, thread_name_prefix="decode")
-    waiting: deque[Future[Decoded]] = deque()
-    largest = 0
-    try:
-        for source in sources:
-            waiting.append(_submit(pool, source, keep_grey, encoding))
-            while len(waiting) > _max_waiting(largest):
-                decoded = waiting.popleft().result()
-                largest = max(largest, 0 if decoded.pixels is None else decoded.pixels.nbytes)
-                yield decoded
-                del decoded  # frees the image before the next one is awaited
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _max_waiting(largest: int) -> int:
-    """Return how many images may wait if each has up to `largest` bytes; 0 means unknown."""
-    if not largest:
-        return THREADS
-    return min(max(1, MAX_WAITING_BYTES // largest), MAX_WAITING)
-
-
-def _submit(
-    pool: ThreadPoolExecutor, source: Source, keep_grey: bool, encoding: str | None
-) -> Future[Decoded]:
-    """Start to read a file; check an array, or pass a source without work on, at once."""
-    if source.path is not None and not source.status:
-        return pool.submit(_decode, source, keep_grey, encoding)
-    done: Future[Decoded] = Future()
-    done.set_result(Decoded(source) if source.status else _decode(source, keep_grey, encoding))
-    return done
-
-
-def _decode(source: Source, keep_grey: bool, encoding: str | None) -> Decoded:
-    """Read one image, or note why it cannot be read."""
+    if source.status:
+        return Decoded(source)
     try:
         if isinstance(source.image, (Path, str)):
             return Decoded(source, io.load_image(source.image, keep_grey, encoding))

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.recording import exclusive
-from ..collection.dispatch import run_images
-from ..collection.manifest import ImageRow, Outcome, RowProgress, collect
-from ..collection.run import FAILURES, Job, Work
+from ..collection.manifest import ImageRow, RowProgress
+from ..collection.run import FAILURES, Job, Outcome, Work, run_images
 from ..collection.sources import Images
 from ..gaussian.gaussians import Gaussians
 from ..image.pixels import check_image
@@ -55,8 +54,7 @@ def encode_each(
     """
     check_encoding(*options)
     job = Job(partial(encode_work, model, *options), _may_join)
-    total, finished = run_images(images, output, overwrite, job, client)
-    return collect(total, finished, output is None, progress)
+    return run_images(images, output, overwrite, job, progress, client)
 
 
 def encode_work(model: EigenGS, colors: str, mean: str, target_psnr: float | None) -> Work:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from ..backend.arrays import Float, types_in, types_of, upload, upload_rows
 from ..backend.feedback import to_html
 from ..backend.recording import exclusive
-from ..backend.selection import select
+from ..backend.selection import BackendError, select
 from ..storage.npz import BadValue
 from .file import CUTOFF, SetData, check, read, write
 from .maps import TextureMap, find_map, slices
@@ -188,7 +188,7 @@ class Gaussians:
         """Travel to another process as NumPy arrays, without derivatives."""
         types = types_of(self.mean)
         kind = np.dtype(f"f{types.bits // 8}")
-        return Gaussians.from_data, (self.data(), types.backend, kind)
+        return _received, (self.data(), types.backend, kind)
 
     def __repr__(self) -> str:
         size = f"{len(self)}, {self.width}x{self.height} pixels"
@@ -343,6 +343,14 @@ class Gaussians:
             If the file cannot be opened.
         """
         return cls.from_data(read(Path(path), sections), backend, dtype)
+
+
+def _received(data: SetData, backend: str, kind: Any) -> Gaussians:
+    """Return a set that came from another process, perhaps of a machine with a GPU."""
+    try:
+        return Gaussians.from_data(data, backend, kind)
+    except BackendError:
+        return Gaussians.from_data(data, None, kind)
 
 
 def clip_parameters(

@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,12 @@ from .pixels import ImageError
 from .remote import is_url, list_urls
 from .resize import center_crop
 
-DECODE_THREADS = min(8, os.cpu_count() or 1)
+THREADS = min(8, os.cpu_count() or 1)
 """Number of threads that decode files; Pillow and NumPy release the interpreter lock."""
 
-MAX_WAITING = 4 * DECODE_THREADS
-"""Largest number of prepared images that wait in memory."""
+MAX_WAITING, MAX_WAITING_BYTES = 512, 1 << 25
+"""Largest number of images that wait in memory, and their bytes, as far as the largest image until
+then tells. One image may wait whatever its size."""
 
 MAX_NAMED = 3
 """Largest number of skipped files that a warning names."""
@@ -199,14 +200,60 @@ def _prepare_images(
     source: Iterable[Any], size: tuple[int, int], space: str
 ) -> Generator[PreparedImage, None, None]:
     """Prepare images in parallel, and yield them in the order of the source."""
-    pool = ThreadPoolExecutor(DECODE_THREADS, thread_name_prefix="decode")
-    waiting: deque[Future[PreparedImage]] = deque()
+
+    def prepare(numbered: tuple[int, Any]) -> PreparedImage:
+        return _prepare(numbered[1], numbered[0], size, space)
+
+    def bytes_of(image: PreparedImage) -> int:
+        return 0 if image.planes is None else image.planes.nbytes
+
+    return read_ahead(enumerate(_singles(source)), prepare, lambda n: _is_file(n[1]), bytes_of)
+
+
+Item = TypeVar("Item")
+Read = TypeVar("Read")
+
+
+def read_ahead(
+    items: Iterable[Item],
+    read: Callable[[Item], Read],
+    is_file: Callable[[Item], bool],
+    bytes_of: Callable[[Read], int],
+) -> Generator[Read, None, None]:
+    """Read items in threads while the caller works on earlier ones.
+
+    Parameters
+    ----------
+    items : iterable
+    read : callable
+        Returns what is yielded for an item.
+    is_file : callable
+        Whether threads may read an item. Others are read at once: the owner of an array may
+        overwrite it when the next one is requested.
+    bytes_of : callable
+        Memory of what was read.
+
+    Yields
+    ------
+    Any
+        In the order of the items. At most `MAX_WAITING` and about `MAX_WAITING_BYTES` wait.
+    """
+    waiting: deque[Future[Read]] = deque()
+    largest = 0
+    pool = ThreadPoolExecutor(THREADS, thread_name_prefix="decode")
     try:
-        for place, item in enumerate(_singles(source)):
-            waiting.append(pool.submit(_prepare, item, place, size, space))
-            # Finish an array at once: its owner may overwrite it.
-            while len(waiting) > (MAX_WAITING if _is_file(item) else 0):
-                yield waiting.popleft().result()
+        for item in items:
+            if is_file(item):
+                waiting.append(pool.submit(read, item))
+            else:
+                waiting.append(Future())
+                waiting[-1].set_result(read(item))
+            most = MAX_WAITING_BYTES // largest if largest else THREADS
+            while len(waiting) > min(max(1, most), MAX_WAITING):
+                found = waiting.popleft().result()
+                largest = max(largest, bytes_of(found))
+                yield found
+                del found  # frees the memory before the next one is awaited
         while waiting:
             yield waiting.popleft().result()
     finally:

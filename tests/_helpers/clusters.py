@@ -150,7 +150,7 @@ class Here:
     @property
     def names(self):
         """Names of the images of each task."""
-        return [[source.name for source in task.sources] for task in self.tasks]
+        return [[source.name for source in task] for task in self.tasks]
 
     def map(self, function, tasks, shared=None, at_once=None):
         from eigengs_dr.backend.executor import Done

@@ -5,7 +5,6 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.clusters import QUICK, Here, files_of, folder_of_photos
-from eigengs_dr.collection import dispatch as module
 from eigengs_dr.collection import run
 from eigengs_dr.image.pixels import LinearImage
 
@@ -46,7 +45,7 @@ def test_relative_names_reach_workers_whole(photos, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     executor = Here()
     rows = eg.fit_many("photos", "fits", client=executor, **QUICK)
-    sources = [source for task in executor.tasks for source in task.sources]
+    sources = [source for task in executor.tasks for source in task]
     assert all(s.image.is_absolute() and s.output.is_absolute() for s in sources)
     assert str(rows[0].input) == "photos/00.png" and str(rows[0].output) == "fits/00.npz"
 
@@ -74,7 +73,7 @@ def test_a_failure_that_may_pass_is_tried_again(photos, tmp_path, monkeypatch):
     rows = eg.fit_many(photos, tmp_path / "fits", client=Here(), **QUICK)
     assert [row.name for row in rows if row.status == "failed"] == ["03"]
     assert rows[3].error.endswith("03.npz: No space left on device")
-    assert tries.count("03.npz") == tries.count("04.npz") == 1 + module.RETRIES
+    assert tries.count("03.npz") == tries.count("04.npz") == 1 + run.RETRIES
     assert len(rows) == 12 and not list((tmp_path / "fits").glob(".*"))
 
 

@@ -11,8 +11,7 @@ import eigengs_dr as eg
 from _helpers.command import smooth_pixels
 from eigengs_dr.collection import fit_many as fit_many_module
 from eigengs_dr.collection import run
-from eigengs_dr.collection import sources as read_ahead
-from eigengs_dr.image import io
+from eigengs_dr.image import folder, io
 
 QUICK = {"gaussians": 20, "iterations": 2}
 
@@ -201,14 +200,12 @@ def test_images_read_ahead_are_few(tmp_path, output, monkeypatch):
     eg_load = io.load_image
     monkeypatch.setattr(io, "load_image", load)
     size = 4 * 24 * 32 * 3
-    monkeypatch.setattr(read_ahead, "MAX_WAITING_BYTES", 5 * size)
+    monkeypatch.setattr(folder, "MAX_WAITING_BYTES", 5 * size)
     monkeypatch.setattr(fit_many_module, "MAX_GROUP_PIXELS", 3 * 24 * 32)
     rows = eg.fit_many(sources, output, gaussians=5, iterations=0)
     assert all(row.status == "done" for row in rows) and len(most) == 40
     # Waiting images, a group and its successor, and results whose files are written.
     assert max(most) <= 5 + 1 + 3 + 1 + run.MAX_WRITING + 1
-    monkeypatch.setattr(read_ahead, "MAX_WAITING_BYTES", 1)
-    assert read_ahead._max_waiting(size) == 1 and read_ahead._max_waiting(0) == read_ahead.THREADS
 
 
 def test_groups_keep_the_order(monkeypatch, photos, output):

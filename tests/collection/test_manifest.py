@@ -52,14 +52,20 @@ def test_skipped_images_keep_their_figures(photos, output):
     assert (output / NAME).read_bytes() == before
 
 
-def test_an_image_that_was_begun_is_done_again(photos, output):
-    """The run that should have replaced its result ended before it did."""
+def test_a_result_stays_until_it_is_replaced(photos, output):
+    """A run that should replace all results and ends early leaves whole files of both runs."""
     eg.fit_many(photos, output, **QUICK)
-    with Manifest(output) as manifest:
-        manifest.start(["01"])
-    assert statuses(output)["01"] == "started"
-    rows = eg.fit_many(photos, output, **QUICK)
-    assert [row.status for row in rows] == ["skipped", "done", "skipped"]
+    before = files_of(output)
+    other = {"gaussians": 10, "iterations": 0}
+
+    def press(done, total, row):
+        raise KeyboardInterrupt
+
+    with pytest.raises(eg.RunInterrupted):
+        eg.fit_many(photos, output, overwrite=True, progress=press, **other)
+    assert files_of(output)["00.npz"] != before["00.npz"]
+    rows = eg.fit_many(photos, output, **other)
+    assert [row.status for row in rows] == ["skipped"] * 3 and rows[0].gaussians == 10
     assert set(statuses(output).values()) == {"done"}
 
 
@@ -69,12 +75,12 @@ def test_a_file_that_was_written_before_its_row_is_done(photos, output):
     whole = (output / "01.npz").read_bytes()
     (output / "01.npz").unlink()
     with Manifest(output) as manifest:
-        manifest.start(["01"])
-        (output / "01.npz").write_bytes(whole)
+        del manifest.rows["01"]
+    (output / "01.npz").write_bytes(whole)
     rows = eg.fit_many(photos, output, **QUICK)
     assert [row.status for row in rows] == ["skipped"] * 3
     assert (rows[1].width, rows[1].height, rows[1].gaussians) == (32, 24, 20)
-    assert set(statuses(output).values()) == {"done"}
+    assert statuses(output) == {"00": "done", "01": "skipped", "02": "done"}
 
 
 def test_a_result_of_no_run_is_kept(photos, output):
@@ -168,12 +174,12 @@ def test_interrupted_runs_leave_one_row_an_image(photos, output):
 
     with pytest.raises(eg.RunInterrupted):
         eg.fit_many(photos, output, progress=press, **QUICK)
-    # All were one group: the others are begun, and perhaps written.
-    assert statuses(output) == {"00": "done", "01": "started", "02": "started"}
+    # All were one group: the others are perhaps written.
+    assert statuses(output) == {"00": "done"}
     written = set(files_of(output))
     for row in eg.fit_many(photos, output, **QUICK):
         assert row.status == ("skipped" if row.output.name in written else "done")
-    assert set(statuses(output).values()) == {"done"}
+    assert set(statuses(output)) == {"00", "01", "02"}
 
 
 def test_encoded_images_have_rows_too(photos, output):

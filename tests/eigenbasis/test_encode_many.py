@@ -61,7 +61,10 @@ def test_files_a_bad_one_and_resuming(backend, tmp_path):
     seen = []
     rows = model.encode_many(tmp_path, tmp_path / "sets", progress=lambda *row: seen.append(row))
     assert [row.status for row in rows] == ["done", "failed", "done"]
-    assert seen == [(number + 1, 3, row) for number, row in enumerate(rows)]
+    assert [(done, total, row.name) for done, total, row in seen] == [
+        (number + 1, 3, row.name) for number, row in enumerate(rows)
+    ]
+    assert len(seen[2][2].result) == rows[2].gaussians and rows[2].result is None
     assert len(eg.Gaussians.load(tmp_path / "sets" / "2.npz")) == rows[2].gaussians
     again = model.encode_many(tmp_path, tmp_path / "sets")
     assert [row.status for row in again] == ["skipped", "failed", "skipped"]

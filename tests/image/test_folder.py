@@ -114,7 +114,7 @@ def test_order_is_that_of_the_source_whatever_is_ready_first(tmp_path, monkeypat
         return load_image(path)
 
     monkeypatch.setattr(stream, "load_image", slow)
-    monkeypatch.setattr(stream, "DECODE_THREADS", 2)
+    monkeypatch.setattr(stream, "THREADS", 2)
     np.testing.assert_array_equal(np.concatenate(read(files)), planes(images))
 
 
