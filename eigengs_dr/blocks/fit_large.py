@@ -22,7 +22,7 @@ from ..storage.atomic import require_writable
 from ..storage.checkpoint import Checkpoint
 from .grid import Block, choose_halo, divide
 from .run import Run
-from .source import Source, forget_pictures, open_source
+from .source import Source, open_source
 
 BLOCK_SIDE = 1024
 """Default side of a block in pixels."""
@@ -90,7 +90,7 @@ def fit_large(
     ----------
     image : path-like or array
         A TIFF file by strips or tiles and a ``.npy`` file are read by windows; other files are
-        decoded whole, into 4 bytes a pixel. Or an array (H, W, 3), (H, W, 1) or (H, W): NumPy's,
+        decoded whole, into 3 bytes a pixel. Or an array (H, W, 3), (H, W, 1) or (H, W): NumPy's,
         also memory-mapped, zarr's or Dask's, of which parts are read by slices.
     output : path-like, optional
         The ``.npz`` file of the result. Blocks that are done wait in a folder beside it, of the
@@ -166,21 +166,16 @@ def fit_large(
         check_suffix(output)
         require_writable(output)
         keep = Checkpoint(output, source.identity | _decisive(options, block), [])
-    try:
-        with (
-            keep as checkpoint,
-            defer_interrupts() if client is None else nullcontext() as interrupted,
-        ):
-            run = Run(
-                source, blocks, options, executor_for(client), checkpoint, progress, interrupted
-            )
-            data = run.fit()
-            errors = run.measure(data)
-            data = _in_unit(data, run.image.unit)
-            if output is not None:
-                write(output, data)
-    finally:
-        forget_pictures()
+    with (
+        keep as checkpoint,
+        defer_interrupts() if client is None else nullcontext() as interrupted,
+    ):
+        run = Run(source, blocks, options, executor_for(client), checkpoint, progress, interrupted)
+        data = run.fit()
+        errors = run.measure(data)
+        data = _in_unit(data, run.image.unit)
+        if output is not None:
+            write(output, data)
     ycbcr, rgb = (psnr_from_mse(e / (3 * source.width * source.height)) for e in errors)
     result = Gaussians.from_data(data, backend)
     seconds = time.perf_counter() - started

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +27,6 @@ GREY = ("1", "L", "I", "I;16", "I;16B", "I;16L", "F")
 """Modes of Pillow for opaque images of one channel."""
 
 Array = NDArray[Any]
-Read = Callable[[slice, slice], Array]
 
 
 class Window(NamedTuple):
@@ -145,48 +144,50 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
         raise ImageError(f"image: is a {kind}; pass a file or an array of shape (H, W, 3)")
     shape, dtype = tuple(int(side) for side in source.shape), np.dtype(source.dtype)
     identity = {"shape": list(shape), "dtype": dtype.str}
-
-    def cut(rows: slice, columns: slice) -> Callable[[], Array]:
-        return partial(np.asarray, np.asarray(source[rows, columns]))
-
     said = encoding_of(source, encoding) or "srgb"
-    return _checked("image", shape, identity, cut, keep_grey, said)
+    return _checked("image", shape, identity, _cut_array(source), keep_grey, said)
+
+
+def _cut_array(pixels: Any) -> Callable[[slice, slice], Callable[[], Array]]:
+    """Return what cuts windows out of an array; each holds its pixels alone."""
+    return lambda rows, columns: partial(np.asarray, np.asarray(pixels[rows, columns]))
 
 
 def _open_file(path: Path, keep_grey: bool, encoding: str | None) -> Source:
     absolute = os.path.abspath(path)
-    shape: tuple[int, ...] | None = None
-    read: Read
     try:
         state = path.stat()
     except OSError as error:
         raise ImageError(f"{path}: {error.strerror or error}; check the path") from None
     if path.is_dir():
         raise ImageError(f"{path}: is a folder; name an image file in it")
+    identity = {"file": absolute, "bytes": state.st_size, "modified": state.st_mtime_ns}
+    shape: tuple[int, ...] | None = None
     if path.suffix.lower() in TIFF_SUFFIXES:
         shape = window_shape(absolute)
-    default = "srgb"
     if shape is not None:
-        read = partial(read_window, absolute)
-        default = "linear" if holds_floats(absolute) else "srgb"
-    elif kind_of(path) is not None:
-        picture = _loaded(absolute, state.st_mtime_ns, keep_grey)
-        shape = picture.shape
-        read = partial(_read_loaded, absolute, state.st_mtime_ns, keep_grey)
-        default = "linear" if isinstance(picture, LinearImage) else "srgb"
+        read, light = partial(read_window, absolute), holds_floats(absolute)
     elif path.suffix.lower() == ".npy":
-        shape = _array_shape(absolute)
-        read = partial(_read_array, absolute)
+        shape, read, light = _array_shape(absolute), partial(_read_array, absolute), False
     else:
-        picture = _decoded(absolute, state.st_mtime_ns)
-        shape = (picture.height, picture.width, 1 if picture.mode in GREY else 3)
-        read = partial(_read_picture, absolute, state.st_mtime_ns)
-    identity = {"file": absolute, "bytes": state.st_size, "modified": state.st_mtime_ns}
+        pixels, light = _decode_whole(path, keep_grey)
+        said = encoding or ("linear" if light else "srgb")
+        return _checked(str(path), pixels.shape, identity, _cut_array(pixels), keep_grey, said)
 
     def cut(rows: slice, columns: slice) -> Callable[[], Array]:
         return partial(read, rows, columns)
 
-    return _checked(str(path), shape, identity, cut, keep_grey, encoding or default)
+    said = encoding or ("linear" if light else "srgb")
+    return _checked(str(path), shape, identity, cut, keep_grey, said)
+
+
+def _decode_whole(path: Path, keep_grey: bool) -> tuple[Array, bool]:
+    """Return the pixels of a file, 8 bits as 8 bits, and whether they are light."""
+    if kind_of(path) is not None:
+        deep = load_image(path, keep_grey)
+        return np.asarray(deep), isinstance(deep, LinearImage)
+    with open_picture(path, MAX_SIDE) as picture:
+        return picture_pixels(picture)[0], False
 
 
 def _checked(
@@ -217,40 +218,6 @@ def _array_shape(path: str) -> tuple[int, ...]:
 def _read_array(path: str, rows: slice, columns: slice) -> Array:
     """Read a part of a ``.npy`` file; the map of the file ends with the call."""
     return np.array(np.load(path, mmap_mode="r", allow_pickle=False)[rows, columns])
-
-
-def _read_picture(path: str, modified: int, rows: slice, columns: slice) -> Array:
-    """Return a part of a file that Pillow decodes."""
-    box = (columns.start, rows.start, columns.stop, rows.stop)
-    picture = _decoded(path, modified)
-    # A crop would check the limit on pixels of the whole process.
-    part = picture.resize((box[2] - box[0], box[3] - box[1]), resample=0, box=box)
-    return picture_pixels(part)[0]
-
-
-def _read_loaded(path: str, modified: int, keep_grey: bool, rows: slice, columns: slice) -> Array:
-    """Return a part of a file of floats or 16 bits."""
-    return np.asarray(_loaded(path, modified, keep_grey)[rows, columns])
-
-
-@lru_cache(maxsize=1)
-def _loaded(path: str, modified: int, keep_grey: bool) -> Array:
-    """Read a file of floats or 16 bits whole, and keep it; see `_decoded`."""
-    return load_image(path, keep_grey)
-
-
-@lru_cache(maxsize=1)
-def _decoded(path: str, modified: int) -> Any:
-    """Decode a file, and keep it for the next window; `modified` tells its versions apart."""
-    with open_picture(Path(path), MAX_SIDE) as picture:
-        picture.load()
-        return picture
-
-
-def forget_pictures() -> None:
-    """Free the memory of the file that Pillow decoded last."""
-    _decoded.cache_clear()
-    _loaded.cache_clear()
 
 
 MAX_SEGMENT = 1 << 26
