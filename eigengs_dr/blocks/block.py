@@ -47,7 +47,7 @@ from ..gaussian.gaussians import Gaussians
 from ..image.pixels import ImageError
 from .draw import draw
 from .grid import Block
-from .source import Window
+from .windows import Window
 
 Array = NDArray[np.floating]
 Arrays = dict[str, NDArray[Any]]

@@ -17,7 +17,7 @@ from ..image.metrics import float_space, squared_error
 from ..raster.render import picture_of, render
 from ..storage.atomic import atomic_write
 from .grid import Block
-from .source import TIFF_SUFFIXES, TILE_SIDE, Source, Window, write_tiles
+from .windows import TIFF_SUFFIXES, TILE_SIDE, Source, Window, write_tiles
 
 BAND_PIXELS = 1 << 22
 """Pixels of a band of a picture that is drawn at once; one takes some 100 bytes."""

@@ -22,7 +22,7 @@ from ..storage.atomic import require_writable
 from ..storage.checkpoint import Checkpoint
 from .grid import Block, choose_halo, divide
 from .run import Run
-from .source import Source, open_source
+from .windows import Source, open_source
 
 BLOCK_SIDE = 1024
 """Default side of a block in pixels."""

@@ -29,7 +29,7 @@ from .block import (
 )
 from .draw import compare, compare_tasks
 from .grid import Arrays, Block, BlockSets, deal
-from .source import Source, Window
+from .windows import Source, Window
 
 Progress = Callable[[int, int, dict[str, Any]], None]
 

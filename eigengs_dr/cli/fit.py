@@ -299,7 +299,7 @@ def _load(path: Any, options: FitOptions) -> Any:
 
 def load_maps(maps: dict[str, MapFile], encoding: str | None) -> dict[str, Any]:
     """Read the images of maps; grey data keep one channel."""
-    from ..gaussian.maps import usual_space
+    from ..gaussian.channels import usual_space
     from ..image.io import load_image
 
     data = {name: rendered_as(m.space or usual_space(name)) is None for name, m in maps.items()}
@@ -540,7 +540,7 @@ def _plan_memory(
         If this process may use too little memory, and the options have no fit by blocks.
     """
     from ..blocks.fit_large import BLOCK_SIDE
-    from ..blocks.source import image_size
+    from ..blocks.windows import image_size
 
     size = image_size(path)
     if size is None:

@@ -114,7 +114,7 @@ class MapOption(click.ParamType):
 
     def convert(self, value: Any, parameter: Any, context: Any) -> MapFile:
         """Parse the text of an option."""
-        from ..gaussian.maps import NAME
+        from ..gaussian.channels import NAME
 
         left, sign, file = value.partition("=")
         name, colon, space = left.partition(":")

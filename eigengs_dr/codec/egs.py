@@ -18,9 +18,9 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..gaussian.channels import MAX_CHANNELS as MAX_MAPS
+from ..gaussian.channels import TextureMap, channel_weights, check_maps
 from ..gaussian.file import CUTOFF, SetData
-from ..gaussian.maps import MAX_CHANNELS as MAX_MAPS
-from ..gaussian.maps import TextureMap, channel_weights, check_maps
 from ..image.color import MAX_CHANNELS, SPACES
 from ..image.hilbert import MAX_LEVELS
 from ..storage.atomic import atomic_write
@@ -282,7 +282,7 @@ def read_maps(take: Callable[[int], bytes]) -> tuple[bytes, tuple[TextureMap, ..
     bytes
         The table as it is in the file.
     tuple of TextureMap
-        `eigengs_dr.gaussian.maps.check_maps` checks them.
+        `eigengs_dr.gaussian.channels.check_maps` checks them.
     """
     table, maps = take(1), []
     if not 1 <= table[0] <= MAX_MAPS:

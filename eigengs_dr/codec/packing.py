@@ -17,8 +17,8 @@ from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..fitting.fit import Fit
 from ..fitting.maps import combine, read_maps
+from ..gaussian.channels import TextureMap, channel_weights, show_sums, slices
 from ..gaussian.gaussians import Gaussians, scale_channels, set_of
-from ..gaussian.maps import TextureMap, channel_weights, show_sums, slices
 from ..image.color import (
     LIGHT,
     UNBOUNDED,

@@ -25,9 +25,9 @@ from ..fitting.descent import FitProblem, run
 from ..fitting.options import PRESETS
 from ..fitting.schedule import Schedule
 from ..fitting.solvers.conjugate_gradient import solve
+from ..gaussian.channels import TextureMap
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
-from ..gaussian.maps import TextureMap
 from ..image.hilbert import hilbert_encode
 from ..image.metrics import psnr_from_mse
 from ..raster.render import render

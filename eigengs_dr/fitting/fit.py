@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..backend.feedback import defer_interrupts, shows_progress, to_html
 from ..backend.recording import exclusive
+from ..gaussian.channels import channel_weights
 from ..gaussian.file import CUTOFF, FitFigures, write
 from ..gaussian.gaussians import Gaussians, scale_channels
-from ..gaussian.maps import channel_weights
 from ..image.metrics import float_space, target_key
 from ..raster.render import picture_of
 from .levels import refine_levels
@@ -167,7 +167,7 @@ def fit(
     space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, or mapping; optional
         Space of the colours and of the squared error, by default "ycbcr". For maps, the space of a
         map by its name; by default "linear" for albedo, color and the like, "normal" for normals,
-        and "data" for other names, see `eigengs_dr.gaussian.maps.usual_space`.
+        and "data" for other names, see `eigengs_dr.gaussian.channels.usual_space`.
         "linear" decodes sRGB: the Gaussians sum to linear light, as textures need it, and errors
         weigh more in the dark. "data" uses one or three channels unchanged (roughness, heights).
         "normal" uses the codes ``(n + 1) / 2`` of a normal map; renderings have normals of length

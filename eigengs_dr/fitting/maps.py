@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..gaussian.channels import TextureMap, check_maps, check_name, show_sums, slices, usual_space
 from ..gaussian.gaussians import Gaussians
-from ..gaussian.maps import TextureMap, check_maps, check_name, show_sums, slices, usual_space
 from ..image.color import rendered_as
 from ..image.metrics import float_space, psnrs_by_rows, target_key
 from ..image.pixels import ImageError

@@ -2,6 +2,6 @@
 
 - ``gaussians``: the set, its bounds, its tensors; several sets as one
 - ``covariance``: factors, Cholesky factors, logarithms, eigenvalues
-- ``maps``: groups of channels with a name and a space
+- ``channels``: groups of channels with a name and a space
 - ``file``: the .npz file, what makes a set valid, and the part that a region shows
 """

@@ -13,8 +13,8 @@ from ..image.color import MAX_CHANNELS, SPACES
 from ..storage import npz
 from ..storage.atomic import reader_of
 from ..storage.npz import BadValue, Field
-from .maps import MAX_CHANNELS as MAX_MAPS
-from .maps import TextureMap, check_maps, find_map, slices
+from .channels import MAX_CHANNELS as MAX_MAPS
+from .channels import TextureMap, check_maps, find_map, slices
 
 FORMAT = "eigengs_dr.gaussians"
 MATERIAL = "eigengs_dr.material"

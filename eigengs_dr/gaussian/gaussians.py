@@ -22,8 +22,8 @@ from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..backend.selection import BackendError, select
 from ..storage.npz import BadValue
+from .channels import TextureMap, find_map, slices
 from .file import CUTOFF, SetData, check, read, write
-from .maps import TextureMap, find_map, slices
 
 MIN_DEVIATION = 0.25
 """Smallest standard deviation along an axis of the factor, in pixels. A narrower Gaussian can fall
@@ -58,9 +58,10 @@ class Gaussians:
         ``exp(-cutoff^2 / 2)`` times the sum of the absolute colours of the Gaussians that end
         before it.
     maps : tuple of TextureMap
-        Groups of channels, if the set has several maps, such as those of a material; see
-        `eigengs_dr.gaussian.maps.TextureMap`. ``gaussians["albedo"]`` is then the set of one map,
-        and the space is "data": each map in its own units. They have at most 16 channels together.
+        Groups of channels, if the set has several maps, such as those of a material, see
+        `eigengs_dr.gaussian.channels.TextureMap`: ``gaussians["albedo"]`` is then the set of one
+        map, and the space is "data": each map in its own units. They have at most 16 channels
+        together.
 
     Examples
     --------

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, Float, UInt, make_divisor, types_of
 from ..backend.recording import exclusive
+from ..gaussian.channels import show_sums, slices
 from ..gaussian.file import MAX_CUTOFF, check_index_range
 from ..gaussian.gaussians import Fitted, Gaussians, set_of
-from ..gaussian.maps import show_sums, slices
 from ..image.color import decode, from_sum, to_picture
 from .adjoint import adjoint
 from .binning.lists import TileLists, build_lists

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from eigengs_dr.gaussian.channels import TextureMap
 from eigengs_dr.gaussian.gaussians import Gaussians
-from eigengs_dr.gaussian.maps import TextureMap
 
 MAPS = (
     TextureMap("albedo", "linear", 3, 0.5),

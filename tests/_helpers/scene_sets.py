@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import eigengs_dr as eg
-from eigengs_dr.gaussian.maps import TextureMap
+from eigengs_dr.gaussian.channels import TextureMap
 
 
 def save_halves(folder):

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from _helpers.command import assert_refused, run, succeeded
-from eigengs_dr.blocks.source import ORIENTATION, image_size
+from eigengs_dr.blocks.windows import ORIENTATION, image_size
 from eigengs_dr.fitting import memory
 
 

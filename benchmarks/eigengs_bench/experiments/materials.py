@@ -21,7 +21,7 @@ from eigengs_bench.harness.store import Job, Row, Task
 from eigengs_bench.harness.timing import Image
 from eigengs_dr.codec.packing import pack
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.gaussian.maps import usual_space
+from eigengs_dr.gaussian.channels import usual_space
 from eigengs_dr.image.color import rendered_as
 from eigengs_dr.image.folder import image_files
 from eigengs_dr.image.io import load_image, to_8bit

@@ -9,7 +9,7 @@ import tifffile
 from PIL import Image
 
 from _helpers.mosaics import Sliced, mosaic
-from eigengs_dr.blocks.source import open_source, window_shape, write_tiles
+from eigengs_dr.blocks.windows import open_source, window_shape, write_tiles
 from eigengs_dr.image.color import to_coded
 from eigengs_dr.image.io import ImageError, load_image, save_image
 

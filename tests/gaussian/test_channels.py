@@ -7,8 +7,8 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.materials import MAPS, material
+from eigengs_dr.gaussian.channels import TextureMap, check_maps, slices, usual_space
 from eigengs_dr.gaussian.file import maps_of, read_head, read_map
-from eigengs_dr.gaussian.maps import TextureMap, check_maps, slices, usual_space
 from eigengs_dr.raster.reference import render_exact
 from eigengs_dr.storage import npz
 from eigengs_dr.storage.npz import BadValue
