@@ -110,16 +110,15 @@ docs: $(DOCS_READY)
 	$(BIN)/sphinx-build -E -W --keep-going -n -d build/docs/doctrees docs build/docs/html
 
 bench: $(READY)
-	@mkdir -p build/bench
-	$(BIN)/eigengs-dr bench kernels --report build/bench/kernels.json
+	$(BIN)/eigengs-dr bench kernels
 
-# The page shows all that is in build/report. To show more, run these commands with more images, sets
-# or steps, and 'bench budget', 'bench rate' and 'bench scaling', then the last one.
+# The report shows all that is in build/report. To show more, run these commands with more images, sets
+# or steps, and 'bench number', 'bench rate' and 'bench scaling', then the last one.
 report: $(READY)
 	@mkdir -p $(RESULTS)
 	$(BIN)/eigengs-dr bench stability -o $(RESULTS)
 	$(BIN)/eigengs-dr bench pareto $(wildcard $(DATA)) -o $(RESULTS) --set samples --images 2
-	$(BIN)/eigengs-dr bench figures $(wildcard $(DATA)) -o $(RESULTS) --images 2
+	$(BIN)/eigengs-dr bench pictures $(wildcard $(DATA)) -o $(RESULTS) --images 2
 	$(if $(wildcard $(DATA)),$(BIN)/eigengs-dr bench tables $(DATA) -o $(RESULTS) --images 4 \
 		--set faces256 --set cats256 --set cars256 --set natural256)
 	$(BIN)/eigengs-dr bench report $(RESULTS) -o build/results

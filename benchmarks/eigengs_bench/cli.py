@@ -1,56 +1,126 @@
-"""``eigengs-dr bench``: one command a question. Each command imports what it needs."""
+"""``eigengs-dr bench``: one command a question, whose module of the same name answers it."""
 
+from collections.abc import Callable
+from functools import wraps
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import click
 
-from eigengs_bench.cli_single import eigen, inverse, kernels, levels, prefilter, radiance, texture
-from eigengs_bench.harness.store import Task
 from eigengs_bench.names import (
-    FIGURES,
     KODAK_COUNTS,
-    NATURAL,
     PAPER_SETS,
     PARTS,
+    PICTURES,
     PRESETS,
+    SAMPLES,
     SETS,
     SOLVE_STEPS,
     TABLES,
 )
-from eigengs_bench.options import (
-    count_option,
-    counts_option,
-    data_argument,
-    many_option,
-    measures_rows,
-    output_option,
-    set_options,
+from eigengs_bench.rows import FILE, Task, code_state
+from eigengs_dr.backend.selection import select
+from eigengs_dr.cli.console import bar
+from eigengs_dr.cli.options import FOLDER, backend_option, number, quiet_option
+from eigengs_dr.cli.outputs import check_outputs, describe_run
+
+folder_option = click.option(
+    "-o",
+    "--output",
+    type=click.Path(file_okay=False, path_type=Path),
+    default="build/bench",
+    metavar="FOLDER",
+    help="For rows, models and charts; the same command goes on.",
 )
-from eigengs_dr.cli.console import say
-from eigengs_dr.cli.options import FOLDER, quiet_option
-
-Names = tuple[str, ...]
+data_argument = click.argument("data", type=FOLDER, required=False, metavar="[DATA]")
 
 
-@click.group()
-def bench() -> None:
-    """Measure speed and accuracy.
+def several(name: str, to: str, values: Any, text: str, default: Any = ()) -> Any:
+    """Make an option that takes some of several words, or numbers, and may be repeated."""
+    kind = values if isinstance(values, click.ParamType) else click.Choice(list(values))
+    text = f"{text}; may be repeated."
+    once: Any = {"callback": lambda context, option, given: tuple(dict.fromkeys(given))}
+    return click.option(name, to, multiple=True, type=kind, default=default, help=text, **once)
 
-    Commands that take -o FOLDER keep their measurements there as lines of JSON: the same command
-    goes on after a break, and one with more sets or images adds lines. DATA has a folder a set
-    (faces256, cats512, cars256, natural256), with images to train on in train/ and others in test/;
-    kodak has no parts.
+
+def sets_option(usual: tuple[str, ...]) -> Any:
+    """Make the option of the sets; by default the usual ones with DATA, and samples without."""
+    text = f"Images, by default {' '.join(usual)} with DATA, and {SAMPLES} without"
+    return several("--set", "names", SETS, text)
+
+
+def question(bench: str, usual: tuple[str, ...] = ()) -> Any:
+    """Make a function of settings, with its options and its text, into a command of the group.
+
+    The command calls ``run(task, **settings)`` of the module of its name, prints the tables that
+    ``summarize(rows)`` returns, and writes its charts to the folder.
+    """
+
+    def decorate(command: Callable[..., Any]) -> Any:
+        @main.command(bench)
+        @folder_option
+        @backend_option
+        @quiet_option
+        @click.pass_context
+        @wraps(command)
+        def wrapped(
+            context: click.Context, output: Path, quiet: bool, backend: str | None, **settings: Any
+        ) -> None:
+            shared = {name: settings.pop(name) for name in Task._fields if name in settings}
+            if "names" in settings:
+                settings["names"] = settings["names"] or (usual if shared["data"] else (SAMPLES,))
+                if not shared["data"] and set(settings["names"]) - {SAMPLES}:
+                    raise ValueError("--set needs DATA, the folder of the set, for all but samples")
+            output.mkdir(parents=True, exist_ok=True)
+            check_outputs([output / FILE], [])
+            select(backend)
+            run = {**describe_run(context, backend), **code_state()}
+            module = import_module(f"eigengs_bench.{bench}")
+            with bar(quiet) as show:
+                task = Task(output, run, backend=backend, progress=show, **shared)
+                section = module.summarize(module.run(task, **settings))
+            _save(section, output, quiet)
+
+        return wrapped
+
+    return decorate
+
+
+def _save(section: Any, output: Path, quiet: bool) -> None:
+    """Write the charts of a section as SVG into a folder; print its tables."""
+    from eigengs_bench.report import as_text, save_figure
+
+    for name, figure in section.charts.items():
+        save_figure(output / f"{name}.svg", figure)
+    if not quiet:
+        click.echo("\n\n".join(map(as_text, section.tables)))
+        click.echo("".join(f"\nchart: {output / name}.svg" for name in section.charts))
+
+
+@click.group("bench")
+def main() -> None:
+    """Measure speed and accuracy: one command a question.
+
+    Measurements are lines of FOLDER/rows.jsonl; a command goes on after a break, and does only what
+    is not there. DATA has a folder a set (faces256, cats512, cars256, natural256), with images to
+    train on in train/ and others in test/; kodak has no parts.
+
+    \b
+    Examples:
+      eigengs-dr bench kernels
+      eigengs-dr bench tables data/ --set natural256 --images 3
+      eigengs-dr bench report build/bench -o report/
     """
 
 
-@bench.command()
-@click.argument("data", type=FOLDER, metavar="DATA")
-@many_option("--set", "names", SETS, "Which images, by default all but kodak")
-@many_option("--table", "tables", TABLES, "Which tables, by default all")
-@count_option("--images", 20, "Of each set.")
-@measures_rows("tables.jsonl")
-def tables(task: Task, names: Names, tables: Names) -> Any:
+@question("tables", PAPER_SETS)
+@data_argument
+@sets_option(PAPER_SETS)
+@several("--table", "tables", TABLES, "By default all")
+@number("--images", "Of each set.", 20, 1)
+@number("--iterations", "Steps of every fit.", 1000, 1)
+def tables() -> None:
     """Measure every method on images of test folders, on which nothing was trained or tuned.
 
     \b
@@ -61,183 +131,15 @@ def tables(task: Task, names: Names, tables: Names) -> Any:
 
     models/ of FOLDER keeps trained bases and models: about a gigabyte a set.
     """
-    from eigengs_bench.experiments.tables import run
-    from eigengs_bench.report.sections.methods import summarize
-
-    return summarize(run(task, names or PAPER_SETS, tables or TABLES))
 
 
-@bench.command()
-@measures_rows("pareto.jsonl")
-@set_options(3)
-def pareto(task: Task, names: Names) -> Any:
-    """Measure speed against accuracy: fits that differ from the default one in one setting.
-
-    FOLDER gets a chart a set, and charts of the renderer and of storage. An image takes about two
-    minutes.
-    """
-    from eigengs_bench.experiments.pareto import run
-    from eigengs_bench.report.sections.pareto import summarize
-
-    return summarize(run(task, names))
-
-
-@bench.command()
-@measures_rows("rate.jsonl")
-@set_options(3)
-def rate(task: Task, names: Names) -> Any:
-    """Compare packed fits with JPEG, JPEG 2000, WebP and AVIF at equal size.
-
-    FOLDER gets a chart a set. An image of 256x256 pixels takes a minute.
-    """
-    from eigengs_bench.experiments.rate import run
-    from eigengs_bench.report.sections.rate import summarize
-
-    return summarize(run(task, names))
-
-
-@bench.command()
-@click.argument("folders", nargs=-1, required=True, type=FOLDER, metavar="FOLDER...")
-@click.option(
-    "--gaussians",
-    "counts",
-    multiple=True,
-    type=click.IntRange(min=1),
-    default=(2000, 8000, 32000),
-    show_default=True,
-    help="Of a set; may be repeated.",
-)
-@measures_rows("materials.jsonl", iterations=300)
-def materials(task: Task, folders: tuple[Path, ...], counts: tuple[int, ...]) -> Any:
-    """Compare maps on shared shapes with a set for each map, PNG, ASTC and BC7.
-
-    A FOLDER holds the images of one material; their names are those of the maps: albedo.jpg,
-    roughness.jpg, normal.jpg. ASTC needs astc-encoder-py, BC7 needs etcpak and texture2ddecoder;
-    without them they are left out.
-    """
-    from eigengs_bench.experiments.materials import run
-    from eigengs_bench.report.sections.materials import summarize
-
-    return summarize(run(task, folders, tuple(dict.fromkeys(counts))))
-
-
-@bench.command()
-@click.option(
-    "--target",
-    "targets",
-    multiple=True,
-    type=click.FloatRange(0, 100, min_open=True),
-    default=(32.0, 36.0, 40.0),
-    show_default=True,
-    help="PSNR in YCbCr to reach; may be repeated.",
-)
-@measures_rows("budget.jsonl")
-@set_options(20, NATURAL)
-def budget(task: Task, names: Names, targets: tuple[float, ...]) -> Any:
-    """Measure how many Gaussians a PSNR takes: of fits of fixed numbers, and by the search.
-
-    \b
-    On every image, in this order:
-      fits of fixed numbers, Gaussians placed once, until two enclose each target
-      the search of fit --target-psnr, and a default fit of the number it found
-      fits of one number, Gaussians placed once, and placed anew on the way
-
-    FOLDER gets a chart a set. An image of 256x256 pixels takes a minute or two.
-    """
-    from eigengs_bench.experiments.budget import run
-    from eigengs_bench.report.sections.budget import summarize
-
-    if any(target != target for target in targets):  # NaN is inside every click.FloatRange
-        raise ValueError("--target is nan; it must be above 0 and at most 100")
-    return summarize(run(task, names, tuple(dict.fromkeys(targets))))
-
-
-@bench.command()
-@click.option("--case", "cases", multiple=True, help="By default all; may be repeated.")
-@many_option("--preset", "presets", PRESETS, "By default all")
-@measures_rows("stability.jsonl", iterations=10_000, least=0)
-def stability(task: Task, cases: Names, presets: Names) -> Any:
-    """Try every preset on hard cases: odd images, odd starts, rates too high.
-
-    With the case "smooth" the command draws stability-tiles.png: what tiling looks like. All cases
-    take about ten minutes; the case "large" takes gigabytes.
-    """
-    from eigengs_bench.experiments.stability import run, tiles_of
-    from eigengs_bench.experiments.stability_cases import chosen_cases
-    from eigengs_bench.report.charts import save_figure, tiles_chart
-    from eigengs_bench.report.page import TILES
-    from eigengs_bench.report.sections.stability import summarize
-
-    chosen = chosen_cases(cases, task.iterations)
-    rows = run(task, chosen, presets or PRESETS)
-    for smooth in (case for case in chosen if case.name == "smooth"):
-        save_figure(task.folder / TILES, tiles_chart(smooth.image(), tiles_of(task, smooth)))
-    return summarize(rows)
-
-
-@bench.command()
-@click.argument("data", type=FOLDER, metavar="DATA")
-@counts_option("--counts", KODAK_COUNTS, "Gaussians; may be repeated.")
-@counts_option("--steps", (1000,), "Steps of a fit; may be repeated.", least=0)
-@count_option("--solve-steps", SOLVE_STEPS, "Steps of the colour solve.")
-@count_option("--photos", 24, "The first ones.")
-@click.option("--timed", is_flag=True, help="Nothing else runs: the seconds count.")
-@measures_rows("kodak.jsonl", iterations=None)
-def kodak(
-    task: Task,
-    photos: int,
-    counts: tuple[int, ...],
-    steps: tuple[int, ...],
-    solve_steps: int,
-    timed: bool,
-) -> Any:
-    """Fit the Kodak photos by numbers of Gaussians, beside what other methods published.
-
-    \b
-    Examples:
-      eigengs-dr bench kodak data -o F
-      eigengs-dr bench kodak data -o F --counts 5000 --counts 10000 --steps 5000
-      eigengs-dr bench kodak data -o F --photos 4 --timed
-      eigengs-dr bench kodak data -o F --counts 28000 --steps 0 --solve-steps 30
-
-    DATA has the photos in kodak/. Ctrl-C keeps the fits that are done. FOLDER gets charts of PSNR
-    over Gaussians, and over the seconds of timed fits.
-    """
-    from eigengs_bench.experiments.kodak import run
-    from eigengs_bench.report.sections.kodak import summarize
-
-    return summarize(run(task._replace(images=photos), counts, steps, solve_steps, timed))
-
-
-@bench.command()
-@many_option("--part", "parts", PARTS, "What to vary, by default all")
-@count_option("--max-side", 4096, "Leave out larger images, in pixels; the largest have 8192.")
-@measures_rows("scaling.jsonl", iterations=24)
-def scaling(task: Task, parts: Names, max_side: int) -> Any:
-    """Measure what size costs: time of a step, of the start, and memory.
-
-    \b
-    pixels   images of 128x128 to 8192x8192 with 0.076 Gaussians a pixel
-    splats   100 to 2,000,000 Gaussians on images of one size
-    threads  1, 2, 4, ... threads on images of three sizes
-    small    images a second of whole fits of 100 steps
-
-    Every size runs in a process of its own. --iterations is the least number of steps behind a
-    mean. All sizes to 4096x4096 take some ten minutes and 5 GB, 8192x8192 needs four times as much.
-    """
-    from eigengs_bench.experiments.scaling import run
-    from eigengs_bench.report.sections.scaling import summarize
-
-    return summarize(run(task, parts or PARTS, max_side))
-
-
-@bench.command()
+@question("pictures")
 @data_argument
-@many_option("--figure", "figures", FIGURES, "What to draw, by default all")
-@count_option("--images", 8, "Test images a set, for curves and radii.")
-@measures_rows("curves.jsonl")
-def figures(task: Task, figures: Names) -> Any:
-    """Draw the pictures of the paper, with our fits.
+@several("--picture", "wanted", PICTURES, "What to draw, by default what DATA is enough for")
+@number("--images", "Test images a set, for curves and radii.", 8, 1)
+@number("--iterations", "Steps of every fit.", 1000, 1)
+def pictures() -> None:
+    """Draw the curves, histograms and pictures of the paper, with our fits.
 
     \b
     iterations  fits at iterations 0, 10, 100 and the last, by every preset
@@ -246,33 +148,117 @@ def figures(task: Task, figures: Names) -> Any:
     radii       how large Gaussians are, with the frequency-aware split and without
     split       what Gaussians for low and for high frequencies render alone
     cross       images projected on bases of other images
-
-    Without DATA the command fits photos of scikit-image, and leaves out figures that need more.
-    FOLDER/figures.json lists the pictures with captions and credits.
     """
-    from eigengs_bench.experiments.figures import run
-    from eigengs_bench.report.frames import Section, table
-
-    lines = [(task.folder / figure.path, figure.caption) for figure in run(task, figures, say)]
-    return Section([table("Pictures", ("file", "caption"), lines)])
 
 
-@bench.command()
+@question("pareto", (SAMPLES,))
+@data_argument
+@sets_option((SAMPLES,))
+@number("--images", "Of each set.", 3, 1)
+@number("--iterations", "Steps of the longest fits.", 1000, 1)
+def pareto() -> None:
+    """Measure speed against accuracy: fits that differ from the default one in one setting.
+
+    An image takes about two minutes.
+    """
+
+
+@question("rate", (SAMPLES,))
+@data_argument
+@sets_option((SAMPLES,))
+@number("--images", "Of each set.", 3, 1)
+@number("--iterations", "Steps of every fit.", 1000, 1)
+def rate() -> None:
+    """Compare packed fits with JPEG, JPEG 2000, WebP and AVIF at equal size.
+
+    An image of 256x256 pixels takes a minute.
+    """
+
+
+@question("number", ("natural256",))
+@data_argument
+@sets_option(("natural256",))
+@several("--target", "targets", click.FloatRange(1, 100), "PSNR in YCbCr", (32.0, 36.0, 40.0))
+@number("--images", "Of each set.", 20, 1)
+@number("--iterations", "Steps of every fit.", 1000, 1)
+def number_of_gaussians() -> None:
+    """Measure how many Gaussians a PSNR takes: of fits of fixed numbers, and by the search.
+
+    On every image: fits of fixed numbers, Gaussians placed once, until two enclose each target; the
+    search of fit --target-psnr, and a default fit of the number it found. An image of 256x256
+    pixels takes a minute or two.
+    """
+
+
+@question("stability")
+@click.option("--case", "cases", multiple=True, help="By default all; may be repeated.")
+@several("--preset", "presets", PRESETS, "By default all", PRESETS)
+@number("--iterations", "Most steps of a fit.", 10_000, 0)
+def stability() -> None:
+    """Try every preset on hard cases: odd images, odd starts, rates too high.
+
+    All cases take about ten minutes; the case "large" takes gigabytes.
+    """
+
+
+@question("kodak")
+@click.argument("data", type=FOLDER, metavar="DATA")
+@several("--counts", "counts", click.IntRange(min=1), "Gaussians", KODAK_COUNTS)
+@several("--steps", "steps", click.IntRange(min=0), "Steps of a fit", (1000,))
+@number("--solve-steps", "Steps of the colour solve.", SOLVE_STEPS, 1)
+@number("--images", "The first photos.", 24, 1)
+@click.option("--timed", is_flag=True, help="Nothing else runs: the seconds count.")
+def kodak() -> None:
+    """Fit the Kodak photos by numbers of Gaussians, beside what other methods published.
+
+    \b
+    Examples:
+      eigengs-dr bench kodak data
+      eigengs-dr bench kodak data --counts 5000 --counts 10000 --steps 5000
+      eigengs-dr bench kodak data --images 4 --timed
+      eigengs-dr bench kodak data --counts 28000 --steps 0 --solve-steps 30
+    """
+
+
+@question("scaling")
+@several("--part", "parts", PARTS, "What to vary", PARTS)
+@number("--max-side", "Leave out larger images, in pixels; the largest have 8192.", 4096, 1)
+@number("--iterations", "Least number of steps behind a mean.", 24, 1)
+def scaling() -> None:
+    """Measure what size costs: time of a step, of the start, and memory.
+
+    \b
+    pixels   images of 128x128 to 8192x8192 with 0.076 Gaussians a pixel
+    splats   100 to 2,000,000 Gaussians on images of one size
+    threads  1, 2, 4, ... threads on images of three sizes
+    small    images a second of whole fits of 100 steps
+
+    Every size runs in a process of its own. All sizes to 4096x4096 take some ten minutes and 5 GB.
+    """
+
+
+@question("kernels")
+def kernels() -> None:
+    """Time the renderer and its derivatives against plain Dr.Jit and the machine's peak."""
+
+
+@question("texture")
+@click.option("--variant", default="llvm_ad_rgb", help="Of Mitsuba.")
+def texture() -> None:
+    """Time a material ball with textures of Gaussians against one with a bitmap, in Mitsuba."""
+
+
+@main.command()
 @click.argument("folder", type=FOLDER, metavar="FOLDER")
-@output_option
+@click.option("-o", "--output", type=click.Path(file_okay=False, path_type=Path), required=True)
 @quiet_option
 def report(folder: Path, output: Path, quiet: bool) -> None:
-    """Write a page of the results that the other commands of bench keep in a folder.
+    """Write README.md and its charts: all questions that the rows of a folder answer.
 
-    The page is index.html, one file that needs no other, and README.md with pictures/ beside it.
     Every section names the commands, days, machines, versions and commits behind its figures.
     """
-    from eigengs_bench.report.page import write_page
+    from eigengs_bench.report import write_report
 
-    write_page(folder, output)
+    write_report(folder, output)
     if not quiet:
-        click.echo(f"wrote {output / 'index.html'} and {output / 'README.md'}")
-
-
-for command in (kernels, eigen, texture, prefilter, inverse, levels, radiance):
-    bench.add_command(command)
+        click.echo(f"wrote {output / 'README.md'}")

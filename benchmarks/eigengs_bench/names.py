@@ -19,15 +19,14 @@ SETS = {
     "natural256": ImageSet("natural256", 256, 256, 5000),
     "cats512": ImageSet("cats512", 512, 512, 20000),
     "kodak": ImageSet("kodak", 768, 512, 20000),
+    "samples": ImageSet("", 256, 256, 5000),  # photos of scikit-image, which need no data
 }
-PAPER_SETS = tuple(name for name in SETS if name != "kodak")
-NATURAL, CATS = "natural256", "cats256"
-SAMPLES = "samples"  # photos of scikit-image, a set that needs no data
+PAPER_SETS = ("faces256", "cats256", "cars256", "natural256", "cats512")
+NATURAL, CATS, SAMPLES = "natural256", "cats256", "samples"
 
 PRESETS = ("default", "gaussianimage", "eigengs")
 TABLES = ("main", "ablation", "cross", "reach")
-FIGURES = ("iterations", "colors", "curves", "radii", "split", "cross")
-CONDITIONS = ("cameras", "grazing", "hidden", "noise")
+PICTURES = ("iterations", "colors", "curves", "radii", "split", "cross")
 PARTS = ("pixels", "splats", "threads", "small")
 KODAK_COUNTS = (5_000, 10_000, 30_000, 50_000, 70_000)  # Gaussians of published tables
 SOLVE_STEPS = 10  # of the colour solve of a fit, by default

@@ -1,1 +1,0 @@
-"""How experiments measure: clocks, rows in files, sets of images."""

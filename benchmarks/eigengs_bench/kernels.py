@@ -1,0 +1,245 @@
+"""How fast the renderer is: against plain Dr.Jit, against the machine, and as Gaussians stretch."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from eigengs_bench.clock import interleaved
+from eigengs_bench.report import Section, number, table
+from eigengs_bench.rows import Row, Task
+from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
+from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.descent import FitProblem, descend
+from eigengs_dr.fitting.options import PRESETS
+from eigengs_dr.fitting.placement.adaptive import place_adaptive
+from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.image.io import sample
+from eigengs_dr.raster.binning.lists import TileLists, build_lists
+from eigengs_dr.raster.binning.tiles import Grid
+from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, KernelParameters, kernel_radius
+from eigengs_dr.raster.reference import render_plain
+from eigengs_dr.raster.render import bin_gaussians, decode_parameters, rasterize, render, to_tensor
+
+# The scene: Gaussians of equal size, spread evenly at random over a square picture.
+SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
+# Tiles of the plain renderer, the best of 4x4, 8x8 and 16x16 in forward and reverse together.
+PLAIN_TILE = (8, 8)
+WARM_UP, ROUNDS = 3, 15  # rounds that compile and settle, and rounds that are measured
+STEPS = 1000  # steps of the refinement behind `growth`
+PEAK_LANES, PEAK_LOOPS, PEAK_UNROLL = 1 << 16, 100, 8  # size of the program that measures the peak
+CUTOFFS = (2.5, 3.0, 3.5, 4.0, 5.0)  # whose time and error are measured
+WIDEST = 8.0  # cutoff that stands for none in double precision (1.3e-14 of an amplitude is left)
+
+
+def run(task: Task) -> list[Row]:
+    """Time the kernels in one run, the variants in turns; every figure is a median.
+
+    `plain_ms` and `fast_ms` are forward and reverse together, with lists given and programs frozen,
+    the ratios plain over fast. `peak_evals_per_ns` counts `exp`, `select` and 3 `fma` without
+    memory; the fractions are evaluations inside the cutoff ellipses over that peak. `growth` is the
+    median time of the steps 900 to 1,000 of a refinement over that of the steps 50 to 150, and
+    `growth_with_lists` the same of the means, in which building lists counts. "cutoffs" has time
+    and error of the picture by cutoff.
+    """
+    job: Row = {"side": SIDE, "gaussians": COUNT, "at": time.time()}  # each call measures anew
+    return task.measure("kernels", [(job, partial(_measure, task))])
+
+
+def summarize(rows: Sequence[Row]) -> Section:
+    """Lay out the figures of the last row, and what a cutoff costs and leaves out."""
+    row = rows[-1]
+    names = [name for name, value in row.items() if isinstance(value, float)]
+    figures = table("Kernels", ("figure", "value"), [(n, f"{row[n]:.4g}") for n in names])
+    lines = [
+        (
+            f"{c['cutoff']:g}",
+            *(number(c[k], 2) for k in ("forward_ms", "step_ms")),
+            *(f"{c[k]:.1e}" for k in ("largest_error", "rms_error")),
+        )
+        for c in row["cutoffs"]
+    ]
+    columns = ("cutoff", "forward, ms", "and reverse, ms", "largest error", "RMS error")
+    caption = "Time of a picture, and what its cutoff leaves out (1 is white)"
+    return Section([figures, table(caption, columns, lines)])
+
+
+def _measure(task: Task) -> Row:
+    types = types_in(select(task.backend))
+    scene = random_scene(types)
+    show = partial(task.progress, "kernels")
+    figures = {**kernel_figures(types, scene, show), **growth_figures(types, task.progress)}
+    return figures | {"cutoffs": cutoff_figures(scene)}
+
+
+def random_scene(types: ArrayTypes) -> Gaussians:
+    """Make the scene that is timed."""
+    generator = np.random.default_rng(0)
+    return Gaussians.from_arrays(
+        generator.uniform(0, SIDE, (COUNT, 2)),
+        np.tile([1 / SIGMA, 0, 1 / SIGMA], (COUNT, 1)),
+        generator.uniform(0, 1, (COUNT, 3)),
+        size=(SIDE, SIDE),
+        space="rgb",
+        backend=types.backend,
+    )
+
+
+def kernel_figures(
+    types: ArrayTypes, scene: Gaussians, progress: Callable[..., None] = lambda *_: None
+) -> Row:
+    """Time both renderers, the lists and the peak on a scene."""
+    plain_forward, plain_step, _ = programs(scene, CUTOFF, plain=True)
+    fast_forward, fast_step, _ = programs(scene, CUTOFF, plain=False)
+    seeds = dr.linspace(types.Float, 0, 1, PEAK_LANES)
+    dr.eval(seeds)
+    timed: dict[str, Callable[[], Any]] = {
+        "plain_ms": plain_step,
+        "fast_ms": fast_step,
+        "plain_forward_ms": plain_forward,
+        "fast_forward_ms": fast_forward,
+        "lists_ms": lambda: bin_gaussians(replace(scene, cutoff=CUTOFF)),
+        "peak_ms": lambda: _peak(seeds),
+    }
+    ms = interleaved(timed, WARM_UP, ROUNDS, progress)
+    for program in (plain_forward, plain_step, fast_forward, fast_step):
+        program.func.clear()  # left to the garbage collector, it may go while another is traced
+    useful = pixels_inside(scene)
+    peak = PEAK_LANES * PEAK_LOOPS * PEAK_UNROLL / (ms.pop("peak_ms") * 1e6)
+    return {
+        **ms,
+        "step_ratio": ms["plain_ms"] / ms["fast_ms"],
+        "forward_ratio": ms["plain_forward_ms"] / ms["fast_forward_ms"],
+        "peak_evals_per_ns": peak,
+        "forward_peak_fraction": useful / (ms["fast_forward_ms"] * 1e6) / peak,
+        "step_peak_fraction": 2 * useful / (ms["fast_ms"] * 1e6) / peak,
+    }
+
+
+def programs(
+    scene: Gaussians, cutoff: float, plain: bool
+) -> tuple[Any, Any, Callable[[], NDArray[Any]]]:
+    """Make frozen programs that draw a scene, forward and with reverse, and what shows it.
+
+    ``program.func.clear()`` frees a program. `plain` is `render_plain` instead of `rasterize`.
+    """
+    parameters = decode_parameters(scene)
+    background = parameters.background
+    draw: Callable[..., Any]
+    if plain:
+        grid, draw = Grid(scene.width, scene.height, PLAIN_TILE), render_plain
+        lists = build_lists(parameters.shape, kernel_radius(cutoff), grid)
+        values = [*scene.mean, *scene.factor, *parameters.color]
+    else:
+        draw, lists = _rasterize, bin_gaussians(replace(scene, cutoff=cutoff))
+        values = [*parameters.shape, *parameters.color]
+    dr.eval(values)
+    shape = (scene.height, scene.width, scene.channels)
+    delta = upload(type(values[0]), np.random.default_rng(1).normal(size=math.prod(shape)))
+
+    @dr.freeze
+    def forward(values: list, background: list, lists: TileLists) -> Any:
+        return draw(values, background, lists, cutoff)
+
+    @dr.freeze
+    def step(values: list, background: list, lists: TileLists, delta: Any) -> list:
+        dr.enable_grad(values)
+        dr.backward(dr.dot(draw(values, background, lists, cutoff), delta))
+        return dr.grad(values)
+
+    def shown() -> NDArray[Any]:
+        image = draw(values, background, lists, cutoff)
+        if plain:
+            return image.numpy().reshape(shape)
+        return to_tensor(image, lists.grid, shape[2]).numpy()
+
+    frozen = partial(step, values, background, lists, delta)
+    return partial(forward, values, background, lists), frozen, shown
+
+
+def _rasterize(values: list, background: list, lists: TileLists, cutoff: float) -> Any:
+    shape, color = values[:NUM_SHAPE_PARAMS], values[NUM_SHAPE_PARAMS:]
+    return rasterize(KernelParameters(shape, color, background), lists, cutoff)
+
+
+def _peak(q: Any) -> Any:
+    types = types_of(q)
+
+    def body(i: Any, q: Any, sums: list) -> tuple:
+        for _ in range(PEAK_UNROLL):
+            w = dr.select(q < 4.5, dr.exp(-q), 0)
+            sums = [dr.fma(w, q, s) for s in sums]
+            q = q + 1e-3
+        return i + 1, q, sums
+
+    start = (types.UInt(0), types.Float(q), [types.Float(0) for _ in range(3)])
+    sums = dr.while_loop(start, lambda i, *_: i < PEAK_LOOPS, body, label="peak")[-1]
+    return sum(sums)
+
+
+def pixels_inside(scene: Gaussians) -> int:
+    """Count pairs of a Gaussian and a pixel of the picture inside its cutoff ellipse."""
+    mean = scene.to_arrays()["mean"].astype(np.float64)
+    reach = int(CUTOFF * SIGMA) + 1
+    near = np.arange(-reach, reach + 1)
+    x, y = (np.floor(mean[:, k])[:, None] + near + 0.5 for k in (0, 1))
+    dx2, dy2 = (x - mean[:, :1]) ** 2, (y - mean[:, 1:]) ** 2
+    dx2[(x < 0) | (x > SIDE)] = np.inf
+    dy2[(y < 0) | (y > SIDE)] = np.inf
+    return int((dx2[:, :, None] + dy2[:, None, :] <= (CUTOFF * SIGMA) ** 2).sum())
+
+
+def growth_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
+    """Time every step of a refinement: Gaussians stretch, and a poor renderer slows down."""
+    photo = sample("astronaut")
+    top, left = ((side - SIDE) // 2 for side in photo.shape[:2])
+    target = rgb_to_ycbcr(photo[top : top + SIDE, left : left + SIDE])
+    mean, factor = place_adaptive(target, COUNT, np.random.default_rng(0))
+    start = Gaussians.from_arrays(
+        mean, factor, np.zeros((COUNT, 3)), size=(SIDE, SIDE), backend=types.backend
+    ).bounded()
+    start = solve(start, target).gaussians
+    ends, sets = [], descend(FitProblem(start, target), PRESETS["default"].schedule, STEPS)
+    for step, _ in enumerate(sets):
+        dr.sync_thread()
+        ends.append(time.perf_counter())
+        if step % 10 == 0:
+            progress("growth", step, STEPS)
+    ms = np.diff(ends) * 1e3
+    early, late = ms[50:150], ms[900:1000]
+    return {
+        "growth": float(np.median(late) / np.median(early)),
+        "growth_with_lists": float(late.mean() / early.mean()),
+        "early_step_ms": float(np.median(early)),
+        "late_step_ms": float(np.median(late)),
+    }
+
+
+def cutoff_figures(scene: Gaussians) -> list[Row]:
+    """Time pictures by cutoff; errors are of all pixels, against float64 at `WIDEST`."""
+    module = select(types_of(scene.mean).backend)
+    colors = {key: module.ArrayXf64(getattr(scene, key)) for key in ("color", "background")}
+    shapes = {"mean": module.Array2f64(scene.mean), "factor": module.Array3f64(scene.factor)}
+    exact = render(replace(scene, **shapes, **colors), cutoff=WIDEST).numpy()
+    rows, timed = list[Row](), dict[str, Any]()
+    for cutoff in CUTOFFS:
+        forward, step, shown = programs(scene, cutoff, plain=False)
+        timed |= {f"forward {cutoff}": forward, f"step {cutoff}": step}
+        error = shown() - exact
+        largest, rms = np.abs(error).max(), np.sqrt(np.mean(error**2))
+        rows.append({"cutoff": cutoff, "largest_error": largest, "rms_error": rms})
+    ms = interleaved(timed, WARM_UP, ROUNDS)
+    for program in timed.values():
+        program.func.clear()
+    return [
+        row | {f"{what}_ms": ms[f"{what} {row['cutoff']}"] for what in ("forward", "step")}
+        for row in rows
+    ]

@@ -1,0 +1,236 @@
+"""Speed against accuracy: fits that differ from the default one in one setting at a time.
+
+The row of a variant has "gaussians", their number, and "trace", a list of `score` at each number of
+steps.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from eigengs_bench import report as fr
+from eigengs_bench.clock import Image, descent, score, warm_up
+from eigengs_bench.images import images_of, is_trained, model_for
+from eigengs_bench.names import SETS
+from eigengs_bench.rows import Job, Row, Task
+from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.fitting.options import PRESETS, FitOptions
+from eigengs_dr.fitting.start import initialize
+from eigengs_dr.gaussian.file import CUTOFF
+
+# Steps of runs of a method whose rates fall: each number is a run of its own.
+HORIZONS = (0, 10, 100, 300, 1000)
+# Steps after which the one run is looked at where rates stay: it stands for all shorter ones.
+MARKS = (0, 10, 20, 50, 100, 200, 500, 1000)
+# Components a channel of the models that all fits start from, and of others.
+DEFAULT_COMPONENTS, COMPONENTS = 300, (50, 100, 500)
+
+
+class Variant(NamedTuple):
+    """A fit with one setting, the knob, at another value; the other fields are arguments of `fit`.
+
+    The default fit is the value "default" of the knob "preset".
+    """
+
+    knob: str
+    value: str | float
+    gaussians: int | None = None
+    preset: str = "default"
+    init: str = "auto"
+    start: EigenGS | None = None
+    solve_steps: int = 10
+    cutoff: float = CUTOFF
+
+
+def run(task: Task, names: Sequence[str]) -> list[Row]:
+    """Measure all variants on sets of images."""
+    return task.measure("pareto", [job for name in names for job in _jobs(task, name)])
+
+
+def variants(task: Task, name: str) -> list[Variant]:
+    """List the fits that are compared on a set, the default one first.
+
+    Their models are trained where they are missing; sets without images to train on use the basis
+    that ships, in one size.
+    """
+    count, models = SETS[name].gaussians, dict[int, EigenGS]()
+    if is_trained(task, name):
+        models = {k: model_for(task, name, name, k) for k in (DEFAULT_COMPONENTS, *COMPONENTS)}
+    basis = models.pop(DEFAULT_COMPONENTS, None) or EigenGS.load("natural", task.backend)
+    return [
+        Variant("preset", "default", count),
+        Variant("preset", "gaussianimage", count, "gaussianimage"),
+        Variant("preset", "eigengs", None, "eigengs", start=basis),
+        Variant("init", "grid", count, init="grid"),
+        Variant("init", "random", count, init="random"),
+        Variant("init", "eigen", None, start=basis),
+        *(Variant("solve steps", k, count, solve_steps=k) for k in (0, 2, 5, 30)),
+        *(Variant("cutoff", k, count, cutoff=k) for k in (2.5, 3.5, 4.0, 5.0)),
+        *(Variant("gaussians", round(k * count), round(k * count)) for k in (0.25, 0.5, 2, 4)),
+        *(Variant("components", k, None, "eigengs", start=model) for k, model in models.items()),
+    ]
+
+
+def _jobs(task: Task, name: str) -> Iterator[Job]:
+    for file, image in images_of(task, name):
+        about = {"set": name, "image": file, "iterations": task.iterations}
+        for fit in variants(task, name):
+            yield {**about, "knob": fit.knob, "value": fit.value}, partial(trace, task, fit, image)
+
+
+def trace(task: Task, fit: Variant, image: Image) -> Row:
+    """Run a variant once untimed, then once for every number of steps it is judged at."""
+    schedule, iterations = PRESETS[fit.preset].schedule, task.iterations
+    options = {k: v for k, v in fit._asdict().items() if k not in ("knob", "value")}
+    options["backend"] = task.backend
+    warm_up(partial(initialize, image, FitOptions(**options)), schedule, iterations)
+    falls = schedule.decay < 1
+    marks = sorted({n for n in (HORIZONS if falls else MARKS) if n < iterations} | {iterations})
+    runs = [(n, (n,)) for n in marks] if falls else [(iterations, tuple(marks))]
+    moments = [m for steps, shown in runs for m in descent(image, steps, shown, **options)]
+    found = [score(moment, image) for moment in moments]
+    return {"gaussians": len(moments[-1].gaussians), "trace": found}
+
+
+# ---------------------------------------------------------------------------------------------
+#  Tables and charts
+# ---------------------------------------------------------------------------------------------
+
+FIT = ["set", "image", "knob", "value"]
+VARIANTS: dict[str, Any] = {
+    "s, start": ("seconds_start", partial(fr.median, decimals=3)),
+    "YCbCr, start": ("psnr_ycbcr_start", fr.mean),
+    "s": ("seconds", fr.median),
+    "YCbCr": ("psnr_ycbcr", fr.mean),
+    "RGB": ("psnr_rgb", fr.mean),
+    "on front": ("front", "first"),
+    "as many": ("front_same", "first"),
+}
+# What a knob is, its colour and marker, and its value in the default fit (or that of eigengs).
+KNOBS = {
+    "init": ("Where Gaussians start", "#8a4f9e", "s", "adaptive"),
+    "solve steps": ("Steps of the colour solve", "#c27c0e", "^", "10"),
+    "cutoff": ("Cutoff in standard deviations", "#7a5c43", "D", "3"),
+    "gaussians": ("Number of Gaussians", "#1f9e89", "v", ""),
+    "components": ("Components a channel of eigengs", "#5a8f3c", "P", "300"),
+}
+LABELS = ("seconds, start included", "PSNR in YCbCr / dB")
+
+
+def summarize(rows: Sequence[Row]) -> fr.Section:
+    """Lay out what was measured: a table and a chart a set."""
+    tables, charts = [], {}
+    for name, part in fr.frame_of(rows, "trace").groupby("set", sort=False):
+        points = points_of(part)
+        tables.append(_variants(str(name), part, points))
+        charts[f"pareto-{name}"] = _chart(points, str(name))
+    return fr.Section(tables, charts)
+
+
+def points_of(fits: pd.DataFrame) -> pd.DataFrame:
+    """Gather the images of a set: medians of seconds and means of PSNRs, NaN where a fit failed.
+
+    "front" and "front_same" are 1 on the front of all points, and on the front of points with as
+    many Gaussians as the default fit.
+    """
+    groups = fits.groupby(["knob", "value", "iteration", "gaussians"], sort=False)
+    points = groups[["psnr_ycbcr"]].agg(lambda values: values.mean(skipna=False))
+    points.insert(0, "seconds", groups.seconds.median())
+    points = points.assign(images=groups.size()).reset_index()
+    same = points.gaussians.isin(points.gaussians[points.value == "default"])
+    for column, some in (("front", points), ("front_same", points[same])):
+        best = front(list(zip(some.seconds, some.psnr_ycbcr, strict=True)))
+        on = [
+            p.Index in some.index and (p.seconds, p.psnr_ycbcr) in best for p in points.itertuples()
+        ]
+        points[column] = pd.Series(on).astype(int)
+    return points
+
+
+def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Find the points (seconds, PSNR) of which none is as fast and better, or faster and as good.
+
+    From the fastest to the best; of equal points one; no point with NaN is on a front.
+    """
+    best, kept = -math.inf, []
+    known = [point for point in points if not any(map(math.isnan, point))]
+    for seconds, reached in sorted(known, key=lambda point: (point[0], -point[1])):
+        if reached > best:
+            best = reached
+            kept.append((seconds, reached))
+    return kept
+
+
+def _variants(name: str, fits: pd.DataFrame, points: pd.DataFrame) -> fr.Table:
+    steps = fits.iteration.max()
+    start, ends = fits[fits.iteration == 0], fits[fits.iteration == steps]
+    lines = ends.merge(start[[*FIT, "seconds", "psnr_ycbcr"]], on=FIT, suffixes=("", "_start"))
+    lines["fit"] = lines.knob + " " + lines.value.map(text_of)
+    for key in ("front", "front_same"):
+        on = points[points[key] == 1].groupby(["knob", "value"], sort=False).iteration
+        at = on.agg(lambda values: ", ".join(f"{step:,}" for step in values)).rename(key)
+        lines = lines.join(at, on=["knob", "value"]).fillna({key: fr.MISSING})
+    caption = (
+        f"{name}, {fr.counted(fits.image)}: seconds and PSNR at the start and after {steps:,} "
+        "steps; after how many steps a fit is on the front of all fits, and on the front of fits "
+        "with as many Gaussians; other settings are the default ones"
+    )
+    return fr.grouped(caption, lines, ["fit"], VARIANTS)
+
+
+def text_of(value: str | float) -> str:
+    """Write the value of a knob."""
+    return value if isinstance(value, str) else f"{value:,g}"
+
+
+def _chart(points: pd.DataFrame, name: str) -> Figure:
+    """Draw all fits of a set (see `points_of`) and their front, and below a panel a setting."""
+    title = f"Speed against accuracy: {name}, images: {points.images.max()}; up and left is better"
+    figure, knobs = fr.new_figure(10, 11.5, title), list(KNOBS)
+    rows: Any = [3 * ["all"], knobs[:3], [*knobs[3:], "."]]
+    axes = figure.subplot_mosaic(rows, height_ratios=(2.4, 1, 1))
+    _overview(axes["all"], points)
+    for knob in knobs:
+        _panel(axes[knob], points, knob)
+    return figure
+
+
+def _overview(axis: Axes, points: pd.DataFrame) -> None:
+    for knob, (title, color, marker, _) in KNOBS.items():
+        if len(some := points[points.knob == knob]):
+            _plot(axis, some, title, color=color, marker=marker, ls="none", ms=5, alpha=0.75)
+    for preset, color in fr.COLORS.items():
+        _plot(axis, _line(points, "preset", preset), preset, color=color, marker="o")
+    same, edge = (points[points[k] == 1].sort_values("seconds") for k in ("front_same", "front"))
+    label = f"front of fits with {same.gaussians.max():,} Gaussians"
+    _plot(axis, same, label, color=fr.INK, lw=1.2, ls="--")
+    _plot(axis, edge, "front: none is better", color=fr.INK, lw=8, alpha=0.18)
+    fr.label_axes(axis, *LABELS)
+
+
+def _panel(axis: Axes, points: pd.DataFrame, knob: str) -> None:
+    title, color, marker, usual = KNOBS[knob]
+    base = "eigengs" if knob == "components" else "default"
+    values = points.value[points.knob == knob].unique()
+    for value, strength in zip(values, np.linspace(0.35, 1, len(values)), strict=True):
+        shade = tuple(1 - float(strength) * (1 - part) for part in to_rgb(color))
+        _plot(axis, _line(points, knob, value), text_of(value), color=shade, marker=marker, ms=4)
+    line = _line(points, "preset", base)
+    usual = usual or text_of(line.gaussians.iloc[0])
+    _plot(axis, line, f"{usual} ({base})", color=fr.INK, lw=2.5)
+    fr.label_axes(axis, *LABELS, title=title)
+
+
+def _plot(axis: Axes, points: pd.DataFrame, label: str, **style: Any) -> None:
+    axis.plot(points.seconds, points.psnr_ycbcr, label=label, **style)
+
+
+def _line(points: pd.DataFrame, knob: str, value: str | float) -> pd.DataFrame:
+    return points[(points.knob == knob) & (points.value == value)].sort_values("iteration")

@@ -1,0 +1,272 @@
+"""Rate against distortion: packed fits beside the codecs of Pillow, and published means.
+
+A row has "points": setting (the number of Gaussians, or the quality), bytes, bits_per_pixel, the
+figures of `judge`, seconds of encoding and decode_seconds.
+"""
+
+import io
+import time
+from collections.abc import Iterator, Sequence
+from functools import partial
+from importlib import import_module
+from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image as pillow
+from scipy.interpolate import PchipInterpolator
+
+from eigengs_bench import report as fr
+from eigengs_bench.clock import Image, judge
+from eigengs_bench.images import images_of
+from eigengs_bench.rows import Job, Row, Task
+from eigengs_dr.codec.packing import pack
+from eigengs_dr.fitting.fit import fit
+from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.image.io import to_8bit
+from eigengs_dr.raster.render import picture_of
+
+OURS = "packed Gaussians"
+PIXELS = (256, 128, 64, 32, 16, 8)  # pixels a Gaussian of the fits that are packed
+# Decibels that packing may lose: of some numbers below it and some above,
+# these had the best PSNR at equal size on training photos, by little.
+BUDGET = 0.8
+WARM_UP = 6  # untimed steps before a fit, that compile its programs
+QUALITIES = (2, 5, 10, 15, 20, 30, 40, 50, 60, 70, 80, 85, 90, 95)
+RATIOS = (200, 120, 80, 60, 48, 40, 32, 26, 20, 16, 13, 10, 8, 6)
+# Decibels of PSNR in 8-bit RGB at which the sizes of files are compared.
+LEVELS = (28.95, 31.27, 32.0, 33.19, 36.0)
+# Slopes at which means are compared with published ones: the fall of the mean squared error, with
+# 255 as white, for a bit a pixel more.
+SLOPES = np.geomspace(1000, 10, 13)
+
+
+class Codec(NamedTuple):
+    """Pillow's name and options of a codec, at a slow and good setting of the encoder; its line.
+
+    The settings are qualities, or ratios of the sizes of the pixels and the file.
+    """
+
+    kind: str
+    options: dict[str, Any]
+    color: str
+    style: str
+    settings: tuple[int, ...] = QUALITIES
+
+    def set_to(self, setting: int) -> dict[str, Any]:
+        """Return the options of a file with a setting."""
+        if self.settings is RATIOS:
+            return {**self.options, "quality_mode": "rates", "quality_layers": [setting]}
+        return {**self.options, "quality": setting}
+
+
+# 4:4:4 and the tuning for PSNR are 0.1 to 0.5 dB better than AVIF's defaults. Slower settings take
+# up to 20 s a photo, for 1 % more bits at equal PSNR.
+AVIF = {"speed": 4, "max_threads": 1, "subsampling": "4:4:4", "advanced": {"tune": "psnr"}}
+CODECS = {
+    "JPEG 4:2:0": Codec("JPEG", {"optimize": True, "subsampling": 2}, "#c27c0e", "s--"),
+    "JPEG 4:4:4": Codec("JPEG", {"optimize": True, "subsampling": 0}, "#b5442f", "D--"),
+    "JPEG 2000": Codec("JPEG2000", {"irreversible": True, "mct": 1}, "#8a6d3b", "v--", RATIOS),
+    "WebP": Codec("WEBP", {"method": 6}, "#5a8f3c", "^--"),
+    "AVIF 4:4:4": Codec("AVIF", AVIF, "#7a4f9a", "x--"),
+    "JPEG XL": Codec("JXL", {"effort": 7}, "#2f8f83", "P--"),
+}
+import_module("pillow_jxl")  # Pillow knows JPEG XL from then on
+
+
+def run(task: Task, names: Sequence[str]) -> list[Row]:
+    """Measure on each image a packed fit of each size, and the codecs."""
+    jobs = [job for name in names for job in _jobs(task, name, images_of(task, name))]
+    return task.measure("rate", jobs)
+
+
+def _jobs(task: Task, name: str, images: list[tuple[str, Image]]) -> Iterator[Job]:
+    settings = {"iterations": task.iterations, "budget": BUDGET}
+    for photo, image in images:
+        about = {"set": name, "image": photo}
+        for pixels in PIXELS:
+            count = max(1, image.shape[0] * image.shape[1] // pixels)
+            label = {**about, "codec": OURS, "gaussians": count, **settings}
+            yield label, partial(_packed, task, image, count)
+        for title, codec in CODECS.items():
+            yield {**about, "codec": title}, partial(_coded, image, codec)
+
+
+def _packed(task: Task, image: Image, count: int) -> Row:
+    made = partial(fit, image, count, backend=task.backend)
+    made(iterations=min(WARM_UP, task.iterations))
+    started = time.perf_counter()
+    fitted = made(iterations=task.iterations)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "fit.egs"
+        receipt = pack(fitted.gaussians, path, image, BUDGET)
+        seconds = {"seconds": time.perf_counter() - started}
+        picture_of(Gaussians.load(path, task.backend))  # compiles
+        loaded = time.perf_counter()
+        shown = picture_of(Gaussians.load(path, task.backend))
+        seconds["decode_seconds"] = time.perf_counter() - loaded
+    return {"points": [_point(count, receipt.bytes, shown, image) | seconds]}
+
+
+def _coded(image: Image, codec: Codec) -> Row:
+    source, points = pillow.fromarray(to_8bit(image).astype(np.uint8)), []
+    for setting in codec.settings:
+        file = io.BytesIO()
+        started = time.perf_counter()
+        source.save(file, codec.kind, **codec.set_to(setting))
+        coded = time.perf_counter()
+        pixels = np.asarray(pillow.open(file).convert("RGB"))
+        seconds = {"seconds": coded - started, "decode_seconds": time.perf_counter() - coded}
+        shown = pixels.astype(np.float32) / 255
+        points.append(_point(setting, len(file.getvalue()), shown, image) | seconds)
+    return {"points": points}
+
+
+def _point(setting: int, size: int, shown: NDArray[Any], image: Image) -> Row:
+    bits = 8 * size / (image.shape[0] * image.shape[1])
+    return {"setting": setting, "bytes": size, "bits_per_pixel": bits, **judge(shown, image)}
+
+
+# ---------------------------------------------------------------------------------------------
+#  Tables and charts
+# ---------------------------------------------------------------------------------------------
+
+
+def summarize(rows: Sequence[Row]) -> fr.Section:
+    """Lay out the bits a pixel that each codec takes for a PSNR: a table and a chart a set."""
+    tables, charts = [], {}
+    for name, part in fr.frame_of(rows, "points").groupby("set", sort=False):
+        tables.append(_table(str(name), part))
+        tables += [_published(part)] if name == "kodak" else []
+        charts[f"rate-{name}"] = _chart(part, str(name))
+    return fr.Section(tables, charts)
+
+
+def rates(points: pd.DataFrame, level: float) -> pd.DataFrame:
+    """Interpolate bits a pixel at a PSNR: a line an image that all codecs reach it on."""
+    found = {
+        key: fr.smallest(dict(zip(part.bits_per_pixel, part.psnr_rgb, strict=True)), level)
+        for key, part in points.groupby(["image", "codec"], sort=False)
+    }
+    return pd.Series(found).unstack().dropna()
+
+
+def _table(name: str, points: pd.DataFrame) -> fr.Table:
+    found = [rates(points, level) for level in LEVELS]
+    lines = [
+        (
+            codec,
+            *(_compared(sizes, codec) for sizes in found),
+            _saved(points, codec),
+            fr.median(part.seconds),
+            fr.median(part.decode_seconds, 3),
+        )
+        for codec, part in points.groupby("codec", sort=False)
+    ]
+    reached = (str(len(sizes)) for sizes in found)
+    lines.append(("images that all reach", *reached, *[fr.MISSING] * 3))
+    caption = (
+        f"{name}, {fr.counted(points.image)}: bits a pixel for a PSNR in 8-bit RGB, interpolated; "
+        "in brackets the bits of a codec over ours, and on how many images ours are fewer "
+        "(images that were JPEG files once suit JPEG). BD-rate: bits of ours at equal PSNR against "
+        "the codec's, mean over the images"
+    )
+    columns = ("codec", *(f"{level:g} dB" for level in LEVELS), "BD-rate", "s", "s to decode")
+    return fr.table(caption, columns, lines, points.code)
+
+
+def _compared(sizes: pd.DataFrame, codec: str) -> str:
+    if sizes.empty:
+        return fr.MISSING
+    mean, ours = sizes[codec].mean(), sizes[OURS]
+    ratio = f" ({mean / ours.mean():.2f}, {(ours < sizes[codec]).sum()})"
+    return fr.number(mean, 2) + ratio * (codec != OURS)
+
+
+def bd_rate(ours: pd.DataFrame, other: pd.DataFrame) -> float:
+    """Return the mean change of the bits at equal PSNR, from -1 on; NaN if no PSNR is of both.
+
+    The logarithm of the bits is interpolated over the PSNR by monotone cubics (Bjontegaard,
+    VCEG-M33; the cubics are those of later reference software).
+    """
+    curves = []
+    for points in (ours, other):
+        best = points.sort_values("bits_per_pixel")
+        best = best[best.psnr_rgb > best.psnr_rgb.cummax().shift(fill_value=-np.inf)]
+        if len(best) < 2:
+            return float("nan")
+        curves.append(PchipInterpolator(best.psnr_rgb, np.log(best.bits_per_pixel)))
+    low, high = (f(*(ends(c.x) for c in curves)) for f, ends in ((max, min), (min, max)))
+    if low >= high:
+        return float("nan")
+    mine, others = (curve.integrate(low, high) / (high - low) for curve in curves)
+    return float(np.exp(mine - others) - 1)
+
+
+def _saved(points: pd.DataFrame, codec: str) -> str:
+    """Write the BD-rate of ours against a codec."""
+    if codec == OURS:
+        return fr.MISSING
+    parts = [part.groupby("codec") for _, part in points.groupby("image", sort=False)]
+    both = [p for p in parts if {OURS, codec} <= set(p.groups)]
+    found = pd.Series([bd_rate(p.get_group(OURS), p.get_group(codec)) for p in both], dtype=float)
+    return fr.MISSING if found.isna().all() else f"{100 * found.mean():+.0f} %"
+
+
+def at_equal_slope(points: pd.DataFrame) -> pd.DataFrame:
+    """Return means over the images: at each slope, every image at the point that suits it best.
+
+    The published means have equal settings of an encoder, which are about equal slopes. Means at
+    equal numbers of Gaussians would give easy and hard images alike, and flatter by about 0.5 dB.
+    """
+    error = 255**2 * 10 ** (-points.psnr_rgb / 10)
+    chosen = []
+    for slope in SLOPES:
+        cost = error + slope * points.bits_per_pixel
+        best = points.loc[cost.groupby(points.image).idxmin()]
+        chosen.append(best[["bits_per_pixel", "psnr_rgb"]].mean())
+    return pd.DataFrame(chosen).drop_duplicates()
+
+
+def _published(points: pd.DataFrame) -> fr.Table:
+    """Lay out the BD-rate of the means of ours and of the codecs against published means."""
+    known = pd.read_csv(str(files("eigengs_bench") / "published_rate.csv"))
+    measured = {name: at_equal_slope(part) for name, part in points.groupby("codec", sort=False)}
+    lines = [
+        (name, f"{100 * bd_rate(measured[OURS], part):+.0f} %", part.source.iloc[0])
+        for name, part in [*known.groupby("method", sort=False)]
+    ]
+    lines += [
+        (name, f"{100 * bd_rate(measured[OURS], part):+.0f} %", "measured here, at equal slope")
+        for name, part in measured.items()
+        if name != OURS
+    ]
+    caption = (
+        f"kodak, {fr.counted(points.image)}: BD-rate of our mean curve at equal slope, against "
+        "published mean curves; above 0 ours takes more bits"
+    )
+    return fr.table(caption, ("method", "BD-rate of ours", "source"), lines, points.code)
+
+
+def _chart(points: pd.DataFrame, name: str) -> Figure:
+    """Draw PSNR in RGB and MS-SSIM over bits a pixel: means over the images, a point a setting."""
+    images = fr.counted(points.image)
+    figure = fr.new_figure(10, 4.8, f"Rate against distortion: {name}, {images}")
+    points = points.sort_values("setting", kind="stable")
+    # Fits have other numbers of Gaussians on images of other sizes: the n-th are one point.
+    rank = points.groupby(["codec", "image"]).cumcount().rename("rank")
+    means = points.groupby(["codec", rank])[["bits_per_pixel", "psnr_rgb", "ms_ssim"]].mean()
+    styles = {OURS: ("#0b6e99", "o-")} | {k: (c.color, c.style) for k, c in CODECS.items()}
+    labels = {"psnr_rgb": "PSNR in 8-bit RGB / dB", "ms_ssim": "MS-SSIM"}
+    for axis, (what, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
+        for codec, (color, style) in styles.items():
+            if codec in means.index:
+                curve = means.loc[codec]
+                axis.plot(curve.bits_per_pixel, curve[what], style, color=color, ms=4, label=codec)
+        fr.label_axes(axis, "bits a pixel", label)
+    return figure

@@ -1,0 +1,212 @@
+"""Rows as data frames, tables and charts, and one report in Markdown of all rows of a folder."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import import_module
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from eigengs_bench.rows import FILE, Row, code_name, read
+from eigengs_dr.storage.atomic import atomic_write
+
+MISSING = "-"  # cell of a figure that is not there
+
+# Lines of the presets, which differ in lightness too, for readers who confuse red and green.
+COLORS = {"default": "#0b6e99", "gaussianimage": "#b5442f", "eigengs": "#5a8f3c"}
+INK = "#222222"
+
+# Titles, and the modules of this package that make tables and charts of their rows.
+QUESTIONS = {
+    "tables": "The methods",
+    "pictures": "The paper's curves and pictures",
+    "pareto": "Speed against accuracy",
+    "stability": "Where methods fail",
+    "kodak": "The Kodak photos, beside published figures",
+    "number": "Gaussians that a PSNR takes",
+    "rate": "Bytes that a PSNR takes",
+    "scaling": "What size costs",
+    "kernels": "How fast the renderer is",
+    "texture": "How fast a texture is in Mitsuba",
+}
+
+
+class Table(NamedTuple):
+    """Texts under headings; the caption says what they are, and what they were measured on."""
+
+    caption: str
+    frame: pd.DataFrame
+
+
+class Section(NamedTuple):
+    """Tables of rows, and charts by the stem of a file."""
+
+    tables: Sequence[Table] = ()
+    charts: Mapping[str, Figure] = {}
+
+
+def write_report(folder: Path, output: Path) -> None:
+    """Write README.md and its charts: all questions that rows of a folder answer.
+
+    `ValueError` if the folder holds no rows, or damaged ones.
+    """
+    parts = ["# Measurements"]
+    output.mkdir(parents=True, exist_ok=True)
+    for bench, title in QUESTIONS.items():
+        if rows := read(folder / FILE, bench):
+            tables, charts = import_module(f"eigengs_bench.{bench}").summarize(rows)
+            parts += [f"## {title}", *(as_text(table, "pipe") for table in tables)]
+            for name, figure in charts.items():
+                save_figure(output / f"{name}.svg", figure)
+                parts.append(f"![{name}]({name}.svg)")
+            parts.append("\n".join(f"- {line}" for line in sources_of(rows)))
+    if len(parts) == 1:
+        raise ValueError(f"{folder}: holds no rows; run a command of eigengs-dr bench first")
+    with atomic_write(output / "README.md") as temporary:
+        temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+
+
+def sources_of(rows: Sequence[Row]) -> list[str]:
+    """Say how rows were made: each command with its days and commit, and the machine."""
+    lines = []
+    for run in (row["run"] for row in rows):
+        lines.append(f"`{run['command']}`, {run['date'][:10]}, {code_name(run)}")
+    for run in (row["run"] for row in rows):
+        versions = {k: v for k, v in run["versions"].items() if v and not k.endswith("_path")}
+        named = ", ".join(f"{name} {version}" for name, version in versions.items())
+        lines.append(f"{run['cpu']}, {run['threads']} threads, backend {run['backend']}; {named}")
+    return list(dict.fromkeys(lines))
+
+
+# ---------------------------------------------------------------------------------------------
+#  Tables
+# ---------------------------------------------------------------------------------------------
+
+
+def frame_of(rows: Iterable[Row], key: str = "") -> pd.DataFrame:
+    """Lay rows out: a line a row, or a line an entry of the list `key` of the rows that have it.
+
+    Columns are the fields of the jobs, the figures, and "code", the name of the code. Figures of
+    fits that have failed, null in the file, are NaN.
+    """
+    lines = []
+    for row in rows:
+        figures = {k: v for k, v in row.items() if k not in ("bench", "job", "run", key)}
+        shared = {**row["job"], **figures, "code": code_name(row["run"])}
+        lines += [{**shared, **entry} for entry in (row.get(key, []) if key else [{}])]
+    return pd.DataFrame([{k: math.nan if v is None else v for k, v in ln.items()} for ln in lines])
+
+
+def table(
+    caption: str, columns: Iterable[str], lines: Iterable[Sequence[Any]], codes: Iterable[str] = ()
+) -> Table:
+    """Make a table of lines of texts; `codes` names the code of all rows behind it."""
+    return Table(caption + remark(codes), pd.DataFrame(list(lines), columns=list(columns)))
+
+
+def grouped(caption: str, frame: pd.DataFrame, by: list[str], columns: Mapping[str, Any]) -> Table:
+    """Make a table with a line a group: a cell is (column, function that writes its values)."""
+    if frame.empty:
+        return Table(caption, frame)
+    cells = frame.groupby(by, sort=False).agg(**columns).reset_index()
+    return Table(caption + remark(frame.code), cells)
+
+
+def remark(codes: Iterable[str]) -> str:
+    """Say that rows are of several commits, or of a tree that was not clean; else ""."""
+    known = list(dict.fromkeys(codes))
+    if len(known) > 1 or any("uncommitted" in code for code in known):
+        kind = "different code" if len(known) > 1 else "code that is in no commit"
+        return f" [rows of {kind}: {'; '.join(known)}]"
+    return ""
+
+
+def as_text(table: Table, style: str = "simple") -> str:
+    """Lay a table out for a terminal, or for Markdown with the style "pipe"."""
+    if table.frame.empty:
+        return f"{table.caption}: none"
+    sides = ["left", *["right"] * (len(table.frame.columns) - 1)]
+    options: Any = {"tablefmt": style, "colalign": sides, "disable_numparse": True}
+    return f"{table.caption}\n\n{table.frame.to_markdown(index=False, **options)}"
+
+
+def number(value: float | None, decimals: int = 1) -> str:
+    """Write a figure; `MISSING` for None and NaN, "inf" for infinity."""
+    return MISSING if value is None or math.isnan(value) else f"{value:,.{decimals}f}"
+
+
+def mean(values: pd.Series, decimals: int = 1) -> str:
+    """Write the mean of figures. NaN is of fits that have failed: "46.3 (2 failed)"."""
+    failed = int(values.isna().sum())
+    return number(values.mean(), decimals) + (f" ({failed} failed)" if failed else "")
+
+
+def median(values: pd.Series, decimals: int = 2) -> str:
+    """Write the median of figures."""
+    return number(values.median(), decimals)
+
+
+def extent(values: pd.Series, decimals: int = 2) -> str:
+    """Write the least and the greatest of some values: "12 to 55"."""
+    ends = f"{number(values.min(), decimals)} to {number(values.max(), decimals)}"
+    return ends if values.count() else MISSING
+
+
+def counted(images: pd.Series) -> str:
+    """Write how many different images there are: "1 image", "3 images"."""
+    return f"{images.nunique()} image" + "s" * (images.nunique() != 1)
+
+
+def smallest(curve: Mapping[Any, float], target: float) -> float:
+    """Interpolate the size at a PSNR, which is taken as linear in the logarithm of the size.
+
+    Between the first two neighbours, by their sizes (Gaussians, or bits), that have the PSNR
+    between them; NaN where there are none.
+    """
+    for (few, low), (many, high) in pairwise(sorted(curve.items())):
+        if low <= target <= high:
+            share = (target - low) / (high - low) if high > low else 0.0
+            return float(few * (many / few) ** share)
+    return math.nan
+
+
+# ---------------------------------------------------------------------------------------------
+#  Charts: two runs write files alike
+# ---------------------------------------------------------------------------------------------
+
+
+def new_figure(width: float, height: float, title: str = "") -> Figure:
+    """Make an empty figure, sides in inches, that arranges its parts itself."""
+    figure = Figure(figsize=(width, height), layout="constrained")  # not pyplot: no screen
+    figure.suptitle(title)
+    return figure
+
+
+def save_figure(path: Path, figure: Figure) -> None:
+    """Write a chart as .svg, .png or .pdf, whole or not at all."""
+    undated: Any = {"Date": None} if path.suffix == ".svg" else None
+    # Names in an SVG file are else drawn at random.
+    with rc_context({"svg.hashsalt": "eigengs_dr"}), BytesIO() as file:
+        figure.savefig(file, format=path.suffix[1:], dpi=90, metadata=undated)
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(file.getvalue())
+
+
+def label_axes(
+    axis: Axes, x: str, y: str, logarithmic: str = "x", legend: bool = True, **rest: Any
+) -> None:
+    """Name the axes, give some of them logarithmic scales with plain numbers, add a legend."""
+    for side in logarithmic:
+        getattr(axis, f"set_{side}scale")("log", subs=(2, 5))
+        getattr(axis, f"{side}axis").set_major_formatter("{x:,g}")
+        getattr(axis, f"{side}axis").set_minor_formatter("{x:,g}")
+    axis.set(xlabel=x, ylabel=y, **rest)
+    axis.grid(alpha=0.3)
+    if legend:
+        axis.legend(fontsize=8, framealpha=0.6)

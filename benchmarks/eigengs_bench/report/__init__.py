@@ -1,1 +1,0 @@
-"""Reports of rows: tables, charts, and the page of both."""

@@ -1,0 +1,163 @@
+"""Measurements as lines of JSON, one by one: a run goes on after a break.
+
+A row has "bench", the question; "job", the name of the measurement; its figures; and "run": date,
+command, machine, versions, and the "commit" of the code with "clean", whether no tracked file
+differed from it. Seconds of other machines or versions differ: a folder holds rows of one machine.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from datetime import datetime, timezone
+from functools import partial
+from importlib.util import find_spec
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from eigengs_dr.cli.outputs import plain
+
+Row = dict[str, Any]
+Job = tuple[Row, Callable[[], Row]]  # what names a measurement, and what makes it
+
+FILE = "rows.jsonl"
+NOT_MACHINE = ("command", "date", "commit", "clean")
+STATUS = Path("/proc/self/status")  # of Linux
+
+
+class Task(NamedTuple):
+    """What questions share: `folder` of rows and models, `data` of image sets, `run` of rows."""
+
+    folder: Path
+    run: Row
+    data: Path | None = None
+    images: int = 20
+    iterations: int = 1000
+    backend: str | None = None
+    progress: Callable[..., None] = lambda *_: None  # progress(label, done, total)
+
+    def measure(self, bench: str, jobs: Iterable[Job], label: str = "") -> list[Row]:
+        """Do the jobs that the folder has no rows of, and add a row after each; return their rows.
+
+        `ValueError` if the file of rows is damaged, or of another machine or other versions.
+        """
+        path = self.folder / FILE
+        known = {_key(row["bench"], row["job"]): row for row in read(path)}
+        for row in known.values():
+            if _machine(row["run"]) != _machine(self.run):
+                raise ValueError(
+                    f"{path}: was measured on another machine or with other versions "
+                    f"({row['run'].get('cpu')}); write to another folder, or delete the file"
+                )
+        wanted, rows = list(jobs), []
+        for done, (name, work) in enumerate(wanted):
+            self.progress(label or bench, done, len(wanted))
+            key = _key(bench, name)
+            if key not in known:
+                now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+                row = {"bench": bench, "job": name, **work(), "run": {"date": now, **self.run}}
+                known[key] = plain(row)
+                _append(path, known[key])
+            rows.append(known[key])
+        self.progress(label or bench, len(wanted), len(wanted))
+        return rows
+
+
+def read(path: Path, bench: str = "") -> list[Row]:
+    """Read the rows of a file, of one question or all; `ValueError` names a damaged line.
+
+    An incomplete last line does not count.
+    """
+    found = []
+    lines = path.read_text("utf-8", "replace").split("\n")[:-1] if path.exists() else []
+    for number, line in enumerate(lines, 1):
+        try:
+            row = json.loads(line)
+            if not isinstance(row["job"], dict) or not isinstance(row["run"], dict):
+                raise TypeError
+            if bench in ("", row["bench"]):
+                found.append(row)
+        except (ValueError, KeyError, TypeError):
+            message = f"{path}: line {number} is not a measurement; delete that line"
+            raise ValueError(message) from None
+    return found
+
+
+def code_state() -> Row:
+    """Find the commit of the code, and whether its tree is clean; both are None without git."""
+    spec = find_spec("eigengs_dr")
+    folder = Path(str(spec and spec.origin)).parent
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(folder), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", "__init__.py")  # not a package below another tree
+        clean = not git("status", "--porcelain", "--untracked-files=no")
+        return {"commit": git("rev-parse", "HEAD"), "clean": clean}
+    except (OSError, subprocess.CalledProcessError):
+        return {"commit": None, "clean": None}
+
+
+def code_name(run: Row) -> str:
+    """Name the code of a run: "commit 0a1b2c3d4", and whether its tree was not clean."""
+    if not run.get("commit"):
+        return f"version {run.get('versions', {}).get('eigengs_dr', 'unknown')}, commit unknown"
+    return f"commit {run['commit'][:9]}" + ("" if run["clean"] else " with uncommitted changes")
+
+
+def alone(title: str, work: Callable[..., Row], *arguments: Any) -> Callable[[], Row]:
+    """Return what measures in a new process, which has the peak of its memory for itself.
+
+    `ValueError` names what is measured if memory runs out.
+    """
+    return partial(_alone, title, work, *arguments)
+
+
+def _alone(title: str, work: Callable[..., Row], *arguments: Any) -> Row:
+    try:
+        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+            return pool.submit(work, *arguments).result()
+    except BrokenProcessPool:
+        raise ValueError(
+            f"{title}: its process was ended, as it is where memory runs out; "
+            "free some, or leave the case out"
+        ) from None
+
+
+def peak_gib() -> float | None:
+    """Most memory of this process so far, in GiB; None on Windows."""
+    if sys.platform == "win32":
+        return None
+    if STATUS.exists():  # the figure of getrusage includes the process that started this one
+        lines = (line.split() for line in STATUS.read_text().splitlines())
+        return next(int(line[1]) / (1 << 20) for line in lines if line[0] == "VmHWM:")
+    import resource
+
+    unit = 30 if sys.platform == "darwin" else 20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << unit)
+
+
+def _append(path: Path, row: Row) -> None:
+    """Add a line behind the last whole one."""
+    path.touch()
+    with path.open("rb+") as file:
+        whole = file.read().rfind(b"\n") + 1
+        file.seek(whole)
+        file.truncate()
+        file.write((json.dumps(row, allow_nan=False) + "\n").encode())
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _key(bench: str, name: Row) -> str:
+    return json.dumps([bench, plain(name)], sort_keys=True)
+
+
+def _machine(run: Row) -> Row:
+    return {key: value for key, value in run.items() if key not in NOT_MACHINE}

@@ -1,0 +1,345 @@
+"""Each question: that its command measures, shows and goes on, and that its sums are right."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from _helpers.benchmarks import (  # noqa: F401  data is a fixture
+    data,
+    lines_of,
+    moment,
+    one_image,
+    row,
+    run,
+    task_in,
+)
+from eigengs_bench import (
+    cases,
+    kernels,
+    kodak,
+    number,
+    pareto,
+    pictures,
+    rate,
+    scaling,
+    stability,
+    tables,
+)
+from eigengs_bench.names import SETS, ImageSet
+from eigengs_bench.rows import FILE, read
+from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.fit import fit
+from eigengs_dr.fitting.options import FitOptions
+from eigengs_dr.fitting.start import initialize
+from eigengs_dr.image.io import save_image
+from eigengs_dr.image.metrics import psnr
+from eigengs_dr.raster.render import picture_of, render
+
+
+def answered(out, bench, *arguments):
+    """The rows and the texts of a command, which does nothing when it is called again."""
+    command = ("bench", bench, *arguments, "-o", out)
+    told = run(*command)
+    assert told.exit_code == 0, told.output
+    rows, before = read(out / FILE, bench), (out / FILE).read_bytes()
+    assert run(*command).stdout == told.stdout and (out / FILE).read_bytes() == before
+    return rows, told.stdout
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Samples as small as the basis allows that ships, and a few Gaussians."""
+    monkeypatch.setitem(SETS, "samples", ImageSet("", 72, 72, 60))
+
+
+# --- The paper's tables, curves and pictures ---
+
+
+def test_tables(data, tmp_path, backend):  # noqa: F811
+    arguments = (data, "--set", "cats256", "--images", 1, "--iterations", 12, "--backend", backend)
+    rows, text = answered(tmp_path / "out", "tables", *arguments)
+    ends = {row["job"]["preset"]: row["moments"][-1] for row in rows if "moments" in row}
+    assert set(ends) == {"default", "gaussianimage", "eigengs"}
+    [reached] = [row for row in rows if "share" in row]
+    assert reached["psnr_ycbcr"] >= ends["gaussianimage"]["psnr_ycbcr"]
+    for title in ("Methods, 12 steps", "Bases of other images", "Colour space", "Time until"):
+        assert title in text
+    # The same figures as those of a fit.
+    [found] = [row for row in rows if row["job"].get("preset") == "default"]
+    image = pictures.images_of(task_in(tmp_path, data=data, images=1), "cats256")[0][1]
+    expected = fit(image, 60, 12, backend=backend)
+    assert found["moments"][-1]["psnr_rgb"] == pytest.approx(expected.trace[-1]["psnr_rgb"])
+
+
+def test_means_of_tables_count_failures():
+    job = {"set": "faces256", "iterations": 1000, "gaussians": 60}
+    usual = {"source": "", "components": 0, "space": "ycbcr", "split": "auto"}
+    made = [
+        row(
+            {**job, **usual, "image": str(k), "preset": preset},
+            moments=[moment(0, 30.0 + 2 * k), moment(1000, value)],
+        )
+        for preset in ("default", "gaussianimage")
+        for k, value in enumerate((34.0, 36.0, None, 42.0))
+    ]
+    first, *_ = tables.summarize(made).tables
+    texts = "faces256,default,4,33.0,37.3 (1 failed),31.3 (1 failed),0.500,0.750,1.000,50,25"
+    assert lines_of(first)[1] == tuple(texts.split(","))
+
+
+def test_a_goal_above_the_start_is_reached_by_descent(backend):
+    image = one_image(0)
+
+    def start(depth):
+        options = FitOptions(gaussians=60, init="grid", solve_steps=depth, backend=backend)
+        return initialize(image, options)
+
+    reached = psnr(picture_of(start(10).gaussians), image, "ycbcr")
+    goal = {"psnr_ycbcr": reached + 3, "seconds": 2.0}
+    found = tables._reach(start, image, goal)
+    assert found["solve_steps"] == 10 and found["iteration"] > 0
+    assert tables._reach(start, image, goal | {"psnr_ycbcr": 200.0}) == {"share": None}
+
+
+def test_pictures(data, tmp_path, backend):  # noqa: F811
+    out = tmp_path / "out"
+    arguments = (data, "--images", 1, "--iterations", 3, "--backend", backend)
+    wanted = [w for name in ("curves", "radii", "split", "cross") for w in ("--picture", name)]
+    rows, text = answered(out, "pictures", *arguments, *wanted)
+    assert {"cats-split.png", "cats-cross.png"} <= {path.name for path in out.iterdir()}
+    assert (out / "curves.svg").exists() and (out / "radii.svg").exists() and "cross" in text
+    assert {row["job"]["set"] for row in rows if "psnr_ycbcr" in row} == {"cats256", "natural256"}
+
+
+# --- Speed against accuracy ---
+
+
+@given(st.lists(st.tuples(st.floats(0.1, 9), st.one_of(st.floats(0, 50), st.just(np.nan)))))
+def test_front_is_what_nothing_beats(points):
+    known = {p for p in points if p[1] == p[1]}
+    beaten = {p for p in known for q in known if q != p and q[0] <= p[0] and q[1] >= p[1]}
+    assert pareto.front(points) == sorted(known - beaten)
+
+
+def test_pareto(small, tmp_path, backend):
+    arguments = ("--images", 1, "--iterations", 3, "--backend", backend)
+    rows, text = answered(tmp_path / "out", "pareto", *arguments)
+    knobs = {row["job"]["knob"] for row in rows}
+    assert knobs == {"preset", "init", "solve steps", "cutoff", "gaussians"}
+    default = next(row for row in rows if row["job"]["value"] == "default")
+    assert [m["iteration"] for m in default["trace"]] == [0, 3] and default["gaussians"] == 60
+    assert "preset default" in text and "gaussians 240" in text
+    assert (tmp_path / "out" / "pareto-samples.svg").exists()
+
+
+# --- Where methods fail ---
+
+
+def case(name="photo", **changes):
+    return cases.Case(name, lambda: cases.photo(32, 32), 30, 10)._replace(**changes)
+
+
+def test_cases_are_what_they_are_called():
+    made = {name: c.image() for name, c in cases.CASES.items() if name != "large"}
+    for image in made.values():
+        assert image.dtype == np.float32 and image.min() >= 0 and image.max() <= 1
+    assert made["impulse"].sum() == 3 and made["1x512"].shape == (1, 512, 3)
+    assert len(np.unique(made["saturated"].reshape(-1, 3), axis=0)) == 8
+
+
+def test_a_cell_says_what_the_moments_say(backend):
+    found = stability.measure_cell(case(shorter=4), "default", backend)
+    moments = stability.moments(case(), cases.photo(32, 32), "default", backend)
+    values = [psnr(m.picture, cases.photo(32, 32), "ycbcr") for m in moments]
+    assert found["start_ycbcr"] == values[0] and found["end_ycbcr"] == values[-1]
+    assert found["drop_ycbcr"] == max(values) - values[-1] and found["finite"]
+    assert abs(found["half_rgb"] - found["end_rgb"]) < 1 and found["condition"] >= 1
+    assert found["shorter_ycbcr"] > found["start_ycbcr"]
+    thin = case(image=lambda: cases.photo(70, 71))
+    assert stability.measure_cell(thin, "eigengs", backend) == {
+        "needs": "a basis with at most 4970 Gaussians"
+    }
+
+
+def test_defects_are_named():
+    def cell(name, preset="default", **figures):
+        usual = {"finite": True, "start_ycbcr": 30.0, "end_ycbcr": 40.0}
+        return row({"case": name, "preset": preset, "iterations": 9}, **{**usual, **figures})
+
+    made = [
+        cell("better"),
+        cell("rounding", end_ycbcr=29.995),
+        cell("worse", end_ycbcr=28.0),
+        cell("shorter", shorter_ycbcr=41.0),
+        cell("broken", finite=False),
+        cell("other", "eigengs", end_ycbcr=1.0),
+    ]
+    assert stability.defects(made) == [
+        "worse: ends 2.00 dB below its start",
+        "shorter: ends 1.00 dB below a run of fewer steps",
+        "broken: not finite",
+    ]
+    first = stability.summarize(made).tables[0]
+    assert lines_of(first)[0] == ("better", "40.0 from 30.0", "-")
+
+
+def test_tiles_are_told_from_slow_errors():
+    x = np.arange(128)
+    image = np.repeat(np.tile(0.2 + 0.6 * x / 127, (128, 1))[..., None], 3, axis=2)
+    waves = np.sqrt(2) * np.sin(2 * np.pi * x / 8)[None, :, None] / 255
+    assert stability.tiling(image + waves, image) == pytest.approx(1, rel=0.1)
+    assert stability.tiling(image + 0.1, image) < 1e-6
+    assert np.isnan(
+        stability.tiling(image, image + 0.5 * (np.indices((128, 128)).sum(0) % 2)[..., None])
+    )
+
+
+def test_stability(monkeypatch, tmp_path):
+    monkeypatch.setitem(cases.CASES, "photo", case())
+    arguments = ("--case", "photo", "--preset", "default", "--iterations", 5)
+    rows, text = answered(tmp_path / "out", "stability", *arguments)
+    assert len(rows) == 1 and "photo" in text and "5 steps" in text
+
+
+# --- Kodak, the number for a quality, rate ---
+
+
+def test_kodak(tmp_path, monkeypatch, backend):
+    monkeypatch.setitem(SETS, "kodak", ImageSet("kodak", 32, 24, 40))
+    monkeypatch.setattr(kodak, "WARM_UP", 1)
+    (tmp_path / "kodak").mkdir()
+    save_image(tmp_path / "kodak" / "a.png", one_image()[:24])
+    arguments = (tmp_path, "--counts", 40, "--steps", 3, "--timed", "--backend", backend)
+    [found], text = answered(tmp_path / "out", "kodak", *arguments)
+    [(_, image)] = kodak.images_of(task_in(tmp_path, data=tmp_path), "kodak")
+    expected = fit(image, 40, 3, space="rgb", backend=backend).image
+    error = np.clip(expected, 0, 1).astype(np.float64) - image
+    assert found["psnr_float"] == pytest.approx(-10 * np.log10(np.mean(error**2)), abs=1e-6)
+    assert "GaussianImage" in text and "measured" in text
+    assert (tmp_path / "out" / "kodak-seconds.svg").exists()
+    assert {"gaussians", "psnr_float", "source"} <= set(kodak.published())
+
+
+def test_number(small, tmp_path, backend):
+    arguments = ("--images", 1, "--iterations", 5, "--target", 20, "--backend", backend)
+    rows, text = answered(tmp_path / "out", "number", *arguments)
+    [searched] = [row for row in rows if "target" in row["job"]]
+    assert searched["stopped"] in ("met", "out of reach")
+    assert "20 dB" in text and len(rows) > 2
+
+
+@pytest.mark.parametrize("target", [5.0, 33.0, 99.0])
+def test_bisection_encloses_a_target(target):
+    counts = [10, 20, 40, 80, 160]
+    found = number.bisect(counts, target, lambda n: {"n": n, "psnr_ycbcr": 10 * np.log2(n / 5)})
+    seen = {row["n"]: row["psnr_ycbcr"] >= target for row in found}
+    reached = [n for n in counts if 10 * np.log2(n / 5) >= target]
+    least = min(reached, default=None)
+    assert least is None or seen[least]
+    below = max((n for n in counts if n not in reached), default=None)
+    assert below is None or not seen[below]
+
+
+def test_rate(small, tmp_path, backend, monkeypatch):
+    monkeypatch.setattr(rate, "QUALITIES", (20, 80))
+    monkeypatch.setattr(rate, "RATIOS", (20, 6))
+    for name, codec in rate.CODECS.items():
+        few = codec.settings[5:10:4]
+        if name != "JPEG 2000":
+            monkeypatch.setitem(rate.CODECS, name, codec._replace(settings=few))
+    arguments = ("--images", 1, "--iterations", 3, "--backend", backend)
+    rows, text = answered(tmp_path / "out", "rate", *arguments)
+    packed = [row["points"][0] for row in rows if row["job"]["codec"] == rate.OURS]
+    assert all(p["bits_per_pixel"] == 8 * p["bytes"] / 72**2 for p in packed) and len(packed) == 6
+    assert {row["job"]["codec"] for row in rows} == {rate.OURS, *rate.CODECS}
+    assert "JPEG XL" in text and "AVIF 4:4:4" in text
+
+
+def curve(bits, decibels, image="a", codec="x"):
+    points = {"bits_per_pixel": bits, "psnr_rgb": decibels, "image": image, "codec": codec}
+    return pd.DataFrame(points)
+
+
+def test_bd_rate_of_half_the_bits():
+    bits, decibels = np.array([0.5, 1.0, 2.0, 4.0]), np.array([28.0, 31.0, 34.0, 37.0])
+    found = rate.bd_rate(curve(bits / 2, decibels), curve(bits, decibels))
+    assert found == pytest.approx(-0.5)
+    assert np.isnan(rate.bd_rate(curve(bits, decibels), curve(bits, decibels + 90)))
+
+
+def test_means_at_equal_slope_give_hard_images_more():
+    """Of D(R) = c 4^-R the slope is proportional to D: all images end at one error."""
+    bits = np.linspace(0.5, 8, 200)
+    points = [
+        curve(bits, 10 * np.log10(255**2 / (c * 4.0**-bits)), str(c)) for c in (1000.0, 16000.0)
+    ]
+    found = rate.at_equal_slope(pd.concat(points, ignore_index=True))
+    error = 255**2 * 10 ** (-found.psnr_rgb / 10)
+    expected = rate.SLOPES / np.log(4)
+    inside = (expected < 400) & (expected > 20)
+    np.testing.assert_allclose(error[inside[: len(error)]], expected[inside], rtol=0.05)
+
+
+# --- What size costs, and how fast the renderer is ---
+
+
+def test_scaling(backend, tmp_path, monkeypatch):
+    monkeypatch.setattr(scaling, "SIDES", (16, 32))
+    monkeypatch.setattr(scaling, "alone", lambda title, work, *rest: lambda: work(*rest))
+    arguments = ("--part", "pixels", "--iterations", 2, "--backend", backend)
+    rows, text = answered(tmp_path / "out", "scaling", *arguments)
+    assert [row["job"]["gaussians"] for row in rows] == [20, 78]
+    assert all(row["mean_ms"] > 0 and row["place_seconds"] > 0 for row in rows)
+    assert "exponents of a step" in text
+    monkeypatch.setattr(scaling, "FIT_SECONDS", 1e-9)
+    assert scaling.measure_fits(scaling.Case(16, 16, 20), 1, backend)["images"] == 1
+    image = scaling.mosaic(2 * scaling.CELL, scaling.CELL + 8)
+    assert image.shape == (scaling.CELL + 8, 2 * scaling.CELL, 3)
+    assert scaling.slope([1, 2, 4], [3, 6, 12]) == pytest.approx(1)
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    for name, value in {"SIDE": 64, "COUNT": 300, "ROUNDS": 2, "PEAK_LANES": 1 << 10}.items():
+        monkeypatch.setattr(kernels, name, value)
+    monkeypatch.setattr(kernels, "CUTOFFS", (2.5, 3.5))
+
+
+def test_kernels(tiny, backend, tmp_path):
+    told = run("bench", "kernels", "--backend", backend, "-o", tmp_path)
+    assert told.exit_code == 0, told.output
+    [found] = read(tmp_path / FILE)
+    for name in ("plain_ms", "fast_ms", "step_ratio", "forward_peak_fraction", "growth"):
+        assert found[name] > 0 and name in told.stdout
+    few, many = found["cutoffs"]
+    assert few["largest_error"] > many["largest_error"] > 0
+    assert json.dumps(found)
+
+
+def test_both_renderers_draw_the_same_picture(tiny, backend):
+    scene, shown = kernels.random_scene(types_in(select(backend))), {}
+    for plain in (True, False):
+        forward, _, show = kernels.programs(scene, kernels.CUTOFF, plain)
+        shown[plain] = show()
+        assert forward().numpy().sum() == pytest.approx(shown[plain].sum(), rel=1e-4)
+        forward.func.clear()
+    expected = render(scene, cutoff=kernels.CUTOFF).numpy()
+    for picture in shown.values():
+        np.testing.assert_allclose(picture, expected, atol=1e-4)
+
+
+@pytest.mark.mitsuba
+def test_texture(monkeypatch):
+    pytest.importorskip("mitsuba")
+    from eigengs_bench import texture
+
+    small = {"SIDE": 16, "TEXELS": 16, "SPP": 1, "COUNTS": (20,), "SETTLED": 20, "CHANGED": (20,)}
+    for name, value in (small | {"STEPS": 2, "ROUNDS": 1}).items():
+        monkeypatch.setattr(texture, name, value)
+    found = texture.measure("llvm_ad_rgb")
+    assert found["ratio_20"] > 0 and found["ratio_step"] > 0 and found["difference"] < 1e-3
