@@ -145,6 +145,7 @@ def pictures() -> None:
     iterations  fits at iterations 0, 10, 100 and the last, by every preset
     colors      fits in YCbCr and in RGB, and their errors
     curves      PSNR every 50 iterations
+    tiles       a slow gradient by every preset, and its errors
     radii       how large Gaussians are, with the frequency-aware split and without
     split       what Gaussians for low and for high frequencies render alone
     cross       images projected on bases of other images

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from PIL import Image as pillow
 
 from eigengs_bench import report as fr
+from eigengs_bench.cases import CASES
 from eigengs_bench.clock import Image, Moment, descent
 from eigengs_bench.images import images_of, is_present, model_for
 from eigengs_bench.names import CATS, NATURAL, PICTURES
 from eigengs_bench.rows import Job, Row, Task, code_name
+from eigengs_bench.stability import moments, tiling
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.io import sample, to_8bit
@@ -48,7 +50,7 @@ PANELS = {
 NEEDS = {"radii": [CATS], "split": [CATS], "cross": [CATS, NATURAL]}
 CREDIT = "Images: AFHQ, NAVER Corp., CC BY-NC 4.0"  # of all pictures of cats
 EVERY = 50  # iterations between two points of a curve
-MAGNIFIED = 8  # factor of an error before it is added to mid-grey
+MAGNIFIED, STRETCHED = 8, 20  # factors of errors before they are added to mid-grey
 MARGIN = 0.08  # around the middle of a picture, in its sides: Gaussians there reach into it
 # Longer side of a picture, and heights of the letters below it and above a row, in pixels.
 CELL, LETTERS, HEADING = 160, 13, 15
@@ -59,9 +61,8 @@ Cell = tuple[str, NDArray[Any]]  # the line below a picture, and the picture: RG
 def run(task: Task, wanted: Sequence[str]) -> list[Row]:
     """Draw pictures into the folder; by default those whose sets of images are there."""
     chosen = wanted or [p for p in PICTURES if all(is_present(task, s) for s in NEEDS.get(p, []))]
-    makers = dict(
-        zip(PICTURES, (_iterations, _colors, _curves, _radii, _split, _cross), strict=True)
-    )
+    functions = (_iterations, _colors, _curves, _tiles, _radii, _split, _cross)
+    makers = dict(zip(PICTURES, functions, strict=True))
     return [row for name in chosen for row in makers[name](task)]
 
 
@@ -248,6 +249,24 @@ def _colors(task: Task) -> list[Row]:
 
     caption = f"A photo fitted in YCbCr and in RGB by the preset default: {_size(model)}"
     return _drawn(task, "colors.jpg", caption, make)
+
+
+def _tiles(task: Task) -> list[Row]:
+    """Show the middle of a slow gradient by every preset, where Gaussians show as round tiles."""
+
+    def make() -> list[tuple[str, Sequence[Cell]]]:
+        case = CASES["smooth"]._replace(iterations=task.iterations)
+        image = case.image()
+        middle = (slice(len(image) // 3, 2 * len(image) // 3),) * 2
+        shown, errors = [], []
+        for preset in METHODS:
+            picture = moments(case, image, preset, task.backend)[-1].picture
+            shown.append((f"{preset}: {tiling(picture, image):.2f}", picture[middle]))
+            errors.append(("", (0.5 + STRETCHED * (picture - image))[middle]))
+        return [("", shown), (f"their errors times {STRETCHED}", errors)]
+
+    caption = f"The middle of a slow gradient after {task.iterations:,} steps, and its tiling, in 8-bit levels"
+    return _drawn(task, "tiles.png", caption, make)
 
 
 def _split(task: Task) -> list[Row]:
