@@ -265,7 +265,8 @@ def _tiles(task: Task) -> list[Row]:
             errors.append(("", (0.5 + STRETCHED * (picture - image))[middle]))
         return [("", shown), (f"their errors times {STRETCHED}", errors)]
 
-    caption = f"The middle of a slow gradient after {task.iterations:,} steps, and its tiling, in 8-bit levels"
+    steps = f"{task.iterations:,} steps"
+    caption = f"The middle of a slow gradient after {steps}, and its tiling in 8-bit levels"
     return _drawn(task, "tiles.png", caption, make)
 
 
