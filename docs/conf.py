@@ -9,6 +9,7 @@ from sphinx.util import logging
 import eigengs_dr as eg
 
 sys.path.insert(0, str(Path(__file__).parent))  # for check_names.py, gallery.py and pages.py
+import measured
 import pages
 from check_names import missing
 
@@ -36,7 +37,8 @@ exclude_patterns = ["tutorials/*.ipynb"]  # sphinx-gallery offers them, beside t
 
 # --- Pages ---------------------------------------------------------------------------------------
 
-myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "substitution"]
+myst_substitutions = measured.substitutions()  # a name that is not there is a warning
 myst_heading_anchors = 3
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True

@@ -20,10 +20,14 @@ from eigengs_bench.names import (
     TABLES,
 )
 from eigengs_bench.rows import FILE, Task, code_state
+from eigengs_bench.rows import record as record_rows
 from eigengs_dr.backend.selection import select
 from eigengs_dr.cli.console import bar
 from eigengs_dr.cli.options import FOLDER, backend_option, number, quiet_option
 from eigengs_dr.cli.outputs import check_outputs, describe_run
+
+MANUAL = Path(__file__).parents[2] / "docs" / "rows.jsonl"
+"""The rows behind the figures of the manual, in a checkout."""
 
 folder_option = click.option(
     "-o",
@@ -60,12 +64,20 @@ def question(bench: str, usual: tuple[str, ...] = ()) -> Any:
     def decorate(command: Callable[..., Any]) -> Any:
         @main.command(bench)
         @folder_option
+        @click.option(
+            "--record", is_flag=True, help="Add the rows to docs/rows.jsonl, for the manual."
+        )
         @backend_option
         @quiet_option
         @click.pass_context
         @wraps(command)
         def wrapped(
-            context: click.Context, output: Path, quiet: bool, backend: str | None, **settings: Any
+            context: click.Context,
+            output: Path,
+            record: bool,
+            quiet: bool,
+            backend: str | None,
+            **settings: Any,
         ) -> None:
             shared = {name: settings.pop(name) for name in Task._fields if name in settings}
             if "names" in settings:
@@ -79,8 +91,10 @@ def question(bench: str, usual: tuple[str, ...] = ()) -> Any:
             module = import_module(f"eigengs_bench.{bench}")
             with bar(quiet) as show:
                 task = Task(output, run, backend=backend, progress=show, **shared)
-                section = module.summarize(module.run(task, **settings))
-            _save(section, output, quiet)
+                rows = module.run(task, **settings)
+            _save(module.summarize(rows), output, quiet)
+            if record:
+                record_rows(MANUAL, rows)
 
         return wrapped
 

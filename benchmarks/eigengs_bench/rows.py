@@ -20,12 +20,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from eigengs_dr.cli.outputs import plain
+from eigengs_dr.storage.atomic import atomic_write
 
 Row = dict[str, Any]
 Job = tuple[Row, Callable[[], Row]]  # what names a measurement, and what makes it
 
 FILE = "rows.jsonl"
 NOT_MACHINE = ("command", "date", "commit", "clean")
+RECORDED = ("command", "date", "commit", "clean", "cpu", "threads", "backend")
 STATUS = Path("/proc/self/status")  # of Linux
 
 
@@ -85,6 +87,30 @@ def read(path: Path, bench: str = "") -> list[Row]:
             message = f"{path}: line {number} is not a measurement; delete that line"
             raise ValueError(message) from None
     return found
+
+
+def record(path: Path, rows: Iterable[Row]) -> None:
+    """Add rows to a file for the manual, instead of those of the same names, with 5 digits.
+
+    A measurement that is made anew each time, "at" some second, has one row there.
+    """
+    known = {_key(row["bench"], row["job"]): row for row in read(path)}
+    for row in rows:
+        job = {k: v for k, v in row["job"].items() if k != "at"}
+        kept = {k: v for k, v in row["run"]["versions"].items() if v and not k.endswith("_path")}
+        run = {k: row["run"][k] for k in RECORDED} | {"versions": kept}
+        known[_key(row["bench"], job)] = _rounded(row | {"job": job, "run": run})
+    lines = (json.dumps(known[key]) for key in sorted(known))
+    with atomic_write(path) as temporary:
+        temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: item if key == "job" else _rounded(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    return float(f"{value:.5g}") if isinstance(value, float) else value
 
 
 def code_state() -> Row:

@@ -36,9 +36,25 @@ def run(task: Task, variant: str) -> list[Row]:
 
 
 def summarize(rows: Sequence[Row]) -> Section:
-    """Lay out the figures of the last row."""
-    lines = [(k, f"{v:.4g}") for k, v in rows[-1].items() if isinstance(v, float)]
-    return Section([table("Texture", ("figure", "value"), lines)])
+    """Lay out the figures of the last row, and what a user of the texture pays."""
+    row = rows[-1]
+    lines = [(k, f"{v:.4g}") for k, v in row.items() if isinstance(v, float)]
+    costs = [(f"{n:,} Gaussians", f"{row[f'ratio_{n}']:.2f}") for n in COUNTS]
+    costs.append((f"{SETTLED:,} Gaussians, prefilter", f"{row['ratio_prefiltered']:.2f}"))
+    costs.append((f"a step of prb, {SETTLED:,} Gaussians", f"{row['ratio_step']:.2f}"))
+    changes = [
+        (what, *(f"{row[f'{name}_{n}_ms']:.1f} ms" for n in CHANGED))
+        for what, name in (("points", "change"), ("prefilter", "change_filtered"))
+    ]
+    over = f"Time of a picture over that with a bitmap of {TEXELS:,} x {TEXELS:,} texels"
+    after = "Time to take over a change of all shapes"
+    return Section(
+        [
+            table("Texture", ("figure", "value"), lines),
+            table(over, ("texture", "over a bitmap"), costs),
+            table(after, ("lookup", *(f"{n:,} Gaussians" for n in CHANGED)), changes),
+        ]
+    )
 
 
 def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Row:

@@ -37,6 +37,17 @@ def test_what_is_measured_is_not_measured_again(tmp_path):
     assert done[-1] == "a"
 
 
+def test_rows_for_the_manual_replace_those_of_their_names(tmp_path):
+    path, task = tmp_path / "manual.jsonl", task_in(tmp_path)
+    rows.record(path, task.measure("it", jobs([], "ab")))
+    other = [row({"image": "a"}, OTHER, value=1.23456789) | {"bench": "it"}]
+    rows.record(path, other)
+    first, second = rows.read(path)
+    assert (first["value"], second["value"]) == (1.2346, 1.5)
+    assert first["run"]["commit"] == OTHER["commit"]
+    assert first["run"]["versions"] == {"eigengs_dr": "0.1.0"}
+
+
 def test_a_line_that_was_cut_short_is_measured_again(tmp_path):
     path, done, task = tmp_path / rows.FILE, [], task_in(tmp_path)
     task.measure("it", jobs(done, "ab"))
