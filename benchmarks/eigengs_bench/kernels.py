@@ -69,7 +69,7 @@ def summarize(rows: Sequence[Row]) -> Section:
     ]
     columns = ("cutoff", "forward, ms", "and reverse, ms", "largest error", "RMS error")
     caption = "Time of a picture, and what its cutoff leaves out (1 is white)"
-    return Section([figures, table(caption, columns, lines)])
+    return Section([figures, table(caption, columns, lines)._replace(name="cutoffs")])
 
 
 def _measure(task: Task) -> Row:

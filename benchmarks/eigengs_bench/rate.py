@@ -177,7 +177,7 @@ def _table(name: str, points: pd.DataFrame) -> fr.Table:
         "the codec's, mean over the images"
     )
     columns = ("codec", *(f"{level:g} dB" for level in LEVELS), "BD-rate", "s", "s to decode")
-    return fr.table(caption, columns, lines, points.code)
+    return fr.table(caption, columns, lines, points.code)._replace(name=name)
 
 
 def _compared(sizes: pd.DataFrame, codec: str) -> str:
@@ -250,7 +250,8 @@ def _published(points: pd.DataFrame) -> fr.Table:
         f"kodak, {fr.counted(points.image)}: BD-rate of our mean curve at equal slope, against "
         "published mean curves; above 0 ours takes more bits"
     )
-    return fr.table(caption, ("method", "BD-rate of ours", "source"), lines, points.code)
+    found = fr.table(caption, ("method", "BD-rate of ours", "source"), lines, points.code)
+    return found._replace(name="published")
 
 
 def _chart(points: pd.DataFrame, name: str) -> Figure:

@@ -38,10 +38,14 @@ QUESTIONS = {
 
 
 class Table(NamedTuple):
-    """Texts under headings; the caption says what they are, and what they were measured on."""
+    """Texts under headings; the caption says what they are, and what they were measured on.
+
+    Pages of the manual know a table by its name.
+    """
 
     caption: str
     frame: pd.DataFrame
+    name: str = ""
 
 
 class Section(NamedTuple):

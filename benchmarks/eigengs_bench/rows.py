@@ -100,7 +100,7 @@ def record(path: Path, rows: Iterable[Row]) -> None:
         kept = {k: v for k, v in row["run"]["versions"].items() if v and not k.endswith("_path")}
         run = {k: row["run"][k] for k in RECORDED} | {"versions": kept}
         known[_key(row["bench"], job)] = _rounded(row | {"job": job, "run": run})
-    lines = (json.dumps(known[key]) for key in sorted(known))
+    lines = map(json.dumps, known.values())
     with atomic_write(path) as temporary:
         temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 

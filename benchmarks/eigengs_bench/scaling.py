@@ -5,18 +5,17 @@ most of which build no lists) and mean_ms (of steps in a row, with lists), and p
 of its process with the interpreter and its libraries. The row of whole fits has images_per_second.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import drjit as dr
 import numpy as np
-import pandas as pd
-from matplotlib.figure import Figure
 
-from eigengs_bench import report as fr
 from eigengs_bench.clock import Image
 from eigengs_bench.rows import Job, Row, Task, alone, peak_gib
 from eigengs_dr.backend.arrays import types_in
@@ -30,6 +29,12 @@ from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.io import sample
 from eigengs_dr.image.resize import center_crop
+
+if TYPE_CHECKING:  # the processes that are measured load neither pandas nor matplotlib
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from eigengs_bench import report as fr
 
 # The mosaic: the middles of photos as squares of as many pixels a side, in turns and turned.
 PHOTOS, CELL = ("astronaut", "chelsea", "coffee", "motorcycle", "rocket"), 256
@@ -203,6 +208,8 @@ CAPTIONS = {
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
     """Lay out seconds and memory over pixels, Gaussians and threads: a table and a chart each."""
+    from eigengs_bench import report as fr
+
     frame = fr.frame_of(rows)
     frame["size"] = [f"{w:,}x{h:,}" for w, h in zip(frame.width, frame.height, strict=True)]
     frame["pixels"] = frame.width * frame.height
@@ -221,7 +228,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
             rate = "images_per_second", partial(_one, decimals=1)
             columns = {"images a second": rate, "peak, GiB": columns["peak, GiB"]}
         caption = CAPTIONS[str(name)] + (_exponents(part) if name in ("pixels", "splats") else "")
-        tables.append(fr.grouped(caption, part, by, columns))
+        tables.append(fr.grouped(caption, part, by, columns)._replace(name=str(name)))
         if name in ("pixels", "splats"):
             over = "pixels" if name == "pixels" else "gaussians"
             charts[f"scaling-{name}"] = _chart(part, over)
@@ -229,7 +236,8 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
 
 
 def _one(values: pd.Series, decimals: int = 2) -> str:
-    return fr.number(values.iloc[-1], decimals)
+    value = values.iloc[-1]
+    return "-" if np.isnan(value) else f"{value:,.{decimals}f}"
 
 
 def slope(x: Sequence[float], y: Sequence[float]) -> float:
@@ -255,6 +263,8 @@ def _exponents(part: pd.DataFrame) -> str:
 
 def _chart(part: pd.DataFrame, x: str) -> Figure:
     """Draw time and memory side by side: a line for images of one density, or of one size each."""
+    from eigengs_bench import report as fr
+
     figure = fr.new_figure(10, 4.2)
     axes = figure.subplots(1, 2)
     for (name, _, some), style in zip(_lines(part), STYLES, strict=False):

@@ -51,8 +51,10 @@ def summarize(rows: Sequence[Row]) -> Section:
     return Section(
         [
             table("Texture", ("figure", "value"), lines),
-            table(over, ("texture", "over a bitmap"), costs),
-            table(after, ("lookup", *(f"{n:,} Gaussians" for n in CHANGED)), changes),
+            table(over, ("texture", "over a bitmap"), costs)._replace(name="costs"),
+            table(after, ("lookup", *(f"{n:,} Gaussians" for n in CHANGED)), changes)._replace(
+                name="changes"
+            ),
         ]
     )
 

@@ -51,7 +51,8 @@ def assert_complete(output, expected):
     assert names == [*expected, NAME]
     rows, clean = read_manifest(output / NAME)
     assert clean and len((output / NAME).read_text().splitlines()) == len(expected)
-    assert {row["status"] for row in rows.values()} == {"done"}
+    # A result that was written before its row is skipped by the next run.
+    assert {row["status"] for row in rows.values()} <= {"done", "skipped"}
 
 
 def test_the_bits_of_one_process(client, photos, output, expected):
