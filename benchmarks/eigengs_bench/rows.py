@@ -2,7 +2,7 @@
 
 A row has "bench", the question; "job", the name of the measurement; its figures; and "run": date,
 command, machine, versions, and the "commit" of the code with "clean", whether no tracked file
-differed from it. Seconds of other machines or versions differ: a folder holds rows of one machine.
+but those of docs/ differed from it. Seconds of other machines or versions differ: a folder holds rows of one machine.
 """
 
 import json
@@ -114,7 +114,7 @@ def _rounded(value: Any) -> Any:
 
 
 def code_state() -> Row:
-    """Find the commit of the code, and whether its tree is clean; both are None without git."""
+    """Find the commit of the code, and whether all but docs/ is clean; both are None without git."""
     spec = find_spec("eigengs_dr")
     folder = Path(str(spec and spec.origin)).parent
 
@@ -124,7 +124,8 @@ def code_state() -> Row:
 
     try:
         git("ls-files", "--error-unmatch", "__init__.py")  # not a package below another tree
-        clean = not git("status", "--porcelain", "--untracked-files=no")
+        everything = ("--", ":/", ":(top,exclude)docs")  # the rows of the manual are there
+        clean = not git("status", "--porcelain", "--untracked-files=no", *everything)
         return {"commit": git("rev-parse", "HEAD"), "clean": clean}
     except (OSError, subprocess.CalledProcessError):
         return {"commit": None, "clean": None}
