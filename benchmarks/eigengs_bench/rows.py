@@ -1,8 +1,9 @@
 """Measurements as lines of JSON, one by one: a run goes on after a break.
 
 A row has "bench", the question; "job", the name of the measurement; its figures; and "run": date,
-command, machine, versions, and the "commit" of the code with "clean", whether no tracked file
-but those of docs/ differed from it. Seconds of other machines or versions differ: a folder holds rows of one machine.
+command, machine, versions, and the "commit" of the code with "clean", whether no tracked file but
+those of docs/ differed from it. Seconds of other machines or versions differ: a folder holds rows
+of one machine.
 """
 
 import json
@@ -114,7 +115,7 @@ def _rounded(value: Any) -> Any:
 
 
 def code_state() -> Row:
-    """Find the commit of the code, and whether all but docs/ is clean; both are None without git."""
+    """Find the commit of the code, and whether all but docs/ is clean; None each without git."""
     spec = find_spec("eigengs_dr")
     folder = Path(str(spec and spec.origin)).parent
 
