@@ -68,9 +68,9 @@ def fit_many(
         write the results, so they need the same file system, or URLs. On llvm the results have
         the same bits whatever the number of workers.
     options : Any
-        Keyword arguments, the options of `eigengs_dr.fit`: gaussians, iterations, init, basis,
+        Keyword arguments, the options of `eigengs_dr.fit`: gaussians, iterations, init, start,
         preset, solve_steps, space, seed, backend, target_psnr, target_space, max_gaussians,
-        cutoff and encoding. A basis is read once.
+        levels, cutoff and encoding. A start is read once.
 
     Returns
     -------
