@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import drjit as dr
 import numpy as np
@@ -23,7 +23,7 @@ from ..raster.binning.lists import TileLists
 from ..raster.kernels import residual, sum_lanes
 from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
 from ..raster.render import batch_to_tiles, bin_gaussians
-from .parameterization import Parameterization
+from .parameterization import Parameterization, Variables
 from .schedule import (
     Relocation,
     Schedule,
@@ -57,6 +57,10 @@ class Control(Protocol):
 
         Some have moved to where the old set left most error, and all are perturbed.
         """
+
+
+StepProgram: TypeAlias = Callable[..., "Descent"]
+"""One step of a descent, see `step_program`."""
 
 
 class FitProblem(NamedTuple):
@@ -215,13 +219,13 @@ def _run_phase(
             yield state.gaussians
 
 
-def rate_table(types: ArrayTypes, schedule: Schedule, factors: Sequence[float]) -> Any:
+def rate_table(types: ArrayTypes, schedule: Schedule, factors: Sequence[float]) -> Float:
     """Return the learning rates of all steps, step after step, as Float."""
     table = np.outer(factors, list(schedule.rates.values()))
     return upload(types.Float, table.ravel().astype(np.float32 if types.bits == 32 else np.float64))
 
 
-def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()) -> Any:
+def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()) -> StepProgram:
     """Make the function of one step for `eigengs_dr.backend.recording.freeze_program`.
 
     Dr.Jit traces the function once and replays it without Python. The program belongs to one run: a
@@ -306,10 +310,10 @@ def _sum_level(parts: Float, lists: TileLists, channels: int, count: int) -> lis
 def _pull_back(
     coordinates: Parameterization,
     fixed: Gaussians,
-    variables: dict[str, Any],
+    variables: Variables,
     gradient: list,
     size: tuple,
-) -> dict[str, Any]:
+) -> Variables:
     """Return the gradient with respect to variables, from that of the kernels' parameters."""
     with dr.resume_grad():
         traced = {name: type(value)(value) for name, value in variables.items()}
@@ -324,7 +328,7 @@ def _pull_back(
         return {name: dr.grad(value) for name, value in traced.items()}
 
 
-def _prefix(pad: Float, count: int) -> Any:
+def _prefix(pad: Float, count: int) -> Float:
     """Return the first `count` entries of an array, or a number as it is."""
     if isinstance(pad, float) or dr.width(pad) in (1, count):
         return pad
@@ -338,7 +342,7 @@ def prefix(gaussians: Gaussians, count: int) -> Gaussians:
     types = types_of(gaussians.mean)
     index = dr.arange(types.UInt, count)
 
-    def take(rows: Any) -> Any:
+    def take(rows: Float) -> Float:
         return type(rows)([dr.gather(types.Float, row, index) for row in rows])
 
     return replace(
@@ -368,11 +372,11 @@ class Descent:
         Factor of the learning rates of means and shapes, one for each Gaussian.
     """
 
-    variables: dict[str, Any]
+    variables: Variables
     moments: dict[str, tuple]
     gaussians: Any
-    packed: Any
-    rate_scale: Any = None
+    packed: Float
+    rate_scale: Float = None
 
 
 def start_descent(gaussians: Gaussians, schedule: Schedule, images: int = 1) -> Descent:
@@ -389,6 +393,6 @@ def start_descent(gaussians: Gaussians, schedule: Schedule, images: int = 1) -> 
     return Descent(variables, moments, gaussians, pack(gaussians), rate_scale)
 
 
-def pack(gaussians: Gaussians) -> Any:
+def pack(gaussians: Gaussians) -> Float:
     """Return the parameters of a set for the kernels, in their layout in memory."""
     return pack_parameters([*kernel_shape(gaussians), *gaussians.color])

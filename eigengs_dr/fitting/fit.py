@@ -23,10 +23,10 @@ from ..raster.render import picture_of
 from .levels import refine_levels
 from .maps import MapImage, balance, combine, read_maps, score_maps, shape_of
 from .options import FitOptions, Levels, Start, named_options
-from .refine import FitProgress, Refinement, Score, measure, refine
+from .refine import FitProgress, Refinement, Row, Score, measure, refine
 from .search import search_count
 from .start import load_start, mean_picture, start_for
-from .target import FitTarget, in_unit, make_target, read_pixels, unit_of
+from .target import FitTarget, PixelsOrPath, in_unit, make_target, read_pixels, unit_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class Fit:
     """
 
     gaussians: Gaussians
-    trace: list[dict[str, Any]] = field(repr=False)
+    trace: list[Row] = field(repr=False)
     image: Any = field(repr=False)
     seconds: float
     seconds_init: float = field(repr=False)
@@ -110,7 +110,7 @@ class FitInterrupted(KeyboardInterrupt):
         The best set so far.
     """
 
-    def __init__(self, result: Any) -> None:
+    def __init__(self, result: Fit) -> None:
         super().__init__("the fit was interrupted; .result holds the best set so far")
         self.result = result
 
@@ -290,7 +290,7 @@ def _maps_alone(
 
 
 @exclusive()
-def fit_image(image: Any, options: FitOptions, progress: FitProgress | None = None) -> Fit:
+def fit_image(image: PixelsOrPath, options: FitOptions, progress: FitProgress | None = None) -> Fit:
     """Fit an image with the options of one record; see `fit` for results and errors."""
     started = time.perf_counter()
     pixels, options = read_pixels(image, options)

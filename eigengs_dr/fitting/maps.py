@@ -7,9 +7,9 @@ square error after a first colour solve, or, where each map has a goal, over the
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +23,7 @@ from ..raster.render import picture_rows
 from ..storage.npz import BadValue
 from .options import FitOptions
 from .placement.adaptive import residual
+from .refine import Row
 from .start import start_from_placement
 from .target import FitTarget, make_target, read_pixels, unit_of
 
@@ -212,7 +213,7 @@ def score_maps(
     weights: Sequence[float],
     started: float,
     space: str = "rgb",
-) -> dict[str, Any]:
+) -> Row:
     """Measure a set of all channels, each times the weight of its map.
 
     Returns
@@ -226,7 +227,7 @@ def score_maps(
     found = {}
     for image, weight, own in zip(images, weights, slices([i.map(1) for i in images]), strict=True):
         spaces = [float_space(image.space), "rgb"]
-        shown: Callable[[slice], Any] = partial(_shown, read, own, weight, image.space)
+        shown = partial(_shown, read, own, weight, image.space)
         ycbcr, rgb = psnrs_by_rows(shown, image.pixels, spaces)
         found[image.name] = {"psnr_ycbcr": ycbcr, "psnr_rgb": rgb}
     row = {
@@ -244,9 +245,15 @@ def score_maps(
 _FIGURES = ("psnr_ycbcr", "psnr_rgb")
 
 
-def _shown(read: Any, own: slice, weight: float, space: str, rows: slice) -> NDArray[Any]:
+def _shown(
+    read: Callable[[slice], NDArray[np.floating]],
+    own: slice,
+    weight: float,
+    space: str,
+    rows: slice,
+) -> NDArray[np.floating]:
     return show_sums(space, read(rows)[..., own] / np.float32(weight))
 
 
-def _list(names: Any) -> str:
+def _list(names: Iterable[str]) -> str:
     return ", ".join(map(str, names)) or "none"

@@ -5,13 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeAlias
 
 import drjit as dr
 
 from ..backend.arrays import Float, rsqrt, tanh, types_of
 from ..gaussian.covariance import cholesky_from_factor, factor_from_cholesky
 from ..gaussian.gaussians import Gaussians
+
+Variables: TypeAlias = dict[str, Float]
+"""Variables by name: arrays of Dr.Jit with one or several numbers for each Gaussian."""
+
+ImageSize: TypeAlias = tuple[Float, Float] | None
+"""Width and height in arrays, or None for those of the set."""
 
 
 class Parameterization(NamedTuple):
@@ -33,10 +39,10 @@ class Parameterization(NamedTuple):
         pixels and as a factor, if every entry of a variable moves by ``moves[name]``.
     """
 
-    encode: Callable[[Gaussians], dict[str, Any]]
+    encode: Callable[[Gaussians], Variables]
     decode: Callable[..., Gaussians]
-    project: Callable[..., dict[str, Any]]
-    reach: Callable[[Gaussians, dict[str, float]], tuple[Any, float]]
+    project: Callable[..., Variables]
+    reach: Callable[[Gaussians, dict[str, float]], tuple[Float, float]]
 
 
 # ---------------------------------------------------------------------------------------------
@@ -44,28 +50,26 @@ class Parameterization(NamedTuple):
 # ---------------------------------------------------------------------------------------------
 
 
-def _size(g: Gaussians) -> Any:
+def _size(g: Gaussians) -> Float:
     """Geometric mean of the standard deviations of a Gaussian, in pixels: ``det F = a c``."""
     return rsqrt(g.factor[0] * g.factor[2])
 
 
-def _encode_relative(g: Gaussians) -> dict[str, Any]:
+def _encode_relative(g: Gaussians) -> Variables:
     return _relative_to(g, _size(g))
 
 
-def _relative_to(g: Gaussians, size: Any) -> dict[str, Any]:
+def _relative_to(g: Gaussians, size: Float) -> Variables:
     return {"mean": g.mean / size, "factor": g.factor * size, "color": g.color}
 
 
-def _decode_relative(fixed: Gaussians, variables: dict[str, Any], size: Any = None) -> Gaussians:
+def _decode_relative(fixed: Gaussians, variables: Variables, size: ImageSize = None) -> Gaussians:
     own = _size(fixed)
     units = {"mean": own, "factor": 1 / own, "color": 1}
     return replace(fixed, **{name: value * units[name] for name, value in variables.items()})
 
 
-def _project_relative(
-    fixed: Gaussians, variables: dict[str, Any], size: Any = None
-) -> dict[str, Any]:
+def _project_relative(fixed: Gaussians, variables: Variables, size: ImageSize = None) -> Variables:
     inside = _relative_to(_decode_relative(fixed, variables).bounded(size), _size(fixed))
     return {name: inside[name] for name in variables}
 
@@ -77,7 +81,7 @@ of lists that are built twice as often. The strict bounds, 1 and 1, would make t
 long again."""
 
 
-def _reach_relative(fixed: Gaussians, moves: dict[str, float]) -> tuple[Any, float]:
+def _reach_relative(fixed: Gaussians, moves: dict[str, float]) -> tuple[Float, float]:
     # An array, because another literal in every build would compile the kernels again.
     share = dr.opaque(types_of(fixed.mean).Float, MOVE_SHARE * moves.get("mean", 0.0))
     return share * _size(fixed), 1 + GROWTH_SHARE * moves.get("factor", 0.0)
@@ -102,7 +106,7 @@ MIN_DIAGONAL = 0.01
 entry that reaches 0 makes the covariance singular, and the set not finite."""
 
 
-def _encode_cholesky(g: Gaussians) -> dict[str, Any]:
+def _encode_cholesky(g: Gaussians) -> Variables:
     types = types_of(g.mean)
     x, y = g.mean
     width, height = (dr.opaque(types.Float, side) for side in (g.width, g.height))
@@ -114,11 +118,11 @@ def _encode_cholesky(g: Gaussians) -> dict[str, Any]:
     }
 
 
-def _atanh(x: Any) -> Any:
+def _atanh(x: Float) -> Float:
     return dr.atanh(dr.clip(x, -0.999999, 0.999999))
 
 
-def _decode_cholesky(fixed: Gaussians, variables: dict[str, Any], size: Any = None) -> Gaussians:
+def _decode_cholesky(fixed: Gaussians, variables: Variables, size: ImageSize = None) -> Gaussians:
     width, height = size or (fixed.width, fixed.height)
     parts = {}
     if "mean" in variables:
@@ -133,9 +137,7 @@ def _decode_cholesky(fixed: Gaussians, variables: dict[str, Any], size: Any = No
     return replace(fixed, **parts)
 
 
-def _project_cholesky(
-    fixed: Gaussians, variables: dict[str, Any], size: Any = None
-) -> dict[str, Any]:
+def _project_cholesky(fixed: Gaussians, variables: Variables, size: ImageSize = None) -> Variables:
     if "cholesky" not in variables:
         return variables
     l1, l2, l3 = variables["cholesky"]
@@ -144,7 +146,7 @@ def _project_cholesky(
     return {**variables, "cholesky": inside}
 
 
-def _reach_cholesky(fixed: Gaussians, moves: dict[str, float]) -> tuple[Any, float]:
+def _reach_cholesky(fixed: Gaussians, moves: dict[str, float]) -> tuple[Float, float]:
     side = 0.5 * max(fixed.width, fixed.height)  # the slope of tanh is at most 1
     return moves.get("mean", 0.0) * side + moves.get("cholesky", 0.0) * fixed.cutoff, 1.0
 
@@ -160,10 +162,12 @@ class Optimizer(Protocol):
     kernel then computes the gradients and the steps of all variables.
     """
 
-    def start(self, value: Any) -> tuple:
+    def start(self, value: Float) -> tuple:
         """Return the moments of a variable before the first step, evaluated."""
 
-    def step(self, value: Any, gradient: Float, moments: tuple, rate: Float, time: Float) -> tuple:
+    def step(
+        self, value: Float, gradient: Float, moments: tuple, rate: Float, time: Float
+    ) -> tuple:
         """Return the value of a variable and its moments after a step.
 
         Parameters
@@ -179,14 +183,14 @@ class Optimizer(Protocol):
         """
 
 
-def zeros_like(value: Any) -> Any:
+def zeros_like(value: Float) -> Float:
     """Return evaluated zeros with the type and the shape of an array."""
     zeros = dr.zeros(type(value), value.shape)
     dr.make_opaque(zeros)
     return zeros
 
 
-def debias(beta: float, time: Float) -> Any:
+def debias(beta: float, time: Float) -> Float:
     """Return ``1 - beta^time``, the weight of all gradients in a moving average so far.
 
     Parameters
@@ -233,11 +237,13 @@ class Adam:
         if not all(0 <= beta < 1 for beta in betas):
             raise ValueError(f"Adam: betas are {betas}; each must be in [0, 1)")
 
-    def start(self, value: Any) -> tuple:
+    def start(self, value: Float) -> tuple:
         """Return the moments before the first step; see `Optimizer`."""
         return zeros_like(value), zeros_like(value)
 
-    def step(self, value: Any, gradient: Float, moments: tuple, rate: Float, time: Float) -> tuple:
+    def step(
+        self, value: Float, gradient: Float, moments: tuple, rate: Float, time: Float
+    ) -> tuple:
         """Return the value and the moments after a step; see `Optimizer`."""
         m, v = moments
         m = dr.lerp(gradient, m, self.beta_1)
@@ -281,11 +287,13 @@ class Adan:
         if not all(0 <= beta < 1 for beta in self.betas):
             raise ValueError(f"Adan: betas are {self.betas}; each must be in [0, 1)")
 
-    def start(self, value: Any) -> tuple:
+    def start(self, value: Float) -> tuple:
         """Return the moments and the gradient before the first step; see `Optimizer`."""
         return tuple(zeros_like(value) for _ in range(4))
 
-    def step(self, value: Any, gradient: Float, moments: tuple, rate: Float, time: Float) -> tuple:
+    def step(
+        self, value: Float, gradient: Float, moments: tuple, rate: Float, time: Float
+    ) -> tuple:
         """Return the value, the moments and the gradient after a step; see `Optimizer`."""
         m, v, n, previous = moments
         beta_1, beta_2, beta_3 = self.betas

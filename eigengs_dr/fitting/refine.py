@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import drjit as dr
 import numpy as np
@@ -19,8 +19,11 @@ from .density_control import prune
 from .descent import FitProblem, run
 from .schedule import Schedule
 
-FitProgress = Callable[[int, int, dict[str, Any]], None]
-Score = Callable[[Gaussians], dict[str, Any]]
+Row: TypeAlias = dict[str, Any]
+"""A row of a trace: its numbers by name, and under "maps" those of every map."""
+
+FitProgress = Callable[[int, int, Row], None]
+Score = Callable[[Gaussians], Row]
 
 
 class Refinement(NamedTuple):
@@ -42,10 +45,10 @@ class Refinement(NamedTuple):
     """
 
     gaussians: Gaussians
-    trace: list[dict[str, Any]]
+    trace: list[Row]
     iterations: int
     stopped: str
-    row: dict[str, Any]
+    row: Row
 
 
 def refine(
@@ -96,9 +99,9 @@ def refine(
     started = time.perf_counter() if started is None else started
     if score is None:
         score = partial(measure, image=image, started=started)
-    marks, trace = trace_steps(iterations), list[dict[str, Any]]()
+    marks, trace = trace_steps(iterations), list[Row]()
     best, current, highest = problem.gaussians, problem.gaussians, -math.inf
-    stopped, step, latest, row = "iterations", 0, dict[str, Any](), dict[str, Any]()
+    stopped, step, latest, row = "iterations", 0, Row(), Row()
     count, larger = len(problem.gaussians), list[tuple[float, int, Gaussians]]()
 
     def judge(step: int, gaussians: Gaussians) -> None:
@@ -145,7 +148,7 @@ def measure(
     image: NDArray[np.float32],
     started: float,
     base_image: NDArray[np.float32] | None = None,
-) -> dict[str, Any]:
+) -> Row:
     """Return the seconds, psnr_ycbcr and psnr_rgb of a set for a row of the trace of `refine`."""
     read = picture_rows(gaussians)
     seconds = time.perf_counter() - started

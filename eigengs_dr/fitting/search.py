@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 
@@ -21,7 +21,7 @@ from ..gaussian.gaussians import Gaussians
 from ..image.metrics import MAX_PSNR
 from .density_control import densify, prune
 from .descent import FitProblem, run
-from .refine import FitProgress, Refinement
+from .refine import FitProgress, Refinement, Row
 from .schedule import Schedule, surplus_for
 
 
@@ -110,8 +110,6 @@ class SearchPolicy:
 
 
 DEFAULT_POLICY = SearchPolicy()
-
-Row = dict[str, Any]
 
 
 def search_count(

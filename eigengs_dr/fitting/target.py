@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from ..image.pixels import MAX_PIXEL, MIN_PIXEL, ImageError, check_data, check_i
 from ..image.strips import by_strips
 from .options import FitOptions
 
+PixelsOrPath: TypeAlias = Any
+"""An image: array_like pixels, a ``mitsuba.Bitmap``, or the path or the address of a file."""
+
 WHITE = 1.001
 """Largest sRGB code of light that counts as bounded by white; renderings exceed 1 by rounding."""
 
@@ -23,7 +26,7 @@ BRIGHT = {"ycbcr": "log", "rgb": "log", "linear": "radiance"}
 """Space of a fit of light above 1 for the space asked for: textures clamp sums in the others."""
 
 
-def read_pixels(image: Any, options: FitOptions) -> tuple[NDArray[np.float32], FitOptions]:
+def read_pixels(image: PixelsOrPath, options: FitOptions) -> tuple[NDArray[np.float32], FitOptions]:
     """Check an image, and convert it to what `eigengs_dr.fitting` works on.
 
     Parameters
@@ -54,7 +57,7 @@ def read_pixels(image: Any, options: FitOptions) -> tuple[NDArray[np.float32], F
     return pixels, options
 
 
-def read_data(image: Any, space: str) -> NDArray[np.float32]:
+def read_data(image: PixelsOrPath, space: str) -> NDArray[np.float32]:
     """Check an image of data, shape (H, W, 1) or (H, W, 3), or of normals, shape (H, W, 3).
 
     Raises

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.arrays import Float, rcp, release_memory, types_of, upload
+from ...backend.arrays import Float, UInt, rcp, release_memory, types_of, upload
 from ...backend.recording import freeze_program
 from ...gaussian.file import MAX_CUTOFF
 from ...gaussian.gaussians import Gaussians
@@ -60,10 +60,10 @@ class Solution(NamedTuple):
 
 def solve(
     gaussians: Gaussians,
-    image: NDArray[Any],
+    image: NDArray[np.floating],
     steps: int = 10,
     warm_start: bool = False,
-    background: NDArray[Any] | None = None,
+    background: NDArray[np.floating] | None = None,
 ) -> Solution:
     """Find the colours and the background that fit an image best on fixed shapes.
 
@@ -108,7 +108,7 @@ def solve(
     return solution
 
 
-def solve_batch(gaussians: Gaussians, images: NDArray[Any], steps: int = 10) -> Solution:
+def solve_batch(gaussians: Gaussians, images: NDArray[np.floating], steps: int = 10) -> Solution:
     """Find the best colours and backgrounds for several images of one size at once.
 
     Every image has its own step lengths, as in `solve`: its result does not depend on the others.
@@ -131,7 +131,7 @@ def solve_batch(gaussians: Gaussians, images: NDArray[Any], steps: int = 10) -> 
         return _solve(gaussians, lists, images, _start(gaussians, images, False), steps)
 
 
-def _start(gaussians: Gaussians, images: NDArray[Any], warm: bool) -> Unknowns:
+def _start(gaussians: Gaussians, images: NDArray[np.floating], warm: bool) -> Unknowns:
     """Return the first unknowns: those of the set, or zero and the mean of each image."""
     types, n = types_of(gaussians.mean), len(gaussians)
     if warm:
@@ -146,7 +146,7 @@ def _start(gaussians: Gaussians, images: NDArray[Any], warm: bool) -> Unknowns:
 def _solve(
     gaussians: Gaussians,
     lists: TileLists,
-    image: NDArray[Any],
+    image: NDArray[np.floating],
     x: Unknowns,
     steps: int,
     hold_background: bool = False,
@@ -194,7 +194,7 @@ def _solve(
 
 def _advance(
     shape: list, x: Unknowns, p: Unknowns, rz: list, lists: TileLists, cutoff: float
-) -> tuple[Unknowns, Any, list]:
+) -> tuple[Unknowns, Float, list]:
     """Move x along p to the least error; return x, ``q = A p``, and ``alpha = rz / |q|^2``."""
     q, lanes = apply(shape, p, lists, cutoff)
     curvature = sum_lanes(lanes, lists)
@@ -206,11 +206,11 @@ def _advance(
 
 def _turn(
     shape: list,
-    error: Any,
+    error: Float,
     p: Unknowns,
     rz: list,
     enough: list,
-    noise: Any,
+    noise: Float,
     inverse: Unknowns,
     lists: TileLists,
     cutoff: float,
@@ -237,7 +237,7 @@ def _turn(
     return p, new_rz, squares
 
 
-def _add_in_place(image: Any, step: Any, factors: list, lists: TileLists) -> None:
+def _add_in_place(image: Float, step: Float, factors: list, lists: TileLists) -> None:
     """Add ``factor step`` by channels to an image in tile layout, in the memory of the image.
 
     A frozen program would copy the image, because it may not change its arguments. No two lanes
@@ -255,8 +255,8 @@ def _add_in_place(image: Any, step: Any, factors: list, lists: TileLists) -> Non
 
 
 def inner_products(
-    gaussians: Gaussians, image: NDArray[Any], squared: bool = False
-) -> NDArray[Any]:
+    gaussians: Gaussians, image: NDArray[np.floating], squared: bool = False
+) -> NDArray[np.floating]:
     """Return the inner products of the weights of every Gaussian with an image.
 
     Parameters
@@ -285,7 +285,7 @@ def inner_products(
 
 def apply(
     shape: list, x: Unknowns, lists: TileLists, cutoff: float, target: Float = None
-) -> tuple[Any, list]:
+) -> tuple[Float, list]:
     """Return ``A x - D``, and for each lane the sums of its squares."""
     packed = pack_parameters([*shape, *x[0]])
     return residual(packed, x[1], lists, kernel_radius(cutoff), target)
@@ -350,12 +350,12 @@ def dots(x: Unknowns, y: Unknowns, grid: Grid) -> list:
     return [sum_by_image(c, grid) + b for c, b in zip(color, background, strict=True)]
 
 
-def add_multiple(x: Unknowns, factors: list, y: Unknowns, image: Any) -> Unknowns:
+def add_multiple(x: Unknowns, factors: list, y: Unknowns, image: UInt) -> Unknowns:
     """Return ``x + factor y``; a factor has one value for each image, see `spread`."""
     color = [dr.fma(spread(f, image), b, a) for a, f, b in zip(x[0], factors, y[0], strict=True)]
     return color, [dr.fma(f, b, a) for a, f, b in zip(x[1], factors, y[1], strict=True)]
 
 
-def spread(values: Float, image: Any) -> Any:
+def spread(values: Float, image: UInt) -> Float:
     """Return the value of the image of each entry; `image` is None if there is only one."""
     return values if image is None else dr.gather(type(values), values, image)

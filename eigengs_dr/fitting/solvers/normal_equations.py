@@ -15,13 +15,13 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from ...backend.arrays import types_of, upload
 from ...backend.recording import freeze_program
@@ -84,9 +84,9 @@ class Block:
     """
 
     rows: slice
-    system: Any
+    system: csr_array
     positions: NDArray[np.floating]
-    factor: Any
+    factor: SuperLU
     spread: NDArray[np.float64]
 
     def divide(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -349,7 +349,7 @@ class BlockInverse(NamedTuple):
         return result
 
 
-def invert(matrix: Any, positions: NDArray[np.floating]) -> BlockInverse | None:
+def invert(matrix: csr_array, positions: NDArray[np.floating]) -> BlockInverse | None:
     """Invert a sparse symmetric matrix in double precision.
 
     Parameters
@@ -382,7 +382,7 @@ def invert(matrix: Any, positions: NDArray[np.floating]) -> BlockInverse | None:
 
 
 def _dissect(
-    matrix: Any, positions: NDArray[np.floating], rows: Indices, depth: int
+    matrix: csr_array, positions: NDArray[np.floating], rows: Indices, depth: int
 ) -> tuple[list[Indices], Indices]:
     """Halve unknowns along their longer axis `depth` times; return leaves and the separator.
 
