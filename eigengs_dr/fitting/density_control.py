@@ -8,15 +8,29 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
+import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.arrays import Float, types_of, upload
 from ..gaussian.gaussians import Gaussians, concatenate, like
 from ..image.resize import resample
+from ..raster.binning.lists import TileLists
+from ..raster.parameters import detached_shape
+from ..raster.render import batch_from_tiles, bin_gaussians, pixels_inside, to_tiles
 from .placement.adaptive import redistribute, residual
 from .placement.density import residual_peaks
 from .schedule import Relocation
-from .solvers.conjugate_gradient import inner_products, solve
+from .solvers.conjugate_gradient import (
+    Unknowns,
+    apply,
+    apply_squared,
+    correlate,
+    held_background,
+    invert,
+    reduce_error,
+    solve,
+)
 
 Array = NDArray[np.floating]
 
@@ -117,11 +131,11 @@ def removal_cost(
     gaussians: Gaussians,
     target: NDArray[np.float32],
     weight: Array | None = None,
-) -> NDArray[np.float64]:
+) -> NDArray[np.float32]:
     """Return how much the squared error grows if one Gaussian is removed, for each Gaussian.
 
-    With the residual r of the set, ``|r + c_n w_n|^2 - |r|^2 = c_n^2 <w_n, w_n> + 2 c_n <w_n, r>``,
-    summed over channels. Cost: two adjoints with respect to colours.
+    With the error e of the set, ``|e - c_n w_n|^2 - |e|^2 = c_n^2 <w_n, w_n> - 2 c_n <w_n, e>``,
+    summed over channels. Cost: a rendering and two adjoints with respect to colours.
 
     Parameters
     ----------
@@ -133,20 +147,71 @@ def removal_cost(
 
     Returns
     -------
-    ndarray of float64, shape (N,)
+    ndarray of float32, shape (N,)
         Negative if the set would be better without the Gaussian.
     """
-    return _removal_cost(gaussians, residual(gaussians, target), weight)
+    with dr.suspend_grad():
+        scene = _compare(gaussians, target, weight)
+        error, _ = scene.error_of(scene.colors)
+        return scene.removal_cost(error, scene.diagonal()).numpy()
 
 
-def _removal_cost(gaussians: Gaussians, missed: Array, weight: Array | None) -> NDArray[np.float64]:
-    """Return the removal costs of a set with a known residual."""
-    counts = np.ones_like(missed) if weight is None else np.square(weight).astype(np.float32)
-    along = inner_products(gaussians, missed * counts)
-    own = inner_products(gaussians, counts, squared=True)
-    color = gaussians.to_arrays()["color"].astype(np.float64)
-    cost: NDArray[np.float64] = (color * (color * own + 2 * along)).sum(axis=1)
-    return cost
+class _Comparison(NamedTuple):
+    """A set and its image on the device, with one build of tile lists.
+
+    Attributes
+    ----------
+    shape : list of Float, shape (N,)
+        See `detached_shape`.
+    colors : Unknowns
+    lists : TileLists
+    cutoff : float
+    target : Float
+        The image in tile layout.
+    squares : Float or None
+        Squares of the weights in tile layout.
+    """
+
+    shape: list
+    colors: Unknowns
+    lists: TileLists
+    cutoff: float
+    target: Float
+    squares: Float
+
+    def error_of(self, colors: Unknowns) -> tuple[Float, list]:
+        """Return the rendering with some colours minus the image, and its squares by lanes."""
+        return apply(self.shape, colors, self.lists, self.cutoff, self.target)
+
+    def diagonal(self) -> Unknowns:
+        """Return ``<w_n, w_n>`` of each channel, or of all channels where there is no weight."""
+        channels, factors = len(self.colors[0]), self.squares
+        if factors is None:
+            channels, factors = 1, pixels_inside(types_of(self.target), self.lists.grid)
+        return apply_squared(self.shape, factors, channels, self.lists, self.cutoff)
+
+    def removal_cost(self, error: Float, diagonal: Unknowns) -> Float:
+        """Return the removal costs of a set with a known error; see `removal_cost`."""
+        color, channels = self.colors[0], len(self.colors[0])
+        weighted = error if self.squares is None else error * self.squares
+        along = correlate(self.shape, weighted, channels, self.lists, self.cutoff)
+        own = diagonal[0] * (channels // len(diagonal[0]))
+        return sum(c * (c * o - 2 * a) for c, o, a in zip(color, own, along, strict=True))
+
+
+def _compare(
+    gaussians: Gaussians, target: NDArray[np.float32], weight: Array | None
+) -> _Comparison:
+    """Upload an image, and list the Gaussians of its tiles."""
+    types, lists = types_of(gaussians.mean), bin_gaussians(gaussians)
+    shape, zeros = detached_shape(gaussians), dr.zeros(types.Float, len(gaussians))
+    colors = [c + zeros for c in gaussians.color], list(gaussians.background)
+    squares = None
+    if weight is not None:
+        squares = dr.square(to_tiles(types, np.asarray(weight, np.float32), lists.grid))
+    image = to_tiles(types, target, lists.grid)
+    dr.eval(shape, colors, squares)
+    return _Comparison(shape, colors, lists, gaussians.cutoff, image, squares)
 
 
 def prune(
@@ -215,39 +280,77 @@ def relocate(
         A set with as many Gaussians, less those dropped. Where `residual_peaks` finds too few
         places, Gaussians of least use stay, with the colour 0.
     """
-    index, arrays = np.arange(len(gaussians)), gaussians.to_arrays()
-    own = index if part is None else index[part.own]
-    value, error = _costs_and_error(gaussians, target, weight, part)
+    own = np.arange(len(gaussians)) if part is None else np.arange(len(gaussians))[part.own]
     leaving = max(int(how.share * len(own)), how.dropped)
-    moved = own[np.argsort(value[own], kind="stable")[:leaving]]
-    kept = np.setdiff1d(index, moved)
-    stay = {k: v if k == "background" else v[kept] for k, v in arrays.items()}
-    rest = like(gaussians, **stay).bounded()
-    if weight is None:
-        held = None if part is None else arrays["background"]
-        rest = solve(rest, target, SOLVE_STEPS, warm_start=True, background=held).gaussians
-    missed = residual(rest, target)
-    if part is not None:
-        inside = np.zeros_like(missed)
-        inside[part.core] = missed[part.core]
-        missed = inside
     places = leaving - how.dropped
+    moved, colors, missed, error = _take_out(gaussians, target, weight, part, own, leaving)
     mean, size, color = _coarse_peaks(missed, places, _spacing(gaussians), weight)
-    found = rest.to_arrays()
-    rows = {"mean": mean, "factor": _round(size), "color": color}
-    new = {"background": found["background"]}
-    for name, peaks in rows.items():
-        new[name] = np.array(arrays[name])
-        new[name][kept], new[name][moved[: len(peaks)]] = found[name], peaks
-    new["color"][moved[len(mean) :]] = 0
+    new, at = gaussians.to_arrays() | colors, moved[: len(mean)]
+    new["mean"][at], new["factor"][at], new["color"][at] = mean, _round(size), color
     if how.noise:
         perturb(new, own, error / len(own), how.noise, how.seed)
-    for name in rows:
+    for name in ("mean", "factor", "color"):
         new[name] = np.delete(new[name], moved[places:], axis=0)
     there = like(gaussians, **new).bounded()
     # The set may be of a class with other bounds.
     values = {name: getattr(there, name) for name in new}
     return replace(gaussians, **values).bounded()
+
+
+def _take_out(
+    gaussians: Gaussians,
+    target: NDArray[np.float32],
+    weight: Array | None,
+    part: Part | None,
+    own: NDArray[np.integer],
+    leaving: int,
+) -> tuple[NDArray[np.integer], dict[str, Array], NDArray[np.float32], float]:
+    """Take the Gaussians of least use out of a set, and solve for the colours of the others.
+
+    One build of tile lists serves all: a Gaussian that is out has the colour 0, and keeps it.
+
+    Returns
+    -------
+    moved : ndarray of int, shape (leaving,)
+        The Gaussians of `own` that are out, those of least use first.
+    colors : dict
+        color (N, C) and background (C,).
+    missed : ndarray of float32, shape (H, W, C)
+        The residual without them, and 0 outside the part.
+    error : float
+        The squared error of the whole set in the part.
+    """
+    with dr.suspend_grad():
+        scene, types = _compare(gaussians, target, weight), types_of(gaussians.mean)
+        inside = types.Float(1)
+        if part is not None:
+            core = np.zeros_like(target)
+            core[part.core] = 1
+            inside = to_tiles(types, core, scene.lists.grid)
+        error, _ = scene.error_of(scene.colors)
+        diagonal = scene.diagonal()
+        cost = scene.removal_cost(error, diagonal)
+        before = dr.sum(dr.square(error * inside))
+        dr.eval(cost, before)
+        moved = own[np.argsort(cost.numpy()[own], kind="stable")[:leaving]]
+        stays = np.ones(len(gaussians), np.float32)
+        stays[moved] = 0
+        keep = upload(types.Float, stays)
+        colors = [c * keep for c in scene.colors[0]], scene.colors[1]
+        dr.eval(colors)
+        error, _ = scene.error_of(colors)
+        dr.eval(error)
+        if weight is None:
+            inverse = [i * keep for i in invert(diagonal[0])] * len(colors[0])
+            free = inverse, invert(diagonal[1]) * len(colors[1])
+            free = free if part is None else held_background(free)
+            dr.eval(free)
+            colors, _ = reduce_error(
+                scene.shape, colors, error, free, scene.lists, scene.cutoff, SOLVE_STEPS
+            )
+        missed = batch_from_tiles(-error * inside, scene.lists.grid, len(colors[0]))[0]
+        rows = [np.stack([v.numpy() for v in part], axis=-1) for part in colors]
+        return moved, {"color": rows[0], "background": rows[1][0]}, missed, before[0]
 
 
 def relocate_levels(
@@ -306,17 +409,6 @@ def _coarse_peaks(
     assert small[0] is not None
     mean, deviation, color = residual_peaks(small[0], count, spacing / math.sqrt(x * y), small[1])
     return mean * (x, y), deviation * math.sqrt(x * y), color
-
-
-def _costs_and_error(
-    gaussians: Gaussians, target: NDArray[np.float32], weight: Array | None, part: Part | None
-) -> tuple[NDArray[np.float64], float]:
-    """Return the removal costs and the squared error of a part, from one residual."""
-    missed = residual(gaussians, target)
-    inside = missed if part is None else missed[part.core]
-    # einsum converts to double precision without a copy of the whole.
-    error = float(np.einsum("ijk,ijk->", inside, inside, dtype=np.float64))
-    return _removal_cost(gaussians, missed, weight), error
 
 
 def _round(size: Array) -> Array:

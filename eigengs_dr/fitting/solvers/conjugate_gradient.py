@@ -31,7 +31,7 @@ from ...raster.parameters import (
     kernel_radius,
     pack_parameters,
 )
-from ...raster.render import batch_to_tiles, bin_gaussians, to_tiles
+from ...raster.render import batch_to_tiles, bin_gaussians, pixels_inside
 
 RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}
 """Tolerance by the bits of a float: a channel stops if ``r^T z``, relative to its first value, is
@@ -151,45 +151,79 @@ def _solve(
     steps: int,
     hold_background: bool = False,
 ) -> Solution:
-    """Solve for an image, or for a batch of images, from the unknowns x.
-
-    Beside the lists, memory holds two images in a step: the error ``A x - D`` and ``A p``.
-    """
-    types, cutoff = types_of(gaussians.mean), gaussians.cutoff
-    grid, channels = lists.grid, gaussians.channels
+    """Solve for an image, or for a batch of images, from the unknowns x."""
+    types, cutoff, grid = types_of(gaussians.mean), gaussians.cutoff, lists.grid
     shape = detached_shape(gaussians)
     dr.eval(shape, x)
-
     target = batch_to_tiles(types, np.asarray(image, np.float32))
     error, lanes = apply(shape, x, lists, cutoff, target)
-    squares = [sum_lanes(lanes, lists)]
-    dr.eval(error, squares)
+    first = sum_lanes(lanes, lists)
+    dr.eval(error, first)
     del target
+    inverse = inverse_diagonal(shape, gaussians.channels, lists, cutoff)
+    if hold_background:
+        inverse = held_background(inverse)
+    x, squares = reduce_error(shape, x, error, inverse, lists, cutoff, steps)
+    residuals = [dr.sum(sum(square)) for square in [first, *squares]]
+    solved = replace(gaussians, color=types.FloatX(x[0]), background=types.FloatX(x[1]))
+    dr.eval(solved, residuals)
+    number = grid.width * grid.height * grid.images * gaussians.channels
+    total = dr.concat(residuals).numpy()  # one copy to the host
+    return Solution(solved, np.sqrt(total / number).tolist())
+
+
+def reduce_error(
+    shape: list,
+    x: Unknowns,
+    error: Float,
+    inverse: Unknowns,
+    lists: TileLists,
+    cutoff: float,
+    steps: int,
+) -> tuple[Unknowns, list]:
+    """Take steps of conjugate gradients from the unknowns x.
+
+    Beside the lists, memory holds two images in a step: the error ``A x - D`` and ``A p``.
+
+    Parameters
+    ----------
+    shape : list of Float, shape (N,)
+        See `detached_shape`.
+    x : Unknowns
+    error : Float
+        ``A x - D`` in tile layout, evaluated. It becomes that of the result, in place.
+    inverse : Unknowns
+        The preconditioner, from `inverse_diagonal`. Unknowns where it is 0 keep their values.
+    lists : TileLists
+    cutoff : float
+    steps : int
+
+    Returns
+    -------
+    x : Unknowns
+    squares : list of list of Float, shape (images,)
+        For each step, and each channel, the sum of the squares of the error after it.
+    """
+    types, channels, grid = types_of(error), len(x[0]), lists.grid
     r = negate(apply_transposed(shape, error, channels, lists, cutoff))
-    inverse = inverse_diagonal(shape, channels, lists, cutoff)
-    if hold_background:  # a direction of 0 never moves it
-        inverse = inverse[0], [dr.opaque(types.Float, 0)] * channels
     p = multiply(r, inverse)
     rz = dots(r, p, grid)
     enough = [RELATIVE_TOLERANCE[types.bits] * a for a in rz]
-    noise = dr.opaque(types.Float, len(gaussians) / grid.images * ROUNDING[types.bits] ** 2)
+    number = dr.width(shape[0]) / grid.images
+    noise = dr.opaque(types.Float, number * ROUNDING[types.bits] ** 2)
     dr.eval(p, rz, enough)
     del r
     dr.flush_malloc_cache()  # what the lists and the start took would stay reserved
+    found = []
     # For this solve only: a program does not notice another number of Gaussians.
     with freeze_program(_advance) as advance, freeze_program(_turn) as turn:
         for _ in range(steps):
             x, q, alpha = advance(shape, x, p, rz, lists, cutoff)
             _add_in_place(error, q, alpha, lists)
             del q  # before the next one
-            p, rz, square = turn(shape, error, p, rz, enough, noise, inverse, lists, cutoff)
-            squares.append(square)
-    residuals = [dr.sum(sum(square)) for square in squares]
-    solved = replace(gaussians, color=types.FloatX(x[0]), background=types.FloatX(x[1]))
-    dr.eval(solved, residuals)
-    number = grid.width * grid.height * grid.images * channels
-    total = dr.concat(residuals).numpy()  # one copy to the host
-    return Solution(solved, np.sqrt(total / number).tolist())
+            p, rz, squares = turn(shape, error, p, rz, enough, noise, inverse, lists, cutoff)
+            found.append(squares)
+    return x, found
 
 
 def _advance(
@@ -254,35 +288,6 @@ def _add_in_place(image: Float, step: Float, factors: list, lists: TileLists) ->
     dr.eval(image)
 
 
-def inner_products(
-    gaussians: Gaussians, image: NDArray[np.floating], squared: bool = False
-) -> NDArray[np.floating]:
-    """Return the inner products of the weights of every Gaussian with an image.
-
-    Parameters
-    ----------
-    gaussians : Gaussians
-        The function ignores the colours.
-    image : ndarray, shape (H, W, C)
-        Image of the native size.
-    squared : bool, optional
-        Square the weights first.
-
-    Returns
-    -------
-    ndarray, shape (N, C)
-        ``sum_x w_n(x) image(x)``. Cost: one adjoint with respect to colours.
-    """
-    with dr.suspend_grad():
-        types = types_of(gaussians.mean)
-        lists = bin_gaussians(gaussians)
-        delta = to_tiles(types, np.asarray(image, np.float32), lists.grid)
-        shape = detached_shape(gaussians)
-        product = apply_squared if squared else apply_transposed
-        rows = product(shape, delta, image.shape[2], lists, gaussians.cutoff)
-        return np.stack([row.numpy() for row in rows[0]], axis=1)
-
-
 def apply(
     shape: list, x: Unknowns, lists: TileLists, cutoff: float, target: Float = None
 ) -> tuple[Float, list]:
@@ -307,13 +312,20 @@ def correlate(shape: list, delta: Float, channels: int, lists: TileLists, cutoff
 
 def inverse_diagonal(shape: list, channels: int, lists: TileLists, cutoff: float) -> Unknowns:
     """Return one over the diagonal of ``A^T A``: all channels have the same."""
-    types = types_of(shape[0])
-    packed = pack_parameters([*shape, types.Float(0)])
-    ones = dr.full(types.Float, 1, lists.grid.images)
-    inside, _ = residual(packed, [ones], lists, kernel_radius(cutoff), None)
-    diagonal = apply_squared(shape, inside, 1, lists, cutoff)
-    color, background = ([dr.select(d > 1e-8, rcp(d), 0) for d in part] for part in diagonal)
-    return color * channels, background * channels
+    inside = pixels_inside(types_of(shape[0]), lists.grid)
+    color, background = apply_squared(shape, inside, 1, lists, cutoff)
+    return invert(color) * channels, invert(background) * channels
+
+
+def invert(diagonal: list) -> list:
+    """Return one over the entries of a diagonal, and 0 for a Gaussian without a pixel."""
+    return [dr.select(d > 1e-8, rcp(d), 0) for d in diagonal]
+
+
+def held_background(inverse: Unknowns) -> Unknowns:
+    """Return a preconditioner with which the background keeps its value."""
+    Float = type(inverse[1][0])
+    return inverse[0], [dr.opaque(Float, 0)] * len(inverse[1])
 
 
 def apply_squared(

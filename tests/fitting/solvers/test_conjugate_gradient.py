@@ -1,17 +1,14 @@
 """The best colours: against dense least squares, and what conjugate gradients promise."""
 
-from dataclasses import replace
-
 import drjit as dr
 import numpy as np
 import pytest
 from drjit import JitFlag
 from hypothesis import given
 
-from _helpers.halves import SIDE, fitted
 from _helpers.sets import SIZE, Scene, few, random_scene, scenes
 from _helpers.solves import matrix, noise, rms, roomy, true_residual
-from eigengs_dr.fitting.solvers.conjugate_gradient import inner_products, solve
+from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.raster.render import render
 
 
@@ -156,16 +153,3 @@ def test_images_of_several_sizes_one_after_the_other(backend):
         image = noise(size=size)
         solution = solve(random_scene(size=size).on(backend), image, 2)
         assert solution.residuals[-1] == pytest.approx(true_residual(solution, image), rel=1e-5)
-
-
-def test_correlations_are_inner_products():
-    start, target = fitted(20)
-    plain = replace(start.gaussians, space="data")
-    ones = np.ones((SIDE, SIDE, 3), np.float32)
-    for n in (0, 7):
-        one = replace(plain[[n]], color=plain[[n]].color * 0 + 1, background=plain.background * 0)
-        weights = render(one).numpy().astype(np.float64)
-        first = inner_products(plain, target)[n]
-        np.testing.assert_allclose(first, (weights * target).sum((0, 1)), rtol=1e-4, atol=1e-5)
-        own = inner_products(plain, ones, squared=True)[n]
-        np.testing.assert_allclose(own, (weights**2).sum((0, 1)), rtol=1e-4)
