@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from ..backend.arrays import Float, types_of, upload
 from ..gaussian.gaussians import Gaussians, concatenate, like
-from ..image.resize import resample
 from ..raster.binning.lists import TileLists
 from ..raster.parameters import detached_shape
-from ..raster.render import batch_from_tiles, bin_gaussians, pixels_inside, to_tiles
-from .placement.adaptive import redistribute, residual
-from .placement.density import residual_peaks
+from ..raster.render import bin_gaussians, pixels_inside, to_tiles
+from .placement.adaptive import redistribute
+from .placement.peaks import Peaks, residual_peaks
 from .schedule import Relocation
 from .solvers.conjugate_gradient import (
     Unknowns,
@@ -119,10 +118,6 @@ class LevelControl(DensityControl):
         return relocate_levels(gaussians, how, self.counts, self.target, self.weight)
 
 
-WORKING_SPACING = 3.0
-"""Pixels between Gaussians for `relocate`. Images with twice this spacing or more are shrunk first:
-wide filters take long, and the descent moves Gaussians by a pixel at once."""
-
 SOLVE_STEPS = 5
 """Steps of the colour solve after dropping Gaussians, so that their neighbours replace them."""
 
@@ -198,6 +193,12 @@ class _Comparison(NamedTuple):
         own = diagonal[0] * (channels // len(diagonal[0]))
         return sum(c * (c * o - 2 * a) for c, o, a in zip(color, own, along, strict=True))
 
+    def peaks(self, error: Float, count: int) -> Peaks:
+        """Return where added Gaussians would reduce an error most."""
+        grid = self.lists.grid
+        spacing = math.sqrt(grid.width * grid.height / dr.width(self.shape[0]))
+        return residual_peaks(-error, grid, len(self.colors[0]), count, spacing, self.squares)
+
 
 def _compare(
     gaussians: Gaussians, target: NDArray[np.float32], weight: Array | None
@@ -247,8 +248,10 @@ def densify(
     """
     if count <= len(gaussians):
         return gaussians
-    missed = residual(gaussians, target)
-    mean, size, color = residual_peaks(missed, count - len(gaussians), _spacing(gaussians), weight)
+    with dr.suspend_grad():
+        scene = _compare(gaussians, target, weight)
+        error, _ = scene.error_of(scene.colors)
+        mean, size, color = scene.peaks(error, count - len(gaussians))
     if not len(mean):
         return gaussians
     return concatenate([gaussians, like(gaussians, mean, _round(size), color).bounded()])
@@ -281,16 +284,14 @@ def relocate(
         places, Gaussians of least use stay, with the colour 0.
     """
     own = np.arange(len(gaussians)) if part is None else np.arange(len(gaussians))[part.own]
-    leaving = max(int(how.share * len(own)), how.dropped)
-    places = leaving - how.dropped
-    moved, colors, missed, error = _take_out(gaussians, target, weight, part, own, leaving)
-    mean, size, color = _coarse_peaks(missed, places, _spacing(gaussians), weight)
+    moved, colors, peaks, error = _take_out(gaussians, target, weight, part, own, how)
+    mean, size, color = peaks
     new, at = gaussians.to_arrays() | colors, moved[: len(mean)]
     new["mean"][at], new["factor"][at], new["color"][at] = mean, _round(size), color
     if how.noise:
         perturb(new, own, error / len(own), how.noise, how.seed)
     for name in ("mean", "factor", "color"):
-        new[name] = np.delete(new[name], moved[places:], axis=0)
+        new[name] = np.delete(new[name], moved[len(moved) - how.dropped :], axis=0)
     there = like(gaussians, **new).bounded()
     # The set may be of a class with other bounds.
     values = {name: getattr(there, name) for name in new}
@@ -303,11 +304,12 @@ def _take_out(
     weight: Array | None,
     part: Part | None,
     own: NDArray[np.integer],
-    leaving: int,
-) -> tuple[NDArray[np.integer], dict[str, Array], NDArray[np.float32], float]:
-    """Take the Gaussians of least use out of a set, and solve for the colours of the others.
+    how: Relocation,
+) -> tuple[NDArray[np.integer], dict[str, Array], Peaks, float]:
+    """Take the Gaussians of least use out of a set, and find where others would be of most use.
 
-    One build of tile lists serves all: a Gaussian that is out has the colour 0, and keeps it.
+    The function solves for the colours of those that stay. One build of tile lists serves all: a
+    Gaussian that is out has the colour 0, and keeps it.
 
     Returns
     -------
@@ -315,8 +317,8 @@ def _take_out(
         The Gaussians of `own` that are out, those of least use first.
     colors : dict
         color (N, C) and background (C,).
-    missed : ndarray of float32, shape (H, W, C)
-        The residual without them, and 0 outside the part.
+    peaks : Peaks
+        Of the error without them in the part, at most as many as are not dropped.
     error : float
         The squared error of the whole set in the part.
     """
@@ -332,6 +334,7 @@ def _take_out(
         cost = scene.removal_cost(error, diagonal)
         before = dr.sum(dr.square(error * inside))
         dr.eval(cost, before)
+        leaving = max(int(how.share * len(own)), how.dropped)
         moved = own[np.argsort(cost.numpy()[own], kind="stable")[:leaving]]
         stays = np.ones(len(gaussians), np.float32)
         stays[moved] = 0
@@ -348,9 +351,9 @@ def _take_out(
             colors, _ = reduce_error(
                 scene.shape, colors, error, free, scene.lists, scene.cutoff, SOLVE_STEPS
             )
-        missed = batch_from_tiles(-error * inside, scene.lists.grid, len(colors[0]))[0]
+        peaks = scene.peaks(error * inside, leaving - how.dropped)
         rows = [np.stack([v.numpy() for v in part], axis=-1) for part in colors]
-        return moved, {"color": rows[0], "background": rows[1][0]}, missed, before[0]
+        return moved, {"color": rows[0], "background": rows[1][0]}, peaks, before[0]
 
 
 def relocate_levels(
@@ -393,22 +396,6 @@ def relocate_levels(
             parts.append(replace(later, background=0 * later.background))
         gaussians = concatenate(parts)
     return gaussians
-
-
-def _coarse_peaks(
-    missed: Array, count: int, spacing: float, weight: Array | None
-) -> tuple[Array, Array, Array]:
-    """Return the places of `residual_peaks`, on a smaller image where Gaussians are far apart."""
-    times = int(spacing / WORKING_SPACING)
-    if times < 2:
-        return residual_peaks(missed, count, spacing, weight)
-    height, width = missed.shape[:2]
-    size = -(-width // times), -(-height // times)
-    small = [None if v is None else resample(v, *size) for v in (missed, weight)]
-    x, y = width / size[0], height / size[1]
-    assert small[0] is not None
-    mean, deviation, color = residual_peaks(small[0], count, spacing / math.sqrt(x * y), small[1])
-    return mean * (x, y), deviation * math.sqrt(x * y), color
 
 
 def _round(size: Array) -> Array:

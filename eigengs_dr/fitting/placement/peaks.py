@@ -1,0 +1,343 @@
+"""The peaks of an error: where an added Gaussian would reduce it most, in kernels that own pixels.
+
+A round Gaussian with the weights w, of the standard deviation s, and with the best colour
+``<w, r> / <w, w>`` reduces the squared error of the residual r by the gain ``<w, r>^2 / <w, w>``.
+Along one axis the weights are ``exp(-k^2 / (2 s^2))`` for the offsets k, so ``<w, r>`` is a blur
+along columns and then along rows, and ``<w, w>`` is the square of ``T = sum_k exp(-k^2 / s^2)``.
+
+Images are in tile layout. A lane owns a run: the 4 pixels of a row of a tile.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from ...backend.arrays import ArrayTypes, Bool, Float, UInt, types_of
+from ...raster.binning.tiles import TILE, Grid, GridArrays
+from ...raster.parameters import gather_run
+
+CANDIDATE_SIZES = (0.2, 0.35, 0.6, 1.0, 1.6)
+"""Candidate sizes of an added Gaussian, as multiples of the mean spacing."""
+
+TRUNCATION = 3.0
+"""Radius of the weights along an axis, in standard deviations."""
+
+SUPPRESSION_RADIUS = 1.5
+"""Distance from an added Gaussian to a worse one, in standard deviations of the added one."""
+
+WORKING_SPACING = 3.0
+"""Pixels between Gaussians for the search. An image with twice this spacing or more is shrunk
+first: wide weights take long, and the descent moves Gaussians by a pixel at once."""
+
+RUN, ROWS = TILE
+
+
+class Peaks(NamedTuple):
+    """Round Gaussians that would reduce the error most, the best first.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (n, 2)
+        In pixels.
+    size : ndarray, shape (n,)
+        Standard deviations in pixels.
+    color : ndarray, shape (n, C)
+        Best colours.
+    """
+
+    mean: NDArray[np.floating]
+    size: NDArray[np.floating]
+    color: NDArray[np.floating]
+
+
+class _Runs(NamedTuple):
+    """The runs of an image, one for each lane.
+
+    Attributes
+    ----------
+    sizes : GridArrays
+    column, row : UInt32
+        The column of the tile, and the row of the pixels.
+    """
+
+    sizes: GridArrays
+    column: UInt
+    row: UInt
+
+    def at(self, column: UInt, row: UInt) -> tuple[UInt, Bool]:
+        """Return the index in tile layout of the run in a place, and whether there is one."""
+        inside = (column >= 0) & (column < self.sizes.nx)
+        inside &= (row >= 0) & (row < self.sizes.ny * ROWS)
+        tile = row // ROWS * self.sizes.nx + column
+        return dr.uint32_array_t(row)(tile * ROWS + row % ROWS), inside
+
+
+def _runs(types: ArrayTypes, grid: Grid) -> _Runs:
+    sizes, lane = grid.in_arrays(types), dr.arange(types.UInt, grid.tiles * ROWS)
+    row, column = sizes.row.divmod(lane // ROWS)
+    return _Runs(sizes, types.Int(column), types.Int(row * ROWS + lane % ROWS))
+
+
+def residual_peaks(
+    missed: Float,
+    grid: Grid,
+    channels: int,
+    count: int,
+    spacing: float,
+    squares: Float = None,
+) -> Peaks:
+    """Find where added round Gaussians would reduce the squared error most.
+
+    The function finds the maxima of the gain over positions and `CANDIDATE_SIZES`, leaves out
+    those inside the `SUPPRESSION_RADIUS` of a better one, and returns the best of the others.
+
+    Cost: for a size, two passes over the image with as many products a value as the weights have
+    offsets; then a window of the largest radius for each maximum.
+
+    Parameters
+    ----------
+    missed : Float, shape (pixels * channels,)
+        Residual r in tile layout, 0 outside the image.
+    grid : Grid
+        Of one image.
+    channels : int
+    count : int
+        Largest number of peaks.
+    spacing : float
+        Mean distance between Gaussians in pixels.
+    squares : Float, optional
+        Factors of the squares of the errors in tile layout, by default 1.
+
+    Returns
+    -------
+    Peaks
+    """
+    types, times = types_of(missed), int(spacing / WORKING_SPACING)
+    if times > 1:
+        small = Grid(-(-grid.width // times), -(-grid.height // times))
+        missed, squares = (
+            None if v is None else _shrunk(v, grid, small, channels, times)
+            for v in (missed, squares)
+        )
+        on_small = residual_peaks(missed, small, channels, count, spacing / times, squares)
+        return Peaks(on_small.mean * times, on_small.size * times, on_small.color)
+    runs = _runs(types, grid)
+    pixels = grid.tiles * grid.pixels
+    gain, size = dr.zeros(types.Float, pixels), dr.zeros(types.Float, pixels)
+    color = dr.zeros(types.Float, pixels * channels)
+    dr.make_opaque(gain, size, color)
+    for deviation in (share * spacing for share in CANDIDATE_SIZES):
+        gain, size, color = _better(missed, runs, channels, deviation, squares, (gain, size, color))
+    top = _local_maxima(gain, runs)
+    reach = math.ceil(SUPPRESSION_RADIUS * CANDIDATE_SIZES[-1] * spacing)
+    place = dr.compress(top > 0)
+    if not dr.width(place):
+        return Peaks(np.zeros((0, 2)), np.zeros(0), np.zeros((0, channels)))
+    place = _apart(place, top, size, runs, reach)
+    column, row = _pixels(place, runs)
+    rows = [
+        dr.gather(types.Float, gain, place),
+        types.Float(column) + 0.5,
+        types.Float(row) + 0.5,
+        dr.gather(types.Float, size, place),
+        *[dr.gather(types.Float, color, place * channels + c) for c in range(channels)],
+    ]
+    dr.eval(rows)
+    found = np.stack([v.numpy() for v in rows], axis=1)
+    best = np.argsort(-found[:, 0], kind="stable")[:count]
+    _, x, y, deviation, *colors = found[best].T
+    return Peaks(np.stack([x, y], axis=1), deviation, np.stack(colors, axis=1))
+
+
+def _shrunk(image: Float, grid: Grid, small: Grid, channels: int, times: int) -> Float:
+    """Return the means over squares of pixels of an image in tile layout; evaluated."""
+    types, side = types_of(image), dr.opaque(types_of(image).Int, times)
+    runs, large = _runs(types, small), _runs(types, grid)
+    x, y = _pixels(dr.arange(types.UInt, small.tiles * small.pixels), runs)
+    width, height = (types.Int(v) for v in (large.sizes.width, large.sizes.height))
+
+    def add(i: UInt, j: UInt, number: Float, sums: list) -> tuple:
+        column, row = x * side + i, y * side + j
+        at, _ = large.at(column // RUN, row)
+        inside = (column < width) & (row < height)
+        place = (at * RUN + type(at)(column % RUN)) * channels
+        sums = [s + dr.gather(types.Float, image, place + c, inside) for c, s in enumerate(sums)]
+        ends = i + 1 == side
+        number = number + dr.select(inside, types.Float(1), 0)
+        return dr.select(ends, 0, i + 1), dr.select(ends, j + 1, j), number, sums
+
+    number, sums = dr.while_loop(
+        (types.Int(0), types.Int(0), types.Float(0), [types.Float(0)] * channels),
+        lambda i, j, number, sums: j < side,
+        add,
+        label="shrink",
+        max_iterations=-1,
+    )[2:]
+    result = dr.empty(types.Float, small.tiles * small.pixels * channels)
+    means = [s / dr.maximum(number, 1) for s in sums]
+    dr.scatter(result, types.FloatX(means), dr.arange(types.UInt, dr.width(x)))
+    dr.eval(result)
+    return result
+
+
+def _better(
+    missed: Float,
+    runs: _Runs,
+    channels: int,
+    deviation: float,
+    squares: Float,
+    best: tuple[Float, Float, Float],
+) -> tuple[Float, Float, Float]:
+    """Return gain, size and colour of the better of the best so far and a size, for each pixel."""
+    types = types_of(missed)
+    radius = max(1, math.ceil(TRUNCATION * deviation))
+    offsets = np.arange(-radius, radius + 1)
+    own = float(np.exp(-np.square(offsets / deviation)).sum()) ** 2
+    # In arrays, so that one program serves all sizes.
+    slope = dr.opaque(types.Float, -0.5 / (math.log(2) * deviation**2))
+    size, inverse = dr.opaque(types.Float, deviation), dr.opaque(types.Float, 1 / own)
+    reach = dr.opaque(types.Int, radius)
+    down = _blur_columns(missed, runs, channels, slope, reach)
+    along = _blur_rows(down, runs, channels, slope, reach)
+    lane = dr.arange(types.UInt, dr.width(runs.row))
+    factors = [1.0] * len(along)
+    if squares is not None:
+        factors = gather_run(types, squares, lane, len(along), True)
+    terms = [dr.square(p) * f * inverse for p, f in zip(along, factors, strict=True)]
+    x, y = types.Float(runs.column * RUN), types.Float(runs.row)
+    gains, sizes, colors = (
+        gather_run(types, v, lane, n * RUN, True)
+        for v, n in zip(best, (1, 1, channels), strict=True)
+    )
+    for i in range(RUN):
+        new = sum(terms[i * channels : (i + 1) * channels])
+        inside = (x + i < runs.sizes.width) & (y < runs.sizes.height)
+        better = inside & (new > gains[i])
+        gains[i] = dr.select(better, new, gains[i])
+        sizes[i] = dr.select(better, size, sizes[i])
+        for k in range(i * channels, (i + 1) * channels):
+            colors[k] = dr.select(better, along[k] * inverse, colors[k])
+    found = [dr.empty(types.Float, dr.width(v)) for v in best]
+    for array, values in zip(found, (gains, sizes, colors), strict=True):
+        dr.scatter(array, types.FloatX(values), lane)
+    dr.eval(found)
+    return found[0], found[1], found[2]
+
+
+def _blur_columns(image: Float, runs: _Runs, channels: int, slope: Float, radius: UInt) -> Float:
+    """Sum the values above and below each pixel times ``2^(slope k^2)``; evaluated."""
+    types, length = types_of(image), RUN * channels
+
+    def add(k: UInt, sums: list) -> tuple:
+        at, inside = runs.at(runs.column, runs.row + k)
+        weight = dr.exp2(slope * dr.square(types.Float(k)))
+        values = gather_run(types, image, at, length, inside & (k <= radius))
+        return k + 1, [dr.fma(weight, v, s) for v, s in zip(values, sums, strict=True)]
+
+    sums = dr.while_loop(
+        (types.Int(-radius), [types.Float(0) for _ in range(length)]),
+        lambda k, sums: k <= radius,
+        add,
+        label="blur columns",
+        max_iterations=-1,
+    )[-1]
+    result = dr.empty(types.Float, dr.width(image))
+    dr.scatter(result, types.FloatX(sums), dr.arange(types.UInt, dr.width(runs.row)))
+    dr.eval(result)
+    return result
+
+
+def _blur_rows(image: Float, runs: _Runs, channels: int, slope: Float, radius: UInt) -> list:
+    """Sum the values beside each pixel times ``2^(slope k^2)``; a list of Float for each value."""
+    types, length = types_of(image), RUN * channels
+    tiles = (radius + RUN - 1) // RUN
+
+    def add(tile: UInt, sums: list) -> tuple:
+        at, inside = runs.at(runs.column + tile, runs.row)
+        values = gather_run(types, image, at, length, inside & (tile <= tiles))
+        weight = {}
+        for offset in range(1 - RUN, RUN):
+            k = tile * RUN + offset
+            near = dr.abs(k) <= radius
+            weight[offset] = dr.select(near, dr.exp2(slope * dr.square(types.Float(k))), 0)
+        sums = list(sums)
+        for i in range(RUN):
+            for j in range(RUN):
+                for c in range(channels):
+                    own = i * channels + c
+                    sums[own] = dr.fma(weight[j - i], values[j * channels + c], sums[own])
+        return tile + 1, sums
+
+    sums: list = dr.while_loop(
+        (types.Int(-tiles), [types.Float(0) for _ in range(length)]),
+        lambda tile, sums: tile <= tiles,
+        add,
+        label="blur rows",
+        max_iterations=-1,
+    )[-1]
+    return sums
+
+
+def _local_maxima(gain: Float, runs: _Runs) -> Float:
+    """Return the gain where it is the largest of 3x3 pixels, and 0 elsewhere; evaluated."""
+    types = types_of(gain)
+    rows = []
+    for step in (-1, 0, 1):
+        values: list = []
+        for tile in (-1, 0, 1):
+            at, inside = runs.at(runs.column + tile, runs.row + step)
+            values += gather_run(types, gain, at, RUN, inside)
+        rows.append(values[RUN - 1 : 2 * RUN + 1])
+    across = [dr.maximum(dr.maximum(a, b), c) for a, b, c in zip(*rows, strict=True)]
+    tops = []
+    for i in range(RUN):
+        largest = dr.maximum(dr.maximum(across[i], across[i + 1]), across[i + 2])
+        own = rows[1][i + 1]
+        tops.append(dr.select(own == largest, own, 0))
+    result = dr.empty(types.Float, dr.width(gain))
+    dr.scatter(result, types.FloatX(tops), dr.arange(types.UInt, dr.width(runs.row)))
+    dr.eval(result)
+    return result
+
+
+def _pixels(place: UInt, runs: _Runs) -> tuple[UInt, UInt]:
+    """Return column and row of pixels by their indices in tile layout."""
+    lane = place // RUN
+    column, row = (dr.gather(type(v), v, lane) for v in (runs.column, runs.row))
+    return column * RUN + type(column)(place % RUN), row
+
+
+def _apart(place: UInt, top: Float, size: Float, runs: _Runs, reach: int) -> UInt:
+    """Return the maxima that no better maximum within its own radius suppresses."""
+    types = types_of(top)
+    column, row = _pixels(place, runs)
+    own = dr.gather(types.Float, top, place)
+    limit = dr.opaque(types.Int, reach)
+    first, last = (column - limit) // RUN, (column + limit) // RUN
+    x, y = types.Float(column), types.Float(row)
+
+    def look(i: UInt, j: UInt, is_best: Bool) -> tuple:
+        at, inside = runs.at(i, j)
+        inside &= j <= row + limit
+        gains, sizes = (gather_run(types, v, at, RUN, inside) for v in (top, size))
+        for k in range(RUN):
+            away = dr.maximum(dr.abs(types.Float(i * RUN + k) - x), dr.abs(types.Float(j) - y))
+            near = away <= dr.ceil(SUPPRESSION_RADIUS * sizes[k])
+            before = (gains[k] > own) | ((gains[k] == own) & (at * RUN + k < place))
+            is_best &= ~(inside & near & before)
+        ends = i >= last
+        return dr.select(ends, first, i + 1), dr.select(ends, j + 1, j), is_best
+
+    is_best = dr.while_loop(
+        (types.Int(first), row - limit, types.Bool(True)),
+        lambda i, j, is_best: is_best & (j <= row + limit),
+        look,
+        label="keep peaks apart",
+        max_iterations=-1,
+    )[-1]
+    return dr.gather(types.UInt, place, dr.compress(is_best))
