@@ -118,7 +118,7 @@ class LevelControl(DensityControl):
         return relocate_levels(gaussians, how, self.counts, self.target, self.weight)
 
 
-SOLVE_STEPS = 5
+SOLVE_STEPS = 2
 """Steps of the colour solve after dropping Gaussians, so that their neighbours replace them."""
 
 

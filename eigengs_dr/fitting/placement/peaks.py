@@ -5,7 +5,7 @@ A round Gaussian with the weights w, of the standard deviation s, and with the b
 Along one axis the weights are ``exp(-k^2 / (2 s^2))`` for the offsets k, so ``<w, r>`` is a blur
 along columns and then along rows, and ``<w, w>`` is the square of ``T = sum_k exp(-k^2 / s^2)``.
 
-Images are in tile layout. A lane owns a run: the 4 pixels of a row of a tile.
+Images are in tile layout. A lane owns a tile, or a run: the 4 pixels of a row of a tile.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ...backend.arrays import ArrayTypes, Bool, Float, UInt, types_of
 from ...raster.binning.tiles import TILE, Grid, GridArrays
 from ...raster.parameters import gather_run
+from ...raster.render import pixels_inside
 
 CANDIDATE_SIZES = (0.2, 0.35, 0.6, 1.0, 1.6)
 """Candidate sizes of an added Gaussian, as multiples of the mean spacing."""
@@ -128,11 +129,11 @@ def residual_peaks(
         return Peaks(on_small.mean * times, on_small.size * times, on_small.color)
     runs = _runs(types, grid)
     pixels = grid.tiles * grid.pixels
-    gain, size = dr.zeros(types.Float, pixels), dr.zeros(types.Float, pixels)
-    color = dr.zeros(types.Float, pixels * channels)
-    dr.make_opaque(gain, size, color)
+    best = tuple(dr.zeros(types.Float, pixels * n) for n in (1, 1, channels))
+    dr.make_opaque(best)
     for deviation in (share * spacing for share in CANDIDATE_SIZES):
-        gain, size, color = _better(missed, runs, channels, deviation, squares, (gain, size, color))
+        best = _better(missed, grid, channels, deviation, squares, best)
+    gain, size, color = best
     top = _local_maxima(gain, runs)
     reach = math.ceil(SUPPRESSION_RADIUS * CANDIDATE_SIZES[-1] * spacing)
     place = dr.compress(top > 0)
@@ -149,8 +150,8 @@ def residual_peaks(
     ]
     dr.eval(rows)
     found = np.stack([v.numpy() for v in rows], axis=1)
-    best = np.argsort(-found[:, 0], kind="stable")[:count]
-    _, x, y, deviation, *colors = found[best].T
+    first = np.argsort(-found[:, 0], kind="stable")[:count]
+    _, x, y, deviation, *colors = found[first].T
     return Peaks(np.stack([x, y], axis=1), deviation, np.stack(colors, axis=1))
 
 
@@ -187,97 +188,94 @@ def _shrunk(image: Float, grid: Grid, small: Grid, channels: int, times: int) ->
 
 def _better(
     missed: Float,
-    runs: _Runs,
+    grid: Grid,
     channels: int,
     deviation: float,
     squares: Float,
-    best: tuple[Float, Float, Float],
-) -> tuple[Float, Float, Float]:
+    best: tuple[Float, ...],
+) -> tuple[Float, ...]:
     """Return gain, size and colour of the better of the best so far and a size, for each pixel."""
-    types = types_of(missed)
+    types, length = types_of(missed), grid.pixels * channels
     radius = max(1, math.ceil(TRUNCATION * deviation))
     offsets = np.arange(-radius, radius + 1)
     own = float(np.exp(-np.square(offsets / deviation)).sum()) ** 2
     # In arrays, so that one program serves all sizes.
     slope = dr.opaque(types.Float, -0.5 / (math.log(2) * deviation**2))
     size, inverse = dr.opaque(types.Float, deviation), dr.opaque(types.Float, 1 / own)
-    reach = dr.opaque(types.Int, radius)
-    down = _blur_columns(missed, runs, channels, slope, reach)
-    along = _blur_rows(down, runs, channels, slope, reach)
-    lane = dr.arange(types.UInt, dr.width(runs.row))
-    factors = [1.0] * len(along)
+    reach, tile = dr.opaque(types.Int, radius), dr.arange(types.UInt, grid.tiles)
+    down = dr.empty(types.Float, dr.width(missed))
+    dr.scatter(down, types.FloatX(_blur(missed, grid, channels, slope, reach, 1)), tile)
+    dr.eval(down)
+    both = _blur(down, grid, channels, slope, reach, 0)
+    factors = [1.0] * length
     if squares is not None:
-        factors = gather_run(types, squares, lane, len(along), True)
-    terms = [dr.square(p) * f * inverse for p, f in zip(along, factors, strict=True)]
-    x, y = types.Float(runs.column * RUN), types.Float(runs.row)
+        factors = gather_run(types, squares, tile, length, True)
+    terms = [dr.square(p) * f * inverse for p, f in zip(both, factors, strict=True)]
+    inside = gather_run(types, pixels_inside(types, grid), tile, grid.pixels, True)
     gains, sizes, colors = (
-        gather_run(types, v, lane, n * RUN, True)
-        for v, n in zip(best, (1, 1, channels), strict=True)
+        gather_run(types, v, tile, dr.width(v) // grid.tiles, True) for v in best
     )
-    for i in range(RUN):
-        new = sum(terms[i * channels : (i + 1) * channels])
-        inside = (x + i < runs.sizes.width) & (y < runs.sizes.height)
-        better = inside & (new > gains[i])
-        gains[i] = dr.select(better, new, gains[i])
-        sizes[i] = dr.select(better, size, sizes[i])
-        for k in range(i * channels, (i + 1) * channels):
-            colors[k] = dr.select(better, along[k] * inverse, colors[k])
-    found = [dr.empty(types.Float, dr.width(v)) for v in best]
+    for n in range(grid.pixels):
+        gain = sum(terms[n * channels : (n + 1) * channels])
+        better = (inside[n] > 0) & (gain > gains[n])
+        gains[n] = dr.select(better, gain, gains[n])
+        sizes[n] = dr.select(better, size, sizes[n])
+        for k in range(n * channels, (n + 1) * channels):
+            colors[k] = dr.select(better, both[k] * inverse, colors[k])
+    found = tuple(dr.empty(types.Float, dr.width(v)) for v in best)
     for array, values in zip(found, (gains, sizes, colors), strict=True):
-        dr.scatter(array, types.FloatX(values), lane)
+        dr.scatter(array, types.FloatX(values), tile)
     dr.eval(found)
-    return found[0], found[1], found[2]
+    return found
 
 
-def _blur_columns(image: Float, runs: _Runs, channels: int, slope: Float, radius: UInt) -> Float:
-    """Sum the values above and below each pixel times ``2^(slope k^2)``; evaluated."""
-    types, length = types_of(image), RUN * channels
+def _blur(image: Float, grid: Grid, channels: int, slope: Float, radius: UInt, axis: int) -> list:
+    """Sum the values along an axis of each pixel times ``2^(slope k^2)``; a lane owns a tile.
 
-    def add(k: UInt, sums: list) -> tuple:
-        at, inside = runs.at(runs.column, runs.row + k)
-        weight = dr.exp2(slope * dr.square(types.Float(k)))
-        values = gather_run(types, image, at, length, inside & (k <= radius))
-        return k + 1, [dr.fma(weight, v, s) for v, s in zip(values, sums, strict=True)]
+    Cost for each tile within the radius: a gather of the tile, 7 exponentials, and 4 products for
+    each value.
 
-    sums = dr.while_loop(
-        (types.Int(-radius), [types.Float(0) for _ in range(length)]),
-        lambda k, sums: k <= radius,
-        add,
-        label="blur columns",
-        max_iterations=-1,
-    )[-1]
-    result = dr.empty(types.Float, dr.width(image))
-    dr.scatter(result, types.FloatX(sums), dr.arange(types.UInt, dr.width(runs.row)))
-    dr.eval(result)
-    return result
+    Parameters
+    ----------
+    axis : int
+        0 for the pixels of a row, 1 for those of a column.
 
-
-def _blur_rows(image: Float, runs: _Runs, channels: int, slope: Float, radius: UInt) -> list:
-    """Sum the values beside each pixel times ``2^(slope k^2)``; a list of Float for each value."""
-    types, length = types_of(image), RUN * channels
-    tiles = (radius + RUN - 1) // RUN
+    Returns
+    -------
+    list of Float, shape (tiles,)
+        One for each value of a tile.
+    """
+    types, side, length = types_of(image), TILE[axis], grid.pixels * channels
+    sizes = grid.in_arrays(types)
+    row, column = (types.Int(v) for v in sizes.row.divmod(dr.arange(types.UInt, grid.tiles)))
+    here, step = ((column, 1), (row, sizes.nx))[axis]
+    count = (sizes.nx, sizes.ny)[axis]
+    own = types.Int(dr.arange(types.UInt, grid.tiles))
+    tiles = (radius + side - 1) // side
+    pixel_of = [(n % TILE[0], n // TILE[0]) for n in range(grid.pixels)]
 
     def add(tile: UInt, sums: list) -> tuple:
-        at, inside = runs.at(runs.column + tile, runs.row)
-        values = gather_run(types, image, at, length, inside & (tile <= tiles))
+        inside = (here + tile >= 0) & (here + tile < count) & (tile <= tiles)
+        values = gather_run(types, image, types.UInt(own + tile * step), length, inside)
         weight = {}
-        for offset in range(1 - RUN, RUN):
-            k = tile * RUN + offset
+        for offset in range(1 - side, side):
+            k = tile * side + offset
             near = dr.abs(k) <= radius
             weight[offset] = dr.select(near, dr.exp2(slope * dr.square(types.Float(k))), 0)
         sums = list(sums)
-        for i in range(RUN):
-            for j in range(RUN):
-                for c in range(channels):
-                    own = i * channels + c
-                    sums[own] = dr.fma(weight[j - i], values[j * channels + c], sums[own])
+        for n, at in enumerate(pixel_of):
+            for m, other in enumerate(pixel_of):
+                if at[1 - axis] == other[1 - axis]:
+                    for c in range(channels):
+                        place, w = n * channels + c, weight[other[axis] - at[axis]]
+                        sums[place] = dr.fma(w, values[m * channels + c], sums[place])
         return tile + 1, sums
 
     sums: list = dr.while_loop(
         (types.Int(-tiles), [types.Float(0) for _ in range(length)]),
         lambda tile, sums: tile <= tiles,
         add,
-        label="blur rows",
+        label="blur",
         max_iterations=-1,
     )[-1]
     return sums
