@@ -17,9 +17,14 @@ from eigengs_bench.rows import Row, Task
 from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.descent import FitProblem, descend
-from eigengs_dr.fitting.options import PRESETS
+from eigengs_dr.fitting.descent import run as descend_to_end
+from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
+from eigengs_dr.fitting.refine import refine
+from eigengs_dr.fitting.schedule import Relocation
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.start import start_for
+from eigengs_dr.fitting.target import make_target
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.io import sample
@@ -35,6 +40,7 @@ SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
 PLAIN_TILE = (8, 8)
 WARM_UP, ROUNDS = 3, 15  # rounds that compile and settle, and rounds that are measured
 STEPS = 1000  # steps of the refinement behind `growth`
+FIT_STEPS, FIT_ROUNDS = 500, 5  # steps of the refinement behind `fit_over_steps`, and how often
 PEAK_LANES, PEAK_LOOPS, PEAK_UNROLL = 1 << 16, 100, 8  # size of the program that measures the peak
 CUTOFFS = (2.5, 3.0, 3.5, 4.0, 5.0)  # whose time and error are measured
 WIDEST = 8.0  # cutoff that stands for none in double precision (1.3e-14 of an amplitude is left)
@@ -47,8 +53,10 @@ def run(task: Task) -> list[Row]:
     the ratios plain over fast. `peak_evals_per_ns` counts `exp`, `select` and 3 `fma` without
     memory; the fractions are evaluations inside the cutoff ellipses over that peak. `growth` is the
     median time of the steps 900 to 1,000 of a refinement over that of the steps 50 to 150, and
-    `growth_with_lists` the same of the means, in which building lists counts. "cutoffs" has time
-    and error of the picture by cutoff.
+    `growth_with_lists` the same of the means, in which building lists counts. `fit_over_steps` is
+    the time of a refinement over that of its steps alone, without relocation, second placement and
+    trace, and `round_in_steps` that of a round of relocation over that of such a step. "cutoffs"
+    has time and error of the picture by cutoff.
     """
     job: Row = {"side": SIDE, "gaussians": COUNT, "at": time.time()}  # each call measures anew
     return task.measure("kernels", [(job, partial(_measure, task))])
@@ -77,6 +85,7 @@ def _measure(task: Task) -> Row:
     scene = random_scene(types)
     show = partial(task.progress, "kernels")
     figures = {**kernel_figures(types, scene, show), **growth_figures(types, task.progress)}
+    figures |= fit_figures(types, partial(task.progress, "fit"))
     return figures | {"cutoffs": cutoff_figures(scene)}
 
 
@@ -199,9 +208,7 @@ def pixels_inside(scene: Gaussians) -> int:
 
 def growth_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
     """Time every step of a refinement: Gaussians stretch, and a poor renderer slows down."""
-    photo = sample("astronaut")
-    top, left = ((side - SIDE) // 2 for side in photo.shape[:2])
-    target = rgb_to_ycbcr(photo[top : top + SIDE, left : left + SIDE])
+    target = rgb_to_ycbcr(photo())
     mean, factor = place_adaptive(target, COUNT, np.random.default_rng(0))
     start = Gaussians.from_arrays(
         mean, factor, np.zeros((COUNT, 3)), size=(SIDE, SIDE), backend=types.backend
@@ -220,6 +227,36 @@ def growth_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
         "growth_with_lists": float(late.mean() / early.mean()),
         "early_step_ms": float(np.median(early)),
         "late_step_ms": float(np.median(late)),
+    }
+
+
+def photo() -> NDArray[np.float32]:
+    """Return the middle of a photo, of the size of the scene."""
+    whole = sample("astronaut")
+    top, left = ((side - SIDE) // 2 for side in whole.shape[:2])
+    return whole[top : top + SIDE, left : left + SIDE]
+
+
+def fit_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
+    """Time a refinement, its steps alone, and a round of relocation."""
+    options = FitOptions(gaussians=COUNT, iterations=FIT_STEPS, backend=types.backend)
+    problem = start_for(make_target(photo(), options.space), options)
+    control, schedule = problem.control, options.method.schedule
+    assert control
+    move = Relocation(schedule.relocate_share, schedule.noise)
+
+    def whole() -> Gaussians:
+        return refine(problem, photo(), schedule, FIT_STEPS).gaussians
+
+    def steps() -> Gaussians:
+        return descend_to_end(problem._replace(control=None), schedule, FIT_STEPS)
+
+    moved = steps()
+    timed = {"fit": whole, "steps": steps, "round": lambda: control.relocate(moved, move)}
+    ms = interleaved(timed, 1, FIT_ROUNDS, progress)
+    return {
+        "fit_over_steps": ms["fit"] / ms["steps"],
+        "round_in_steps": ms["round"] / (ms["steps"] / FIT_STEPS),
     }
 
 

@@ -305,7 +305,8 @@ def test_scaling(backend, tmp_path, monkeypatch):
 
 @pytest.fixture
 def tiny(monkeypatch):
-    for name, value in {"SIDE": 64, "COUNT": 300, "ROUNDS": 2, "PEAK_LANES": 1 << 10}.items():
+    small = {"SIDE": 64, "COUNT": 300, "ROUNDS": 2, "PEAK_LANES": 1 << 10, "FIT_STEPS": 20}
+    for name, value in (small | {"FIT_ROUNDS": 1}).items():
         monkeypatch.setattr(kernels, name, value)
     monkeypatch.setattr(kernels, "CUTOFFS", (2.5, 3.5))
 
@@ -314,7 +315,8 @@ def test_kernels(tiny, backend, tmp_path):
     told = run("bench", "kernels", "--backend", backend, "-o", tmp_path)
     assert told.exit_code == 0, told.output
     [found] = read(tmp_path / FILE)
-    for name in ("plain_ms", "fast_ms", "step_ratio", "forward_peak_fraction", "growth"):
+    names = "plain_ms", "fast_ms", "step_ratio", "forward_peak_fraction", "growth"
+    for name in (*names, "fit_over_steps", "round_in_steps"):
         assert found[name] > 0 and name in told.stdout
     few, many = found["cutoffs"]
     assert few["largest_error"] > many["largest_error"] > 0
