@@ -11,6 +11,7 @@ import ctypes
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -76,6 +77,7 @@ def types_in(module: Any, bits: int = 32) -> ArrayTypes:
     return _types(module.__name__, bits)
 
 
+@cache
 def _types(module: str, bits: int) -> ArrayTypes:
     names = sys.modules[module]
     suffix = "64" if bits == 64 else ""
