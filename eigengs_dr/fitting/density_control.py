@@ -118,8 +118,13 @@ class LevelControl(DensityControl):
         return relocate_levels(gaussians, how, self.counts, self.target, self.weight)
 
 
-SOLVE_STEPS = 2
-"""Steps of the colour solve after dropping Gaussians, so that their neighbours replace them."""
+ROUND_STEPS = 2
+"""Steps of the colour solve in a round of relocation, so that neighbours replace the Gaussians that
+leave. The descent goes on: 5 steps have the PSNR of 2 (6 training photos, 600 to 5,000 Gaussians,
+300 and 1,000 steps)."""
+
+PRUNE_STEPS = 5
+"""Steps of the colour solve in `prune`, after which there may be no descent."""
 
 
 def removal_cost(
@@ -232,7 +237,7 @@ def prune(
     kept = np.sort(np.argsort(-value, kind="stable")[:count])
     if weight is not None:
         return gaussians[kept]
-    return solve(gaussians[kept], target, SOLVE_STEPS, warm_start=True).gaussians
+    return solve(gaussians[kept], target, PRUNE_STEPS, warm_start=True).gaussians
 
 
 def densify(
@@ -349,10 +354,10 @@ def _take_out(
             free = free if part is None else held_background(free)
             dr.eval(free)
             colors, _ = reduce_error(
-                scene.shape, colors, error, free, scene.lists, scene.cutoff, SOLVE_STEPS
+                scene.shape, colors, error, free, scene.lists, scene.cutoff, ROUND_STEPS
             )
         peaks = scene.peaks(error * inside, leaving - how.dropped)
-        rows = [np.stack([v.numpy() for v in part], axis=-1) for part in colors]
+        rows = [np.stack([v.numpy() for v in found], axis=-1) for found in colors]
         return moved, {"color": rows[0], "background": rows[1][0]}, peaks, before[0]
 
 
