@@ -14,7 +14,7 @@ from .fitting.options import level_counts
 from .gaussian.gaussians import Gaussians, concatenate, from_tensors, to_tensors
 from .image.io import load_image, sample, save_image
 from .image.metrics import ms_ssim, psnr, ssim
-from .image.pixels import ImageError, LinearImage
+from .image.pixels import ImageError
 from .plugins import register_plugins
 from .raster.render import picture_of, render, tile_lists
 from .scene.convert import convert_scene
@@ -34,7 +34,6 @@ __all__ = [
     "ImageError",
     "ImageRow",
     "LargeFit",
-    "LinearImage",
     "RunInterrupted",
     "concatenate",
     "convert_scene",

@@ -16,8 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..image.formats import kind_of, open_header
-from ..image.io import ImageError, load_image, open_picture, picture_pixels
-from ..image.pixels import LinearImage, check_data, check_image, encoding_of
+from ..image.io import (
+    ImageError,
+    check_data,
+    check_image,
+    open_picture,
+    picture_pixels,
+    read_file,
+)
+from ..image.pixels import encoding_of
 from ..image.remote import is_url
 
 MAX_SIDE = 1 << 16
@@ -136,7 +143,7 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
         If there is no such file, it is no image, or the shape or the size is wrong.
     """
     if is_url(source):
-        source = load_image(source, keep_grey, encoding)
+        source, encoding = read_file(source, keep_grey, encoding)
     if isinstance(source, (str, os.PathLike)):
         return _open_file(Path(source), keep_grey, encoding)
     if not hasattr(source, "shape") or not hasattr(source, "dtype"):
@@ -184,8 +191,8 @@ def _open_file(path: Path, keep_grey: bool, encoding: str | None) -> Source:
 def _decode_whole(path: Path, keep_grey: bool) -> tuple[Array, bool]:
     """Return the pixels of a file, 8 bits as 8 bits, and whether they are light."""
     if kind_of(path) is not None:
-        deep = load_image(path, keep_grey)
-        return np.asarray(deep), isinstance(deep, LinearImage)
+        found = read_file(path, keep_grey)
+        return found.pixels, found.encoding == "linear"
     with open_picture(path, MAX_SIDE) as picture:
         return picture_pixels(picture)[0], False
 

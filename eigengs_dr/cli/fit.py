@@ -292,19 +292,19 @@ def _fit_one(
 
 
 def _load(path: Any, options: FitOptions) -> Any:
-    from ..image.io import load_image
+    from ..image.io import read_file
 
-    return load_image(path, rendered_as(options.space) is None, options.encoding)
+    return read_file(path, rendered_as(options.space) is None, options.encoding)
 
 
 def load_maps(maps: dict[str, MapFile], encoding: str | None) -> dict[str, Any]:
     """Read the images of maps; grey data keep one channel."""
     from ..gaussian.channels import usual_space
-    from ..image.io import load_image
+    from ..image.io import read_file
 
     data = {name: rendered_as(m.space or usual_space(name)) is None for name, m in maps.items()}
     return {
-        name: load_image(m.path, data[name], None if data[name] else encoding)
+        name: read_file(m.path, data[name], None if data[name] else encoding)
         for name, m in maps.items()
     }
 

@@ -72,6 +72,8 @@ def pack(
     select(backend)
     import eigengs_dr as eg
 
+    from ..image.io import read_file
+
     gaussians = eg.Gaussians.load(file, backend)
     spaces = {m.name: m.space for m in gaussians.maps}
     if maps and not spaces:
@@ -80,7 +82,7 @@ def pack(
         raise ValueError(f"{file}: holds a material; give its images by --map NAME=FILE")
     if levels is not None and spaces:
         raise ValueError(f"{file}: a material has no levels in .egs files; leave --levels out")
-    images: Any = eg.load_image(image, gaussians.channels == 1, encoding) if image else None
+    images: Any = read_file(image, gaussians.channels == 1, encoding) if image else None
     if maps:
         known = {k: m._replace(space=m.space or spaces.get(k)) for k, m in maps.items()}
         images = load_maps(known, encoding)

@@ -67,12 +67,12 @@ def view(
     check_outputs([page], [file, *([image] if image else [])])
     select(backend)
     from ..image.color import rendered_as
-    from ..image.io import load_image
+    from ..image.io import read_file
     from ..viewer.view import view as make_page
 
     source, counts = _load(file, name, levels, backend)
     grey = rendered_as(getattr(source, "space", "rgb")) is None
-    pixels = load_image(image, grey, encoding) if image else None
+    pixels: Any = read_file(image, grey, encoding) if image else None
     try:
         made = make_page(source, pixels, levels=counts, title=file.stem)
     except ValueError as error:

@@ -29,9 +29,8 @@ from ..image.color import (
     to_log,
     to_pu21,
 )
-from ..image.io import read_image
+from ..image.io import check_data, check_image
 from ..image.metrics import MAX_PSNR, psnrs_by_rows
-from ..image.pixels import check_data, check_image
 from ..raster.render import picture_of, render
 from .egs import MAX_SECTIONS, SUFFIX
 from .quantization import Steps
@@ -189,7 +188,6 @@ def _compared(gaussians: Gaussians, image: ArrayLike, encoding: str | None) -> A
     """
     grey = gaussians.channels == 1
     data = rendered_as(gaussians.space) is None
-    image = read_image(image, data, None if data else encoding)
     pixels = check_data(image) if data else check_image(image, grey, encoding=encoding)
     expected = (gaussians.height, gaussians.width, gaussians.channels)
     if pixels.shape != expected:

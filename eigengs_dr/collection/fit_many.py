@@ -17,10 +17,10 @@ from ..fitting.options import FitOptions, refuse_unknown
 from ..fitting.start import load_start
 from ..fitting.target import unit_of
 from ..image.color import rendered_as
-from ..image.pixels import LinearImage
+from ..image.pixels import EncodedImage
 from .fit_batch import MAX_SIDE, fit_batch, fits_in_batches
 from .manifest import ImageRow
-from .run import FAILURES, Job, Outcome, Pixels, Work, run_images
+from .run import FAILURES, Job, Outcome, Work, run_images
 from .sources import Images
 
 MAX_GROUP_PIXELS = 1 << 18
@@ -132,33 +132,31 @@ def fit_work(options: FitOptions) -> Work:
     return partial(_fit_group, options=options)
 
 
-def _may_join(group: list[Pixels], pixels: Pixels) -> bool:
+def _may_join(group: list[EncodedImage], added: EncodedImage) -> bool:
     """Group small images of one size and encoding, up to `MAX_GROUP_PIXELS`."""
+    (first, encoding), (pixels, own) = group[0], added
     enough = (len(group) + 1) * pixels.shape[0] * pixels.shape[1] > MAX_GROUP_PIXELS
-    alike = type(group[0]) is type(pixels) and group[0].shape == pixels.shape
-    return alike and _is_small(pixels) and not enough
+    alike = encoding == own and first.shape == pixels.shape
+    return alike and max(pixels.shape[:2]) <= MAX_SIDE and not enough
 
 
-def _is_small(pixels: Pixels) -> bool:
-    return max(pixels.shape[:2]) <= MAX_SIDE
-
-
-def _fit_group(images: list[Pixels], options: FitOptions) -> Iterator[Outcome]:
+def _fit_group(images: list[EncodedImage], options: FitOptions) -> Iterator[Outcome]:
     """Fit images of one size, together if they are small."""
-    plain = not isinstance(images[0], LinearImage)
-    plain &= all(unit_of(image, options.space) == 1 for image in images)
-    if plain and fits_in_batches(options, images[0]):
+    pixels = [image.pixels for image in images]
+    plain = images[0].encoding == "srgb"
+    plain &= all(unit_of(values, options.space) == 1 for values in pixels)
+    if plain and fits_in_batches(options, pixels[0]):
         try:
-            results = fit_batch(np.stack(images), options)
+            results = fit_batch(np.stack(pixels), options)
         except FAILURES:
             pass  # below, each image says what is wrong with it
         else:
             for result in results:
                 yield Outcome(result.gaussians, result, _figures(result))
             return
-    for pixels in images:
+    for image in images:
         try:
-            result = fit_image(pixels, options)
+            result = fit_image(image, options)
         except FAILURES as error:
             yield Outcome(None, None, {"error": str(error) or type(error).__name__})
         else:

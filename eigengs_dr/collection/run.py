@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.executor import Executor, executor_for
 from ..backend.feedback import defer_interrupts, warn
 from ..gaussian.file import write
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import read_ahead
+from ..image.pixels import EncodedImage
 from .manifest import ImageRow, Manifest, RowProgress, RunInterrupted
 from .sources import Decoded, Images, Source, decode, list_sources, make_folder, plan_output
 
@@ -38,8 +38,6 @@ MAX_WRITING, MAX_WRITING_PIXELS = 32, 1 << 22
 
 FAILURES = (ValueError, OSError, MemoryError)
 """Errors of one image, which do not end the run."""
-
-Pixels = NDArray[np.float32]
 
 
 class Outcome(NamedTuple):
@@ -60,7 +58,7 @@ class Outcome(NamedTuple):
     figures: dict[str, Any]
 
 
-Work = Callable[[list[Pixels]], Iterator[Outcome]]
+Work = Callable[[list[EncodedImage]], Iterator[Outcome]]
 """``work(images)`` yields the outcome of every image of a group, in order."""
 
 
@@ -73,7 +71,7 @@ class Job:
     make_work : callable
         Returns the `Work`. It is called once in each process.
     may_join : callable
-        ``may_join(group, pixels)``: whether an image may join a group that is not empty.
+        ``may_join(group, image)``: whether an image may join a group that is not empty.
     keep_grey, encoding
         See `eigengs_dr.image.io.load_image`.
     steps
@@ -81,7 +79,7 @@ class Job:
     """
 
     make_work: Callable[[], Work]
-    may_join: Callable[[list[Pixels], Pixels], bool]
+    may_join: Callable[[list[EncodedImage], EncodedImage], bool]
     keep_grey: bool = False
     encoding: str | None = None
     steps: int = 0
@@ -209,25 +207,25 @@ def _is_file(source: Source) -> bool:
 
 
 def _bytes_of(decoded: Decoded) -> int:
-    return 0 if decoded.pixels is None else decoded.pixels.nbytes
+    return 0 if decoded.image is None else decoded.image.pixels.nbytes
 
 
 def _group(
-    decoded: Iterable[Decoded], may_join: Callable[[list[Pixels], Pixels], bool]
+    decoded: Iterable[Decoded], may_join: Callable[[list[EncodedImage], EncodedImage], bool]
 ) -> Iterator[list[Decoded]]:
     """Collect consecutive images that may be worked on together.
 
     Images without work stay in the group, so that the order of the images is kept.
     """
     group: list[Decoded] = []
-    images: list[Pixels] = []
+    images: list[EncodedImage] = []
     for item in decoded:
-        if item.pixels is not None and images and not may_join(images, item.pixels):
+        if item.image is not None and images and not may_join(images, item.image):
             yield group
             group, images = [], []
         group.append(item)
-        if item.pixels is not None:
-            images.append(item.pixels)
+        if item.image is not None:
+            images.append(item.image)
         elif not images:
             yield group
             group = []
@@ -237,13 +235,13 @@ def _group(
 
 def _work_on(group: list[Decoded], work: Work) -> Iterator[tuple[Finished, Gaussians | None]]:
     """Yield the rows of a group, with the Gaussians to write."""
-    outcomes = work([item.pixels for item in group if item.pixels is not None])
-    for source, pixels, may_pass in group:
-        if pixels is None:
+    outcomes = work([item.image for item in group if item.image is not None])
+    for source, image, may_pass in group:
+        if image is None:
             yield Finished(source.place, source.row, may_pass), None
             continue
         gaussians, result, figures = next(outcomes)
-        height, width = pixels.shape[:2]
+        height, width = image.pixels.shape[:2]
         row = replace(source.row, width=width, height=height, result=result, **figures)
         if gaussians is None:
             row = _failed(row, source, row.error)

@@ -5,16 +5,16 @@ from __future__ import annotations
 import glob
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..gaussian.file import read_head
 from ..image import io
 from ..image.folder import image_files
+from ..image.pixels import EncodedImage
 from ..image.remote import is_url, list_urls, stem_of
 from ..storage.atomic import refuse_url, require_writable
 from .manifest import ImageRow, Manifest
@@ -205,14 +205,14 @@ class Decoded(NamedTuple):
     ----------
     source : Source
         With the status "failed" and the error if the image cannot be read.
-    pixels : ndarray of float32, shape (H, W, C), or None
-        None if the source needs no work.
+    image : EncodedImage or None
+        Pixels (H, W, C) of float32, and what they are; None if the source needs no work.
     may_pass : bool
         Whether the failure may pass: the network did not bring the image.
     """
 
     source: Source
-    pixels: NDArray[np.float32] | None = None
+    image: EncodedImage | None = None
     may_pass: bool = False
 
 
@@ -226,15 +226,14 @@ def decode(source: Source, keep_grey: bool, encoding: str | None) -> Decoded:
     keep_grey : bool
         Whether the images are data, which keep one channel.
     encoding : {"srgb", "linear"} or None
-        What the pixels are, see `eigengs_dr.image.io.load_image`.
+        What the pixels are, see `eigengs_dr.image.io.check_image`.
     """
     if source.status:
         return Decoded(source)
     try:
-        if isinstance(source.image, (Path, str)):
-            return Decoded(source, io.load_image(source.image, keep_grey, encoding))
-        check = io.check_data if keep_grey else partial(io.mark_image, encoding=encoding)
-        return Decoded(source, check(source.image))
+        if keep_grey:
+            return Decoded(source, EncodedImage(io.check_data(source.image), "srgb"))
+        return Decoded(source, io.read_floats(source.image, encoding=encoding))
     except io.ImageError as error:
         text = str(error) if source.path else f"{source.name}: {str(error).removeprefix('image: ')}"
         return Decoded(source._replace(status="failed", error=text))

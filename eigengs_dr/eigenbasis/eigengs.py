@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..backend.feedback import shows_progress, to_html
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
-from ..image.io import check_image, read_image
+from ..image.io import check_image
 from ..image.resize import resample
 from .encoder import Encoder, check_encoding
 from .model_file import read_members, write_model
@@ -193,7 +193,7 @@ class EigenGS:
         UserWarning
             If all components miss the target; the result then has all of them.
         """
-        return self.encoder.project(check_image(read_image(image), copy=False), target_psnr)
+        return self.encoder.project(check_image(image, copy=False), target_psnr)
 
     @exclusive()
     def reconstruct(
@@ -245,7 +245,7 @@ class EigenGS:
             As `project`; also if an option is unknown, or a target comes with exact colours.
         """
         check_encoding(colors, mean, target_psnr)
-        pixels = check_image(read_image(image), copy=False)
+        pixels = check_image(image, copy=False)
         return self.encoder.encode([pixels], colors, mean, target_psnr)[0]
 
     @shows_progress

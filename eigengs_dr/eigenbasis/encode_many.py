@@ -16,7 +16,8 @@ from ..collection.manifest import ImageRow, RowProgress
 from ..collection.run import FAILURES, Job, Outcome, Work, run_images
 from ..collection.sources import Images
 from ..gaussian.gaussians import Gaussians
-from ..image.pixels import check_image
+from ..image.io import check_image
+from ..image.pixels import EncodedImage
 from .encoder import check_encoding
 
 if TYPE_CHECKING:
@@ -71,21 +72,21 @@ def encode_work(model: EigenGS, colors: str, mean: str, target_psnr: float | Non
     return partial(_encode_group, encode=encode)
 
 
-def _may_join(group: list[Pixels], pixels: Pixels) -> bool:
+def _may_join(group: list[EncodedImage], added: EncodedImage) -> bool:
     """Group images of any sizes, which all have the size of the model when they are encoded."""
-    area = sum(image.size for image in [*group, pixels]) // 3
+    area = sum(image.pixels.size for image in [*group, added]) // 3
     return len(group) < MAX_GROUP and area <= MAX_GROUP_PIXELS
 
 
-def _encode_group(images: list[Pixels], encode: EncodeGroup) -> Iterator[Outcome]:
+def _encode_group(images: list[EncodedImage], encode: EncodeGroup) -> Iterator[Outcome]:
     """Encode a group; if that fails, encode its images one by one to find the bad one."""
     started = time.perf_counter()
     try:
         sets = encode([check_image(image, copy=False) for image in images])
     except FAILURES as error:
         if len(images) > 1:
-            for pixels in images:
-                yield from _encode_group([pixels], encode)
+            for image in images:
+                yield from _encode_group([image], encode)
         else:
             yield Outcome(None, None, {"error": str(error) or type(error).__name__})
         return

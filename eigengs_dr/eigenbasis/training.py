@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..backend.feedback import defer_interrupts, warn
 from ..image.folder import list_images
-from ..image.io import ImageError, check_image, load_image
+from ..image.io import ImageError, check_image
 from ..image.metrics import psnr
 from ..image.remote import is_url
 from ..image.resize import center_crop
@@ -106,9 +106,7 @@ def _readable(
     for i, path in enumerate(files):
         watch(i)
         try:
-            image = center_crop(
-                check_image(load_image(path), copy=False), basis.width, basis.height
-            )
+            image = center_crop(check_image(path, copy=False), basis.width, basis.height)
         except (ImageError, OSError) as error:
             bad.append(str(error))
         else:

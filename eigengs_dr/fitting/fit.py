@@ -208,8 +208,8 @@ def fit(
         Radius of a Gaussian in standard deviations, in (0, 12]; the set keeps it.
     encoding : {"srgb", "linear"}, optional
         What the pixels of the image are: sRGB codes, or light as in renderings. By default what the
-        image says (`eigengs_dr.load_image` marks light, a ``mitsuba.Bitmap`` has a flag), else
-        "srgb". Data are used as they are.
+        image says (a file of floats holds light, a ``mitsuba.Bitmap`` has a flag), else "srgb".
+        Data are used as they are.
 
     Returns
     -------

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..gaussian.gaussians import Gaussians
 from ..image.color import LIGHT, rendered_as, rgb_to_ycbcr, to_linear, to_log
-from ..image.io import read_image
-from ..image.pixels import MAX_PIXEL, MIN_PIXEL, ImageError, check_data, check_image, encoding_of
+from ..image.io import check_data, check_image, read_image
+from ..image.pixels import MAX_PIXEL, MIN_PIXEL, ImageError
 from ..image.strips import by_strips
 from .options import FitOptions
 
@@ -49,10 +49,9 @@ def read_pixels(image: PixelsOrPath, options: FitOptions) -> tuple[NDArray[np.fl
     """
     if rendered_as(options.space) is None:
         return read_data(image, options.space), options
-    image = read_image(image, encoding=options.encoding)
-    encoding = encoding_of(image, options.encoding) or "srgb"
-    pixels = check_image(image, copy=False, encoding=encoding)
-    if encoding == "linear" and pixels.max() > WHITE:
+    found = read_image(image, encoding=options.encoding)
+    pixels = check_image(found, copy=False)
+    if found.encoding == "linear" and pixels.max() > WHITE:
         options = replace(options, space=BRIGHT.get(options.space, options.space))
     return pixels, options
 
@@ -65,7 +64,7 @@ def read_data(image: PixelsOrPath, space: str) -> NDArray[np.float32]:
     ImageError
         If the image is unusable, or no normal map.
     """
-    pixels = check_data(read_image(image, keep_grey=True), copy=False)
+    pixels = check_data(image, copy=False)
     if space != "normal":
         return pixels
     if pixels.shape[2] != 3:

@@ -28,31 +28,26 @@ from .formats import (
 from .openimageio import ADVICE, is_installed
 from .pixels import (
     MAX_PIXEL,
+    EncodedImage,
     ImageError,
-    LinearImage,
-    check_data,
     check_encoding,
-    check_image,
     check_light,
     check_range,
     encoding_of,
-    mark_image,
     to_floats,
 )
 from .remote import is_url, local_copy
-from .strips import map_threads, strips
+from .strips import by_strips, map_threads, strips
 
 __all__ = [
     "SAVE_OPTIONS",
     "SUFFIXES",
     "ImageError",
-    "LinearImage",
     "bits_of",
     "check_data",
     "check_image",
     "dtype_of",
     "load_image",
-    "mark_image",
     "open_picture",
     "picture_pixels",
     "read_image",
@@ -66,9 +61,7 @@ SUFFIXES = (*SAVE_OPTIONS, *FLOAT_SUFFIXES)
 """Suffixes of image files."""
 
 
-def load_image(
-    path: str | Path, keep_grey: bool = False, encoding: str | None = None
-) -> NDArray[np.float32]:
+def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]:
     """Read an image file as RGB.
 
     The function replicates grey, converts palette, CMYK and YCbCr, and applies the orientation of
@@ -83,14 +76,13 @@ def load_image(
         such a file, which needs fsspec, from the extra ``cluster``.
     keep_grey : bool, optional
         Return one channel if the file is opaque grey.
-    encoding : {"srgb", "linear"}, optional
-        What the pixels of the file are. By default "linear" for files of floats, else "srgb".
 
     Returns
     -------
     ndarray of float32, shape (H, W, 3) or (H, W, 1)
-        RGB. sRGB lies in [0, 1]. Light is not bounded, and marked by the type `LinearImage`, so
-        that `fit` and `save_image` know it.
+        What the file holds: sRGB in [0, 1], or light without a bound, of a file of floats. Pass
+        such an array on with ``encoding="linear"``; a function that takes the file itself, as
+        `fit` does, knows what the file holds.
 
     Warns
     -----
@@ -106,12 +98,22 @@ def load_image(
     OSError
         If a URL cannot be read.
     """
+    return read_file(path, keep_grey).pixels
+
+
+def read_file(
+    path: str | Path, keep_grey: bool = False, encoding: str | None = None
+) -> EncodedImage:
+    """Read an image file as `load_image` does, and say what its pixels are.
+
+    `encoding` overrules the file: by default files of floats hold light, others sRGB.
+    """
     check_encoding(encoding)
     if is_url(path):
         url = str(path)
         with local_copy(url) as file:
             try:
-                return load_image(file, keep_grey, encoding)
+                return read_file(file, keep_grey, encoding)
             except ImageError as error:
                 raise ImageError(str(error).replace(str(file), url)) from None
     path = Path(path)
@@ -125,19 +127,94 @@ def load_image(
         if frames > 1:
             warn(f"{path}: holds {frames} frames, the first is used")
         found = pixels, "srgb"
-    image = to_floats(found[0], str(path), keep_grey)
-    if (encoding or found[1]) == "linear":
-        return check_light(image, str(path)).view(LinearImage)
-    return check_range(image, str(path))
+    said = encoding or found[1]
+    return EncodedImage(_check(to_floats(found[0], str(path), keep_grey), str(path), said), said)
 
 
-def read_image(image: Any, keep_grey: bool = False, encoding: str | None = None) -> Any:
-    """Read an image that is a file or a URL; return anything else as it is.
+def _check(pixels: NDArray[np.float32], name: str, encoding: str) -> NDArray[np.float32]:
+    """Refuse pixels out of range."""
+    return check_light(pixels, name) if encoding == "linear" else check_range(pixels, name)
 
-    For parameters, results and errors see `load_image`.
+
+def read_image(image: Any, keep_grey: bool = False, encoding: str | None = None) -> EncodedImage:
+    """Read an image that is a file or a URL; say of anything else what its pixels are.
+
+    For parameters and errors see `read_file` and `eigengs_dr.image.pixels.encoding_of`. Pixels of
+    which nobody says what they are count as sRGB.
     """
-    is_file = isinstance(image, (str, os.PathLike))
-    return load_image(image, keep_grey, encoding) if is_file else image
+    if isinstance(image, (str, os.PathLike)):
+        return read_file(image, keep_grey, encoding)  # type: ignore[arg-type]
+    if isinstance(image, EncodedImage):
+        return image._replace(encoding=encoding or image.encoding)
+    return EncodedImage(image, encoding_of(image, encoding) or "srgb")
+
+
+def read_floats(
+    image: Any, keep_grey: bool = False, copy: bool = True, encoding: str | None = None
+) -> EncodedImage:
+    """Read an image and convert it to float32 as `load_image` does: light stays light.
+
+    For parameters and errors see `check_image`.
+    """
+    pixels, said = read_image(image, keep_grey, encoding)
+    floats = to_floats(pixels, "image", keep_grey, copy)
+    return EncodedImage(_check(floats, "image", said), said)
+
+
+def check_image(
+    image: Any, keep_grey: bool = False, copy: bool = True, encoding: str | None = None
+) -> NDArray[np.float32]:
+    """Convert an image to sRGB in float32, and refuse what is not an image.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W), (H, W, 1) or (H, W, 3); or path-like or URL
+        Grey or RGB: uint8 or uint16 (scaled to [0, 1]), bool, or floats with 1 as white. sRGB may
+        overshoot [0, 1] by 0.5, as in resampled images; it is not clamped. Light may have any
+        finite value. A file and a ``mitsuba.Bitmap`` say themselves what they hold.
+    keep_grey : bool, optional
+        Return one channel if the image is grey.
+    copy : bool, optional
+        Without it, a C-contiguous image of float32 in sRGB is returned as it is.
+    encoding : {"srgb", "linear"}, optional
+        What the pixels are. By default what the image says, else "srgb".
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W, 3) or (H, W, 1)
+        sRGB: light above 1 gives codes above 1, see `eigengs_dr.image.color.to_coded`. The array is
+        C-contiguous. It shares no memory with `image`, unless `copy` is False.
+
+    Raises
+    ------
+    ImageError
+        If the shape, the dtype or the range is wrong, the image has no pixels, or a pixel is not
+        finite.
+    ValueError
+        If the encoding is unknown.
+
+    Examples
+    --------
+    >>> check_image(np.array([[0, 51], [102, 255]], np.uint8))[..., 0]
+    array([[0. , 0.2],
+           [0.4, 1. ]], dtype=float32)
+    """
+    found = read_image(image, keep_grey, encoding)
+    light = found.encoding == "linear"
+    pixels = read_floats(found, keep_grey, copy and not light).pixels
+    return by_strips(to_coded, pixels) if light else pixels
+
+
+def check_data(image: Any, copy: bool = True) -> NDArray[np.float32]:
+    """Convert an image of data to float32: one channel or three, of any finite values.
+
+    For parameters, result and errors see `check_image`; integers are scaled to [0, 1], and nothing
+    is converted to sRGB.
+    """
+    if isinstance(image, (str, os.PathLike)):
+        image = load_image(image, keep_grey=True)  # type: ignore[arg-type]
+    pixels = image.pixels if isinstance(image, EncodedImage) else image
+    return check_light(to_floats(pixels, "image", keep_grey=True, copy=copy), "image")
 
 
 def _load_deep(path: Path, keep_grey: bool) -> tuple[NDArray[Any], str] | None:

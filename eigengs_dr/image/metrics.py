@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from .color import RGB_TO_YCBCR, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_linear, to_pu21
 from .io import to_8bit
-from .pixels import LinearImage, check_image
 from .strips import map_threads, strips
 
 MAX_PSNR = 100.0
@@ -44,8 +43,8 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     ----------
     a, b : array_like, shape (H, W, 3) or (H, W, 1)
         RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to
-        [0, 1]). Their order does not matter. Light from `eigengs_dr.load_image` is
-        encoded as sRGB first.
+        [0, 1]). Their order does not matter. Encode light as sRGB first, by
+        `eigengs_dr.image.color.to_coded`.
     space : {"rgb", "ycbcr", "data", "pu21"}
         Space in which the mean squared error over all pixels and channels is computed.
 
@@ -275,10 +274,7 @@ def _scaled(image: NDArray[Any]) -> NDArray[Any]:
 
 def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return both images as RGB of one shape (H, W, 3) without a copy; grey is replicated."""
-    x, y = (
-        check_image(image) if isinstance(image, LinearImage) else _scaled(np.asarray(image))
-        for image in (a, b)
-    )
+    x, y = (_scaled(np.asarray(image)) for image in (a, b))
     if x.shape != y.shape:
         raise ValueError(f"images have shapes {x.shape} and {y.shape}; crop or scale one of them")
     if x.ndim != 3 or x.shape[2] not in (1, 3) or x.size == 0:

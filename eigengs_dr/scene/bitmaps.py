@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..image.io import load_image
-from ..image.pixels import ImageError, LinearImage
+from ..image.io import check_image, read_file
+from ..image.pixels import ImageError
 from ..plugins import register_plugins  # first: its error says what to install
 
 # isort: split
@@ -168,15 +168,16 @@ def read_pixels(use: Use) -> NDArray[np.float32] | str:
     try:
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            image = load_image(use.file, keep_grey=use.raw)
+            found = read_file(use.file, keep_grey=use.raw)
     except ImageError as error:
         return str(error).removeprefix(f"{use.file}: ")
     if any("transparent" in str(warning.message) for warning in said):
         return "its pixels are transparent"
+    image = found.pixels
     if image.max() > 1.001 or image.min() < -0.001:
         return f"values from {image.min():g} to {image.max():g}, beyond 0 and 1"
-    if use.raw and isinstance(image, LinearImage):
-        image = np.asarray(image)
+    if not use.raw:
+        image = check_image(found, copy=False)
     extreme = float(((image <= 0.02) | (image >= 0.98)).all(axis=2).mean())
     if extreme >= TWO_VALUES and np.ptp(image) > 0.5:
         return "a mask of two values: Gaussians would soften its edges"

@@ -27,8 +27,8 @@ from ..gaussian.covariance import max_deviation
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.color import to_coded, to_linear
+from ..image.io import check_data, check_image
 from ..image.metrics import psnr as psnr_of
-from ..image.pixels import check_data, check_image
 from ..plugins.cone import PIXEL
 from ..raster.render import render
 from .target import MARGIN, error_weights, seen_by, smoothest_target

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from ..gaussian.covariance import outline
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
-from ..image.io import to_8bit
-from ..image.pixels import check_image
+from ..image.io import check_data, check_image, to_8bit
 from ..image.resize import resample
 
 OUTLINES = 800
@@ -83,9 +82,10 @@ def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
     return _outlined(under, subset, [HIGH_COLOR] * len(subset))
 
 
-def displayed(image: Picture, space: str) -> Picture:
-    """Return an image from `eigengs_dr.load_image` as people look at it: sRGB, or data."""
-    return np.asarray(image) if rendered_as(space) is None else check_image(image, copy=False)
+def displayed(image: Any, space: str) -> Picture:
+    """Return an image as people look at it: sRGB, or data."""
+    data = rendered_as(space) is None
+    return check_data(image, copy=False) if data else check_image(image, copy=False)
 
 
 def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Picture:

@@ -23,8 +23,7 @@ from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.gaussians import Gaussians, one_image
 from ..image.color import UNBOUNDED, rendered_as
-from ..image.io import read_image
-from ..image.pixels import check_data, check_image
+from ..image.io import check_data, check_image
 from ..storage.atomic import atomic_write
 from .facts import channel_views, describe_model, describe_set, describe_share, light_of
 from .pictures import check_aspect, photo_uri
@@ -203,5 +202,4 @@ def view(
 def _photo(image: ArrayLike, space: str, encoding: str | None) -> NDArray[np.float32]:
     """Return a photo as people look at it: sRGB, or data."""
     data = rendered_as(space) is None
-    image = read_image(image, data, None if data else encoding)
     return check_data(image) if data else check_image(image, encoding=encoding)

@@ -6,7 +6,6 @@ import pytest
 import eigengs_dr as eg
 from _helpers.clusters import QUICK, Here, files_of, folder_of_photos
 from eigengs_dr.collection import run
-from eigengs_dr.image.pixels import LinearImage
 
 
 @pytest.fixture
@@ -106,8 +105,9 @@ def test_images_and_steps_decide_the_chunks(side, iterations, longest):
 
 
 def test_light_stays_light(photos):
-    light = eg.sample("coffee")[:24, :32].astype(np.float32).view(LinearImage)
-    [far], [here] = (eg.fit_many([light], client=client, **QUICK) for client in (Here(), None))
+    light = eg.sample("coffee")[:24, :32].astype(np.float32)
+    quick = QUICK | {"encoding": "linear"}
+    [far], [here] = (eg.fit_many([light], client=client, **quick) for client in (Here(), None))
     np.testing.assert_array_equal(far.result.image, here.result.image)
 
 

@@ -9,8 +9,8 @@ import pytest
 import tifffile
 
 from _helpers.errors import one_line
-from eigengs_dr.image.io import ImageError, LinearImage, load_image, save_image
-from eigengs_dr.image.pixels import check_image
+from eigengs_dr.image.color import to_coded
+from eigengs_dr.image.io import ImageError, check_image, load_image, read_file, save_image
 
 LIGHT = (np.random.default_rng(0).random((5, 7, 3)) ** 8 * 5000).astype(np.float32)
 FLOATS = [".exr", ".hdr", ".pfm", ".tif"]
@@ -33,7 +33,7 @@ def test_floats_come_back(tmp_path, suffix, channels):
     path, light = tmp_path / f"a{suffix}", LIGHT[..., :channels]
     save_image(path, light, bits=32)
     found = load_image(path, keep_grey=True)
-    assert isinstance(found, LinearImage) and found.dtype == np.float32
+    assert read_file(path, keep_grey=True).encoding == "linear" and found.dtype == np.float32
     if suffix == ".hdr":  # 8 bits, and one exponent for three channels
         assert (np.abs(found - light) <= light.max(axis=2, keepdims=True) / 128).all()
     else:
@@ -46,7 +46,7 @@ def test_16_bits_come_back(tmp_path, suffix, channels):
     values = np.random.default_rng(1).integers(0, 65536, (5, 7, channels), np.uint16)
     save_image(tmp_path / f"a{suffix}", values, bits=16)
     found = load_image(tmp_path / f"a{suffix}", keep_grey=True)
-    assert not isinstance(found, LinearImage)
+    assert read_file(tmp_path / f"a{suffix}", keep_grey=True).encoding == "srgb"
     np.testing.assert_array_equal(np.rint(found * 65535), values)
 
 
@@ -180,18 +180,20 @@ def test_encoding_of_a_file_can_be_said(tmp_path):
     codes = np.full((2, 3, 3), 0.5)
     save_image(tmp_path / "a.exr", codes)
     save_image(tmp_path / "a.png", codes)
-    assert not isinstance(load_image(tmp_path / "a.exr", encoding="srgb"), LinearImage)
-    assert isinstance(load_image(tmp_path / "a.png", encoding="linear"), LinearImage)
+    assert read_file(tmp_path / "a.exr").encoding == "linear"
+    assert read_file(tmp_path / "a.png").encoding == "srgb"
+    np.testing.assert_array_equal(check_image(tmp_path / "a.exr", encoding="srgb"), 0.5)
+    light = check_image(tmp_path / "a.png", encoding="linear")
+    np.testing.assert_allclose(light, to_coded(load_image(tmp_path / "a.png")), rtol=1e-6)
     with pytest.raises(ValueError, match="encoding 'gamma' is unknown") as error:
-        load_image(tmp_path / "a.png", encoding="gamma")
+        check_image(tmp_path / "a.png", encoding="gamma")
     one_line(error)
 
 
 def test_light_is_coded_in_files_of_integers(tmp_path):
     light = np.full((2, 3, 3), 0.214041, np.float32)
-    for image, said in ((light, "linear"), (light.view(LinearImage), None)):
-        save_image(tmp_path / "a.png", image, encoding=said)
-        np.testing.assert_allclose(load_image(tmp_path / "a.png"), 0.5, atol=0.5 / 255)
+    save_image(tmp_path / "a.png", light, encoding="linear")
+    np.testing.assert_allclose(load_image(tmp_path / "a.png"), 0.5, atol=0.5 / 255)
     save_image(tmp_path / "a.png", light)
     np.testing.assert_allclose(load_image(tmp_path / "a.png"), light, atol=0.5 / 255)
 
@@ -207,9 +209,7 @@ def test_light_above_1_is_clamped_in_files_of_integers(tmp_path):
 
 
 def test_check_image_codes_light():
-    codes = check_image(LIGHT.view(LinearImage))
-    assert type(codes) is np.ndarray and codes.max() > 10
-    np.testing.assert_array_equal(codes, check_image(LIGHT, encoding="linear"))
+    assert check_image(LIGHT, encoding="linear").max() > 10
     np.testing.assert_allclose(
         check_image(np.full((1, 1, 3), 0.214041), encoding="linear"), 0.5, rtol=1e-6
     )
@@ -221,49 +221,6 @@ def test_check_image_codes_light():
 def test_light_beyond_single_precision():
     with pytest.raises(ImageError, match="scale it first"):
         check_image(np.full((2, 2), 1e10), encoding="linear")
-
-
-@pytest.mark.parametrize(
-    ("stays", "compute"),
-    [
-        (True, lambda light: (2 * light)[:2].copy()),
-        (True, lambda light: light / 3 + light - 0.25 * light),
-        (True, lambda light: light * np.array([1.0, 0.5, 0.25], np.float32)),
-        (True, lambda light: light.mean(axis=0, keepdims=True)),
-        (True, lambda light: np.maximum(light, 0)),
-        (True, lambda light: light @ np.eye(3)),
-        (True, lambda light: light.astype(np.float16)),
-        (False, lambda light: light ** (1 / 2.2)),
-        (False, lambda light: np.sqrt(light)),
-        (False, lambda light: np.log(1 + light)),
-        (False, lambda light: light * light),
-        (False, lambda light: light / light.max(axis=0)),
-        (False, lambda light: 1 / (1 + light)),
-        (False, lambda light: light > 0.5),
-        (False, lambda light: light.astype(np.uint8)),
-        (False, np.asarray),
-    ],
-)
-def test_light_stays_marked_while_it_is_light(stays, compute):
-    """Powers, ratios and integers are no light: they would be encoded a second time."""
-    result = compute(np.abs(LIGHT).view(LinearImage) + 1)
-    assert (type(result) is LinearImage) == stays
-    assert stays or type(result) is np.ndarray
-    plain = compute(np.abs(LIGHT) + 1)
-    np.testing.assert_array_equal(np.asarray(result), plain)
-
-
-def test_light_in_place():
-    light = np.abs(LIGHT).view(LinearImage)
-    light *= 2
-    assert type(light) is LinearImage
-    np.testing.assert_array_equal(np.asarray(light), 2 * np.abs(LIGHT))
-
-
-def test_coded_light_is_not_coded_again(tmp_path):
-    light = np.full((2, 2, 3), 0.214041, np.float32).view(LinearImage)
-    save_image(tmp_path / "a.png", light ** (1 / 2.2))
-    np.testing.assert_allclose(load_image(tmp_path / "a.png"), 0.4962, atol=1 / 255)
 
 
 @pytest.mark.mitsuba

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...backend.feedback import shows_progress, to_html, warn
 from ...image.color import check_size, to_planes, ycbcr_to_rgb
 from ...image.folder import Source
-from ...image.io import check_image, read_image
+from ...image.io import check_image
 from ...image.resize import resample
 from .basis_file import ENERGY_TOLERANCE, read_basis, write_basis
 from .incremental import EigenState, orient
@@ -268,7 +268,7 @@ class Eigenbasis:
 
     def _centred(self, image: ArrayLike) -> NDArray[np.float32]:
         """Resample and convert an image and subtract the mean; shape (C, H, W)."""
-        pixels = resample(check_image(read_image(image)), self.width, self.height)
+        pixels = resample(check_image(image), self.width, self.height)
         planes = to_planes(pixels, self.space) - self.mean.reshape(self.channels, -1)
         return planes.reshape(self.mean.shape)
 
