@@ -192,13 +192,14 @@ def test_images_read_ahead_are_few(tmp_path, output, monkeypatch):
         __hash__ = object.__hash__
 
     def load(source, keep_grey=False, encoding=None):
-        pixels = eg_load(path, keep_grey).view(Pixels)
+        found = read_file(path, keep_grey)
+        pixels = found.pixels.view(Pixels)
         alive.add(pixels)
         most.append(len(alive))
-        return pixels
+        return found._replace(pixels=pixels)
 
-    eg_load = io.load_image
-    monkeypatch.setattr(io, "load_image", load)
+    read_file = io.read_file
+    monkeypatch.setattr(io, "read_file", load)
     size = 4 * 24 * 32 * 3
     monkeypatch.setattr(folder, "MAX_WAITING_BYTES", 5 * size)
     monkeypatch.setattr(fit_many_module, "MAX_GROUP_PIXELS", 3 * 24 * 32)

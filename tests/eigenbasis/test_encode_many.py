@@ -8,6 +8,7 @@ from _helpers.families import family, small_model, splits
 from eigengs_dr.eigenbasis import encode_many
 from eigengs_dr.eigenbasis.encoder import Encoder
 from eigengs_dr.image.io import save_image
+from eigengs_dr.image.pixels import EncodedImage
 
 
 @pytest.mark.parametrize(
@@ -86,8 +87,8 @@ def test_one_failure_does_not_fail_its_group(backend, monkeypatch):
     assert rows[1].error == "000001: MemoryError"
 
 
-def test_groups_are_bounded(monkeypatch):
-    small, large = np.zeros((10, 10, 3), np.float32), np.zeros((2000, 2000, 3), np.float32)
+def test_groups_are_bounded():
+    small, large = (EncodedImage(np.zeros((n, n, 3), np.float32), "srgb") for n in (10, 2000))
     assert encode_many._may_join([small] * 31, small)
     assert not encode_many._may_join([small] * 32, small)
     assert not encode_many._may_join([large], large)
