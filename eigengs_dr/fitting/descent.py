@@ -15,7 +15,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import ArrayTypes, Float, UInt, types_of, upload
+from ..backend.arrays import ArrayTypes, Float, UInt, make_divisor, types_of, upload
 from ..backend.recording import freeze_program, release_later
 from ..gaussian.gaussians import Gaussians
 from ..raster.adjoint import adjoint_pieces, sum_pieces
@@ -30,7 +30,6 @@ from .schedule import (
     first_phase,
     lr_factor,
     next_build,
-    rate_scale_of,
     relocations,
     surplus_for,
 )
@@ -385,12 +384,49 @@ def start_descent(gaussians: Gaussians, schedule: Schedule, images: int = 1) -> 
     variables = {name: dr.detach(encoded[name]) for name in schedule.rates}
     dr.eval(variables)
     moments = {name: optimizer.start(value) for name, value in variables.items()}
-    rate_scale, Float = None, types_of(gaussians.mean).Float
+    rate_scale = None
     if schedule.rate_exponent:
-        rows = [np.broadcast_to(row.numpy(), len(gaussians)) for row in gaussians.color]
-        color = np.stack(rows, axis=1).reshape(images, -1, len(rows))
-        rate_scale = upload(Float, rate_scale_of(color, schedule.rate_exponent).ravel())
+        zeros = dr.zeros(types_of(gaussians.mean).Float, len(gaussians))
+        color = [dr.detach(row) + zeros for row in gaussians.color]
+        rate_scale = rate_scale_of(color, schedule.rate_exponent, images)
+        dr.eval(rate_scale)
     return Descent(variables, moments, gaussians, pack(gaussians), rate_scale)
+
+
+MAX_RATE_SCALE = 1.7
+"""How much faster or slower than the others a Gaussian may move."""
+
+
+def rate_scale_of(color: list, exponent: float, images: int = 1) -> Float:
+    """Return factors of learning rates for the Gaussians of one image after another.
+
+    The error depends most on bright Gaussians, so they move less. With the length of a colour |c|,
+    the factor is ``(mean |c| / |c|)^exponent``, at most `MAX_RATE_SCALE` and at least its inverse.
+    The mean is that of the own image.
+
+    Parameters
+    ----------
+    color : list of Float, shape (N,)
+        By channels.
+    exponent : float
+    images : int, optional
+
+    Returns
+    -------
+    Float, shape (N,)
+        1 if all colours are 0.
+    """
+    types = types_of(color[0])
+    length = dr.sqrt(sum(dr.square(row) for row in color))
+    count = dr.width(length) // images
+    mean = dr.sum(length)
+    if images > 1:
+        own, _ = make_divisor(types, count).divmod(dr.arange(types.UInt, dr.width(length)))
+        mean = dr.gather(types.Float, dr.block_sum(length, count), own)
+    mean *= dr.opaque(types.Float, 1 / count)
+    ratio = dr.select(mean > 0, mean / length, types.Float(1))
+    bound = MAX_RATE_SCALE ** (1 / exponent)
+    return dr.clip(ratio, 1 / bound, bound) ** exponent
 
 
 def pack(gaussians: Gaussians) -> Float:

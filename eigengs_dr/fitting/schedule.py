@@ -12,9 +12,6 @@ from dataclasses import dataclass, field
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 if TYPE_CHECKING:
     from .parameterization import Optimizer, Parameterization
 
@@ -79,7 +76,8 @@ class Schedule:
     surplus : float
         Share of Gaussians that are placed in addition and leave again, see `surplus_for`.
     rate_exponent : float
-        Exponent by which the rates of means and shapes fall with the colour, see `rate_scale_of`.
+        Exponent by which the rates of means and shapes fall with the colour, see
+        `eigengs_dr.fitting.descent.rate_scale_of`.
     """
 
     optimizer: str
@@ -134,34 +132,6 @@ def lr_factor(schedule: Schedule, step: int, iterations: int, start: int = 0) ->
     along = 0.5 * (1 + math.cos(math.pi * step / iterations))
     left = schedule.decay + (1 - schedule.decay) * along
     return left * min(1.0, max(0, step - start + 1) / max(1, schedule.warm_up))
-
-
-MAX_RATE_SCALE = 1.7
-"""How much faster or slower than the others a Gaussian may move."""
-
-
-def rate_scale_of(color: NDArray[np.floating], exponent: float) -> NDArray[np.float32]:
-    """Return factors of learning rates, for sets of Gaussians.
-
-    The error depends most on bright Gaussians, so they move less. With the length of a colour |c|,
-    the factor is ``(mean |c| / |c|)^exponent``, at most `MAX_RATE_SCALE` and at least its inverse.
-
-    Parameters
-    ----------
-    color : ndarray, shape (M, N, C)
-        Colours of N Gaussians of each of M sets.
-    exponent : float
-
-    Returns
-    -------
-    ndarray of float32, shape (M, N)
-        1 if all colours are 0.
-    """
-    length = np.sqrt(np.square(color, dtype=np.float64).sum(axis=2))
-    mean = length.mean(axis=1, keepdims=True)
-    ratio = np.divide(mean, length, out=np.full_like(length, np.inf), where=length > 0)
-    ratio[(mean == 0).ravel()] = 1
-    return np.clip(ratio**exponent, 1 / MAX_RATE_SCALE, MAX_RATE_SCALE).astype(np.float32)
 
 
 RELOCATE_UNTIL, MIN_RELOCATIONS, MAX_RELOCATIONS = 0.65, 2, 72

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from eigengs_dr.backend.arrays import types_in, upload, upload_rows
+from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.density_control import MAX_NOISE, SHAPE_SHARE, perturb
+from eigengs_dr.fitting.schedule import Relocation
 
 COUNT, SIDE = 4000, 48
 
@@ -27,16 +30,20 @@ def moves(before, after):
     return np.stack([a * x + b * y, c * y]), np.stack([k / a, (m - k * b / a) / c, n / c])
 
 
-def copied(arrays):
-    return {name: values.copy() for name, values in arrays.items()}
+def perturbed(before, error, strength, seed, own=range(COUNT), backend="llvm", images=1):
+    """The arrays after `perturb`; the error is that of each image."""
+    types = types_in(select(backend), 64)
+    mean, factor, color = (upload_rows(types.Float, before[k].T) for k in before)
+    errors = upload(types.Float, np.broadcast_to(error, images))
+    how = Relocation(0.1, strength, seed)
+    after = perturb(types.Float2(*mean), types.Float3(*factor), color, own, errors, how)
+    return {"mean": after[0].numpy().T, "factor": after[1].numpy().T}
 
 
-def test_each_mean_adds_the_same_error():
+def test_each_mean_adds_the_same_error(backend):
     """``|F dm|^2`` has the mean ``2 e^2``, with ``e^2 = strength^2 error / (pi |A|^2)``."""
     before, strength, error = scene(1.0), 0.5, 0.01
-    after = copied(before)
-    perturb(after, np.arange(COUNT), error, strength, seed=3)
-    moved, shape = moves(before, after)
+    moved, shape = moves(before, perturbed(before, error, strength, 3, backend=backend))
     a, _, c = before["factor"].T
     amplitude = np.square(before["color"]).sum(axis=1) / (a * c)
     e = np.minimum(strength * np.sqrt(error / (np.pi * amplitude)), MAX_NOISE)
@@ -45,39 +52,43 @@ def test_each_mean_adds_the_same_error():
     logs = np.stack([np.log(shape[0]), np.log(shape[2])]) / e
     np.testing.assert_allclose(logs.std(axis=1), SHAPE_SHARE, atol=0.03)
     np.testing.assert_allclose((shape[1] / e).std(), SHAPE_SHARE, atol=0.03)
-    np.testing.assert_array_equal(after["color"], before["color"])
 
 
 @pytest.mark.parametrize("color", [0.0, 1e-30, 1e-6])
 def test_faint_gaussians_move_by_the_largest_noise(color):
     before = scene(color)
-    after = copied(before)
-    perturb(after, np.arange(COUNT), 0.01, 1.0, seed=0)
-    np.testing.assert_allclose(moves(before, after)[0].std(axis=1), MAX_NOISE, rtol=0.05)
+    moved = moves(before, perturbed(before, 0.01, 1.0, 0))[0]
+    np.testing.assert_allclose(moved.std(axis=1), MAX_NOISE, rtol=0.05)
 
 
 def test_only_the_own_gaussians_move():
-    before, own = scene(1.0), np.arange(10, 30)
-    after = copied(before)
-    perturb(after, own, 0.01, 1.0, seed=0)
+    before = scene(1.0)
+    after = perturbed(before, 0.01, 1.0, 0, own=range(10, 30))
     moved = np.flatnonzero((after["mean"] != before["mean"]).any(axis=1))
-    np.testing.assert_array_equal(moved, own)
+    np.testing.assert_array_equal(moved, range(10, 30))
 
 
 def test_a_perfect_image_keeps_its_gaussians():
     before = scene(1.0)
-    after = copied(before)
-    perturb(after, np.arange(COUNT), 0.0, 1.0, seed=0)
-    for name in before:
+    after = perturbed(before, 0.0, 1.0, 0)
+    for name in after:
         np.testing.assert_allclose(after[name], before[name], rtol=1e-12)
 
 
 def test_seeds():
-    sets = [copied(scene(1.0)) for _ in range(3)]
-    for arrays, seed in zip(sets, (1, 1, 2), strict=True):
-        perturb(arrays, np.arange(COUNT), 0.01, 1.0, seed)
-    assert (sets[0]["mean"] == sets[1]["mean"]).all()
-    assert (sets[0]["mean"] != sets[2]["mean"]).any()
+    sets = [perturbed(scene(1.0), 0.01, 1.0, seed)["mean"] for seed in (1, 1, 2)]
+    assert (sets[0] == sets[1]).all()
+    assert (sets[0] != sets[2]).any()
+
+
+def test_images_of_a_batch_have_the_noise_that_they_have_alone():
+    before, errors = scene(1.0), np.array([0.01, 0.1])
+    both = {name: np.tile(values, (2, 1)) for name, values in before.items()}
+    after = perturbed(both, errors, 1.0, 5, images=2)
+    for k, error in enumerate(errors):
+        alone = perturbed(before, error, 1.0, 5)
+        for name, values in alone.items():
+            np.testing.assert_array_equal(after[name].reshape(2, COUNT, -1)[k], values)
 
 
 def test_the_error_added_to_an_image():
@@ -96,7 +107,6 @@ def test_the_error_added_to_an_image():
 
     strength, error, added = 0.3, 0.05, []
     for seed in range(200):
-        moved = copied(arrays)
-        perturb(moved, np.arange(1), error, strength, seed)
+        moved = perturbed(arrays, error, strength, seed, own=range(1))
         added.append(np.square(image(moved["mean"]) - image(arrays["mean"])).sum())
     assert np.mean(added) == pytest.approx(strength**2 * error, rel=0.2)

@@ -25,10 +25,10 @@ def test_other_starts_stay_where_they_were_put(init):
 
 def test_relocation_gains_from_any_start():
     image = eg.sample("coffee")[100:164, 200:264]
-    options = FitOptions(gaussians=200, init="grid", iterations=300)
+    options = FitOptions(gaussians=200, init="grid")
     start = initialize(image, options)
     moved, left = (
-        refine(problem, image, options.method.schedule, 300).row["psnr_rgb"]
+        refine(problem, image, options.method.schedule, 1000).row["psnr_rgb"]
         for problem in (start, start._replace(control=None))
     )
     assert moved > left + 0.5

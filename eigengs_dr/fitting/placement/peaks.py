@@ -5,7 +5,8 @@ A round Gaussian with the weights w, of the standard deviation s, and with the b
 Along one axis the weights are ``exp(-k^2 / (2 s^2))`` for the offsets k, so ``<w, r>`` is a blur
 along columns and then along rows, and ``<w, w>`` is the square of ``T = sum_k exp(-k^2 / s^2)``.
 
-Images are in tile layout. A lane owns a tile, or a run: the 4 pixels of a row of a tile.
+Images are in tile layout. A lane owns a tile, or a run: the 4 pixels of a row of a tile. A batch of
+images takes one launch of each kernel, and each image has peaks of its own.
 """
 
 from __future__ import annotations
@@ -15,9 +16,8 @@ from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
-from ...backend.arrays import ArrayTypes, Bool, Float, UInt, types_of
+from ...backend.arrays import ArrayTypes, Bool, Float, UInt, make_divisor, types_of
 from ...raster.binning.tiles import TILE, Grid, GridArrays
 from ...raster.parameters import gather_run
 from ...raster.render import pixels_inside
@@ -39,21 +39,25 @@ RUN, ROWS = TILE
 
 
 class Peaks(NamedTuple):
-    """Round Gaussians that would reduce the error most, the best first.
+    """Round Gaussians that would reduce the error most: image after image, the best first.
 
     Attributes
     ----------
-    mean : ndarray, shape (n, 2)
+    mean : Array2f, shape (n, 2)
         In pixels.
-    size : ndarray, shape (n,)
+    size : Float, shape (n,)
         Standard deviations in pixels.
-    color : ndarray, shape (n, C)
-        Best colours.
+    color : list of Float, shape (n,)
+        Best colours, by channels.
+    image, rank : UInt32, shape (n,)
+        The image, and the place of the peak among those of its image.
     """
 
-    mean: NDArray[np.floating]
-    size: NDArray[np.floating]
-    color: NDArray[np.floating]
+    mean: Float
+    size: Float
+    color: list
+    image: UInt
+    rank: UInt
 
 
 class _Runs(NamedTuple):
@@ -62,26 +66,46 @@ class _Runs(NamedTuple):
     Attributes
     ----------
     sizes : GridArrays
-    column, row : UInt32
-        The column of the tile, and the row of the pixels.
+    column, row : Int32
+        The column of the tile, and the row of the pixels in their image.
+    first : Int32
+        The index of the first run of the image.
     """
 
     sizes: GridArrays
     column: UInt
     row: UInt
+    first: UInt
 
-    def at(self, column: UInt, row: UInt) -> tuple[UInt, Bool]:
+    def at(self, column: UInt, row: UInt, first: UInt) -> tuple[UInt, Bool]:
         """Return the index in tile layout of the run in a place, and whether there is one."""
         inside = (column >= 0) & (column < self.sizes.nx)
         inside &= (row >= 0) & (row < self.sizes.ny * ROWS)
         tile = row // ROWS * self.sizes.nx + column
-        return dr.uint32_array_t(row)(tile * ROWS + row % ROWS), inside
+        return dr.uint32_array_t(row)(first + tile * ROWS + row % ROWS), inside
+
+    def of(self, place: UInt) -> tuple[UInt, UInt, UInt]:
+        """Return column and row of pixels by their indices, and `first` of their images."""
+        lane = place // RUN
+        column, row, first = (
+            dr.gather(type(v), v, lane) for v in (self.column, self.row, self.first)
+        )
+        return column * RUN + type(column)(place % RUN), row, first
 
 
 def _runs(types: ArrayTypes, grid: Grid) -> _Runs:
     sizes, lane = grid.in_arrays(types), dr.arange(types.UInt, grid.tiles * ROWS)
-    row, column = sizes.row.divmod(lane // ROWS)
-    return _Runs(sizes, types.Int(column), types.Int(row * ROWS + lane % ROWS))
+    tile = lane // ROWS
+    column, row = (types.Int(v) for v in sizes.first_pixel(tile))
+    first = _first_run(types, grid, sizes.image_of(tile)) + dr.zeros(types.Int, dr.width(lane))
+    return _Runs(sizes, column // RUN, row + types.Int(lane % ROWS), first)
+
+
+def _first_run(types: ArrayTypes, grid: Grid, image: UInt) -> UInt:
+    """Return the index of the first run of an image; the image is None if there is only one."""
+    if image is None:
+        return types.Int(0)
+    return types.Int(image) * dr.opaque(types.Int, grid.nx * grid.ny * ROWS)
 
 
 def residual_peaks(
@@ -105,10 +129,9 @@ def residual_peaks(
     missed : Float, shape (pixels * channels,)
         Residual r in tile layout, 0 outside the image.
     grid : Grid
-        Of one image.
     channels : int
     count : int
-        Largest number of peaks.
+        Largest number of peaks of an image.
     spacing : float
         Mean distance between Gaussians in pixels.
     squares : Float, optional
@@ -120,13 +143,16 @@ def residual_peaks(
     """
     types, times = types_of(missed), int(spacing / WORKING_SPACING)
     if times > 1:
-        small = Grid(-(-grid.width // times), -(-grid.height // times))
+        side = -(-grid.width // times), -(-grid.height // times)
+        small = Grid(*side, images=grid.images)
         missed, squares = (
             None if v is None else _shrunk(v, grid, small, channels, times)
             for v in (missed, squares)
         )
-        on_small = residual_peaks(missed, small, channels, count, spacing / times, squares)
-        return Peaks(on_small.mean * times, on_small.size * times, on_small.color)
+        peaks = residual_peaks(missed, small, channels, count, spacing / times, squares)
+        if not dr.width(peaks.size):
+            return peaks
+        return peaks._replace(mean=peaks.mean * times, size=peaks.size * times)
     runs = _runs(types, grid)
     pixels = grid.tiles * grid.pixels
     best = tuple(dr.zeros(types.Float, pixels * n) for n in (1, 1, channels))
@@ -135,39 +161,63 @@ def residual_peaks(
         best = _better(missed, grid, channels, deviation, squares, best)
     gain, size, color = best
     top = _local_maxima(gain, runs)
-    reach = math.ceil(SUPPRESSION_RADIUS * CANDIDATE_SIZES[-1] * spacing)
     place = dr.compress(top > 0)
-    if not dr.width(place):
-        return Peaks(np.zeros((0, 2)), np.zeros(0), np.zeros((0, channels)))
-    place = _apart(place, top, size, runs, reach)
-    column, row = _pixels(place, runs)
-    rows = [
-        dr.gather(types.Float, gain, place),
-        types.Float(column) + 0.5,
-        types.Float(row) + 0.5,
+    if dr.width(place):
+        reach = math.ceil(SUPPRESSION_RADIUS * CANDIDATE_SIZES[-1] * spacing)
+        place = _apart(place, top, size, runs, reach)
+    place, image, rank = _ranked(place, gain, grid, count)
+    if not dr.width(place):  # Dr.Jit does not compute with no elements
+        none = types.Float()
+        return Peaks(types.Float2(none, none), none, [none] * channels, place, place)
+    column, row, _ = runs.of(place)
+    peaks = Peaks(
+        types.Float2(types.Float(column) + 0.5, types.Float(row) + 0.5),
         dr.gather(types.Float, size, place),
-        *[dr.gather(types.Float, color, place * channels + c) for c in range(channels)],
-    ]
-    dr.eval(rows)
-    found = np.stack([v.numpy() for v in rows], axis=1)
-    first = np.argsort(-found[:, 0], kind="stable")[:count]
-    _, x, y, deviation, *colors = found[first].T
-    return Peaks(np.stack([x, y], axis=1), deviation, np.stack(colors, axis=1))
+        [dr.gather(types.Float, color, place * channels + c) for c in range(channels)],
+        image,
+        rank,
+    )
+    dr.eval(peaks)
+    return peaks
 
 
-def _shrunk(image: Float, grid: Grid, small: Grid, channels: int, times: int) -> Float:
-    """Return the means over squares of pixels of an image in tile layout; evaluated."""
-    types, side = types_of(image), dr.opaque(types_of(image).Int, times)
+def _ranked(place: UInt, gain: Float, grid: Grid, count: int) -> tuple[UInt, UInt, UInt]:
+    """Return the best `count` places of each image by falling gain, their images and ranks."""
+    types, number = types_of(gain), dr.width(place)
+    if not number:
+        return place, place, place
+    order = dr.argsort(-dr.gather(types.Float, gain, place))
+    place = dr.gather(types.UInt, place, order)
+    rank, image = dr.arange(types.UInt, number), dr.zeros(types.UInt, number)
+    if grid.images > 1:
+        image, _ = make_divisor(types, grid.tiles * grid.pixels // grid.images).divmod(place)
+        order = dr.argsort(image)
+        place, image = (dr.gather(types.UInt, v, order) for v in (place, image))
+        sums = dr.zeros(types.UInt, grid.images)
+        dr.scatter_add(sums, types.UInt(1), image)
+        rank -= dr.gather(types.UInt, dr.prefix_sum(sums), image)
+    first = dr.compress(rank < dr.opaque(types.UInt, count))
+    if not dr.width(first):
+        return first, first, first
+    place, image, rank = (dr.gather(types.UInt, v, first) for v in (place, image, rank))
+    return place, image, rank
+
+
+def _shrunk(values: Float, grid: Grid, small: Grid, channels: int, times: int) -> Float:
+    """Return the means over squares of pixels of images in tile layout; evaluated."""
+    types, side = types_of(values), dr.opaque(types_of(values).Int, times)
     runs, large = _runs(types, small), _runs(types, grid)
-    x, y = _pixels(dr.arange(types.UInt, small.tiles * small.pixels), runs)
+    place = dr.arange(types.UInt, small.tiles * small.pixels)
+    x, y, _ = runs.of(place)
+    first = _first_run(types, grid, runs.sizes.image_of(place // small.pixels))
     width, height = (types.Int(v) for v in (large.sizes.width, large.sizes.height))
 
     def add(i: UInt, j: UInt, number: Float, sums: list) -> tuple:
         column, row = x * side + i, y * side + j
-        at, _ = large.at(column // RUN, row)
+        at, _ = large.at(column // RUN, row, first)
         inside = (column < width) & (row < height)
-        place = (at * RUN + type(at)(column % RUN)) * channels
-        sums = [s + dr.gather(types.Float, image, place + c, inside) for c, s in enumerate(sums)]
+        start = (at * RUN + type(at)(column % RUN)) * channels
+        sums = [s + dr.gather(types.Float, values, start + c, inside) for c, s in enumerate(sums)]
         ends = i + 1 == side
         number = number + dr.select(inside, types.Float(1), 0)
         return dr.select(ends, 0, i + 1), dr.select(ends, j + 1, j), number, sums
@@ -247,10 +297,9 @@ def _blur(image: Float, grid: Grid, channels: int, slope: Float, radius: UInt, a
     """
     types, side, length = types_of(image), TILE[axis], grid.pixels * channels
     sizes = grid.in_arrays(types)
-    row, column = (types.Int(v) for v in sizes.row.divmod(dr.arange(types.UInt, grid.tiles)))
-    here, step = ((column, 1), (row, sizes.nx))[axis]
-    count = (sizes.nx, sizes.ny)[axis]
     own = types.Int(dr.arange(types.UInt, grid.tiles))
+    here = types.Int(sizes.first_pixel(types.UInt(own))[axis]) // side
+    step, count = ((1, sizes.nx), (sizes.nx, sizes.ny))[axis]
     tiles = (radius + side - 1) // side
     pixel_of = [(n % TILE[0], n // TILE[0]) for n in range(grid.pixels)]
 
@@ -288,7 +337,7 @@ def _local_maxima(gain: Float, runs: _Runs) -> Float:
     for step in (-1, 0, 1):
         values: list = []
         for tile in (-1, 0, 1):
-            at, inside = runs.at(runs.column + tile, runs.row + step)
+            at, inside = runs.at(runs.column + tile, runs.row + step, runs.first)
             values += gather_run(types, gain, at, RUN, inside)
         rows.append(values[RUN - 1 : 2 * RUN + 1])
     across = [dr.maximum(dr.maximum(a, b), c) for a, b, c in zip(*rows, strict=True)]
@@ -303,24 +352,17 @@ def _local_maxima(gain: Float, runs: _Runs) -> Float:
     return result
 
 
-def _pixels(place: UInt, runs: _Runs) -> tuple[UInt, UInt]:
-    """Return column and row of pixels by their indices in tile layout."""
-    lane = place // RUN
-    column, row = (dr.gather(type(v), v, lane) for v in (runs.column, runs.row))
-    return column * RUN + type(column)(place % RUN), row
-
-
 def _apart(place: UInt, top: Float, size: Float, runs: _Runs, reach: int) -> UInt:
     """Return the maxima that no better maximum within its own radius suppresses."""
     types = types_of(top)
-    column, row = _pixels(place, runs)
+    column, row, start = runs.of(place)
     own = dr.gather(types.Float, top, place)
     limit = dr.opaque(types.Int, reach)
     first, last = (column - limit) // RUN, (column + limit) // RUN
     x, y = types.Float(column), types.Float(row)
 
     def look(i: UInt, j: UInt, is_best: Bool) -> tuple:
-        at, inside = runs.at(i, j)
+        at, inside = runs.at(i, j, start)
         inside &= j <= row + limit
         gains, sizes = (gather_run(types, v, at, RUN, inside) for v in (top, size))
         for k in range(RUN):

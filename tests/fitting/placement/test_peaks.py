@@ -1,5 +1,7 @@
 """The peaks of an error, beside a plain search by NumPy and SciPy."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,14 +18,23 @@ from eigengs_dr.fitting.placement.peaks import (
     residual_peaks,
 )
 from eigengs_dr.raster.binning.tiles import Grid
-from eigengs_dr.raster.render import to_tiles
+from eigengs_dr.raster.render import batch_to_tiles, to_tiles
 
 
 def found_peaks(missed, count, spacing, weight=None, backend="llvm"):
     types, grid = types_in(select(backend)), Grid(missed.shape[1], missed.shape[0])
     squares = None if weight is None else to_tiles(types, np.square(weight, dtype=np.float32), grid)
     image = to_tiles(types, missed.astype(np.float32), grid)
-    return residual_peaks(image, grid, missed.shape[2], count, spacing, squares)
+    return to_numpy(residual_peaks(image, grid, missed.shape[2], count, spacing, squares))
+
+
+def to_numpy(peaks):
+    """Mean (n, 2), size (n,) and colour (n, C)."""
+    return SimpleNamespace(
+        mean=peaks.mean.numpy().T,
+        size=peaks.size.numpy(),
+        color=np.stack([row.numpy() for row in peaks.color], axis=1),
+    )
 
 
 def plain_peaks(missed, spacing, weight=None):
@@ -81,27 +92,28 @@ def test_the_gain_of_a_place_is_what_a_gaussian_takes(backend, deviation):
     """Of a residual that is one round Gaussian of a tried size, also where it is below a pixel."""
     y, x = np.indices((64, 64)) + 0.5
     alone = 0.7 * np.exp(-((x - 32.5) ** 2 + (y - 30.5) ** 2) / (2 * deviation**2))
-    mean, size, color = found_peaks(alone[..., None], 1, deviation, backend=backend)
-    np.testing.assert_allclose(mean, [[32.5, 30.5]])
-    np.testing.assert_allclose(size, [deviation], rtol=1e-6)
-    np.testing.assert_allclose(color, [[0.7]], rtol=0.01)
+    found = found_peaks(alone[..., None], 1, deviation, backend=backend)
+    np.testing.assert_allclose(found.mean, [[32.5, 30.5]])
+    np.testing.assert_allclose(found.size, [deviation], rtol=1e-6)
+    np.testing.assert_allclose(found.color, [[0.7]], rtol=0.01)
 
 
 def test_a_wide_gaussian_is_found_on_a_smaller_image(backend):
     y, x = np.indices((101, 90)) + 0.5
     alone = 0.7 * np.exp(-((x - 39) ** 2 + (y - 57) ** 2) / (2 * 12.0**2))
     missed = np.stack([alone, 0 * alone, -alone], axis=2)
-    mean, size, color = found_peaks(missed, 1, 12.0, backend=backend)
-    np.testing.assert_allclose(mean, [[39, 57]], atol=2)
-    np.testing.assert_allclose(size, [12.0], rtol=1e-6)
-    np.testing.assert_allclose(color, [[0.7, 0, -0.7]], atol=0.02)
+    found = found_peaks(missed, 1, 12.0, backend=backend)
+    np.testing.assert_allclose(found.mean, [[39, 57]], atol=2)
+    np.testing.assert_allclose(found.size, [12.0], rtol=1e-6)
+    np.testing.assert_allclose(found.color, [[0.7, 0, -0.7]], atol=0.02)
 
 
 @given(st.integers(0, 40))
 def test_places_keep_apart_and_never_exceed(count):
     missed = np.random.default_rng(count).normal(size=(24, 20, 3))
-    mean, size, color = found_peaks(missed, count, 4.0)
-    assert len(mean) == len(size) == len(color) <= count
+    found = found_peaks(missed, count, 4.0)
+    mean, size = found.mean, found.size
+    assert len(mean) == len(size) == len(found.color) <= count
     for k in range(len(mean)):
         away = np.abs(mean[k + 1 :] - mean[k]).max(axis=1)
         assert (away > np.ceil(SUPPRESSION_RADIUS * size[k])).all()
@@ -110,3 +122,21 @@ def test_places_keep_apart_and_never_exceed(count):
 def test_an_image_without_error_has_no_peaks(backend):
     found = found_peaks(np.zeros((9, 14, 3)), 5, 3.0, backend=backend)
     assert len(found.mean) == len(found.size) == len(found.color) == 0
+
+
+def test_each_image_of_a_batch_has_its_own_peaks(backend):
+    """Those that it has alone, bit for bit: a neighbour in memory is no neighbour in space."""
+    missed = np.random.default_rng(2).normal(size=(3, 22, 17, 2)).astype(np.float32)
+    missed[1] = 0
+    types, grid = types_in(select(backend)), Grid(17, 22, images=3)
+    for spacing in (2.5, 7.0):
+        found = residual_peaks(batch_to_tiles(types, missed), grid, 2, 9, spacing)
+        together, image = to_numpy(found), found.image.numpy()
+        for k in range(3):
+            alone = found_peaks(missed[k], 9, spacing, backend=backend)
+            for name in ("mean", "size", "color"):
+                np.testing.assert_array_equal(
+                    getattr(together, name)[image == k], getattr(alone, name)
+                )
+            ranks = found.rank.numpy()[image == k]
+            np.testing.assert_array_equal(ranks, np.arange(len(alone.size)))
