@@ -22,8 +22,9 @@ from ..image.metrics import float_space, target_key
 from ..raster.render import picture_of
 from .levels import refine_levels
 from .maps import MapImage, balance, combine, read_maps, score_maps, shape_of
+from .measure import Row, measure
 from .options import FitOptions, Levels, Start, named_options
-from .refine import FitProgress, Refinement, Row, Score, measure, refine
+from .refine import FitProgress, Refinement, Score, refine
 from .search import search_count
 from .start import load_start, mean_picture, start_for
 from .target import FitTarget, PixelsOrPath, in_unit, make_target, read_pixels, unit_of

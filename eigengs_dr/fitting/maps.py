@@ -7,23 +7,21 @@ square error after a first colour solve, or, where each map has a goal, over the
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..gaussian.channels import TextureMap, check_maps, check_name, show_sums, slices, usual_space
+from ..gaussian.channels import TextureMap, check_maps, check_name, slices, usual_space
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
-from ..image.metrics import float_space, psnrs_by_rows, target_key
+from ..image.metrics import target_key
 from ..image.pixels import ImageError
-from ..raster.render import picture_rows
 from ..storage.npz import BadValue
+from .measure import Row, Shown, psnrs
 from .options import FitOptions
 from .placement.adaptive import residual
-from .refine import Row
 from .start import start_from_placement
 from .target import FitTarget, make_target, read_pixels, unit_of
 
@@ -222,17 +220,19 @@ def score_maps(
         seconds; psnr_ycbcr and psnr_rgb, means over the maps; maps, with both of each map; and with
         goals, margin: how far the map that is farthest from its goal is above it, in dB.
     """
-    read = picture_rows(gaussians)
-    seconds = time.perf_counter() - started
-    found = {}
-    for image, weight, own in zip(images, weights, slices([i.map(1) for i in images]), strict=True):
-        spaces = [float_space(image.space), "rgb"]
-        shown = partial(_shown, read, own, weight, image.space)
-        ycbcr, rgb = psnrs_by_rows(shown, image.pixels, spaces)
-        found[image.name] = {"psnr_ycbcr": ycbcr, "psnr_rgb": rgb}
+    own = slices([image.map(1) for image in images])
+    parts = [
+        Shown(image.pixels, image.space, channels, weight)
+        for image, channels, weight in zip(images, own, weights, strict=True)
+    ]
+    figures = psnrs(gaussians, parts)[..., 0]
+    found = {
+        image.name: dict(zip(_FIGURES, pair.tolist(), strict=True))
+        for image, pair in zip(images, figures, strict=True)
+    }
     row = {
-        "seconds": seconds,
-        **{key: float(np.mean([f[key] for f in found.values()])) for key in _FIGURES},
+        "seconds": time.perf_counter() - started,
+        **dict(zip(_FIGURES, figures.mean(axis=0).tolist(), strict=True)),
         "maps": found,
     }
     goals = [image.goal for image in images if image.goal is not None]
@@ -243,16 +243,6 @@ def score_maps(
 
 
 _FIGURES = ("psnr_ycbcr", "psnr_rgb")
-
-
-def _shown(
-    read: Callable[[slice], NDArray[np.floating]],
-    own: slice,
-    weight: float,
-    space: str,
-    rows: slice,
-) -> NDArray[np.floating]:
-    return show_sums(space, read(rows)[..., own] / np.float32(weight))
 
 
 def _list(names: Iterable[str]) -> str:

@@ -6,21 +6,18 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian.gaussians import Gaussians
-from ..image.metrics import MAX_PSNR, float_space, psnrs_by_rows
-from ..raster.render import picture_rows
+from ..image.metrics import MAX_PSNR
 from .density_control import prune
 from .descent import FitProblem, run
+from .measure import Row, measure
 from .schedule import Schedule
-
-Row: TypeAlias = dict[str, Any]
-"""A row of a trace: its numbers by name, and under "maps" those of every map."""
 
 FitProgress = Callable[[int, int, Row], None]
 Score = Callable[[Gaussians], Row]
@@ -141,23 +138,6 @@ def refine(
             if at not in [row["iteration"] for row in trace]:
                 judge(at, prune(dr.detach(found), problem.target, count, problem.weight))
     return Refinement(dr.detach(best), trace, step, stopped, row)
-
-
-def measure(
-    gaussians: Gaussians,
-    image: NDArray[np.float32],
-    started: float,
-    base_image: NDArray[np.float32] | None = None,
-) -> Row:
-    """Return the seconds, psnr_ycbcr and psnr_rgb of a set for a row of the trace of `refine`."""
-    read = picture_rows(gaussians)
-    seconds = time.perf_counter() - started
-
-    def shown(rows: slice) -> NDArray[np.floating]:
-        return read(rows) if base_image is None else read(rows) + base_image[rows]
-
-    ycbcr, rgb = psnrs_by_rows(shown, image, [float_space(gaussians.space), "rgb"])
-    return {"seconds": seconds, "psnr_ycbcr": ycbcr, "psnr_rgb": rgb}
 
 
 def trace_steps(iterations: int) -> set[int]:

@@ -21,7 +21,8 @@ from ..gaussian.gaussians import Gaussians
 from ..image.metrics import MAX_PSNR
 from .density_control import densify, prune
 from .descent import FitProblem, run
-from .refine import FitProgress, Refinement, Row
+from .measure import Row
+from .refine import FitProgress, Refinement
 from .schedule import Schedule, surplus_for
 
 

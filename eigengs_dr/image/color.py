@@ -331,7 +331,7 @@ def from_log(codes: Any) -> Any:
     return (dr.exp2(codes * (factor / math.log(2))) - 1) * (1 / LOG_SLOPE)
 
 
-def to_pu21(light: NDArray[Any]) -> NDArray[Any]:
+def to_pu21(light: Any) -> Any:
     """Encode linear light so that equal differences are about equally visible, also above 1.
 
     The code is logarithmic in bright light and nearly linear in the dark. Light is clamped to
@@ -339,12 +339,12 @@ def to_pu21(light: NDArray[Any]) -> NDArray[Any]:
 
     Parameters
     ----------
-    light : ndarray of float32 or float64, any shape
+    light : NumPy or Dr.Jit array of floats, any shape
         Linear light; 1 is a luminance of `PU21_WHITE`.
 
     Returns
     -------
-    ndarray, same shape and dtype
+    array, same shape and type
         Codes from 0 to 2.3; 1 for light of 1.
 
     References
@@ -359,10 +359,13 @@ def to_pu21(light: NDArray[Any]) -> NDArray[Any]:
     array([0.  , 0.62, 1.  , 2.12])
     """
     p1, p2, p3, p4, p5, p6 = _PU21
-    power = np.clip(light * PU21_WHITE, *PU21_RANGE) ** p4
+    select, maximum, raise_to = _functions(light)
+    low, high = PU21_RANGE
+    light = maximum(light * PU21_WHITE, low)
+    power = raise_to(select(light > high, high, light), p4)
     codes = ((p1 + p2 * power) / (1 + p3 * power)) ** p5 - p6
     white = ((p1 + p2 * PU21_WHITE**p4) / (1 + p3 * PU21_WHITE**p4)) ** p5 - p6
-    return np.asarray(codes / white, light.dtype)
+    return codes / white
 
 
 SHORTEST = 1e-6

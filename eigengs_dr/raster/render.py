@@ -1,12 +1,10 @@
 """Differentiable rendering of Gaussians, in forward and reverse mode.
 
-Kernels write an image in tile layout. `render` returns it as rows of pixels, a tensor;
-`picture_rows` reads it by strips of rows, so that a large picture is in memory once.
+Kernels write an image in tile layout. `render` returns it as rows of pixels, a tensor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from operator import index
 from typing import Any
@@ -444,43 +442,3 @@ class _Rows(dr.CustomOp):
         result = dr.empty(types.Float, self.run * dr.width(source))
         dr.scatter(result, types.FloatX(gather_run(types, values, source, self.run, True)), target)
         return result
-
-
-@exclusive()
-def picture_rows(gaussians: Gaussians) -> Callable[[slice], NDArray[np.floating]]:
-    """Render a set at its native size; return a function that reads rows of the picture.
-
-    The rendering stays in tile layout, so that no second image is in memory.
-
-    Parameters
-    ----------
-    gaussians : Gaussians
-
-    Returns
-    -------
-    callable
-        ``read(rows)`` for a slice of rows returns an array (rows, width, C): these rows of
-        `eigengs_dr.raster.render.picture_of`. Threads may read at the same time.
-
-    Raises
-    ------
-    ValueError
-        As `eigengs_dr.raster.render.render`.
-    """
-    gaussians = dr.detach(gaussians)
-    check_index_range(gaussians.width, gaussians.height, gaussians.channels, TILE)
-    lists = bin_gaussians(gaussians, adjoint=False)
-    image = rasterize(decode_parameters(gaussians), lists, gaussians.cutoff)
-    grid, channels = lists.grid, gaussians.channels
-    side = grid.tile[1]
-    # Pixels and channels share an axis: a row of a tile is then copied as one run.
-    tiles = image.numpy().reshape(grid.ny, grid.nx, side, grid.tile[0] * channels)
-
-    def read(rows: slice) -> NDArray[np.floating]:
-        first, last = rows.start // side, -(-rows.stop // side)
-        whole = tiles[first:last].transpose(0, 2, 1, 3)
-        whole = whole.reshape((last - first) * side, -1, channels)
-        part = whole[rows.start - first * side : rows.stop - first * side, : grid.width]
-        return to_picture(gaussians.space, from_sum(gaussians.space, part))
-
-    return read

@@ -42,7 +42,8 @@ def test_trace(backend):
     assert 0 < result.seconds_init <= seconds[0]
     assert seconds[-1] <= result.seconds
     best = max(result.trace, key=lambda row: row["psnr_ycbcr"])
-    assert psnr(picture(), result.image, space="rgb") == best["psnr_rgb"]
+    reached = psnr(picture(), result.image, space="rgb")
+    assert best["psnr_rgb"] == pytest.approx(reached, abs=1e-3)
 
 
 def test_zero_iterations_keep_the_solved_start(backend):

@@ -27,7 +27,8 @@ def test_interruption_keeps_the_best_so_far(backend, when):
     assert (result.iterations, result.stopped) == (when, "interrupted")
     rows = [row["iteration"] for row in result.trace]
     assert rows == sorted({m for m in (0, 10, 20, 50) if m <= when} | {when})
-    assert max(figures(result)) == psnr(picture(), result.image, space="ycbcr")
+    reached = psnr(picture(), result.image, space="ycbcr")
+    assert max(figures(result)) == pytest.approx(reached, abs=1e-3)
 
 
 def press_ctrl_c(*arguments):

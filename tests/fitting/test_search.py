@@ -91,7 +91,8 @@ def test_interrupted_while_it_settles_it_keeps_the_goal_with_fewer():
     assert found.stopped == "interrupted"
     assert found.iterations < whole.iterations
     assert len(found.gaussians) <= best[0]
-    assert 28 <= found.psnr_rgb == eg.psnr(picture(), found.image)
+    assert found.psnr_rgb >= 28
+    assert found.psnr_rgb == pytest.approx(eg.psnr(picture(), found.image), abs=1e-3)
 
 
 @pytest.mark.parametrize("goal", [26, 28, 30])

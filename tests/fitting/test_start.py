@@ -69,7 +69,8 @@ def test_fit_by_the_paper(backend, others):
     assert result.trace[-1]["psnr_ycbcr"] > result.trace[0]["psnr_ycbcr"] + 1
     whole = eg.render(result.gaussians).numpy() + result.mean_image
     np.testing.assert_array_equal(whole, result.image)
-    assert eg.psnr(result.image, others[0], "ycbcr") == max(r["psnr_ycbcr"] for r in result.trace)
+    reached = eg.psnr(result.image, others[0], "ycbcr")
+    assert max(r["psnr_ycbcr"] for r in result.trace) == pytest.approx(reached, abs=1e-3)
 
 
 def test_a_fit_goes_on_from_a_set(backend, others, tmp_path):

@@ -22,11 +22,13 @@ from ...raster.binning.tiles import TILE, Grid, GridArrays
 from ...raster.parameters import gather_run
 from ...raster.render import pixels_inside
 
-CANDIDATE_SIZES = (0.2, 0.35, 0.6, 1.0, 1.6)
-"""Candidate sizes of an added Gaussian, as multiples of the mean spacing."""
+CANDIDATE_SIZES = (0.2, 0.35, 0.6, 1.0)
+"""Candidate sizes of an added Gaussian, as multiples of the mean spacing. A fifth, 1.6, takes two
+thirds of the time of these four, and gains 0.00 dB (9 training photos of 256x256 pixels, 800 to
+5,000 Gaussians, 300 and 1,000 steps)."""
 
-TRUNCATION = 3.0
-"""Radius of the weights along an axis, in standard deviations."""
+TRUNCATION = 2.5
+"""Radius of the weights along an axis, in standard deviations; 3 gains 0.00 dB there."""
 
 SUPPRESSION_RADIUS = 1.5
 """Distance from an added Gaussian to a worse one, in standard deviations of the added one."""
