@@ -226,6 +226,23 @@ def reduce_error(
     return x, found
 
 
+def take_step(
+    shape: list, x: Unknowns, error: Float, inverse: Unknowns, lists: TileLists, cutoff: float
+) -> Unknowns:
+    """Take one step from the unknowns x, which is a step of steepest descent; see `reduce_error`.
+
+    Cost: an adjoint with respect to colours and a rendering.
+    """
+    channels, grid = len(x[0]), lists.grid
+    r = negate(apply_transposed(shape, error, channels, lists, cutoff))
+    p = multiply(r, inverse)
+    rz = dots(r, p, grid)
+    dr.eval(p, rz)
+    x, q, alpha = _advance(shape, x, p, rz, lists, cutoff)
+    _add_in_place(error, q, alpha, lists)
+    return x
+
+
 def _advance(
     shape: list, x: Unknowns, p: Unknowns, rz: list, lists: TileLists, cutoff: float
 ) -> tuple[Unknowns, Float, list]:
