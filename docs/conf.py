@@ -4,14 +4,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
 from sphinx.util import logging
 
 import eigengs_dr as eg
 
-sys.path.insert(0, str(Path(__file__).parent))  # for check_names.py, gallery.py and pages.py
+sys.path.insert(0, str(Path(__file__).parent))  # for what stands beside this file
 import measured
 import pages
-from check_names import missing
+from check_pages import missing, untraced
 
 LOGGER = logging.getLogger(__name__)
 
@@ -76,13 +77,22 @@ def skip_tuple_fields(
     return True if is_field else None
 
 
-def check_names(app: Any) -> None:
-    """Warn of public names that the reference leaves out, and of names that do not exist."""
+def check_pages(app: Any) -> None:
+    """Warn of public names that the reference leaves out, wrong names and figures of no source."""
     listed = set((Path(__file__).parent / "reference" / "python.md").read_text().split())
     for name in sorted(set(eg.__all__) - listed):
         LOGGER.warning("reference/python.md: the public name %s is not listed", name)
     for line in missing():
         LOGGER.warning("%s does not exist", line)
+    for line in untraced():
+        LOGGER.warning("a figure that is neither of a row nor marked: %s", line)
+
+
+def mark_measured(
+    name: str, raw: str, text: str, line: int, inliner: Any, *_: Any
+) -> tuple[list[nodes.Node], list[nodes.system_message]]:
+    """Show the figures of the role "measured", with how and at which commit they were measured."""
+    return [nodes.inline(raw, text, classes=["measured"])], []
 
 
 def write_pages(app: Any) -> None:
@@ -106,7 +116,8 @@ def show_examples_as_code(app: Any, context: Any, lines: list[str]) -> None:
 
 def setup(app: Any) -> None:
     """Connect the functions above."""
-    app.connect("builder-inited", check_names)
+    app.add_role("measured", mark_measured)
+    app.connect("builder-inited", check_pages)
     app.connect("builder-inited", write_pages)
     app.connect("autodoc-skip-member", skip_tuple_fields)
     app.connect("sphinx-click-process-description", show_examples_as_code)

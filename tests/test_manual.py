@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from eigengs_dr.fitting.options import PRESETS
-from eigengs_dr.fitting.schedule import first_phase, next_build, relocations
 
 FOLDER = Path(__file__).parent.parent / "docs"
 STEP = 1e-6
-BLOCK = re.compile(r"(<!-- not run -->\n)?^```python\n(.*?)^```", re.M | re.S)
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.M | re.S)
 
 
 def run_page(name, gaussians=None):
@@ -26,9 +24,8 @@ def run_page(name, gaussians=None):
         text = re.sub(r"gaussians=\d+", f"gaussians={gaussians}", text)
     space = {"__name__": "page"}
     for found in BLOCK.finditer(text):
-        if not found[1]:
-            line = text.count("\n", 0, found.start(2))
-            exec(compile("\n" * line + found[2], str(FOLDER / name), "exec"), space)
+        line = text.count("\n", 0, found.start(1))
+        exec(compile("\n" * line + found[1], str(FOLDER / name), "exec"), space)
     return space
 
 
@@ -170,28 +167,40 @@ def test_getting_started_lists_all_extras():
     assert set(re.findall(r"^(\w+) = \[", extras, re.M)) == said
 
 
-def test_names_are_where_the_manual_says():
-    check = runpy.run_path(str(FOLDER / "check_names.py"))
+@pytest.fixture(scope="module")
+def check():
+    return runpy.run_path(str(FOLDER / "check_pages.py"))
+
+
+def test_names_are_where_the_manual_says(check):
     assert check["missing"]() == []
     assert check["exists"]("eigengs_dr.fitting.placement.density.target_density")
     assert not check["exists"]("eigengs_dr.fitting.placement.adaptive.target_density")
     assert not check["exists"]("eigengs_dr.fitting.placement.adaptive.nothing")
 
 
-def test_the_manual_counts_builds_of_lists():
-    """The number that two pages name, of 1,000 steps of the preset `default`."""
-    builds = 0
-    schedule = PRESETS["default"].schedule
-    first = first_phase(schedule, 1000)
-    for steps, surplus in ((first, 0), (1000 - first, 1)):
-        moves = relocations(schedule, steps, surplus) if surplus else {}
-        stop = 0
-        for step in range(steps):
-            if step in moves:
-                stop = step
-            if step == stop:
-                end = min((s for s in moves if s > step), default=steps)
-                stop, _ = next_build(schedule, step, steps, min(end, steps))
-                builds += 1
-    for page in ("how-to/gpu.md", "theory/fitting.md"):
-        assert re.search(rf"\b{builds} in (all )?1,000 steps", (FOLDER / page).read_text()), builds
+def test_figures_of_the_manual_can_be_traced(check):
+    assert check["untraced"]() == []
+
+
+@pytest.mark.parametrize(
+    ("text", "traced"),
+    [
+        ("it takes 3.5 s", False),
+        ("it gains 0.1 to\n0.2 dB", False),
+        ("| a | b |\n|---|---:|\n| x | 2 |", False),
+        ("it takes {measured}`3.5 s`", False),
+        ("it takes {measured}`3.5 s (2 photos, commit 0a1b2c3)`", True),
+        ("it takes {{ kernels.fast_ms|round(1) }} ms, as `36 dB` and $6$ dB are set", True),
+        ("```sh\nfit photo.jpg  # 36 dB\n```\n16 bits, 3 x 3 pixels, 24 photos, min(k, 2)", True),
+    ],
+)
+def test_what_a_traced_figure_is(check, text, traced):
+    assert (check["untraced_in"](text) == []) == traced
+
+
+def test_figures_of_the_readme_are_of_rows():
+    rows = (FOLDER / "rows.jsonl").read_text()
+    text = (FOLDER.parent / "README.md").read_text()
+    figures = re.findall(r"(\d+\.\d+) dB \|", text)
+    assert figures and all(f'"{figure}"' in rows for figure in figures)

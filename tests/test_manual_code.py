@@ -37,12 +37,7 @@ ROOM = """<scene version="3.0.0">
   </bsdf></shape>
 </scene>"""
 
-NOT_RUN = {
-    "how-to/cluster.md": "starts clusters; tests/cluster has what it does",
-    "how-to/gpu.md": "needs a GPU",
-    "how-to/own-loop.md": "runs as a whole in test_manual.py",
-    "getting-started.md": "runs as a whole in test_manual.py",
-}
+RUN_AS_A_WHOLE = ("how-to/own-loop.md", "getting-started.md")  # in test_manual.py
 
 
 def is_mitsuba(page):
@@ -52,7 +47,7 @@ def is_mitsuba(page):
 def cases():
     for page in PAGES:
         name = str(page.relative_to(ROOT / "docs" if "docs" in page.parts else ROOT))
-        if BLOCK.search(page.read_text()) and name not in NOT_RUN:
+        if BLOCK.search(page.read_text()) and name not in RUN_AS_A_WHOLE:
             marks = [pytest.mark.mitsuba] if is_mitsuba(page) else []
             yield pytest.param(page, id=name, marks=marks)
 
@@ -67,7 +62,8 @@ def space(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     image = eg.sample("coffee")[100:124, 200:224]
     images = [np.roll(image, 5 * k, axis=1) for k in range(5)]
-    (tmp_path / "photos").mkdir()
+    for folder in ("photos", "states"):
+        (tmp_path / folder).mkdir()
     for k, other in enumerate(images):
         eg.save_image(f"photos/{k}.png", other)
     for name in ("photo.jpg", "wood.jpg", "huge.tif"):
@@ -83,6 +79,7 @@ def space(tmp_path, monkeypatch):
     (tmp_path / "room.xml").write_text(ROOM)
     n = np.full((24, 24, 3), (0.5, 0.5, 1.0))
     space = {
+        "__name__": "__main__",
         "eg": eg,
         "np": np,
         "image": image,
@@ -95,7 +92,9 @@ def space(tmp_path, monkeypatch):
 
 
 def small(code):
-    """Shrink numbers of Gaussians and pixels to what a tiny image takes."""
+    """Shrink numbers of Gaussians, pixels and workers to what a tiny image takes, without a GPU."""
+    code = code.replace("n_workers=4", "n_workers=1").replace(".Pool(4)", ".Pool(1)")
+    code = code.replace('"cuda"', '"llvm"')
     return NUMBER.sub(lambda found: str(min(200, int(found[0].replace("_", "")) // 50)), code)
 
 

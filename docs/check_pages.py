@@ -1,4 +1,9 @@
-"""List the names in the manual that the package does not have: ``python docs/check_names.py``."""
+"""List what pages of the manual say without a ground: ``python docs/check_pages.py``.
+
+These are names that the package does not have, and figures that nobody can trace: a number with
+a unit that is not filled in from a row, not marked as ``{measured}``, and neither code nor a
+formula, which say what is set or computed; and tables of numbers that no row holds.
+"""
 
 import ast
 import importlib
@@ -8,7 +13,14 @@ from pathlib import Path
 from types import ModuleType
 
 FOLDER = Path(__file__).parent
-NAME = re.compile(r"`(eigengs_dr(?:\.\w+)+)`(?:, `(\w+)` \|)?")
+PAGES = sorted([*FOLDER.glob("*.md"), *FOLDER.glob("*/*.md")])
+NAME = re.compile(r"`(eigengs_dr(?:\.\w+)+)`(?:, `(\w+)`$)?")
+FIGURE = re.compile(r"\d ?(?:dB|min|[mnu]?s|[kMG]i?B|GB/s|%)(?![\w/(])|^\|.*---:")
+TRACED = re.compile(
+    r"^```.*?^```|^\$\$.*?^\$\$|\{\{.*?\}\}|\$[^$]+\$|``.+?``"
+    r"|\{measured\}`[^`]*\bcommit [0-9a-f]{7}[^`]*`|(?<!\{measured\})`[^`]+`",
+    re.M | re.S,
+)
 
 FORMATS = {
     f"eigengs_dr.{kind}" for kind in ("gaussians", "material", "eigenbasis", "model", "checkpoint")
@@ -52,10 +64,10 @@ def own(module: ModuleType) -> set[str]:
 def missing() -> list[str]:
     """Find names that do not exist, with the file and the line that mention them.
 
-    A second name after a comma, as in `` `eigengs_dr.a.b`, `c` ``, is taken beside the first.
+    A second name that ends a line, as in `` `eigengs_dr.a.b`, `c` ``, is taken beside the first.
     """
     found = []
-    for path in sorted([*FOLDER.glob("*.md"), *FOLDER.glob("*/*.md")]):
+    for path in PAGES:
         for number, line in enumerate(path.read_text().splitlines(), 1):
             for name, second in NAME.findall(line):
                 names = [name, f"{name.rpartition('.')[0]}.{second}"] if second else [name]
@@ -64,5 +76,16 @@ def missing() -> list[str]:
     return found
 
 
+def untraced() -> list[str]:
+    """Find figures without a source, with the file and the line that give them."""
+    return [f"{path.name}:{line}" for path in PAGES for line in untraced_in(path.read_text())]
+
+
+def untraced_in(text: str) -> list[str]:
+    """Find the lines of a page that give figures without a source, with their numbers."""
+    rest = TRACED.sub(lambda traced: "\n" * traced[0].count("\n"), text).splitlines()
+    return [f"{n}: {line.strip()}" for n, line in enumerate(rest, 1) if FIGURE.search(line)]
+
+
 if __name__ == "__main__":
-    sys.exit("\n".join(missing()) or 0)
+    sys.exit("\n".join([*missing(), *untraced()]) or 0)
