@@ -18,7 +18,7 @@ NAME = re.compile(r"`(eigengs_dr(?:\.\w+)+)`(?:, `(\w+)`$)?")
 FIGURE = re.compile(r"\d ?(?:dB|min|[mnu]?s|[kMG]i?B|GB/s|%)(?![\w/(])|^\|.*---:")
 TRACED = re.compile(
     r"^```.*?^```|^\$\$.*?^\$\$|\{\{.*?\}\}|\$[^$]+\$|``.+?``"
-    r"|\{measured\}`[^`]*\bcommit [0-9a-f]{7}[^`]*`|(?<!\{measured\})`[^`]+`",
+    r"|\{measured\}`[^`]*\bcommit\s[0-9a-f]{7}[^`]*`|(?<!\{measured\})`[^`]+`",
     re.M | re.S,
 )
 
