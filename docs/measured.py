@@ -4,7 +4,8 @@
 for a table with its source, ``{{ kernels.step_ratio|round(1) }}`` for a figure of the last row, and
 charts in ``images/measured/``. A name that no row holds ends the build.
 
-Rows of "once" hold tables that no question of today makes: their caption, columns and lines.
+Rows of "once" hold tables that no question of today makes: their caption, columns and lines. If
+nobody wrote down the commit of a run, theirs is the one with which the figures came into a page.
 """
 
 from importlib import import_module
