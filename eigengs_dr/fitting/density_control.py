@@ -318,7 +318,8 @@ def relocate(
             cost = dr.select(_among(types, own, total), cost, dr.inf)
         moved = _least(cost, leaving, grid.images)
         keep = dr.full(types.Float, 1, total)
-        dr.scatter(keep, types.Float(0), moved)
+        if leaving:
+            dr.scatter(keep, types.Float(0), moved)
 
         # What is missing without them
         _, squares = channel_moments(error * inside, len(scene.colors[0]), grid)
@@ -369,6 +370,8 @@ def _among(types: ArrayTypes, own: range, total: int) -> Bool:
 def _least(cost: Float, number: int, images: int) -> UInt:
     """Return the `number` Gaussians of least cost of each image, image after image."""
     types, total = types_of(cost), dr.width(cost)
+    if not number:  # of less than ten Gaussians
+        return types.UInt()
     order = dr.argsort(cost)
     if images > 1:  # a stable sort by image keeps the order by cost
         image, _ = make_divisor(types, total // images).divmod(order)

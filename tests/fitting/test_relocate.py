@@ -135,3 +135,9 @@ def test_a_descent_relocates_and_goes_on():
     assert (len(sets), calls) == (76, [SCHEDULE.relocate_share] * 3)
     error = [squared_error(s, start.target) for s in (sets[0], sets[-1])]
     assert error[1] < 0.7 * error[0]
+
+
+@pytest.mark.parametrize("count", [1, 9])
+def test_sets_too_small_for_a_share_keep_their_gaussians(count):
+    result = eg.fit(eg.sample("coffee")[:32, :32], count)
+    assert len(result.gaussians) == count
