@@ -20,6 +20,7 @@ PAGES = [
     *sorted((ROOT / "docs").glob("*/*.md")),
 ]
 BLOCK = re.compile(r"^ *```python\n(.*?)^ *```", re.M | re.S)
+TEXTURE = re.compile(r'<texture name="\w+" (type="gaussian_texture">.*?</texture>)', re.S)
 COMMAND = re.compile(r"^ *((?:.*&& )?eigengs-dr [^\n#]*)", re.M)
 NUMBER = re.compile(r"\b\d[\d_]{3,}\b")
 
@@ -41,7 +42,7 @@ RUN_AS_A_WHOLE = ("how-to/own-loop.md", "getting-started.md")  # in test_manual.
 
 
 def is_mitsuba(page):
-    return "mi." in page.read_text()
+    return "mi." in page.read_text() or bool(TEXTURE.search(page.read_text()))
 
 
 def cases():
@@ -111,6 +112,8 @@ def test_python_of_a_page_runs(page, space):
     for found in BLOCK.finditer(text):
         line = text.count("\n", 0, found.start(1))
         exec(compile("\n" * line + small(found[1]), str(page), "exec"), space)
+    for texture in TEXTURE.findall(text):
+        mi.load_string(f'<texture version="3.0.0" {texture}')
 
 
 TEXTS = {str(page.relative_to(ROOT)): page.read_text() for page in PAGES}
