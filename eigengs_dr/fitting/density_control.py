@@ -323,7 +323,7 @@ def relocate(
 
         # What is missing without them
         _, squares = channel_moments(error * inside, len(scene.colors[0]), grid)
-        strength = sum(squares) * dr.opaque(types.Float, 1 / len(own))
+        strength = sum(squares) * dr.opaque(types.Float, 1 / max(1, len(own)))
         colors = [c * keep for c in scene.colors[0]], scene.colors[1]
         dr.eval(colors, keep, strength)
         error, _ = scene.error_of(colors)
