@@ -13,9 +13,8 @@ import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache
 from itertools import pairwise
-from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -49,9 +48,8 @@ BATCH = 48
 """Columns of one sparse product."""
 
 MIN_BATCH = 12
-"""Least number of columns for sparse products and block inverses. With 48 columns, 5,000 Gaussians
-and 256x256 pixels, a sparse product takes a third of the time of adjoints, and a block inverse a
-third of that of back-substitutions. With the 3 of one image, neither is faster."""
+"""Least number of columns for sparse products. With 48 columns, 5,000 Gaussians and 256x256 pixels,
+a sparse product takes a third of the time of adjoints; with the 3 of one image it is not faster."""
 
 MAX_KEPT_WEIGHTS = 1 << 24
 """Largest number of weights that stay in memory for sparse products, in 128 MiB."""
@@ -74,8 +72,6 @@ class Block:
         Range of the Gaussians.
     system : csr_array of float64, shape (n, n)
         ``A^T A + ridge``.
-    positions : ndarray, shape (n, 2)
-        Means of the Gaussians.
     factor : SuperLU
         Factorisation of ``A^T A + ridge`` in single precision, which halves the memory to read for
         every image; its rounding is below the ridge.
@@ -85,20 +81,12 @@ class Block:
 
     rows: slice
     system: csr_array
-    positions: NDArray[np.floating]
     factor: SuperLU
     spread: NDArray[np.float64]
 
     def divide(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ``(A^T A + ridge)^-1`` times a column (n,) or columns (n, M)."""
-        if sums.ndim == 2 and sums.shape[1] >= MIN_BATCH and self.inverse:
-            return self.inverse.solve(sums.astype(np.float32)).astype(np.float64)
         return self.factor.solve(np.asarray(sums, np.float32, order="F")).astype(np.float64)
-
-    @cached_property
-    def inverse(self) -> BlockInverse | None:
-        """``(A^T A + ridge)^-1`` for many columns, or None if it is too large."""
-        return invert(self.system, self.positions)
 
 
 @cache
@@ -135,7 +123,6 @@ class NormalEquations:
     def __init__(self, gaussians: Gaussians, low: int = 0) -> None:
         self.count, self.radius = len(gaussians), kernel_radius(gaussians.cutoff)
         self.width, self.height = gaussians.width, gaussians.height
-        self.means = gaussians.to_arrays()["mean"]
         matrix = weight_matrix(gaussians)
         double = matrix.astype(np.float64)
         self.gram = (double @ double.T).tocsr()
@@ -173,7 +160,7 @@ class NormalEquations:
                 "differ more"
             ) from None
         coverage = self.coverage[rows]
-        block = Block(rows, system, self.means[rows], factor, 0 * coverage)
+        block = Block(rows, system, factor, 0 * coverage)
         spread = block.divide(coverage)
         return replace(block, spread=spread + block.divide(coverage - system @ spread))
 
@@ -288,119 +275,6 @@ class NormalEquations:
 def squared_norms(planes: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return ``|D|^2`` of every plane D: planes (M, H, W) give shape (M,)."""
     return np.einsum("nij,nij->n", planes, planes, dtype=np.float64)
-
-
-LEAF = 300
-"""Approximate number of unknowns of a leaf. 5,000 Gaussians on a grid then have 16 leaves of 160 to
-260, and a separator of 1,290, which needs the fewest products."""
-
-MAX_ENTRIES = 1 << 23
-"""Largest number of entries of the blocks, in 32 MiB; 5,000 Gaussians on a grid have 3 million."""
-
-Matrix = NDArray[np.float32]
-Indices = NDArray[np.int64]
-
-
-class Leaf(NamedTuple):
-    """Unknowns that couple only with each other and with the separator.
-
-    Attributes
-    ----------
-    rows : ndarray of int64, shape (n,)
-    inverse : ndarray of float32, shape (n, n)
-        ``D^-1``.
-    neighbours : ndarray of int64, shape (s,)
-        Places in the separator of the unknowns that couple with this leaf.
-    coupling : ndarray of float32, shape (n, s)
-        ``E`` without its zero columns.
-    """
-
-    rows: Indices
-    inverse: Matrix
-    neighbours: Indices
-    coupling: Matrix
-
-
-class BlockInverse(NamedTuple):
-    """The inverse of a sparse symmetric matrix; see the module.
-
-    Attributes
-    ----------
-    leaves : list of Leaf
-    separator : ndarray of int64, shape (s,)
-    schur_inverse : ndarray of float32, shape (s, s)
-        ``C^-1``.
-    """
-
-    leaves: list[Leaf]
-    separator: Indices
-    schur_inverse: Matrix
-
-    def solve(self, columns: Matrix) -> Matrix:
-        """Return ``A^-1`` times columns, both of shape (N, M)."""
-        result, sums = np.empty_like(columns), columns[self.separator]
-        for leaf in self.leaves:
-            sums[leaf.neighbours] -= leaf.coupling.T @ (leaf.inverse @ columns[leaf.rows])
-        shared = self.schur_inverse @ sums
-        result[self.separator] = shared
-        for leaf in self.leaves:
-            left = columns[leaf.rows] - leaf.coupling @ shared[leaf.neighbours]
-            result[leaf.rows] = leaf.inverse @ left
-        return result
-
-
-def invert(matrix: csr_array, positions: NDArray[np.floating]) -> BlockInverse | None:
-    """Invert a sparse symmetric matrix in double precision.
-
-    Parameters
-    ----------
-    matrix : csr_array of float64, shape (N, N)
-        Positive definite.
-    positions : ndarray, shape (N, 2)
-        Unknowns that are close to each other should have close positions.
-
-    Returns
-    -------
-    BlockInverse or None
-        None if the blocks have more than `MAX_ENTRIES` entries.
-    """
-    depth = max(0, round(np.log2(len(positions) / LEAF)))
-    parts, separator = _dissect(matrix, positions, np.arange(len(positions)), depth)
-    if sum(len(rows) ** 2 for rows in [*parts, separator]) > MAX_ENTRIES:
-        return None
-    schur = matrix[separator][:, separator].toarray()
-    leaves = []
-    for rows in parts:
-        own = matrix[rows]
-        inverse, edge = np.linalg.inv(own[:, rows].toarray()), own[:, separator]
-        neighbours = np.unique(edge.indices).astype(np.int64)
-        coupling = edge[:, neighbours].toarray()
-        schur[np.ix_(neighbours, neighbours)] -= coupling.T @ inverse @ coupling
-        single = inverse.astype(np.float32), coupling.astype(np.float32)
-        leaves.append(Leaf(rows, single[0], neighbours, single[1]))
-    return BlockInverse(leaves, separator, np.linalg.inv(schur).astype(np.float32))
-
-
-def _dissect(
-    matrix: csr_array, positions: NDArray[np.floating], rows: Indices, depth: int
-) -> tuple[list[Indices], Indices]:
-    """Halve unknowns along their longer axis `depth` times; return leaves and the separator.
-
-    The separator of two halves are the unknowns of the first that couple with the second.
-    """
-    if depth == 0 or len(rows) < 2:
-        return [rows], rows[:0]
-    axis = int(np.argmax(np.ptp(positions[rows], axis=0)))
-    order = rows[np.argsort(positions[rows, axis], kind="stable")]
-    first, second = order[: len(order) // 2], order[len(order) // 2 :]
-    touches = np.diff(matrix[first][:, second].indptr) > 0
-    separator, first = first[touches], first[~touches]
-    leaves = []
-    for half in (first, second):
-        inner, between = _dissect(matrix, positions, half, depth - 1)
-        leaves += [part for part in inner if len(part)]
-        separator = np.concatenate([separator, between])
-    return leaves, separator
 
 
 MAX_WEIGHTS = 1 << 28
