@@ -23,8 +23,7 @@ class Done(NamedTuple):
 
     Attributes
     ----------
-    index : int
-        Place of the task among the tasks, from 0.
+    task : Any
     value : Any
         What the function returned.
     lost : str
@@ -32,7 +31,7 @@ class Done(NamedTuple):
         None. Else empty.
     """
 
-    index: int  # type: ignore[assignment]  # hides the method of tuples
+    task: Any
     value: Any
     lost: str = ""
 
@@ -50,11 +49,7 @@ class Executor(Protocol):
     workers: int
 
     def map(
-        self,
-        function: Function,
-        tasks: Iterable[Any],
-        shared: Any = None,
-        at_once: int | None = None,
+        self, function: Function, tasks: Iterable[Any], shared: Any = None
     ) -> Generator[Done, None, None]:
         """Call ``function(task, shared)`` for every task, and yield the results.
 
@@ -67,9 +62,6 @@ class Executor(Protocol):
             workers become free, a few ahead.
         shared : Any
             What all tasks use; it travels once.
-        at_once : int, optional
-            Largest number of tasks that are drawn and have not ended; by default some more than
-            there are workers.
 
         Yields
         ------
@@ -96,20 +88,16 @@ class LocalExecutor:
     workers = 1
 
     def map(
-        self,
-        function: Function,
-        tasks: Iterable[Any],
-        shared: Any = None,
-        at_once: int | None = None,
+        self, function: Function, tasks: Iterable[Any], shared: Any = None
     ) -> Generator[Done, None, None]:
         """Call ``function(task, shared)`` for every task; see `Executor.map`."""
-        for index, task in enumerate(tasks):
-            yield Done(index, function(task, shared))
+        for task in tasks:
+            yield Done(task, function(task, shared))
 
 
 def completed(
     executor: Executor, function: Function, tasks: Iterable[Any], shared: Any = None
-) -> Generator[tuple[int, Any], None, None]:
+) -> Generator[tuple[Any, Any], None, None]:
     """Run tasks none of which may fail.
 
     Parameters
@@ -120,8 +108,7 @@ def completed(
 
     Yields
     ------
-    index : int
-    value : Any
+    task, value : Any
         See `Done`.
 
     Raises
@@ -130,10 +117,10 @@ def completed(
         If a task was given up.
     """
     with closing(executor.map(function, tasks, shared)) as ended:
-        for index, value, lost in ended:
+        for task, value, lost in ended:
             if lost:
                 raise ClusterError(f"a part of the work cannot be done: {lost}")
-            yield index, value
+            yield task, value
 
 
 def executor_for(client: Any = None) -> Executor:
@@ -157,13 +144,11 @@ def executor_for(client: Any = None) -> Executor:
     """
     if client is None:
         return LocalExecutor()
-    if isinstance(client, Executor) and _package(client) not in EXECUTORS:
+    kind = type(client)
+    if make := EXECUTORS.get(kind.__module__.partition(".")[0]):
+        return make(client)
+    if isinstance(client, Executor):
         return client
-    if _package(client) not in EXECUTORS:
-        kind = f"{type(client).__module__}.{type(client).__name__}"
-        raise TypeError(f"client is a {kind}; pass a distributed.Client, or None")
-    return EXECUTORS[_package(client)](client)
-
-
-def _package(client: Any) -> str:
-    return type(client).__module__.partition(".")[0]
+    raise TypeError(
+        f"client is a {kind.__module__}.{kind.__name__}; pass a distributed.Client, or None"
+    )

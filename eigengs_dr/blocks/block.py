@@ -17,9 +17,8 @@ that it is the density of the whole image.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -49,19 +48,15 @@ from .draw import draw
 from .grid import Block
 from .windows import Window
 
-Array = NDArray[np.floating]
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, NDArray[np.floating]]
 
 
-@dataclass(frozen=True)
-class Settings:
+class Settings(NamedTuple):
     """What all tasks of a run share.
 
     Attributes
     ----------
     options : FitOptions
-    size : (int, int)
-        Width and height of the image in pixels.
     spacing : float
         Mean distance of the Gaussians, in pixels.
     background : tuple of float
@@ -69,7 +64,6 @@ class Settings:
     """
 
     options: FitOptions
-    size: tuple[int, int]
     spacing: float
     background: tuple[float, ...] = ()
 
@@ -86,12 +80,26 @@ class Surveyed(NamedTuple):
 
 
 class PlaceTask(NamedTuple):
-    """A block whose Gaussians shall be placed; see `eigengs_dr.blocks.block.place_block`."""
+    """A block whose Gaussians shall be placed.
+
+    Attributes
+    ----------
+    window : Window
+        The pixels.
+    block : Block
+    gaussians : int
+        From 1 to the pixels of the core.
+    old : dict of str to ndarray, or None
+        What a fit has shown about the density: the mean (N, 2) of the Gaussians in the window, in
+        its pixels, and the ratio (N, 1), see
+        `eigengs_dr.fitting.placement.density.density_ratio`. By default the density follows the
+        second derivatives alone.
+    """
 
     window: Window
     block: Block
     gaussians: int = 0
-    old: OldSet | None = None
+    old: Arrays | None = None
 
 
 class FitTask(NamedTuple):
@@ -102,10 +110,9 @@ class FitTask(NamedTuple):
     window : Window
         The pixels.
     block : Block
-    mean, factor : ndarray of float32, shapes (N, 2) and (N, 3)
-        The Gaussians whose means lie in the window, as they start; in pixels of the window.
-    color : ndarray of float32, shape (N, C), or None
-        Their colours; by default a solve finds the first ones.
+    arrays : dict of str to ndarray of float32
+        Mean (N, 2) and factor (N, 3) of the Gaussians whose means lie in the window, as they start;
+        in pixels of the window. And their color (N, C); else a solve finds the first ones.
     own : slice
         Those of them that belong to the block.
     fixed : dict of str to ndarray, or None
@@ -118,9 +125,7 @@ class FitTask(NamedTuple):
 
     window: Window
     block: Block
-    mean: Array
-    factor: Array
-    color: Array | None
+    arrays: Arrays
     own: slice
     fixed: Arrays | None
     iterations: int
@@ -137,7 +142,7 @@ def survey(task: PlaceTask, settings: Settings) -> Surveyed:
     if options.space == "normal":
         read_data(pixels, options.space)  # no other range makes normals
     target = make_target(pixels, options.space)
-    density = window_density(target.shown, settings.spacing)
+    density = density_from_hessian(target.shown, settings.spacing)
     core = task.block.core
     return Surveyed(
         float(density[core].sum(dtype=np.float64)),
@@ -146,12 +151,25 @@ def survey(task: PlaceTask, settings: Settings) -> Surveyed:
     )
 
 
-def place(task: PlaceTask, settings: Settings) -> tuple[Array, Array]:
-    """Place the Gaussians of a block; see `eigengs_dr.blocks.block.place_block`."""
-    options = settings.options
-    target = make_target(task.window.read(), options.space)
-    image = target.shown
-    return place_block(image, task.block, task.gaussians, settings.spacing, task.old)
+def place(task: PlaceTask, settings: Settings) -> Arrays:
+    """Place and shape the Gaussians of a block.
+
+    Returns
+    -------
+    dict of str to ndarray
+        The mean (n, 2) in pixels of the window, inside of the core, and the factor (n, 3).
+    """
+    image = make_target(task.window.read(), settings.options.space).shown
+    density = density_from_hessian(image, settings.spacing)
+    if task.old is not None:
+        owner = nearest_center(task.old["mean"], density.shape)
+        scale_by_owner(density, owner, task.old["ratio"][:, 0])
+    rows, columns = task.block.core
+    inside = normalize_density(density[rows, columns].copy(), task.gaussians)
+    density[rows, columns] = inside
+    mean = lloyd_step(stratify_along_hilbert(inside, task.gaussians), inside)
+    mean += np.array([columns.start, rows.start])
+    return {"mean": mean, "factor": shapes_from_hessian(mean, density, image, settings.spacing)}
 
 
 StepDone = Callable[[int], None]
@@ -165,8 +183,8 @@ def find_density(task: FitTask, settings: Settings, step_done: StepDone | None =
     Returns
     -------
     dict of str to ndarray
-        The means (n, 2) of the own Gaussians in pixels of the window, ratio (n, 1), see
-        `eigengs_dr.blocks.block.OldSet`, and the mass (1,) of the density in the core.
+        The mean (n, 2) of the own Gaussians in pixels of the window, their ratio (n, 1), see
+        `PlaceTask`, and the mass (1,) of the density in the core.
     """
     target = make_target(task.window.read(), settings.options.space)
     problem = _start(task, target, settings)
@@ -214,17 +232,19 @@ def _start(task: FitTask, target: FitTarget, settings: Settings) -> FitProblem:
         arrays = task.fixed | {"background": np.zeros(channels, np.float32)}
         others = SetData(arrays, (width, height), "data", options.cutoff)
         values = values - draw(others, options.backend)
+    solved = "color" in task.arrays
+    uncolored = np.zeros((len(task.arrays["mean"]), channels), np.float32)
     placed = Gaussians.from_arrays(
-        task.mean,
-        task.factor,
-        np.zeros((len(task.mean), channels), np.float32) if task.color is None else task.color,
+        task.arrays["mean"],
+        task.arrays["factor"],
+        task.arrays.get("color", uncolored),
         background,
         size=(width, height),
         space=options.space,
         backend=options.backend,
         cutoff=options.cutoff,
     ).bounded()
-    if task.color is None:
+    if not solved:
         placed = solve(placed, values, options.solve_steps, background=background).gaussians
     return FitProblem(placed, values, target.weight)
 
@@ -244,74 +264,6 @@ def _descend(
 
 def _squared_error(found: Gaussians, problem: FitProblem) -> NDArray[np.float32]:
     return squared_error(residual(found, problem.target), problem.weight)
-
-
-class OldSet(NamedTuple):
-    """What a fit has shown about the density.
-
-    Attributes
-    ----------
-    mean : ndarray, shape (N, 2)
-        Means of the Gaussians of a window, in its pixels.
-    ratio : ndarray, shape (N,)
-        See `eigengs_dr.fitting.placement.density.density_ratio`.
-    """
-
-    mean: Array
-    ratio: Array
-
-
-def window_density(image: Array, spacing: float, old: OldSet | None = None) -> NDArray[np.float32]:
-    """Return the density of Gaussians in a window, up to a factor that all windows share.
-
-    Parameters
-    ----------
-    image : ndarray, shape (H, W, C)
-        The window.
-    spacing : float
-        Mean distance of the Gaussians of the whole image, in pixels.
-    old : OldSet, optional
-        By default the density follows the second derivatives alone.
-
-    Returns
-    -------
-    ndarray of float32, shape (H, W)
-    """
-    density = density_from_hessian(image, spacing)
-    if old is not None:
-        scale_by_owner(density, nearest_center(old.mean, density.shape), old.ratio)
-    return density
-
-
-def place_block(
-    image: Array, block: Block, count: int, spacing: float, old: OldSet | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Place and shape the Gaussians of a block.
-
-    Parameters
-    ----------
-    image : ndarray, shape (H, W, C)
-        The window of the block, in the space of the squared error.
-    block : Block
-    count : int
-        Number of Gaussians, from 1 to the pixels of the core.
-    spacing, old
-        See `window_density`.
-
-    Returns
-    -------
-    mean : ndarray, shape (count, 2)
-        In pixels of the window; all lie in the core.
-    factor : ndarray, shape (count, 3)
-        See `eigengs_dr.Gaussians`.
-    """
-    density = window_density(image, spacing, old)
-    rows, columns = block.core
-    inside = normalize_density(density[rows, columns].copy(), count)
-    density[rows, columns] = inside
-    mean = lloyd_step(stratify_along_hilbert(inside, count), inside)
-    mean += np.array([columns.start, rows.start])
-    return mean, shapes_from_hessian(mean, density, image, spacing)
 
 
 SHORT_ROUNDS, LAST_ROUNDS = 3, 5

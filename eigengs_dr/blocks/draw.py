@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from ..gaussian.file import SetData, crop
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
+from ..image.formats import TIFF_SUFFIXES
 from ..image.io import bits_of, dtype_of, to_file, write_pixels
 from ..image.metrics import float_space, squared_error
 from ..raster.render import picture_of, render
 from ..storage.atomic import atomic_write
 from .grid import Block
-from .windows import TIFF_SUFFIXES, TILE_SIDE, Source, Window, write_tiles
+from .windows import TILE_SIDE, Source, Window, write_tiles
 
 BAND_PIXELS = 1 << 22
 """Pixels of a band of a picture that is drawn at once; one takes some 100 bytes."""
@@ -140,6 +141,7 @@ def save_region(
 class CompareTask(NamedTuple):
     """A part of an image, and the Gaussians that it shows."""
 
+    block: Block
     window: Window
     data: SetData
     backend: str | None
@@ -156,7 +158,7 @@ def compare_tasks(
             shown = crop(data, (0, band.start), (source.width, band.stop - band.start))
         size = (block.columns.stop - block.columns.start, band.stop - band.start)
         part = crop(shown, (block.columns.start, 0), size)
-        yield CompareTask(source.window(block.rows, block.columns), part, backend)
+        yield CompareTask(block, source.window(block.rows, block.columns), part, backend)
 
 
 def compare(task: CompareTask, shared: Any = None) -> tuple[float, float]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,19 +111,6 @@ def _parts(length: int, side: int, halo: int) -> list[tuple[slice, slice]]:
     return [(core, slice(start, start + window)) for core, start in zip(cores, starts, strict=True)]
 
 
-def neighbors(block: Block, blocks: list[Block]) -> list[Block]:
-    """Return the blocks whose cores touch the window of a block, with itself, in order."""
-    return [
-        other
-        for other in blocks
-        if _overlap(other.rows, block.window_rows) and _overlap(other.columns, block.window_columns)
-    ]
-
-
-def _overlap(a: slice, b: slice) -> bool:
-    return bool(a.start < b.stop and b.start < a.stop)
-
-
 def deal(mass: NDArray[np.float64], pixels: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     """Deal Gaussians to blocks in proportion to their masses.
 
@@ -168,7 +156,7 @@ def deal(mass: NDArray[np.float64], pixels: NDArray[np.int64], count: int) -> ND
     return dealt
 
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, NDArray[np.float32]]
 
 COLUMNS = {"mean": 2, "factor": 3, "ratio": 1}
 """Numbers of a Gaussian in the arrays; a colour has as many as the image has channels."""
@@ -192,38 +180,36 @@ class BlockSets:
     Attributes
     ----------
     arrays : dict of str to ndarray of float32, shape (N, columns)
-    parts : list of slice
-        The rows of each block.
+    counts
     """
 
     def __init__(
         self,
         blocks: list[Block],
-        counts: NDArray[Any],
+        counts: NDArray[np.int64],
         names: tuple[str, ...],
         channels: int = 3,
         cutoff: float = CUTOFF,
     ) -> None:
-        ends = np.cumsum(counts).tolist()
-        self.blocks, self.cutoff = blocks, cutoff
-        self.size = np.array([blocks[-1].columns.stop, blocks[-1].rows.stop])
-        self.parts = [slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+        self.blocks, self.counts, self.cutoff = blocks, counts, cutoff
+        self._ends = np.cumsum(counts)
         self.arrays: Arrays = {
-            name: np.empty((ends[-1], COLUMNS.get(name, channels)), np.float32) for name in names
+            name: np.empty((self._ends[-1], COLUMNS.get(name, channels)), np.float32)
+            for name in names
         }
+        # What the Gaussians of a block touch: left, top, right, bottom.
         self._boxes = np.empty((len(blocks), 4))
-
-    def counts(self) -> NDArray[np.int64]:
-        """Return the number of Gaussians of each block."""
-        return np.array([part.stop - part.start for part in self.parts])
 
     def put(self, block: Block, found: Arrays) -> None:
         """Set the rows of a block; its means are in pixels of its window."""
-        part = self.parts[block.number]
+        part = self._part(block)
         for name, rows in self.arrays.items():
             rows[part] = found[name] + block.corner if name == "mean" else found[name]
+        mean, reach = self.arrays["mean"][part], np.zeros(1)
         if "factor" in self.arrays:
-            self._measure(block)
+            reach = np.stack(reaches(self._data(part)), axis=1)
+        box = (mean - reach).min(axis=0), (mean + reach).max(axis=0)
+        self._boxes[block.number] = np.concatenate(box)
 
     def in_window(self, block: Block) -> tuple[Arrays, slice]:
         """Return the Gaussians whose means lie in the window of a block, in the window's pixels.
@@ -234,20 +220,11 @@ class BlockSets:
         own : slice
             Those of the block itself: all of them, wherever they lie.
         """
-        found: dict[str, list[NDArray[Any]]] = {name: [] for name in self.arrays}
-        before, own = 0, slice(0, 0)
-        for other in neighbors(block, self.blocks):
-            part = self.parts[other.number]
-            inside = _in_window(self.arrays["mean"][part], block)
-            if other.number == block.number:
-                inside[:] = True  # rounding may move one across the edge
-                own = slice(before, before + len(inside))
-            before += int(inside.sum())
-            for name, rows in found.items():
-                rows.append(self.arrays[name][part][inside])
-        arrays = {name: np.concatenate(rows) for name, rows in found.items()}
+        numbers = np.concatenate([inside for inside, _ in self._near(block)])
+        first = int(np.searchsorted(numbers, self._part(block).start))
+        arrays = {name: rows[numbers] for name, rows in self.arrays.items()}
         arrays["mean"] = (arrays["mean"] - block.corner).astype(np.float32)
-        return arrays, own
+        return arrays, slice(first, first + int(self.counts[block.number]))
 
     def around(self, block: Block) -> Arrays:
         """Return the other Gaussians that touch the window of a block, in the window's pixels.
@@ -257,50 +234,30 @@ class BlockSets:
         dict of str to ndarray
             Mean, factor and color of those that `in_window` leaves out.
         """
-        near = {other.number for other in neighbors(block, self.blocks)}
-        found = [{name: rows[:0] for name, rows in self.arrays.items()}]
-        for other in self.blocks:
-            if other.number == block.number or not self._reaches(other, block):
-                continue
-            data = self._data(other)
-            if other.number in near:
-                outside = ~_in_window(data.arrays["mean"], block)
-                rows = {name: data.arrays[name][outside] for name in self.arrays}
-                data = data._replace(arrays=data.arrays | rows)
-            found.append(crop(data, *_window(block)).arrays)
-        return {name: np.concatenate([part[name] for part in found]) for name in self.arrays}
+        numbers = np.concatenate([outside for _, outside in self._near(block)])
+        (left, top), (width, height) = block.corner.tolist(), block.window_size.tolist()
+        found = crop(self._data(numbers), (left, top), (int(width), int(height))).arrays
+        return {name: found[name] for name in self.arrays}
 
-    def _measure(self, block: Block) -> None:
-        """Note the box that the Gaussians of a block touch: left, top, right, bottom."""
-        mean = self.arrays["mean"][self.parts[block.number]]
-        reach = np.stack(reaches(self._data(block)), axis=1)
-        box = (mean - reach).min(axis=0), (mean + reach).max(axis=0)
-        self._boxes[block.number] = np.concatenate(box)
+    def _near(self, block: Block) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """Yield the Gaussians of each block near a window: those inside of it, and the others."""
+        low, high = block.corner, block.corner + block.window_size
+        apart = (self._boxes[:, :2] > high) | (self._boxes[:, 2:] < low)
+        is_own = np.arange(len(apart)) == block.number
+        for number in np.flatnonzero(~apart.any(axis=1) | is_own):
+            part = self._part(self.blocks[number])
+            mean = self.arrays["mean"][part]
+            # Rounding may move an own one across the edge.
+            inside = np.all((mean >= low) & (mean <= high) | is_own[number], axis=1)
+            yield part.start + np.flatnonzero(inside), part.start + np.flatnonzero(~inside)
 
-    def _reaches(self, block: Block, part: Block) -> bool:
-        """Whether some Gaussians of a block may touch the window of a part."""
-        (left, top), (width, height) = _window(part)
-        box = self._boxes[block.number]
-        return bool(
-            (box[:2] <= (left + width, top + height)).all() and (box[2:] >= (left, top)).all()
-        )
+    def _part(self, block: Block) -> slice:
+        """Return the rows of a block."""
+        end = int(self._ends[block.number])
+        return slice(end - int(self.counts[block.number]), end)
 
-    def _data(self, block: Block) -> SetData:
-        """Return the Gaussians of a block as a set."""
-        part = self.parts[block.number]
-        arrays = {name: rows[part] for name, rows in self.arrays.items()}
+    def _data(self, rows: slice | NDArray[np.int64]) -> SetData:
+        """Return some Gaussians as a set."""
+        arrays = {name: values[rows] for name, values in self.arrays.items()}
         arrays["background"] = np.zeros(1, np.float32)
         return SetData(arrays, (1, 1), "data", self.cutoff)
-
-
-def _in_window(mean: NDArray[Any], block: Block) -> NDArray[np.bool_]:
-    """Return which of some means (n, 2), in pixels of the image, lie in the window of a block."""
-    low, high = block.corner, block.corner + block.window_size
-    inside: NDArray[np.bool_] = np.all((mean >= low) & (mean <= high), axis=1)
-    return inside
-
-
-def _window(part: Block) -> tuple[tuple[float, float], tuple[int, int]]:
-    """Return the corner and the size of the window of a part."""
-    (left, top), (width, height) = part.corner.tolist(), part.window_size.astype(int).tolist()
-    return (left, top), (width, height)

@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.executor import ClusterError, Executor
+from ..backend.executor import Executor, completed
 from ..fitting.options import FitOptions
 from ..fitting.schedule import first_phase
 from ..gaussian.file import SetData
 from ..storage.checkpoint import Checkpoint
-from .block import (
-    FitTask,
-    OldSet,
-    PlaceTask,
-    Settings,
-    find_density,
-    fit_block,
-    place,
-    rounds,
-    survey,
-)
+from .block import FitTask, PlaceTask, Settings, find_density, fit_block, place, rounds, survey
 from .draw import compare, compare_tasks
 from .grid import Arrays, Block, BlockSets, deal
 from .windows import Source, Window
@@ -34,53 +24,60 @@ from .windows import Source, Window
 Progress = Callable[[int, int, dict[str, Any]], None]
 
 
+@dataclass
 class Run:
     """One call of `eigengs_dr.fit_large`.
 
-    Parameters
+    Attributes
     ----------
     image : Source
+        After `fit` with the unit of the fit, in which the set is.
     blocks : list of Block
     options : FitOptions
         With the number of Gaussians.
     executor : Executor
-    checkpoint : Checkpoint, optional
+    checkpoint : Checkpoint or None
         Where blocks that are done wait for the end of the run.
-    progress : callable, optional
+    progress : callable or None
         See `eigengs_dr.fit_large`.
-    interrupted : callable, optional
+    interrupted : callable or None
         ``interrupted()``: whether the run shall end; None on a cluster.
-
-    Attributes
-    ----------
     resumed : int
         Number of blocks, of all rounds, that an earlier call had fitted.
-    image : Source
-        After `fit` with the unit of the fit, in which the set is.
     """
 
-    def __init__(
-        self,
-        image: Source,
-        blocks: list[Block],
-        options: FitOptions,
-        executor: Executor,
-        checkpoint: Checkpoint | None = None,
-        progress: Progress | None = None,
-        interrupted: Callable[[], bool] | None = None,
-    ) -> None:
-        assert options.gaussians is not None
-        self.image, self.blocks, self.options, self.executor = image, blocks, options, executor
-        self.checkpoint, self.progress, self.interrupted = checkpoint, progress, interrupted
-        spacing = (image.width * image.height / options.gaussians) ** 0.5
-        self.settings = Settings(options, (image.width, image.height), spacing)
-        self.resumed, self.stage, self.done, self.total = 0, "", 0, 0
+    image: Source
+    blocks: list[Block]
+    options: FitOptions
+    executor: Executor
+    checkpoint: Checkpoint | None = None
+    progress: Progress | None = None
+    interrupted: Callable[[], bool] | None = None
+    resumed: int = 0
+    settings: Settings = field(init=False)
+    stage: str = ""
+    done: int = 0
+    total: int = 0
+
+    def __post_init__(self) -> None:
+        spacing = (self.image.width * self.image.height / self.count) ** 0.5
+        self.settings = Settings(self.options, spacing)
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        assert self.options.gaussians is not None
+        return self.options.gaussians
 
     def fit(self) -> SetData:
         """Place and fit all Gaussians; a long fit places them again where error was left."""
         steps = self.options.iterations
         first = first_phase(self.options.method.schedule, steps)
-        sets = self._fit_blocks(self._place_all(first), steps - first)
+        mass = self._survey()
+        placed = self._place(mass)
+        if first:
+            placed = self._place(*self._find_density(placed, first))
+        sets = self._fit_blocks(placed, steps - first)
         background = np.array(self.settings.background, np.float32)
         return SetData(
             sets.arrays | {"background": background},
@@ -93,16 +90,8 @@ class Run:
         """Return the sums of the squared errors for psnr_ycbcr and psnr_rgb."""
         self._begin("measure", len(self.blocks))
         tasks = compare_tasks(self.image, data, self.blocks, self.options.backend)
-        sums = {b.number: value for b, value in self._map(compare, tasks, self.blocks)}
-        ycbcr, rgb = np.sum([value for _, value in sorted(sums.items())], axis=0).tolist()
+        ycbcr, rgb = np.sum(self._in_order(compare, tasks), axis=0).tolist()
         return ycbcr, rgb
-
-    def _place_all(self, first: int) -> BlockSets:
-        """Place all Gaussians; if there are first steps, again where these leave error."""
-        mass, old = self._survey(), None
-        if first:
-            old, mass = self._find_density(self._place(mass), first)
-        return self._place(mass, old)
 
     def _survey(self) -> NDArray[np.float64]:
         """Return the masses of all blocks, and set the background: the mean of the image.
@@ -111,66 +100,64 @@ class Run:
         that the whole image says.
         """
         self._begin("survey", len(self.blocks))
-        tasks = (PlaceTask(self._window(block), block) for block in self.blocks)
-        found = {b.number: value for b, value in self._map(survey, tasks, self.blocks)}
-        unit = max(value.unit for value in found.values())
+        found = self._in_order(survey, (PlaceTask(self._window(b), b) for b in self.blocks))
+        unit = max(value.unit for value in found)
         if unit > 1:
             self.image = replace(self.image, unit=unit)
             return self._survey()
-        figures = np.array([[value.mass, *value.total] for _, value in sorted(found.items())])
+        figures = np.array([[value.mass, *value.total] for value in found])
         mean = figures[:, 1:].sum(axis=0) / (self.image.width * self.image.height)
-        self.settings = replace(self.settings, background=tuple(mean.tolist()))
+        self.settings = self.settings._replace(background=tuple(mean.tolist()))
         if self.checkpoint is not None:
             _check_unchanged(self.checkpoint, figures)
         return figures[:, 0]
 
     def _place(self, mass: NDArray[np.float64], old: BlockSets | None = None) -> BlockSets:
         """Deal the Gaussians to the blocks by their masses, and place them."""
-        assert self.options.gaussians is not None
-        pixels = np.array([block.pixels for block in self.blocks])
-        counts = deal(mass, pixels, self.options.gaussians)
+        counts = deal(mass, np.array([block.pixels for block in self.blocks]), self.count)
         placed = BlockSets(self.blocks, counts, ("mean", "factor"))
-
-        def tasks() -> Iterator[PlaceTask]:
-            for block, count in zip(self.blocks, counts.tolist(), strict=True):
-                seen = None
-                if old is not None:
-                    arrays, _ = old.in_window(block)
-                    seen = OldSet(arrays["mean"], arrays["ratio"][:, 0])
-                yield PlaceTask(self._window(block), block, count, seen)
-
         self._begin("place", len(self.blocks))
-        for block, (mean, factor) in self._map(place, tasks(), self.blocks):
-            placed.put(block, {"mean": mean, "factor": factor})
+        tasks = (
+            PlaceTask(
+                self._window(block),
+                block,
+                int(counts[block.number]),
+                None if old is None else old.in_window(block)[0],
+            )
+            for block in self.blocks
+        )
+        for block, found in self._map(place, tasks):
+            placed.put(block, found)
         return placed
 
-    def _find_density(self, placed: BlockSets, steps: int) -> tuple[BlockSets, NDArray[np.float64]]:
-        """Fit all blocks for some steps; return means, ratios and masses of the wanted density."""
-        old = BlockSets(self.blocks, placed.counts(), ("mean", "ratio"))
+    def _find_density(self, placed: BlockSets, steps: int) -> tuple[NDArray[np.float64], BlockSets]:
+        """Fit all blocks for some steps; return masses, means and ratios of the wanted density."""
+        old = BlockSets(self.blocks, placed.counts, ("mean", "ratio"))
         mass = np.empty(len(self.blocks))
-
-        def make_task(block: Block) -> FitTask:
-            return self._fit_task(block, placed, steps, range(steps))
-
+        task = partial(self._fit_task, sets=placed, steps=steps, part=range(steps))
         self._begin("density", len(self.blocks) * steps)
-        for block, found in self._fitted("density-", find_density, self.blocks, make_task, steps):
+        for block, found in self._fitted("density-", find_density, task, steps):
             mass[block.number] = found["mass"][0]
             old.put(block, found)
-        return old, mass
+        return mass, old
 
     def _fit_blocks(self, sets: BlockSets, steps: int) -> BlockSets:
         """Fit all blocks, round by round, from sets without colours."""
         parts = rounds(self.options.method.schedule, steps)
-        names, counts = ("mean", "factor", "color"), sets.counts()
         self._begin("fit", len(self.blocks) * steps)
         first = self._kept_round(len(parts))
         self.resumed += first * len(self.blocks)
         self._advance(len(self.blocks) * parts[first].start)
         for number, part in enumerate(parts[first:], start=first):
+            found = BlockSets(
+                self.blocks,
+                sets.counts,
+                ("mean", "factor", "color"),
+                self.image.channels,
+                self.options.cutoff,
+            )
             task = partial(self._fit_task, sets=sets, steps=steps, part=part)
-            found = BlockSets(self.blocks, counts, names, self.image.channels, self.options.cutoff)
-            done = self._fitted(f"fit{number}-", fit_block, self.blocks, task, len(part))
-            for block, arrays in done:
+            for block, arrays in self._fitted(f"fit{number}-", fit_block, task, len(part)):
                 found.put(block, arrays)
             sets = found
             if self.checkpoint is not None:
@@ -190,44 +177,41 @@ class Run:
     def _fit_task(self, block: Block, sets: BlockSets, steps: int, part: range) -> FitTask:
         """Return the task of a block: its window, all Gaussians in it, and others that touch it."""
         arrays, own = sets.in_window(block)
-        mean, factor, color = arrays["mean"], arrays["factor"], arrays.get("color")
-        fixed = None if color is None else sets.around(block)
-        return FitTask(self._window(block), block, mean, factor, color, own, fixed, steps, part)
+        fixed = sets.around(block) if "color" in arrays else None
+        return FitTask(self._window(block), block, arrays, own, fixed, steps, part)
 
     def _fitted(
-        self,
-        stage: str,
-        function: Any,
-        parts: list[Block],
-        make_task: Callable[[Block], FitTask],
-        steps: int,
+        self, stage: str, function: Any, make_task: Callable[[Block], FitTask], steps: int
     ) -> Iterator[tuple[Block, Arrays]]:
-        """Yield the parts that an earlier call has fitted, then fit the others and keep them."""
-        waiting = list[Block]()
-        for part in parts:
-            found = self.checkpoint.load(f"{stage}{part.number}") if self.checkpoint else None
+        """Yield the blocks that an earlier call has fitted, then fit the others and keep them."""
+        waiting = []
+        for block in self.blocks:
+            found = self.checkpoint.load(f"{stage}{block.number}") if self.checkpoint else None
             if found is None:
-                waiting.append(part)
+                waiting.append(block)
                 continue
             self.resumed += 1
             self._advance(steps)
-            yield part, found
+            yield block, found
         if self.interrupted is not None:
             function = partial(function, step_done=self._step_done)
-        for part, found in self._map(function, map(make_task, waiting), waiting, steps):
+        for block, found in self._map(function, map(make_task, waiting), steps):
             if self.checkpoint is not None:
-                self.checkpoint.save(f"{stage}{part.number}", found)
-            yield part, found
+                self.checkpoint.save(f"{stage}{block.number}", found)
+            yield block, found
+
+    def _in_order(self, function: Any, tasks: Iterable[Any]) -> list[Any]:
+        """Run a task of each block, and return the results in the order of the blocks."""
+        found = {block.number: value for block, value in self._map(function, tasks)}
+        return [found[block.number] for block in self.blocks]
 
     def _map(
-        self, function: Any, tasks: Iterator[Any], parts: list[Block], steps: int = 1
+        self, function: Any, tasks: Iterable[Any], steps: int = 1
     ) -> Iterator[tuple[Block, Any]]:
-        """Run the tasks of some parts, and yield the parts with their results."""
-        with closing(self.executor.map(function, tasks, self.settings)) as ended:
-            for done in ended:
-                if done.lost:
-                    raise ClusterError(f"{self.image.name}: {done.lost}")
-                yield parts[done.index], done.value
+        """Run tasks of blocks, and yield the blocks with their results."""
+        with closing(completed(self.executor, function, tasks, self.settings)) as ended:
+            for task, value in ended:
+                yield task.block, value
                 self._advance(steps)  # the caller has kept the result: `progress` may raise
                 self._stop_if_interrupted()
 
@@ -236,7 +220,7 @@ class Run:
 
     def _begin(self, stage: str, total: int) -> None:
         self.stage, self.done, self.total = stage, 0, total
-        self._show(0)
+        self._advance(0)
 
     def _advance(self, steps: int) -> None:
         self.done += steps

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
-from ..image.formats import kind_of, open_header
+from ..image.formats import TIFF_SUFFIXES, kind_of, open_header
 from ..image.io import (
     ImageError,
     check_data,
@@ -30,10 +30,11 @@ from ..image.remote import is_url
 MAX_SIDE = 1 << 16
 """Longest side of a set of Gaussians, in pixels."""
 
-GREY = ("1", "L", "I", "I;16", "I;16B", "I;16L", "F")
-"""Modes of Pillow for opaque images of one channel."""
+Pixels = NDArray[Any]
+"""Pixels (h, w) or (h, w, channels) of any type."""
 
-Array = NDArray[Any]
+Load = Callable[[], Pixels]
+"""Returns a part of an image in the dtype of the source. It holds a path, or the pixels."""
 
 
 class Window(NamedTuple):
@@ -42,7 +43,7 @@ class Window(NamedTuple):
     Attributes
     ----------
     load : callable
-        Returns the pixels in the dtype of the source. It holds a path, or the pixels.
+        See `Load`.
     keep_grey : bool
         Whether the image is data, which keep one channel.
     name : str
@@ -53,7 +54,7 @@ class Window(NamedTuple):
         Data are divided by it.
     """
 
-    load: Callable[[], Array]
+    load: Load
     keep_grey: bool
     name: str
     encoding: str = "srgb"
@@ -103,7 +104,7 @@ class Source:
     channels: int
     name: str
     identity: dict[str, Any]
-    cut: Callable[[slice, slice], Callable[[], Array]]
+    cut: Callable[[slice, slice], Load]
     keep_grey: bool
     encoding: str = "srgb"
     unit: float = 1.0
@@ -112,8 +113,7 @@ class Source:
         """Return a part of the image."""
         part = f"rows {rows.start} to {rows.stop}, columns {columns.start} to {columns.stop}"
         name = f"{self.name}, {part}"
-        load = self.cut(rows, columns)
-        return Window(load, self.keep_grey, name, self.encoding, self.unit)
+        return Window(self.cut(rows, columns), self.keep_grey, name, self.encoding, self.unit)
 
 
 def open_source(source: Any, keep_grey: bool = False, encoding: str | None = None) -> Source:
@@ -145,84 +145,72 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
     if is_url(source):
         source, encoding = read_file(source, keep_grey, encoding)
     if isinstance(source, (str, os.PathLike)):
-        return _open_file(Path(source), keep_grey, encoding)
-    if not hasattr(source, "shape") or not hasattr(source, "dtype"):
+        name, identity = str(source), _identity(Path(source))
+        shape, cut, said = _open_file(Path(source), keep_grey)
+        encoding = encoding or said
+    elif hasattr(source, "shape") and hasattr(source, "dtype"):
+        name, shape, cut = "image", tuple(int(side) for side in source.shape), _cutter(source)
+        identity = {"shape": list(shape), "dtype": np.dtype(source.dtype).str}
+        encoding = encoding_of(source, encoding) or "srgb"
+    else:
         kind = type(source).__name__
         raise ImageError(f"image: is a {kind}; pass a file or an array of shape (H, W, 3)")
-    shape, dtype = tuple(int(side) for side in source.shape), np.dtype(source.dtype)
-    identity = {"shape": list(shape), "dtype": dtype.str}
-    said = encoding_of(source, encoding) or "srgb"
-    return _checked("image", shape, identity, _cut_array(source), keep_grey, said)
+    if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] not in (1, 3)):
+        raise ImageError(f"{name}: shape {shape}, expected (H, W) or (H, W, 3)")
+    if not all(1 <= side <= MAX_SIDE for side in shape[:2]):
+        raise ImageError(f"{name}: {shape[1]}x{shape[0]} pixels; sides go from 1 to {MAX_SIDE:,}")
+    channels = 1 if keep_grey and shape[2:] in ((), (1,)) else 3
+    return Source(shape[1], shape[0], channels, name, identity, cut, keep_grey, encoding)
 
 
-def _cut_array(pixels: Any) -> Callable[[slice, slice], Callable[[], Array]]:
-    """Return what cuts windows out of an array; each holds its pixels alone."""
-    return lambda rows, columns: partial(np.asarray, np.asarray(pixels[rows, columns]))
-
-
-def _open_file(path: Path, keep_grey: bool, encoding: str | None) -> Source:
-    absolute = os.path.abspath(path)
+def _identity(path: Path) -> dict[str, Any]:
+    """Return what tells a file from others, and from itself when it has changed."""
     try:
         state = path.stat()
     except OSError as error:
         raise ImageError(f"{path}: {error.strerror or error}; check the path") from None
     if path.is_dir():
         raise ImageError(f"{path}: is a folder; name an image file in it")
-    identity = {"file": absolute, "bytes": state.st_size, "modified": state.st_mtime_ns}
-    shape: tuple[int, ...] | None = None
-    if path.suffix.lower() in TIFF_SUFFIXES:
-        shape = window_shape(absolute)
-    if shape is not None:
-        read, light = partial(read_window, absolute), holds_floats(absolute)
-    elif path.suffix.lower() == ".npy":
-        shape, read, light = _array_shape(absolute), partial(_read_array, absolute), False
-    else:
-        pixels, light = _decode_whole(path, keep_grey)
-        said = encoding or ("linear" if light else "srgb")
-        return _checked(str(path), pixels.shape, identity, _cut_array(pixels), keep_grey, said)
-
-    def cut(rows: slice, columns: slice) -> Callable[[], Array]:
-        return partial(read, rows, columns)
-
-    said = encoding or ("linear" if light else "srgb")
-    return _checked(str(path), shape, identity, cut, keep_grey, said)
+    return {
+        "file": os.path.abspath(path),
+        "bytes": state.st_size,
+        "modified": state.st_mtime_ns,
+    }
 
 
-def _decode_whole(path: Path, keep_grey: bool) -> tuple[Array, bool]:
-    """Return the pixels of a file, 8 bits as 8 bits, and whether they are light."""
+def _open_file(
+    path: Path, keep_grey: bool
+) -> tuple[tuple[int, ...], Callable[[slice, slice], Load], str]:
+    """Return the shape of an image file, what cuts windows out of it, and its encoding."""
+    absolute = os.path.abspath(path)
+    if path.suffix.lower() == ".npy":
+        try:
+            shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
+        except (ValueError, EOFError, OSError) as error:
+            raise ImageError(f"{path}: not a readable .npy file ({error})") from None
+        return shape, partial(partial, _read_array, absolute), "srgb"
+    if path.suffix.lower() in TIFF_SUFFIXES and (found := window_shape(absolute)):
+        shape, dtype = found
+        return shape, partial(partial, read_window, absolute), _encoding(dtype)
     if kind_of(path) is not None:
-        found = read_file(path, keep_grey)
-        return found.pixels, found.encoding == "linear"
-    with open_picture(path, MAX_SIDE) as picture:
-        return picture_pixels(picture)[0], False
+        pixels, encoding = read_file(path, keep_grey)
+    else:  # 8 bits stay 8 bits
+        with open_picture(path, MAX_SIDE) as picture:
+            pixels, encoding = picture_pixels(picture)[0], "srgb"
+    return pixels.shape, _cutter(pixels), encoding
 
 
-def _checked(
-    name: str,
-    shape: tuple[int, ...],
-    identity: dict[str, Any],
-    cut: Callable[[slice, slice], Callable[[], Array]],
-    keep_grey: bool,
-    encoding: str,
-) -> Source:
-    """Return a source, or refuse what is no image or too large."""
-    if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] not in (1, 3)):
-        raise ImageError(f"{name}: shape {shape}, expected (H, W) or (H, W, 3)")
-    if not all(1 <= side <= MAX_SIDE for side in shape[:2]):
-        raise ImageError(f"{name}: {shape[1]}x{shape[0]} pixels; sides go from 1 to {MAX_SIDE:,}")
-    grey = len(shape) == 2 or shape[2] == 1
-    channels = 1 if grey and keep_grey else 3
-    return Source(shape[1], shape[0], channels, name, identity, cut, keep_grey, encoding)
+def _encoding(dtype: np.dtype[Any]) -> str:
+    """Return what a TIFF file of a type holds."""
+    return "linear" if dtype.kind == "f" else "srgb"
 
 
-def _array_shape(path: str) -> tuple[int, ...]:
-    try:
-        return tuple(np.load(path, mmap_mode="r", allow_pickle=False).shape)
-    except (ValueError, EOFError, OSError) as error:
-        raise ImageError(f"{path}: not a readable .npy file ({error})") from None
+def _cutter(pixels: Any) -> Callable[[slice, slice], Load]:
+    """Return what cuts windows out of an array; each holds its pixels alone."""
+    return lambda rows, columns: partial(np.asarray, np.asarray(pixels[rows, columns]))
 
 
-def _read_array(path: str, rows: slice, columns: slice) -> Array:
+def _read_array(path: str, rows: slice, columns: slice) -> Pixels:
     """Read a part of a ``.npy`` file; the map of the file ends with the call."""
     return np.array(np.load(path, mmap_mode="r", allow_pickle=False)[rows, columns])
 
@@ -231,16 +219,12 @@ MAX_SEGMENT = 1 << 26
 """Values of the largest strip or tile that is decoded for a window. A file of one compressed strip
 is better decoded once."""
 
-TIFF_SUFFIXES = (".tif", ".tiff")
-
 TILE_SIDE = 256
 """Side of the tiles of files that `write_tiles` writes, in pixels."""
 
-Pixels = NDArray[Any]
 
-
-def window_shape(path: str) -> tuple[int, int, int] | None:
-    """Return height, width and channels of a TIFF file that `read_window` reads, else None.
+def window_shape(path: str) -> tuple[tuple[int, int, int], np.dtype[Any]] | None:
+    """Return height, width, channels and the type of a TIFF file that `read_window` reads, or None.
 
     Such a file holds grey or RGB as 8 or 16 bits or floats. Its strips or tiles are plain, or have
     a compression that tifffile knows here: others need the package imagecodecs.
@@ -250,7 +234,6 @@ def window_shape(path: str) -> tuple[int, int, int] | None:
     try:
         with tifffile.TiffFile(path) as file:
             page = file.pages[0]
-            height, width = page.imagelength, page.imagewidth
             channels = page.samplesperpixel
             plain = page.planarconfig == 1 and page.photometric in (1, 2) and page.imagedepth == 1
             turned = "Orientation" in page.tags and page.tags["Orientation"].value != 1
@@ -258,14 +241,79 @@ def window_shape(path: str) -> tuple[int, int, int] | None:
             if not plain or turned or not known or channels not in (1, 3):
                 return None
             if not page.is_memmappable:
-                segment = page.chunks[-3:] if page.is_tiled else page.chunks
-                if np.prod(segment, dtype=np.int64) > MAX_SEGMENT:
+                if np.prod(page.chunks, dtype=np.int64) > MAX_SEGMENT:
                     return None
                 _decode(file, page, 0)
+            return (page.imagelength, page.imagewidth, channels), page.dtype
     except Exception:  # tifffile raises many types; Pillow reads what it does not, or says why not
         return None
-    return height, width, channels
 
+
+def read_window(path: str, rows: slice, columns: slice) -> Pixels:
+    """Read a part of a TIFF file for which `window_shape` returns a shape.
+
+    Parameters
+    ----------
+    path : str
+    rows, columns : slice
+        Inside the image.
+
+    Returns
+    -------
+    ndarray, shape (R, C, channels) or (R, C)
+
+    Raises
+    ------
+    ImageError
+        If the file is missing or damaged.
+    """
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as file:
+            page = file.pages[0]
+            if not page.is_memmappable:
+                return _from_segments(file, page, rows, columns)
+        # A map of its own, so that the pages of the file leave the memory with it.
+        whole = tifffile.memmap(path, page=0, mode="r")
+        return np.array(whole[rows, columns], whole.dtype.newbyteorder("="))
+    except Exception as error:  # tifffile raises many types
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ImageError(f"{path}: damaged or unreadable ({reason}); export it again") from error
+
+
+def _from_segments(file: Any, page: Any, rows: slice, columns: slice) -> Pixels:
+    """Decode the strips or tiles that a window touches. One without data is black."""
+    height, width = page.chunks[:2]
+    across = -(-page.imagewidth // width)
+    shape = (rows.stop - rows.start, columns.stop - columns.start, page.samplesperpixel)
+    result = np.zeros(shape, page.dtype)
+    for row in range(rows.start // height, -(-rows.stop // height)):
+        for column in range(columns.start // width, -(-columns.stop // width)):
+            segment = _decode(file, page, row * across + column)
+            if segment is not None:
+                here, there = _shared(rows, row * height, segment.shape[0])
+                left, right = _shared(columns, column * width, segment.shape[1])
+                result[here, left] = segment[there, right]
+    return result
+
+
+def _shared(part: slice, start: int, length: int) -> tuple[slice, slice]:
+    """Return what a part shares with a segment, counted from the start of each."""
+    first, last = max(part.start, start), min(part.stop, start + length)
+    return slice(first - part.start, last - part.start), slice(first - start, last - start)
+
+
+def _decode(file: Any, page: Any, number: int) -> Pixels | None:
+    """Return a strip or a tile (R, C, channels)."""
+    file.filehandle.seek(page.dataoffsets[number])
+    data = file.filehandle.read(page.databytecounts[number])
+    segment, _, _ = page.decode(data, number)
+    return None if segment is None else np.asarray(segment[0])
+
+
+GREY = ("1", "L", "I", "I;16", "I;16B", "I;16L", "F")
+"""Modes of Pillow for opaque images of one channel."""
 
 TURNED = range(5, 9)
 """EXIF orientations that swap width and height."""
@@ -281,8 +329,8 @@ def image_size(path: Path | str) -> tuple[int, int, int] | None:
     """
     if isinstance(path, str):
         return None
-    if path.suffix.lower() in TIFF_SUFFIXES and (shape := window_shape(str(path))):
-        return shape
+    if path.suffix.lower() in TIFF_SUFFIXES and (found := window_shape(str(path))):
+        return found[0]
     try:
         with open_header(path) as file:
             width, height = file.size
@@ -294,90 +342,11 @@ def image_size(path: Path | str) -> tuple[int, int, int] | None:
     return (width, height, channels) if turned else (height, width, channels)
 
 
-def holds_floats(path: str) -> bool:
-    """Return whether a TIFF file, for which `window_shape` returns a shape, holds floats."""
-    import tifffile
-
-    with tifffile.TiffFile(path) as file:
-        return bool(file.pages[0].dtype.kind == "f")
-
-
-def read_window(path: str, rows: slice, columns: slice) -> Pixels:
-    """Read a part of a TIFF file for which `window_shape` returns a shape.
-
-    Parameters
-    ----------
-    path : str
-    rows, columns : slice
-        Inside the image.
-
-    Returns
-    -------
-    ndarray, shape (R, C, channels)
-
-    Raises
-    ------
-    ImageError
-        If the file is missing or damaged.
-    """
-    import tifffile
-
-    try:
-        with tifffile.TiffFile(path) as file:
-            page = file.pages[0]
-            if page.is_memmappable:
-                # A map of its own, so that the pages of the file leave the memory with it.
-                whole = np.memmap(
-                    path,
-                    page.dtype.newbyteorder(file.byteorder),
-                    "r",
-                    page.dataoffsets[0],
-                    (page.imagelength, page.imagewidth, page.samplesperpixel),
-                )
-                return np.array(whole[rows, columns], whole.dtype.newbyteorder("="))
-            return _from_segments(file, page, rows, columns)
-    except Exception as error:  # tifffile raises many types
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ImageError(f"{path}: damaged or unreadable ({reason}); export it again") from error
-
-
-def _from_segments(file: Any, page: Any, rows: slice, columns: slice) -> Pixels:
-    """Decode the strips or tiles that a window touches."""
-    if page.is_tiled:
-        height, width = page.tilelength, page.tilewidth
-    else:
-        height, width = page.rowsperstrip, page.imagewidth
-    across = -(-page.imagewidth // width)
-    shape = (rows.stop - rows.start, columns.stop - columns.start, page.samplesperpixel)
-    result = np.empty(shape, page.dtype)
-    for row in range(rows.start // height, -(-rows.stop // height)):
-        for column in range(columns.start // width, -(-columns.stop // width)):
-            segment = _decode(file, page, row * across + column)
-            top, left = row * height, column * width
-            y0, x0 = max(rows.start, top), max(columns.start, left)
-            y1 = min(rows.stop, top + segment.shape[0])
-            x1 = min(columns.stop, left + segment.shape[1])
-            result[y0 - rows.start : y1 - rows.start, x0 - columns.start : x1 - columns.start] = (
-                segment[y0 - top : y1 - top, x0 - left : x1 - left]
-            )
-    return result
-
-
-def _decode(file: Any, page: Any, number: int) -> Pixels:
-    """Return a strip or a tile (R, C, channels); a segment without data is black."""
-    file.filehandle.seek(page.dataoffsets[number])
-    data = file.filehandle.read(page.databytecounts[number])
-    segment, _, shape = page.decode(data, number)
-    if segment is None:
-        return np.zeros(shape[1:], page.dtype)
-    return np.asarray(segment[0])
-
-
 def write_tiles(
     path: str | os.PathLike[str],
     shape: tuple[int, int, int],
     bands: Iterator[Pixels],
-    dtype: Any = np.uint8,
+    dtype: DTypeLike = np.uint8,
 ) -> None:
     """Write a tiled TIFF file, a BigTIFF if it has more than 4 GB, from bands of rows.
 

@@ -200,9 +200,9 @@ def fit(
 
 def _expand(source: Path | str) -> Sequence[Path | str]:
     """Replace a folder, a pattern or a URL by the images that it stands for."""
-    from ..collection.sources import list_files
+    from ..image.folder import list_images
 
-    return [source] if isinstance(source, Path) and source.is_file() else list_files(source)
+    return [source] if isinstance(source, Path) and source.is_file() else list_images(source)
 
 
 def _model(settings: dict[str, Any], basis: str | None) -> EigenGS | None:

@@ -60,7 +60,7 @@ def render(
     """
     if scale is not None and size is not None:
         raise click.UsageError("--scale and --size exclude each other; give one of them")
-    from ..blocks.windows import TIFF_SUFFIXES
+    from ..image.formats import TIFF_SUFFIXES
     from ..image.io import SUFFIXES, bits_of
 
     [output] = name_outputs([file], output, SUFFIXES)

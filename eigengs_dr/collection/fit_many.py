@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import fields, replace
 from functools import partial
 from typing import Any
@@ -18,9 +17,9 @@ from ..fitting.start import load_start
 from ..fitting.target import unit_of
 from ..image.color import rendered_as
 from ..image.pixels import EncodedImage
-from .fit_batch import MAX_SIDE, fit_batch, fits_in_batches
+from .fit_batch import fit_batch, fits_in_batches
 from .manifest import ImageRow
-from .run import FAILURES, Job, Outcome, Work, run_images
+from .run import Job, run_images
 from .sources import Images
 
 MAX_GROUP_PIXELS = 1 << 18
@@ -114,56 +113,34 @@ def fit_many(
     settings = FitOptions(**options)
     if settings.start is not None:
         settings = replace(settings, start=load_start(settings.start, settings.backend))
-    keep_grey = rendered_as(settings.space) is None
-    make_work = partial(fit_work, settings)
-    job = Job(make_work, _may_join, keep_grey, settings.encoding, settings.iterations)
+    if client is None:
+        select(settings.backend)  # a backend that is missing is said before the work
+    job = Job(
+        partial(_fit_group, options=settings),
+        partial(_may_join, options=settings),
+        rendered_as(settings.space) is None,
+        settings.encoding,
+        settings.iterations,
+    )
     return run_images(images, output, overwrite, job, progress, client)
 
 
-def fit_work(options: FitOptions) -> Work:
-    """Return the `Work` of a fit of many images.
-
-    Raises
-    ------
-    BackendError
-        If the backend is not available.
-    """
-    select(options.backend)
-    return partial(_fit_group, options=options)
+def _may_join(group: list[EncodedImage], added: EncodedImage, options: FitOptions) -> bool:
+    """Group small images of one size, up to `MAX_GROUP_PIXELS`."""
+    first, last = group[-1].pixels, added.pixels
+    alike = first.shape == last.shape and _is_batchable(group[-1], options)
+    area = (len(group) + 1) * last.shape[0] * last.shape[1]
+    return alike and _is_batchable(added, options) and area <= MAX_GROUP_PIXELS
 
 
-def _may_join(group: list[EncodedImage], added: EncodedImage) -> bool:
-    """Group small images of one size and encoding, up to `MAX_GROUP_PIXELS`."""
-    (first, encoding), (pixels, own) = group[0], added
-    enough = (len(group) + 1) * pixels.shape[0] * pixels.shape[1] > MAX_GROUP_PIXELS
-    alike = encoding == own and first.shape == pixels.shape
-    return alike and max(pixels.shape[:2]) <= MAX_SIDE and not enough
+def _is_batchable(image: EncodedImage, options: FitOptions) -> bool:
+    """Return whether a batch may hold an image."""
+    plain = image.encoding == "srgb" and unit_of(image.pixels, options.space) == 1
+    return plain and fits_in_batches(options, image.pixels)
 
 
-def _fit_group(images: list[EncodedImage], options: FitOptions) -> Iterator[Outcome]:
-    """Fit images of one size, together if they are small."""
-    pixels = [image.pixels for image in images]
-    plain = images[0].encoding == "srgb"
-    plain &= all(unit_of(values, options.space) == 1 for values in pixels)
-    if plain and fits_in_batches(options, pixels[0]):
-        try:
-            results = fit_batch(np.stack(pixels), options)
-        except FAILURES:
-            pass  # below, each image says what is wrong with it
-        else:
-            for result in results:
-                yield Outcome(result.gaussians, result, _figures(result))
-            return
-    for image in images:
-        try:
-            result = fit_image(image, options)
-        except FAILURES as error:
-            yield Outcome(None, None, {"error": str(error) or type(error).__name__})
-        else:
-            yield Outcome(result.gaussians, result, _figures(result))
-
-
-def _figures(result: Fit) -> dict[str, Any]:
-    """Return the figures of a fit for its row."""
-    names = ("psnr_ycbcr", "psnr_rgb", "seconds", "iterations", "stopped")
-    return {name: getattr(result, name) for name in names}
+def _fit_group(images: list[EncodedImage], options: FitOptions) -> list[Fit]:
+    """Fit one image, or several that may be in one batch."""
+    if len(images) == 1:
+        return [fit_image(images[0], options)]
+    return fit_batch(np.stack([image.pixels for image in images]), options)

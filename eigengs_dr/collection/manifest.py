@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import json
 import math
-import os
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, NamedTuple
 
 from ..storage.atomic import atomic_write, lock_folder, remove_stale
 
@@ -96,18 +95,9 @@ KEYS = [field.name for field in fields(ImageRow) if field.name != "result"]
 Row = dict[str, Any]
 
 
-class Manifest:
-    """The manifest of a folder; a context manager that holds the lock of the folder.
-
-    Parameters
-    ----------
-    folder : Path
-        An existing folder.
-
-    Attributes
-    ----------
-    rows : dict of str to dict
-        The last row of each image, by its name.
+@contextmanager
+def open_manifest(folder: Path) -> Iterator[Manifest]:
+    """Open the manifest of an existing folder, and hold the lock of the folder, during a block.
 
     Raises
     ------
@@ -116,60 +106,60 @@ class Manifest:
     ValueError
         If the file is no manifest.
     """
-
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / NAME
-        self.rows: dict[str, Row] = {}
-
-    def __enter__(self) -> Manifest:
-        with ExitStack() as stack:
-            stack.enter_context(lock_folder(self.path.parent))
-            remove_stale(self.path.parent)
-            self.rows, clean = read_manifest(self.path)
-            if not clean:
-                self._rewrite()  # else the next row would continue a half line
-            self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *details: Any) -> None:
-        """Leave one row an image, and free the folder."""
-        with self._stack:
-            os.close(self._file)  # Windows replaces no file that is open
+    path = folder / NAME
+    with lock_folder(folder):
+        remove_stale(folder)
+        rows, clean = read_manifest(path)
+        if not clean:
+            write_manifest(path, rows)  # else the next row would continue a half line
+        file = path.open("ab")
+        try:
+            yield Manifest(path, rows, file)
+        finally:
             # If the disk is too full for a second file, the longer one holds the same rows.
             with suppress(OSError):
-                self._rewrite()
-                remove_stale(self.path.parent)
+                file.close()  # Windows replaces no file that is open
+                write_manifest(path, rows)
+                remove_stale(folder)
+
+
+class Manifest(NamedTuple):
+    """The manifest of a folder.
+
+    Attributes
+    ----------
+    path : Path
+    rows : dict of str to dict
+        The last row of each image, by its name.
+    file : file
+        Takes the rows to come.
+    """
+
+    path: Path
+    rows: dict[str, Row]
+    file: BinaryIO
 
     def add(self, row: ImageRow) -> None:
         """Record what became of an image. A skipped image keeps the row of its result."""
         if row.status == "skipped" and self.rows.get(row.name, {}).get("status") == "done":
             return
         self.rows[row.name] = _to_json(row)
-        text = (json.dumps(self.rows[row.name]) + "\n").encode()
         try:
-            while text:  # a disk that is nearly full takes a part of it
-                text = text[os.write(self._file, text) :]
+            self.file.write(json.dumps(self.rows[row.name]).encode() + b"\n")
+            self.file.flush()
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(self.path)) from error
 
-    def output(self, name: str) -> Path:
-        """Return the file of the result of an image."""
-        return self.path.with_name(f"{name}.npz")
 
-    def _rewrite(self) -> None:
-        with atomic_write(self.path) as temporary:
-            lines = (json.dumps(self.rows[name]) + "\n" for name in sorted(self.rows))
-            temporary.write_text("".join(lines), encoding="utf-8")
+def write_manifest(path: Path, rows: dict[str, Row]) -> None:
+    """Write a manifest with one line an image, sorted by name."""
+    with atomic_write(path) as temporary:
+        lines = (json.dumps(rows[name]) + "\n" for name in sorted(rows))
+        temporary.write_text("".join(lines), encoding="utf-8")
 
 
 def read_manifest(path: Path) -> tuple[dict[str, Row], bool]:
-    """Read a manifest.
-
-    Parameters
-    ----------
-    path : Path
-        The file; it need not exist.
+    """Read a manifest, which need not exist.
 
     Returns
     -------
@@ -188,8 +178,8 @@ def read_manifest(path: Path) -> tuple[dict[str, Row], bool]:
     rows: dict[str, Row] = {}
     if not path.exists():
         return rows, True
-    lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
-    for number, line in enumerate(lines[:-1], 1):
+    *lines, rest = path.read_text(encoding="utf-8", errors="replace").split("\n")
+    for number, line in enumerate(lines, 1):
         try:
             row = json.loads(line)
             if row["status"] not in STATUSES or not isinstance(row["name"], str):
@@ -200,17 +190,13 @@ def read_manifest(path: Path) -> tuple[dict[str, Row], bool]:
                 "folder"
             ) from None
         rows[row["name"]] = row
-    return rows, not lines[-1]
+    return rows, not rest
 
 
 def _to_json(row: ImageRow) -> Row:
     """Return a row as types of JSON; the output without its folder, which may move."""
-    plain: Row = {}
-    for key in KEYS:
-        value = getattr(row, key)
-        if isinstance(value, Path):
-            value = value.name if key == "output" else str(value)
-        if isinstance(value, float) and not math.isfinite(value):
-            value = None
-        plain[key] = value.item() if hasattr(value, "item") else value
-    return plain
+    plain: Row = {key: getattr(row, key) for key in KEYS}
+    plain["input"] = None if row.input is None else str(row.input)
+    plain["output"] = None if row.output is None else row.output.name
+    infinite = [k for k, v in plain.items() if isinstance(v, float) and not math.isfinite(v)]
+    return plain | dict.fromkeys(infinite)

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 import os
+import time
 import warnings
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,75 +24,52 @@ import numpy as np
 
 from ..backend.executor import Executor, executor_for
 from ..backend.feedback import defer_interrupts, warn
+from ..fitting.fit import Fit
 from ..gaussian.file import write
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import read_ahead
+from ..image.io import check_data, read_floats
 from ..image.pixels import EncodedImage
-from .manifest import ImageRow, Manifest, RowProgress, RunInterrupted
-from .sources import Decoded, Images, Source, decode, list_sources, make_folder, plan_output
+from ..storage.atomic import refuse_url, require_writable
+from .manifest import ImageRow, Manifest, RowProgress, RunInterrupted, open_manifest
+from .sources import Images, Source, list_sources, plan_output
 
 WRITERS = 2
 """Threads that compress and write results: 5,000 Gaussians take 6 ms."""
 
-MAX_WRITING, MAX_WRITING_PIXELS = 32, 1 << 22
-"""Largest number of results that wait for their file, and pixels of their images."""
+MAX_WRITING = 8
+"""Largest number of results that wait for their file."""
 
 FAILURES = (ValueError, OSError, MemoryError)
 """Errors of one image, which do not end the run."""
 
-
-class Outcome(NamedTuple):
-    """Result of the work on one image.
-
-    Attributes
-    ----------
-    gaussians : Gaussians or None
-        None if the image failed.
-    result : Any
-        What `ImageRow.result` holds.
-    figures : dict
-        Other attributes of the `ImageRow`.
-    """
-
-    gaussians: Gaussians | None
-    result: Any
-    figures: dict[str, Any]
+FIGURES = ("psnr_ycbcr", "psnr_rgb", "iterations", "stopped")
+"""What a row has of a fit."""
 
 
-Work = Callable[[list[EncodedImage]], Iterator[Outcome]]
-"""``work(images)`` yields the outcome of every image of a group, in order."""
-
-
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """What a run does with its images. It can travel to the workers of a cluster.
 
     Attributes
     ----------
-    make_work : callable
-        Returns the `Work`. It is called once in each process.
+    work : callable
+        ``work(images)`` returns the results of a group, in order.
     may_join : callable
-        ``may_join(group, image)``: whether an image may join a group that is not empty.
-    keep_grey, encoding
-        See `eigengs_dr.image.io.load_image`.
-    steps
+        ``may_join(group, image)``: whether an image may join a group that is not empty; by default
+        none may.
+    keep_grey : bool
+        Whether the images are data, which keep one channel.
+    encoding : {"srgb", "linear"} or None
+        See `eigengs_dr.image.io.check_image`.
+    steps : int
         Steps of gradient descent of an image: how much work it is.
     """
 
-    make_work: Callable[[], Work]
-    may_join: Callable[[list[EncodedImage], EncodedImage], bool]
+    work: Callable[[list[EncodedImage]], list[Fit] | list[Gaussians]]
+    may_join: Callable[[list[EncodedImage], EncodedImage], bool] | None = None
     keep_grey: bool = False
     encoding: str | None = None
     steps: int = 0
-
-    @cached_property
-    def work(self) -> Work:
-        """The work on groups of images, ready."""
-        return self.make_work()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave the work here: it may hold arrays of Dr.Jit, which do not travel."""
-        return {key: value for key, value in self.__dict__.items() if key != "work"}
 
 
 class Finished(NamedTuple):
@@ -126,47 +104,74 @@ def run_images(
     """
     sources = list_sources(images)
     total = len(sources) if isinstance(sources, list) else None
-    loop: Callable[..., Generator[Finished, None, None]] = run_job
-    if client is None:
-        _ = job.work  # what is wrong with the options is said before the work
-    else:
-        loop = partial(
-            run_on_workers, executor=executor_for(client), total=total, keep=output is None
-        )
+    executor = None if client is None else executor_for(client)
     rows: dict[int, ImageRow] = {}
+
+    def note(place: int, row: ImageRow) -> None:
+        if manifest:
+            manifest.add(row)
+        rows[place] = replace(row, result=None) if manifest else row
+        if progress:
+            progress(len(rows), total, row)
+
+    def with_work() -> Iterator[Source]:
+        for source in sources:
+            planned: Source | ImageRow = source
+            if source.error:
+                planned = source.row("failed", error=source.error)
+            elif manifest:
+                planned = plan_output(source, manifest, overwrite)
+            if isinstance(planned, ImageRow):
+                note(source.place, planned)
+            else:
+                yield planned
+
     with ExitStack() as stack:
-        manifest = None
+        manifest: Manifest | None = None
         if output is not None:
-            manifest = stack.enter_context(Manifest(make_folder(output)))
-            sources = (plan_output(source, manifest, overwrite) for source in sources)
+            manifest = stack.enter_context(open_manifest(make_folder(output)))
+        if executor is None:
+            found = run_here(with_work(), job)
+        else:
+            found = run_on_workers(with_work(), job, executor, total, output is None)
         try:
-            for place, row, _ in stack.enter_context(closing(loop(sources, job))):
-                if manifest:
-                    manifest.add(row)
-                rows[place] = replace(row, result=None) if manifest else row
-                if progress:
-                    progress(len(rows), total, row)
+            for place, row, _ in stack.enter_context(closing(found)):
+                note(place, row)
         except KeyboardInterrupt:
             raise RunInterrupted([rows[place] for place in sorted(rows)]) from None
     return [rows[place] for place in sorted(rows)]
+
+
+def make_folder(output: str | os.PathLike[str]) -> Path:
+    """Create the folder of the results, and check that files can be written there.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be created or written, or is a URL.
+    """
+    refuse_url(output)
+    output = Path(output)
+    if output.exists() and not output.is_dir():
+        raise OSError(f"{output}: is a file; many images need a folder")
+    output.mkdir(parents=True, exist_ok=True)
+    require_writable(output / "probe.npz")
+    return output
 
 
 # ---------------------------------------------------------------------------------------------
 #  In this process: groups of images
 # ---------------------------------------------------------------------------------------------
 
-Writing = tuple[Finished, Future[None] | None]
+Decoded = tuple[Source, EncodedImage | Exception]
+"""An image that was read, or why it cannot be read."""
+
+Writing = tuple[Source, ImageRow, "Future[None] | None"]
 """An image, and its file if that is being written."""
 
 
-def run_job(sources: Iterable[Source], job: Job) -> Generator[Finished, None, None]:
+def run_here(sources: Iterable[Source], job: Job) -> Generator[Finished, None, None]:
     """Work on groups of images, and write each result while the next ones are computed.
-
-    Parameters
-    ----------
-    sources : iterable of Source
-        With their output files.
-    job : Job
 
     Yields
     ------
@@ -178,111 +183,113 @@ def run_job(sources: Iterable[Source], job: Job) -> Generator[Finished, None, No
     KeyboardInterrupt
         After Ctrl-C or SIGTERM, when all results are written and yielded.
     """
-    read = partial(decode, keep_grey=job.keep_grey, encoding=job.encoding)
-    decoded = read_ahead(sources, read, _is_file, _bytes_of)
-    writing, stopped = deque[Writing](), False
+    decoded = read_ahead(sources, partial(_decode, job=job), _is_file, _bytes_of)
+    writing: deque[Writing] = deque()
     with (
         closing(decoded),
         ThreadPoolExecutor(WRITERS, thread_name_prefix="write") as pool,
         defer_interrupts() as interrupted,
     ):
         try:
-            for group in _group(decoded, job.may_join):
-                for finished, gaussians in _work_on(group, job.work):
-                    writing.append((finished, _write(pool, finished.row.output, gaussians)))
-                    while writing and (_are_many(writing) or _is_written(writing[0])):
-                        yield _written(*writing.popleft())
+            for group in _groups(decoded, job):
+                for source, row, gaussians in _work_on(group, job):
+                    file = None
+                    if gaussians is not None and row.output:
+                        # The thread that calls this owns all work of Dr.Jit.
+                        file = pool.submit(write, row.output, gaussians.data())
+                    writing.append((source, row, file))
+                    while writing and (len(writing) > MAX_WRITING or _is_written(writing[0])):
+                        yield _finish(*writing.popleft())
                     if interrupted():
                         raise KeyboardInterrupt
         except KeyboardInterrupt:
-            stopped = True
-        while writing:
-            yield _written(*writing.popleft())
-        if stopped:
-            raise KeyboardInterrupt
+            yield from (_finish(*entry) for entry in writing)
+            raise
+        yield from (_finish(*entry) for entry in writing)
+
+
+def _decode(source: Source, job: Job) -> Decoded:
+    """Read one image. An array is copied: its owner may overwrite it."""
+    try:
+        if job.keep_grey:
+            return source, EncodedImage(check_data(source.image), "srgb")
+        return source, read_floats(source.image, encoding=job.encoding)
+    except FAILURES as error:
+        return source, error
 
 
 def _is_file(source: Source) -> bool:
-    return source.path is not None and not source.status
+    return source.path is not None
 
 
 def _bytes_of(decoded: Decoded) -> int:
-    return 0 if decoded.image is None else decoded.image.pixels.nbytes
+    image = decoded[1]
+    return 0 if isinstance(image, Exception) else image.pixels.nbytes
 
 
-def _group(
-    decoded: Iterable[Decoded], may_join: Callable[[list[EncodedImage], EncodedImage], bool]
-) -> Iterator[list[Decoded]]:
-    """Collect consecutive images that may be worked on together.
-
-    Images without work stay in the group, so that the order of the images is kept.
-    """
+def _groups(decoded: Iterable[Decoded], job: Job) -> Iterator[list[Decoded]]:
+    """Collect consecutive images that may be worked on together."""
     group: list[Decoded] = []
-    images: list[EncodedImage] = []
     for item in decoded:
-        if item.image is not None and images and not may_join(images, item.image):
-            yield group
-            group, images = [], []
-        group.append(item)
-        if item.image is not None:
-            images.append(item.image)
-        elif not images:
+        images = [image for _, image in [*group, item] if isinstance(image, EncodedImage)]
+        alone = job.may_join is None or len(images) <= len(group)
+        if group and (alone or not job.may_join(images[:-1], images[-1])):  # type: ignore[misc]
             yield group
             group = []
+        group.append(item)
     if group:
         yield group
 
 
-def _work_on(group: list[Decoded], work: Work) -> Iterator[tuple[Finished, Gaussians | None]]:
+def _work_on(group: list[Decoded], job: Job) -> Iterator[tuple[Source, ImageRow, Gaussians | None]]:
     """Yield the rows of a group, with the Gaussians to write."""
-    outcomes = work([item.image for item in group if item.image is not None])
-    for source, image, may_pass in group:
-        if image is None:
-            yield Finished(source.place, source.row, may_pass), None
+    started = time.perf_counter()
+    results = _results([image for _, image in group], job)
+    seconds = (time.perf_counter() - started) / len(group)
+    for (source, image), result in zip(group, results, strict=True):
+        if isinstance(result, Exception) or isinstance(image, Exception):
+            yield source, _failed(source, result), None
             continue
-        gaussians, result, figures = next(outcomes)
+        gaussians = result if isinstance(result, Gaussians) else result.gaussians
         height, width = image.pixels.shape[:2]
-        row = replace(source.row, width=width, height=height, result=result, **figures)
-        if gaussians is None:
-            row = _failed(row, source, row.error)
-        else:
-            row = replace(row, status="done", gaussians=len(gaussians))
-        yield Finished(source.place, row), gaussians
+        figures = {name: getattr(result, name) for name in FIGURES if hasattr(result, name)}
+        figures |= {"width": width, "height": height, "gaussians": len(gaussians)}
+        yield source, source.row("done", seconds=seconds, result=result, **figures), gaussians
 
 
-def _failed(row: ImageRow, source: Source, reason: str) -> ImageRow:
-    return replace(row, status="failed", error=f"{source.path or source.name}: {reason}")
+def _results(images: list[Any], job: Job) -> list[Any]:
+    """Return the results of a group; if it fails, its images say one by one what is wrong."""
+    if isinstance(images[0], Exception):
+        return images
+    try:
+        return list(job.work(images))
+    except FAILURES as error:
+        return [error] if len(images) == 1 else [_results([image], job)[0] for image in images]
 
 
-def _write(
-    pool: ThreadPoolExecutor, output: Path | None, gaussians: Gaussians | None
-) -> Future[None] | None:
-    """Start to write a set; the thread that calls this owns all work of Dr.Jit."""
-    if output is None or gaussians is None:
-        return None
-    return pool.submit(write, output, gaussians.data())
-
-
-def _are_many(writing: deque[Writing]) -> bool:
-    rows = [item.row for item, _ in writing]
-    pixels = sum((row.width or 0) * (row.height or 0) for row in rows)
-    return len(writing) > MAX_WRITING or pixels > MAX_WRITING_PIXELS
+def _failed(source: Source, error: Exception) -> ImageRow:
+    """Return the row of an image that failed; its result is the error."""
+    name, text = str(source.path or source.name), str(error) or type(error).__name__
+    if isinstance(error, OSError) and error.filename is not None:
+        text = f"{error.filename}: {error.strerror}"
+    elif not text.startswith(name):
+        text = f"{name}: {text.removeprefix('image: ')}"
+    return source.row("failed", error=text, result=error)
 
 
 def _is_written(entry: Writing) -> bool:
-    return entry[1] is None or entry[1].done()
+    return entry[2] is None or entry[2].done()
 
 
-def _written(finished: Finished, future: Future[None] | None) -> Finished:
+def _finish(source: Source, row: ImageRow, file: Future[None] | None) -> Finished:
     """Wait for the file of a result; a file that cannot be written is an error of the image."""
     try:
-        if future:
-            future.result()
+        if file:
+            file.result()
     except OSError as error:
-        named = str(error) if error.filename is None else f"{error.filename}: {error.strerror}"
-        row = replace(finished.row, status="failed", error=named)
-        return Finished(finished.place, row, may_pass=True)
-    return finished
+        row = _failed(source, error)
+    may_pass = isinstance(row.result, OSError)
+    return Finished(source.place, replace(row, result=None) if row.error else row, may_pass)
 
 
 # ---------------------------------------------------------------------------------------------
@@ -302,14 +309,9 @@ FIRST_STEPS = 10
 URL_SIZE = 1 << 16
 """Pixels that stand for an image behind a URL, which nothing is known of."""
 
-MAX_CHUNK_BYTES = 1 << 24
-"""Bytes of the arrays of a chunk: the scheduler keeps a copy until the chunk is done."""
-
-RETRIES = 2
-"""Repetitions of an image whose failure may pass: a full disk, a network."""
-
-Chunk = list[Source]
-"""Images for one task, with absolute paths."""
+BYTE_WORK = 8
+"""Work of a byte of an array: the scheduler keeps a copy, of at most 16 MB, until its chunk is
+done."""
 
 
 def run_on_workers(
@@ -320,7 +322,7 @@ def run_on_workers(
     Parameters
     ----------
     sources, job
-        See `run_job`.
+        See `run_here`.
     executor : Executor
     total : int or None
         Number of images, if it is known.
@@ -330,119 +332,91 @@ def run_on_workers(
     Yields
     ------
     Finished
-        One for each image, in any order. An image whose failure may pass is repeated up to
-        `RETRIES` times. If a chunk ends its worker, its images are repeated one by one, so that an
-        image fails for its own fault only.
+        One for each image, in any order. An image whose failure may pass is tried once more. So
+        are the images of a chunk that ends its worker, one by one: an image fails for its own fault
+        only.
 
     Raises
     ------
     ClusterError
         If the cluster is lost.
     """
-    named: dict[int, Source] = {}  # the images as the user named them, by place
-    passed, again, tries = deque[Finished](), deque[Source](), Counter[int]()
-    under_way: dict[int, Chunk] = {}
-
-    def begin(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-        for index, chunk in enumerate(chunks):
-            under_way[index] = chunk
-            yield chunk
-
-    tasks: Iterable[Chunk] = _cut(sources, job, _longest(total, executor.workers), named, passed)
-    at_once = None
-    while True:
-        with closing(executor.map(run_chunk, begin(tasks), (job, keep), at_once)) as ended:
-            for index, result, lost in ended:
-                chunk = under_way.pop(index)
-                if lost and len(chunk) > 1:
-                    again.extend(chunk)
-                elif lost:
-                    source = named.pop(chunk[0].place)
-                    yield Finished(source.place, _failed(source.row, source, lost))
-                else:
-                    finished, notes = result
-                    for note in notes:
-                        warn(note)
-                    for source, (place, row, may_pass) in zip(chunk, finished, strict=True):
-                        tries[place] += 1
-                        if may_pass and tries[place] <= RETRIES:
-                            again.append(source)
-                            continue
-                        own = named.pop(place)
-                        yield Finished(place, replace(row, input=own.path, output=own.output))
-                while passed:
-                    yield passed.popleft()
-        yield from passed
-        passed.clear()
-        if not again:
-            return
-        tasks, at_once = [[source] for source in again], 1
-        again.clear()
+    again: list[Source] = []
+    chunks = _cut(sources, job, total, executor.workers), ([source] for source in again)
+    for last, tasks in enumerate(chunks):
+        with closing(executor.map(run_chunk, tasks, (job, keep, Path.cwd()))) as ended:
+            for chunk, result, lost in ended:
+                finished, notes = result or ([_lost(source, lost) for source in chunk], [])
+                for text in notes:
+                    warn(text)
+                for source, entry in zip(chunk, finished, strict=True):
+                    if entry.may_pass and not last:
+                        again.append(source)
+                    else:
+                        yield entry
 
 
-def run_chunk(chunk: Chunk, shared: tuple[Job, bool]) -> tuple[list[Finished], list[str]]:
-    """Work on the images of a chunk, on a worker; return what became of them, and its warnings."""
-    job, keep = shared
+def _lost(source: Source, lost: str) -> Finished:
+    """Return an image whose chunk has ended its worker."""
+    error = f"{source.path or source.name}: {lost}"
+    return Finished(source.place, source.row("failed", error=error), may_pass=True)
+
+
+def run_chunk(
+    chunk: list[Source], shared: tuple[Job, bool, Path]
+) -> tuple[list[Finished], list[str]]:
+    """Work on the images of a chunk, on a worker; return what became of them, and its warnings.
+
+    Names are relative to the folder of the client, as the user gave them, and so in the rows.
+    """
+    job, keep, folder = shared
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        finished = [
-            entry if keep else entry._replace(row=replace(entry.row, result=None))
-            for entry in run_job(chunk, job)
-        ]
+        found = list(run_here((_absolute(source, folder) for source in chunk), job))
+    finished = []
+    for source, entry in zip(chunk, found, strict=True):
+        row = replace(entry.row, input=source.path, output=source.output)
+        finished.append(entry._replace(row=row if keep else replace(row, result=None)))
     return finished, [str(n.message) for n in caught if issubclass(n.category, UserWarning)]
 
 
-def _longest(total: int | None, workers: int) -> Callable[[int], int]:
-    """Return the most images of a chunk, after some were drawn.
-
-    The last chunks are shorter, so that all workers end at about the same time.
-    """
-    if total is None:
-        return lambda drawn: MAX_CHUNK
-    return lambda drawn: min(MAX_CHUNK, max(1, (total - drawn) // (2 * workers)))
+def _absolute(source: Source, folder: Path) -> Source:
+    """Name files from the root: a worker runs in another folder."""
+    image = folder / source.image if isinstance(source.image, Path) else source.image
+    return source._replace(image=image, output=source.output and folder / source.output)
 
 
 def _cut(
-    sources: Iterable[Source],
-    job: Job,
-    longest: Callable[[int], int],
-    named: dict[int, Source],
-    passed: deque[Finished],
-) -> Iterator[Chunk]:
-    """Cut the images into chunks; those without work pass by."""
-    chunk, held, work, most = list[Source](), 0, 0, longest(0)
+    sources: Iterable[Source], job: Job, total: int | None, workers: int
+) -> Iterator[list[Source]]:
+    """Cut the images into chunks.
+
+    The last ones are shorter, so that all workers end at about the same time.
+    """
+    chunk: list[Source] = []
+    work = 0
     for drawn, source in enumerate(sources, 1):
-        if source.status:
-            passed.append(Finished(source.place, source.row))
-            continue
-        named[source.place] = source
-        if source.path is None:
-            # A copy, as its owner may reuse it; light stays light.
-            source = source._replace(image=np.array(source.image, subok=True))
-            held += source.image.nbytes
-        chunk.append(_absolute(source))
-        work += _size_of(source) * (FIRST_STEPS + job.steps)
-        if len(chunk) >= most or work >= MAX_CHUNK_WORK or held >= MAX_CHUNK_BYTES:
+        if source.path is None:  # a copy, as its owner may reuse it
+            source = source._replace(image=np.array(source.image))
+        chunk.append(source)
+        work += _work_of(source, job.steps)
+        longest = MAX_CHUNK if total is None else min(MAX_CHUNK, (total - drawn) // (2 * workers))
+        if len(chunk) >= longest or work >= MAX_CHUNK_WORK:
             yield chunk
-            chunk, held, work, most = [], 0, 0, longest(drawn)
+            chunk, work = [], 0
     if chunk:
         yield chunk
 
 
-def _size_of(source: Source) -> int:
-    """Return the pixels of an array, or the bytes of a file."""
+def _work_of(source: Source, steps: int) -> int:
+    """Return the pixels of an image times its steps, as far as they are known."""
+    steps += FIRST_STEPS
     if source.path is None:
-        return int(math.prod(np.shape(source.image)[:2]))
+        pixels = math.prod(source.image.shape[:2])
+        return max(pixels * steps, BYTE_WORK * source.image.nbytes)
     if isinstance(source.path, str):
-        return URL_SIZE
+        return URL_SIZE * steps
     try:
-        return source.path.stat().st_size
+        return source.path.stat().st_size * steps
     except OSError:  # the worker says what is wrong with it
         return 0
-
-
-def _absolute(source: Source) -> Source:
-    """Name files from the root: a worker runs in another folder."""
-    image = source.image.absolute() if isinstance(source.image, Path) else source.image
-    output = None if source.output is None else Path(os.path.abspath(source.output))
-    return source._replace(image=image, output=output)

@@ -4,7 +4,6 @@
 - ``components``: shared Gaussians for all components: shapes and weights
 - ``eigengs``: the model `EigenGS`
 - ``encoder``: an image to Gaussians of the model, or to coefficients
-- ``encode_many``: many images, in groups
 - ``options``: the options of a training; an eigenbasis to a model
 - ``training``: a folder of images to a model, and its figures on images held out
 - ``model_file``: the file of a model

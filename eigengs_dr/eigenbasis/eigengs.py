@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ from ..backend.feedback import shows_progress, to_html
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image
+from ..image.pixels import EncodedImage
 from ..image.resize import resample
 from .encoder import Encoder, check_encoding
 from .model_file import read_members, write_model
@@ -269,8 +270,7 @@ class EigenGS:
             See `eigengs_dr.fit_many`. ``ImageRow.result`` is a `Gaussians`, if there is no output
             folder; rows have no PSNR.
         colors, mean, target_psnr
-            See `encode`. The Gaussians equal those of `encode` to float32 rounding, whatever the
-            number of workers.
+            See `encode`. The Gaussians have the bits of `encode`.
 
         Returns
         -------
@@ -282,10 +282,11 @@ class EigenGS:
         ValueError, OSError, RunInterrupted
             See `encode` and `eigengs_dr.fit_many`.
         """
-        from .encode_many import encode_each
+        from ..collection.run import Job, run_images
 
-        options = (colors, mean, target_psnr)
-        return encode_each(self, options, images, output, overwrite, progress, client)
+        check_encoding(colors, mean, target_psnr)
+        job = Job(partial(_encode_all, model=self, options=(colors, mean, target_psnr)))
+        return run_images(images, output, overwrite, job, progress, client)
 
     def dense_mean(self, width: int, height: int) -> Planes:
         """Return the pixels of the mean image, shape (height, width, C), in the model's space."""
@@ -325,6 +326,14 @@ class EigenGS:
     def encoder(self) -> Encoder:
         """The functions of `eigengs_dr.eigenbasis.encoder`, with what they compute once."""
         return Encoder(self.gaussians, self.weights, self.mean_image, self.low)
+
+
+@exclusive()
+def _encode_all(
+    images: list[EncodedImage], model: EigenGS, options: tuple[str, str, float | None]
+) -> list[Gaussians]:
+    """Encode images, here or on a worker."""
+    return [model.encode(image, *options) for image in images]
 
 
 @cache

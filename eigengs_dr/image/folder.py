@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -90,9 +91,31 @@ def image_files(folder: str | Path) -> list[Path]:
     return files
 
 
-def list_images(folder: str | os.PathLike[str]) -> list[Path] | list[str]:
-    """List the images of a folder, as `image_files`, or behind a URL, as `list_urls`."""
-    return list_urls(str(folder)) if is_url(folder) else image_files(Path(folder))
+def list_images(images: str | os.PathLike[str]) -> Sequence[str | Path]:
+    """List the images of a folder, a glob, or a URL of one of them or of a file.
+
+    Parameters
+    ----------
+    images : path-like
+
+    Returns
+    -------
+    sequence of Path or str
+        Files or URLs, sorted by name.
+
+    Raises
+    ------
+    ImageError
+        If there is none.
+    """
+    if is_url(images):
+        return list_urls(str(images))
+    if glob.has_magic(os.fspath(images)) and not os.path.exists(images):
+        files = sorted(Path(name) for name in glob.glob(os.fspath(images), recursive=True))
+        if not files:
+            raise ImageError(f"{images}: no file has such a name; check the pattern")
+        return files
+    return image_files(Path(images))
 
 
 def read_blocks(

@@ -384,16 +384,6 @@ def batch_to_tiles(types: ArrayTypes, images: NDArray[Any]) -> Any:
     return result
 
 
-def batch_from_tiles(image: Float, grid: Grid, channels: int) -> NDArray[Any]:
-    """Copy a batch of images from tile layout to an array (M, height, width, channels)."""
-    tile_width, tile_height = grid.tile
-    tiles = image.numpy().reshape(grid.images, grid.ny, grid.nx, tile_height, tile_width, channels)
-    whole = tiles.transpose(0, 1, 3, 2, 4, 5).reshape(
-        grid.images, grid.ny * tile_height, grid.nx * tile_width, channels
-    )
-    return np.ascontiguousarray(whole[:, : grid.height, : grid.width])
-
-
 def to_tensor(image: Float, grid: Grid, channels: int) -> Any:
     """Convert an image from tile layout to a tensor (height, width, channels); differentiable."""
     types = types_of(image)

@@ -52,9 +52,9 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = _target(path)
     temporary = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
-    # tempfile would make a file that only its owner may read.
-    temporary.touch(exist_ok=False)
     try:
+        # tempfile would make a file that only its owner may read.
+        temporary.touch(exist_ok=False)
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())

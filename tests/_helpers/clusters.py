@@ -152,12 +152,12 @@ class Here:
         """Names of the images of each task."""
         return [[source.name for source in task] for task in self.tasks]
 
-    def map(self, function, tasks, shared=None, at_once=None):
+    def map(self, function, tasks, shared=None):
         from eigengs_dr.backend.executor import Done
 
-        for index, task in reversed(list(enumerate(tasks))):
+        for task in reversed(list(tasks)):
             self.tasks.append(task)
             if self.lost & set(self.names[-1]):
-                yield Done(index, None, "its worker ended 2 times")
+                yield Done(task, None, "its worker ended 2 times")
             else:
-                yield Done(index, function(task, shared))
+                yield Done(task, function(task, shared))

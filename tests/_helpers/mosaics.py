@@ -29,9 +29,9 @@ class Backwards:
 
     workers = 1
 
-    def map(self, function, tasks, shared=None, at_once=None):
-        for index, task in reversed(list(enumerate(tasks))):
-            yield Done(index, function(task, shared))
+    def map(self, function, tasks, shared=None):
+        for task in reversed(list(tasks)):
+            yield Done(task, function(task, shared))
 
 
 class Sliced:

@@ -34,7 +34,7 @@ def test_an_executor_is_taken_as_it_is():
 
 def test_completed_is_strict_about_lost_tasks():
     class Losing:
-        def map(self, function, tasks, shared=None, at_once=None):
+        def map(self, function, tasks, shared=None):
             yield Done(1, 5)
             yield Done(0, None, "its worker ended 2 times")
 

@@ -163,10 +163,10 @@ def test_output_that_cannot_be_written():
 
 def test_lost_task_is_one_line():
     class Losing(Backwards):
-        def map(self, function, tasks, shared=None, at_once=None):
-            yield Done(0, None, "a task ended its worker 3 times")
+        def map(self, function, tasks, shared=None):
+            yield Done(None, None, "a task ended its worker 3 times")
 
-    with pytest.raises(eg.ClusterError, match="image: a task ended its worker 3 times"):
+    with pytest.raises(eg.ClusterError, match="cannot be done: a task ended its worker 3 times"):
         eg.fit_large(mosaic(128), **FEW, client=Losing())
 
 

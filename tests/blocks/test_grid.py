@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eigengs_dr.blocks.grid import choose_halo, deal, divide, neighbors
+from eigengs_dr.blocks.grid import choose_halo, deal, divide
 
 
 @given(st.integers(1, 300), st.integers(1, 300), st.integers(20, 120), st.integers(0, 40))
@@ -27,19 +27,6 @@ def test_cores_tile_the_image_inside_their_windows(width, height, side, halo):
             assert min(length, core.stop + halo) <= around.stop <= length
     assert (covered == 1).all()
     assert len({tuple(block.window_size) for block in blocks}) == 1
-
-
-def test_neighbors_of_a_window():
-    blocks = divide(400, 300, 100, 16)
-    for block in blocks:
-        rows, columns = block.window_rows, block.window_columns
-        seen = [
-            other
-            for other in blocks
-            if max(other.rows.start, rows.start) < min(other.rows.stop, rows.stop)
-            and max(other.columns.start, columns.start) < min(other.columns.stop, columns.stop)
-        ]
-        assert block in seen and neighbors(block, blocks) == seen
 
 
 @given(

@@ -43,7 +43,7 @@ def assert_same(source, pixels, part=PART):
 def test_tiff_is_read_by_windows(tmp_path, pixels, options):
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, pixels, photometric="rgb", **options)
-    assert window_shape(str(path)) == (150, 150, 3)
+    assert window_shape(str(path)) == ((150, 150, 3), np.uint8)
     assert_same(open_source(path), pixels)
 
 
@@ -177,4 +177,4 @@ def test_tiles_are_written(tmp_path, channels):
     write_tiles(tmp_path / "a.tif", pixels.shape, iter([pixels[:512], pixels[512:]]))
     found = np.asarray(Image.open(tmp_path / "a.tif"))
     np.testing.assert_array_equal(found.reshape(pixels.shape), pixels)
-    assert window_shape(str(tmp_path / "a.tif")) == pixels.shape
+    assert window_shape(str(tmp_path / "a.tif")) == (pixels.shape, np.uint8)

@@ -40,7 +40,7 @@ def test_the_same_command_continues(photos, tmp_path):
 
 
 def test_ctrl_c_keeps_what_is_done(photos, tmp_path, monkeypatch):
-    complete, fitted = fit_many_module.fit_batch, []
+    complete, fitted = fit_many_module.fit_image, []
 
     def interrupted(*arguments):
         fitted.append(complete(*arguments))
@@ -49,7 +49,7 @@ def test_ctrl_c_keeps_what_is_done(photos, tmp_path, monkeypatch):
         return fitted[-1]
 
     monkeypatch.setattr(fit_many_module, "MAX_GROUP_PIXELS", 1)  # every image is a group
-    monkeypatch.setattr(fit_many_module, "fit_batch", interrupted)
+    monkeypatch.setattr(fit_many_module, "fit_image", interrupted)
     report = tmp_path / "r.json"
     result = run("fit", photos, "-o", tmp_path / "fits", "--report", report, *QUICK)
     assert result.exit_code == 130

@@ -6,12 +6,10 @@ import pytest
 import eigengs_dr as eg
 from _helpers.families import SPLATS, small_basis
 from eigengs_dr.backend.executor import ClusterError, Done
-from eigengs_dr.eigenbasis.components import solve as weights
 
 
 @pytest.mark.parametrize("options", [{}, {"frequency_aware": True}, {"iterations": 1}])
-def test_the_bits_of_one_process(client, monkeypatch, options):
-    monkeypatch.setattr(weights, "BATCH", 5)  # several groups of each channel
+def test_the_bits_of_one_process(client, options):
     here = eg.EigenGS.fit(small_basis(), SPLATS, backend="llvm", **options)
     far = eg.EigenGS.fit(small_basis(), SPLATS, backend="llvm", client=client, **options)
     for name, array in here.gaussians.to_arrays().items():
@@ -26,7 +24,7 @@ def test_a_group_that_is_lost():
     class Losing:
         workers = 1
 
-        def map(self, function, tasks, shared=None, at_once=None):
+        def map(self, function, tasks, shared=None):
             yield Done(0, None, "its worker ended 2 times")
 
     with pytest.raises(ClusterError, match="a part of the work cannot be done: its worker ended"):

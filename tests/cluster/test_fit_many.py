@@ -244,6 +244,5 @@ def test_encoded_images_are_those_of_this_process(client, photos, output):
         found, expected = row.result.to_arrays(), other.result.to_arrays()
         stored = eg.Gaussians.load(output / f"{row.name}.npz").to_arrays()
         for name, values in expected.items():
-            # Groups share matrix products, whose rounding depends on their width.
-            np.testing.assert_allclose(found[name], values, atol=2e-5)
-            np.testing.assert_allclose(stored[name], values, atol=2e-5)
+            np.testing.assert_array_equal(found[name], values)
+            np.testing.assert_array_equal(stored[name], values)

@@ -5,7 +5,6 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.clusters import QUICK, Here, files_of, folder_of_photos
-from eigengs_dr.collection import run
 
 
 @pytest.fixture
@@ -40,12 +39,20 @@ def test_results_travel_back_without_an_output():
         np.testing.assert_array_equal(row.result.image, alone.image)
 
 
-def test_relative_names_reach_workers_whole(photos, tmp_path, monkeypatch):
+def test_names_are_those_of_the_user(photos, tmp_path, monkeypatch):
+    """Workers run in other folders."""
     monkeypatch.chdir(tmp_path)
-    executor = Here()
-    rows = eg.fit_many("photos", "fits", client=executor, **QUICK)
-    sources = [source for task in executor.tasks for source in task]
-    assert all(s.image.is_absolute() and s.output.is_absolute() for s in sources)
+
+    class Elsewhere(Here):
+        def map(self, function, tasks, shared=None):
+            tasks = list(tasks)
+            with monkeypatch.context() as patched:
+                patched.chdir("/")
+                ended = list(super().map(function, tasks, shared))
+            yield from ended
+
+    rows = eg.fit_many("photos", "fits", client=Elsewhere(), **QUICK)
+    assert [row.status for row in rows] == ["done"] * 12
     assert str(rows[0].input) == "photos/00.png" and str(rows[0].output) == "fits/00.npz"
 
 
@@ -55,28 +62,29 @@ def test_images_of_a_lost_chunk_are_done_one_by_one(photos, tmp_path):
     assert [row.name for row in rows if row.status == "failed"] == ["02"]
     assert rows[2].error == f"{photos / '02.png'}: its worker ended 2 times"
     assert sum(row.status == "done" for row in rows) == 11
-    assert ["00", "01", "02"] in executor.names
-    assert all([name] in executor.names for name in ("00", "01", "02"))
+    chunk = next(names for names in executor.names if "02" in names)
+    assert len(chunk) > 1 and all([name] in executor.names for name in chunk)
 
 
-def test_a_failure_that_may_pass_is_tried_again(photos, tmp_path, monkeypatch):
-    write, tries = run.write, []
+def test_a_failure_that_may_pass_is_tried_again(photos, tmp_path):
+    """As a full disk of one worker, and of all."""
+    output = tmp_path / "fits"
+    output.mkdir()
+    (output / "03.npz").symlink_to(tmp_path / "gone" / "03.npz")
+    (output / "04.npz").symlink_to(tmp_path / "late" / "04.npz")
 
-    def full_disk(path, data):
-        tries.append(path.name)
-        if path.name == "03.npz" or (path.name == "04.npz" and tries.count("04.npz") < 3):
-            raise OSError(28, "No space left on device", str(path))
-        write(path, data)
+    def mend(done, total, row):
+        (tmp_path / "late").mkdir(exist_ok=True)
 
-    monkeypatch.setattr(run, "write", full_disk)
-    rows = eg.fit_many(photos, tmp_path / "fits", client=Here(), **QUICK)
+    executor = Here()
+    rows = eg.fit_many(photos, output, client=executor, progress=mend, **QUICK)
     assert [row.name for row in rows if row.status == "failed"] == ["03"]
-    assert rows[3].error.endswith("03.npz: No space left on device")
-    assert tries.count("03.npz") == tries.count("04.npz") == 1 + run.RETRIES
-    assert len(rows) == 12 and not list((tmp_path / "fits").glob(".*"))
+    assert rows[3].error.endswith("03.npz: No such file or directory")
+    assert executor.names.count(["03"]) == executor.names.count(["04"]) == 1
+    assert len(rows) == 12 and not list(output.glob(".*"))
 
 
-def test_images_without_work_pass_by(photos, tmp_path):
+def test_images_without_work_reach_no_worker(photos, tmp_path):
     (photos / "05.png").write_text("no image")
     eg.fit_many([photos / "01.png", photos / "07.png"], tmp_path / "fits", **QUICK)
     executor = Here()
@@ -87,7 +95,7 @@ def test_images_without_work_pass_by(photos, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("side", "iterations", "longest"), [(4, 0, 8), (64, 10000, 4), (128, 10000, 1)]
+    ("side", "iterations", "longest"), [(4, 0, 6), (64, 10000, 4), (128, 10000, 1)]
 )
 def test_images_and_steps_decide_the_chunks(side, iterations, longest):
     """Long chunks of little work; the last ones are short, so that all workers end together."""

@@ -9,7 +9,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.clusters import QUICK, files_of, folder_of_photos
-from eigengs_dr.collection.manifest import KEYS, NAME, Manifest, read_manifest
+from eigengs_dr.collection.manifest import KEYS, NAME, open_manifest, read_manifest
 from eigengs_dr.storage.atomic import lock_folder
 
 
@@ -74,7 +74,7 @@ def test_a_file_that_was_written_before_its_row_is_done(photos, output):
     eg.fit_many(photos, output, **QUICK)
     whole = (output / "01.npz").read_bytes()
     (output / "01.npz").unlink()
-    with Manifest(output) as manifest:
+    with open_manifest(output) as manifest:
         del manifest.rows["01"]
     (output / "01.npz").write_bytes(whole)
     rows = eg.fit_many(photos, output, **QUICK)

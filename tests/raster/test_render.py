@@ -31,7 +31,6 @@ from eigengs_dr.image.color import rgb_to_ycbcr, ycbcr_to_rgb
 from eigengs_dr.raster.binning.tiles import TILE, Grid
 from eigengs_dr.raster.reference import render_plain
 from eigengs_dr.raster.render import (
-    batch_from_tiles,
     bin_gaussians,
     decode_parameters,
     picture_of,
@@ -274,6 +273,6 @@ def test_tiles_of_any_memory_layout(backend, size, layout):
         image = image.astype(np.float32 if layout == "pixels" else np.float64, order="C")
     grid = Grid(width, height)
     tiles = to_tiles(types_in(select(backend)), image, grid)
-    np.testing.assert_array_equal(batch_from_tiles(tiles, grid, 5)[0], image)
+    np.testing.assert_array_equal(to_tensor(tiles, grid, 5).numpy(), image)
     outside = grid.tiles * grid.pixels - width * height
     assert (tiles.numpy() == 0).sum() == 5 * outside

@@ -249,8 +249,12 @@ class SharedShapes:
 
 
 class Group(NamedTuple):
-    """A task: some components of one channel (m, H, W), and their weights (m, N + 1) if known."""
+    """A task: some components of one channel (m, H, W), and their weights (m, N + 1) if known.
 
+    The place is the channel, and which of its components they are.
+    """
+
+    place: tuple[int, slice]
     planes: Planes
     weights: Planes | None
 
@@ -301,11 +305,12 @@ def find_weights(
     errors = [np.empty(len(planes)) for planes in components]
     places = [(c, rows) for c, planes in enumerate(components) for rows in _groups(len(planes))]
     tasks = (
-        Group(components[c][rows], known[c][rows] if c < len(known) else None) for c, rows in places
+        Group((c, rows), components[c][rows], known[c][rows] if c < len(known) else None)
+        for c, rows in places
     )
     with closing(completed(executor, solve_group, tasks, shapes)) as ended:
-        for index, (solved, error) in ended:
-            c, rows = places[index]
+        for group, (solved, error) in ended:
+            c, rows = group.place
             found[c][rows], errors[c][rows] = solved, error
     return Weighted(tuple(found), tuple(errors))
 

@@ -170,11 +170,11 @@ def _merge_shards(
     length = max(1, block_length(options.size) // (BLOCKS_OF_SHARD if count > 1 else 1))
     shared = _Shared(options, length, advance if local else None)
     with closing(completed(executor, make_shard, wanted, shared)) as ended:
-        for index, (states, notes) in ended:
+        for shard, (states, notes) in ended:
             for note in notes:
                 warn(note)
-            ready[wanted[index].number] = states
-            done += _size(wanted[index].number, total)
+            ready[shard.number] = states
+            done += _size(shard.number, total)
             if progress and not local:
                 progress(done, total, {})
             first = _add_ready(sums, ready, first, options, folder)

@@ -108,29 +108,6 @@ def solve(
     return solution
 
 
-def solve_batch(gaussians: Gaussians, images: NDArray[np.floating], steps: int = 10) -> Solution:
-    """Find the best colours and backgrounds for several images of one size at once.
-
-    Every image has its own step lengths, as in `solve`: its result does not depend on the others.
-
-    Parameters
-    ----------
-    gaussians : Gaussians
-        The Gaussians of all images, image after image, equally many for each.
-    images : ndarray, shape (M, H, W, C)
-    steps : int, optional
-        Number of steps.
-
-    Returns
-    -------
-    Solution
-        The background of the set has one value for each image. The residuals are over all images.
-    """
-    with dr.suspend_grad():
-        lists = bin_gaussians(gaussians, images=len(images))
-        return _solve(gaussians, lists, images, _start(gaussians, images, False), steps)
-
-
 def _start(gaussians: Gaussians, images: NDArray[np.floating], warm: bool) -> Unknowns:
     """Return the first unknowns: those of the set, or zero and the mean of each image."""
     types, n = types_of(gaussians.mean), len(gaussians)
