@@ -165,7 +165,9 @@ def fit_large(
     if output is not None:
         check_suffix(output)
         require_writable(output)
-        keep = Checkpoint(output, source.identity | _decisive(options, block), [])
+        names = ("gaussians", "iterations", "space", "solve_steps", "cutoff", "encoding")
+        decisive = {name: getattr(options, name) for name in names} | {"block": block}
+        keep = Checkpoint(output, source.identity | decisive, [])
     with (
         keep as checkpoint,
         defer_interrupts() if client is None else nullcontext() as interrupted,
@@ -217,11 +219,3 @@ def _in_unit(data: SetData, unit: float) -> SetData:
         return data
     scaled = {k: data.arrays[k] * np.float32(unit) for k in ("color", "background")}
     return data._replace(arrays=data.arrays | scaled)
-
-
-def _decisive(options: FitOptions, side: int) -> dict[str, Any]:
-    """Return the options on which the result depends."""
-    names = ("gaussians", "iterations", "space", "solve_steps", "cutoff", "encoding")
-    values = {name: getattr(options, name) for name in names} | {"block": side}
-    # JSON has no numbers of NumPy.
-    return {k: v.item() if isinstance(v, np.generic) else v for k, v in values.items()}

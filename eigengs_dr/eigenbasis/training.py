@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
-from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,88 +28,6 @@ from .pca.basis import Eigenbasis, check_components
 from .pca.stream import PCAOptions, find_state
 from .pca.truncation import TruncationCurve
 
-OnImage = Callable[[int], None]
-"""``watch(i)`` runs before image number i; an error that it raises ends the work."""
-
-
-def truncation_curve_on(
-    basis: Eigenbasis, files: Sequence[Path | str], watch: OnImage
-) -> TruncationCurve | None:
-    """Measure the truncation curve of images; see `Eigenbasis.truncation_curve`.
-
-    Parameters
-    ----------
-    basis : Eigenbasis
-    files : sequence of Path
-        Images of any size; unreadable files are skipped.
-    watch : callable
-        See `OnImage`.
-
-    Returns
-    -------
-    TruncationCurve or None
-        None if no file can be read.
-    """
-    readable = _readable(files, basis, watch, [])
-    first = next(readable, None)
-    return None if first is None else basis.truncation_curve(chain([first], readable))
-
-
-def evaluate(
-    model: EigenGS, basis: Eigenbasis, files: Sequence[Path | str], watch: OnImage
-) -> dict[str, float]:
-    """Measure the PSNR of PCA, of projected colours and of exact colours.
-
-    Parameters
-    ----------
-    model : EigenGS
-    basis : Eigenbasis
-        The basis that the model renders.
-    files : sequence of Path
-        Images of any size.
-    watch : callable
-        See `OnImage`.
-
-    Returns
-    -------
-    dict of str to float
-        Mean psnr_ycbcr over the images, in dB: "psnr_pca" of the basis, "psnr_init" of projected
-        and "psnr_solved" of exact colours. Empty if no file can be read.
-
-    Warns
-    -----
-    UserWarning
-        If a file cannot be read.
-    """
-    rows: list[dict[str, float]] = []
-    bad: list[str] = []
-    for image in _readable(files, basis, watch, bad):
-        pictures = {
-            "psnr_pca": basis.reconstruct(basis.project(image)),
-            "psnr_init": render(model.encode(image, "projected")).numpy(),
-            "psnr_solved": render(model.encode(image, "exact")).numpy(),
-        }
-        rows.append({name: psnr(image, picture, "ycbcr") for name, picture in pictures.items()})
-    if bad:
-        message = f"{len(bad)} of {len(files)} images held out were skipped, as {bad[0]}"
-        warn(message)
-    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]} if rows else {}
-
-
-def _readable(
-    files: Sequence[Path | str], basis: Eigenbasis, watch: OnImage, bad: list[str]
-) -> Iterator[NDArray[np.float32]]:
-    """Read images and crop them to the size of a basis; append errors to `bad`."""
-    for i, path in enumerate(files):
-        watch(i)
-        try:
-            image = center_crop(check_image(path, copy=False), basis.width, basis.height)
-        except (ImageError, OSError) as error:
-            bad.append(str(error))
-        else:
-            yield image
-
-
 HELD_OUT = 10
 """Every tenth image is held out of the training and measured."""
 
@@ -133,10 +48,11 @@ class Training(NamedTuple):
     """Result of `train`: the model, the basis that it renders, and figures.
 
     The figures are ``seconds``, ``pca_seconds``, ``shape_seconds``, ``weight_seconds`` (of the last
-    run alone if ``resumed``), ``peak_rss_mb``, ``images``, ``iterations``, ``components`` (of each
-    channel), ``gaussians``, ``frequency_aware``, ``split_reason``, ``psnr_held_out`` (`held_out` of
-    the model), and those of `eigengs_dr.eigenbasis.components.solve.ComponentFit` and
-    `eigengs_dr.eigenbasis.training.evaluate`.
+    run alone if ``resumed``), ``images``, ``iterations``, ``components`` (of each channel),
+    ``gaussians``, ``frequency_aware``, ``split_reason``, ``psnr_held_out`` (`held_out` of the
+    model), those of `eigengs_dr.eigenbasis.components.solve.ComponentFit`, and of images held out
+    the mean psnr_ycbcr of PCA, ``psnr_pca``, of projected colours, ``psnr_init``, and of exact
+    colours, ``psnr_solved``.
     """
 
     model: EigenGS
@@ -188,30 +104,25 @@ def train(
     names = [path if isinstance(path, str) else path.name for path in found]
     steps = settings.training_steps
     record = {**asdict(settings), "iterations": steps, "folder": str(folder)}
-    with Checkpoint(output, json.loads(json.dumps(record)), names) as checkpoint:
+    with Checkpoint(output, record, names) as checkpoint, defer_interrupts() as interrupted:
         if names != checkpoint.files:
             warn(
                 f"{folder}: the images have changed since this training began; it goes on with "
                 f"the {len(checkpoint.files)} that were there"
             )
         files = [name if is_url(name) else Path(folder) / name for name in checkpoint.files]
-        held_out = files[HELD_OUT - 1 :: HELD_OUT]
+        held_out = files[HELD_OUT - 1 :: HELD_OUT][:MAX_HELD_OUT]
         training = [path for i, path in enumerate(files) if i % HELD_OUT != HELD_OUT - 1]
-        with defer_interrupts() as interrupted:
-            run = Run(checkpoint, settings, backend, progress, interrupted, client)
-            try:
-                held_out = held_out[:MAX_HELD_OUT]
-                basis = _basis(training, held_out, run)
-                pca_seconds = time.perf_counter() - started
-                model = _model(
-                    basis, truncation_curve_on(basis, held_out, run.stop_if_interrupted), run
-                )
-                scores = evaluate(model, basis, held_out, partial(run.measure, total=len(held_out)))
-            except ValueError as error:
-                if not checkpoint.holds_work:
-                    raise
-                advice = f"to start anew, delete {checkpoint.folder}"
-                raise ValueError(f"{error}; {advice}") from None
+        run = Run(checkpoint, settings, backend, progress, interrupted, held_out, client)
+        try:
+            basis = _basis(training, run)
+            pca_seconds = time.perf_counter() - started
+            model = _model(basis, run)
+            scores = _evaluate(model, basis, run)
+        except ValueError as error:
+            if not checkpoint.holds_work:
+                raise
+            raise ValueError(f"{error}; to start anew, delete {checkpoint.folder}") from None
         figures = {
             "resumed": checkpoint.resumed,
             "images": basis.count,
@@ -224,7 +135,6 @@ def train(
             "pca_seconds": pca_seconds,
             **model.figures,
             **scores,
-            "peak_rss_mb": _peak_rss(),
             "seconds": time.perf_counter() - started,
         }
         model.save(output)
@@ -239,21 +149,17 @@ class Run(NamedTuple):
     backend: str | None
     progress: StageProgress
     interrupted: Callable[[], bool]
+    held_out: Sequence[Path | str]
     client: Any = None
 
-    def stop_if_interrupted(self, *done: Any) -> None:
+    def stop_if_interrupted(self) -> None:
         """Raise `Interrupted` after Ctrl-C."""
         if self.interrupted():
             kept = self.checkpoint.holds_work
             raise Interrupted("the same command goes on from here" if kept else "nothing is saved")
 
-    def measure(self, done: int, total: int) -> None:
-        """Report progress before an image is measured."""
-        self.progress("measure", done, total)
-        self.stop_if_interrupted()
 
-
-def _basis(files: list[Path | str], held_out: list[Path | str], run: Run) -> Eigenbasis:
+def _basis(files: list[Path | str], run: Run) -> Eigenbasis:
     """Find the components, or read them from the checkpoint, which keeps the states of shards."""
     settings, checkpoint = run.settings, run.checkpoint
     if (path := checkpoint.folder / "basis.npz").exists():
@@ -270,7 +176,7 @@ def _basis(files: list[Path | str], held_out: list[Path | str], run: Run) -> Eig
         state, settings.size, settings.components, settings.energy, settings.space
     )
     if settings.target_psnr is not None:
-        if (curve := truncation_curve_on(basis, held_out, run.stop_if_interrupted)) is None:
+        if (curve := _curve(basis, run)) is None:
             raise ValueError(
                 f"target_psnr needs images that are held out, one in {HELD_OUT}, and none can be "
                 "read; give more images, or use energy"
@@ -281,9 +187,9 @@ def _basis(files: list[Path | str], held_out: list[Path | str], run: Run) -> Eig
     return basis
 
 
-def _model(basis: Eigenbasis, curve: TruncationCurve | None, run: Run) -> EigenGS:
+def _model(basis: Eigenbasis, run: Run) -> EigenGS:
     """Fit Gaussians to the components, and save checkpoints."""
-    checkpoint = run.checkpoint
+    checkpoint, curve = run.checkpoint, _curve(basis, run)
     run.stop_if_interrupted()
     run.progress("weights", 0, 1)
     saved = time.perf_counter()
@@ -297,29 +203,52 @@ def _model(basis: Eigenbasis, curve: TruncationCurve | None, run: Run) -> EigenG
         trains = run.settings.training_steps > 0
         if trains and (run.interrupted() or time.perf_counter() - saved > SAVE_SECONDS):
             saved = time.perf_counter()
-            flat = {f"{i}.{k}": v for i, state in enumerate(states) for k, v in state.items()}
-            checkpoint.save("shapes", flat)
+            for band, state in enumerate(states):
+                checkpoint.save(f"shapes-{band}", state)
         run.stop_if_interrupted()
 
-    states = _states(checkpoint.load("shapes") or {})
+    states: list[State] = []
+    while (state := checkpoint.load(f"shapes-{len(states)}")) is not None:
+        states.append(state)
     members = fit_model(basis, run.settings, run.backend, advance, states, save, run.client)
     return EigenGS(**members, held_out=np.zeros(0) if curve is None else curve.psnr)
 
 
-def _states(flat: dict[str, Any]) -> list[State]:
-    """Unflatten the states of all bands; the key "1.step" is the step of the second band."""
-    states: dict[str, State] = {}
-    for key, array in flat.items():
-        side, name = key.split(".", 1)
-        states.setdefault(side, {})[name] = array
-    return [states[side] for side in sorted(states)]
+def _curve(basis: Eigenbasis, run: Run) -> TruncationCurve | None:
+    """Return the truncation curve of the images held out, None if none can be read."""
+    images = _readable(basis, run)
+    first = next(images, None)
+    return None if first is None else basis.truncation_curve(chain([first], images))
 
 
-def _peak_rss() -> float | None:
-    """Return the peak memory of this process in MiB, or None on Windows."""
-    if sys.platform == "win32":
-        return None
-    import resource
+def _evaluate(model: EigenGS, basis: Eigenbasis, run: Run) -> dict[str, float]:
+    """Measure the images held out, for the figures of `Training`, and warn of bad files."""
+    rows: list[dict[str, float]] = []
+    bad: list[str] = []
+    for image in _readable(basis, run, bad, "measure"):
+        pictures = {
+            "psnr_pca": basis.reconstruct(basis.project(image)),
+            "psnr_init": render(model.encode(image, "projected")).numpy(),
+            "psnr_solved": render(model.encode(image, "exact")).numpy(),
+        }
+        rows.append({name: psnr(image, picture, "ycbcr") for name, picture in pictures.items()})
+    if bad:
+        warn(f"{len(bad)} of {len(run.held_out)} images held out were skipped, as {bad[0]}")
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]} if rows else {}
 
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10  # macOS bytes, Linux KiB
+
+def _readable(
+    basis: Eigenbasis, run: Run, bad: list[str] | None = None, stage: str = ""
+) -> Iterator[NDArray[np.float32]]:
+    """Read the images held out at the size of a basis, skip those that cannot be read."""
+    for done, path in enumerate(run.held_out):
+        if stage:
+            run.progress(stage, done, len(run.held_out))
+        run.stop_if_interrupted()
+        try:
+            image = center_crop(check_image(path, copy=False), basis.width, basis.height)
+        except (ImageError, OSError) as error:
+            if bad is not None:
+                bad.append(str(error))
+        else:
+            yield image

@@ -54,6 +54,8 @@ class Checkpoint:
     def __init__(
         self, output: str | os.PathLike[str], settings: dict[str, Any], files: list[str]
     ) -> None:
+        # JSON has no tuples, and no numbers of NumPy.
+        settings = json.loads(json.dumps(settings, default=lambda number: number.item()))
         self.folder = Path(f"{os.fspath(output)}.checkpoint")
         self.files = files
         self.resumed = self.folder.exists()

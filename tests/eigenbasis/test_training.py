@@ -19,7 +19,6 @@ FIGURES = {
     "pca_seconds",
     "shape_seconds",
     "weight_seconds",
-    "peak_rss_mb",
     "components",
     "gaussians",
 }
@@ -39,7 +38,6 @@ def test_end_to_end(folder, output):
     assert figures["psnr_init"] == pytest.approx(figures["psnr_pca"], abs=0.5)
     assert figures["psnr_solved"] > figures["psnr_pca"] + 5
     assert 0 < figures["pca_seconds"] <= figures["seconds"]
-    assert 10 < figures["peak_rss_mb"] < 1e5
     assert ("components", 22, 22) in stages
     assert [stage for stage, *_ in stages[-3:]] == ["weights", "measure", "measure"]
     assert all(0 <= done <= total for _, done, total in stages)
