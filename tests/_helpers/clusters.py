@@ -103,15 +103,6 @@ def mend_writes():
     run.write = write
 
 
-def fill_disk():
-    """Let every write of a result fail, in this process."""
-
-    def full(write, path, data):
-        raise OSError(28, "No space left on device", str(path))
-
-    patch_write(full)
-
-
 def slow_writes():
     """Let every write of a result take long, in this process."""
 

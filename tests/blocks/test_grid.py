@@ -1,11 +1,10 @@
 """Blocks, and the Gaussians dealt to them."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eigengs_dr.blocks.grid import choose_halo, deal, divide
+from eigengs_dr.blocks.grid import deal, divide
 
 
 @given(st.integers(1, 300), st.integers(1, 300), st.integers(20, 120), st.integers(0, 40))
@@ -47,8 +46,3 @@ def test_gaussians_follow_the_picture():
     assert dealt.tolist() == [100, 200, 500]
     # A full block leaves the rest to the others.
     assert deal(np.array([1.0, 8.0, 1.0]), np.array([100, 100, 100]), 200).tolist() == [50, 100, 50]
-
-
-@pytest.mark.parametrize("spacing", [1.0, 4.5, 16.0])
-def test_halo_grows_with_the_spacing(spacing):
-    assert choose_halo(spacing) == max(16, np.ceil(5 * spacing))

@@ -58,26 +58,6 @@ def test_a_folder_keeps_the_last_rounds_alone(tmp_path):
     assert set(kept) == {f"fit2-{number}.npz" for number in range(4)}
 
 
-def test_blocks_of_an_older_version_are_not_used(tmp_path):
-    """Its blocks were fitted in one go, by other rates, so that their errors are others too."""
-    settings = FEW | {"gaussians": 200, "block": 32, "iterations": 200}
-    output = tmp_path / "a.npz"
-
-    def stop(done, total, row):
-        if row["stage"] == "fit":
-            raise Stop
-
-    with pytest.raises(Stop):
-        eg.fit_large(mosaic(64), output, progress=stop, **settings)
-    folder = tmp_path / "a.npz.checkpoint"
-    for number in range(4):
-        (folder / f"density-{number}.npz").unlink()
-    for name in ("density0", "density3", "fit0", "fit3", "seam3"):
-        (folder / f"{name}.npz").write_bytes(b"an older version")
-    again = eg.fit_large(mosaic(64), output, **settings)
-    assert again.resumed == 0 and not folder.exists()
-
-
 @pytest.mark.parametrize("part", [0.3, 0.6, 0.95])
 def test_a_round_with_a_hole_is_taken_again(tmp_path, part):
     """In any round, a run goes on from the last one that is complete, with the same bits."""

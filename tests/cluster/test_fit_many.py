@@ -17,7 +17,6 @@ from _helpers.clusters import (
     QUICK,
     DieInWrite,
     files_of,
-    fill_disk,
     folder_of_photos,
     mend_writes,
     slow_writes,
@@ -74,15 +73,6 @@ def test_a_basis_and_results_travel(client):
             np.testing.assert_array_equal(row.result.gaussians.to_arrays()[name], values)
 
 
-def test_mistakes_are_said_as_in_one_process(client, photos, output):
-    with pytest.raises(ValueError, match="init 'nothing' is unknown"):
-        eg.fit_many(photos, output, client=client, init="nothing")
-    (photos / "03.png").write_text("no image")
-    rows = eg.fit_many(photos, output, client=client, **QUICK)
-    assert [row.name for row in rows if row.status == "failed"] == ["03"]
-    assert "03.png: not an image that Pillow knows" in rows[3].error
-
-
 def test_a_worker_that_is_killed(client, photos, output, expected):
     """It loses what it does, which another worker does again."""
     killed = []
@@ -112,35 +102,6 @@ def test_an_image_that_kills_its_worker(client, photos, output, expected):
     for path in left:  # what the killed worker left goes when it is old
         os.utime(path, (0, 0))
     eg.fit_many(photos, output, client=client, **QUICK)
-    assert_complete(output, expected)
-
-
-def test_a_full_disk_at_a_worker(client, photos, output, expected):
-    """The other worker writes the image; if all disks are full, the image fails."""
-    addresses = list(client.run(os.getpid))
-    client.run(fill_disk, workers=addresses[:1])
-    rows = eg.fit_many(photos, output, client=client, **QUICK)
-    client.run(fill_disk)
-    more = eg.fit_many(photos, output, overwrite=True, client=client, **QUICK)
-    assert {row.status for row in more} == {"failed"}
-    assert more[0].error == f"{output / '00.npz'}: No space left on device"
-    client.run(mend_writes)
-    eg.fit_many(photos, output, client=client, **QUICK)
-    assert_complete(output, expected)
-    assert {row.status for row in rows} <= {"done", "failed"}
-
-
-def test_two_runs_into_one_folder(client, photos, output, expected):
-    refused = []
-
-    def second(done, total, row):
-        if not refused:
-            with pytest.raises(OSError, match="writes into this folder") as error:
-                eg.fit_many(photos, output, **QUICK)
-            refused.append(str(error.value))
-
-    eg.fit_many(photos, output, client=client, progress=second, **QUICK)
-    assert refused and "\n" not in refused[0]
     assert_complete(output, expected)
 
 

@@ -80,11 +80,6 @@ def test_an_iterator_may_reuse_its_array():
     assert means == pytest.approx([0.2, 0.4, 0.6], abs=0.02)
 
 
-def test_numbers_of_gaussians_are_levels(photos):
-    [row, *_] = eg.fit_many(photos, levels=[20, 50], iterations=2)
-    assert row.gaussians == 50
-
-
 def test_levels_of_detail(photos, output):
     [row, *_] = eg.fit_many(photos, output, levels=2, **QUICK)
     alone = eg.fit(eg.load_image(row.input), levels=2, **QUICK)

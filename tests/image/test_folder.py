@@ -8,11 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import eigengs_dr.image.folder as stream
 from _helpers.errors import one_line
 from eigengs_dr.image.color import check_size, rgb_to_ycbcr, to_planes
-from eigengs_dr.image.folder import image_files, read_blocks
-from eigengs_dr.image.io import ImageError, check_image, load_image, save_image
+from eigengs_dr.image.folder import (
+    MAX_WAITING,
+    MAX_WAITING_BYTES,
+    image_files,
+    read_ahead,
+    read_blocks,
+)
+from eigengs_dr.image.io import ImageError, check_image, save_image
 from eigengs_dr.image.resize import center_crop
 
 WIDTH, HEIGHT = SIZE = (6, 5)
@@ -101,33 +106,28 @@ def test_blocks_cut_the_source_at_multiples_of_their_length(count, length):
     assert all(np.array_equal(a, b) for a, b in zip(blocks[1:], rest, strict=True))
 
 
-def test_order_is_that_of_the_source_whatever_is_ready_first(tmp_path, monkeypatch):
-    images = pictures(12)
-    files = image_files(write(tmp_path, images))
+def test_order_is_that_of_the_source_whatever_is_ready_first():
     second = threading.Event()
 
-    def slow(path):
-        if path == files[0]:
+    def slow(number):
+        if number == 0:
             assert second.wait(100)
-        if path == files[1]:
+        if number == 1:
             second.set()
-        return load_image(path)
+        return number
 
-    monkeypatch.setattr(stream, "load_image", slow)
-    monkeypatch.setattr(stream, "THREADS", 2)
-    np.testing.assert_array_equal(np.concatenate(read(files)), planes(images))
+    found = read_ahead(range(12), slow, lambda number: True, lambda number: 1)
+    assert list(found) == list(range(12))
 
 
-def test_few_images_wait_in_memory(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("size", "waiting"), [(1, MAX_WAITING), (MAX_WAITING_BYTES // 5, 5)])
+def test_few_images_wait_in_memory(size, waiting):
     started = []
-    files = image_files(write(tmp_path, pictures(40)))
-    monkeypatch.setattr(stream, "MAX_WAITING", 5)
-    monkeypatch.setattr(stream, "load_image", lambda path: started.append(path) or load_image(path))
-    blocks = read_blocks(files, SIZE, "rgb", 2)
-    for taken in range(2, 13, 2):
-        next(blocks)
-        assert len(started) <= taken + 5
-    blocks.close()
+    found = read_ahead(range(2000), started.append, lambda number: True, lambda image: size)
+    for taken, _ in zip(range(500), found, strict=False):
+        assert len(started) <= taken + 1 + waiting
+    found.close()
+    assert waiting < len(started)
 
 
 def test_progress_counts_every_image(tmp_path):
