@@ -33,9 +33,6 @@ MAX_SIDE = 1 << 16
 Pixels = NDArray[Any]
 """Pixels (h, w) or (h, w, channels) of any type."""
 
-Load = Callable[[], Pixels]
-"""Returns a part of an image in the dtype of the source. It holds a path, or the pixels."""
-
 
 class Window(NamedTuple):
     """A part of an image that is read when it is needed, perhaps in another process.
@@ -43,7 +40,7 @@ class Window(NamedTuple):
     Attributes
     ----------
     load : callable
-        See `Load`.
+        Returns the pixels in the dtype of the source. It holds a path, or the pixels.
     keep_grey : bool
         Whether the image is data, which keep one channel.
     name : str
@@ -54,7 +51,7 @@ class Window(NamedTuple):
         Data are divided by it.
     """
 
-    load: Load
+    load: Callable[[], Pixels]
     keep_grey: bool
     name: str
     encoding: str = "srgb"
@@ -93,8 +90,8 @@ class Source:
         The path of the file, or "image".
     identity : dict
         What tells this image from others, in numbers and texts.
-    cut : callable
-        ``cut(rows, columns)`` returns what `Window.load` holds.
+    pixels : str or array
+        The path of a file that is read by windows; or what ``pixels[rows, columns]`` is a part of.
     keep_grey, encoding, unit
         See `Window`.
     """
@@ -104,7 +101,7 @@ class Source:
     channels: int
     name: str
     identity: dict[str, Any]
-    cut: Callable[[slice, slice], Load]
+    pixels: Any
     keep_grey: bool
     encoding: str = "srgb"
     unit: float = 1.0
@@ -112,8 +109,11 @@ class Source:
     def window(self, rows: slice, columns: slice) -> Window:
         """Return a part of the image."""
         part = f"rows {rows.start} to {rows.stop}, columns {columns.start} to {columns.stop}"
-        name = f"{self.name}, {part}"
-        return Window(self.cut(rows, columns), self.keep_grey, name, self.encoding, self.unit)
+        if isinstance(self.pixels, str):
+            load = partial(_read_part, self.pixels, rows, columns)
+        else:
+            load = partial(np.asarray, np.asarray(self.pixels[rows, columns]))
+        return Window(load, self.keep_grey, f"{self.name}, {part}", self.encoding, self.unit)
 
 
 def open_source(source: Any, keep_grey: bool = False, encoding: str | None = None) -> Source:
@@ -146,10 +146,10 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
         source, encoding = read_file(source, keep_grey, encoding)
     if isinstance(source, (str, os.PathLike)):
         name, identity = str(source), _identity(Path(source))
-        shape, cut, said = _open_file(Path(source), keep_grey)
+        shape, pixels, said = _open_file(Path(source), keep_grey)
         encoding = encoding or said
     elif hasattr(source, "shape") and hasattr(source, "dtype"):
-        name, shape, cut = "image", tuple(int(side) for side in source.shape), _cutter(source)
+        name, shape, pixels = "image", tuple(int(side) for side in source.shape), source
         identity = {"shape": list(shape), "dtype": np.dtype(source.dtype).str}
         encoding = encoding_of(source, encoding) or "srgb"
     else:
@@ -160,7 +160,7 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
     if not all(1 <= side <= MAX_SIDE for side in shape[:2]):
         raise ImageError(f"{name}: {shape[1]}x{shape[0]} pixels; sides go from 1 to {MAX_SIDE:,}")
     channels = 1 if keep_grey and shape[2:] in ((), (1,)) else 3
-    return Source(shape[1], shape[0], channels, name, identity, cut, keep_grey, encoding)
+    return Source(shape[1], shape[0], channels, name, identity, pixels, keep_grey, encoding)
 
 
 def _identity(path: Path) -> dict[str, Any]:
@@ -178,41 +178,30 @@ def _identity(path: Path) -> dict[str, Any]:
     }
 
 
-def _open_file(
-    path: Path, keep_grey: bool
-) -> tuple[tuple[int, ...], Callable[[slice, slice], Load], str]:
-    """Return the shape of an image file, what cuts windows out of it, and its encoding."""
+def _open_file(path: Path, keep_grey: bool) -> tuple[tuple[int, ...], str | Pixels, str]:
+    """Return the shape of an image file, its `Source.pixels`, and its encoding."""
     absolute = os.path.abspath(path)
     if path.suffix.lower() == ".npy":
         try:
             shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
         except (ValueError, EOFError, OSError) as error:
             raise ImageError(f"{path}: not a readable .npy file ({error})") from None
-        return shape, partial(partial, _read_array, absolute), "srgb"
+        return shape, absolute, "srgb"
     if path.suffix.lower() in TIFF_SUFFIXES and (found := window_shape(absolute)):
-        shape, dtype = found
-        return shape, partial(partial, read_window, absolute), _encoding(dtype)
+        return found[0], absolute, "linear" if found[1].kind == "f" else "srgb"
     if kind_of(path) is not None:
         pixels, encoding = read_file(path, keep_grey)
     else:  # 8 bits stay 8 bits
         with open_picture(path, MAX_SIDE) as picture:
             pixels, encoding = picture_pixels(picture)[0], "srgb"
-    return pixels.shape, _cutter(pixels), encoding
+    return pixels.shape, pixels, encoding
 
 
-def _encoding(dtype: np.dtype[Any]) -> str:
-    """Return what a TIFF file of a type holds."""
-    return "linear" if dtype.kind == "f" else "srgb"
-
-
-def _cutter(pixels: Any) -> Callable[[slice, slice], Load]:
-    """Return what cuts windows out of an array; each holds its pixels alone."""
-    return lambda rows, columns: partial(np.asarray, np.asarray(pixels[rows, columns]))
-
-
-def _read_array(path: str, rows: slice, columns: slice) -> Pixels:
-    """Read a part of a ``.npy`` file; the map of the file ends with the call."""
-    return np.array(np.load(path, mmap_mode="r", allow_pickle=False)[rows, columns])
+def _read_part(path: str, rows: slice, columns: slice) -> Pixels:
+    """Read a part of a file that is read by windows; maps of the file end with the call."""
+    if path.lower().endswith(".npy"):
+        return np.array(np.load(path, mmap_mode="r", allow_pickle=False)[rows, columns])
+    return read_window(path, rows, columns)
 
 
 MAX_SEGMENT = 1 << 26
@@ -274,7 +263,6 @@ def read_window(path: str, rows: slice, columns: slice) -> Pixels:
             page = file.pages[0]
             if not page.is_memmappable:
                 return _from_segments(file, page, rows, columns)
-        # A map of its own, so that the pages of the file leave the memory with it.
         whole = tifffile.memmap(path, page=0, mode="r")
         return np.array(whole[rows, columns], whole.dtype.newbyteorder("="))
     except Exception as error:  # tifffile raises many types

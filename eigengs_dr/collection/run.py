@@ -230,13 +230,18 @@ def _bytes_of(decoded: Decoded) -> int:
 def _groups(decoded: Iterable[Decoded], job: Job) -> Iterator[list[Decoded]]:
     """Collect consecutive images that may be worked on together."""
     group: list[Decoded] = []
-    for item in decoded:
-        images = [image for _, image in [*group, item] if isinstance(image, EncodedImage)]
-        alone = job.may_join is None or len(images) <= len(group)
-        if group and (alone or not job.may_join(images[:-1], images[-1])):  # type: ignore[misc]
+    for source, image in decoded:
+        images = [found for _, found in group if isinstance(found, EncodedImage)]
+        joins = (
+            images
+            and isinstance(image, EncodedImage)
+            and job.may_join is not None
+            and job.may_join(images, image)
+        )
+        if group and not joins:
             yield group
             group = []
-        group.append(item)
+        group.append((source, image))
     if group:
         yield group
 

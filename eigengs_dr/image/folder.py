@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -176,7 +177,13 @@ def read_blocks(
     total = None
     if isinstance(source, Sequence):
         total = sum(1 if _is_file(item) else len(_images(item)) for item in source)
-    return _blocks(_prepare_images(source, size, space), size, length, total, progress)
+    images = read_ahead(
+        enumerate(_singles(source)),
+        partial(_prepare, size=size, space=space),
+        lambda numbered: _is_file(numbered[1]),
+        lambda image: 0 if image.planes is None else image.planes.nbytes,
+    )
+    return _blocks(images, size, length, total, progress)
 
 
 def _blocks(
@@ -217,20 +224,6 @@ def _blocks(
         warn(f"{len(problems)} of {done} images were skipped: {named}")
     if fitted:
         warn(f"{fitted} of {done} images were centre-cropped and resized to {size[0]}x{size[1]}")
-
-
-def _prepare_images(
-    source: Iterable[Any], size: tuple[int, int], space: str
-) -> Generator[PreparedImage, None, None]:
-    """Prepare images in parallel, and yield them in the order of the source."""
-
-    def prepare(numbered: tuple[int, Any]) -> PreparedImage:
-        return _prepare(numbered[1], numbered[0], size, space)
-
-    def bytes_of(image: PreparedImage) -> int:
-        return 0 if image.planes is None else image.planes.nbytes
-
-    return read_ahead(enumerate(_singles(source)), prepare, lambda n: _is_file(n[1]), bytes_of)
 
 
 Item = TypeVar("Item")
@@ -292,8 +285,9 @@ def _singles(source: Iterable[Any]) -> Iterator[Any]:
             yield from _images(item)
 
 
-def _prepare(item: Any, place: int, size: tuple[int, int], space: str) -> PreparedImage:
+def _prepare(numbered: tuple[int, Any], size: tuple[int, int], space: str) -> PreparedImage:
     """Read, crop and convert one image."""
+    place, item = numbered
     loaded = _is_file(item)
     try:
         image = check_image(load_image(item) if loaded else item, copy=not loaded)
