@@ -162,12 +162,6 @@ def test_lost_task_is_one_line():
         eg.fit_large(mosaic(128), **FEW, client=Losing())
 
 
-def test_steps_improve_what_the_solve_found():
-    solved = eg.fit_large(mosaic(128), **FEW | {"iterations": 0})
-    fitted = eg.fit_large(mosaic(128), **FEW)
-    assert fitted.psnr_ycbcr > solved.psnr_ycbcr
-
-
 @pytest.mark.slow
 def test_memory_is_that_of_a_block(tmp_path):
     """Four times the pixels take a quarter of what a fit of the whole would take more."""

@@ -29,16 +29,6 @@ def test_results_are_those_of_this_process(photos, tmp_path):
     assert [name for _, _, name in seen] != sorted(name for _, _, name in seen)
 
 
-def test_results_travel_back_without_an_output():
-    images = [np.full((24, 32, 3), value, np.float32) for value in (0.2, 0.4, 0.6)]
-    rows = eg.fit_many(iter(images), client=Here(), gaussians=4, iterations=1)
-    for row, image in zip(rows, images, strict=True):
-        alone = eg.fit(image, gaussians=4, iterations=1)
-        for name, values in alone.gaussians.to_arrays().items():
-            np.testing.assert_array_equal(row.result.gaussians.to_arrays()[name], values)
-        np.testing.assert_array_equal(row.result.image, alone.image)
-
-
 def test_names_are_those_of_the_user(photos, tmp_path, monkeypatch):
     """Workers run in other folders."""
     monkeypatch.chdir(tmp_path)
@@ -110,13 +100,6 @@ def test_images_and_steps_decide_the_chunks(side, iterations, longest):
         assert sorted(lengths, reverse=True) == lengths
         again.append(chunks)
     assert again[0] == again[1]
-
-
-def test_light_stays_light(photos):
-    light = eg.sample("coffee")[:24, :32].astype(np.float32)
-    quick = QUICK | {"encoding": "linear"}
-    [far], [here] = (eg.fit_many([light], client=client, **quick) for client in (Here(), None))
-    np.testing.assert_array_equal(far.result.image, here.result.image)
 
 
 def test_warnings_of_workers_are_said_here(tmp_path):

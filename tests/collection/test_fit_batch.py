@@ -128,11 +128,6 @@ def test_interrupts_end_the_batch(backend, monkeypatch):
         fit_batch(pictures(2), options(backend))
 
 
-def test_too_many_gaussians_are_refused(backend):
-    with pytest.raises(ValueError, match="gaussians is 5000; an image of 33x30 takes 1 to 990"):
-        fit_batch(pictures(2), options(backend, gaussians=5000))
-
-
 @pytest.mark.parametrize(
     ("changed", "expected"),
     [({}, True), ({"init": "grid"}, True), ({"preset": "gaussianimage"}, False),

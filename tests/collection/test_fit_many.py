@@ -25,11 +25,6 @@ def photos(tmp_path):
     return folder
 
 
-@pytest.fixture
-def output(tmp_path):
-    return tmp_path / "fits"
-
-
 def statuses(rows):
     return {row.name: row.status for row in rows}
 
@@ -162,20 +157,6 @@ def test_a_result_that_cannot_be_written(photos, output, tmp_path):
     rows = eg.fit_many(photos, output, **QUICK)
     assert statuses(rows) == {"a": "done", "b": "failed", "c": "done", "d": "done"}
     assert rows[1].error == f"{output / 'b.npz'}: No such file or directory"
-
-
-def test_images_read_ahead_are_few():
-    """Their number follows from their size; the image that is fitted comes on top."""
-    ahead = []
-
-    def images():
-        for drawn in range(12):
-            ahead.append(drawn - len(done))
-            yield np.full((1024, 1024, 3), 0.5, np.float32)  # 12 of 32 MB
-
-    done = []
-    eg.fit_many(images(), gaussians=1, iterations=0, progress=lambda *row: done.append(row))
-    assert len(done) == 12 and max(ahead) <= 2 + 3
 
 
 def test_mistakes_are_found_before_the_work(photos, output, tmp_path):

@@ -8,19 +8,9 @@ import sys
 import pytest
 
 import eigengs_dr as eg
-from _helpers.clusters import QUICK, files_of, folder_of_photos
+from _helpers.clusters import QUICK, files_of
 from eigengs_dr.collection.manifest import KEYS, NAME, read_manifest
 from eigengs_dr.storage.atomic import lock_folder
-
-
-@pytest.fixture
-def photos(tmp_path):
-    return folder_of_photos(tmp_path / "photos", 3)
-
-
-@pytest.fixture
-def output(tmp_path):
-    return tmp_path / "fits"
 
 
 def statuses(output):

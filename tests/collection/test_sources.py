@@ -6,14 +6,9 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.clusters import QUICK, folder_of_photos
+from _helpers.clusters import QUICK
 from eigengs_dr.collection.sources import list_sources
 from eigengs_dr.image.remote import is_url, list_urls
-
-
-@pytest.fixture
-def photos(tmp_path):
-    return folder_of_photos(tmp_path / "photos", 3)
 
 
 @pytest.fixture
