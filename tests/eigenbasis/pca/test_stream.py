@@ -31,12 +31,12 @@ class Backwards:
         self.stop = stop
         self.done = []
 
-    def map(self, function, tasks, shared=None, at_once=None):
-        for index, task in reversed(list(enumerate(tasks))):
+    def map(self, function, tasks, shared=None):
+        for task in reversed(list(tasks)):
             if self.stop is not None and len(self.done) >= self.stop:
                 raise KeyboardInterrupt
             self.done.append(function.__name__)
-            yield Done(index, function(task, shared))
+            yield Done(task, function(task, shared))
 
 
 def options(components=20):
