@@ -57,6 +57,8 @@ class Settings(NamedTuple):
     Attributes
     ----------
     options : FitOptions
+    gaussians : int
+        Number of Gaussians of all blocks.
     spacing : float
         Mean distance of the Gaussians, in pixels.
     background : tuple of float
@@ -64,6 +66,7 @@ class Settings(NamedTuple):
     """
 
     options: FitOptions
+    gaussians: int
     spacing: float
     background: tuple[float, ...] = ()
 

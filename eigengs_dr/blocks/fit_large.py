@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,12 +14,14 @@ from ..backend.executor import executor_for
 from ..backend.feedback import defer_interrupts, shows_progress
 from ..backend.selection import select
 from ..fitting.options import FitOptions, named_options
-from ..gaussian.file import CUTOFF, SetData, check_suffix, write
+from ..fitting.target import in_unit
+from ..gaussian.file import CUTOFF, check_suffix, write
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
 from ..image.metrics import psnr_from_mse
 from ..storage.atomic import require_writable
 from ..storage.checkpoint import Checkpoint
+from .block import Settings
 from .grid import Block, choose_halo, divide
 from .run import Run
 from .windows import Source, open_source
@@ -159,33 +161,33 @@ def fit_large(
         encoding=encoding,
     )
     source = open_source(image, rendered_as(space) is None, encoding)
-    blocks, options = plan(source, options, block)
+    blocks, settings = plan(source, options, block)
     select(backend)
     keep: Any = nullcontext()
     if output is not None:
         check_suffix(output)
         require_writable(output)
-        names = ("gaussians", "iterations", "space", "solve_steps", "cutoff", "encoding")
-        decisive = {name: getattr(options, name) for name in names} | {"block": block}
+        names = ("iterations", "space", "solve_steps", "cutoff", "encoding")
+        decisive = {name: getattr(options, name) for name in names}
+        decisive |= {"gaussians": settings.gaussians, "block": block}
         keep = Checkpoint(output, source.identity | decisive, [])
     with (
         keep as checkpoint,
         defer_interrupts() if client is None else nullcontext() as interrupted,
     ):
-        run = Run(source, blocks, options, executor_for(client), checkpoint, progress, interrupted)
+        run = Run(source, blocks, settings, executor_for(client), checkpoint, progress, interrupted)
         data = run.fit()
         errors = run.measure(data)
-        data = _in_unit(data, run.image.unit)
+        result = in_unit(Gaussians.from_data(data, backend), run.image.unit)
         if output is not None:
-            write(output, data)
+            write(output, result.data())
     ycbcr, rgb = (psnr_from_mse(e / (3 * source.width * source.height)) for e in errors)
-    result = Gaussians.from_data(data, backend)
     seconds = time.perf_counter() - started
     return LargeFit(result, ycbcr, rgb, len(blocks), run.resumed, iterations, seconds)
 
 
-def plan(image: Source, options: FitOptions, side: int) -> tuple[list[Block], FitOptions]:
-    """Return the blocks of a fit, and the options with the number of Gaussians.
+def plan(image: Source, options: FitOptions, side: int) -> tuple[list[Block], Settings]:
+    """Return the blocks of a fit, and what their tasks share.
 
     Raises
     ------
@@ -210,12 +212,4 @@ def plan(image: Source, options: FitOptions, side: int) -> tuple[list[Block], Fi
         raise ValueError(
             f"gaussians is {count}; an image of {image.width}x{image.height} takes 1 to {pixels}"
         )
-    return blocks, replace(options, gaussians=count)
-
-
-def _in_unit(data: SetData, unit: float) -> SetData:
-    """Multiply the colours and the background of a set."""
-    if unit == 1:
-        return data
-    scaled = {k: data.arrays[k] * np.float32(unit) for k in ("color", "background")}
-    return data._replace(arrays=data.arrays | scaled)
+    return blocks, Settings(options, count, spacing)

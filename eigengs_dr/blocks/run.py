@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.executor import Executor, completed
-from ..fitting.options import FitOptions
 from ..fitting.schedule import first_phase
 from ..gaussian.file import SetData
 from ..storage.checkpoint import Checkpoint
@@ -33,8 +32,8 @@ class Run:
     image : Source
         After `fit` with the unit of the fit, in which the set is.
     blocks : list of Block
-    options : FitOptions
-        With the number of Gaussians.
+    settings : Settings
+        With the background, after `fit`.
     executor : Executor
     checkpoint : Checkpoint or None
         Where blocks that are done wait for the end of the run.
@@ -48,31 +47,21 @@ class Run:
 
     image: Source
     blocks: list[Block]
-    options: FitOptions
+    settings: Settings
     executor: Executor
     checkpoint: Checkpoint | None = None
     progress: Progress | None = None
     interrupted: Callable[[], bool] | None = None
     resumed: int = 0
-    settings: Settings = field(init=False)
     stage: str = ""
     done: int = 0
     total: int = 0
 
-    def __post_init__(self) -> None:
-        spacing = (self.image.width * self.image.height / self.count) ** 0.5
-        self.settings = Settings(self.options, spacing)
-
-    @property
-    def count(self) -> int:
-        """Number of Gaussians."""
-        assert self.options.gaussians is not None
-        return self.options.gaussians
-
     def fit(self) -> SetData:
         """Place and fit all Gaussians; a long fit places them again where error was left."""
-        steps = self.options.iterations
-        first = first_phase(self.options.method.schedule, steps)
+        options = self.settings.options
+        steps = options.iterations
+        first = first_phase(options.method.schedule, steps)
         mass = self._survey()
         placed = self._place(mass)
         if first:
@@ -82,14 +71,14 @@ class Run:
         return SetData(
             sets.arrays | {"background": background},
             (self.image.width, self.image.height),
-            self.options.space,
-            self.options.cutoff,
+            options.space,
+            options.cutoff,
         )
 
     def measure(self, data: SetData) -> tuple[float, float]:
         """Return the sums of the squared errors for psnr_ycbcr and psnr_rgb."""
         self._begin("measure", len(self.blocks))
-        tasks = compare_tasks(self.image, data, self.blocks, self.options.backend)
+        tasks = compare_tasks(self.image, data, self.blocks, self.settings.options.backend)
         ycbcr, rgb = np.sum(self._in_order(compare, tasks), axis=0).tolist()
         return ycbcr, rgb
 
@@ -114,7 +103,8 @@ class Run:
 
     def _place(self, mass: NDArray[np.float64], old: BlockSets | None = None) -> BlockSets:
         """Deal the Gaussians to the blocks by their masses, and place them."""
-        counts = deal(mass, np.array([block.pixels for block in self.blocks]), self.count)
+        pixels = np.array([block.pixels for block in self.blocks])
+        counts = deal(mass, pixels, self.settings.gaussians)
         placed = BlockSets(self.blocks, counts, ("mean", "factor"))
         self._begin("place", len(self.blocks))
         tasks = (
@@ -143,7 +133,7 @@ class Run:
 
     def _fit_blocks(self, sets: BlockSets, steps: int) -> BlockSets:
         """Fit all blocks, round by round, from sets without colours."""
-        parts = rounds(self.options.method.schedule, steps)
+        parts = rounds(self.settings.options.method.schedule, steps)
         self._begin("fit", len(self.blocks) * steps)
         first = self._kept_round(len(parts))
         self.resumed += first * len(self.blocks)
@@ -154,7 +144,7 @@ class Run:
                 sets.counts,
                 ("mean", "factor", "color"),
                 self.image.channels,
-                self.options.cutoff,
+                self.settings.options.cutoff,
             )
             task = partial(self._fit_task, sets=sets, steps=steps, part=part)
             for block, arrays in self._fitted(f"fit{number}-", fit_block, task, len(part)):

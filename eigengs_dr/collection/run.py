@@ -100,7 +100,7 @@ def run_images(
 ) -> list[ImageRow]:
     """Run a job; for arguments, rows and errors see `eigengs_dr.fit_many`.
 
-    In this process the images end in their order.
+    In this process the images on which there is work end in their order.
     """
     sources = list_sources(images)
     total = len(sources) if isinstance(sources, list) else None

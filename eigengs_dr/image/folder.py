@@ -158,7 +158,7 @@ def read_blocks(
     ImageError
         If the source has no images, none of its files can be read, or an array is not an image.
     ValueError
-        If the size, the space or the length is invalid.
+        If the size or the space is invalid.
 
     Warns
     -----
@@ -168,8 +168,6 @@ def read_blocks(
     size = check_size(size)
     if space not in BASIS_SPACES:
         raise ValueError(f"colour space {space!r} is unknown; use one of {', '.join(BASIS_SPACES)}")
-    if length < 1:
-        raise ValueError(f"length is {length}; a block needs at least 1 image")
     if isinstance(source, str | os.PathLike):
         source = list_images(source)
     elif isinstance(source, np.ndarray):
