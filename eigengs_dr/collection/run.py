@@ -421,7 +421,5 @@ def _work_of(source: Source, steps: int) -> int:
         return max(pixels * steps, BYTE_WORK * source.image.nbytes)
     if isinstance(source.path, str):
         return URL_SIZE * steps
-    try:
-        return source.path.stat().st_size * steps
-    except OSError:  # the worker says what is wrong with it
-        return 0
+    # What is wrong with a file, the worker says.
+    return source.path.stat().st_size * steps if source.path.is_file() else 0
