@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import numpy as np
@@ -82,7 +82,7 @@ def fit_batch(images: NDArray[np.float32], options: FitOptions) -> list[Fit]:
     targets = [make_target(pixels, options.space) for pixels in images]
     starts = [start_from_placement(target, options).gaussians for target in targets]
     seconds_init = (time.perf_counter() - started) / len(images)
-    records = [_Record(t.pixels, start) for t, start in zip(targets, starts, strict=True)]
+    found = [Refinement(start, [], 0, "iterations", {}) for start in starts]
     controls = [control_for(target, options) for target in targets]
     values = np.stack([control.target for control in controls])
     weights = [control.weight for control in controls if control.weight is not None]
@@ -97,49 +97,30 @@ def fit_batch(images: NDArray[np.float32], options: FitOptions) -> list[Fit]:
         # A set with more Gaussians than asked for does not compare, see `refine`.
         if step in marks and len(batch) == len(problem.gaussians):
             seconds = (time.perf_counter() - started) / len(images)
-            for record, found in zip(records, _split(batch), strict=True):
-                if record.stopped != "exact":
-                    record.judge(step, found, seconds)
+            for k, (target, reached) in enumerate(zip(targets, _split(batch), strict=True)):
+                if found[k].stopped != "exact":
+                    row = {"iteration": step, **measure(reached, target.pixels, 0)}
+                    found[k] = _judge(found[k], reached, row | {"seconds": seconds})
         if step % 10 == 0:
             dr.sync_thread()
         if interrupted():
             raise KeyboardInterrupt
-        return all(record.stopped == "exact" for record in records)
+        return all(one.stopped == "exact" for one in found)
 
     with defer_interrupts() as interrupted:
         run(problem, options.method.schedule, options.iterations, after)
-    fits = [
-        finish(
-            Refinement(r.best, r.trace, r.trace[-1]["iteration"], r.stopped, r.row),
-            r.best,
-            None,
-            started,
-            seconds_init,
-        )
-        for r in records
-    ]
+    fits = [finish(one, one.gaussians, None, started, seconds_init) for one in found]
     share = (time.perf_counter() - started) / len(images)
     return [replace(fit, seconds=share) for fit in fits]
 
 
-@dataclass
-class _Record:
-    """The trace and the best set of one image; see `eigengs_dr.fitting.refine.Refinement`."""
-
-    pixels: NDArray[np.float32]
-    best: Gaussians
-    row: Row = field(default_factory=lambda: {"psnr_ycbcr": -math.inf})
-    trace: list[Row] = field(default_factory=list)
-    stopped: str = "iterations"
-
-    def judge(self, step: int, found: Gaussians, seconds: float) -> None:
-        """Add a row to the trace, and keep the best set."""
-        row = {"iteration": step, **measure(found, self.pixels, 0), "seconds": seconds}
-        self.trace.append(row)
-        if row["psnr_ycbcr"] > self.row["psnr_ycbcr"]:
-            self.best, self.row = found, row
-        if row["psnr_ycbcr"] > MAX_PSNR:
-            self.stopped = "exact"
+def _judge(found: Refinement, reached: Gaussians, row: Row) -> Refinement:
+    """Add a row to the trace of an image, and keep the best set."""
+    found.trace.append(row)
+    if row["psnr_ycbcr"] > found.row.get("psnr_ycbcr", -math.inf):
+        found = found._replace(gaussians=reached, row=row)
+    stopped = "exact" if row["psnr_ycbcr"] > MAX_PSNR else found.stopped
+    return found._replace(iterations=row["iteration"], stopped=stopped)
 
 
 @dataclass(frozen=True)
