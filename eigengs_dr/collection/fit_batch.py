@@ -1,15 +1,13 @@
 """Fits of several images of one size in one program.
 
 The Gaussians of all images are one set, image after image, and the tiles of all images are one
-list of tiles. A small image alone would wait for launches most of the time. Placements and the rows
-of the traces are those of each image alone.
+list of tiles. A small image alone would wait for launches most of the time.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -22,10 +20,13 @@ from ..backend.recording import exclusive
 from ..fitting.density_control import DensityControl
 from ..fitting.descent import FitProblem, run
 from ..fitting.fit import Fit, finish
+from ..fitting.measure import Row, Shown, psnrs
 from ..fitting.options import FitOptions
-from ..fitting.refine import Refinement, Row, measure, trace_steps
-from ..fitting.start import PLACEMENTS, control_for, start_from_placement
-from ..fitting.target import make_target
+from ..fitting.placement.adaptive import place_by_error
+from ..fitting.refine import Refinement, trace_steps
+from ..fitting.solvers.conjugate_gradient import solve
+from ..fitting.start import PLACEMENTS, control_for, place
+from ..fitting.target import FitTarget, make_target
 from ..gaussian.gaussians import Gaussians, like
 from ..image.metrics import MAX_PSNR
 
@@ -80,27 +81,23 @@ def fit_batch(images: NDArray[np.float32], options: FitOptions) -> list[Fit]:
     started = time.perf_counter()
     options.check_image(images[0])
     targets = [make_target(pixels, options.space) for pixels in images]
-    starts = [start_from_placement(target, options).gaussians for target in targets]
+    control = _control(targets, options)
+    placed = _stack([place(target, options) for target in targets])
+    start = solve(placed, control.target, options.solve_steps).gaussians
+    problem = FitProblem(start, control.target, control.weight, control)
     seconds_init = (time.perf_counter() - started) / len(images)
-    found = [Refinement(start, [], 0, "iterations", {}) for start in starts]
-    controls = [control_for(target, options) for target in targets]
-    values = np.stack([control.target for control in controls])
-    weights = [control.weight for control in controls if control.weight is not None]
-    weight = np.stack(weights) if weights else None
-    control = _BatchControl(
-        values, weight, values, redistributes=controls[0].redistributes, each=controls
-    )
-    problem = FitProblem(_stack(starts), values, weight, control)
+    found = [Refinement(start, [], 0, "iterations", {}) for _ in images]
     marks = trace_steps(options.iterations)
 
     def after(step: int, batch: Gaussians) -> bool:
         # A set with more Gaussians than asked for does not compare, see `refine`.
-        if step in marks and len(batch) == len(problem.gaussians):
+        if step in marks and len(batch) == len(start):
+            figures = psnrs(batch, [Shown(images, options.space)])[0].T.tolist()
             seconds = (time.perf_counter() - started) / len(images)
-            for k, (target, reached) in enumerate(zip(targets, _split(batch), strict=True)):
+            for k, (ycbcr, rgb) in enumerate(figures):
                 if found[k].stopped != "exact":
-                    row = {"iteration": step, **measure(reached, target.pixels, 0)}
-                    found[k] = _judge(found[k], reached, row | {"seconds": seconds})
+                    row = {"seconds": seconds, "psnr_ycbcr": ycbcr, "psnr_rgb": rgb}
+                    found[k] = _judge(found[k], batch, {"iteration": step, **row})
         if step % 10 == 0:
             dr.sync_thread()
         if interrupted():
@@ -109,16 +106,21 @@ def fit_batch(images: NDArray[np.float32], options: FitOptions) -> list[Fit]:
 
     with defer_interrupts() as interrupted:
         run(problem, options.method.schedule, options.iterations, after)
-    fits = [finish(one, one.gaussians, None, started, seconds_init) for one in found]
+    batches = {id(one.gaussians): one.gaussians for one in found}
+    sets = {name: _split(batch) for name, batch in batches.items()}
+    fits = [
+        finish(one, sets[id(one.gaussians)][k], None, started, seconds_init)
+        for k, one in enumerate(found)
+    ]
     share = (time.perf_counter() - started) / len(images)
     return [replace(fit, seconds=share) for fit in fits]
 
 
-def _judge(found: Refinement, reached: Gaussians, row: Row) -> Refinement:
-    """Add a row to the trace of an image, and keep the best set."""
+def _judge(found: Refinement, batch: Gaussians, row: Row) -> Refinement:
+    """Add a row to the trace of an image, and keep the batch with its best set."""
     found.trace.append(row)
     if row["psnr_ycbcr"] > found.row.get("psnr_ycbcr", -math.inf):
-        found = found._replace(gaussians=reached, row=row)
+        found = found._replace(gaussians=batch, row=row)
     stopped = "exact" if row["psnr_ycbcr"] > MAX_PSNR else found.stopped
     return found._replace(iterations=row["iteration"], stopped=stopped)
 
@@ -129,16 +131,30 @@ class _BatchControl(DensityControl):
 
     Attributes
     ----------
-    each : list of DensityControl
+    each : tuple of DensityControl
         That of each image.
     """
 
-    each: Sequence[DensityControl] = ()
+    each: tuple[DensityControl, ...] = ()
 
     def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
-        """Place all sets anew, one after the other."""
-        share, pairs = count // len(self.each), zip(self.each, _split(gaussians), strict=True)
-        return _stack([control.redistribute(one, share) for control, one in pairs])
+        """Place all sets anew."""
+        share = count // len(self.each)
+        placed = [
+            place_by_error(one, share, c.shown, c.target, c.weight)
+            for c, one in zip(self.each, _split(gaussians), strict=True)
+        ]
+        return solve(_stack(placed), self.target, self.solve_steps).gaussians
+
+
+def _control(targets: list[FitTarget], options: FitOptions) -> _BatchControl:
+    """Return the density control of a batch."""
+    each = tuple(control_for(target, options) for target in targets)
+    values = np.stack([target.values for target in targets])
+    weights = [target.weight for target in targets if target.weight is not None]
+    weight = np.stack(weights) if weights else None
+    anew = each[0].redistributes
+    return _BatchControl(values, weight, values, options.solve_steps, anew, each=each)
 
 
 def _stack(sets: list[Gaussians]) -> Gaussians:

@@ -22,6 +22,7 @@ from .options import FitOptions, level_counts
 from .placement.adaptive import place_like, residual
 from .refine import FitProgress, Refinement, Score, refine
 from .schedule import Schedule
+from .solvers.conjugate_gradient import solve
 from .start import start_from_placement
 from .target import FitTarget
 
@@ -94,7 +95,8 @@ def _place_levels(
         problem = start._replace(gaussians=gaussians)
         gaussians = run(problem, schedule, steps, lambda *_: interrupted(), levels=below)
         left = residual(gaussians, start.target)
-        added = place_like(gaussians, left, left, count - len(gaussians))
+        added = place_like(gaussians, left, count - len(gaussians))
+        added = solve(added, left).gaussians
         # The background is one for all levels: a new one would change the earlier levels.
         gaussians = concatenate([gaussians, replace(added, background=0 * added.background)])
     return gaussians

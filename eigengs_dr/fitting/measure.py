@@ -106,9 +106,8 @@ def psnrs(gaussians: Gaussians, parts: Sequence[Shown]) -> NDArray[np.float64]:
         dr.eval(rendered)
         sums = [s for part in parts for s in _squared_errors(rendered, part, gaussians, lists.grid)]
         dr.eval(sums)
-        totals = dr.concat(sums).numpy()  # one copy to the host
     sizes = [part.image.size // images for part in parts for _ in range(2)]
-    mse = totals.reshape(len(sizes), images) / np.array(sizes)[:, None]
+    mse = np.array([s.numpy() / size for s, size in zip(sums, sizes, strict=True)])
     return np.vectorize(psnr_from_mse)(mse).reshape(len(parts), 2, images)
 
 

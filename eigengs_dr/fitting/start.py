@@ -211,14 +211,22 @@ def mean_picture(options: FitOptions, width: int, height: int) -> NDArray[np.flo
 
 def start_from_placement(target: FitTarget, options: FitOptions) -> FitProblem:
     """Place Gaussians by the image alone, and find their colours."""
-    method, count = options.method, options.count_for(target.values)
+    start = place(target, options)
+    if options.method.solves:
+        start = solve(start, target.values, options.solve_steps).gaussians
+    return FitProblem(start, target.values, target.weight, control_for(target, options))
+
+
+def place(target: FitTarget, options: FitOptions) -> Gaussians:
+    """Place Gaussians by the image alone, with the colour 0, or by chance if none is solved for."""
+    count = options.count_for(target.values)
     height, width, channels = target.values.shape
     generator = np.random.default_rng(options.seed)
     mean, factor = PLACEMENTS[str(options.placement)](target.shown, count, generator)
     color: NDArray[np.floating] = np.zeros((count, channels), np.float32)
-    if not method.solves:
+    if not options.method.solves:
         color = generator.uniform(0, 1, color.shape)
-    start = Gaussians.from_arrays(
+    return Gaussians.from_arrays(
         mean,
         factor,
         color,
@@ -227,9 +235,6 @@ def start_from_placement(target: FitTarget, options: FitOptions) -> FitProblem:
         backend=options.backend,
         cutoff=options.cutoff,
     ).bounded()
-    if method.solves:
-        start = solve(start, target.values, options.solve_steps).gaussians
-    return FitProblem(start, target.values, target.weight, control_for(target, options))
 
 
 def control_for(target: FitTarget, options: FitOptions) -> DensityControl:

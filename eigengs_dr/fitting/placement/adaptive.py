@@ -328,9 +328,21 @@ def redistribute(
     Gaussians
         The new set. It keeps no Gaussian of the old set.
     """
+    placed = place_by_error(gaussians, count, image, target, weight)
+    return solve(placed, target, solve_steps).gaussians
+
+
+def place_by_error(
+    gaussians: Gaussians,
+    count: int,
+    image: Array,
+    target: NDArray[np.float32],
+    weight: Array | None = None,
+) -> Gaussians:
+    """Place the set of `redistribute`, with the colour 0."""
     error = squared_error(residual(gaussians, target), weight)
     density = density_for_error(gaussians.to_arrays()["mean"], error)
-    return place_like(gaussians, image, target, count, density, solve_steps)
+    return place_like(gaussians, image, count, density)
 
 
 def density_for_error(mean: Array, error: NDArray[np.float32]) -> Density:
@@ -349,21 +361,15 @@ def density_for_error(mean: Array, error: NDArray[np.float32]) -> Density:
 
 
 def place_like(
-    gaussians: Gaussians,
-    image: Array,
-    target: NDArray[np.float32],
-    count: int,
-    density: Density | None = None,
-    solve_steps: int = 10,
+    gaussians: Gaussians, image: Array, count: int, density: Density | None = None
 ) -> Gaussians:
-    """Place Gaussians by an image in the space and size of another set; solve for their colours.
+    """Place Gaussians by an image in the space and size of another set, with the colour 0.
 
-    For the parameters see `redistribute`, and for the density
-    `eigengs_dr.fitting.placement.adaptive.place_adaptive`.
+    For the parameters see `redistribute` and `place_adaptive`.
     """
     mean, factor = place_adaptive(image, count, density=density)
     placed = like(gaussians, mean, factor, np.zeros((count, gaussians.channels), np.float32))
-    return solve(placed.bounded(), target, solve_steps).gaussians
+    return placed.bounded()
 
 
 def residual(gaussians: Gaussians, target: NDArray[np.float32]) -> NDArray[np.float32]:

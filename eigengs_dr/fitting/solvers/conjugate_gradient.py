@@ -74,8 +74,9 @@ def solve(
     Parameters
     ----------
     gaussians : Gaussians
-    image : ndarray, shape (H, W, C)
-        Image of the native size, in the space of the set.
+    image : ndarray, shape (H, W, C) or (M, H, W, C)
+        Image of the native size, in the space of the set. A batch of images has step lengths for
+        each: the set holds the Gaussians of all, image after image, equally many for each.
     steps : int, optional
         Number of steps. Few steps regularise the colours of Gaussians that overlap much.
     warm_start : bool, optional
@@ -86,6 +87,7 @@ def solve(
     Returns
     -------
     Solution
+        The background of a batch has a value for each image; its residuals are over all images.
 
     Raises
     ------
@@ -93,17 +95,19 @@ def solve(
         If image and set differ in shape, or steps is negative.
     """
     expected = (gaussians.height, gaussians.width, gaussians.channels)
-    if image.shape != expected:
+    if image.shape[-3:] != expected:
         raise ValueError(f"solve: image has shape {image.shape}, the set needs {expected}")
     if steps < 0:
         raise ValueError(f"solve: steps is {steps}; it must be at least 0")
     with dr.suspend_grad():
         types = types_of(gaussians.mean)
-        color, free = _start(gaussians, image[None], warm_start)
+        images = image if image.ndim == 4 else image[None]
+        color, free = _start(gaussians, images, warm_start)
         if background is not None:
             free = [upload(types.Float, row) for row in np.asarray(background)[:, None]]
         start, hold = (color, free), background is not None
-        solution = _solve(gaussians, bin_gaussians(gaussians), image, start, steps, hold)
+        lists = bin_gaussians(gaussians, images=len(images))
+        solution = _solve(gaussians, lists, image, start, steps, hold)
     release_memory()  # the lists too
     return solution
 
