@@ -50,9 +50,10 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     from ..gaussian import file as set_file
     from ..gaussian.gaussians import Gaussians
     from ..storage import npz
+    from ..storage.atomic import reader_of
 
     file = SHIPPED.get(str(file), file)
-    packed = egs.is_egs(file)
+    packed = bool(reader_of(file))
     kinds = {
         set_file.FORMAT: "image",
         set_file.MATERIAL: "material",

@@ -108,14 +108,16 @@ def turns_of(stretch: Double, fineness: Double) -> IntArray:
     return np.clip(turns, 1, MAX_TURNS).astype(np.int64)
 
 
-def factors_of(scale: Double, stretch: Double, turn: Double) -> Double:
-    """Return the factors a, b, c, shape (N, 3), for s, l and t in turns, by exact arithmetic."""
+def factors_of(scale: IntArray, stretch: IntArray, turn: IntArray, fineness: Double) -> Double:
+    """Return the factors a, b, c, shape (N, 3), for integers and Q, by exact arithmetic."""
+    length = stretch * (STRETCH_STEP / fineness)
+    angle = turn / turns_of(length, fineness)
     with np.errstate(all="ignore"):
-        wide, size = exp2(2 * LOG2E * stretch), exp2(LOG2E * scale)
+        wide, size = exp2(2 * LOG2E * length), exp2(LOG2E * (scale * (SCALE_STEP / fineness)))
         odd = 0.5 * (wide - 1 / wide)
-        half = cos_turns(0.5 * turn)
+        half = cos_turns(0.5 * angle)
         a = np.sqrt(1 / wide + 2 * odd * half * half)
-        return np.stack([a * size, odd * sin_turns(turn) / a * size, size / a], axis=1)
+        return np.stack([a * size, odd * sin_turns(angle) / a * size, size / a], axis=1)
 
 
 def parts_of(factor: Array, fineness: Array, cell: float) -> IntArray:
@@ -155,7 +157,7 @@ def quantize(arrays: dict[str, Array], steps: Steps, dead_zone: float = 0.0) -> 
     stretch = _whole("shape", np.hypot(u, v) * fineness / STRETCH_STEP)
     turns = turns_of(stretch * (STRETCH_STEP / fineness), fineness)
     turn = np.rint(np.arctan2(v, u) / (2 * np.pi) * turns).astype(np.int64) % turns
-    factor = _factors(scale, stretch, turn, fineness)
+    factor = factors_of(scale, stretch, turn, fineness)
     parts = parts_of(factor, fineness, steps.cell)
     mean = np.asarray(arrays["mean"], np.float64) / steps.cell
     cell_y, part_y = _place(mean[:, 1], parts[:, 1])
@@ -178,7 +180,7 @@ def dequantize(symbols: Symbols, steps: Steps) -> dict[str, Array]:
     Numbers of hostile files may overflow to infinity or zero.
     """
     fineness = precision(symbols.color)
-    factor = _factors(symbols.scale, symbols.stretch, symbols.turn, fineness)
+    factor = factors_of(symbols.scale, symbols.stretch, symbols.turn, fineness)
     parts = parts_of(factor, fineness, steps.cell)
     with np.errstate(all="ignore"):
         size = exp2(LOG2E * (symbols.scale * (SCALE_STEP / fineness)))
@@ -187,13 +189,6 @@ def dequantize(symbols: Symbols, steps: Steps) -> dict[str, Array]:
             "factor": factor,
             "color": symbols.color * (steps.color * size)[:, None],
         }
-
-
-def _factors(scale: IntArray, stretch: IntArray, turn: IntArray, fineness: Double) -> Double:
-    """Return the factors of integers."""
-    length = stretch * (STRETCH_STEP / fineness)
-    turns = turns_of(length, fineness)
-    return factors_of(scale * (SCALE_STEP / fineness), length, turn / turns)
 
 
 def _place(values: Array, parts: IntArray) -> tuple[IntArray, IntArray]:
