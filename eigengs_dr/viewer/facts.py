@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from ..eigenbasis.eigengs import EigenGS
 from ..gaussian.file import check
 from ..gaussian.gaussians import Gaussians
-from ..image.color import LIGHT, YCBCR_TO_RGB, decode
+from ..image.color import YCBCR_TO_RGB, decode
 
 MAX_GAUSSIANS = 1 << 20
 """Most Gaussians of a page; those of a photo take 43 bytes each."""
@@ -52,29 +52,29 @@ def describe_set(gaussians: Gaussians, levels: Sequence[int] = ()) -> dict[str, 
         "height": gaussians.height,
         "cutoff": gaussians.cutoff,
         "levels": marks,
-        "mean": to_text(data.arrays["mean"], "<f4"),
-        "factor": to_text(data.arrays["factor"], "<f4"),
-        "color": to_text(color, "<f4"),
+        "mean": to_text(data.arrays["mean"]),
+        "factor": to_text(data.arrays["factor"]),
+        "color": to_text(color),
         "background": background.tolist(),
     }
 
 
-def decoded(gaussians: Gaussians) -> tuple[NDArray[Any], NDArray[Any]]:
+def decoded(gaussians: Gaussians) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the colours (N, C) and the background (C,) of a set, decoded to RGB."""
-    arrays, space = gaussians.to_arrays(), gaussians.space
-    black = np.stack(decode(space, list(np.zeros((gaussians.channels, 1)))))
-    color = np.stack(decode(space, list(arrays["color"].T.astype(np.float64)))) - black
-    return color.T, np.stack(decode(space, list(arrays["background"].astype(np.float64))))
+    arrays = gaussians.to_arrays()
+    black = np.zeros_like(arrays["background"])
+    rows = np.vstack([arrays["color"], arrays["background"], black]).astype(np.float64)
+    rgb = np.stack(decode(gaussians.space, list(rows.T)), axis=1)
+    return rgb[:-2] - rgb[-1], rgb[-2]
 
 
-def to_text(array: NDArray[Any], kind: DTypeLike) -> str:
+def to_text(array: NDArray[np.floating], kind: str = "<f4") -> str:
     """Return the bytes of an array in base64."""
     return b64encode(np.ascontiguousarray(array, kind).tobytes()).decode()
 
 
-def light_of(space: str) -> int:
-    """Return what sums are: 0 codes and data, 1 linear light, 2 logarithms of light, 3 normals."""
-    return {"log": 2, "normal": 3}.get(space, int(space in LIGHT))
+LIGHTS = {"linear": 1, "radiance": 1, "log": 2, "normal": 3}
+"""What sums are, by space: 1 linear light, 2 logarithms of light, 3 normals; 0 codes and data."""
 
 
 def channel_views(channels: int) -> list[tuple[str, tuple[int, int, int]]]:
@@ -113,25 +113,36 @@ def describe_model(model: EigenGS, image: NDArray[np.float32] | None = None) -> 
     image : ndarray of float32, shape (H, W, 3), optional
         A photo in sRGB, to encode and to move along the components.
     """
-    space = model.gaussians.space
+    space, counts = model.gaussians.space, kept_counts(model)
+    channels = []
+    for name, weights, values, count in zip(
+        NAMES[space], model.weights, model.eigenvalues, counts, strict=True
+    ):
+        scales = np.abs(weights[:count]).max(axis=1, initial=0)
+        scales = np.where(scales > 0, scales, 1)
+        text = to_text(weights[:count] / scales[:, None], "<f2")
+        deviations = np.sqrt(values[:count]).tolist()
+        found = {"deviations": deviations, "scales": scales.tolist(), "weights": text}
+        channels.append({"name": name, **found})
+    photo = None
+    if image is not None:
+        color, background = decoded(model.encode(image))
+        scores = [  # coefficients in standard deviations
+            (own[:count] / np.sqrt(np.maximum(values[:count], np.finfo(float).tiny))).tolist()
+            for own, values, count in zip(
+                model.project(image), model.eigenvalues, counts, strict=True
+            )
+        ]
+        photo = {"color": to_text(color), "background": background.tolist(), "scores": scores}
     matrix = YCBCR_TO_RGB if space == "ycbcr" else np.eye(3)
-    channels = [
-        _describe_channel(name, weights[:count], values[:count])
-        for name, weights, values, count in zip(
-            NAMES[space], model.weights, model.eigenvalues, kept_counts(model), strict=True
-        )
-    ]
-    photo = None if image is None else _describe_photo(model, image)
     return {"matrix": matrix.tolist(), "channels": channels, "photo": photo}
 
 
 def kept_counts(model: EigenGS) -> list[int]:
     """Return how many components of each channel a page has: those with the largest variances."""
     fitting = MAX_BYTES // (2 * (len(model.gaussians) + 1))
-    variances = np.sort(np.concatenate(model.eigenvalues))[::-1]
-    least = (
-        variances[fitting - 1] if 0 < fitting <= len(variances) else np.inf if not fitting else 0
-    )
+    variances = [np.inf, *np.sort(np.concatenate(model.eigenvalues))[::-1]]
+    least = variances[min(fitting, len(variances) - 1)]
     return [max(min(FEWEST, len(v)), int((v >= least).sum())) for v in model.eigenvalues]
 
 
@@ -140,34 +151,9 @@ def describe_share(model: EigenGS) -> str:
     counts, whole = kept_counts(model), sum(model.components)
     if sum(counts) == whole:
         return ""
-    kept = sum(float(v[:n].sum()) for v, n in zip(model.eigenvalues, counts, strict=True))
-    total = sum(float(v.sum()) for v in model.eigenvalues)
+    kept = sum(v[:n].sum() for v, n in zip(model.eigenvalues, counts, strict=True))
+    total = sum(v.sum() for v in model.eigenvalues)
     return (
         f"A random image uses the first {sum(counts)} of {whole} components, "
         f"with {kept / total:.0%} of their variance."
     )
-
-
-def _describe_channel(
-    name: str, weights: NDArray[np.float32], eigenvalues: NDArray[np.float64]
-) -> dict[str, Any]:
-    scales = np.abs(weights).max(axis=1, initial=0)
-    scales = np.where(scales > 0, scales, 1)
-    return {
-        "name": name,
-        "deviations": np.sqrt(eigenvalues).tolist(),
-        "scales": scales.tolist(),
-        "weights": to_text(weights / scales[:, None], "<f2"),
-    }
-
-
-def _describe_photo(model: EigenGS, image: NDArray[np.float32]) -> dict[str, Any]:
-    """Return the best colours for a photo, and its scores: coefficients in standard deviations."""
-    color, background = decoded(model.encode(image))
-    scores = [
-        (coefficients[:count] / np.sqrt(np.maximum(values[:count], np.finfo(float).tiny))).tolist()
-        for coefficients, values, count in zip(
-            model.project(image), model.eigenvalues, kept_counts(model), strict=True
-        )
-    ]
-    return {"color": to_text(color, "<f4"), "background": background.tolist(), "scores": scores}

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from base64 import b64encode
 from io import BytesIO
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..gaussian.covariance import outline
 from ..gaussian.gaussians import Gaussians
@@ -34,7 +33,7 @@ look straight, and Pillow takes no larger coordinates."""
 LOW_COLOR, HIGH_COLOR = (214, 96, 20), (30, 90, 160)
 """Colours of outlines: orange for the Gaussians of low frequencies, blue for all others."""
 
-Picture = NDArray[Any]
+Picture = NDArray[np.floating]
 Color = tuple[int, int, int]
 
 
@@ -82,10 +81,11 @@ def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
     return _outlined(under, subset, [HIGH_COLOR] * len(subset))
 
 
-def displayed(image: Any, space: str) -> Picture:
-    """Return an image as people look at it: sRGB, or data."""
-    data = rendered_as(space) is None
-    return check_data(image, copy=False) if data else check_image(image, copy=False)
+def displayed(image: ArrayLike, space: str, encoding: str | None = None) -> NDArray[np.float32]:
+    """Return an image as people look at it, for sets of a space: sRGB, or data."""
+    if rendered_as(space) is None:
+        return check_data(image, copy=False)
+    return check_image(image, copy=False, encoding=encoding)
 
 
 def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Picture:
@@ -120,19 +120,14 @@ def _outlined(picture: Picture, gaussians: Gaussians, colors: list[Color]) -> Pi
     under = np.broadcast_to(to_8bit(picture), (height, width, 3)).astype(np.uint8)
     image = Image.fromarray(under.repeat(2, axis=0).repeat(2, axis=1))
     draw = ImageDraw.Draw(image)
-    points = _outlines(gaussians.scaled(2 * width, 2 * height))
+    arrays = gaussians.scaled(2 * width, 2 * height).to_arrays()
+    points = outline(arrays["factor"]) + arrays["mean"].astype(np.float64)[:, None]
     for n in reversed(np.flatnonzero(_in_sight(points, image.size))):
         draw.line(points[n].ravel().tolist(), fill=colors[n], width=2)
     return np.asarray(image.resize((width, height), Image.Resampling.BOX), np.float32) / 255
 
 
-def _outlines(gaussians: Gaussians) -> Picture:
-    """Return closed outlines at one standard deviation, shape (N, 25, 2)."""
-    arrays = gaussians.to_arrays()
-    return outline(arrays["factor"]) + arrays["mean"].astype(np.float64)[:, None]
-
-
-def _in_sight(points: Picture, size: tuple[int, int]) -> Picture:
+def _in_sight(points: Picture, size: tuple[int, int]) -> NDArray[np.bool_]:
     """Tell which outlines may cross a picture and are small enough for Pillow."""
     low, high = points.min(axis=1), points.max(axis=1)
     longest = MAX_REACH * max(size)
@@ -153,15 +148,8 @@ QUALITY = 92
 """Quality of JPEG."""
 
 
-def check_aspect(pixels: NDArray[Any], size: tuple[int, int]) -> None:
-    """Raise ValueError unless a photo has the aspect ratio of a set, to a pixel.
-
-    Parameters
-    ----------
-    pixels : ndarray, shape (H, W, C)
-    size : (int, int)
-        Native width and height of the set.
-    """
+def check_aspect(pixels: Picture, size: tuple[int, int]) -> None:
+    """Raise ValueError unless a photo has the width and height of a set as its aspect ratio."""
     height, width = pixels.shape[:2]
     if abs(width * size[1] - height * size[0]) > max(*size, width, height):
         raise ValueError(
@@ -170,7 +158,7 @@ def check_aspect(pixels: NDArray[Any], size: tuple[int, int]) -> None:
         )
 
 
-def photo_uri(pixels: NDArray[Any]) -> str:
+def photo_uri(pixels: NDArray[np.float32]) -> str:
     """Return a link that holds a photo, as JPEG, or as PNG if that is smaller.
 
     Parameters
@@ -181,20 +169,11 @@ def photo_uri(pixels: NDArray[Any]) -> str:
     from PIL import Image
 
     height, width = pixels.shape[:2]
-    scale = min(1.0, MAX_SIDE / max(width, height))
-    if scale < 1:
-        pixels = resample(pixels, max(1, round(scale * width)), max(1, round(scale * height)))
-    codes = to_8bit(pixels).astype(np.uint8)
+    small = resample(pixels, *within(min(MAX_SIDE, max(width, height)), width, height))
+    codes = to_8bit(small).astype(np.uint8)
     picture = Image.fromarray(codes[..., 0] if codes.shape[2] == 1 else codes)
-    best = min(
-        (_encoded(picture, "jpeg", quality=QUALITY, subsampling=0), "jpeg"),
-        (_encoded(picture, "png", optimize=True), "png"),
-        key=lambda file: len(file[0]),
-    )
-    return f"data:image/{best[1]};base64,{b64encode(best[0]).decode()}"
-
-
-def _encoded(picture: Any, kind: str, **options: Any) -> bytes:
-    file = BytesIO()
-    picture.save(file, kind, **options)
-    return file.getvalue()
+    jpeg, png = BytesIO(), BytesIO()
+    picture.save(jpeg, "jpeg", quality=QUALITY, subsampling=0)
+    picture.save(png, "png", optimize=True)
+    kind, file = min(("jpeg", jpeg), ("png", png), key=lambda found: found[1].tell())
+    return f"data:image/{kind};base64,{b64encode(file.getvalue()).decode()}"

@@ -26,47 +26,35 @@ CELL = 240
 COLUMNS = 7
 """Pictures side by side in a sheet."""
 
-Column = tuple[str, list[Picture]]
-"""A name, and pictures on one scale: of a component, or as Gaussians render it, or both."""
-
 
 def component_sheet(model: EigenGS, basis: Eigenbasis | None = None) -> Picture:
     """Draw the mean image, some components and the outlines of the Gaussians of a model.
-
-    Components are signed, so mid-grey is zero. A component of a colour difference has the two
-    colours of that difference.
 
     Parameters
     ----------
     model : EigenGS
     basis : Eigenbasis, optional
         The basis that the model was fitted to. The sheet shows its components above the rendered
-        ones, on the same scale.
+        ones.
 
     Returns
     -------
     ndarray of float, shape (H, W, 3)
         RGB, not clamped, under 2,000 pixels wide.
-
-    Raises
-    ------
-    ValueError
-        If the basis and the model differ in size, space or number of components.
     """
-    if basis is not None:
-        _require_same(model, basis)
-    columns = [_mean(model, basis), *_components(model, basis)]
-    captioned = [_captioned(name, *pictures) for name, pictures in columns]
-    rows = range(0, len(captioned), COLUMNS)
-    tables = [join_pictures(captioned[k : k + COLUMNS], 1) for k in rows]
-    outlines = [_captioned("standard deviations", ellipses(model.gaussians, model.low))]
-    if model.low:
-        outlines += _parts_of_mean(model)
-    return join_pictures([*tables, join_pictures(outlines, 1)], 0)
+    sources: list[EigenGS | Eigenbasis] = [model] if basis is None else [basis, model]
+    columns = zip(*(first_components(source) for source in sources), strict=True)
+    cells = [_captioned(column[0][0], *(picture for _, picture in column)) for column in columns]
+    tables = [join_pictures(cells[k : k + COLUMNS], 1) for k in range(0, len(cells), COLUMNS)]
+    outlines = _captioned("standard deviations", ellipses(model.gaussians, model.low))
+    return join_pictures([*tables, outlines], 0)
 
 
 def first_components(source: EigenGS | Eigenbasis) -> list[tuple[str, Picture]]:
     """Draw the mean image and some components of a basis, or as the Gaussians of a model show them.
+
+    Components are signed, so mid-grey is zero. A component of a colour difference has the two
+    colours of that difference.
 
     Parameters
     ----------
@@ -78,51 +66,24 @@ def first_components(source: EigenGS | Eigenbasis) -> list[tuple[str, Picture]]:
         Names and pictures in RGB, not clamped; the longer side has `CELL` pixels.
     """
     if isinstance(source, EigenGS):
-        columns = [_mean(source, None), *_components(source, None)]
+        space, counts = source.gaussians.space, source.components
+        mean, picks = render(source.gaussians).numpy(), _picks(counts)
+        planes: Picture = np.zeros(0)
+        if picks:  # there are at most 13, so one program renders all
+            weights = np.stack([source.weights[channel][j] for channel, j in picks], axis=1)
+            rendered = render(with_colors(source.gaussians, weights, "data")).numpy()
+            planes = np.moveaxis(rendered, 2, 0)
     else:
-        columns = [("mean", [_cell(_mean_of(source))])]
-        for channel, j in _picks(tuple(map(len, source.components))):
-            columns.append(_column(source.space, channel, j, [source.components[channel][j]]))
-    return [(name, pictures[0]) for name, pictures in columns]
-
-
-def _require_same(model: EigenGS, basis: Eigenbasis) -> None:
-    """Raise ValueError unless a basis has the size, space and components of a model."""
-    shapes = model.gaussians
-    expected = (shapes.width, shapes.height, shapes.space, model.components)
-    actual = (basis.width, basis.height, basis.space, tuple(map(len, basis.components)))
-    if expected != actual:
-        raise ValueError(
-            f"basis is {actual}, the model {expected}; pass the basis it was fitted to"
-        )
-
-
-def _mean(model: EigenGS, basis: Eigenbasis | None) -> Column:
-    """Draw the column of the mean image."""
-    pictures = [render(model.gaussians).numpy()]
-    if basis is not None:
-        pictures.insert(0, _mean_of(basis))
-    return "mean", [_cell(picture) for picture in pictures]
-
-
-def _mean_of(basis: Eigenbasis) -> Picture:
-    """Return the mean image of a basis in RGB."""
-    return np.stack(decode(basis.space, list(basis.mean)), axis=2)
-
-
-def _components(model: EigenGS, basis: Eigenbasis | None) -> list[Column]:
-    """Draw one column for each component of the sheet."""
-    picks = _picks(model.components)
-    if not picks:
-        return []
-    # There are at most 13 channels, so one program renders all.
-    weights = np.stack([model.weights[channel][j] for channel, j in picks], axis=1)
-    rendered = render(with_colors(model.gaussians, weights, "data")).numpy()
-    columns = []
-    for (channel, j), plane in zip(picks, np.moveaxis(rendered, 2, 0), strict=True):
-        planes = [plane] if basis is None else [basis.components[channel][j], plane]
-        columns.append(_column(model.gaussians.space, channel, j, planes))
-    return columns
+        space, counts = source.space, tuple(map(len, source.components))
+        mean, picks = np.stack(decode(space, list(source.mean)), axis=2), _picks(counts)
+        planes = np.array([source.components[channel][j] for channel, j in picks])
+    shown = [("mean", _cell(mean))]
+    for (channel, j), plane in zip(picks, planes, strict=True):
+        # A quantile, because one bright pixel must not make everything else grey.
+        scale = 0.5 / (np.quantile(np.abs(plane), 0.999) or 1)
+        picture = _cell(0.5 + scale * plane[..., None] * _hue(space, channel))
+        shown.append((f"{CHANNELS[space][channel]} {j + 1}", picture))
+    return shown
 
 
 def _picks(components: tuple[int, ...]) -> list[tuple[int, int]]:
@@ -132,26 +93,6 @@ def _picks(components: tuple[int, ...]) -> list[tuple[int, int]]:
         for channel, count in enumerate(components)
         for number in (OTHERS if channel else FIRST)
         if number <= count
-    ]
-
-
-def _column(space: str, channel: int, j: int, planes: list[Picture]) -> Column:
-    """Draw one component, (H, W), or several forms of it on one scale."""
-    # A quantile, because one bright pixel must not make everything else grey.
-    scale = 0.5 / (np.quantile(np.abs(planes[0]), 0.999) or 1)
-    hue = _hue(space, channel)
-    pictures = [_cell(0.5 + scale * plane[..., None] * hue) for plane in planes]
-    return f"{CHANNELS[space][channel]} {j + 1}", pictures
-
-
-def _parts_of_mean(model: EigenGS) -> list[Picture]:
-    """Draw the shares of the Gaussians of low and of high frequencies in the mean image."""
-    low = render(model.gaussians[: model.low]).numpy()
-    high = render(model.gaussians).numpy() - low
-    rest = len(model.gaussians) - model.low
-    return [
-        _captioned(f"mean by {model.low} low", _cell(low)),
-        _captioned(f"mean by {rest} high", _cell(0.5 + high)),
     ]
 
 

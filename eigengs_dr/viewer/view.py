@@ -11,35 +11,18 @@ from dataclasses import dataclass
 from functools import cache
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import jinja2
-import numpy as np
-from markupsafe import Markup
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..backend.recording import exclusive
 from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
-from ..gaussian.gaussians import Gaussians, one_image
+from ..gaussian.gaussians import Gaussians, one_image, set_of
 from ..image.color import UNBOUNDED, rendered_as
-from ..image.io import check_data, check_image
 from ..storage.atomic import atomic_write
-from .facts import channel_views, describe_model, describe_set, describe_share, light_of
-from .pictures import check_aspect, photo_uri
-
-SCRIPTS = (
-    "data.js",
-    "camera.js",
-    "shaders.js",
-    "renderer.js",
-    "model.js",
-    "gestures.js",
-    "viewer.js",
-    "panel.js",
-    "main.js",
-)
-"""The programs of the page, in the order in which they run."""
+from .facts import LIGHTS, channel_views, describe_model, describe_set, describe_share
+from .pictures import check_aspect, displayed, photo_uri
 
 FRAME_HEIGHT = 560
 """Height of a page inside a notebook, in pixels."""
@@ -84,30 +67,16 @@ class Page:
         return f'<iframe srcdoc="{escape(self.html)}" style="{style}"></iframe>'
 
 
-def build_page(**values: Any) -> Page:
-    """Fill the template; for the values see ``web/page.html.j2``. Text is escaped."""
-    loader = _environment().loader
-    assert loader is not None
-    scripts = [Markup(_source(name)) for name in SCRIPTS]
-    template = _environment().get_template("page.html.j2")
-    return Page(template.render(style=Markup(_source("page.css")), scripts=scripts, **values))
-
-
 @cache
-def _environment() -> jinja2.Environment:
-    """Return the environment of the template; an unknown value is an error."""
-    return jinja2.Environment(
+def _template() -> jinja2.Template:
+    """Return the template of a page; an unknown value is an error, and text is escaped."""
+    environment = jinja2.Environment(
         loader=jinja2.PackageLoader("eigengs_dr.viewer", "web"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-
-
-def _source(name: str) -> str:
-    loader = _environment().loader
-    assert loader is not None
-    return loader.get_source(_environment(), name)[0]
+    return environment.get_template("page.html.j2")
 
 
 @exclusive()
@@ -158,48 +127,33 @@ def view(
     >>> "One Gaussian" in page.html
     True
     """
-    if isinstance(source, Fit):
-        if source.mean_image is not None:
-            raise ValueError("the fit has a mean image of pixels, which a page cannot draw")
-        source = source.gaussians
-    if isinstance(source, Gaussians):
-        one_image(source)
-    if not isinstance(source, Gaussians | EigenGS):
+    if not isinstance(source, Gaussians | Fit | EigenGS):
         raise TypeError(
             f"{type(source).__name__} cannot be shown; expected Gaussians, Fit or EigenGS"
         )
-    gaussians = source if isinstance(source, Gaussians) else source.gaussians
-    pixels = None if image is None else _photo(image, gaussians.space, encoding)
-    model = None
-    if isinstance(source, EigenGS):
-        model = describe_model(source, pixels)
-        if pixels is not None:
-            gaussians = gaussians.scaled(pixels.shape[1], pixels.shape[0])
+    whole = source if isinstance(source, EigenGS) else None
+    gaussians = one_image(set_of(source)) if whole is None else whole.gaussians
+    pixels = None if image is None else displayed(image, gaussians.space, encoding)
+    model = None if whole is None else describe_model(whole, pixels)
+    if pixels is not None and whole is not None:
+        gaussians = gaussians.scaled(pixels.shape[1], pixels.shape[0])
     elif pixels is not None:
         check_aspect(pixels, (gaussians.width, gaussians.height))
     views = channel_views(gaussians.channels)
     facts = {
         "set": describe_set(gaussians, levels),
-        "light": light_of(gaussians.space),
+        "light": LIGHTS.get(gaussians.space, 0),
         "channels": views[0][1],
         "photo": None if pixels is None else photo_uri(pixels),
         "model": model,
     }
-    return build_page(
+    html = _template().render(
         title=title,
         summary=f"{len(gaussians):,} Gaussians, {gaussians.width} x {gaussians.height} pixels",
         facts=facts,
-        photo=pixels is not None,
-        model=model is not None,
-        model_note=describe_share(source) if isinstance(source, EigenGS) else "",
-        levels=bool(levels),
-        views=views if len(views) > 1 else [],
+        model_note="" if whole is None else describe_share(whole),
+        views=views,
         bright=gaussians.space in UNBOUNDED,
         color_name="Colour" if rendered_as(gaussians.space) else "Values",
     )
-
-
-def _photo(image: ArrayLike, space: str, encoding: str | None) -> NDArray[np.float32]:
-    """Return a photo as people look at it: sRGB, or data."""
-    data = rendered_as(space) is None
-    return check_data(image) if data else check_image(image, encoding=encoding)
+    return Page(html)

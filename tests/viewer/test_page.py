@@ -11,8 +11,7 @@ from eigengs_dr.viewer.view import Page
 
 
 @pytest.mark.parametrize(
-    "space, channels",
-    [("ycbcr", 3), ("linear", 3), ("log", 3), ("data", 1)],
+    "space, channels", [("ycbcr", 3), ("linear", 3), ("log", 3), ("normal", 3), ("data", 1)]
 )
 def test_draws_as_the_renderer(actual, space, channels):
     gaussians = make_set(space, channels, cutoff=4.0)
@@ -31,12 +30,6 @@ def test_shows_each_channel_of_data(actual):
     assert differ(tab.image(), whole[..., [4, 4, 4]]) < 0.05
 
 
-def test_normals_have_length_1(actual):
-    gaussians = make_set("normal")
-    tab = actual(eg.view(gaussians))
-    assert differ(tab.image(), codes(gaussians)) < 0.05
-
-
 def test_light_is_exposed(actual):
     gaussians = make_set("radiance")
     tab = actual(eg.view(gaussians))
@@ -48,16 +41,13 @@ def test_light_is_exposed(actual):
     assert differ(tab.image(), codes(darker)) < 0.05
 
 
-def test_levels_are_the_first_gaussians(actual):
+def test_the_first_gaussians_are_levels_or_the_largest(actual):
     gaussians = make_set()
     tab = actual(eg.view(gaussians, levels=[20, 100, COUNT]))
     tab.page.click("#levels button:nth-child(2)")
     assert tab.page.text_content("#count-text") == "100 of 300"
     assert differ(tab.image(), codes(gaussians[:100])) < 0.05
 
-
-def test_without_levels_the_largest_come_first(actual):
-    gaussians = make_set()
     factor = gaussians.to_arrays()["factor"]
     order = np.argsort(factor[:, 0] * factor[:, 2], kind="stable")
     tab = actual(eg.view(gaussians))
