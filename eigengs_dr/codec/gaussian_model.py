@@ -104,24 +104,21 @@ def crowding(cells: IntArray) -> list[Array]:
     The numbers of Gaussians in a small and in a large window, and the square of the distance to the
     nearer neighbour along the curve.
     """
-    corner = cells.min(axis=0)
-    counts = [_count(cells - corner, shift, reach) for shift, reach in ((1, 1), (2, 2))]
-    ends = squared_distance(cells[1:], cells[:-1])
-    before, after = np.append(ends[:1], ends), np.append(ends, ends[-1:])
-    if len(cells) == 1:
-        before = after = np.zeros(1)
-    return [*map(log2, counts), log2(np.minimum(before, after) + 1)]
+    counts = [_count(cells - cells.min(axis=0), reach) for reach in (1, 2)]
+    ends = np.pad(squared_distance(cells[1:], cells[:-1]), 1, constant_values=np.inf)
+    nearer = np.minimum(ends[1:], ends[:-1]) if len(cells) > 1 else np.zeros(1)
+    return [*map(log2, counts), log2(nearer + 1)]
 
 
-def _count(cells: IntArray, shift: int, reach: int) -> Array:
-    """Count Gaussians in windows of ``2 reach + 1`` squares a side, of ``2^shift`` cells."""
+def _count(cells: IntArray, reach: int) -> Array:
+    """Count Gaussians in windows of ``2 reach + 1`` squares, of ``2^reach`` cells or more."""
+    shift, side = reach, 2 * reach + 1
     while int(np.prod((cells.max(axis=0) >> shift) + 1)) > COARSE * len(cells) + 256:
         shift += 1
     x, y = (cells >> shift).T
-    grid = np.zeros((int(y.max()) + 2 * reach + 2, int(x.max()) + 2 * reach + 2), np.int64)
+    grid = np.zeros((int(y.max()) + side + 1, int(x.max()) + side + 1), np.int64)
     np.add.at(grid, (y + reach + 1, x + reach + 1), 1)
     sums = grid.cumsum(axis=0).cumsum(axis=1)
-    side = 2 * reach + 1
     inside = sums[y + side, x + side] - sums[y, x + side] - sums[y + side, x] + sums[y, x]
     return inside.astype(np.float64)
 

@@ -17,18 +17,10 @@ from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..fitting.fit import Fit
 from ..fitting.maps import combine, read_maps
+from ..fitting.target import make_target
 from ..gaussian.channels import TextureMap, channel_weights, show_sums, slices
 from ..gaussian.gaussians import Gaussians, scale_channels, set_of
-from ..image.color import (
-    LIGHT,
-    UNBOUNDED,
-    rendered_as,
-    rgb_to_ycbcr,
-    to_coded,
-    to_linear,
-    to_log,
-    to_pu21,
-)
+from ..image.color import LIGHT, rendered_as, to_coded, to_linear, to_pu21
 from ..image.io import check_data, check_image
 from ..image.metrics import MAX_PSNR, psnr_from_mse, psnrs_by_rows
 from ..raster.render import picture_of
@@ -85,7 +77,6 @@ def pack(
     image: ArrayLike | Mapping[str, ArrayLike] | None = None,
     max_psnr_drop: float = BUDGET,
     sections: Sequence[int] | None = None,
-    cutoff: float | None = None,
     encoding: str | None = None,
 ) -> PackResult:
     """Write a set to the smallest ``.egs`` file whose loss of PSNR stays within a budget.
@@ -110,8 +101,6 @@ def pack(
         Number of Gaussians in each section of the file, in the order of the set. A reader may stop
         after any section; the budget holds for each of these prefixes. By default one section.
         Inside a section, Gaussians are stored in Hilbert-curve order.
-    cutoff : float, optional
-        Radius of a Gaussian in standard deviations; by default the cutoff of the set.
     encoding : {"srgb", "linear"}, optional
         What the pixels of the image are, see `eigengs_dr.fit`.
 
@@ -139,8 +128,6 @@ def pack(
             f"{MAX_PSNR:g} dB, such as 0.5"
         )
     whole: Gaussians = dr.detach(set_of(gaussians))
-    if cutoff is not None:
-        whole = replace(whole, cutoff=float(cutoff))
     rows = _section_rows(len(whole), sections)
     if not whole.maps:
         if isinstance(image, Mapping):
@@ -212,12 +199,9 @@ def _image_of(g: Gaussians, image: ArrayLike, encoding: str | None) -> Array:
     expected = (g.height, g.width, g.channels)
     if pixels.shape != expected:
         raise ValueError(f"pack: image has shape {pixels.shape}, the set needs {expected}")
-    if g.space == "ycbcr":
-        return rgb_to_ycbcr(pixels)
-    if g.space in UNBOUNDED:
-        light = to_linear(pixels)
-        return to_log(light) if g.space == "log" else to_pu21(light)
-    return pixels
+    if g.space == "radiance":
+        return to_pu21(to_linear(pixels))
+    return pixels if g.space == "linear" else make_target(pixels, g.space).values
 
 
 def _shown(g: Gaussians) -> Array:
