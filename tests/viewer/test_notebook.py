@@ -32,16 +32,13 @@ def test_a_set_is_its_picture():
     assert np.abs(shown - expected).mean() < 4  # JPEG
 
 
-def test_a_large_set_is_scaled_down():
-    gaussians = random_scene(0, 60, (48, 32)).on("llvm").scaled(4800, 3200)
+@pytest.mark.parametrize(
+    ("channels", "size", "shape"), [(3, (4800, 3200), (320, 480, 3)), (5, (48, 32), (32, 48))]
+)
+def test_large_sets_are_scaled_down_and_one_of_many_channels_is_shown(channels, size, shape):
+    gaussians = random_scene(0, 60, (48, 32), channels).on("llvm").scaled(*size)
     [shown] = pictures(gaussians._repr_html_())
-    assert shown.shape[:2] == (320, 480)
-
-
-def test_of_many_channels_the_first_is_shown():
-    gaussians = random_scene(0, 60, (48, 32), channels=5).on("llvm")
-    [shown] = pictures(gaussians._repr_html_())
-    assert shown.shape == (32, 48)
+    assert shown.shape == shape
 
 
 def test_a_fit_is_its_picture():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.browser import PHONE
 from _helpers.families import family, small_model
 from _helpers.shown import COUNT, SIZE, codes, differ, make_set
 from eigengs_dr.viewer.view import Page
@@ -66,7 +65,7 @@ def test_text_is_escaped(show):
 
 
 def test_everything_is_in_reach_on_a_phone(show):
-    tab = show(eg.view(small_model("llvm"), family(count=1)[0]), PHONE)
+    tab = show(eg.view(small_model("llvm"), family(count=1)[0]), "phone")
     assert tab.run("document.documentElement.scrollWidth <= innerWidth")
     for name in ("#count", "#outlines", "#compare", "#random-image", "summary"):
         tab.page.locator(name).scroll_into_view_if_needed()
@@ -80,7 +79,7 @@ def test_shows_20_000_gaussians_of_a_photo(show):
     page = eg.view(gaussians, photo)
     size = len(page.html.encode())
     assert size < 1_500_000
-    tab = show(page, {"viewport": {"width": 1280, "height": 800}})
+    tab = show(page, "large")
     seconds = tab.run("viewer.ready") / 1000
     tab.page.click("#actual-size")
     difference = differ(tab.image(), codes(gaussians))
