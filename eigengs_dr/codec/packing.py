@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import types_of
-from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..fitting.fit import Fit
 from ..fitting.maps import combine, read_maps
@@ -64,10 +63,6 @@ class PackResult(NamedTuple):
     psnr: float | dict[str, float]
     psnr_drop: float
     steps: Steps
-
-    def _repr_html_(self) -> str:
-        """Return what a notebook shows."""
-        return to_html(self)
 
 
 @exclusive()

@@ -9,7 +9,6 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codec.packing import PackResult
 from ..eigenbasis.eigengs import EigenGS
 from ..eigenbasis.pca.basis import Eigenbasis
 from ..fitting.fit import Fit
@@ -48,15 +47,6 @@ def _show_fit(fit: Fit) -> str:
         small = {name: image[::step, ::step] for name, image in fit.image.items()}
         return _block(repr(fit), *_images(small))
     return _block(repr(fit), *_images(fit.image[::step, ::step]))
-
-
-@to_html.register
-def _show_packed(packed: PackResult) -> str:
-    psnr = f"psnr={packed.psnr:.2f}" if isinstance(packed.psnr, float) else "psnr_rgb: "
-    if isinstance(packed.psnr, Mapping):
-        psnr += ", ".join(f"{name} {value:.2f}" for name, value in packed.psnr.items())
-    text = f"{packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bpp, {psnr}"
-    return _block(text) + _show_set(packed.gaussians)
 
 
 @to_html.register(Eigenbasis)

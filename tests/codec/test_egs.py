@@ -17,8 +17,8 @@ import eigengs_dr as eg
 from _helpers.packed import SPACES, STEPS, peak
 from _helpers.sets import COUNT, SIZE, check_equal, few, random_scene, scenes
 from eigengs_dr.codec import egs as packed
-from eigengs_dr.codec import weights
 from eigengs_dr.codec.quantization import Steps, Symbols, quantize
+from eigengs_dr.codec.weights import SMALL
 from eigengs_dr.storage.npz import MAX_ENTRIES
 
 FILES = Path(__file__).parent / "files"
@@ -37,8 +37,7 @@ def test_stored_files_keep_their_numbers(version, digest):
 
 def content(scene=None, space="data", sections=(COUNT,)):
     scene = scene or random_scene()
-    arrays = {"mean": scene.mean, "factor": scene.factor, "color": scene.color}
-    symbols = quantize(arrays, STEPS)
+    symbols = quantize(scene._asdict(), STEPS)
     ends = np.cumsum(sections)
     parts = [symbols.select(slice(end - k, end)) for end, k in zip(ends, sections, strict=True)]
     return packed.EgsContent(parts, STEPS, scene.background.astype(np.float32), scene.size, space)
@@ -78,18 +77,12 @@ def test_equal_splats_take_few_bits():
     assert 8000 < len(packed.to_bytes(content()._replace(sections=[same]))) < 11000
 
 
-def test_files_of_many_and_of_few_gaussians_come_back(path):
+@pytest.mark.parametrize("count", [1, 2, 20, SMALL + 100])
+def test_files_of_many_and_of_few_gaussians_come_back(path, count):
     """They differ in what the model of the probabilities may use."""
-    generator = np.random.default_rng(0)
-    for count in (1, 2, 20, weights.SMALL + 100):
-        arrays = {
-            "mean": generator.uniform(0, 200, (count, 2)),
-            "factor": np.abs(generator.normal(0.4, 0.1, (count, 3))) + 0.01,
-            "color": generator.normal(0, 0.3, (count, 3)) * generator.uniform(0, 1, (count, 1)),
-        }
-        before = content()._replace(sections=[quantize(arrays, STEPS)])
-        path.write_bytes(packed.to_bytes(before))
-        assert rows_of(packed.read(path).sections[0]) == rows_of(before.sections[0])
+    before = content(random_scene(0, count, (200, 200)), sections=(count,))
+    packed.write(path, before)
+    assert rows_of(packed.read(path).sections[0]) == rows_of(before.sections[0])
 
 
 @pytest.mark.parametrize(("space", "channels"), SPACES)

@@ -20,11 +20,6 @@ ALLOWED = packing.MSE_WITHOUT_IMAGE * (10 ** (packing.BUDGET / 10) - 1)
 """Mean squared error that rounding may add to a set without an image."""
 
 
-@pytest.fixture
-def fitted():
-    return small_fit()
-
-
 @pytest.fixture(scope="module")
 def receipts(tmp_path_factory):
     """Receipts and files of two budgets."""
@@ -35,8 +30,8 @@ def receipts(tmp_path_factory):
 
 
 @pytest.mark.parametrize("budget", [0.5, 3.0])
-def test_the_budget_holds_and_is_used(fitted, receipts, budget):
-    gaussians, image = fitted
+def test_the_budget_holds_and_is_used(receipts, budget):
+    gaussians, image = small_fit()
     receipt, file = receipts[budget]
     found = eg.Gaussians.load(file)
     before, after = (eg.psnr(picture_of(g), image, "ycbcr") for g in (gaussians, found))
@@ -48,8 +43,8 @@ def test_the_budget_holds_and_is_used(fitted, receipts, budget):
     np.testing.assert_array_equal(picture_of(found), picture_of(receipt.gaussians))
 
 
-def test_files_are_small_and_equal_for_equal_arguments(fitted, receipts, path):
-    gaussians, image = fitted
+def test_files_are_small_and_equal_for_equal_arguments(receipts, path):
+    gaussians, image = small_fit()
     (_, file), (_, smaller) = receipts.values()
     assert smaller.stat().st_size < 0.9 * file.stat().st_size
     eg.pack(gaussians, path, image)
@@ -59,8 +54,8 @@ def test_files_are_small_and_equal_for_equal_arguments(fitted, receipts, path):
     assert file.stat().st_size < saved.stat().st_size / 4
 
 
-def test_without_an_image_the_rendering_is_kept(fitted, path):
-    gaussians, _ = fitted
+def test_without_an_image_the_rendering_is_kept(path):
+    gaussians, _ = small_fit()
     receipt = eg.pack(gaussians, path)
     pictures = [picture_of(g) for g in (eg.Gaussians.load(path), gaussians)]
     error = np.mean(np.square(np.subtract(*map(rgb_to_ycbcr, pictures))))
@@ -68,17 +63,17 @@ def test_without_an_image_the_rendering_is_kept(fitted, path):
     assert receipt.psnr == pytest.approx(-10 * np.log10(error), abs=1e-2)
 
 
-def test_light_is_compared_as_it_is_shown(fitted, path):
-    image = fitted[1] ** 3  # dark
+def test_light_is_compared_as_it_is_shown(path):
+    image = small_fit()[1] ** 3  # dark
     gaussians = eg.fit(image, 60, iterations=40, space="linear", backend="llvm").gaussians
     found = eg.pack(gaussians, path, image).gaussians
     before, after = (eg.psnr(picture_of(g), image, "data") for g in (gaussians, found))
     assert 0.7 * packing.BUDGET < before - after <= packing.BUDGET + 1e-3
 
 
-def test_later_gaussians_compensate_for_earlier_ones(fitted):
+def test_later_gaussians_compensate_for_earlier_ones():
     """The steps of a file leave less error than without compensation."""
-    gaussians, image = fitted
+    gaussians, image = small_fit()
     steps, target = Steps(0.25, 1.0), rgb_to_ycbcr(image)
     ways = [
         rounding.quantize_with_feedback(gaussians, target, steps),
@@ -89,13 +84,8 @@ def test_later_gaussians_compensate_for_earlier_ones(fitted):
     assert after[0] - before < 0.8 * (after[1] - before)
 
 
-def test_two_gaussians_have_no_order_of_groups(fitted, path):
-    gaussians, _ = fitted
-    assert len(eg.pack(gaussians[:2], path).gaussians) == 2
-
-
-def test_sections_hold_the_splats_in_their_order(fitted, path):
-    gaussians, image = fitted
+def test_sections_hold_the_splats_in_their_order(path):
+    gaussians, image = small_fit()
     eg.pack(gaussians, path, image, sections=[10, 30, 60])
     assert packed.section_counts(path) == [10, 30, 60]
     first = eg.Gaussians.load(path, sections=1).to_arrays()["mean"]
@@ -117,6 +107,7 @@ def edge_cases():
     scene = random_scene(7)
     return {
         "one splat": scene.permuted([0]),
+        "two splats": scene.permuted([0, 1]),
         "equal splats": scene.permuted([0] * COUNT),
         "at the corners": scene._replace(
             mean=np.array([[0, 0], [SIZE[0], 0], [0, SIZE[1]], SIZE] * (COUNT // 4), float)
@@ -138,8 +129,8 @@ def test_edge_cases(backend, path, name):
     assert len(receipt.gaussians) == len(gaussians)
 
 
-def test_mistakes_leave_the_old_file(fitted, path):
-    gaussians, image = fitted
+def test_mistakes_leave_the_old_file(path):
+    gaussians, image = small_fit()
     path.write_text("old")
     for words, arguments in {
         "max_psnr_drop is 0": (None, 0),
