@@ -171,7 +171,7 @@ def _draw(file: Path, kind: str, picture: Path) -> None:
     from ..image.io import save_image
     from ..image.resize import join_pictures
     from ..raster.render import picture_of
-    from ..viewer.sheets import component_sheet
+    from ..viewer.pictures import component_sheet
 
     if kind == "image":
         data = read(file)

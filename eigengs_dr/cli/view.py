@@ -101,7 +101,7 @@ def _load(
     from ..gaussian.gaussians import Gaussians
     from ..storage import npz
     from ..storage.atomic import reader_of
-    from ..viewer.facts import check_count
+    from ..viewer.view import check_count
 
     file = SHIPPED.get(str(file), file)
     sections = egs.section_counts(file) if reader_of(file) else []

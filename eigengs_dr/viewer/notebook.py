@@ -14,9 +14,8 @@ from ..eigenbasis.pca.basis import Eigenbasis
 from ..fitting.fit import Fit
 from ..gaussian.gaussians import Gaussians
 from ..raster.render import picture_of
-from .facts import MAX_GAUSSIANS
-from .pictures import photo_uri, within
-from .sheets import first_components
+from .pictures import first_components, photo_uri, within
+from .view import MAX_GAUSSIANS
 
 MAX_SIDE = 480
 """Longest side of the picture of a set, in pixels. Smaller sets are shown at their size."""

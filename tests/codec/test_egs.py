@@ -77,10 +77,11 @@ def test_equal_splats_take_few_bits():
     assert 8000 < len(packed.to_bytes(content()._replace(sections=[same]))) < 11000
 
 
-@pytest.mark.parametrize("count", [1, 2, 20, SMALL + 100])
-def test_files_of_many_and_of_few_gaussians_come_back(path, count):
+@pytest.mark.parametrize("channels", [1, 3, 5])
+@pytest.mark.parametrize("count", [1, 2, 9, 16, 17, 100, SMALL + 100])
+def test_files_of_many_and_of_few_gaussians_come_back(path, count, channels):
     """They differ in what the model of the probabilities may use."""
-    before = content(random_scene(0, count, (200, 200)), sections=(count,))
+    before = content(random_scene(0, count, (200, 200), channels), sections=(count,))
     packed.write(path, before)
     assert rows_of(packed.read(path).sections[0]) == rows_of(before.sections[0])
 

@@ -7,8 +7,15 @@ from _helpers.families import small_basis, small_model
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.resize import GAP, resample
 from eigengs_dr.raster.render import render
-from eigengs_dr.viewer.pictures import LIGHTER, MAX_OUTLINES, comparison, ellipses, overlay
-from eigengs_dr.viewer.sheets import CELL, component_sheet
+from eigengs_dr.viewer.pictures import (
+    CELL,
+    LIGHTER,
+    MAX_OUTLINES,
+    comparison,
+    component_sheet,
+    ellipses,
+    overlay,
+)
 
 
 def test_a_sheet_has_components_above_their_renderings():

@@ -10,7 +10,7 @@ import eigengs_dr as eg
 from _helpers.families import small_basis, small_model
 from _helpers.sets import random_scene
 from eigengs_dr.fitting.fit import Fit
-from eigengs_dr.viewer.facts import MAX_GAUSSIANS, describe_share, kept_counts
+from eigengs_dr.viewer.view import MAX_GAUSSIANS, describe_share, kept_counts
 
 
 def make_set():
