@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .exact_math import angle_in_turns, cos_turns, log2, sin_turns
+from .exact_math import angle_in_turns, cos_turns, in_order, log2, sin_turns
 from .quantization import (
     SCALE_STEP,
     STRETCH_STEP,
@@ -33,7 +33,7 @@ from .quantization import (
     turns_of,
 )
 from .range_coder import Coder, categorical
-from .weights import CLASSES, MIN_WIDTH, Model, Weights, fit_weights, weighted
+from .weights import CLASSES, MIN_WIDTH, Model, Weights, fit_weights
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -67,14 +67,6 @@ class Pass(NamedTuple):
     def mean(self, values: Array) -> Array:
         """Return the weighted means of values (N,) of the neighbours, shape (n,)."""
         return in_order(self.weight * values[self.known])
-
-
-def in_order(rows: Array) -> Array:
-    """Return the sum of rows (K, n), one after another: the same bits everywhere."""
-    total = np.zeros(rows.shape[1])
-    for row in rows:
-        total = total + row
-    return total
 
 
 def passes_of(cells: IntArray) -> list[Pass]:
@@ -223,8 +215,8 @@ def sector_chances(sharpness: int) -> Array:
     return np.asarray(1 / (1 + sharpness / SHARPNESS * away * away))
 
 
-Features = Callable[[Pass], tuple[list[Array], list[Array]]]
-"""The features of centres and widths for the Gaussians of a pass."""
+Features = Callable[[Pass], tuple[Array, Array]]
+"""The features of centres and of widths, shape (F, n), for the n Gaussians of a pass."""
 
 
 class GaussianCoder:
@@ -277,8 +269,8 @@ class GaussianCoder:
         for part in self.passes:
             centers, widths = features(part)
             rows, unit = part.rows, step[part.rows]
-            center = weighted(weights.center, centers) / unit
-            width = np.maximum(weighted(weights.width, widths) / unit, MIN_WIDTH)
+            center = in_order(weights.center[:, None] * centers) / unit
+            width = np.maximum(in_order(weights.width[:, None] * widths) / unit, MIN_WIDTH)
             result[rows] = self.coder.numbers(center, width, weights.tails, given[rows])
             self.values[rows] = result[rows] * unit
         return result
@@ -287,18 +279,13 @@ class GaussianCoder:
         """Find the weights for numbers that are all known, and note them in the model."""
         self.values = given * step
         both = zip(*(features(part) for part in self.passes), strict=True)
-        center, width = (
-            np.stack([np.concatenate(rows) for rows in zip(*kind, strict=True)], axis=1)
-            for kind in both
-        )
+        center, width = (np.ascontiguousarray(np.concatenate(kind, axis=1).T) for kind in both)
         order = np.concatenate([part.rows for part in self.passes])
         found = fit_weights(center, width, self.values[order], step[order], self.rich)
         self.model.weights.append(found)
         return found
 
-    def _color_features(
-        self, color: IntArray, k: int, part: Pass
-    ) -> tuple[list[Array], list[Array]]:
+    def _color_features(self, color: IntArray, k: int, part: Pass) -> tuple[Array, Array]:
         """Return the features of channel k: the channel near by, and the two channels before it."""
         rows, here = part.rows, self.values
         center, width = [part.mean(here)], [np.ones(len(rows)), part.mean(np.abs(here))]
@@ -306,20 +293,19 @@ class GaussianCoder:
             slope = part.mean(other * here) / (part.mean(other * other) + 1)
             center += [other[rows], slope * other[rows]]
             width += [np.abs(other[rows]), np.abs(part.mean(other))]
-        return center, [*width, *(values[rows] for values in self.crowding[:2])]
+        return np.stack(center), np.stack([*width, *(near[rows] for near in self.crowding[:2])])
 
-    def _scale_features(
-        self, bright: Array, step: Array, part: Pass
-    ) -> tuple[list[Array], list[Array]]:
+    def _scale_features(self, bright: Array, step: Array, part: Pass) -> tuple[Array, Array]:
         """Return the features of s: small Gaussians are where many are."""
         rows, one = part.rows, np.ones(len(part.rows))
-        center = [one, bright[rows], *(values[rows] for values in self.crowding)]
-        return [*center, part.mean(self.values), part.mean(bright)], [one, step[rows]]
+        center = [one, bright[rows], *(near[rows] for near in self.crowding)]
+        center += [part.mean(self.values), part.mean(bright)]
+        return np.stack(center), np.stack([one, step[rows]])
 
     def _stretch_features(
         self, bright: Array, s: Array, step: Array, part: Pass
-    ) -> tuple[list[Array], list[Array]]:
+    ) -> tuple[Array, Array]:
         """Return the features of l."""
         rows, one = part.rows, np.ones(len(part.rows))
-        center = [one, bright[rows], s[rows], self.crowding[1][rows]]
-        return [*center, part.mean(self.values)], [one, step[rows]]
+        center = [one, bright[rows], s[rows], self.crowding[1][rows], part.mean(self.values)]
+        return np.stack(center), np.stack([one, step[rows]])

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian.covariance import log_shapes
-from .exact_math import cos_turns, exp2, sin_turns
+from .exact_math import cos_turns, exp2, in_order, sin_turns
 
 Array = NDArray[np.floating]
 Double = NDArray[np.float64]
@@ -94,10 +94,7 @@ class Symbols(NamedTuple):
 
 def precision(color: IntArray) -> Double:
     """Return Q, shape (N,), for colours (N, C) in steps."""
-    squares: Double = np.zeros(len(color))
-    for channel in color.T.astype(np.float64):  # one after another: the same bits everywhere
-        squares = squares + channel * channel
-    return np.maximum(np.sqrt(squares), MIN_PRECISION)
+    return np.maximum(np.sqrt(in_order(np.square(color.T.astype(np.float64)))), MIN_PRECISION)
 
 
 def turns_of(stretch: Double, fineness: Double) -> IntArray:
