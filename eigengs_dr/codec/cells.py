@@ -57,12 +57,12 @@ def _code_halves(coder: Coder, number: IntArray, evenness: int, upper: IntArray)
     """Code how many of each `number` of Gaussians lie in the second half."""
     result = np.zeros_like(number)
     kind = np.where(number > MAX_MODELLED, 1, number)
-    for n in np.unique(kind):
+    for n in range(1, MAX_MODELLED + 1):
         rows = np.flatnonzero(kind == n)
-        if n == 1:
+        if n == 1 and len(rows):
             result[rows] = _any_number(coder, number[rows], upper[rows])
-        else:
-            result[rows] = coder.code(_beta_binomial(int(n), evenness), upper[rows])
+        elif len(rows):
+            result[rows] = coder.code(_beta_binomial(n, evenness), upper[rows])
     return result
 
 
