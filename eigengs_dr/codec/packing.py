@@ -21,7 +21,7 @@ from ..gaussian.channels import TextureMap, channel_weights, show_sums, slices
 from ..gaussian.gaussians import Gaussians, scale_channels, set_of
 from ..image.color import LIGHT, rendered_as, to_coded, to_linear, to_pu21
 from ..image.io import check_data, check_image
-from ..image.metrics import MAX_PSNR, psnr_from_mse, psnrs_by_rows
+from ..image.metrics import MAX_PSNR, psnr, psnr_from_mse
 from ..raster.render import picture_of
 from .egs import MAX_SECTIONS, SUFFIX, write
 from .quantization import Steps
@@ -124,33 +124,26 @@ def pack(
         )
     whole: Gaussians = dr.detach(set_of(gaussians))
     rows = _section_rows(len(whole), sections)
-    if not whole.maps:
-        if isinstance(image, Mapping):
-            raise ValueError("pack: the set has no maps; give its image alone")
-        found, before = round_within(whole, _compare(whole, image, encoding), max_psnr_drop, rows)
-        size = write(output, found.packed)
-    else:
-        if len(rows) > 1:
-            raise ValueError("pack: a set with maps has one section; leave the sections out")
-        maps, shown, compared = _compare_maps(whole, image, encoding)
-        scaled = replace(scale_channels(whole, channel_weights(maps)), maps=())
-        found, before = round_within(scaled, compared, max_psnr_drop, rows)
-        size = write(output, found.packed._replace(maps=maps))
+    if whole.maps and len(rows) > 1:
+        raise ValueError("pack: a set with maps has one section; leave the sections out")
+    compare = _compare_maps if whole.maps else _compare
+    maps, shown, compared = compare(whole, image, encoding)
+    weighted = scale_channels(whole, channel_weights(maps)) if maps else whole
+    found, before = round_within(replace(weighted, maps=()), compared, max_psnr_drop, rows)
+    size = write(output, found.packed._replace(maps=maps))
     rounded = Gaussians.load(output, types_of(whole.mean).backend)
-    psnr: float | dict[str, float] = psnr_from_mse(found.error)
-    if whole.maps:
+    after = psnr_from_mse(max(found.error + compared.unseen, MIN_MSE))
+    figure: float | dict[str, float] = psnr_from_mse(found.error)
+    if maps:
         pictures = picture_of(rounded)
-        psnr = {
-            m.name: psnrs_by_rows(pictures[m.name].__getitem__, image, ["rgb"])[0]
-            for m, image in zip(maps, shown, strict=True)
-        }
-    unseen = MSE_WITHOUT_IMAGE if image is None else 0
+        pairs = zip(maps, shown, strict=True)
+        figure = {m.name: psnr(pictures[m.name], image) for m, image in pairs}
     return PackResult(
         gaussians=rounded,
         bytes=size,
         bits_per_pixel=8 * size / (whole.width * whole.height),
-        psnr=psnr,
-        psnr_drop=psnr_from_mse(before) - psnr_from_mse(max(found.error + unseen, MIN_MSE)),
+        psnr=figure,
+        psnr_drop=psnr_from_mse(before) - after,
         steps=found.packed.steps,
     )
 
@@ -170,8 +163,15 @@ def _section_rows(count: int, sections: Sequence[int] | None) -> list[slice]:
 # --- A set of one image --------------------------------------------------------------------------
 
 
-def _compare(g: Gaussians, image: ArrayLike | None, encoding: str | None) -> Comparison:
-    """Compare a set with its image, or with its own rendering."""
+Images = ArrayLike | Mapping[str, ArrayLike] | None
+Compared = tuple[tuple[TextureMap, ...], list[Array], Comparison]
+"""The maps with their weights for packing, what people see of them, and the comparison."""
+
+
+def _compare(g: Gaussians, image: Images, encoding: str | None) -> Compared:
+    """Compare a set without maps with its image, or with its own rendering."""
+    if isinstance(image, Mapping):
+        raise ValueError("pack: the set has no maps; give its image alone")
     shown = _shown(g) if image is None else _image_of(g, image, encoding)
     # The best linear light is not the best sRGB picture. So compensation keeps a set in linear
     # light near its own rendering, not near the image.
@@ -181,7 +181,7 @@ def _compare(g: Gaussians, image: ArrayLike | None, encoding: str | None) -> Com
         return float(np.mean(np.square(_shown(found) - shown, dtype=np.float64)))
 
     unseen = MSE_WITHOUT_IMAGE if image is None else 0.0
-    return Comparison(error, planes_of(g) if keeps else shown, unseen)
+    return (), [], Comparison(error, planes_of(g) if keeps else shown, unseen)
 
 
 def _image_of(g: Gaussians, image: ArrayLike, encoding: str | None) -> Array:
@@ -214,10 +214,8 @@ SMALL = 1 / 255
 """A small change of sums, to measure slopes by."""
 
 
-def _compare_maps(
-    g: Gaussians, images: ArrayLike | Mapping[str, ArrayLike] | None, encoding: str | None
-) -> tuple[tuple[TextureMap, ...], list[Array], Comparison]:
-    """Return the maps with the weights for packing, what people see of them, and the comparison."""
+def _compare_maps(g: Gaussians, images: Images, encoding: str | None) -> Compared:
+    """Compare a set with maps with their images, or with its own rendering."""
     maps, cuts = g.maps, slices(g.maps)
 
     def show(sums: Array) -> list[Array]:
@@ -247,9 +245,7 @@ def _compare_maps(
     return maps, shown, Comparison(error, values * scale, unseen)
 
 
-def _images_of(
-    g: Gaussians, images: ArrayLike | Mapping[str, ArrayLike], encoding: str | None
-) -> tuple[list[Array], Array]:
+def _images_of(g: Gaussians, images: Images, encoding: str | None) -> tuple[list[Array], Array]:
     """Return the images in the order of the maps, and their values in the spaces of the maps."""
     spaces = {m.name: m.space for m in g.maps}
     if not isinstance(images, Mapping):
