@@ -50,9 +50,10 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     from ..gaussian import file as set_file
     from ..gaussian.gaussians import Gaussians
     from ..storage import npz
+    from ..storage.atomic import reader_of
 
     file = SHIPPED.get(str(file), file)
-    packed = egs.is_egs(file)
+    packed = bool(reader_of(file))
     kinds = {
         set_file.FORMAT: "image",
         set_file.MATERIAL: "material",
@@ -170,7 +171,7 @@ def _draw(file: Path, kind: str, picture: Path) -> None:
     from ..image.io import save_image
     from ..image.resize import join_pictures
     from ..raster.render import picture_of
-    from ..viewer.sheets import component_sheet
+    from ..viewer.pictures import component_sheet
 
     if kind == "image":
         data = read(file)

@@ -81,7 +81,7 @@ def train(
     from ..fitting.options import default_count
     from ..image.folder import list_images
     from ..image.io import save_image
-    from ..viewer.sheets import component_sheet
+    from ..viewer.pictures import component_sheet
 
     [output] = name_outputs([folder], output, [".npz"])
     [picture] = name_pictures([folder], preview)

@@ -100,10 +100,11 @@ def _load(
     from ..gaussian import file as set_file
     from ..gaussian.gaussians import Gaussians
     from ..storage import npz
-    from ..viewer.facts import check_count
+    from ..storage.atomic import reader_of
+    from ..viewer.view import check_count
 
     file = SHIPPED.get(str(file), file)
-    sections = egs.section_counts(file) if egs.is_egs(file) else []
+    sections = egs.section_counts(file) if reader_of(file) else []
     if not sections and npz.format_of(file) == model_file.FORMAT:
         for option, value in (("--levels", levels), ("--map", name)):
             if value is not None:

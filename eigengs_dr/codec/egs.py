@@ -1,8 +1,12 @@
 """The ``.egs`` file format: Gaussians as integers, in sections that are read one by one.
 
 All numbers are little endian. The file starts with a header (`_HEADER`), the background and a
-checksum; the header of a set with maps is followed by their table. The sections follow, see
-`eigengs_dr.codec.egs_section`.
+checksum; the header of a set with maps is followed by their table.
+
+The sections follow, each coded for itself. A section starts with its number of Gaussians, its
+length and its checksum (`HEAD`). Its body holds a byte (`RICH` and an index in `EVENNESS`), the
+weights of a model (`eigengs_dr.codec.weights`), and the words of a range coder: the cells
+(`eigengs_dr.codec.cells`), then all other integers (`eigengs_dr.codec.gaussian_model`).
 """
 
 from __future__ import annotations
@@ -10,23 +14,25 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian.channels import MAX_CHANNELS as MAX_MAPS
 from ..gaussian.channels import TextureMap, channel_weights, check_maps
 from ..gaussian.file import CUTOFF, SetData
 from ..image.color import MAX_CHANNELS, SPACES
-from ..image.hilbert import MAX_LEVELS
+from ..image.hilbert import MAX_LEVELS, hilbert_encode
 from ..storage.atomic import atomic_write
 from ..storage.npz import MAX_ENTRIES, BadValue
-from .egs_section import decode_body, exactly, read_body, section_to_bytes
+from . import weights
+from .cells import EVENNESS, code_cells
+from .gaussian_model import GaussianCoder
 from .quantization import Steps, Symbols, dequantize
+from .range_coder import Decoder, Encoder
 
 IntArray = NDArray[np.int64]
 
@@ -45,10 +51,14 @@ _HEADER = struct.Struct("<4sBBBBHIIiiffd")
 """Magic, version, space, channels, levels of the square of cells, sections, width, height, column
 and row of the first cell, the steps, and the cutoff."""
 
-_CHECK = struct.Struct("<I")
-
 _MAP = struct.Struct("<BBBd")
-"""A map in the table, before its name; see `maps_to_bytes`."""
+"""A map in the table, before its name; see `_map_table`."""
+
+HEAD = struct.Struct("<III")
+"""Number of Gaussians, number of bytes that follow, and the CRC-32 of that number and the bytes."""
+
+RICH = 0x80
+"""Flag of a section that stores all weights, not only the first ones."""
 
 
 class EgsContent(NamedTuple):
@@ -79,29 +89,18 @@ class EgsContent(NamedTuple):
     cutoff: float = CUTOFF
     maps: tuple[TextureMap, ...] = ()
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return mean (N, 2), factor (N, 3), color (N, C) and background (C,), all of float32."""
+    def set_data(self) -> SetData:
+        """Return the set, in single precision."""
         values = {**dequantize(self.whole(), self.steps), "background": self.background}
         with np.errstate(over="ignore"):
-            return {name: value.astype(np.float32) for name, value in values.items()}
-
-    def set_data(self) -> SetData:
-        """Return the set."""
-        arrays = self.arrays()
-        if self.maps:
-            weights = np.array(channel_weights(self.maps), np.float32)
-            arrays |= {name: arrays[name] / weights for name in ("color", "background")}
+            arrays = {name: value.astype(np.float32) for name, value in values.items()}
+        scale = np.array(channel_weights(self.maps) or 1, np.float32)
+        arrays |= {name: arrays[name] / scale for name in ("color", "background")}
         return SetData(arrays, self.size, self.space, self.cutoff, self.maps)
 
     def whole(self) -> Symbols:
         """Return the Gaussians of all sections."""
         return Symbols(*map(np.concatenate, zip(*self.sections, strict=True)))
-
-
-def is_egs(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file starts with `MAGIC`; raise `OSError` if it cannot be opened."""
-    with open(path, "rb") as file:
-        return file.read(len(MAGIC)) == MAGIC
 
 
 def to_bytes(packed: EgsContent) -> bytes:
@@ -121,8 +120,8 @@ def to_bytes(packed: EgsContent) -> bytes:
         *packed.steps,
         packed.cutoff,
     )
-    head += packed.background.astype("<f4").tobytes() + maps_to_bytes(packed.maps)
-    parts = [head, _CHECK.pack(zlib.crc32(head))]
+    head += packed.background.astype("<f4").tobytes() + _map_table(packed.maps)
+    parts = [head, zlib.crc32(head).to_bytes(4, "little")]
     parts += [section_to_bytes(part, packed.steps, corner, levels) for part in packed.sections]
     return b"".join(parts)
 
@@ -138,6 +137,64 @@ def write(path: str | os.PathLike[str], packed: EgsContent) -> int:
     content = to_bytes(packed)
     with atomic_write(path) as temporary:
         return temporary.write_bytes(content)
+
+
+def _map_table(maps: Sequence[TextureMap]) -> bytes:
+    """Return the table of maps; nothing for an image.
+
+    A byte holds the number of maps. Each map has the length of its name, the index of its space,
+    its number of channels (a byte each), its weight (float64), and its name in ASCII.
+    """
+    parts = [bytes([len(maps)])] if maps else []
+    for m in maps:
+        name = m.name.encode("ascii")
+        parts += [_MAP.pack(len(name), SPACES.index(m.space), m.channels, m.weight), name]
+    return b"".join(parts)
+
+
+def section_to_bytes(section: Symbols, steps: Steps, corner: IntArray, levels: int) -> bytes:
+    """Return the bytes of a section; sort its Gaussians in Hilbert-curve order.
+
+    Parameters
+    ----------
+    section : Symbols
+    steps : Steps
+    corner : ndarray of int, shape (2,)
+        Column and row of the first cell of the file.
+    levels : int
+        The square of cells has ``2^levels`` columns and rows.
+    """
+    cells, count = section.cell - corner, len(section.cell)
+    # Gaussians in one cell are sorted too, so that equal sets in any order give equal files.
+    rest = np.column_stack(section[1:])
+    order = np.lexsort([*rest.T[::-1], hilbert_encode(cells, levels)])
+    given = section._replace(cell=cells).select(order)
+    evenness = min(range(len(EVENNESS)), key=lambda k: len(_cells(cells, levels, k).to_bytes()))
+    ways = [True, False] if count < weights.SMALL else [True]
+    body = min((_body(given, steps, levels, evenness, rich) for rich in ways), key=len)
+    body = body.ljust(count, b"\0")  # a reader expects a byte for a Gaussian, or more
+    return HEAD.pack(count, len(body), section_check(count, body)) + body
+
+
+def _cells(cells: IntArray, levels: int, evenness: int) -> Encoder:
+    """Return an encoder that has coded cells, with one of the parameters `EVENNESS`."""
+    coder = Encoder()
+    code_cells(coder, cells, levels, EVENNESS[evenness])
+    return coder
+
+
+def _body(given: Symbols, steps: Steps, levels: int, evenness: int, rich: bool) -> bytes:
+    """Return the body of a section, with all weights or with the first ones."""
+    coder = _cells(given.cell, levels, evenness)
+    walk = GaussianCoder(coder, given.cell, rich=rich)
+    walk.code(given, steps)
+    head = bytes([evenness | RICH * rich]) + weights.to_bytes(walk.model, rich)
+    return head + coder.to_bytes()
+
+
+def section_check(count: int, body: bytes) -> int:
+    """Return the checksum of a section."""
+    return zlib.crc32(body, zlib.crc32(count.to_bytes(4, "little")))
 
 
 def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsContent:
@@ -161,12 +218,28 @@ def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsConten
     OSError
         If the file cannot be opened.
     """
-    path = Path(path)
-    with path.open("rb") as file:
-        try:
-            return _read(file, os.fstat(file.fileno()).st_size, sections)
-        except BadValue as error:
-            raise ValueError(f"{path}: {error}") from None
+    with _opened(path) as file:
+        levels, count, corner, content = _read_header(file)
+        if sections is not None and not 1 <= sections <= count:
+            raise BadValue(f"the file has {count} sections, not {sections}; ask for 1 to {count}")
+        channels = len(content.background)
+        room = MAX_ENTRIES // max(3, channels)
+        for number in range(1, (sections or count) + 1):
+            body, splats = read_body(file, number)
+            if splats > room:
+                raise BadValue(
+                    f"section {number} claims {splats} Gaussians, but at most {room} more can be "
+                    "read"
+                )
+            room -= splats
+            try:
+                symbols = decode_body(body, splats, channels, levels, content.steps)
+            except BadValue as error:
+                raise BadValue(f"section {number}: {error}; copy the file again") from None
+            content.sections.append(symbols._replace(cell=symbols.cell + corner))
+        if sections is None and file.read(1):
+            raise BadValue("data follow the last section; copy the file again")
+        return content
 
 
 def read_set(path: Path, sections: int | None = None) -> SetData:
@@ -176,79 +249,49 @@ def read_set(path: Path, sections: int | None = None) -> SetData:
 
 def maps_of(path: str | os.PathLike[str]) -> tuple[TextureMap, ...]:
     """Return the maps of a packed set, without its Gaussians; errors as `read`."""
-    path = Path(path)
-    with path.open("rb") as file:
-        try:
-            return _read_header(file)[3].maps
-        except BadValue as error:
-            raise ValueError(f"{path}: {error}") from None
+    with _opened(path) as file:
+        return _read_header(file)[3].maps
 
 
 def section_counts(path: str | os.PathLike[str]) -> list[int]:
     """Return the number of Gaussians of each section, without decoding them; errors as `read`."""
-    path = Path(path)
-    with path.open("rb") as file:
+    with _opened(path) as file:
+        _, count, *_ = _read_header(file)
+        return [read_body(file, k + 1)[1] for k in range(count)]
+
+
+@contextmanager
+def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a file, which errors name."""
+    with open(path, "rb") as file:
         try:
-            (_, count, *_), size = _read_header(file), os.fstat(file.fileno()).st_size
-            return [read_body(file, size, k + 1)[1] for k in range(count)]
+            yield file
         except BadValue as error:
             raise ValueError(f"{path}: {error}") from None
 
 
 def _read_header(file: BinaryIO) -> tuple[int, int, IntArray, EgsContent]:
-    """Return the levels, the number of sections, the first cell, and a content without sections."""
-    head = exactly(file, 5)
-    if head[:4] != MAGIC:
+    """Return the levels, the number of sections, the first cell, and a content without sections.
+
+    Headers that `to_bytes` never writes are refused; `Gaussians.load` checks the rest.
+    """
+    head = exactly(file, _HEADER.size)
+    magic, version, space, channels, levels, count, *rest = _HEADER.unpack(head)
+    if magic != MAGIC:
         raise BadValue("not a packed set of Gaussians; it may be damaged or something else")
-    if head[4] not in (VERSION, MAPS_VERSION):
+    if version not in (VERSION, MAPS_VERSION):
         raise BadValue(
-            f"version is {head[4]}, but this package reads versions {VERSION} and {MAPS_VERSION}; "
-            + ("upgrade eigengs-dr" if head[4] > VERSION else "pack the set again")
+            f"version is {version}, but this package reads versions {VERSION} and {MAPS_VERSION}; "
+            + ("upgrade eigengs-dr" if version > VERSION else "pack the set again")
         )
-    head += exactly(file, _HEADER.size - len(head))
-    _, _, space, channels, levels, count, width, height, *rest = _HEADER.unpack(head)
+    width, height, x, y, color, cell, cutoff = rest
     background = exactly(file, 4 * channels)
-    table = b""
-    maps: tuple[TextureMap, ...] = ()
-    if head[4] == MAPS_VERSION:
-        table, maps = read_maps(partial(exactly, file))
-    (check,) = _CHECK.unpack(exactly(file, _CHECK.size))
-    if check != zlib.crc32(head + background + table):
+    table, maps = _read_maps(file) if version == MAPS_VERSION else (b"", ())
+    if exactly(file, 4) != zlib.crc32(head + background + table).to_bytes(4, "little"):
         raise BadValue("the header is damaged; copy the file again")
-    if maps:
+    if version == MAPS_VERSION:
         check_maps(maps, channels)
-    corner, steps = np.array(rest[:2], np.int64), Steps(*rest[2:4])
-    _check_header(space, channels, levels, count, steps)
-    values = np.frombuffer(background, "<f4")
-    content = EgsContent([], steps, values, (width, height), SPACES[space], rest[4], maps)
-    return levels, count, corner, content
-
-
-def _read(file: BinaryIO, size: int, wanted: int | None) -> EgsContent:
-    levels, count, corner, content = _read_header(file)
-    channels = len(content.background)
-    if wanted is not None and not 1 <= wanted <= count:
-        raise BadValue(f"the file has {count} sections, not {wanted}; ask for 1 to {count}")
-    found: list[Symbols] = []
-    for number in range(1, (wanted or count) + 1):
-        body, splats = read_body(file, size, number)
-        room = MAX_ENTRIES // max(3, channels) - sum(len(section.cell) for section in found)
-        if splats > room:
-            raise BadValue(
-                f"section {number} claims {splats} Gaussians, but at most {room} more can be read"
-            )
-        try:
-            symbols = decode_body(body, splats, channels, levels, content.steps)
-        except BadValue as error:
-            raise BadValue(f"section {number}: {error}; copy the file again") from None
-        found.append(symbols._replace(cell=symbols.cell + corner))
-    if wanted is None and file.read(1):
-        raise BadValue("data follow the last section; copy the file again")
-    return content._replace(sections=found)
-
-
-def _check_header(space: int, channels: int, levels: int, count: int, steps: Steps) -> None:
-    """Raise BadValue for headers that `to_bytes` never writes; `Gaussians.load` checks the rest."""
+    steps = Steps(color, cell)
     if not 1 <= channels <= MAX_CHANNELS:
         raise BadValue(f"the header claims {channels} channels, expected 1 to {MAX_CHANNELS}")
     if space >= len(SPACES) or levels > MAX_LEVELS:
@@ -257,42 +300,70 @@ def _check_header(space: int, channels: int, levels: int, count: int, steps: Ste
         raise BadValue(f"the header claims {count} sections, expected 1 to {MAX_SECTIONS}")
     if not all(0 < step < np.inf for step in steps):
         raise BadValue(f"the steps are {tuple(steps)}, expected numbers above 0")
+    values = np.frombuffer(background, "<f4")
+    content = EgsContent([], steps, values, (width, height), SPACES[space], cutoff, maps)
+    return levels, count, np.array([x, y]), content
 
 
-def maps_to_bytes(maps: Sequence[TextureMap]) -> bytes:
-    """Return the table of maps; nothing for an image.
-
-    A byte holds the number of maps. Each map has the length of its name, the index of its space,
-    its number of channels (a byte each), its weight (float64), and its name in ASCII.
-    """
-    if not maps:
-        return b""
-    parts = [bytes([len(maps)])]
-    for m in maps:
-        name = m.name.encode("ascii")
-        parts += [_MAP.pack(len(name), SPACES.index(m.space), m.channels, m.weight), name]
-    return b"".join(parts)
-
-
-def read_maps(take: Callable[[int], bytes]) -> tuple[bytes, tuple[TextureMap, ...]]:
-    """Read a table; `take` returns the next bytes, or raises `BadValue`.
-
-    Returns
-    -------
-    bytes
-        The table as it is in the file.
-    tuple of TextureMap
-        `eigengs_dr.gaussian.channels.check_maps` checks them.
-    """
-    table, maps = take(1), []
-    if not 1 <= table[0] <= MAX_MAPS:
-        raise BadValue(f"the header claims {table[0]} maps, expected 1 to {MAX_MAPS}")
+def _read_maps(file: BinaryIO) -> tuple[bytes, tuple[TextureMap, ...]]:
+    """Read a table of maps; return its bytes and the maps, which `check_maps` checks."""
+    table, maps = exactly(file, 1), []
     for _ in range(table[0]):
-        entry = take(_MAP.size)
-        length, space, channels, weight = _MAP.unpack(entry)
-        name = take(length)
-        if space >= len(SPACES):
-            raise BadValue("the header holds unknown values; upgrade eigengs-dr")
-        maps.append(TextureMap(name.decode("ascii", "replace"), SPACES[space], channels, weight))
+        entry = exactly(file, _MAP.size)
+        length, number, channels, weight = _MAP.unpack(entry)
+        name = exactly(file, length)
+        space = SPACES[number] if number < len(SPACES) else f"number {number}"
+        maps.append(TextureMap(name.decode("ascii", "replace"), space, channels, weight))
         table += entry + name
     return table, tuple(maps)
+
+
+def read_body(file: BinaryIO, number: int) -> tuple[bytes, int]:
+    """Read the next section of a file, and return its body and its number of Gaussians.
+
+    Raises
+    ------
+    BadValue
+        If the section is cut off or damaged.
+    """
+    splats, length, check = HEAD.unpack(exactly(file, HEAD.size))
+    if length > os.fstat(file.fileno()).st_size - file.tell():
+        raise BadValue(f"section {number} is cut off; copy the file again")
+    # Every Gaussian takes at least one byte, so the length of the file bounds the memory.
+    if not 1 <= splats <= length:
+        raise BadValue(
+            f"section {number} claims {splats} Gaussians in {length} bytes; copy the file again"
+        )
+    body = exactly(file, length)
+    if section_check(splats, body) != check:
+        raise BadValue(f"section {number} is damaged; copy the file again")
+    return body, splats
+
+
+def decode_body(body: bytes, splats: int, channels: int, levels: int, steps: Steps) -> Symbols:
+    """Return the Gaussians of a section; the body may be hostile although the checksum is right.
+
+    Raises
+    ------
+    BadValue
+        If the body is none that `section_to_bytes` writes.
+    """
+    rich, evenness = bool(body[0] & RICH), body[0] & ~RICH
+    if evenness >= len(EVENNESS):
+        raise BadValue("the first byte is unknown")
+    model, codes = weights.from_bytes(body[1:], channels, rich)
+    coder = Decoder(codes[: len(codes) // 4 * 4])  # a short body is filled up with bytes
+    with np.errstate(all="ignore"):  # the weights may be hostile
+        one, two = np.zeros(splats, np.int64), np.zeros((splats, 2), np.int64)
+        cells = code_cells(coder, two, levels, EVENNESS[evenness])
+        cells = cells[np.argsort(hilbert_encode(cells, levels), kind="stable")]
+        unknown = Symbols(cells, two, np.zeros((splats, channels), np.int64), one, one, one)
+        return GaussianCoder(coder, cells, model).code(unknown, steps)
+
+
+def exactly(file: BinaryIO, count: int) -> bytes:
+    """Read `count` bytes, or raise BadValue."""
+    data = file.read(count)
+    if len(data) < count:
+        raise BadValue("the file is cut off; copy it again")
+    return data

@@ -26,9 +26,6 @@ _EXP2 = (
 )
 """Taylor coefficients of ``2^x``: the powers of ln 2 over the factorials."""
 
-_LOG2 = 2.8853900817779268
-"""2 / ln 2: the factor of the series of the logarithm."""
-
 _SIN = (
     6.283185307179586,
     -41.341702240399755,
@@ -40,11 +37,13 @@ _SIN = (
 )
 """Taylor coefficients of ``sin(2 pi x) / x`` in ``x^2``."""
 
-_ATAN_TERMS = 12
-"""Terms of the series of the arc tangent, for arguments up to tan(pi / 16)."""
 
-_INVERSE_TURN = 0.15915494309189535
-"""1 / (2 pi)."""
+def in_order(rows: Array) -> Array:
+    """Return the sum of rows (K, n), one after another, as libraries do not promise."""
+    total = np.zeros(rows.shape[1])
+    for row in rows:
+        total = total + row
+    return total
 
 
 def exp2(x: Array) -> Array:
@@ -61,7 +60,7 @@ def log2(x: Array) -> Array:
     mantissa, exponent = np.where(low, 2 * mantissa, mantissa), exponent - low
     t = (mantissa - 1) / (mantissa + 1)  # ln m = 2 (t + t^3 / 3 + t^5 / 5 + ...)
     series = _polynomial([1 / (2 * k + 1) for k in range(6)], t * t)
-    return exponent + _LOG2 * t * series
+    return exponent + 2.8853900817779268 * t * series  # 2 / ln 2
 
 
 def sin_turns(x: Array) -> Array:
@@ -82,8 +81,8 @@ def angle_in_turns(y: Array, x: Array) -> Array:
     t = near / np.where(far > 0, far, 1.0)
     for _ in range(2):  # tan(a / 2) from tan(a), twice
         t = t / (1 + np.sqrt(1 + t * t))
-    terms = [(-1) ** k / (2 * k + 1) for k in range(_ATAN_TERMS)]
-    angle = 4 * _INVERSE_TURN * t * _polynomial(terms, t * t)
+    terms = [(-1) ** k / (2 * k + 1) for k in range(12)]  # for t up to tan(pi / 16)
+    angle = 4 * 0.15915494309189535 * t * _polynomial(terms, t * t)  # 1 / (2 pi)
     angle = np.where(np.abs(y) > np.abs(x), 0.25 - angle, angle)
     angle = np.where(x < 0, 0.5 - angle, angle)
     return np.where(y < 0, -angle, angle)

@@ -15,12 +15,13 @@ on every machine, see `eigengs_dr.codec.exact_math`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .exact_math import angle_in_turns, cos_turns, log2, sin_turns
+from .exact_math import angle_in_turns, cos_turns, in_order, log2, sin_turns
 from .quantization import (
     SCALE_STEP,
     STRETCH_STEP,
@@ -32,7 +33,7 @@ from .quantization import (
     turns_of,
 )
 from .range_coder import Coder, categorical
-from .weights import CLASSES, MIN_WIDTH, Model, Weights, fit_weights, weighted
+from .weights import CLASSES, MIN_WIDTH, Model, Weights, fit_weights
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -40,7 +41,7 @@ IntArray = NDArray[np.int64]
 STRIDES = (8, 4, 2, 1)
 """Distances of the passes after the first one, along the curve."""
 
-PLACES = (-3, -1, 1, 3)
+PLACES = np.array([-3, -1, 1, 3])
 """Known neighbours, in strides."""
 
 COARSE = 16
@@ -53,46 +54,40 @@ class Pass(NamedTuple):
     Attributes
     ----------
     rows : ndarray of int64, shape (n,)
-    known : list of ndarray of int64, shape (n,)
-        Neighbours that earlier passes coded; empty in the first pass.
-    weight : list of ndarray of float64, shape (n,)
+    known : ndarray of int64, shape (K, n)
+        Neighbours that earlier passes coded; none in the first pass.
+    weight : ndarray of float64, shape (K, n)
         Weights of the neighbours, whose sum is 1: they fall with the square of the distance.
     """
 
     rows: IntArray
-    known: list[IntArray]
-    weight: list[Array]
+    known: IntArray
+    weight: Array
 
     def mean(self, values: Array) -> Array:
         """Return the weighted means of values (N,) of the neighbours, shape (n,)."""
-        total = np.zeros(len(self.rows))
-        for known, weight in zip(self.known, self.weight, strict=True):
-            total = total + weight * values[known]
-        return total
+        return in_order(self.weight * values[self.known])
 
 
 def passes_of(cells: IntArray) -> list[Pass]:
     """Divide Gaussians, in the order of the curve, into passes; cells have the shape (N, 2)."""
     index = np.arange(len(cells))
-    passes = [Pass(index[:: 2 * STRIDES[0]], [], [])]
+    first = index[:: 2 * STRIDES[0]]
+    passes = [Pass(first, np.zeros((0, len(first)), np.int64), np.zeros((0, len(first))))]
     for stride in STRIDES:
         rows = index[stride :: 2 * stride]
-        known, weight = list[IntArray](), list[Array]()
-        total = np.zeros(len(rows))
-        for place in PLACES:
-            other = rows + place * stride
-            inside = (other >= 0) & (other < len(cells))
-            other = np.clip(other, 0, len(cells) - 1)
-            near = np.where(inside, 1 / (squared_distance(cells[rows], cells[other]) + 1), 0)
-            known, weight, total = [*known, other], [*weight, near], total + near
-        passes.append(Pass(rows, known, [w / total for w in weight]))
+        other = rows + stride * PLACES[:, None]
+        inside = (other >= 0) & (other < len(cells))
+        other = np.clip(other, 0, len(cells) - 1)
+        near = np.where(inside, 1 / (squared_distance(cells[rows], cells[other]) + 1), 0)
+        passes.append(Pass(rows, other, near / in_order(near)))
     return [found for found in passes if len(found.rows)]
 
 
 def squared_distance(one: IntArray, other: IntArray) -> Array:
-    """Return the squares of the distances of cells (N, 2)."""
-    x, y = (one - other).T.astype(np.float64)
-    return x * x + y * y
+    """Return the squares of the distances of cells, shape (..., 2)."""
+    away = (one - other).astype(np.float64)
+    return away[..., 0] * away[..., 0] + away[..., 1] * away[..., 1]
 
 
 def crowding(cells: IntArray) -> list[Array]:
@@ -101,24 +96,21 @@ def crowding(cells: IntArray) -> list[Array]:
     The numbers of Gaussians in a small and in a large window, and the square of the distance to the
     nearer neighbour along the curve.
     """
-    corner = cells.min(axis=0)
-    counts = [_count(cells - corner, shift, reach) for shift, reach in ((1, 1), (2, 2))]
-    ends = squared_distance(cells[1:], cells[:-1])
-    before, after = np.append(ends[:1], ends), np.append(ends, ends[-1:])
-    if len(cells) == 1:
-        before = after = np.zeros(1)
-    return [*map(log2, counts), log2(np.minimum(before, after) + 1)]
+    counts = [_count(cells - cells.min(axis=0), reach) for reach in (1, 2)]
+    ends = np.pad(squared_distance(cells[1:], cells[:-1]), 1, constant_values=np.inf)
+    nearer = np.minimum(ends[1:], ends[:-1]) if len(cells) > 1 else np.zeros(1)
+    return [*map(log2, counts), log2(nearer + 1)]
 
 
-def _count(cells: IntArray, shift: int, reach: int) -> Array:
-    """Count Gaussians in windows of ``2 reach + 1`` squares a side, of ``2^shift`` cells."""
+def _count(cells: IntArray, reach: int) -> Array:
+    """Count Gaussians in windows of ``2 reach + 1`` squares, of ``2^reach`` cells or more."""
+    shift, side = reach, 2 * reach + 1
     while int(np.prod((cells.max(axis=0) >> shift) + 1)) > COARSE * len(cells) + 256:
         shift += 1
     x, y = (cells >> shift).T
-    grid = np.zeros((int(y.max()) + 2 * reach + 2, int(x.max()) + 2 * reach + 2), np.int64)
+    grid = np.zeros((int(y.max()) + side + 1, int(x.max()) + side + 1), np.int64)
     np.add.at(grid, (y + reach + 1, x + reach + 1), 1)
     sums = grid.cumsum(axis=0).cumsum(axis=1)
-    side = 2 * reach + 1
     inside = sums[y + side, x + side] - sums[y, x + side] - sums[y + side, x] + sums[y, x]
     return inside.astype(np.float64)
 
@@ -143,7 +135,6 @@ class Directions:
 
     Parameters
     ----------
-    coder : Encoder or Decoder
     passes : list of Pass
     length : ndarray of float64, shape (N,)
         Stretches l.
@@ -151,19 +142,17 @@ class Directions:
         Numbers of directions.
     """
 
-    def __init__(self, coder: Coder, passes: list[Pass], length: Array, turns: IntArray) -> None:
-        self.coder, self.passes, self.length, self.turns = coder, passes, length, turns
+    def __init__(self, passes: list[Pass], length: Array, turns: IntArray) -> None:
+        self.passes, self.length, self.turns = passes, length, turns
         self.u, self.v = np.zeros(len(turns)), np.zeros(len(turns))
 
-    def code(self, sharpness: IntArray, given: IntArray | None = None) -> IntArray:
+    def code(self, coder: Coder, sharpness: IntArray, given: IntArray) -> IntArray:
         """Code the directions, integers from 0 to ``turns - 1``."""
         result = np.zeros_like(self.turns)
         for part in self.passes:
-            rows = part.rows
+            rows, turns = part.rows, self.turns[part.rows]
             ahead, label = self._look(part)
-            turns = self.turns[rows]
-            away = None if given is None else (given[rows] - ahead) % turns
-            away = self._code_pass(turns, label, sharpness, away)
+            away = _code_pass(coder, turns, label, sharpness, (given[rows] - ahead) % turns)
             result[rows] = (away + ahead) % turns
             self._learn(rows, result[rows])
         return result
@@ -193,21 +182,21 @@ class Directions:
         label = np.digitize(self.length[part.rows], LENGTHS) * (len(AGREEMENTS) + 1)
         return ahead, label + np.digitize(np.sqrt(u * u + v * v), AGREEMENTS)
 
-    def _code_pass(
-        self, turns: IntArray, labels: IntArray, sharpness: IntArray, given: IntArray | None
-    ) -> IntArray:
-        """Code directions relative to those of the neighbours."""
-        sector, few = np.zeros_like(turns), turns < SECTORS
-        wanted = None if given is None else _sector(given, turns)
-        for label in np.unique(labels[~few]):
-            rows = np.flatnonzero((labels == label) & ~few)
-            model = categorical(sector_chances(int(sharpness[label])))
-            inside = None if wanted is None else wanted[rows]
-            sector[rows] = self.coder.table(model, len(rows), inside)
-        first = np.where(few, 0, _first(sector, turns))
-        last = np.where(few, turns, _first(sector + 1, turns))
-        place = None if given is None else np.where(few, given, (given - first) % turns)
-        return (first + self.coder.uniform(last - first, place)) % turns
+
+def _code_pass(
+    coder: Coder, turns: IntArray, labels: IntArray, sharpness: IntArray, given: IntArray
+) -> IntArray:
+    """Code directions relative to those of the neighbours."""
+    sector, few = np.zeros_like(turns), turns < SECTORS
+    wanted = _sector(given, turns)
+    for label in np.unique(labels[~few]):
+        rows = np.flatnonzero((labels == label) & ~few)
+        model = categorical(sector_chances(int(sharpness[label])))
+        sector[rows] = coder.code(model, wanted[rows])
+    first = np.where(few, 0, _first(sector, turns))
+    last = np.where(few, turns, _first(sector + 1, turns))
+    place = np.where(few, given, (given - first) % turns)
+    return (first + coder.uniform(last - first, place)) % turns
 
 
 def _sector(turn: IntArray, turns: IntArray) -> IntArray:
@@ -226,8 +215,8 @@ def sector_chances(sharpness: int) -> Array:
     return np.asarray(1 / (1 + sharpness / SHARPNESS * away * away))
 
 
-Features = Callable[[Pass], tuple[list[Array], list[Array]]]
-"""The features of centres and widths for the Gaussians of a pass."""
+Features = Callable[[Pass], tuple[Array, Array]]
+"""The features of centres and of widths, shape (F, n), for the n Gaussians of a pass."""
 
 
 class GaussianCoder:
@@ -252,95 +241,71 @@ class GaussianCoder:
         self.passes, self.crowding = passes_of(cells), crowding(cells)
         self.values = np.zeros(len(cells))  # of the kind that is being coded, as far as known
 
-    def code(self, channels: int, steps: Steps, given: Symbols | None = None) -> Symbols:
-        """Code the numbers; an encoder needs them."""
-        color = np.zeros((len(self.cells), channels), np.int64)
-        for k in range(channels):
-            known = None if given is None else given.color[:, k]
-            one = np.ones(len(self.cells))
-            color[:, k] = self._numbers(self._color_features(color, k), one, known)
+    def code(self, given: Symbols, steps: Steps) -> Symbols:
+        """Code the numbers; a decoder takes their shapes only."""
+        color, one = np.zeros_like(given.color), np.ones(len(self.cells))
+        for k, values in enumerate(given.color.T):
+            color[:, k] = self._numbers(partial(self._color_features, color, k), one, values)
         fineness = precision(color)
-        self.bright = log2(fineness)
-        step, known = SCALE_STEP / fineness, None if given is None else given.scale
-        scale = self._numbers(self._scale_features(step), step, known)
-        s = scale * step
-        step, known = STRETCH_STEP / fineness, None if given is None else given.stretch
-        stretch = self._numbers(self._stretch_features(step, s), step, known)
+        bright, step = log2(fineness), SCALE_STEP / fineness
+        scale = self._numbers(partial(self._scale_features, bright, step), step, given.scale)
+        s, step = scale * step, STRETCH_STEP / fineness
+        features = partial(self._stretch_features, bright, s, step)
+        stretch = self._numbers(features, step, given.stretch)
         length = stretch * step
-        turns = turns_of(length, fineness)
-        directions = Directions(self.coder, self.passes, length, turns)
-        if self.known is None and self.rich and given is not None:
+        directions = Directions(self.passes, length, turns_of(length, fineness))
+        if self.known is None and self.rich:
             self.model.sharpness = directions.fit(given.turn)
-        turn = directions.code(self.model.sharpness, None if given is None else given.turn)
-        parts = parts_of(factors_of(s, length, turn / turns), fineness, steps.cell)
-        part = np.zeros_like(self.cells)
-        for axis in range(2):
-            known = None if given is None else given.part[:, axis]
-            part[:, axis] = self.coder.uniform(parts[:, axis], known)
-        return Symbols(self.cells, part, color, scale, stretch, turn)
+        turn = directions.code(self.coder, self.model.sharpness, given.turn)
+        parts = parts_of(factors_of(scale, stretch, turn, fineness), fineness, steps.cell)
+        place = [self.coder.uniform(parts[:, axis], given.part[:, axis]) for axis in range(2)]
+        return Symbols(self.cells, np.stack(place, axis=1), color, scale, stretch, turn)
 
-    def _numbers(self, features: Features, step: Array, given: IntArray | None) -> IntArray:
+    def _numbers(self, features: Features, step: Array, given: IntArray) -> IntArray:
         """Code one kind of numbers, pass by pass."""
-        result = np.zeros(len(step), np.int64)
-        if self.known is None:
-            assert given is not None
-            weights = self._fit(features, step, given)
-            self.model.weights.append(weights)
-        else:
-            weights = next(self.known)
+        result = np.zeros_like(given)
+        weights = next(self.known) if self.known else self._fit(features, step, given)
         self.values = np.zeros(len(step))
         for part in self.passes:
             centers, widths = features(part)
             rows, unit = part.rows, step[part.rows]
-            center = weighted(weights.center, centers) / unit
-            width = np.maximum(weighted(weights.width, widths) / unit, MIN_WIDTH)
-            known = None if given is None else given[rows]
-            result[rows] = self.coder.numbers(center, width, weights.tails, known)
+            center = in_order(weights.center[:, None] * centers) / unit
+            width = np.maximum(in_order(weights.width[:, None] * widths) / unit, MIN_WIDTH)
+            result[rows] = self.coder.numbers(center, width, weights.tails, given[rows])
             self.values[rows] = result[rows] * unit
         return result
 
     def _fit(self, features: Features, step: Array, given: IntArray) -> Weights:
-        """Find the weights for numbers that are all known."""
+        """Find the weights for numbers that are all known, and note them in the model."""
         self.values = given * step
         both = zip(*(features(part) for part in self.passes), strict=True)
-        center, width = (
-            np.stack([np.concatenate(rows) for rows in zip(*kind, strict=True)], axis=1)
-            for kind in both
-        )
+        center, width = (np.ascontiguousarray(np.concatenate(kind, axis=1).T) for kind in both)
         order = np.concatenate([part.rows for part in self.passes])
-        return fit_weights(center, width, self.values[order], step[order], self.rich)
+        found = fit_weights(center, width, self.values[order], step[order], self.rich)
+        self.model.weights.append(found)
+        return found
 
-    def _color_features(self, color: IntArray, k: int) -> Features:
+    def _color_features(self, color: IntArray, k: int, part: Pass) -> tuple[Array, Array]:
         """Return the features of channel k: the channel near by, and the two channels before it."""
-        before = [color[:, j].astype(np.float64) for j in range(max(0, k - 2), k)]
+        rows, here = part.rows, self.values
+        center, width = [part.mean(here)], [np.ones(len(rows)), part.mean(np.abs(here))]
+        for other in color.T[max(0, k - 2) : k].astype(np.float64):
+            slope = part.mean(other * here) / (part.mean(other * other) + 1)
+            center += [other[rows], slope * other[rows]]
+            width += [np.abs(other[rows]), np.abs(part.mean(other))]
+        return np.stack(center), np.stack([*width, *(near[rows] for near in self.crowding[:2])])
 
-        def features(part: Pass) -> tuple[list[Array], list[Array]]:
-            rows, here = part.rows, self.values
-            center, width = [part.mean(here)], [np.ones(len(rows)), part.mean(np.abs(here))]
-            for other in before:
-                slope = part.mean(other * here) / (part.mean(other * other) + 1)
-                center += [other[rows], slope * other[rows]]
-                width += [np.abs(other[rows]), np.abs(part.mean(other))]
-            return center, [*width, *(values[rows] for values in self.crowding[:2])]
-
-        return features
-
-    def _scale_features(self, step: Array) -> Features:
+    def _scale_features(self, bright: Array, step: Array, part: Pass) -> tuple[Array, Array]:
         """Return the features of s: small Gaussians are where many are."""
+        rows, one = part.rows, np.ones(len(part.rows))
+        center = [one, bright[rows], *(near[rows] for near in self.crowding)]
+        center += [part.mean(self.values), part.mean(bright)]
+        return np.stack(center), np.stack([one, step[rows]])
 
-        def features(part: Pass) -> tuple[list[Array], list[Array]]:
-            rows, one = part.rows, np.ones(len(part.rows))
-            center = [one, self.bright[rows], *(values[rows] for values in self.crowding)]
-            return [*center, part.mean(self.values), part.mean(self.bright)], [one, step[rows]]
-
-        return features
-
-    def _stretch_features(self, step: Array, s: Array) -> Features:
+    def _stretch_features(
+        self, bright: Array, s: Array, step: Array, part: Pass
+    ) -> tuple[Array, Array]:
         """Return the features of l."""
-
-        def features(part: Pass) -> tuple[list[Array], list[Array]]:
-            rows, one = part.rows, np.ones(len(part.rows))
-            center = [one, self.bright[rows], s[rows], self.crowding[1][rows]]
-            return [*center, part.mean(self.values)], [one, step[rows]]
-
-        return features
+        rows, one = part.rows, np.ones(len(part.rows))
+        center = [one, bright[rows], s[rows], self.crowding[1][rows], part.mean(self.values)]
+        return np.stack(center), np.stack([one, step[rows]])

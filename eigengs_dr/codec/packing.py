@@ -6,35 +6,26 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import types_of
-from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..fitting.fit import Fit
 from ..fitting.maps import combine, read_maps
+from ..fitting.target import make_target
 from ..gaussian.channels import TextureMap, channel_weights, show_sums, slices
 from ..gaussian.gaussians import Gaussians, scale_channels, set_of
-from ..image.color import (
-    LIGHT,
-    UNBOUNDED,
-    rendered_as,
-    rgb_to_ycbcr,
-    to_coded,
-    to_linear,
-    to_log,
-    to_pu21,
-)
+from ..image.color import LIGHT, rendered_as, to_coded, to_linear, to_pu21
 from ..image.io import check_data, check_image
-from ..image.metrics import MAX_PSNR, psnrs_by_rows
-from ..raster.render import picture_of, render
-from .egs import MAX_SECTIONS, SUFFIX
+from ..image.metrics import MAX_PSNR, psnr, psnr_from_mse
+from ..raster.render import picture_of
+from .egs import MAX_SECTIONS, SUFFIX, write
 from .quantization import Steps
-from .rounding import MIN_MSE, write_smallest
+from .rounding import MIN_MSE, Comparison, planes_of, round_within
 
 Array = NDArray[np.floating]
 
@@ -73,10 +64,6 @@ class PackResult(NamedTuple):
     psnr_drop: float
     steps: Steps
 
-    def _repr_html_(self) -> str:
-        """Return what a notebook shows."""
-        return to_html(self)
-
 
 @exclusive()
 def pack(
@@ -85,7 +72,6 @@ def pack(
     image: ArrayLike | Mapping[str, ArrayLike] | None = None,
     max_psnr_drop: float = BUDGET,
     sections: Sequence[int] | None = None,
-    cutoff: float | None = None,
     encoding: str | None = None,
 ) -> PackResult:
     """Write a set to the smallest ``.egs`` file whose loss of PSNR stays within a budget.
@@ -110,8 +96,6 @@ def pack(
         Number of Gaussians in each section of the file, in the order of the set. A reader may stop
         after any section; the budget holds for each of these prefixes. By default one section.
         Inside a section, Gaussians are stored in Hilbert-curve order.
-    cutoff : float, optional
-        Radius of a Gaussian in standard deviations; by default the cutoff of the set.
     encoding : {"srgb", "linear"}, optional
         What the pixels of the image are, see `eigengs_dr.fit`.
 
@@ -131,35 +115,6 @@ def pack(
     -----
     On one machine and backend, the same arguments give the same file bit for bit.
     """
-    check_request(output, max_psnr_drop)
-    whole: Gaussians = dr.detach(set_of(gaussians))
-    if cutoff is not None:
-        whole = replace(whole, cutoff=float(cutoff))
-    rows = section_rows(len(whole), sections)
-    if whole.maps:
-        if len(rows) > 1:
-            raise ValueError("pack: a set with maps has one section; leave the sections out")
-        return _pack_maps(whole, output, image, max_psnr_drop, encoding)
-    if isinstance(image, Mapping):
-        raise ValueError("pack: the set has no maps; give its image alone")
-    shown = _shown(whole) if image is None else _compared(whole, image, encoding)
-    # The best linear light is not the best sRGB picture. So compensation keeps a set in linear
-    # light near its own rendering, not near the image.
-    keeps = image is None or whole.space in LIGHT
-    target = _planes_of(whole) if keeps else shown
-    unseen = MSE_WITHOUT_IMAGE if image is None else 0
-
-    def errors(found: Gaussians) -> list[float]:
-        parts = [*(found[: r.stop] for r in rows[:-1]), found]
-        return [_error(part, shown) for part in parts]
-
-    figures = write_smallest(output, whole, target, errors, max_psnr_drop, rows, unseen)
-    found = Gaussians.load(output, types_of(whole.mean).backend)
-    return PackResult(gaussians=found, **figures)
-
-
-def check_request(output: str | os.PathLike[str], max_psnr_drop: float) -> None:
-    """Raise ValueError for another suffix than ``.egs``, or a budget out of range."""
     if Path(output).suffix.lower() != SUFFIX:
         raise ValueError(f"{output}: pack writes {SUFFIX} files; use this suffix, or save()")
     if not 0 < max_psnr_drop <= MAX_PSNR:
@@ -167,9 +122,33 @@ def check_request(output: str | os.PathLike[str], max_psnr_drop: float) -> None:
             f"pack: max_psnr_drop is {max_psnr_drop}; it must be above 0 and at most "
             f"{MAX_PSNR:g} dB, such as 0.5"
         )
+    whole: Gaussians = dr.detach(set_of(gaussians))
+    rows = _section_rows(len(whole), sections)
+    if whole.maps and len(rows) > 1:
+        raise ValueError("pack: a set with maps has one section; leave the sections out")
+    compare = _compare_maps if whole.maps else _compare
+    maps, shown, compared = compare(whole, image, encoding)
+    weighted = scale_channels(whole, channel_weights(maps)) if maps else whole
+    found, before = round_within(replace(weighted, maps=()), compared, max_psnr_drop, rows)
+    size = write(output, found.packed._replace(maps=maps))
+    rounded = Gaussians.load(output, types_of(whole.mean).backend)
+    after = psnr_from_mse(max(found.error + compared.unseen, MIN_MSE))
+    figure: float | dict[str, float] = psnr_from_mse(found.error)
+    if maps:
+        pictures = picture_of(rounded)
+        pairs = zip(maps, shown, strict=True)
+        figure = {m.name: psnr(pictures[m.name], image) for m, image in pairs}
+    return PackResult(
+        gaussians=rounded,
+        bytes=size,
+        bits_per_pixel=8 * size / (whole.width * whole.height),
+        psnr=figure,
+        psnr_drop=psnr_from_mse(before) - after,
+        steps=found.packed.steps,
+    )
 
 
-def section_rows(count: int, sections: Sequence[int] | None) -> list[slice]:
+def _section_rows(count: int, sections: Sequence[int] | None) -> list[slice]:
     """Return the range of the Gaussians of each section."""
     counts = [count] if sections is None else [int(k) for k in sections]
     if not counts or min(counts) < 1 or sum(counts) != count or len(counts) > MAX_SECTIONS:
@@ -181,90 +160,92 @@ def section_rows(count: int, sections: Sequence[int] | None) -> list[slice]:
     return [slice(end - k, end) for end, k in zip(ends, counts, strict=True)]
 
 
-def _compared(gaussians: Gaussians, image: ArrayLike, encoding: str | None) -> Array:
+# --- A set of one image --------------------------------------------------------------------------
+
+
+Images = ArrayLike | Mapping[str, ArrayLike] | None
+Compared = tuple[tuple[TextureMap, ...], list[Array], Comparison]
+"""The maps with their weights for packing, what people see of them, and the comparison."""
+
+
+def _compare(g: Gaussians, image: Images, encoding: str | None) -> Compared:
+    """Compare a set without maps with its image, or with its own rendering."""
+    if isinstance(image, Mapping):
+        raise ValueError("pack: the set has no maps; give its image alone")
+    shown = _shown(g) if image is None else _image_of(g, image, encoding)
+    # The best linear light is not the best sRGB picture. So compensation keeps a set in linear
+    # light near its own rendering, not near the image.
+    keeps = image is None or g.space in LIGHT
+
+    def error(found: Gaussians) -> float:
+        return float(np.mean(np.square(_shown(found) - shown, dtype=np.float64)))
+
+    unseen = MSE_WITHOUT_IMAGE if image is None else 0.0
+    return (), [], Comparison(error, planes_of(g) if keeps else shown, unseen)
+
+
+def _image_of(g: Gaussians, image: ArrayLike, encoding: str | None) -> Array:
     """Return the image in the space of the comparison.
 
     It is the set's space; for linear light, sRGB, and for light above 1, PU21, which has bounds.
     """
-    grey = gaussians.channels == 1
-    data = rendered_as(gaussians.space) is None
-    pixels = check_data(image) if data else check_image(image, grey, encoding=encoding)
-    expected = (gaussians.height, gaussians.width, gaussians.channels)
+    data = rendered_as(g.space) is None
+    pixels = check_data(image) if data else check_image(image, g.channels == 1, encoding=encoding)
+    expected = (g.height, g.width, g.channels)
     if pixels.shape != expected:
         raise ValueError(f"pack: image has shape {pixels.shape}, the set needs {expected}")
-    if gaussians.space == "ycbcr":
-        return rgb_to_ycbcr(pixels)
-    if gaussians.space in UNBOUNDED:
-        light = to_linear(pixels)
-        return to_log(light) if gaussians.space == "log" else to_pu21(light)
-    return pixels
+    if g.space == "radiance":
+        return to_pu21(to_linear(pixels))
+    return pixels if g.space == "linear" else make_target(pixels, g.space).values
 
 
-def _shown(gaussians: Gaussians) -> Array:
-    """Render a set in the space of the comparison, see `_compared`."""
-    planes = _planes_of(gaussians)
-    if gaussians.space == "radiance":
+def _shown(g: Gaussians) -> Array:
+    """Render a set in the space of the comparison, see `_image_of`."""
+    planes = planes_of(g)
+    if g.space == "radiance":
         return to_pu21(planes)
-    return to_coded(np.maximum(planes, 0)) if gaussians.space == "linear" else planes
+    return to_coded(np.maximum(planes, 0)) if g.space == "linear" else planes
 
 
-def _planes_of(gaussians: Gaussians) -> Array:
-    """Render a set in its own space."""
-    return render(replace(gaussians, space="data")).numpy()
-
-
-def _error(gaussians: Gaussians, shown: Array) -> float:
-    return float(np.mean(np.square(_shown(gaussians) - shown, dtype=np.float64)))
+# --- A set with maps -----------------------------------------------------------------------------
 
 
 SMALL = 1 / 255
 """A small change of sums, to measure slopes by."""
 
 
-def _pack_maps(
-    g: Gaussians,
-    output: str | os.PathLike[str],
-    images: Any,
-    max_psnr_drop: float,
-    encoding: str | None,
-) -> PackResult:
-    """Pack a set with maps; see `pack`."""
-    maps = g.maps
-    own = render(g).numpy()
-    shown, values = _shown_maps(own, maps), own
+def _compare_maps(g: Gaussians, images: Images, encoding: str | None) -> Compared:
+    """Compare a set with maps with their images, or with its own rendering."""
+    maps, cuts = g.maps, slices(g.maps)
+
+    def show(sums: Array) -> list[Array]:
+        return [show_sums(m.space, sums[..., c]) for m, c in zip(g.maps, cuts, strict=True)]
+
+    values = own = planes_of(g)
+    shown = rendered = show(own)
     factors, unseen = [m.weight**2 for m in maps], MSE_WITHOUT_IMAGE
     if images is not None:
-        rendered = shown
         shown, values = _images_of(g, images, encoding)
-        factors = [1 / e for e in _errors(rendered, shown)]
-        # Equal steps of weighted colours then add to each map an error in the ratio of its own.
-        logs = 0.5 * np.log(np.multiply(factors, _slopes(own, rendered, maps)))
-        weights, cuts = np.exp(logs - logs.mean()), slices(maps)
-        maps = tuple(m._replace(weight=float(w)) for m, w in zip(maps, weights, strict=True))
-        unseen = 0.0
+        factors, unseen = [1 / e for e in _errors(rendered, shown)], 0.0
+        # The slope: how much the squared error of what is seen exceeds that of the sums. Equal
+        # steps of weighted colours then add to each map an error in the ratio of its own.
+        moved = _errors(show(own + np.float32(SMALL)), rendered)
+        logs = 0.5 * np.log(np.multiply(factors, [error / SMALL**2 for error in moved]))
+        weights = np.exp(logs - logs.mean()).tolist()
+        maps = tuple(m._replace(weight=w) for m, w in zip(maps, weights, strict=True))
         for m, c in zip(maps, cuts, strict=True):
-            if m.space in LIGHT:  # as `pack` keeps light near its own rendering
+            if m.space in LIGHT:  # as a set of one image in linear light
                 values[..., c] = own[..., c]
     scale = np.array(channel_weights(maps), np.float32)
 
-    def errors(found: Gaussians) -> list[float]:
-        seen = _errors(_shown_maps(render(found).numpy() / scale, maps), shown)
-        return [float(np.mean(np.multiply(seen, factors)))]
+    def error(found: Gaussians) -> float:
+        seen = _errors(show(planes_of(found) / scale), shown)
+        return float(np.mean(np.multiply(seen, factors)))
 
-    weighted = replace(scale_channels(g, scale.tolist()), maps=())
-    rows = section_rows(len(g), None)
-    target = values * scale
-    figures = write_smallest(output, weighted, target, errors, max_psnr_drop, rows, unseen, maps)
-    found = Gaussians.load(output, types_of(g.mean).backend)
-    pictures = picture_of(found)
-    figures["psnr"] = {
-        m.name: psnrs_by_rows(pictures[m.name].__getitem__, image, ["rgb"])[0]
-        for m, image in zip(maps, shown, strict=True)
-    }
-    return PackResult(gaussians=found, **figures)
+    return maps, shown, Comparison(error, values * scale, unseen)
 
 
-def _images_of(g: Gaussians, images: Any, encoding: str | None) -> tuple[list[Array], Array]:
+def _images_of(g: Gaussians, images: Images, encoding: str | None) -> tuple[list[Array], Array]:
     """Return the images in the order of the maps, and their values in the spaces of the maps."""
     spaces = {m.name: m.space for m in g.maps}
     if not isinstance(images, Mapping):
@@ -283,17 +264,6 @@ def _images_of(g: Gaussians, images: Any, encoding: str | None) -> tuple[list[Ar
     units = [image.unit for image in found]
     pixels: list[Array] = [i.pixels * np.float32(i.unit) for i in found]
     return pixels, combine(found, units).values
-
-
-def _shown_maps(sums: Array, maps: tuple[TextureMap, ...]) -> list[Array]:
-    """Convert sums of all channels to what people look at, map by map."""
-    return [show_sums(m.space, sums[..., c]) for m, c in zip(maps, slices(maps), strict=True)]
-
-
-def _slopes(sums: Array, shown: list[Array], maps: tuple[TextureMap, ...]) -> list[float]:
-    """Return how much the squared error of what is seen exceeds that of the sums, map by map."""
-    moved = _errors(_shown_maps(sums + np.float32(SMALL), maps), shown)
-    return [error / SMALL**2 for error in moved]
 
 
 def _errors(a: list[Array], b: list[Array]) -> list[float]:

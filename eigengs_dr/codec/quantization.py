@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian.covariance import log_shapes
-from .exact_math import cos_turns, exp2, sin_turns
+from .exact_math import cos_turns, exp2, in_order, sin_turns
 
 Array = NDArray[np.floating]
 Double = NDArray[np.float64]
@@ -94,10 +94,7 @@ class Symbols(NamedTuple):
 
 def precision(color: IntArray) -> Double:
     """Return Q, shape (N,), for colours (N, C) in steps."""
-    squares: Double = np.zeros(len(color))
-    for channel in color.T.astype(np.float64):  # one after another: the same bits everywhere
-        squares = squares + channel * channel
-    return np.maximum(np.sqrt(squares), MIN_PRECISION)
+    return np.maximum(np.sqrt(in_order(np.square(color.T.astype(np.float64)))), MIN_PRECISION)
 
 
 def turns_of(stretch: Double, fineness: Double) -> IntArray:
@@ -108,14 +105,16 @@ def turns_of(stretch: Double, fineness: Double) -> IntArray:
     return np.clip(turns, 1, MAX_TURNS).astype(np.int64)
 
 
-def factors_of(scale: Double, stretch: Double, turn: Double) -> Double:
-    """Return the factors a, b, c, shape (N, 3), for s, l and t in turns, by exact arithmetic."""
+def factors_of(scale: IntArray, stretch: IntArray, turn: IntArray, fineness: Double) -> Double:
+    """Return the factors a, b, c, shape (N, 3), for integers and Q, by exact arithmetic."""
+    length = stretch * (STRETCH_STEP / fineness)
+    angle = turn / turns_of(length, fineness)
     with np.errstate(all="ignore"):
-        wide, size = exp2(2 * LOG2E * stretch), exp2(LOG2E * scale)
+        wide, size = exp2(2 * LOG2E * length), exp2(LOG2E * (scale * (SCALE_STEP / fineness)))
         odd = 0.5 * (wide - 1 / wide)
-        half = cos_turns(0.5 * turn)
+        half = cos_turns(0.5 * angle)
         a = np.sqrt(1 / wide + 2 * odd * half * half)
-        return np.stack([a * size, odd * sin_turns(turn) / a * size, size / a], axis=1)
+        return np.stack([a * size, odd * sin_turns(angle) / a * size, size / a], axis=1)
 
 
 def parts_of(factor: Array, fineness: Array, cell: float) -> IntArray:
@@ -155,7 +154,7 @@ def quantize(arrays: dict[str, Array], steps: Steps, dead_zone: float = 0.0) -> 
     stretch = _whole("shape", np.hypot(u, v) * fineness / STRETCH_STEP)
     turns = turns_of(stretch * (STRETCH_STEP / fineness), fineness)
     turn = np.rint(np.arctan2(v, u) / (2 * np.pi) * turns).astype(np.int64) % turns
-    factor = _factors(scale, stretch, turn, fineness)
+    factor = factors_of(scale, stretch, turn, fineness)
     parts = parts_of(factor, fineness, steps.cell)
     mean = np.asarray(arrays["mean"], np.float64) / steps.cell
     cell_y, part_y = _place(mean[:, 1], parts[:, 1])
@@ -178,7 +177,7 @@ def dequantize(symbols: Symbols, steps: Steps) -> dict[str, Array]:
     Numbers of hostile files may overflow to infinity or zero.
     """
     fineness = precision(symbols.color)
-    factor = _factors(symbols.scale, symbols.stretch, symbols.turn, fineness)
+    factor = factors_of(symbols.scale, symbols.stretch, symbols.turn, fineness)
     parts = parts_of(factor, fineness, steps.cell)
     with np.errstate(all="ignore"):
         size = exp2(LOG2E * (symbols.scale * (SCALE_STEP / fineness)))
@@ -187,13 +186,6 @@ def dequantize(symbols: Symbols, steps: Steps) -> dict[str, Array]:
             "factor": factor,
             "color": symbols.color * (steps.color * size)[:, None],
         }
-
-
-def _factors(scale: IntArray, stretch: IntArray, turn: IntArray, fineness: Double) -> Double:
-    """Return the factors of integers."""
-    length = stretch * (STRETCH_STEP / fineness)
-    turns = turns_of(length, fineness)
-    return factors_of(scale * (SCALE_STEP / fineness), length, turn / turns)
 
 
 def _place(values: Array, parts: IntArray) -> tuple[IntArray, IntArray]:

@@ -1,17 +1,17 @@
 """Integers as bits by a range coder (Martin, "Range encoding", 1979), of the library constriction.
 
 `Encoder` and `Decoder` have the same methods. Each codes an array of integers with a probability
-for each of them: the encoder takes the integers, the decoder returns them. So one function walks
-through a file in both directions, see `eigengs_dr.codec.gaussian_model`.
+for each of them: the encoder writes the integers and returns them, the decoder takes their number
+and returns those of the file. So one function walks through a file in both directions, see
+`eigengs_dr.codec.gaussian_model`.
 """
 
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
 
-import constriction
 import numpy as np
+from constriction import stream
 from numpy.typing import NDArray
 
 from ..storage.npz import BadValue
@@ -41,36 +41,30 @@ OFFSETS = 4
 TAILS = (2, 4, 8)
 """Degrees of freedom of Student's distributions: their functions are algebraic for even ones."""
 
-
-@cache
-def _uniform() -> Any:
-    return constriction.stream.model.Uniform()
+UNIFORM = stream.model.Uniform()
 
 
-def categorical(probabilities: Array) -> Any:
+def categorical(probabilities: Array) -> stream.model.Model:
     """Return a model of the integers from 0, with these probabilities up to a factor."""
-    return constriction.stream.model.Categorical(np.asarray(probabilities, float), perfect=False)
+    return stream.model.Categorical(np.asarray(probabilities, float), perfect=False)
 
 
 class Coder:
-    """What both directions share: distributions made of `_uniform` and `_table`."""
+    """What both directions share: distributions made of `UNIFORM` and tables."""
 
-    def uniform(self, sizes: IntArray, values: IntArray | None = None) -> IntArray:
+    def code(self, model: stream.model.Model, values: IntArray, *sizes: IntArray) -> IntArray:
+        """Code integers by one model of the library, and the sizes that it takes for each."""
+        raise NotImplementedError
+
+    def uniform(self, sizes: IntArray, values: IntArray) -> IntArray:
         """Code integers from 0 to ``sizes - 1``, all equally likely; sizes up to 2^20."""
         result = np.zeros(len(sizes), np.int64)
         free = sizes > 1  # a range coder has no distribution of one value
         if free.any():
-            given = None if values is None else values[free]
-            result[free] = self._code(_uniform(), given, len(sizes), sizes[free])
+            result[free] = self.code(UNIFORM, values[free], sizes[free].astype(np.int32))
         return result
 
-    def table(self, model: Any, count: int, values: IntArray | None = None) -> IntArray:
-        """Code `count` integers by one model from `categorical`."""
-        return self._code(model, values, count, None)
-
-    def numbers(
-        self, center: Array, width: Array, tails: int, values: IntArray | None = None
-    ) -> IntArray:
+    def numbers(self, center: Array, width: Array, tails: int, values: IntArray) -> IntArray:
         """Code integers with Student's distribution around centres.
 
         Parameters
@@ -79,68 +73,53 @@ class Coder:
             Widths above 0.
         tails : int
             Degrees of freedom, one of `TAILS`.
-        values : ndarray of int64, shape (N,), optional
+        values : ndarray of int64, shape (N,)
         """
         center = np.clip(np.nan_to_num(center), -(2.0**40), 2.0**40)
         base = np.floor(center + 0.5)
         offset = np.floor((center - base + 0.5) * OFFSETS).astype(np.int64)
         octaves = log2(np.clip(np.nan_to_num(width), 2.0**-20, 2.0**45))
         kind = np.clip(np.rint(PER_OCTAVE * octaves), MIN_CLASS, MAX_CLASS).astype(np.int64)
-        shift = np.maximum(0, -(-kind // PER_OCTAVE) - 3)
-        away = None if values is None else values - base.astype(np.int64)
-        high = np.zeros(len(center), np.int64)
+        shift = _shift(kind)
+        base = base.astype(np.int64)
+        top, low = (values - base) >> shift, (values - base) & (1 << shift) - 1
+        high = np.zeros_like(top)
         label = kind * OFFSETS + np.clip(offset, 0, OFFSETS - 1)
         order = np.argsort(label, kind="stable")
         ends = np.flatnonzero(np.diff(label[order], append=np.iinfo(np.int64).max)) + 1
-        top = None if away is None else away >> shift
         for rows in np.split(order, ends[:-1]):
-            model = _student(int(label[rows[0]]), tails)
-            given = None if top is None else np.clip(top[rows] + REACH, 0, 2 * REACH - 1)
-            high[rows] = self.table(model, len(rows), given) - REACH
+            inside = np.clip(top[rows] + REACH, 0, 2 * REACH - 1)
+            high[rows] = self.code(_student(int(label[rows[0]]), tails), inside) - REACH
         for side, edge in ((-1, -REACH), (1, REACH - 1)):
             rows = np.flatnonzero(high == edge)
-            if len(rows):
-                given = None if top is None else side * (top[rows] - edge)
-                high[rows] = edge + side * self._unbounded(len(rows), given)
-        low = self._low_bits(shift, None if away is None else away & (1 << shift) - 1)
-        return base.astype(np.int64) + (high << shift) + low
+            high[rows] += side * self._unbounded(side * (top[rows] - edge))
+        return base + (high << shift) + self._low_bits(shift, low)
 
-    def _unbounded(self, count: int, values: IntArray | None) -> IntArray:
+    def _unbounded(self, values: IntArray) -> IntArray:
         """Code integers from 0 on: the number of bits, then the bits."""
-        bits = None
-        if values is not None:
-            bits = np.frexp((values + 1).astype(np.float64))[1].astype(np.int64) - 1
-        bits = self.uniform(np.full(count, MAX_BITS), bits)
-        given = None if values is None else values + 1 - (1 << bits)
-        return (1 << bits) + self._low_bits(bits, given) - 1
+        bits = np.frexp((values + 1).astype(np.float64))[1].astype(np.int64) - 1
+        bits = self.uniform(np.full(len(values), MAX_BITS), bits)
+        return (1 << bits) + self._low_bits(bits, values + 1 - (1 << bits)) - 1
 
-    def _low_bits(self, bits: IntArray, values: IntArray | None) -> IntArray:
+    def _low_bits(self, bits: IntArray, values: IntArray) -> IntArray:
         """Code integers of known numbers of bits, all equally likely."""
         result = np.zeros(len(bits), np.int64)
         for first in range(0, int(bits.max(initial=0)), CHUNK):
             length = np.clip(bits - first, 0, CHUNK)
-            given = None if values is None else values >> first & (1 << length) - 1
+            given = values >> first & (1 << length) - 1
             result += self.uniform(1 << length, given) << first
         return result
-
-    def _code(
-        self, model: Any, values: IntArray | None, count: int, sizes: IntArray | None
-    ) -> IntArray:
-        raise NotImplementedError
 
 
 class Encoder(Coder):
     """Integers to bytes."""
 
     def __init__(self) -> None:
-        self._coder = constriction.stream.queue.RangeEncoder()
+        self._coder = stream.queue.RangeEncoder()
 
-    def _code(
-        self, model: Any, values: IntArray | None, count: int, sizes: IntArray | None
-    ) -> IntArray:
-        assert values is not None
-        more = [] if sizes is None else [sizes.astype(np.int32)]
-        self._coder.encode(values.astype(np.int32), model, *more)
+    def code(self, model: stream.model.Model, values: IntArray, *sizes: IntArray) -> IntArray:
+        """Write integers; see `Coder.code`."""
+        self._coder.encode(values.astype(np.int32), model, *sizes)
         return values
 
     def to_bytes(self) -> bytes:
@@ -154,27 +133,28 @@ class Decoder(Coder):
     def __init__(self, data: bytes) -> None:
         if len(data) % 4:
             raise BadValue("the codes are no whole number of words")
-        self._coder = constriction.stream.queue.RangeDecoder(
-            np.frombuffer(data, "<u4").astype(np.uint32)
-        )
+        self._coder = stream.queue.RangeDecoder(np.frombuffer(data, "<u4").astype(np.uint32))
 
-    def _code(
-        self, model: Any, values: IntArray | None, count: int, sizes: IntArray | None
-    ) -> IntArray:
-        more = count if sizes is None else sizes.astype(np.int32)
+    def code(self, model: stream.model.Model, values: IntArray, *sizes: IntArray) -> IntArray:
+        """Read as many integers as there are values; see `Coder.code`."""
         try:
-            return np.asarray(self._coder.decode(model, more), np.int64)
+            found = self._coder.decode(model, *(sizes or (len(values),)))
         except (AssertionError, ValueError):
             raise BadValue("the codes are damaged") from None
+        return np.asarray(found, np.int64)
+
+
+def _shift(kind: IntArray) -> IntArray:
+    """Return the low bits of numbers of a class of widths, which have no table."""
+    return np.maximum(0, -(-kind // PER_OCTAVE) - 3)
 
 
 @cache
-def _student(label: int, tails: int) -> Any:
+def _student(label: int, tails: int) -> stream.model.Model:
     """Return the model of the high parts of numbers of a class, see `Coder.numbers`."""
     kind, offset = divmod(label, OFFSETS)
-    shift = max(0, -(-kind // PER_OCTAVE) - 3)
     width = float(exp2(np.array(kind / PER_OCTAVE)))
-    edges = np.arange(-REACH, REACH + 1) * float(1 << shift) - 0.5
+    edges = np.arange(-REACH, REACH + 1) * float(1 << _shift(np.int64(kind))) - 0.5
     edges = (edges - ((offset + 0.5) / OFFSETS - 0.5)) / width
     below = _student_cdf(np.asarray(edges, np.float64), tails)
     below[0], below[-1] = 0.0, 1.0

@@ -1,6 +1,6 @@
 """Rounding as coarse as a loss of PSNR allows: the search of the steps, and error feedback.
 
-All steps follow from one, see `eigengs_dr.codec.quantization`. `write_smallest` searches the
+All steps follow from one, see `eigengs_dr.codec.quantization`. `round_within` searches the
 largest one that the loss allows, first without error feedback, which is fast, then with it.
 
 With error feedback, Gaussians that are not yet rounded compensate for those that are. The Gaussians
@@ -12,10 +12,9 @@ A set in several sections gets no compensation, because a reader may stop after 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,15 +22,11 @@ from numpy.typing import NDArray
 from ..backend.arrays import types_of
 from ..fitting.descent import FitProblem, run
 from ..fitting.options import PRESETS
-from ..fitting.schedule import Schedule
 from ..fitting.solvers.conjugate_gradient import solve
-from ..gaussian.channels import TextureMap
-from ..gaussian.file import SetData
-from ..gaussian.gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians, like
 from ..image.hilbert import hilbert_encode
-from ..image.metrics import psnr_from_mse
 from ..raster.render import render
-from .egs import EgsContent, write
+from .egs import EgsContent
 from .quantization import DEAD_ZONE, Steps, Symbols, dequantize, quantize
 
 Array = NDArray[np.floating]
@@ -51,63 +46,75 @@ FEEDBACK = 0.6
 TOO_FINE = "pack: no rounding is fine enough for the budget; allow more dB"
 
 
-def write_smallest(
-    output: str | os.PathLike[str],
-    gaussians: Gaussians,
-    target: Array,
-    errors: Callable[[Gaussians], list[float]],
-    max_psnr_drop: float,
-    rows: list[slice],
-    unseen: float = 0.0,
-    maps: tuple[TextureMap, ...] = (),
-) -> dict[str, Any]:
-    """Round a set as coarsely as a budget allows, and write the file.
+class Comparison(NamedTuple):
+    """What the loss of a set is measured by.
+
+    Attributes
+    ----------
+    error : callable
+        ``error(gaussians)`` returns the mean squared error of a set.
+    target : ndarray, shape (H, W, C)
+        What compensation for the rounding aims at, in the space of the set.
+    unseen : float
+        Mean squared error that `error` does not see, and that adds to it.
+    """
+
+    error: Callable[[Gaussians], float]
+    target: Array
+    unseen: float
+
+
+def round_within(
+    gaussians: Gaussians, compared: Comparison, max_psnr_drop: float, rows: list[slice]
+) -> tuple[Attempt, float]:
+    """Round a set as coarsely as a budget allows.
 
     Parameters
     ----------
-    output : path-like
     gaussians : Gaussians
         Set without gradients.
-    target : ndarray, shape (H, W, C)
-        What compensation for the rounding aims at, in the space of the set.
-    errors : callable
-        ``errors(gaussians)`` returns the mean squared error of each prefix that `rows` end at.
+    compared : Comparison
     max_psnr_drop : float
-        Allowed loss of each prefix in dB.
+        Allowed loss in dB of each prefix: of the Gaussians up to the end of each section.
     rows : list of slice
         The sections.
-    unseen : float, optional
-        Mean squared error that `errors` does not see, and that adds to it.
-    maps : tuple of TextureMap, optional
-        The maps of the set, by whose weights the colours are multiplied.
 
     Returns
     -------
-    dict
-        bytes, bits_per_pixel, psnr, psnr_drop and steps of the result, see `PackResult`.
+    Attempt
+        The best one.
+    float
+        The mean squared error before, with what is unseen.
 
     Raises
     ------
     ValueError
         If no rounding meets the budget.
-    OSError
-        If the file cannot be written; an existing file then stays unchanged.
     """
+    unseen = compared.unseen
+
+    def errors(found: Gaussians) -> list[float]:
+        return [compared.error(part) for part in (*(found[: r.stop] for r in rows[:-1]), found)]
+
     before = [max(error + unseen, MIN_MSE) for error in errors(gaussians)]
     limits = [error * 10 ** (max_psnr_drop / 10) - unseen for error in before]
     if min(limits) <= 0:
         raise ValueError(TOO_FINE)
 
     def judge(packed: EgsContent) -> Attempt:
-        after = zip(errors(to_gaussians(packed, gaussians)), limits, before, strict=True)
-        # The worst prefix counts.
-        return Attempt(max((e + unseen - b) / (m + unseen - b) for e, m, b in after), packed)
+        after = errors(Gaussians.from_data(packed.set_data(), types_of(gaussians.mean).backend))
+        shares = [
+            (e + unseen - b) / (m + unseen - b)
+            for e, m, b in zip(after, limits, before, strict=True)
+        ]
+        return Attempt(max(shares), packed, after[-1])  # the worst prefix counts
 
     def plain(octaves: float) -> Attempt:
         return judge(quantize_sections(gaussians, _steps(gaussians, octaves), rows))
 
     def compensated(octaves: float) -> Attempt:
-        return judge(quantize_with_feedback(gaussians, target, _steps(gaussians, octaves)))
+        steps = _steps(gaussians, octaves)
+        return judge(quantize_with_feedback(gaussians, compared.target, steps))
 
     found = largest_within(plain)
     if len(rows) == 1:  # compensation for the whole set would harm its prefixes
@@ -116,16 +123,7 @@ def write_smallest(
         found = largest_within(compensated, start, least) or found
     if found is None:
         raise ValueError(TOO_FINE)
-    packed = found[1].packed
-    after = errors(to_gaussians(packed, gaussians))[-1]
-    size = write(output, packed._replace(maps=maps))
-    return {
-        "bytes": size,
-        "bits_per_pixel": 8 * size / (gaussians.width * gaussians.height),
-        "psnr": psnr_from_mse(after),
-        "psnr_drop": psnr_from_mse(before[-1]) - psnr_from_mse(max(after + unseen, MIN_MSE)),
-        "steps": packed.steps,
-    }
+    return found[1], before[-1]
 
 
 def _steps(gaussians: Gaussians, octaves: float) -> Steps:
@@ -160,10 +158,13 @@ class Attempt(NamedTuple):
         Error that rounding adds, relative to the largest that the budget allows.
     packed : EgsContent
         The rounded set.
+    error : float
+        Its mean squared error.
     """
 
     excess: float
     packed: EgsContent
+    error: float
 
 
 def largest_within(
@@ -191,33 +192,26 @@ def largest_within(
     (float, Attempt) or None
         The octaves and the attempt; None if the smallest step exceeds the limit.
     """
-    octaves, tried = start, list[tuple[float, float]]()
+    octaves = start
+    tried: dict[float, float] = {}
     best: tuple[float, Attempt] | None = None
     while True:
         found = attempt(octaves)
-        tried.append((octaves, found.excess))
+        tried[octaves] = found.excess
         if found.excess <= 1 and (best is None or octaves > best[0]):
             best = octaves, found
-        goal = _crossing(tried) - MARGIN
+        goal = _crossing(list(tried.items())) - MARGIN
         if best is None:
             if octaves <= least:
                 return None
-            lowest = min(place for place, _ in tried)
-            octaves = max(min(goal, lowest - MARGIN * len(tried)), least)
+            octaves = max(min(goal, min(tried) - MARGIN * len(tried)), least)
             continue
-        low = best[0] + MARGIN
-        high = min((place for place, _ in tried if place > best[0]), default=MAX_OCTAVES + MARGIN)
-        if low > high - MARGIN or _is_enough(best, len(tried)):
+        low, used = best[0] + MARGIN, best[1].excess
+        high = min((place for place in tried if place > best[0]), default=MAX_OCTAVES + MARGIN)
+        enough = used >= ENOUGH or (len(tried) >= ATTEMPTS and used >= FAIR)
+        if low > high - MARGIN or enough or len(tried) >= MAX_ATTEMPTS:
             return best
         octaves = min(max(goal, low), high - MARGIN)
-
-
-def _is_enough(best: tuple[float, Attempt], number: int) -> bool:
-    """Return whether the best of a number of attempts is good enough."""
-    used = best[1].excess
-    if used >= ENOUGH or number >= MAX_ATTEMPTS:
-        return True
-    return number >= ATTEMPTS and used >= FAIR
 
 
 def _crossing(tried: list[tuple[float, float]]) -> float:
@@ -267,57 +261,46 @@ def quantize_with_feedback(gaussians: Gaussians, target: Array, steps: Steps) ->
     """
     count = len(gaussians)
     groups = min(GROUPS, count)
-    place = np.empty(count, np.int64)
-    place[_along_curve(gaussians)] = np.arange(count)
-    free, rest, done = np.arange(count), np.asarray(target, np.float32), list[Symbols]()
+    group_of = np.argsort(_along_curve(gaussians)) % groups
+    schedule = PRESETS["default"].schedule
+    rates = {name: RATE * rate for name, rate in schedule.rates.items()}
+    slow = replace(schedule, rates=rates, redistribute_after=0)
+    free, rest = np.arange(count), np.asarray(target, np.float32)
+    done: list[Symbols] = []
     current, inside = gaussians, _all_inside(gaussians)
     for group in range(groups):
-        arrays, now = current.to_arrays(), place[free] % groups == group
+        arrays, now = current.to_arrays(), group_of[free] == group
         chosen = {name: arrays[name][now] for name in ("mean", "factor", "color")}
         done.append(quantize(chosen, steps, DEAD_ZONE))
         free = free[~now]
         if not len(free):
             break
-        rest = rest - _rendered(gaussians, dequantize(done[-1], steps))
+        rest = rest - planes_of(like(gaussians, **dequantize(done[-1], steps)))
         current = solve(current[np.flatnonzero(~now)], rest, 2, warm_start=True).gaussians
         if inside:  # descent would move means outside the image into it
-            current = run(FitProblem(current, rest), _slow_schedule(), STEPS)
+            current = run(FitProblem(current, rest), slow, STEPS)
     symbols = Symbols(*map(np.concatenate, zip(*done, strict=True)))
-    return content_of(gaussians, [symbols], steps, current.to_arrays()["background"])
+    return _content(gaussians, [symbols], steps, current.to_arrays()["background"])
 
 
 def quantize_sections(gaussians: Gaussians, steps: Steps, rows: list[slice]) -> EgsContent:
     """Round a set without compensation, in sections of these ranges of Gaussians."""
     arrays = gaussians.to_arrays()
     symbols = quantize(arrays, steps, DEAD_ZONE)
-    parts = [symbols.select(r) for r in rows]
-    return content_of(gaussians, parts, steps, arrays["background"])
+    return _content(gaussians, [symbols.select(r) for r in rows], steps, arrays["background"])
 
 
-def content_of(
-    gaussians: Gaussians, sections: list[Symbols], steps: Steps, background: Array
+def planes_of(gaussians: Gaussians) -> NDArray[np.float32]:
+    """Render a set in its own space."""
+    return np.asarray(render(replace(gaussians, space="data")).numpy(), np.float32)
+
+
+def _content(
+    gaussians: Gaussians, sections: list[Symbols], steps: Steps, background: NDArray[np.float32]
 ) -> EgsContent:
     """Return the content of a file for a set."""
     size = (gaussians.width, gaussians.height)
     return EgsContent(sections, steps, background, size, gaussians.space, gaussians.cutoff)
-
-
-def to_gaussians(packed: EgsContent, like: Gaussians) -> Gaussians:
-    """Return the Gaussians of a content, on the backend of another set; maps stay weighted."""
-    return Gaussians.from_data(packed._replace(maps=()).set_data(), types_of(like.mean).backend)
-
-
-def _rendered(like: Gaussians, arrays: dict[str, Array]) -> NDArray[np.float32]:
-    """Render Gaussians without background, in the space and size of a set."""
-    data = SetData(arrays, (like.width, like.height), "data", like.cutoff)
-    found = Gaussians.from_data(data, types_of(like.mean).backend)
-    return np.asarray(render(found).numpy(), np.float32)
-
-
-def _slow_schedule() -> Schedule:
-    schedule = PRESETS["default"].schedule
-    rates = {name: RATE * rate for name, rate in schedule.rates.items()}
-    return replace(schedule, rates=rates, redistribute_after=0)
 
 
 def _along_curve(gaussians: Gaussians) -> NDArray[np.intp]:

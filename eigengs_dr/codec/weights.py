@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..storage.npz import BadValue
+from .exact_math import in_order
 from .range_coder import TAILS
 
 Array = NDArray[np.float64]
@@ -88,9 +89,9 @@ def fit_weights(
         known = np.append(values / spread, np.zeros(len(ridge)))
         solved = np.linalg.lstsq(np.vstack([scaled, ridge]), known, rcond=None)[0]
         found[some] = stored_center(solved)
-        error = values - weighted(found, list(center.T))
+        error = values - in_order(found[:, None] * center.T)
         parts[some] = _fit_width(width[:, some], np.abs(error) + 0.1 * step, spread)
-        spread = np.maximum(weighted(parts, list(width.T)), MIN_WIDTH * step)
+        spread = np.maximum(in_order(parts[:, None] * width.T), MIN_WIDTH * step)
     trials = [(w, tails) for tails in TAILS for w in WIDTHS]
     best = min(trials, key=lambda trial: _bits(error / step, trial[0] * spread / step, trial[1]))
     return Weights(found, stored_width(parts * best[0]), best[1])
@@ -108,14 +109,6 @@ def _bits(error: Array, width: Array, tails: int) -> float:
     t = error / width
     density = np.log2(width) + 0.5 * (tails + 1) * np.log2(1 + t * t / tails)
     return float(density.sum()) + len(t) * {2: 1.5, 4: 1.415, 8: 1.369}[tails]
-
-
-def weighted(weights: Array, features: list[Array]) -> Array:
-    """Return the weighted sum of features, one after another: the same bits everywhere."""
-    total = np.zeros(len(features[0]))
-    for weight, values in zip(weights, features, strict=True):
-        total = total + weight * values
-    return total
 
 
 def stored_center(weights: Array) -> Array:

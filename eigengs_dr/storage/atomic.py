@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 TEMPORARY = re.compile(r"\.[0-9a-f]{16}")
 """Names of temporary files, without their suffix."""
@@ -50,8 +50,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     >>> with atomic_write("/tmp/note.txt") as temporary:
     ...     _ = temporary.write_text("whole")
     """
-    target = _target(path)
-    temporary = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
+    target, temporary = _target(path)
     try:
         # tempfile would make a file that only its owner may read.
         temporary.touch(exist_ok=False)
@@ -60,9 +59,10 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.fsync(file.fileno())
         os.replace(temporary, target)
     except BaseException as error:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink()
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):
-            # The error of a full disk has no name, or the name of the temporary file.
+            # The error has no name, as that of a full disk, or the name of the temporary file.
             raise OSError(error.errno, error.strerror or str(error), str(path)) from error
         raise
 
@@ -97,8 +97,7 @@ def require_writable(path: str | os.PathLike[str]) -> None:
     OSError
         If the file cannot be written: one line that names the file and the reason.
     """
-    target = _target(path)
-    probe = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
+    target, probe = _target(path)
     try:
         # Mode bits do not show read-only disks, quotas and access lists.
         probe.touch(exist_ok=False)
@@ -118,14 +117,17 @@ def refuse_url(path: str | os.PathLike[str]) -> None:
         raise OSError(f"{path}: results cannot be written to URLs; write to a folder, and copy it")
 
 
-def _target(path: str | os.PathLike[str]) -> Path:
-    """Follow links, and refuse a target that must not be replaced, such as /dev/null."""
+def _target(path: str | os.PathLike[str]) -> tuple[Path, Path]:
+    """Follow links to a target, and name a temporary file beside it.
+
+    A target that must not be replaced, such as /dev/null, is refused.
+    """
     refuse_url(path)
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
         kind = "a folder" if target.is_dir() else "a device"
         raise OSError(f"{path}: is {kind}; choose another path")
-    return target
+    return target, target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
 
 
 try:
@@ -161,51 +163,39 @@ def lock_folder(folder: Path) -> Iterator[None]:
         yield
         return
     path = folder / ".lock"
-    file = _locked(path, folder)
-    try:
-        yield
-    finally:
-        # The file goes before the lock: a run that opens it later makes a new one.
-        path.unlink(missing_ok=True)
-        os.close(file)
-
-
-def _locked(path: Path, folder: Path) -> int:
-    """Return the descriptor of the lock file; it holds the lock."""
-    while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    with _locked(path) as file:
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {platform.node()}")
+        file.flush()
         try:
-            _take(file)
-            # The run before may have deleted the file between the two calls.
-            if _is_same(path, file):
-                os.truncate(file, 0)
-                os.write(file, f"process {os.getpid()} on {platform.node()}".encode())
-                return file
-        except BlockingIOError:
-            holder = os.read(file, 200).decode(errors="replace") or "another process"
-            os.close(file)
-            raise OSError(
-                f"{folder}: {holder} writes into this folder; wait for its end, or use another "
-                "folder"
-            ) from None
-        os.close(file)
+            yield
+        finally:
+            path.unlink(missing_ok=True)  # before the lock goes: a later run makes a new file
 
 
-def _take(file: int) -> None:
-    """Lock a file, or raise BlockingIOError."""
+def _locked(path: Path) -> TextIO:
+    """Open the lock file and lock it."""
+    file = path.open("a+", errors="replace")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        with file:
+            file.seek(0)
+            holder = file.read(200) or "another process"
+        raise OSError(
+            f"{path.parent}: {holder} writes into this folder; wait for its end, or use another "
+            "folder"
+        ) from None
     except OSError as error:
         if error.errno not in NO_LOCKS:
+            file.close()
             raise
-
-
-def _is_same(path: Path, file: int) -> bool:
-    """Whether a path still names an open file."""
-    try:
-        return os.path.samestat(os.stat(path), os.fstat(file))
-    except FileNotFoundError:
-        return False
+    # The run before may have deleted the file between the two calls.
+    with suppress(FileNotFoundError):
+        if os.path.samestat(path.stat(), os.fstat(file.fileno())):
+            return file
+    file.close()
+    return _locked(path)
 
 
 class Reader(NamedTuple):

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 import os
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
@@ -18,6 +17,9 @@ from .atomic import atomic_write
 
 MAX_ENTRIES = 1 << 26
 """Largest number of elements of one array; a file that claims more is refused."""
+
+
+Arrays = dict[str, NDArray[Any]]
 
 
 class BadValue(ValueError):
@@ -46,7 +48,7 @@ def write(
     path: str | os.PathLike[str],
     name: str,
     version: int,
-    arrays: dict[str, NDArray[Any]],
+    arrays: Mapping[str, NDArray[np.generic]],
     compressed: bool = True,
 ) -> None:
     """Write arrays with the name and the version of their format, in one step.
@@ -71,9 +73,7 @@ def write(
         (np.savez_compressed if compressed else np.savez)(file, **members)
 
 
-def read(
-    path: str | os.PathLike[str], name: str, version: int, layout: dict[str, Field]
-) -> dict[str, NDArray[Any]]:
+def read(path: str | os.PathLike[str], name: str, version: int, layout: dict[str, Field]) -> Arrays:
     """Read the arrays of `layout` from a file that `write` wrote; the file may be hostile.
 
     Parameters
@@ -99,16 +99,8 @@ def read(
     OSError
         If the file cannot be opened.
     """
-    with _opened(Path(path), name) as archive:
-        found = str(_member(archive, "format", Field("U", 0)))
-        if found != name:
-            raise BadValue(f"format is {found[:40]!r}, expected {name!r}")
-        newest = int(_member(archive, "version", Field("i8", 0)))
-        if not 1 <= newest <= version:
-            raise BadValue(
-                f"version is {newest}, this package reads up to {version}; upgrade eigengs-dr"
-            )
-        return {key: _member(archive, key, field) for key, field in layout.items()}
+    with _opened(path, name, version) as archive:
+        return {key: _read_array(archive, key, field) for key, field in layout.items()}
 
 
 def read_version(path: str | os.PathLike[str], name: str, version: int) -> int:
@@ -118,8 +110,8 @@ def read_version(path: str | os.PathLike[str], name: str, version: int) -> int:
 
 def format_of(path: str | os.PathLike[str]) -> str:
     """Return the name of the format of a file that `write` wrote; errors as for `read`."""
-    with _opened(Path(path), "eigengs_dr") as archive:
-        return str(_member(archive, "format", Field("U", 0)))
+    with _opened(path) as archive:
+        return str(_read_array(archive, "format", Field("U", 0)))
 
 
 def read_shapes(
@@ -129,18 +121,13 @@ def read_shapes(
 
     For parameters and errors see `read`. A damaged array is not noticed.
     """
-    read_version(path, name, version)
-    with _opened(Path(path), name) as archive:
-        shapes = {}
-        for key, field in layout.items():
-            with _member_file(archive, key) as (file, entry):
-                shapes[key] = _checked_header(file, entry, key, field)[0]
-        return shapes
+    with _opened(path, name, version) as archive:
+        return {key: _checked_shape(archive, key, field) for key, field in layout.items()}
 
 
 def sizes_of(path: str | os.PathLike[str]) -> dict[str, int]:
     """Return the bytes that each array takes in a file, by its name; errors as for `read`."""
-    with _opened(Path(path), "eigengs_dr") as archive:
+    with _opened(path) as archive:
         return {e.filename.removesuffix(".npy"): e.compress_size for e in archive.infolist()}
 
 
@@ -151,11 +138,15 @@ UNPACKED, SHRINKS = 1 << 26, 16
 
 
 @contextmanager
-def _opened(path: Path, name: str) -> Iterator[zipfile.ZipFile]:
-    """Open a file, and turn every error inside the block into one line."""
-    with path.open("rb") as file:
+def _opened(
+    path: str | os.PathLike[str], name: str = "eigengs_dr", version: int | None = None
+) -> Iterator[zipfile.ZipFile]:
+    """Open a file, of a format up to a version; turn every error in the block into one line."""
+    with open(path, "rb") as file:
         try:
             with zipfile.ZipFile(file) as archive:
+                if version is not None:
+                    _check_format(archive, name, version)
                 yield archive
         except BadValue as error:
             raise ValueError(f"{path}: {error}") from None
@@ -170,24 +161,38 @@ def _opened(path: Path, name: str) -> Iterator[zipfile.ZipFile]:
             ) from None
 
 
-@contextmanager
-def _member_file(archive: zipfile.ZipFile, key: str) -> Iterator[tuple[IO[bytes], zipfile.ZipInfo]]:
-    """Open one array of an archive."""
+def _check_format(archive: zipfile.ZipFile, name: str, version: int) -> None:
+    """Raise `BadValue` for another format or a newer version."""
+    found = str(_read_array(archive, "format", Field("U", 0)))
+    if found != name:
+        raise BadValue(f"format is {found[:40]!r}, expected {name!r}")
+    number = int(_read_array(archive, "version", Field("i8", 0)))
+    if not 1 <= number <= version:
+        raise BadValue(
+            f"version is {number}, this package reads up to {version}; upgrade eigengs-dr"
+        )
+
+
+def _read_array(archive: zipfile.ZipFile, key: str, field: Field) -> NDArray[Any]:
+    """Check the header of one array, then read the array."""
+    _checked_shape(archive, key, field)
+    with archive.open(f"{key}.npy") as file:
+        try:
+            return np.asarray(npy.read_array(file, allow_pickle=False))
+        except ValueError:
+            raise BadValue(f"key '{key}' is cut off") from None
+
+
+def _checked_shape(archive: zipfile.ZipFile, key: str, field: Field) -> tuple[int, ...]:
+    """Return the shape of one array; check it and the type by the header."""
     try:
         entry = archive.getinfo(f"{key}.npy")
     except KeyError:
         raise BadValue(f"key '{key}' is missing") from None
     with archive.open(entry) as file:
-        yield file, entry
-
-
-def _checked_header(
-    file: IO[bytes], entry: zipfile.ZipInfo, key: str, field: Field
-) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Read and check the header of one array: shape, order and dtype."""
-    major = npy.read_magic(file)
-    read_header = npy.read_array_header_1_0 if major == (1, 0) else npy.read_array_header_2_0
-    shape, fortran, dtype = read_header(file)
+        major = npy.read_magic(file)
+        read_header = npy.read_array_header_1_0 if major == (1, 0) else npy.read_array_header_2_0
+        shape, _, dtype = read_header(file)
     expected = np.dtype(field.kind)
     fits = dtype.kind == "U" if expected.kind == "U" else dtype == expected
     if not fits or len(shape) != field.ndim:
@@ -198,24 +203,12 @@ def _checked_header(
         )
     if min(shape, default=0) < 0:
         raise BadValue(f"key '{key}' has the negative shape {shape}")
-    count = math.prod(shape)
     if dtype.kind == "U" and dtype.itemsize > 4 * 64:
         raise BadValue(f"key '{key}' is a text of over 64 characters")
-    if count > field.most or count * dtype.itemsize > entry.file_size:
-        raise BadValue(f"key '{key}' claims shape {shape}, more than the file holds")
+    count = math.prod(shape)
     claimed, packed = count * dtype.itemsize, entry.compress_size
+    if count > field.most or claimed > entry.file_size:
+        raise BadValue(f"key '{key}' claims shape {shape}, more than the file holds")
     if claimed > max(UNPACKED, packed * SHRINKS):
         raise BadValue(f"key '{key}' claims {claimed:,} bytes, of {packed:,} in the file")
-    return shape, fortran, dtype
-
-
-def _member(archive: zipfile.ZipFile, key: str, field: Field) -> NDArray[Any]:
-    """Check the header of one array, then read the array."""
-    with _member_file(archive, key) as (file, entry):
-        shape, fortran, dtype = _checked_header(file, entry, key, field)
-        count = math.prod(shape)
-        data = file.read(count * dtype.itemsize)
-    if len(data) != count * dtype.itemsize:
-        raise BadValue(f"key '{key}' is cut off")
-    order = "F" if fortran else "C"
-    return np.frombuffer(data, dtype).reshape(shape, order=order)  # type: ignore[call-overload]
+    return shape

@@ -1,19 +1,22 @@
-"""Pictures of sets: outlines of Gaussians, alone or over the picture; photos in a page."""
+"""Pictures of sets and models: outlines of Gaussians, components, and photos in a page."""
 
 from __future__ import annotations
 
 from base64 import b64encode
 from io import BytesIO
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from ..eigenbasis.eigengs import EigenGS
+from ..eigenbasis.pca.basis import Eigenbasis
+from ..eigenbasis.pca.truncation import CHANNELS
 from ..gaussian.covariance import outline
-from ..gaussian.gaussians import Gaussians
-from ..image.color import rendered_as
+from ..gaussian.gaussians import Gaussians, with_colors
+from ..image.color import decode, rendered_as
 from ..image.io import check_data, check_image, to_8bit
-from ..image.resize import resample
+from ..image.resize import join_pictures, resample, text_line
+from ..raster.render import render
 
 OUTLINES = 800
 """Longer side of a picture of ellipses, in pixels."""
@@ -34,7 +37,7 @@ look straight, and Pillow takes no larger coordinates."""
 LOW_COLOR, HIGH_COLOR = (214, 96, 20), (30, 90, 160)
 """Colours of outlines: orange for the Gaussians of low frequencies, blue for all others."""
 
-Picture = NDArray[Any]
+Picture = NDArray[np.floating]
 Color = tuple[int, int, int]
 
 
@@ -82,10 +85,11 @@ def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
     return _outlined(under, subset, [HIGH_COLOR] * len(subset))
 
 
-def displayed(image: Any, space: str) -> Picture:
-    """Return an image as people look at it: sRGB, or data."""
-    data = rendered_as(space) is None
-    return check_data(image, copy=False) if data else check_image(image, copy=False)
+def displayed(image: ArrayLike, space: str, encoding: str | None = None) -> NDArray[np.float32]:
+    """Return an image as people look at it, for sets of a space: sRGB, or data."""
+    if rendered_as(space) is None:
+        return check_data(image, copy=False)
+    return check_image(image, copy=False, encoding=encoding)
 
 
 def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Picture:
@@ -120,19 +124,14 @@ def _outlined(picture: Picture, gaussians: Gaussians, colors: list[Color]) -> Pi
     under = np.broadcast_to(to_8bit(picture), (height, width, 3)).astype(np.uint8)
     image = Image.fromarray(under.repeat(2, axis=0).repeat(2, axis=1))
     draw = ImageDraw.Draw(image)
-    points = _outlines(gaussians.scaled(2 * width, 2 * height))
+    arrays = gaussians.scaled(2 * width, 2 * height).to_arrays()
+    points = outline(arrays["factor"]) + arrays["mean"].astype(np.float64)[:, None]
     for n in reversed(np.flatnonzero(_in_sight(points, image.size))):
         draw.line(points[n].ravel().tolist(), fill=colors[n], width=2)
     return np.asarray(image.resize((width, height), Image.Resampling.BOX), np.float32) / 255
 
 
-def _outlines(gaussians: Gaussians) -> Picture:
-    """Return closed outlines at one standard deviation, shape (N, 25, 2)."""
-    arrays = gaussians.to_arrays()
-    return outline(arrays["factor"]) + arrays["mean"].astype(np.float64)[:, None]
-
-
-def _in_sight(points: Picture, size: tuple[int, int]) -> Picture:
+def _in_sight(points: Picture, size: tuple[int, int]) -> NDArray[np.bool_]:
     """Tell which outlines may cross a picture and are small enough for Pillow."""
     low, high = points.min(axis=1), points.max(axis=1)
     longest = MAX_REACH * max(size)
@@ -146,6 +145,105 @@ def within(longest: int, width: int, height: int) -> tuple[int, int]:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
+FIRST = (1, 2, 3, 5, 10, 20, 50, 100, 200)
+"""Numbers of the components to show of the first channel, counted from 1."""
+
+OTHERS = (1, 2)
+"""Numbers of the components to show of the other channels."""
+
+CELL = 240
+"""Longer side of a component in a sheet, in pixels."""
+
+COLUMNS = 7
+"""Pictures side by side in a sheet."""
+
+
+def component_sheet(model: EigenGS, basis: Eigenbasis | None = None) -> Picture:
+    """Draw the mean image, some components and the outlines of the Gaussians of a model.
+
+    Parameters
+    ----------
+    model : EigenGS
+    basis : Eigenbasis, optional
+        The basis that the model was fitted to. The sheet shows its components above the rendered
+        ones.
+
+    Returns
+    -------
+    ndarray of float, shape (H, W, 3)
+        RGB, not clamped, under 2,000 pixels wide.
+    """
+    sources: list[EigenGS | Eigenbasis] = [model] if basis is None else [basis, model]
+    columns = zip(*(first_components(source) for source in sources), strict=True)
+    cells = [_captioned(column[0][0], *(picture for _, picture in column)) for column in columns]
+    tables = [join_pictures(cells[k : k + COLUMNS], 1) for k in range(0, len(cells), COLUMNS)]
+    outlines = _captioned("standard deviations", ellipses(model.gaussians, model.low))
+    return join_pictures([*tables, outlines], 0)
+
+
+def first_components(source: EigenGS | Eigenbasis) -> list[tuple[str, Picture]]:
+    """Draw the mean image and some components of a basis, or as the Gaussians of a model show them.
+
+    Components are signed, so mid-grey is zero. A component of a colour difference has the two
+    colours of that difference.
+
+    Parameters
+    ----------
+    source : EigenGS or Eigenbasis
+
+    Returns
+    -------
+    list of (str, ndarray of float, shape (H, W, 3))
+        Names and pictures in RGB, not clamped; the longer side has `CELL` pixels.
+    """
+    if isinstance(source, EigenGS):
+        space, counts = source.gaussians.space, source.components
+        mean, picks = render(source.gaussians).numpy(), _picks(counts)
+        planes: Picture = np.zeros(0)
+        if picks:  # there are at most 13, so one program renders all
+            weights = np.stack([source.weights[channel][j] for channel, j in picks], axis=1)
+            rendered = render(with_colors(source.gaussians, weights, "data")).numpy()
+            planes = np.moveaxis(rendered, 2, 0)
+    else:
+        space, counts = source.space, tuple(map(len, source.components))
+        mean, picks = np.stack(decode(space, list(source.mean)), axis=2), _picks(counts)
+        planes = np.array([source.components[channel][j] for channel, j in picks])
+    shown = [("mean", _cell(mean))]
+    for (channel, j), plane in zip(picks, planes, strict=True):
+        # A quantile, because one bright pixel must not make everything else grey.
+        scale = 0.5 / (np.quantile(np.abs(plane), 0.999) or 1)
+        picture = _cell(0.5 + scale * plane[..., None] * _hue(space, channel))
+        shown.append((f"{CHANNELS[space][channel]} {j + 1}", picture))
+    return shown
+
+
+def _picks(components: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Return the channels and indices of the components to show."""
+    return [
+        (channel, number - 1)
+        for channel, count in enumerate(components)
+        for number in (OTHERS if channel else FIRST)
+        if number <= count
+    ]
+
+
+def _hue(space: str, channel: int) -> NDArray[np.float32]:
+    """Return the RGB direction of one channel of a space; its largest entry is 1."""
+    difference = np.subtract(decode(space, list(np.eye(3)[channel])), decode(space, [0.0] * 3))
+    return (difference / np.abs(difference).max()).astype(np.float32)
+
+
+def _cell(picture: Picture) -> Picture:
+    """Resize a picture for a sheet."""
+    width, height = within(CELL, picture.shape[1], picture.shape[0])
+    return resample(picture.astype(np.float32), width, height)
+
+
+def _captioned(text: str, *pictures: Picture) -> Picture:
+    """Stack pictures below a line of text."""
+    return join_pictures([text_line(text, pictures[0].shape[1]), *pictures], 0)
+
+
 MAX_SIDE = 2048
 """Longest side of a photo in a page, in pixels; larger photos are scaled down."""
 
@@ -153,15 +251,8 @@ QUALITY = 92
 """Quality of JPEG."""
 
 
-def check_aspect(pixels: NDArray[Any], size: tuple[int, int]) -> None:
-    """Raise ValueError unless a photo has the aspect ratio of a set, to a pixel.
-
-    Parameters
-    ----------
-    pixels : ndarray, shape (H, W, C)
-    size : (int, int)
-        Native width and height of the set.
-    """
+def check_aspect(pixels: Picture, size: tuple[int, int]) -> None:
+    """Raise ValueError unless a photo has the width and height of a set as its aspect ratio."""
     height, width = pixels.shape[:2]
     if abs(width * size[1] - height * size[0]) > max(*size, width, height):
         raise ValueError(
@@ -170,7 +261,7 @@ def check_aspect(pixels: NDArray[Any], size: tuple[int, int]) -> None:
         )
 
 
-def photo_uri(pixels: NDArray[Any]) -> str:
+def photo_uri(pixels: NDArray[np.float32]) -> str:
     """Return a link that holds a photo, as JPEG, or as PNG if that is smaller.
 
     Parameters
@@ -181,20 +272,11 @@ def photo_uri(pixels: NDArray[Any]) -> str:
     from PIL import Image
 
     height, width = pixels.shape[:2]
-    scale = min(1.0, MAX_SIDE / max(width, height))
-    if scale < 1:
-        pixels = resample(pixels, max(1, round(scale * width)), max(1, round(scale * height)))
-    codes = to_8bit(pixels).astype(np.uint8)
+    small = resample(pixels, *within(min(MAX_SIDE, max(width, height)), width, height))
+    codes = to_8bit(small).astype(np.uint8)
     picture = Image.fromarray(codes[..., 0] if codes.shape[2] == 1 else codes)
-    best = min(
-        (_encoded(picture, "jpeg", quality=QUALITY, subsampling=0), "jpeg"),
-        (_encoded(picture, "png", optimize=True), "png"),
-        key=lambda file: len(file[0]),
-    )
-    return f"data:image/{best[1]};base64,{b64encode(best[0]).decode()}"
-
-
-def _encoded(picture: Any, kind: str, **options: Any) -> bytes:
-    file = BytesIO()
-    picture.save(file, kind, **options)
-    return file.getvalue()
+    jpeg, png = BytesIO(), BytesIO()
+    picture.save(jpeg, "jpeg", quality=QUALITY, subsampling=0)
+    picture.save(png, "png", optimize=True)
+    kind, file = min(("jpeg", jpeg), ("png", png), key=lambda found: found[1].tell())
+    return f"data:image/{kind};base64,{b64encode(file.getvalue()).decode()}"

@@ -6,6 +6,7 @@ A page is one HTML file that needs no other file and no network.
 from __future__ import annotations
 
 import os
+from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -15,34 +16,16 @@ from typing import Any
 
 import jinja2
 import numpy as np
-from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.recording import exclusive
 from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
-from ..gaussian.gaussians import Gaussians, one_image
-from ..image.color import UNBOUNDED, rendered_as
-from ..image.io import check_data, check_image
+from ..gaussian.file import check
+from ..gaussian.gaussians import Gaussians, one_image, set_of
+from ..image.color import UNBOUNDED, YCBCR_TO_RGB, decode, rendered_as
 from ..storage.atomic import atomic_write
-from .facts import channel_views, describe_model, describe_set, describe_share, light_of
-from .pictures import check_aspect, photo_uri
-
-SCRIPTS = (
-    "data.js",
-    "camera.js",
-    "shaders.js",
-    "renderer.js",
-    "model.js",
-    "gestures.js",
-    "viewer.js",
-    "panel.js",
-    "main.js",
-)
-"""The programs of the page, in the order in which they run."""
-
-FRAME_HEIGHT = 560
-"""Height of a page inside a notebook, in pixels."""
+from .pictures import check_aspect, displayed, photo_uri
 
 
 @dataclass(frozen=True, repr=False)
@@ -80,34 +63,20 @@ class Page:
 
     def _repr_html_(self) -> str:
         """Show the page in a frame of its own, so that neither page styles the other."""
-        style = f"width: 100%; height: {FRAME_HEIGHT}px; border: 1px solid #8886"
+        style = "width: 100%; height: 560px; border: 1px solid #8886"
         return f'<iframe srcdoc="{escape(self.html)}" style="{style}"></iframe>'
 
 
-def build_page(**values: Any) -> Page:
-    """Fill the template; for the values see ``web/page.html.j2``. Text is escaped."""
-    loader = _environment().loader
-    assert loader is not None
-    scripts = [Markup(_source(name)) for name in SCRIPTS]
-    template = _environment().get_template("page.html.j2")
-    return Page(template.render(style=Markup(_source("page.css")), scripts=scripts, **values))
-
-
 @cache
-def _environment() -> jinja2.Environment:
-    """Return the environment of the template; an unknown value is an error."""
-    return jinja2.Environment(
+def _template() -> jinja2.Template:
+    """Return the template of a page; an unknown value is an error, and text is escaped."""
+    environment = jinja2.Environment(
         loader=jinja2.PackageLoader("eigengs_dr.viewer", "web"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-
-
-def _source(name: str) -> str:
-    loader = _environment().loader
-    assert loader is not None
-    return loader.get_source(_environment(), name)[0]
+    return environment.get_template("page.html.j2")
 
 
 @exclusive()
@@ -158,48 +127,176 @@ def view(
     >>> "One Gaussian" in page.html
     True
     """
-    if isinstance(source, Fit):
-        if source.mean_image is not None:
-            raise ValueError("the fit has a mean image of pixels, which a page cannot draw")
-        source = source.gaussians
-    if isinstance(source, Gaussians):
-        one_image(source)
-    if not isinstance(source, Gaussians | EigenGS):
+    if not isinstance(source, Gaussians | Fit | EigenGS):
         raise TypeError(
             f"{type(source).__name__} cannot be shown; expected Gaussians, Fit or EigenGS"
         )
-    gaussians = source if isinstance(source, Gaussians) else source.gaussians
-    pixels = None if image is None else _photo(image, gaussians.space, encoding)
-    model = None
-    if isinstance(source, EigenGS):
-        model = describe_model(source, pixels)
-        if pixels is not None:
-            gaussians = gaussians.scaled(pixels.shape[1], pixels.shape[0])
+    whole = source if isinstance(source, EigenGS) else None
+    gaussians = one_image(set_of(source)) if whole is None else whole.gaussians
+    pixels = None if image is None else displayed(image, gaussians.space, encoding)
+    model = None if whole is None else describe_model(whole, pixels)
+    if pixels is not None and whole is not None:
+        gaussians = gaussians.scaled(pixels.shape[1], pixels.shape[0])
     elif pixels is not None:
         check_aspect(pixels, (gaussians.width, gaussians.height))
     views = channel_views(gaussians.channels)
     facts = {
         "set": describe_set(gaussians, levels),
-        "light": light_of(gaussians.space),
+        "light": LIGHTS.get(gaussians.space, 0),
         "channels": views[0][1],
         "photo": None if pixels is None else photo_uri(pixels),
         "model": model,
     }
-    return build_page(
+    html = _template().render(
         title=title,
         summary=f"{len(gaussians):,} Gaussians, {gaussians.width} x {gaussians.height} pixels",
         facts=facts,
-        photo=pixels is not None,
-        model=model is not None,
-        model_note=describe_share(source) if isinstance(source, EigenGS) else "",
-        levels=bool(levels),
-        views=views if len(views) > 1 else [],
+        model_note="" if whole is None else describe_share(whole),
+        views=views,
         bright=gaussians.space in UNBOUNDED,
         color_name="Colour" if rendered_as(gaussians.space) else "Values",
     )
+    return Page(html)
 
 
-def _photo(image: ArrayLike, space: str, encoding: str | None) -> NDArray[np.float32]:
-    """Return a photo as people look at it: sRGB, or data."""
-    data = rendered_as(space) is None
-    return check_data(image) if data else check_image(image, encoding=encoding)
+# --- What a page knows of a set and of a model: arrays in base64, with colours decoded to RGB -----
+
+MAX_GAUSSIANS = 1 << 20
+"""Most Gaussians of a page; those of a photo take 43 bytes each."""
+
+
+def check_count(count: int) -> None:
+    """Raise ValueError if a page cannot show so many Gaussians."""
+    if count > MAX_GAUSSIANS:
+        raise ValueError(
+            f"{count:,} Gaussians are too many for a page; the most is {MAX_GAUSSIANS:,}"
+        )
+
+
+def describe_set(gaussians: Gaussians, levels: Sequence[int] = ()) -> dict[str, Any]:
+    """Return the arrays of a set for a page.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    levels : sequence of int, optional
+        Numbers of first Gaussians that make a whole image each, ascending.
+
+    Raises
+    ------
+    ValueError
+        If the set has too many Gaussians or values that are not valid, or a level is out of range.
+    """
+    check_count(len(gaussians))
+    data = gaussians.data()
+    check(data)
+    marks = [int(n) for n in levels]
+    if marks != sorted(set(marks)) or (marks and not 1 <= marks[0] <= marks[-1] <= len(gaussians)):
+        raise ValueError(f"levels are {marks}; expected ascending numbers up to {len(gaussians)}")
+    color, background = decoded(gaussians)
+    return {
+        "width": gaussians.width,
+        "height": gaussians.height,
+        "cutoff": gaussians.cutoff,
+        "levels": marks,
+        "mean": to_text(data.arrays["mean"]),
+        "factor": to_text(data.arrays["factor"]),
+        "color": to_text(color),
+        "background": background.tolist(),
+    }
+
+
+def decoded(gaussians: Gaussians) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the colours (N, C) and the background (C,) of a set, decoded to RGB."""
+    arrays = gaussians.to_arrays()
+    black = np.zeros_like(arrays["background"])
+    rows = np.vstack([arrays["color"], arrays["background"], black]).astype(np.float64)
+    rgb = np.stack(decode(gaussians.space, list(rows.T)), axis=1)
+    return rgb[:-2] - rgb[-1], rgb[-2]
+
+
+def to_text(array: NDArray[np.floating], kind: str = "<f4") -> str:
+    """Return the bytes of an array in base64."""
+    return b64encode(np.ascontiguousarray(array, kind).tobytes()).decode()
+
+
+LIGHTS = {"linear": 1, "radiance": 1, "log": 2, "normal": 3}
+"""What sums are, by space: 1 linear light, 2 logarithms of light, 3 normals; 0 codes and data."""
+
+
+def channel_views(channels: int) -> list[tuple[str, tuple[int, int, int]]]:
+    """Return names and triples of channels to look at.
+
+    Examples
+    --------
+    >>> channel_views(3), channel_views(2)
+    ([('Colour', (0, 1, 2))], [('1', (0, 0, 0)), ('2', (1, 1, 1))])
+    """
+    if channels == 3:
+        return [("Colour", (0, 1, 2))]
+    single = [(str(c + 1), (c, c, c)) for c in range(channels)]
+    return [*([("1, 2, 3 as red, green, blue", (0, 1, 2))] if channels > 3 else []), *single]
+
+
+MAX_BYTES = 1 << 20
+"""Most bytes of weights in a page, before base64; each takes 2."""
+
+FEWEST = 8
+"""Components of each channel that a page has in any case: those with a slider."""
+
+NAMES = {
+    "ycbcr": ("Brightness (Y)", "Yellow to blue (Cb)", "Green to red (Cr)"),
+    "rgb": ("Red", "Green", "Blue"),
+}
+"""What the channels of a model are called, by its space."""
+
+
+def describe_model(model: EigenGS, image: NDArray[np.float32] | None = None) -> dict[str, Any]:
+    """Return the components of a model for a page.
+
+    Parameters
+    ----------
+    model : EigenGS
+    image : ndarray of float32, shape (H, W, 3), optional
+        A photo in sRGB, to encode and to move along the components.
+    """
+    space, counts = model.gaussians.space, kept_counts(model)
+    deviations = [np.sqrt(v[:n]) for v, n in zip(model.eigenvalues, counts, strict=True)]
+    channels = []
+    for name, weights, deviation in zip(NAMES[space], model.weights, deviations, strict=True):
+        kept = weights[: len(deviation)]
+        scales = np.abs(kept).max(axis=1, initial=0)
+        scales = np.where(scales > 0, scales, 1)
+        channel = {"name": name, "deviations": deviation.tolist(), "scales": scales.tolist()}
+        channels.append(channel | {"weights": to_text(kept / scales[:, None], "<f2")})
+    photo = None
+    if image is not None:
+        color, background = decoded(model.encode(image))
+        scores = [  # coefficients in standard deviations
+            (found[: len(d)] / np.maximum(d, np.finfo(float).tiny ** 0.5)).tolist()
+            for found, d in zip(model.project(image), deviations, strict=True)
+        ]
+        photo = {"color": to_text(color), "background": background.tolist(), "scores": scores}
+    matrix = YCBCR_TO_RGB if space == "ycbcr" else np.eye(3)
+    return {"matrix": matrix.tolist(), "channels": channels, "photo": photo}
+
+
+def kept_counts(model: EigenGS) -> list[int]:
+    """Return how many components of each channel a page has: those with the largest variances."""
+    fitting = MAX_BYTES // (2 * (len(model.gaussians) + 1))
+    variances = [np.inf, *np.sort(np.concatenate(model.eigenvalues))[::-1]]
+    least = variances[min(fitting, len(variances) - 1)]
+    return [max(min(FEWEST, len(v)), int((v >= least).sum())) for v in model.eigenvalues]
+
+
+def describe_share(model: EigenGS) -> str:
+    """Return a sentence on what the page leaves out of a model; empty if it has everything."""
+    counts, whole = kept_counts(model), sum(model.components)
+    if sum(counts) == whole:
+        return ""
+    kept = sum(v[:n].sum() for v, n in zip(model.eigenvalues, counts, strict=True))
+    total = sum(v.sum() for v in model.eigenvalues)
+    return (
+        f"A random image uses the first {sum(counts)} of {whole} components, "
+        f"with {kept / total:.0%} of their variance."
+    )

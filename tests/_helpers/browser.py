@@ -24,14 +24,16 @@ FLAGS = [
     "--disable-sync",
 ]
 
-DESKTOP = {"viewport": {"width": 700, "height": 420}, "color_scheme": "light"}
-
-PHONE = {
-    "viewport": {"width": 360, "height": 640},
-    "device_scale_factor": 2,
-    "is_mobile": True,
-    "has_touch": True,
-    "color_scheme": "dark",
+DEVICES = {
+    "desktop": {"viewport": {"width": 700, "height": 420}, "color_scheme": "light"},
+    "large": {"viewport": {"width": 1280, "height": 800}},
+    "phone": {
+        "viewport": {"width": 360, "height": 640},
+        "device_scale_factor": 2,
+        "is_mobile": True,
+        "has_touch": True,
+        "color_scheme": "dark",
+    },
 }
 
 

@@ -9,7 +9,7 @@ from _helpers.families import small_model
 from _helpers.materials import material
 from _helpers.sets import random_scene
 from eigengs_dr.codec import egs
-from eigengs_dr.viewer import facts
+from eigengs_dr.viewer import view as page
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_sections_of_a_packed_file_are_levels(photo, tmp_path):
 
 def test_refuses_too_many_gaussians_before_it_decodes_them(photo, tmp_path, monkeypatch):
     said("pack", photo, "-o", "photo.egs", "--levels", 2)
-    monkeypatch.setattr(facts, "MAX_GAUSSIANS", 63)
+    monkeypatch.setattr(page, "MAX_GAUSSIANS", 63)
     monkeypatch.setattr(egs, "decode_body", None)
     for name in ("photo.egs", "photo.npz"):
         assert_refused(run("view", name), name, "64 Gaussians are too many for a page")

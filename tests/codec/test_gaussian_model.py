@@ -1,53 +1,21 @@
-"""The probabilities: passes, neighbours and directions."""
+"""The probabilities: directions and weights."""
 
 import numpy as np
 import pytest
 
-from eigengs_dr.codec.gaussian_model import SECTORS, Directions, crowding, passes_of
+from eigengs_dr.codec.gaussian_model import SECTORS, Directions, passes_of
 from eigengs_dr.codec.range_coder import Decoder, Encoder
-
-
-@pytest.mark.parametrize("count", [1, 2, 9, 16, 17, 100])
-def test_passes_hold_all_gaussians_and_know_earlier_ones(count):
-    cells, known = np.random.default_rng(0).integers(0, 99, (count, 2)), set()
-    for part in passes_of(cells):
-        for others, weight in zip(part.known, part.weight, strict=True):
-            assert known.issuperset(others[weight > 0])
-        if part.weight:
-            np.testing.assert_allclose(sum(part.weight), 1)
-        assert known.isdisjoint(part.rows)
-        known.update(part.rows.tolist())
-    assert known == set(range(count))
-
-
-def test_near_neighbors_weigh_more():
-    cells = np.stack([np.arange(4) ** 3, np.zeros(4, int)], axis=1)
-    part = passes_of(cells)[-1]
-    values = np.array([10.0, 0, 20.0, 0])
-    assert part.rows.tolist() == [1, 3]
-    assert part.mean(values)[0] == pytest.approx((10 / 2 + 20 / 50) / (1 / 2 + 1 / 50))
-
-
-def test_crowding_counts_gaussians_in_windows():
-    cells = np.array([[0, 0], [1, 1], [0, 1], [90, 90]])
-    small, large, near = crowding(cells)
-    np.testing.assert_allclose(small, np.log2([3, 3, 3, 1]))
-    np.testing.assert_allclose(large, np.log2([3, 3, 3, 1]))
-    np.testing.assert_allclose(near, np.log2([3, 2, 2, 90**2 + 89**2 + 1]))
-
-
-def test_windows_of_far_gaussians_take_little_memory():
-    assert len(crowding(np.array([[0, 0], [1 << 23, 1 << 23]]))) == 3
+from eigengs_dr.codec.weights import fit_weights
 
 
 def coded(turn, turns, length):
-    """Return the bits of each direction, and whether they come back."""
+    """Return the bits of each direction, which come back."""
     passes = passes_of(np.arange(2 * len(turn)).reshape(-1, 2))
     encoder = Encoder()
-    sharpness = Directions(encoder, passes, length, turns).fit(turn)
-    Directions(encoder, passes, length, turns).code(sharpness, turn)
+    sharpness = Directions(passes, length, turns).fit(turn)
+    Directions(passes, length, turns).code(encoder, sharpness, turn)
     decoder = Decoder(encoder.to_bytes())
-    found = Directions(decoder, passes, length, turns).code(sharpness)
+    found = Directions(passes, length, turns).code(decoder, sharpness, np.zeros_like(turn))
     np.testing.assert_array_equal(found, turn)
     return 8 * len(encoder.to_bytes()) / len(turn)
 
@@ -65,3 +33,17 @@ def test_directions_along_an_edge_take_fewer_bits():
     edge = np.rint(20 + 2 * generator.normal(size=3000)).astype(np.int64) % 64
     assert coded(generator.integers(0, 64, 3000), turns, length) < 6.1
     assert coded(edge, turns, length) < 4.5
+
+
+def test_the_fit_finds_what_numbers_follow():
+    generator = np.random.default_rng(0)
+    center = generator.normal(size=(4000, 2))
+    width = np.stack([np.ones(4000), generator.uniform(0, 9, 4000)], axis=1)
+    noise = generator.standard_t(8, 4000) * (0.5 + width[:, 1])
+    step = np.full(4000, 0.1)
+    values = np.rint((30 * center[:, 0] + noise) / step) * step
+    found = fit_weights(center, width, values, step)
+    np.testing.assert_allclose(found.center, [30, 0], atol=0.3)
+    assert found.width[1] == pytest.approx(1, rel=0.3)
+    plain = fit_weights(center, width, values, step, rich=False)
+    assert plain.center[1] == plain.width[1] == 0

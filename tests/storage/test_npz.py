@@ -1,34 +1,69 @@
 """Files of arrays, with a format and a version."""
 
-import errno
-
 import numpy as np
 import pytest
 
-from eigengs_dr.storage import npz as archive
-from eigengs_dr.storage.atomic import atomic_write
+from eigengs_dr.storage import npz
+from eigengs_dr.storage.npz import Field
+
+ARRAYS = {
+    "a": np.arange(24, dtype="f4").reshape(2, 3, 4),
+    "b": np.array(-5),
+    "c": np.array("été"),
+    "d": np.asfortranarray(np.arange(6).reshape(2, 3)),
+}
+LAYOUT = {"a": Field("f4", 3), "b": Field("i8", 0), "c": Field("U", 0), "d": Field("i8", 2)}
 
 
-def test_archive_reads_what_it_wrote(tmp_path):
-    layout = {"a": archive.Field("f4", 3), "b": archive.Field("i8", 0), "c": archive.Field("U", 0)}
-    arrays = {
-        "a": np.arange(24, dtype="f4").reshape(2, 3, 4),
-        "b": np.array(-5),
-        "c": np.array("été"),
-    }
-    archive.write(tmp_path / "x", "some.format", 3, arrays)
-    for version in (3, 4):
-        found = archive.read(tmp_path / "x", "some.format", version, layout)
-        for key, value in arrays.items():
+@pytest.fixture
+def path(tmp_path):
+    npz.write(tmp_path / "x", "some.format", 3, ARRAYS)
+    return tmp_path / "x"
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_arrays_come_back(path, compressed):
+    npz.write(path, "some.format", 3, ARRAYS, compressed)
+    for newest in (3, 4):
+        found = npz.read(path, "some.format", newest, LAYOUT)
+        for key, value in ARRAYS.items():
             np.testing.assert_array_equal(found[key], value)
-    with pytest.raises(ValueError, match="version is 3, this package reads up to 2"):
-        archive.read(tmp_path / "x", "some.format", 2, layout)
+    assert (npz.format_of(path), npz.read_version(path, "some.format", 9)) == ("some.format", 3)
+    assert npz.sizes_of(path).keys() == {"format", "version", *ARRAYS}
 
 
-def test_a_full_disk_names_the_file(tmp_path):
-    """The system reports it without a name."""
-    target = tmp_path / "x.npz"
-    with pytest.raises(OSError, match="No space left") as error, atomic_write(target):
-        raise OSError(errno.ENOSPC, "No space left on device")
-    assert error.value.filename == str(target)
-    assert list(tmp_path.iterdir()) == []
+@pytest.mark.parametrize(
+    ("name", "version", "layout", "message"),
+    [
+        ("other", 3, {}, "format is 'some.format', expected 'other'"),
+        ("some.format", 2, {}, "version is 3, this package reads up to 2; upgrade"),
+        ("some.format", 3, {"z": Field("f4", 1)}, "key 'z' is missing"),
+        ("some.format", 3, {"a": Field("f8", 3)}, "key 'a' is 3-dimensional float32, expected 3-d"),
+        ("some.format", 3, {"a": Field("f4", 2)}, "expected 2-dimensional float32"),
+        ("some.format", 3, {"b": Field("U", 0)}, "expected 0-dimensional text"),
+        ("some.format", 3, {"a": Field("f4", 3, 23)}, r"key 'a' claims shape \(2, 3, 4\), more"),
+    ],
+)
+def test_what_does_not_fit_is_refused(path, name, version, layout, message):
+    for read in (npz.read, npz.read_shapes):
+        with pytest.raises(ValueError, match=f"x: .*{message}"):
+            read(path, name, version, layout)
+
+
+def test_shapes_need_no_arrays(path):
+    assert npz.read_shapes(path, "some.format", 3, LAYOUT) == {
+        key: array.shape for key, array in ARRAYS.items()
+    }
+    content = bytearray(path.read_bytes())
+    place = content.find(b"a.npy") + 100  # behind the header of the first array
+    content[place : place + 8] = bytes(8)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"x: .*(not a readable|cut off)"):
+        npz.read(path, "some.format", 3, LAYOUT)
+
+
+@pytest.mark.parametrize("damage", [lambda data: b"", lambda data: data[:-9], lambda data: b"text"])
+def test_what_is_no_archive_is_refused(path, damage):
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(ValueError, match=r"x: not a readable some.format file \(.*\); it may be"):
+        npz.read(path, "some.format", 3, LAYOUT)

@@ -1,26 +1,24 @@
 """One browser for all tests of pages, and one window a device: new ones take half a second."""
 
+from functools import cache
+
 import pytest
 
-from _helpers.browser import DESKTOP, Tab, chromium
+from _helpers.browser import DEVICES, Tab, chromium
 
 
 @pytest.fixture(scope="package")
 def window():
     """Return the window of a device."""
-    windows = {}
     with chromium() as browser:
 
-        def window(device):
-            key = repr(device)
-            if key not in windows:
-                windows[key] = browser.new_page(**device)
-                windows[key].set_default_timeout(
-                    200_000
-                )  # milliseconds; others may use the machine
-            return windows[key]
+        @cache
+        def open_window(device):
+            found = browser.new_page(**DEVICES[device])
+            found.set_default_timeout(200_000)  # milliseconds; others may use the machine
+            return found
 
-        yield window
+        yield open_window
 
 
 @pytest.fixture
@@ -28,7 +26,7 @@ def show(window, tmp_path):
     """Show a page in the browser; at the end, check that nothing went wrong in it."""
     tabs = []
 
-    def show(page, device=DESKTOP):
+    def show(page, device="desktop"):
         path = tmp_path / f"{len(tabs)}.html"
         page.save(path)
         tabs.append(Tab(window(device), path))

@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.browser import PHONE
 from _helpers.families import family, small_model
 from _helpers.shown import COUNT, SIZE, codes, differ, make_set
 from eigengs_dr.viewer.view import Page
 
 
 @pytest.mark.parametrize(
-    "space, channels",
-    [("ycbcr", 3), ("linear", 3), ("log", 3), ("data", 1)],
+    "space, channels", [("ycbcr", 3), ("linear", 3), ("log", 3), ("normal", 3), ("data", 1)]
 )
 def test_draws_as_the_renderer(actual, space, channels):
     gaussians = make_set(space, channels, cutoff=4.0)
@@ -31,12 +29,6 @@ def test_shows_each_channel_of_data(actual):
     assert differ(tab.image(), whole[..., [4, 4, 4]]) < 0.05
 
 
-def test_normals_have_length_1(actual):
-    gaussians = make_set("normal")
-    tab = actual(eg.view(gaussians))
-    assert differ(tab.image(), codes(gaussians)) < 0.05
-
-
 def test_light_is_exposed(actual):
     gaussians = make_set("radiance")
     tab = actual(eg.view(gaussians))
@@ -48,16 +40,13 @@ def test_light_is_exposed(actual):
     assert differ(tab.image(), codes(darker)) < 0.05
 
 
-def test_levels_are_the_first_gaussians(actual):
+def test_the_first_gaussians_are_levels_or_the_largest(actual):
     gaussians = make_set()
     tab = actual(eg.view(gaussians, levels=[20, 100, COUNT]))
     tab.page.click("#levels button:nth-child(2)")
     assert tab.page.text_content("#count-text") == "100 of 300"
     assert differ(tab.image(), codes(gaussians[:100])) < 0.05
 
-
-def test_without_levels_the_largest_come_first(actual):
-    gaussians = make_set()
     factor = gaussians.to_arrays()["factor"]
     order = np.argsort(factor[:, 0] * factor[:, 2], kind="stable")
     tab = actual(eg.view(gaussians))
@@ -76,7 +65,7 @@ def test_text_is_escaped(show):
 
 
 def test_everything_is_in_reach_on_a_phone(show):
-    tab = show(eg.view(small_model("llvm"), family(count=1)[0]), PHONE)
+    tab = show(eg.view(small_model("llvm"), family(count=1)[0]), "phone")
     assert tab.run("document.documentElement.scrollWidth <= innerWidth")
     for name in ("#count", "#outlines", "#compare", "#random-image", "summary"):
         tab.page.locator(name).scroll_into_view_if_needed()
@@ -90,7 +79,7 @@ def test_shows_20_000_gaussians_of_a_photo(show):
     page = eg.view(gaussians, photo)
     size = len(page.html.encode())
     assert size < 1_500_000
-    tab = show(page, {"viewport": {"width": 1280, "height": 800}})
+    tab = show(page, "large")
     seconds = tab.run("viewer.ready") / 1000
     tab.page.click("#actual-size")
     difference = differ(tab.image(), codes(gaussians))

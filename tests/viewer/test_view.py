@@ -10,12 +10,11 @@ import eigengs_dr as eg
 from _helpers.families import small_basis, small_model
 from _helpers.sets import random_scene
 from eigengs_dr.fitting.fit import Fit
-from eigengs_dr.viewer import facts
-from eigengs_dr.viewer.facts import describe_share, kept_counts
+from eigengs_dr.viewer.view import MAX_GAUSSIANS, describe_share, kept_counts
 
 
-def make_set(count=20, size=(32, 24)):
-    return random_scene(0, count, size).on("llvm", space="rgb")
+def make_set():
+    return random_scene(0, 20, (32, 24)).on("llvm", space="rgb")
 
 
 def facts_of(page):
@@ -29,24 +28,17 @@ def test_a_fit_is_its_gaussians():
     assert facts_of(eg.view(fit, image))["set"] == facts_of(eg.view(fit.gaussians))["set"]
 
 
-def test_a_page_needs_no_other_file():
-    page = eg.view(make_set(), np.zeros((24, 32, 3), np.float32))
+def test_a_page_is_one_file(tmp_path):
+    page = eg.view(make_set(), np.zeros((24, 32, 3), np.float32), title='a "title"')
     links = re.findall(r"(?:src|href|url)\s*[=(]\s*[\"']?(?!data:)\S+", page.html)
     assert [link for link in links if "http" in link] == []
     assert "default-src 'none'" in page.html
-
-
-def test_saves_the_whole_page(tmp_path):
-    page = eg.view(make_set())
     page.save(tmp_path / "a.html")
     assert (tmp_path / "a.html").read_text(encoding="utf-8") == page.html
     with pytest.raises(ValueError, match="must end in"):
         page.save(tmp_path / "a.png")
     assert [path.name for path in tmp_path.iterdir()] == ["a.html"]
-
-
-def test_a_notebook_shows_it_in_a_frame():
-    shown = eg.view(make_set(), title='a "title"')._repr_html_()
+    shown = page._repr_html_()
     assert shown.startswith('<iframe srcdoc="&lt;!DOCTYPE html&gt;')
     assert shown.count('"') == 4  # of two attributes
 
@@ -77,32 +69,30 @@ def test_refuses_other_things():
     fit = Fit(make_set(), [], np.zeros((24, 32, 3)), 0, 0, 0, "", np.zeros((24, 32, 3)))
     with pytest.raises(ValueError, match="mean image of pixels"):
         eg.view(fit)
-
-
-def test_refuses_values_that_are_not_finite():
     gaussians = make_set()
     gaussians.mean.x = gaussians.mean.x / 0
     with pytest.raises(ValueError, match="mean holds values that are not finite"):
         eg.view(gaussians)
 
 
-def test_refuses_too_many(monkeypatch):
-    monkeypatch.setattr(facts, "MAX_GAUSSIANS", 10)
-    with pytest.raises(ValueError, match="20 Gaussians are too many for a page; the most is 10"):
-        eg.view(make_set())
+def test_a_set_of_too_many_has_no_page_and_no_picture():
+    arrays = [np.ones((MAX_GAUSSIANS + 1, columns)) for columns in (2, 3, 1)]
+    gaussians = eg.Gaussians.from_arrays(*arrays, size=(8, 8), space="data")
+    with pytest.raises(ValueError, match=r"1,048,577 Gaussians are too many .* 1,048,576"):
+        eg.view(gaussians)
+    html = gaussians._repr_html_()
+    assert "Gaussians(1048577" in html and "<img" not in html
 
 
-def test_a_page_has_the_components_of_largest_variance(monkeypatch):
-    model = small_model("llvm")
-    assert kept_counts(model) == [12, 6, 6]
-    assert describe_share(model) == ""
-    monkeypatch.setattr("eigengs_dr.viewer.facts.FEWEST", 1)
-    monkeypatch.setattr("eigengs_dr.viewer.facts.MAX_BYTES", 2 * 101 * 10 + 5)
+def test_a_page_has_the_components_of_largest_variance():
+    assert kept_counts(small_model("llvm")) == [12, 6, 6]
+    assert describe_share(small_model("llvm")) == ""
+    model = eg.EigenGS.load("natural")
     counts = kept_counts(model)
-    assert sum(counts) == 10
+    assert counts == [93, 8, 8]  # all sliders, and what fits
     kept = np.concatenate([v[:n] for v, n in zip(model.eigenvalues, counts, strict=True)])
     left = np.concatenate([v[n:] for v, n in zip(model.eigenvalues, counts, strict=True)])
-    assert kept.min() >= left.max()
+    assert model.eigenvalues[0][92] >= left.max()
     share = kept.sum() / (kept.sum() + left.sum())
-    assert f"first 10 of 24 components, with {share:.0%}" in describe_share(model)
+    assert f"first 109 of 350 components, with {share:.0%}" in describe_share(model)
     assert [len(c["deviations"]) for c in facts_of(eg.view(model))["model"]["channels"]] == counts

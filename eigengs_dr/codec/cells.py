@@ -1,0 +1,104 @@
+"""The cells of Gaussians without their order, which saves ``log2(N!)`` bits for N of them.
+
+A square is halved until its parts are single cells, once across and once along in turn. The number
+of Gaussians in a half, of n in both, follows a beta-binomial distribution: Gaussians of a fit keep
+their distance, so halves have more equal numbers than by chance. The counts of large parts also
+tell where Gaussians are dense.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from constriction import stream
+from numpy.typing import NDArray
+
+from .range_coder import Coder, categorical
+
+IntArray = NDArray[np.int64]
+
+EVENNESS = (1, 2, 4, 8, 16, 64)
+"""Parameters of the distribution that a file may name: 1 for any number, 64 nearly for halves."""
+
+MAX_MODELLED = 15
+"""Largest number of Gaussians whose halves have that distribution; larger ones are rare."""
+
+
+def code_cells(coder: Coder, cells: IntArray, levels: int, evenness: int) -> IntArray:
+    """Code the cells of Gaussians in any order; return them in the order of `morton_encode`.
+
+    Parameters
+    ----------
+    coder : Encoder or Decoder
+    cells : ndarray of int64, shape (N, 2)
+        Column and row of each cell; a decoder takes their number only.
+    levels : int
+        The square has ``2^levels`` cells a side.
+    evenness : int
+        One of `EVENNESS`.
+
+    Returns
+    -------
+    ndarray of int64, shape (N, 2)
+    """
+    codes = np.sort(morton_encode(cells, levels))
+    prefix, number = np.zeros(1, np.int64), np.array([len(cells)])
+    for rest in reversed(range(2 * levels)):
+        upper = np.cumsum(number) - np.searchsorted(codes, (2 * prefix + 1) << rest)
+        upper = _code_halves(coder, number, evenness, upper)
+        prefix = np.stack([2 * prefix, 2 * prefix + 1], axis=1).ravel()
+        number = np.stack([number - upper, upper], axis=1).ravel()
+        prefix, number = prefix[number > 0], number[number > 0]
+    return morton_decode(np.repeat(prefix, number), levels)
+
+
+def _code_halves(coder: Coder, number: IntArray, evenness: int, upper: IntArray) -> IntArray:
+    """Code how many of each `number` of Gaussians lie in the second half."""
+    result = np.zeros_like(number)
+    kind = np.where(number > MAX_MODELLED, 1, number)
+    for n in range(1, MAX_MODELLED + 1):
+        rows = np.flatnonzero(kind == n)
+        if n == 1 and len(rows):
+            result[rows] = _any_number(coder, number[rows], upper[rows])
+        elif len(rows):
+            result[rows] = coder.code(_beta_binomial(n, evenness), upper[rows])
+    return result
+
+
+def _any_number(coder: Coder, number: IntArray, upper: IntArray) -> IntArray:
+    """Code integers from 0 to `number`, which may be large."""
+    if number.max() < 1 << 20:
+        return coder.uniform(number + 1, upper)
+    result, factor = np.zeros_like(number), 1
+    while factor <= number.max():  # digits of 16 bits; damaged ones are clipped
+        digit = upper // factor & 0xFFFF
+        result += factor * coder.uniform(np.full(len(number), 1 << 16), digit)
+        factor <<= 16
+    return np.minimum(result, number)
+
+
+@cache
+def _beta_binomial(n: int, evenness: int) -> stream.model.Model:
+    """Return the model of the number of n Gaussians in a half."""
+    chances = [1.0]
+    for k in range(n):
+        chances.append(chances[-1] * (n - k) / (k + 1) * (k + evenness) / (n - k - 1 + evenness))
+    return categorical(np.array(chances))
+
+
+def morton_encode(cells: IntArray, levels: int) -> IntArray:
+    """Return the bits of columns and rows (N, 2) in turn, highest first, as integers (N,)."""
+    code = np.zeros(len(cells), np.int64)
+    for level in range(levels):
+        x, y = (cells >> level & 1).T
+        code |= x << 2 * level + 1 | y << 2 * level
+    return code
+
+
+def morton_decode(codes: IntArray, levels: int) -> IntArray:
+    """Return the columns and rows (N, 2) of integers (N,): the inverse of `morton_encode`."""
+    x = y = np.zeros_like(codes)
+    for level in range(levels):
+        x, y = x | (codes >> 2 * level + 1 & 1) << level, y | (codes >> 2 * level & 1) << level
+    return np.stack([x, y], axis=1)
