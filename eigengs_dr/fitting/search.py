@@ -25,92 +25,70 @@ from .measure import Row
 from .refine import FitProgress, Refinement
 from .schedule import Schedule, surplus_for
 
+# The constants of a search, chosen on training photos of ImageNet classes. With a surplus in the
+# fit, a fit of 1.0 and a margin of 1.1 take 4.6 and 1.6 % fewer Gaussians for 32 and 36 dB on 9
+# training photos, and 2.7 % fewer for 40 dB on 4 of them, than a fit of 0.7 with a margin of 1.35
+# and no surplus. With a margin of 1.05, one of the 9 photos takes twice as many for 32 dB, because
+# no set in between meets the goal.
 
-@dataclass(frozen=True)
-class SearchPolicy:
-    """The constants of a search, chosen on training photos of ImageNet classes.
+TRY_SHARE, FIT_SHARE, POLISH_SHARE = 0.1, 1.0, 0.15
+"""Steps of a try, of the fit and of a polish, as fractions of the iterations."""
 
-    With a surplus in the fit, a fit of 1.0 and a margin of 1.1 take 4.6 and 1.6 % fewer Gaussians
-    for 32 and 36 dB on 9 training photos, and 2.7 % fewer for 40 dB on 4 of them, than a fit of 0.7
-    with a margin of 1.35 and no surplus. With a margin of 1.05, one of the 9 photos takes twice as
-    many for 32 dB, because no set in between meets the goal.
+MAX_LENGTH = 2
+"""Steps of the search, at most, as a multiple of the iterations, if these exceed some ten and
+one fit suffices; else up to a quarter as much again."""
 
-    Attributes
-    ----------
-    try_share, fit_share, polish_share : float
-        Steps of a try, of the fit and of a polish, as fractions of the iterations.
-    max_length : float
-        Steps of the search, at most, as a multiple of the iterations, if these exceed some ten and
-        one fit suffices; else up to a quarter as much again.
-    max_tries : int
-        Largest number of tries.
-    max_polishes : int
-        Number of polishes after which a search ends if a set meets the goal.
-    sure_polishes, sure_drops : int
-        Number of polishes that a search may take whatever its steps were before; and if the fit
-        met the goal, so that they drop Gaussians.
-    db_per_doubling : float
-        Gain of twice as many Gaussians, in dB, until two tries of the image measure it; see
-        `eigengs_dr.fitting.placement.density.ERROR_EXPONENT`.
-    doubling_range : (float, float)
-        Allowed range of the measured gain, in dB; training images gained 1.6 to 8.
-    min_octaves : float
-        Smallest distance of two tries that measures the gain, in doublings.
-    late_share : float
-        Gain of a fit after the steps of a try, as a fraction of the gain in these steps; measured
-        0.3 to 0.5 with 80 to 4,000 Gaussians.
-    margin : float
-        Gaussians of the fit over the estimated number; dropping some works better than adding some.
-    max_leap : float
-        Largest ratio of the numbers of Gaussians of two consecutive tries.
-    try_tolerance, fit_tolerance : float
-        Largest relative difference from the estimated number for the last try, and largest relative
-        lack of Gaussians for the fit; a surplus is for the polishes.
-    max_drop, drop_per_db, largest_drop : float
-        Largest fraction of the Gaussians that one polish drops near the goal, for each decibel
-        above it, and at all. A short search overshoots by decibels: 200 steps of a material fitted
-        11,122 Gaussians with 35.6 dB for 32 dB; a second fit of fewer, in the steps that were left,
-        missed the goal.
-    polish_rate : float
-        Learning rates of a polish, as a fraction of those of the schedule.
-    polish_gain : float
-        Expected gain of the first polish, in dB; training images gained 0.2.
-    gain_decay : float
-        Expected gain of the next polish, as a fraction of the gain of the last.
-    surplus : float
-        Decibels above the goal that do not justify another polish.
-    """
+MAX_TRIES = 4
+"""Largest number of tries. One alone takes 2 % more Gaussians with 1,000 iterations and 5 %
+fewer with 300, in the same time (9 training photos, 32 to 40 dB); but two tries measure the
+slope, without which a search does not converge where Gaussians gain much more than usual."""
 
-    try_share: float = 0.1
-    fit_share: float = 1.0
-    polish_share: float = 0.15
-    max_length: float = 2
-    max_tries: int = 4
-    max_polishes: int = 7
-    sure_polishes: int = 3
-    sure_drops: int = 5
-    db_per_doubling: float = 4.0
-    doubling_range: tuple[float, float] = (2.0, 12.0)
-    min_octaves: float = 0.25
-    late_share: float = 0.37
-    margin: float = 1.1
-    max_leap: float = 16
-    try_tolerance: float = 0.1
-    fit_tolerance: float = 0.6
-    max_drop: float = 0.15
-    drop_per_db: float = 0.1
-    largest_drop: float = 0.3
-    polish_rate: float = 0.5
-    polish_gain: float = 0.1
-    gain_decay: float = 0.5
-    surplus: float = 0.02
+MAX_POLISHES = 7
+"""Number of polishes after which a search ends if a set meets the goal."""
 
-    def drop_for(self, above: float) -> float:
-        """Return the largest fraction of the Gaussians that one polish drops."""
-        return min(max(self.max_drop, self.drop_per_db * above), self.largest_drop)
+SURE_POLISHES, SURE_DROPS = 3, 5
+"""Number of polishes that a search may take whatever its steps were before; and if the fit met
+the goal, so that they drop Gaussians."""
 
+DB_PER_DOUBLING = 4.0
+"""Gain of twice as many Gaussians, in dB, until two tries of the image measure it; see
+`eigengs_dr.fitting.placement.density.ERROR_EXPONENT`."""
 
-DEFAULT_POLICY = SearchPolicy()
+DOUBLING_RANGE = (2.0, 12.0)
+"""Allowed range of the measured gain, in dB; training images gained 1.6 to 8."""
+
+MIN_OCTAVES = 0.25
+"""Smallest distance of two tries that measures the gain, in doublings."""
+
+LATE_SHARE = 0.37
+"""Gain of a fit after the steps of a try, as a fraction of the gain in these steps; measured 0.3
+to 0.5 with 80 to 4,000 Gaussians."""
+
+MARGIN = 1.1
+"""Gaussians of the fit over the estimated number; dropping some works better than adding some."""
+
+MAX_OCTAVES = 4.0
+"""Largest distance of two consecutive tries, in doublings."""
+
+TRY_TOLERANCE, FIT_TOLERANCE = 0.1, 0.6
+"""Largest relative difference from the estimated number for the last try, and largest relative
+lack of Gaussians for the fit; a surplus is for the polishes."""
+
+MAX_DROP, DROP_PER_DB, LARGEST_DROP = 0.15, 0.1, 0.3
+"""Largest fraction of the Gaussians that one polish drops near the goal, for each decibel above
+it, and at all. A short search overshoots by decibels: 200 steps of a material fitted 11,122
+Gaussians with 35.6 dB for 32 dB; a second fit of fewer, in the steps that were left, missed the
+goal."""
+
+POLISH_RATE = 0.5
+"""Learning rates of a polish, as a fraction of those of the schedule."""
+
+POLISH_GAIN, GAIN_DECAY = 0.1, 0.5
+"""Expected gain of the first polish, in dB, and of the next polish, as a fraction of the gain of
+the last; training images gained 0.2 dB."""
+
+ENOUGH = 0.02
+"""Decibels above the goal that do not justify another polish."""
 
 
 def search_count(
@@ -123,7 +101,6 @@ def search_count(
     iterations: int = 1000,
     progress: FitProgress | None = None,
     interrupted: Callable[[], bool] = lambda: False,
-    policy: SearchPolicy = DEFAULT_POLICY,
 ) -> Refinement:
     """Find the smallest number of Gaussians that meets a goal.
 
@@ -144,8 +121,6 @@ def search_count(
         Steps of a fit with a known number; the search takes up to about twice as many.
     progress, interrupted : callable, optional
         See `eigengs_dr.fitting.refine.refine`.
-    policy : SearchPolicy, optional
-        The constants of the search.
 
     Returns
     -------
@@ -154,17 +129,17 @@ def search_count(
         measured set, with iteration, gaussians and the values of `measure`. `stopped` is "met",
         "out of reach" or "interrupted".
     """
-    shares = (policy.try_share, policy.fit_share, policy.polish_share)
+    shares = (TRY_SHARE, FIT_SHARE, POLISH_SHARE)
     tries, fit, polish = (max(1, round(share * iterations)) for share in shares)
-    planned = policy.max_tries * tries + fit + policy.max_polishes * polish
-    run = _Run(start, measure, figure, goal, schedule, progress, interrupted, policy, planned)
+    planned = MAX_TRIES * tries + fit + MAX_POLISHES * polish
+    run = _Run(start, measure, figure, goal, schedule, progress, interrupted, planned)
     try:
         estimate = _estimate(run, most, tries)
         if not interrupted() and (run.best.missing > 0 or len(run.best.gaussians) > 1):
-            longest = round(policy.max_length * iterations)
+            longest = round(MAX_LENGTH * iterations)
             trial = _fit_estimate(run, estimate, most, fit, longest)
             # If the iterations are few, or two fits have used them up, polish all the same.
-            sure = policy.sure_drops if trial.missing <= 0 else policy.sure_polishes
+            sure = SURE_DROPS if trial.missing <= 0 else SURE_POLISHES
             most_steps = max(longest, run.step + sure * polish)
             _polish(run, trial, most, polish, most_steps)
         ended = interrupted()
@@ -198,15 +173,13 @@ class _Run:
     schedule: Schedule
     progress: FitProgress | None
     interrupted: Callable[[], bool]
-    policy: SearchPolicy
     planned: int
     step: int = 0
-    db_per_doubling: float = field(init=False)
+    db_per_doubling: float = DB_PER_DOUBLING
     trace: list[Row] = field(default_factory=list)
     best: _Trial = field(init=False)
 
     def __post_init__(self) -> None:
-        self.db_per_doubling = self.policy.db_per_doubling
         self.best = self.score(self.start.gaussians)
 
     def descend(
@@ -266,20 +239,16 @@ def _estimate(run: _Run, most: int, steps: int) -> _Estimate:
     """Estimate the number of Gaussians by tries, each placed where the one before left error."""
     assert run.start.control
     placed, before, last = run.start.gaussians, run.best, None
-    for _ in range(run.policy.max_tries):
+    for _ in range(MAX_TRIES):
         trial = run.descend(placed, steps)
         _update_slope(run, last, trial)
-        gain = run.policy.late_share * max(0.0, before.missing - trial.missing)
+        gain = LATE_SHARE * max(0.0, before.missing - trial.missing)
         count = min(
             most,
-            round(
-                run.policy.margin * _count_for_gain(run, len(placed), trial.missing - gain, most)
-            ),
+            round(MARGIN * _count_for_gain(run, len(placed), trial.missing - gain, most)),
         )
         # The first try was placed by the image, without errors: it does not count as close.
-        close = last is not None and abs(count - len(placed)) <= run.policy.try_tolerance * len(
-            placed
-        )
+        close = last is not None and abs(count - len(placed)) <= TRY_TOLERANCE * len(placed)
         placed = run.start.control.redistribute(trial.gaussians, count)
         last, before = trial, run.score(placed)
         if close or run.interrupted():
@@ -291,7 +260,7 @@ def _fit_estimate(run: _Run, estimate: _Estimate, most: int, steps: int, most_st
     """Fit the estimated number; if it was far off, fit once more, in the steps that are left."""
     trial, number = _fit(run, estimate, steps), len(estimate.placed)
     count = _count_for_gain(run, number, trial.missing, most)
-    if run.interrupted() or count - number <= run.policy.fit_tolerance * number:
+    if run.interrupted() or count - number <= FIT_TOLERANCE * number:
         return trial
     assert run.start.control
     again = _Estimate(trial.gaussians, run.start.control.redistribute(trial.gaussians, count))
@@ -313,17 +282,14 @@ def _update_slope(run: _Run, last: _Trial | None, trial: _Trial) -> None:
     if last is None:
         return
     octaves = math.log2(len(trial.gaussians) / len(last.gaussians))
-    if abs(octaves) >= run.policy.min_octaves:
-        low, high = run.policy.doubling_range
+    if abs(octaves) >= MIN_OCTAVES:
+        low, high = DOUBLING_RANGE
         run.db_per_doubling = min(max((last.missing - trial.missing) / octaves, low), high)
 
 
 def _count_for_gain(run: _Run, count: int, missing: float, most: int) -> int:
     """Return the number of Gaussians that would gain the missing decibels."""
-    octaves = min(
-        max(missing / run.db_per_doubling, -math.log2(run.policy.max_leap)),
-        math.log2(run.policy.max_leap),
-    )
+    octaves = min(max(missing / run.db_per_doubling, -MAX_OCTAVES), MAX_OCTAVES)
     return min(most, max(1, round(count * 2**octaves)))
 
 
@@ -333,18 +299,19 @@ def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
     `most_steps` limits the steps of the search: if `densify` finds few places, it would not end.
     """
     target, weight = run.start.target, run.start.weight
-    least_growth, rounds, gain = 1.02, 0, run.policy.polish_gain
+    least_growth, rounds, gain = 1.02, 0, POLISH_GAIN
     while run.step + steps <= most_steps and not run.interrupted():
         count, found = len(trial.gaussians), run.best
-        if found.missing <= 0 and rounds >= run.policy.max_polishes:
+        if found.missing <= 0 and rounds >= MAX_POLISHES:
             return
         missing = trial.missing - gain
         if trial.missing <= 0:
+            drop = min(max(MAX_DROP, -DROP_PER_DB * trial.missing), LARGEST_DROP)
             wanted = max(
                 _count_for_gain(run, count, missing, count),
-                math.floor((1 - run.policy.drop_for(-trial.missing)) * count),
+                math.floor((1 - drop) * count),
             )
-            if wanted == count or -missing < run.policy.surplus:
+            if wanted == count or -missing < ENOUGH:
                 return
             changed = prune(trial.gaussians, target, wanted, weight)
         elif found.missing <= 0:
@@ -363,8 +330,8 @@ def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
             least_growth = 2 * least_growth - 1
         rounds += 1
         expected = trial.missing + run.db_per_doubling * math.log2(count / len(changed))
-        trial = run.descend(changed, steps, run.policy.polish_rate)
-        gain = run.policy.gain_decay * max(0.0, expected - trial.missing)
+        trial = run.descend(changed, steps, POLISH_RATE)
+        gain = GAIN_DECAY * max(0.0, expected - trial.missing)
 
 
 TRIMS = 5
