@@ -56,8 +56,3 @@ HTML[:] = [_later("viewer.notebook:to_html")]
 EXECUTORS["distributed"] = _later("cluster.executor:ClusterExecutor")
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-
-def load_ipython_extension(shell: Any) -> None:
-    """Shorten errors in a notebook: what ``%load_ext eigengs_dr`` calls."""
-    resolve_name("eigengs_dr.backend.feedback:install")(shell)

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.arrays import Bool
-from eigengs_dr.backend.recording import guest, without_collector
+from eigengs_dr.backend.recording import collector_off, guest
 from eigengs_dr.image.color import rendered_as
 from eigengs_dr.raster.lookup.footprint import arrange
 from eigengs_dr.raster.lookup.points import (
@@ -177,7 +177,7 @@ def gaussian_texture() -> type:
 
         # --- Lookups -----------------------------------------------------------------------------
 
-        @without_collector
+        @collector_off()
         def eval(self, si: Interaction, active: Bool = True) -> Any:
             color = self._color(si, active)
             if len(color) == 1 or mi.is_monochromatic:
@@ -191,11 +191,11 @@ def gaussian_texture() -> type:
                 )
             return upsample(mi.Color3f(*color), si.wavelengths, self.spectra)
 
-        @without_collector
+        @collector_off()
         def eval_1(self, si: Interaction, active: Bool = True) -> Any:
             return luminance(self._color(si, active))
 
-        @without_collector
+        @collector_off()
         def eval_3(self, si: Interaction, active: Bool = True) -> Any:
             if self.channels != 3:
                 raise ValueError(
@@ -204,7 +204,7 @@ def gaussian_texture() -> type:
                 )
             return mi.Color3f(*self._color(si, active))
 
-        @without_collector
+        @collector_off()
         def eval_1_grad(self, si: Interaction, active: Bool = True) -> Any:
             (x, sx), (y, sy), active = self._point(si, active)
             terms = gradient_terms(kernel_radius(self.cutoff))
@@ -243,15 +243,15 @@ def gaussian_texture() -> type:
 
         # --- Sampling ----------------------------------------------------------------------------
 
-        @without_collector
+        @collector_off()
         def sample_position(self, sample: Any, active: Bool = True) -> tuple:
             return self._emission().sample(sample, active)
 
-        @without_collector
+        @collector_off()
         def pdf_position(self, p: Any, active: Bool = True) -> Any:
             return self._emission().density(p, active)
 
-        @without_collector
+        @collector_off()
         def sample_spectrum(self, si: Interaction, sample: Any, active: Bool = True) -> tuple:
             if not mi.is_spectral:
                 return mi.Color0f(), self.eval(si, active)

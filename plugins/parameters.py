@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.backend.arrays import types_of, upload_tensor
+from eigengs_dr.backend.arrays import types_of, upload
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.gaussians import (
     FIELDS,
@@ -267,10 +267,10 @@ class FromModel:
         weights = np.zeros((channels, most, len(self.start) + 1), np.float32)
         for padded, own in zip(weights, model.weights, strict=True):
             padded[: len(own)] = own
-        self.weights = [upload_tensor(mi.TensorXf, w.T) for w in weights]
+        self.weights = [upload(mi.TensorXf, w.T) for w in weights]
         if coefficients is None:
             coefficients = np.zeros((channels, most), np.float32)
-        self.coefficients = upload_tensor(mi.TensorXf, coefficients)
+        self.coefficients = upload(mi.TensorXf, coefficients)
 
     def put(self, callback: Any) -> None:
         """Show the coefficients to `mitsuba.traverse`."""

@@ -4,7 +4,7 @@
 - ``selection``: picks llvm or cuda
 - ``arrays``: array types that go together; copies of NumPy arrays; exact arithmetic on cuda
 - ``recording``: frozen programs; one thread at a time
-- ``feedback``: bars, warnings, Ctrl-C and SIGTERM between steps, pictures and errors in a notebook
+- ``feedback``: bars, warnings, Ctrl-C and SIGTERM between steps, pictures in a notebook
 - ``executor``: where tasks run, in this process or on a cluster
 - ``doctor``: what works here and what to install
 """

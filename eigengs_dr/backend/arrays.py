@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -31,21 +32,21 @@ Bool = Any
 class ArrayTypes(NamedTuple):
     """The array types of one backend and one float precision."""
 
-    Float: Any
-    Int: Any
-    UInt: Any
-    Bool: Any
-    Float2: Any
-    Float3: Any
-    Float4: Any
-    UInt2: Any
-    FloatX: Any
-    Tensor: Any
+    Float: type
+    Int: type
+    UInt: type
+    Bool: type
+    Float2: type
+    Float3: type
+    Float4: type
+    UInt2: type
+    FloatX: type
+    Tensor: type
     backend: str
     bits: int
 
 
-def types_of(array: Any) -> ArrayTypes:
+def types_of(array: Float) -> ArrayTypes:
     """Return the array types with the backend and the precision of a Dr.Jit array.
 
     Parameters
@@ -72,7 +73,7 @@ def types_of(array: Any) -> ArrayTypes:
     return _types(module, 64 if dr.type_v(leaf) == dr.VarType.Float64 else 32)
 
 
-def types_in(module: Any, bits: int = 32) -> ArrayTypes:
+def types_in(module: ModuleType, bits: int = 32) -> ArrayTypes:
     """Return the types of ``drjit.llvm.ad`` or ``drjit.cuda.ad`` with 32 or 64 bits a float."""
     return _types(module.__name__, bits)
 
@@ -82,7 +83,7 @@ def _types(module: str, bits: int) -> ArrayTypes:
     names = sys.modules[module]
     suffix = "64" if bits == 64 else ""
 
-    def of(name: str) -> Any:
+    def of(name: str) -> type:
         return getattr(names, name + suffix)
 
     return ArrayTypes(
@@ -114,8 +115,12 @@ def release_memory() -> None:
             trim(0)
 
 
-def upload(kind: Any, values: NDArray[Any]) -> Any:
-    """Copy a flat NumPy array into memory that Dr.Jit owns.
+Values = NDArray[np.generic]
+"""A NumPy array of any dtype that converts to that of its target."""
+
+
+def upload(kind: type, values: Values) -> Float:
+    """Copy a NumPy array into memory that Dr.Jit owns.
 
     ``kind(values)`` may share NumPy's memory, which may be unaligned. Dr.Jit then replaces packet
     gathers by single gathers, which are 10 times slower, and traces a frozen function again.
@@ -123,31 +128,21 @@ def upload(kind: Any, values: NDArray[Any]) -> Any:
     Parameters
     ----------
     kind : type
-        Dr.Jit array type, e.g. ``drjit.llvm.ad.Float``.
-    values : ndarray, shape (n,)
+        Dr.Jit type of a flat array, e.g. ``drjit.llvm.ad.Float``, or of a tensor.
+    values : ndarray, shape (n,), or any shape for a tensor
         Any dtype that converts to `kind`.
 
     Returns
     -------
-    Dr.Jit array of type `kind`, shape (n,)
+    Dr.Jit array of type `kind`, same shape
         Evaluated.
     """
+    if dr.is_tensor_v(kind):
+        return kind(upload(dr.array_t(kind), values.ravel()), values.shape)
     return upload_rows(kind, [values])[0]
 
 
-def upload_tensor(kind: Any, values: NDArray[Any]) -> Any:
-    """Copy a NumPy array of any shape into a Dr.Jit tensor, as `upload` does.
-
-    Parameters
-    ----------
-    kind : type
-        Dr.Jit tensor type, e.g. ``drjit.llvm.ad.TensorXf``.
-    values : ndarray
-    """
-    return kind(upload(dr.array_t(kind), values.ravel()), values.shape)
-
-
-def upload_rows(kind: Any, rows: Iterable[NDArray[Any]]) -> list:
+def upload_rows(kind: type, rows: Iterable[Values]) -> list[Float]:
     """Copy flat NumPy arrays as `upload` does, but wait only once for all copies."""
     targets = []
     for values in rows:
@@ -176,7 +171,7 @@ TANH_SMALL = 0.625
 """Below, ``1 - exp(-2 |v|)`` would lose digits."""
 
 
-def rcp(x: Any) -> Any:
+def rcp(x: Float) -> Float:
     """Return ``1 / x``, in double precision to the last bits on every backend.
 
     Parameters
@@ -195,7 +190,7 @@ def rcp(x: Any) -> Any:
     return _with_slope(value, -dr.square(value), x)
 
 
-def rsqrt(x: Any) -> Any:
+def rsqrt(x: Float) -> Float:
     """Return ``1 / sqrt(x)``, in double precision to the last bits on every backend.
 
     Parameters
@@ -214,7 +209,7 @@ def rsqrt(x: Any) -> Any:
     return _with_slope(value, -0.5 * value * dr.square(value), x)
 
 
-def tanh(v: Any) -> Any:
+def tanh(v: Float) -> Float:
     """Return the hyperbolic tangent, differentiable, with a relative error of a few last bits.
 
     Parameters
@@ -257,11 +252,11 @@ class Divisor:
         The number s.
     """
 
-    divisor: Any
-    multiplier: Any
-    shift: Any
+    divisor: UInt
+    multiplier: UInt
+    shift: UInt
 
-    def divmod(self, n: Any) -> tuple[Any, Any]:
+    def divmod(self, n: UInt) -> tuple[UInt, UInt]:
         """Return the quotient and the remainder of UInt32 below 2^31."""
         quotient = dr.mul_hi(n + n, self.multiplier) >> self.shift
         return quotient, n - quotient * self.divisor
@@ -274,12 +269,12 @@ def make_divisor(types: ArrayTypes, value: int) -> Divisor:
     return Divisor(*(dr.opaque(types.UInt, v) for v in (value, multiplier, shift)))
 
 
-def _with_slope(value: Any, slope: Any, x: Any) -> Any:
+def _with_slope(value: Float, slope: Float, x: Float) -> Float:
     """Return a value whose derivative by x is `slope`; Dr.Jit's own takes `drjit.rcp`."""
     return dr.replace_grad(value, slope * x) if dr.grad_enabled(x) else value
 
 
-def _polynomial(x: Any, coefficients: tuple[float, ...]) -> Any:
+def _polynomial(x: Float, coefficients: tuple[float, ...]) -> Float:
     """Evaluate a polynomial by Horner's rule, from the highest power."""
     result = type(x)(coefficients[0])
     for coefficient in coefficients[1:]:
@@ -287,5 +282,5 @@ def _polynomial(x: Any, coefficients: tuple[float, ...]) -> Any:
     return result
 
 
-def _is_double(x: Any) -> bool:
+def _is_double(x: Float) -> bool:
     return bool(dr.type_v(x) == dr.VarType.Float64)

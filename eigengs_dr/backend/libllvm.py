@@ -11,7 +11,6 @@ import os
 import platform
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,12 +65,14 @@ def candidates() -> list[Library]:
             # A small file with this name is a linker script.
             if os.path.isfile(real) and os.path.getsize(real) > 1_000_000:
                 found.setdefault(real, Library(path, _version_in(path) or _version_in(real)))
-    return sorted(found.values(), key=_preference)
+    return sorted(
+        found.values(), key=lambda one: (one.version not in TESTED_VERSIONS, -(one.version or 0))
+    )
 
 
-def _preference(library: Library) -> tuple[bool, int]:
-    """Return the sort key of `candidates`."""
-    return library.version not in TESTED_VERSIONS, -(library.version or 0)
+def _usable() -> list[str]:
+    """Return the paths of the usable libraries in the order of `candidates`."""
+    return [library.path for library in candidates() if library.usable]
 
 
 def select_libllvm() -> None:
@@ -82,28 +83,27 @@ def select_libllvm() -> None:
     """
     if os.environ.get(PATH_VARIABLE) or "drjit" in sys.modules:
         return
-    library = next(_usable(), None)
-    if library:
-        os.environ[PATH_VARIABLE] = library.path
+    for path in _usable()[:1]:
+        os.environ[PATH_VARIABLE] = path
 
 
 def _patterns() -> list[str]:
     """Return the file patterns of libLLVM on this operating system."""
-    conda = os.environ.get("CONDA_PREFIX", "")
+    conda = os.environ.get("CONDA_PREFIX")
     if sys.platform == "win32":
+        names, inside = ["LLVM-C.dll"], r"\Library\bin"
         folders = [os.environ.get("PROGRAMFILES", r"C:\Program Files") + r"\LLVM\bin"]
-        names = ["LLVM-C.dll"]
-        folders += [conda + r"\Library\bin"] if conda else []
     elif sys.platform == "darwin":
-        prefixes = ["/opt/homebrew/opt/llvm*", "/usr/local/opt/llvm*", "/opt/local/libexec/llvm-*"]
-        folders = [prefix + "/lib" for prefix in prefixes] + ([conda + "/lib"] if conda else [])
-        names = ["libLLVM*.dylib"]
+        names, inside = ["libLLVM*.dylib"], "/lib"
+        folders = ["/opt/homebrew/opt/llvm*/lib", "/usr/local/opt/llvm*/lib"]
+        folders += ["/opt/local/libexec/llvm-*/lib"]
     else:
+        names, inside = ["libLLVM.so*", "libLLVM-*.so*"], "/lib"
         multiarch = f"/usr/lib/{platform.machine()}-linux-gnu"
         folders = ["/usr/lib/llvm-*/lib", multiarch, "/usr/lib64", "/usr/lib64/llvm*/lib"]
-        folders += ["/usr/lib", "/usr/local/lib"] + ([conda + "/lib"] if conda else [])
+        folders += ["/usr/lib", "/usr/local/lib"]
         folders += filter(None, os.environ.get("LD_LIBRARY_PATH", "").split(":"))
-        names = ["libLLVM.so*", "libLLVM-*.so*"]
+    folders += [conda + inside] if conda else []
     return [os.path.join(folder, name) for folder in folders for name in names]
 
 
@@ -113,11 +113,6 @@ def _version_in(path: str) -> int | None:
     folder = re.search(r"llvm(?:[@-]?|/)(\d+)[^/\\]*[/\\]lib", path, re.IGNORECASE)
     found = name or folder
     return int(found.group(1)) if found else None
-
-
-def _usable() -> Iterator[Library]:
-    """Return the usable libraries in the order of `candidates`."""
-    return (library for library in candidates() if library.usable)
 
 
 def load_failure() -> str:
@@ -136,13 +131,10 @@ def load_failure() -> str:
 def advice() -> str:
     """Say in part of a line what to do: use another library of this machine, or install one."""
     failed = os.path.realpath(os.environ.get(PATH_VARIABLE) or loaded_path() or "")
-    others = (library.path for library in _usable() if os.path.realpath(library.path) != failed)
-    other = next(others, None)
-    return (
-        f"set {PATH_VARIABLE}={other} before drjit is imported, or {INSTALL_ADVICE}"
-        if other
-        else INSTALL_ADVICE
-    )
+    for path in _usable():
+        if os.path.realpath(path) != failed:
+            return f"set {PATH_VARIABLE}={path} before drjit is imported, or {INSTALL_ADVICE}"
+    return INSTALL_ADVICE
 
 
 def loaded_path() -> str | None:

@@ -17,10 +17,13 @@ from typing import Any
 
 import drjit as dr
 
+Program = Callable[..., Any]
+"""A function of Dr.Jit arrays."""
+
 _LOCK = threading.RLock()
 """The thread that holds it may use Dr.Jit."""
 
-_retired: deque[Callable[[], Any]] = deque()
+_retired: deque[Callable[[], None]] = deque()
 """Functions that free programs and arrays that nobody uses any more; for `_clear_retired`."""
 
 _calls = 0
@@ -57,7 +60,7 @@ def exclusive() -> Iterator[None]:
     ...     dr.enable_grad(start.color)
     ...     dr.backward(dr.sum(eg.render(start).array))
     """
-    if _guests.here:
+    if getattr(_guests, "here", 0):
         yield
         return
     with _LOCK:
@@ -68,13 +71,8 @@ def exclusive() -> Iterator[None]:
             _clear_retired()
 
 
-class _Guests(threading.local):
-    """Whether this thread works for another one, which may hold the lock and waits for it."""
-
-    here = False
-
-
-_guests = _Guests()
+_guests = threading.local()
+"""``here`` counts the blocks of `guest` around this thread, which works for one that waits."""
 
 _ONE_GUEST = threading.RLock()
 """The guest that holds it may use Dr.Jit."""
@@ -88,11 +86,11 @@ def guest() -> Iterator[None]:
     caller holds the lock, they would wait for it for ever. Guests take turns.
     """
     with _ONE_GUEST:
-        before, _guests.here = _guests.here, True
+        _guests.here = getattr(_guests, "here", 0) + 1
         try:
             yield
         finally:
-            _guests.here = before
+            _guests.here -= 1
 
 
 MANY_RECORDINGS = 1000
@@ -100,7 +98,7 @@ MANY_RECORDINGS = 1000
 
 
 @contextmanager
-def freeze_program(function: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
+def freeze_program(function: Program) -> Iterator[Program]:
     """Freeze a function with `drjit.freeze` during a block, and free its program after the block.
 
     While Dr.Jit 1.5 records a program, the process ends if Python frees another program or an array
@@ -142,7 +140,7 @@ def freeze_program(function: Callable[..., Any]) -> Iterator[Callable[..., Any]]
 
 
 @contextmanager
-def release_later(*objects: Any) -> Iterator[None]:
+def release_later(*objects: object) -> Iterator[None]:
     """Keep objects during a block, and release them after it as `freeze_program` its program.
 
     For a generator that holds arrays of its caller, because they may share NumPy's memory.
@@ -159,7 +157,7 @@ def release_later(*objects: Any) -> Iterator[None]:
         _retire(kept.clear)
 
 
-def _retire(release: Callable[[], Any]) -> None:
+def _retire(release: Callable[[], None]) -> None:
     """Call a function that frees objects, at once or when no program is being called."""
     _retired.append(release)
     if _LOCK.acquire(blocking=False):
@@ -177,7 +175,17 @@ def _clear_retired() -> None:
 
 @contextmanager
 def collector_off() -> Iterator[None]:
-    """Keep Python's garbage collector off during a block; on again after the last thread's."""
+    """Keep Python's garbage collector off during a block or a call; on after the last thread's.
+
+    Lookups of a texture need it too: Mitsuba calls them while it records a program. If the
+    collector frees another scene during the recording, the program loses the textures of that
+    scene; it then ends the process or reads freed memory.
+
+    Returns
+    -------
+    context manager
+        Also a decorator, ``@collector_off()``.
+    """
     global _pauses, _collects
     with _COLLECTOR_LOCK:
         if _pauses == 0:
@@ -191,28 +199,3 @@ def collector_off() -> Iterator[None]:
             _pauses -= 1
             if _pauses == 0 and _collects:
                 gc.enable()
-
-
-def without_collector(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that runs without Python's garbage collector.
-
-    Lookups of a texture need it too: Mitsuba calls them while it records a program. If the
-    collector frees another scene during the recording, the program loses the textures of that
-    scene; it then ends the process or reads freed memory.
-
-    Parameters
-    ----------
-    function : callable
-
-    Returns
-    -------
-    callable
-        With the arguments and the result of `function`.
-    """
-
-    @wraps(function)
-    def call(*arguments: Any, **settings: Any) -> Any:
-        with collector_off():
-            return function(*arguments, **settings)
-
-    return call

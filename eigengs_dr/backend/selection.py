@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,8 +18,6 @@ from .libllvm import MIN_VERSION, advice, load_failure, loaded_path
 
 UNTESTED_ON_GPU = "tested with a simulated driver only, not yet on a GPU"
 """State of the cuda backend, until the whole suite has passed on a GPU."""
-
-_cuda_announced = False
 
 
 class BackendError(RuntimeError):
@@ -73,12 +72,10 @@ def select(backend: str | None = None) -> ModuleType:
     return dr.llvm.ad
 
 
+@cache
 def _announce_cuda() -> None:
     """Warn of the state of the cuda backend, once in a process."""
-    global _cuda_announced
-    if not _cuda_announced:
-        _cuda_announced = True
-        warn(f"backend cuda: {UNTESTED_ON_GPU}; compare with backend 'llvm'")
+    warn(f"backend cuda: {UNTESTED_ON_GPU}; compare with backend 'llvm'")
 
 
 def describe(backend: str | None = None) -> dict[str, Any]:

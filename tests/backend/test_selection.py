@@ -28,18 +28,18 @@ def fake_drjit(monkeypatch, *, llvm, version, cuda=False):
     monkeypatch.delenv(PATH_VARIABLE, raising=False)
 
 
-def test_machine_without_llvm(monkeypatch):
-    fake_drjit(monkeypatch, llvm=False, version=(-1, -1, -1))
+@pytest.mark.parametrize(
+    ("works", "version", "words"),
+    [
+        (False, (-1, -1, -1), r"no libLLVM was found; install LLVM 17.*libllvm19"),
+        (True, (15, 0, 6), r"LLVM 15, which crashes.*libllvm19"),
+    ],
+)
+def test_machine_without_an_llvm_that_works(monkeypatch, works, version, words):
+    fake_drjit(monkeypatch, llvm=works, version=version)
     monkeypatch.setattr(module, "candidates", lambda: [])
-    with pytest.raises(BackendError, match=r"no libLLVM was found; install LLVM 17.*libllvm19"):
+    with pytest.raises(BackendError, match=words):
         select()
-
-
-def test_machine_with_old_llvm_only(monkeypatch):
-    fake_drjit(monkeypatch, llvm=True, version=(15, 0, 6))
-    monkeypatch.setattr(module, "candidates", lambda: [])
-    with pytest.raises(BackendError, match=r"LLVM 15, which crashes.*libllvm19"):
-        select("llvm")
 
 
 def test_cuda_without_gpu(monkeypatch):
@@ -50,7 +50,7 @@ def test_cuda_without_gpu(monkeypatch):
 
 def test_first_use_of_cuda_says_that_no_gpu_was_tested(monkeypatch):
     fake_drjit(monkeypatch, llvm=True, version=(19, 1, 7), cuda=True)
-    monkeypatch.setattr(selection, "_cuda_announced", False)
+    selection._announce_cuda.cache_clear()
     with pytest.warns(UserWarning, match="backend cuda: .* not yet on a GPU; compare with") as told:
         assert select("cuda") is sys.modules["drjit"].cuda.ad
     assert "\n" not in str(told[0].message)

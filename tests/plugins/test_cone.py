@@ -193,7 +193,7 @@ class TestPlane:
 
 
 def test_the_collector_stays_out_of_lookups():
-    """Scenes freed while another one is recorded end the process; see `without_collector`."""
+    """Scenes freed while another one is recorded end the process; see `collector_off`."""
     seen = []
     tex = texture(gaussians())
     look = type(tex)._color

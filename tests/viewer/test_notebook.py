@@ -62,48 +62,6 @@ def test_bases_and_models_show_components():
         assert np.corrcoef(a.ravel(), b.ravel())[0, 1] > 0.9
 
 
-@pytest.fixture
-def shell():
-    """An IPython shell without colours that has loaded the extension."""
-    interactive = pytest.importorskip("IPython.core.interactiveshell", reason="no IPython")
-    found = interactive.InteractiveShell()
-    found.run_line_magic("colors", "nocolor")
-    found.run_cell("%load_ext eigengs_dr\nimport eigengs_dr as eg\nimport numpy as np")
-    yield found
-    interactive.InteractiveShell.clear_instance()
-
-
-def said(shell, capsys, code):
-    """What a cell that fails prints."""
-    capsys.readouterr()
-    assert not shell.run_cell(code).success
-    return capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    "code, message",
-    [
-        ("eg.fit(np.full((8, 8, 3), 200.0))", "ImageError: image: pixels run from 200 to 200"),
-        ("eg.fit(np.zeros((8, 8, 3)), 500)", "ValueError: gaussians is 500"),
-        ("eg.Gaussians.load('missing.npz')", "FileNotFoundError"),
-        ("eg.view(3)", "TypeError: int cannot be shown"),
-    ],
-)
-def test_mistakes_are_short(shell, capsys, code, message):
-    out = said(shell, capsys, f"x = 1\n{code}")
-    assert f"----> 2 {code}" in out
-    assert out.strip().splitlines()[-1].startswith(message)
-    assert ".py" not in out and len(out.splitlines()) <= 8
-    shell.run_line_magic("tb", "")
-    assert ".py" in capsys.readouterr().out
-
-
-def test_other_errors_stay_whole(shell, capsys):
-    assert "ZeroDivisionError" in said(shell, capsys, "1 / 0")
-    out = said(shell, capsys, "np.linalg.inv(np.zeros((2, 2)))")
-    assert ".py" in out and "LinAlgError" in out
-
-
 def test_the_notebook_runs():
     nbformat = pytest.importorskip("nbformat", reason="no nbformat")
     client = pytest.importorskip("nbclient", reason="no nbclient")
