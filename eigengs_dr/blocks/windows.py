@@ -15,15 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..image.formats import TIFF_SUFFIXES, kind_of, open_header
-from ..image.io import (
-    ImageError,
-    check_data,
-    check_image,
-    open_picture,
-    picture_pixels,
-    read_file,
-)
+from ..image.formats import TIFF_SUFFIXES, kind_of, open_header, open_picture, picture_pixels
+from ..image.io import ImageError, check_data, check_image, read_file
 from ..image.pixels import encoding_of
 from ..image.remote import is_url
 

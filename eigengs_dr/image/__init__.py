@@ -1,7 +1,7 @@
 """Pixels: no Gaussians here.
 
 - ``io``: image files, and photos of scikit-image
-- ``formats``: files of more than 8 bits; ``openimageio``: EXR and HDR
+- ``formats``: the libraries that read and write a file
 - ``remote``: images behind URLs
 - ``pixels``: what pixels are, sRGB or light, and the checks of an image
 - ``folder``: many images, in blocks

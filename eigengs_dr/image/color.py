@@ -8,12 +8,20 @@ colour space, and a row for each channel.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from operator import index
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+Array = Any
+"""Floats of NumPy, or a flat, nested or tensor array of floats of Dr.Jit."""
+
+Function = Callable[..., Array]
+
+FloatImage = NDArray[np.floating]
+"""Floats of NumPy."""
 
 SPACES = ("ycbcr", "rgb", "linear", "data", "radiance", "log", "normal")
 """Names of the colour spaces that the channels of a set of Gaussians may have.
@@ -48,11 +56,11 @@ RGB_TO_YCBCR: NDArray[np.float64] = (
 YCBCR_OFFSET: NDArray[np.float64] = np.array([16.0, 128.0, 128.0]) / 255
 """YCbCr of black, shape (3,)."""
 
-YCBCR_TO_RGB: NDArray[np.floating[Any]] = np.linalg.inv(RGB_TO_YCBCR)
+YCBCR_TO_RGB: FloatImage = np.linalg.inv(RGB_TO_YCBCR)
 """Inverse of `RGB_TO_YCBCR`, shape (3, 3)."""
 
 
-def rgb_to_ycbcr(image: NDArray[Any]) -> NDArray[Any]:
+def rgb_to_ycbcr(image: FloatImage) -> FloatImage:
     """Convert RGB to studio-range YCbCr / 255.
 
     For RGB in [0, 1], Y lies in [16, 235] / 255, and Cb and Cr lie in [16, 240] / 255. Values are
@@ -84,7 +92,7 @@ def rgb_to_ycbcr(image: NDArray[Any]) -> NDArray[Any]:
     return result
 
 
-def ycbcr_to_rgb(image: NDArray[Any]) -> NDArray[Any]:
+def ycbcr_to_rgb(image: FloatImage) -> FloatImage:
     """Convert studio-range YCbCr / 255 to RGB, the inverse of `rgb_to_ycbcr`.
 
     Parameters
@@ -106,7 +114,7 @@ def ycbcr_to_rgb(image: NDArray[Any]) -> NDArray[Any]:
     return (image - YCBCR_OFFSET.astype(image.dtype)) @ YCBCR_TO_RGB.T.astype(image.dtype)
 
 
-def to_linear(coded: Any) -> Any:
+def to_linear(coded: Array) -> Array:
     """Decode sRGB to linear light: ``x / 12.92``, above 0.04045 ``((x + 0.055) / 1.055)^2.4``.
 
     The function works elementwise and keeps the precision. Values and derivatives are finite
@@ -143,7 +151,7 @@ def to_linear(coded: Any) -> Any:
     return select(coded <= 0.04045, coded * (1 / 12.92), curved)
 
 
-def to_coded(linear: Any) -> Any:
+def to_coded(linear: Array) -> Array:
     """Encode linear light as sRGB: ``12.92 x``, above 0.0031308 ``1.055 x^(1 / 2.4) - 0.055``.
 
     This is the inverse of `to_linear`. The constants of the standard leave a step of 3e-8 between
@@ -169,7 +177,7 @@ def to_coded(linear: Any) -> Any:
     return select(linear <= 0.0031308, linear * 12.92, curved)
 
 
-def to_picture(space: str, rendered: NDArray[Any]) -> NDArray[Any]:
+def to_picture(space: str, rendered: FloatImage) -> FloatImage:
     """Convert a rendering of a set to what people look at: light becomes sRGB.
 
     Parameters
@@ -189,7 +197,7 @@ def to_picture(space: str, rendered: NDArray[Any]) -> NDArray[Any]:
     return rendered
 
 
-def from_sum(space: str, summed: Any) -> Any:
+def from_sum(space: str, summed: Array) -> Array:
     """Convert the sums of Gaussians to what a rendering holds, where decoding colours cannot.
 
     Parameters
@@ -216,7 +224,7 @@ def rendered_as(space: str) -> str | None:
     return "srgb" if space in ("ycbcr", "rgb") else "linear"
 
 
-def decode(space: str, channels: Sequence[Any]) -> list[Any]:
+def decode(space: str, channels: Sequence[Array]) -> list[Array]:
     """Convert YCbCr channels to RGB, and return the channels of other spaces unchanged.
 
     Parameters
@@ -249,24 +257,24 @@ def decode(space: str, channels: Sequence[Any]) -> list[Any]:
     return [a * y + b * cb + c * cr + d for (a, b, c), d in zip(matrix, black, strict=True)]
 
 
-def _functions(array: Any) -> tuple[Any, Any, Any]:
-    """Return select, maximum and power for a NumPy or a Dr.Jit array."""
+def _functions(array: Array) -> tuple[Function, Function, Function]:
+    """Return select, maximum and power for a NumPy or a Dr.Jit array; refuse integers of NumPy."""
     if not isinstance(array, np.ndarray | np.generic | float):
         import drjit as dr  # loads libLLVM
 
         return dr.select, dr.maximum, dr.power
-    if isinstance(array, np.ndarray | np.generic) and array.dtype not in (np.float32, np.float64):
-        raise ValueError(f"array is {array.dtype}; convert to float32 or float64 in [0, 1] first")
+    dtype = np.asarray(array).dtype
+    if dtype not in (np.float32, np.float64):
+        raise ValueError(f"array is {dtype}; convert to float32 or float64 in [0, 1] first")
     return np.where, np.maximum, np.power
 
 
-def _check_rgb(image: NDArray[Any]) -> NDArray[Any]:
+def _check_rgb(image: FloatImage) -> FloatImage:
     """Refuse an image without three float channels: bytes would be read as values in [0, 1]."""
     image = np.asarray(image)
     if image.shape[-1:] != (3,):
         raise ValueError(f"image has shape {image.shape}; expected (..., 3)")
-    if image.dtype not in (np.float32, np.float64):
-        raise ValueError(f"image is {image.dtype}; convert to float32 or float64 in [0, 1] first")
+    _functions(image)
     return image
 
 
@@ -284,7 +292,7 @@ PU21_RANGE = (0.005, 10_000.0)
 _PU21 = (0.353487901, 0.3734658629, 8.277049286e-05, 0.9062562627, 0.09150303166, 0.9099517204)
 
 
-def to_log(light: NDArray[Any]) -> NDArray[Any]:
+def to_log(light: FloatImage) -> FloatImage:
     """Encode light above 0 by logarithms: ``log(1 + 100 I) / log(101)``, so that 1 stays 1.
 
     Below 0 the code goes on as a straight line.
@@ -311,7 +319,7 @@ def to_log(light: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(coded / math.log1p(LOG_SLOPE), light.dtype)
 
 
-def from_log(codes: Any) -> Any:
+def from_log(codes: Array) -> Array:
     """Decode `to_log`; negative codes give light above -0.01.
 
     Parameters
@@ -331,7 +339,7 @@ def from_log(codes: Any) -> Any:
     return (dr.exp2(codes * (factor / math.log(2))) - 1) * (1 / LOG_SLOPE)
 
 
-def to_pu21(light: Any) -> Any:
+def to_pu21(light: Array) -> Array:
     """Encode linear light so that equal differences are about equally visible, also above 1.
 
     The code is logarithmic in bright light and nearly linear in the dark. Light is clamped to
@@ -372,7 +380,7 @@ SHORTEST = 1e-6
 """Squared length below which a vector has no direction; it stays nearly zero."""
 
 
-def renormalize(codes: Any) -> Any:
+def renormalize(codes: Array) -> Array:
     """Scale the vectors of a normal map to the length 1.
 
     Parameters
@@ -400,7 +408,7 @@ def renormalize(codes: Any) -> Any:
     return type(codes)(dr.select(axis == 0, x, dr.select(axis == 1, y, z)), codes.shape)
 
 
-def unit_codes(channels: Sequence[Any]) -> list[Any]:
+def unit_codes(channels: Sequence[Array]) -> list[Array]:
     """Return the codes of the unit vectors along three channels of codes; see `renormalize`."""
     vector = [2 * channel - 1 for channel in channels]
     square = sum((v * v for v in vector[1:]), vector[0] * vector[0])
@@ -419,7 +427,7 @@ BASIS_SPACES = ("ycbcr", "rgb")
 """Colour spaces of a family."""
 
 
-def check_size(size: Any) -> tuple[int, int]:
+def check_size(size: Iterable[int]) -> tuple[int, int]:
     """Return a size, (width, height) in pixels, as two integers.
 
     Parameters
@@ -457,12 +465,6 @@ def to_planes(image: NDArray[np.float32], space: str) -> NDArray[np.float32]:
     if space == "rgb":
         return planes
     # No matrix product: the threads of BLAS would compete with the decoding threads for cores.
-    result = np.empty_like(planes)
-    for row, weights, offset in zip(
-        result, RGB_TO_YCBCR.astype(np.float32), YCBCR_OFFSET.astype(np.float32), strict=True
-    ):
-        np.multiply(planes[0], weights[0], out=row)
-        row += weights[1] * planes[1]
-        row += weights[2] * planes[2]
-        row += offset
+    result = np.einsum("ij,jn->in", RGB_TO_YCBCR.astype(np.float32), planes)
+    result += YCBCR_OFFSET.astype(np.float32)[:, None]
     return result

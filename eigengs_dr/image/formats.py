@@ -1,28 +1,30 @@
-"""Which function reads and writes a file: Pillow, tifffile for TIFF of more bits, OpenImageIO.
+"""Which library reads and writes a file: Pillow, tifffile for TIFF of more bits, OpenImageIO.
 
-Pillow keeps 8 bits of TIFF files and reads no floats. A portable float map has a header of three
-lines, then rows of float32 from bottom to top; OpenImageIO 3.2 returns them upside down.
+Pillow keeps 8 bits of TIFF files and reads no floats. OpenImageIO, from the extra ``hdr``, is one
+wheel of 8 MB that needs NumPy alone and does EXR, Radiance HDR and PNG of 16 bits; imageio does it
+by a download or by OpenCV. A portable float map has a header of three lines, then rows of float32
+from bottom to top; OpenImageIO 3.2 returns them upside down.
 """
 
 from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import openimageio
-from .pixels import ImageError
+from ..backend.feedback import warn
+from .pixels import EncodedImage, ImageError, Pixels, peak_of, reason_of
 from .strips import map_threads, strips
 
 if TYPE_CHECKING:
     from PIL.Image import Image
-
 
 FLOAT_SUFFIXES = (".exr", ".hdr", ".pfm")
 """Suffixes of files that hold floats, whatever is written."""
@@ -40,32 +42,43 @@ BITS: dict[str, tuple[int, ...]] = {
 """Bits of a value that a file may have, by its suffix; the first is the default. 32 are floats, and
 so are 16 in an EXR file. An HDR file stores 8 bits of a value and an exponent."""
 
-_TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+SAVE_OPTIONS: dict[str, dict[str, Any]] = {
+    ".png": {},
+    ".jpg": {"quality": 95},
+    ".jpeg": {"quality": 95},
+    ".webp": {"quality": 95},
+    ".tif": {},
+    ".tiff": {},
+    ".bmp": {},
+    ".ppm": {},
+}
+"""Suffixes of files that Pillow writes, with the options that it receives."""
 
-_PNG_START = b"\x89PNG\r\n\x1a\n"
+MAX_PIXELS = 1 << 29
+"""Largest number of pixels of a file; a damaged header may claim more than memory holds."""
+
+ADVICE = "needs OpenImageIO; type: pip install 'eigengs-dr[hdr]'"
+
+MAX_HALF = 65_504.0
+"""Largest finite float of 16 bits."""
+
+_STARTS = {
+    b"\x76\x2f\x31\x01": "exr",
+    b"#?": "hdr",
+    b"PF": "pfm",
+    b"Pf": "pfm",
+    b"II*\0": "tiff",
+    b"MM\0*": "tiff",
+    b"II+\0": "tiff",
+    b"MM\0+": "tiff",
+    b"\x89PNG\r\n\x1a\n": "png",
+}
 
 _DEEP_PNG = (2, 4, 6)
 """Colour types of PNG of which Pillow keeps 8 bits only: RGB, grey with alpha, RGBA."""
 
-
-class DeepPixels(NamedTuple):
-    """What a file holds.
-
-    Attributes
-    ----------
-    pixels : ndarray of uint16 or floats, shape (H, W, C)
-    orientation : int
-        As in EXIF; 1 is upright.
-    associated : bool
-        Whether colours are multiplied by alpha already.
-    one_channel : bool
-        Whether the file is an EXR file of a single channel, which may be anything.
-    """
-
-    pixels: NDArray[Any]
-    orientation: int = 1
-    associated: bool = False
-    one_channel: bool = False
+_DEEP_TIFF = ("u2", "f2", "f4", "f8")
+"""Types of values of a TIFF file that tifffile reads here."""
 
 
 def kind_of(path: Path) -> str | None:
@@ -80,88 +93,88 @@ def kind_of(path: Path) -> str | None:
     """
     with path.open("rb") as file:
         start = file.read(32)
-    if start[:4] == b"\x76\x2f\x31\x01":
-        return "exr"
-    if start[:2] == b"#?":
-        return "hdr"
-    if start[:2] in (b"PF", b"Pf") and start[2:3].isspace():
-        return "pfm"
-    if start[:4] in _TIFF_STARTS:
-        return "tiff"
-    if start[:8] == _PNG_START and start[24:25] == b"\x10" and start[25] in _DEEP_PNG:
-        return "png"
-    return None
+    kind = next((kind for first, kind in _STARTS.items() if start.startswith(first)), None)
+    if kind == "png" and not (start[24:25] == b"\x10" and start[25] in _DEEP_PNG):
+        return None
+    if kind == "pfm" and not start[2:3].isspace():
+        return None
+    return kind
 
 
-def read_deep(path: Path) -> DeepPixels | None:
-    """Read a file without loss, if Pillow would lose some of it.
+def decode_file(path: Path, keep_grey: bool) -> EncodedImage:
+    """Return the pixels of a file, grey or RGB in its own dtype, and what they are.
 
-    Raises
-    ------
-    ValueError
-        If the file is damaged or holds more than one image of RGB, or a package is missing.
-    OSError
-        If the file cannot be opened.
+    For warnings and errors see `load_image`.
     """
-    readers: dict[str | None, Callable[[Path], DeepPixels | None]] = {
-        "exr": _read_exr,
-        "hdr": lambda path: DeepPixels(openimageio.read(path, integers=False)),
-        "pfm": lambda path: DeepPixels(read_pfm(path)),
-        "png": lambda path: DeepPixels(openimageio.read(path, integers=True)),
-        "tiff": lambda path: (found := read_tiff(path)) and DeepPixels(*found),
-    }
-    reader = readers.get(kind_of(path))
-    return reader(path) if reader else None
+    with image_errors(path):
+        kind = kind_of(path)
+        if kind == "png" and not has_openimageio():
+            warn(f"{path}: keeps 8 of its 16 bits; to keep all {ADVICE}")
+            kind = None
+        pixels = _read_deep(path, kind)
+    if pixels is None:
+        with open_picture(path) as file:
+            frames = getattr(file, "n_frames", 1)
+            pixels, transparent = picture_pixels(file)
+        if transparent:
+            warn(f"{path}: transparent pixels are shown over white")
+        if frames > 1:
+            warn(f"{path}: holds {frames} frames, the first is used")
+        return EncodedImage(pixels, "srgb")
+    encoding, channels = "linear" if pixels.dtype.kind == "f" else "srgb", pixels.shape[2]
+    if kind == "exr" and channels == 1 and not keep_grey:
+        raise ImageError(
+            f"{path}: holds one channel, not R, G and B; read it as data (keep_grey=True, "
+            "--space data), or export it as RGB"
+        )
+    if channels in (1, 3):
+        return EncodedImage(pixels, encoding)
+    if (pixels[..., -1] < peak_of(pixels.dtype)).any():
+        warn(f"{path}: transparent pixels are shown over {'black' if kind == 'exr' else 'white'}")
+        if kind != "exr":  # whose colours are multiplied by alpha
+            return EncodedImage(over_white(pixels), encoding)
+    return EncodedImage(pixels[..., :-1], encoding)
 
 
-def _read_exr(path: Path) -> DeepPixels:
-    pixels = openimageio.read_exr(path)
-    return DeepPixels(pixels, associated=True, one_channel=pixels.shape[2] == 1)
+def _read_deep(path: Path, kind: str | None) -> Pixels | None:
+    """Return pixels (H, W, C) of uint16 or floats, or None if Pillow reads them without loss."""
+    if kind == "tiff":
+        return _read_tiff(path)
+    if kind == "pfm":
+        return _read_pfm(path)
+    return None if kind is None else _read_openimageio(path, kind)
 
 
-def write_deep(path: Path, pixels: NDArray[Any], bits: int) -> None:
+def write_deep(path: Path, pixels: Pixels, bits: int) -> None:
     """Write pixels (H, W, C): float32, or uint16 for PNG and TIFF files of 16 bits.
 
     Raises
     ------
-    ValueError, OSError
+    ImportError, ValueError, OSError
         If a package is missing, or the file cannot be written.
     """
     suffix = path.suffix.lower()
+    grey = pixels.shape[2] == 1
+    flat = pixels[..., 0] if grey else pixels
     if suffix in TIFF_SUFFIXES:
-        write_tiff(path, pixels)
+        import tifffile
+
+        kind = "minisblack" if grey else "rgb"
+        tifffile.imwrite(path, flat, photometric=kind, compression="zlib")
     elif suffix == ".pfm":
-        write_pfm(path, pixels)
-    elif suffix == ".png" and pixels.shape[2] == 1:
+        header = f"{'Pf' if grey else 'PF'}\n{pixels.shape[1]} {pixels.shape[0]}\n-1.0\n"
+        path.write_bytes(header.encode() + pixels[::-1].astype("<f4").tobytes())
+    elif suffix == ".png" and grey:
         from PIL import Image
 
-        Image.fromarray(pixels[..., 0]).save(path)
+        Image.fromarray(flat).save(path)
     else:
-        openimageio.write(path, pixels, bits)
+        _write_openimageio(path, pixels, bits)
 
 
-def turn(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """Turn pixels (H, W, C) upright, by the orientation of EXIF."""
-    if orientation in (5, 6, 7, 8):
-        pixels = pixels.swapaxes(0, 1)
-    if orientation in (3, 4, 7, 8):
-        pixels = pixels[::-1]
-    if orientation in (2, 3, 6, 7):
-        pixels = pixels[:, ::-1]
-    return pixels
-
-
-SAVE_OPTIONS: dict[str, dict[str, Any]] = {
-    ".png": {},
-    ".jpg": {"quality": 95},
-    ".jpeg": {"quality": 95},
-    ".webp": {"quality": 95},
-    ".tif": {},
-    ".tiff": {},
-    ".bmp": {},
-    ".ppm": {},
-}
-"""Suffixes of files that Pillow writes, with the options that it receives."""
+# ---------------------------------------------------------------------------------------------
+#  Pillow
+# ---------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -218,27 +231,25 @@ def image_errors(path: Path) -> Iterator[None]:
         yield
     except ImageError:
         raise
-    except FileNotFoundError:
-        raise ImageError(f"{path}: no such file; check the path") from None
-    except IsADirectoryError:
-        raise ImageError(f"{path}: is a folder; name an image file in it") from None
-    except PermissionError:
-        raise ImageError(f"{path}: may not be read; check its permissions") from None
-    except UnidentifiedImageError:
-        raise ImageError(
-            f"{path}: not an image that Pillow knows; save it as PNG or JPEG"
-        ) from None
-    except Image.DecompressionBombError:
-        limit = f"{2 * (Image.MAX_IMAGE_PIXELS or 0):,}"
-        raise ImageError(
-            f"{path}: has more than {limit} pixels; scale it down first, or fit it in blocks"
-        ) from None
-    except Exception as error:  # on damaged files Pillow's decoders raise many types
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ImageError(f"{path}: damaged or unsupported ({reason}); export it again") from error
+    except Exception as error:  # on damaged files decoders raise many types
+        reason = reason_of(error)
+        known = {
+            FileNotFoundError: "no such file; check the path",
+            IsADirectoryError: "is a folder; name an image file in it",
+            PermissionError: "may not be read; check its permissions",
+            UnidentifiedImageError: "not an image that Pillow knows; save it as PNG or JPEG",
+            Image.DecompressionBombError: (
+                f"has more than {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels; scale it down first, "
+                "or fit it in blocks"
+            ),
+            ImportError: reason,
+        }
+        damaged = f"damaged or unsupported ({reason}); export it again"
+        said = next((text for kind, text in known.items() if isinstance(error, kind)), damaged)
+        raise ImageError(f"{path}: {said}") from error
 
 
-def picture_pixels(image: Image) -> tuple[NDArray[Any], bool]:
+def picture_pixels(image: Image) -> tuple[Pixels, bool]:
     """Return the pixels of a Pillow image, and whether some of them are transparent."""
     if image.mode == "I":  # 16-bit grey of PGM files comes as 32-bit integers
         return np.asarray(image) / 65535, False
@@ -248,110 +259,139 @@ def picture_pixels(image: Image) -> tuple[NDArray[Any], bool]:
         # `convert` copies the image even if the mode stays.
         return np.asarray(image if image.mode in ("1", "L", "RGB") else image.convert("RGB")), False
     pixels = np.asarray(image.convert("RGBA"))
-    shown = np.empty((*pixels.shape[:2], 3), np.float32)
-
-    def show_over_white(rows: slice) -> None:
-        part = pixels[rows].astype(np.float32) / 255
-        color, alpha = part[..., :3], part[..., 3:]
-        shown[rows] = 1 - alpha * (1 - color)
-
-    map_threads(show_over_white, strips(*shown.shape[:2]))
-    return shown, bool(pixels[..., 3].min() < 255)
+    return over_white(pixels), bool(pixels[..., 3].min() < 255)
 
 
-DEEP = ("u2", "f2", "f4", "f8")
-"""Types of values that this module reads."""
+def over_white(pixels: Pixels) -> NDArray[np.float32]:
+    """Show colours with alpha, the last channel, over white."""
+    height, width, channels = pixels.shape
+    shown = np.empty((height, width, channels - 1), np.float32)
 
-MAX_PIXELS = 1 << 29
-"""Largest number of pixels, as of other files; a damaged header may claim more than fits."""
+    def show(rows: slice) -> None:
+        part = np.divide(pixels[rows], peak_of(pixels.dtype), dtype=np.float32)
+        shown[rows] = 1 - part[..., -1:] * (1 - part[..., :-1])
 
-PLAIN = (1, 2)
-"""Photometric interpretations: black is zero, and RGB."""
+    map_threads(show, strips(height, width))
+    return shown
 
 
-def read_tiff(path: Path) -> tuple[NDArray[Any], int] | None:
-    """Read the first image of a file, if it holds more than 8 bits.
+# ---------------------------------------------------------------------------------------------
+#  TIFF and portable float maps
+# ---------------------------------------------------------------------------------------------
 
-    Returns
-    -------
-    pixels : ndarray of uint16 or floats, shape (H, W, C)
-    orientation : int
-        The tag of this name, as in EXIF: 1 is upright.
-        None, instead of both, for a file that Pillow reads as well.
 
-    Raises
-    ------
-    ValueError
-        If the file is damaged, or its compression is unknown to tifffile.
-    """
+def _read_tiff(path: Path) -> Pixels | None:
+    """Read the first image of a TIFF file, if it holds more than 8 bits."""
     import tifffile
 
-    try:
-        with tifffile.TiffFile(path) as file:
-            page = file.pages[0]
-            known = page.dtype is not None and page.dtype.str[1:] in DEEP
-            if not known or page.photometric not in PLAIN or page.samplesperpixel > 4:
-                return None
-            if page.imagewidth * page.imagelength > MAX_PIXELS:
-                raise ValueError(f"more than {MAX_PIXELS:,} pixels")
-            pixels = page.asarray()
-            turned = page.tags["Orientation"].value if "Orientation" in page.tags else 1
-            if pixels.ndim == 3 and page.planarconfig == 2:
-                pixels = np.moveaxis(pixels, 0, 2)
-    except Exception as error:  # tifffile raises many types
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ValueError(f"damaged or unsupported ({reason}); export it again") from error
-    return pixels if pixels.ndim == 3 else pixels[..., None], int(turned)
-
-
-def write_tiff(path: Path, pixels: NDArray[Any]) -> None:
-    """Write uint16 or float32 (H, W, 3) or (H, W, 1) without loss."""
-    import tifffile
-
-    grey = pixels.shape[2] == 1
-    tifffile.imwrite(
-        path,
-        pixels[..., 0] if grey else pixels,
-        photometric="minisblack" if grey else "rgb",
-        compression="zlib",
-    )
+    with tifffile.TiffFile(path) as file:
+        page = file.pages[0]
+        known = page.dtype is not None and page.dtype.str[1:] in _DEEP_TIFF
+        black_is_zero = page.photometric in (1, 2)  # grey or RGB, no palette
+        if not known or not black_is_zero or page.samplesperpixel > 4:
+            return None
+        _check_size(path, page.imagewidth, page.imagelength)
+        pixels = page.asarray()
+        turned = page.tags["Orientation"].value if "Orientation" in page.tags else 1
+        if pixels.ndim == 3 and page.planarconfig == 2:
+            pixels = np.moveaxis(pixels, 0, 2)
+    pixels = pixels if pixels.ndim == 3 else pixels[..., None]
+    # The orientation is that of EXIF.
+    if turned in (5, 6, 7, 8):
+        pixels = pixels.swapaxes(0, 1)
+    if turned in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    return pixels[:, ::-1] if turned in (2, 3, 6, 7) else pixels
 
 
 _HEADER = re.compile(rb"(P[Ff])\s+(\d{1,9})\s+(\d{1,9})\s+(-?[0-9.eE+-]+)\s")
 """Kind (PF is RGB, Pf is grey), width, height, and a scale that is negative for little endian."""
 
 
-def read_pfm(path: Path) -> NDArray[np.float32]:
-    """Read a portable float map.
-
-    Returns
-    -------
-    ndarray of float32, shape (H, W, 3) or (H, W, 1)
-
-    Raises
-    ------
-    ValueError
-        If the file is damaged.
-    """
+def _read_pfm(path: Path) -> Pixels:
+    """Read a portable float map."""
     content = path.read_bytes()
     header = _HEADER.match(content)
     if not header:
-        raise ValueError("damaged or unsupported (no header of a float map); export it again")
+        raise ValueError("no header of a float map")
     width, height, channels = int(header[2]), int(header[3]), 3 if header[1] == b"PF" else 1
     if len(content) - header.end() != 4 * width * height * channels:
-        raise ValueError("damaged (its size is not that of its header); copy or export it again")
+        raise ValueError("its size is not that of its header")
     order = "<f4" if float(header[4]) < 0 else ">f4"
     pixels = np.frombuffer(content, order, offset=header.end())
-    return pixels.reshape(height, width, channels)[::-1].astype(np.float32)
+    return pixels.reshape(height, width, channels)[::-1]
 
 
-def write_pfm(path: Path, pixels: NDArray[Any]) -> None:
-    """Write floats (H, W, 3) or (H, W, 1) as a portable float map of little endian."""
+def _check_size(path: Path, width: int, height: int) -> None:
+    if width * height > MAX_PIXELS:
+        raise ImageError(f"{path}: has more than {MAX_PIXELS:,} pixels; scale it down first")
+
+
+# ---------------------------------------------------------------------------------------------
+#  OpenImageIO: EXR, Radiance HDR, and PNG of 16 bits
+# ---------------------------------------------------------------------------------------------
+
+
+def has_openimageio() -> bool:
+    """Return whether OpenImageIO is installed."""
+    return find_spec("OpenImageIO") is not None
+
+
+def _openimageio() -> Any:
+    try:
+        import OpenImageIO
+    except ImportError:
+        raise ImportError(ADVICE) from None
+    return OpenImageIO
+
+
+def _read_openimageio(path: Path, kind: str) -> Pixels:
+    """Read a file of one image; alpha is not multiplied into the colours, except in EXR."""
+    oiio = _openimageio()
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    file = oiio.ImageInput.open(str(path), config)
+    if not file:
+        raise OSError(oiio.geterror().strip())
+    spec = file.spec()
+    _check_size(path, spec.width, spec.height)
+    if kind == "exr":
+        names = tuple(spec.channelnames)
+        if file.seek_subimage(1, 0):
+            raise ImageError(f"{path}: holds several parts; save one as a file of its own")
+        if spec.deep:
+            raise ImageError(f"{path}: holds deep pixels; flatten it first")
+        if len(names) > 1 and names not in (("R", "G", "B"), ("R", "G", "B", "A")):
+            shown = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+            raise ImageError(
+                f"{path}: holds the channels {shown}; save the layer that is meant, as R, G and B, "
+                "to a file of its own"
+            )
+    file.seek_subimage(0, 0)
+    values = oiio.UINT16 if kind == "png" else oiio.FLOAT
+    pixels = file.read_image(0, 0, 0, spec.nchannels, values)
+    if pixels is None:
+        raise OSError(file.geterror().strip())
+    return np.asarray(pixels)
+
+
+def _write_openimageio(path: Path, pixels: Pixels, bits: int) -> None:
+    """Write an EXR or HDR file, or a PNG of 16 bits; 16-bit floats are clamped to +-65,504."""
+    oiio = _openimageio()
+    suffix = path.suffix.lower()
+    if suffix == ".hdr":  # it has three channels
+        pixels = np.broadcast_to(pixels, (*pixels.shape[:2], 3))
     height, width, channels = pixels.shape
-    kind = "PF" if channels == 3 else "Pf"
-    with path.open("wb") as file:
-        file.write(f"{kind}\n{width} {height}\n-1.0\n".encode())
-        file.write(pixels[::-1].astype("<f4").tobytes())
-
-
-Pixels = NDArray[Any]
+    kind = "uint16" if pixels.dtype == np.uint16 else ("half" if bits == 16 else "float")
+    if kind == "half":
+        pixels = np.clip(pixels, -MAX_HALF, MAX_HALF)
+    spec = oiio.ImageSpec(width, height, channels, kind)
+    spec.channelnames = ("R", "G", "B") if channels == 3 else ("Y",)
+    if suffix == ".exr":
+        spec.attribute("compression", "zip")
+    file = oiio.ImageOutput.create(str(path))
+    if not file:
+        raise OSError(oiio.geterror().strip())
+    written = file.open(str(path), spec) and file.write_image(np.ascontiguousarray(pixels))
+    if not (file.close() and written):
+        raise OSError(file.geterror().strip())

@@ -16,14 +16,12 @@ IntArray = NDArray[np.int64]
 
 # The order in which a Hilbert curve visits the quarters of a square, by state: as it is (0), with
 # columns and rows swapped (1), with both counted from the other side (2), or both changes (3).
-_RIGHT = np.array([[0, 0, 1, 1], [0, 1, 1, 0], [1, 1, 0, 0], [1, 0, 0, 1]], np.int32)
-
-_LOW = _RIGHT[[1, 0, 3, 2]]
+_RIGHT = np.array([[0, 0, 1, 1], [0, 1, 1, 0], [1, 1, 0, 0], [1, 0, 0, 1]])
 
 _STATE = np.arange(4, dtype=np.int8)[:, None] ^ np.array([1, 0, 0, 3], np.int8)
 """The state of the curve inside each quarter, in the order of the curve."""
 
-_PLACE = np.argsort(2 * _RIGHT + _LOW, axis=1)
+_PLACE = np.argsort(2 * _RIGHT + _RIGHT[[1, 0, 3, 2]], axis=1)
 """The place in this order of the quarter in column ``right`` and row ``low``, by state and
 ``2 right + low``."""
 
@@ -55,11 +53,18 @@ def hilbert_encode(points: IntArray, levels: int) -> IntArray:
     array([0, 1, 2, 3])
     """
     x, y = np.asarray(points, np.int64).T
-    place, state = np.zeros_like(x), np.zeros(len(x), np.int8)
+    return _walk(x, y, levels)[0]
+
+
+def _walk(
+    x: IntArray, y: IntArray, levels: int, start: int = 0
+) -> tuple[IntArray, NDArray[np.int8]]:
+    """Return the indices of points on a curve with a state, and its states inside the points."""
+    place, state = np.zeros_like(x), np.full(len(x), start, np.int8)
     for level in reversed(range(levels)):
         quarter = _PLACE[state, 2 * (x >> level & 1) + (y >> level & 1)]
         place, state = 4 * place + quarter, _STATE[state, quarter]
-    return place
+    return place, state
 
 
 class Square(NamedTuple):
@@ -109,42 +114,26 @@ def hilbert_squares(height: int, width: int) -> list[Square]:
     list of Square
         Squares of `SQUARE` pixels a side, or one square if the image is smaller.
     """
-    whole = 1 << max(height - 1, width - 1).bit_length()
-    side = min(whole, SQUARE)
-    found = zip(*(a.tolist() for a in _quarter(whole, side, 0, height, width)), strict=True)
+    levels = max(height - 1, width - 1).bit_length()
+    side = min(1 << levels, SQUARE)
+    low, right = np.indices((-(-height // side), -(-width // side))).reshape(2, -1)
+    place, states = _walk(right, low, levels - side.bit_length() + 1)
+
+    def part(number: int, length: int) -> slice:
+        return slice(side * number, min(side * number + side, length))
+
     return [
-        Square(
-            slice(row, min(row + side, height)),
-            slice(column, min(column + side, width)),
-            side,
-            state,
-        )
-        for row, column, state in found
+        Square(part(int(low[k]), height), part(int(right[k]), width), side, int(states[k]))
+        for k in np.argsort(place)
     ]
 
 
 @lru_cache(maxsize=4)  # the squares of an image have one side
 def _order(side: int, state: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Return row and column of all pixels of a square in the order of the curve."""
-    row, column, _ = _quarter(side, 1, state, side, side)
+    low, right = np.indices((side, side)).reshape(2, -1)
+    place, _ = _walk(right, low, side.bit_length() - 1, state)
+    order = np.empty(side * side, np.int32)
+    order[place] = np.arange(side * side)
+    row, column = np.divmod(order, np.int32(side))
     return row, column
-
-
-def _quarter(
-    side: int, stop: int, state: int, height: int, width: int
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int8]]:
-    """Replace a square by its quarters, level by level, down to squares of the side `stop`.
-
-    Return the first row, the first column and the state of each square inside the image, in the
-    order of the curve. The cost is proportional to their number: nothing is sorted.
-    """
-    column = row = np.zeros(1, np.int32)
-    states = np.full(1, state, np.int8)
-    while side > stop:
-        side >>= 1
-        column = column[:, None] + side * _RIGHT[states]
-        row = row[:, None] + side * _LOW[states]
-        states = _STATE[states]
-        inside = (column < width) & (row < height)
-        column, row, states = column[inside], row[inside], states[inside]
-    return row, column, states

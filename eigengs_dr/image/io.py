@@ -2,60 +2,38 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.feedback import warn
 from ..storage.atomic import atomic_write, refuse_url
 from .color import to_coded, to_linear
 from .formats import (
+    ADVICE,
     BITS,
     FLOAT_SUFFIXES,
     SAVE_OPTIONS,
-    image_errors,
-    kind_of,
-    open_picture,
-    picture_pixels,
-    read_deep,
-    turn,
+    decode_file,
+    has_openimageio,
     write_deep,
 )
-from .openimageio import ADVICE, is_installed
 from .pixels import (
     MAX_PIXEL,
     EncodedImage,
     ImageError,
+    Pixels,
     check_encoding,
-    check_light,
-    check_range,
     encoding_of,
+    peak_of,
+    reason_of,
     to_floats,
 )
 from .remote import is_url, local_copy
 from .strips import by_strips, map_threads, strips
-
-__all__ = [
-    "SAVE_OPTIONS",
-    "SUFFIXES",
-    "ImageError",
-    "bits_of",
-    "check_data",
-    "check_image",
-    "dtype_of",
-    "load_image",
-    "open_picture",
-    "picture_pixels",
-    "read_image",
-    "save_image",
-    "to_8bit",
-    "to_file",
-    "write_pixels",
-]
 
 SUFFIXES = (*SAVE_OPTIONS, *FLOAT_SUFFIXES)
 """Suffixes of image files."""
@@ -117,23 +95,9 @@ def read_file(
             except ImageError as error:
                 raise ImageError(str(error).replace(str(file), url)) from None
     path = Path(path)
-    found = _load_deep(path, keep_grey)
-    if found is None:
-        with open_picture(path) as file:
-            frames = getattr(file, "n_frames", 1)
-            pixels, transparent = picture_pixels(file)
-        if transparent:
-            warn(f"{path}: transparent pixels are shown over white")
-        if frames > 1:
-            warn(f"{path}: holds {frames} frames, the first is used")
-        found = pixels, "srgb"
-    said = encoding or found[1]
-    return EncodedImage(_check(to_floats(found[0], str(path), keep_grey), str(path), said), said)
-
-
-def _check(pixels: NDArray[np.float32], name: str, encoding: str) -> NDArray[np.float32]:
-    """Refuse pixels out of range."""
-    return check_light(pixels, name) if encoding == "linear" else check_range(pixels, name)
+    found = decode_file(path, keep_grey)
+    said = encoding or found.encoding
+    return EncodedImage(to_floats(found.pixels, str(path), keep_grey, encoding=said), said)
 
 
 def read_image(image: Any, keep_grey: bool = False, encoding: str | None = None) -> EncodedImage:
@@ -157,8 +121,7 @@ def read_floats(
     For parameters and errors see `check_image`.
     """
     pixels, said = read_image(image, keep_grey, encoding)
-    floats = to_floats(pixels, "image", keep_grey, copy)
-    return EncodedImage(_check(floats, "image", said), said)
+    return EncodedImage(to_floats(pixels, "image", keep_grey, copy, said), said)
 
 
 def check_image(
@@ -214,43 +177,7 @@ def check_data(image: Any, copy: bool = True) -> NDArray[np.float32]:
     if isinstance(image, (str, os.PathLike)):
         image = load_image(image, keep_grey=True)  # type: ignore[arg-type]
     pixels = image.pixels if isinstance(image, EncodedImage) else image
-    return check_light(to_floats(pixels, "image", keep_grey=True, copy=copy), "image")
-
-
-def _load_deep(path: Path, keep_grey: bool) -> tuple[NDArray[Any], str] | None:
-    """Return the pixels of a file of floats or 16 bits, without alpha, and their encoding.
-
-    Returns None for a file that Pillow reads as well.
-    """
-    with image_errors(path):
-        if kind_of(path) == "png" and not is_installed():
-            warn(f"{path}: keeps 8 of its 16 bits; to keep all {ADVICE}")
-            return None
-        try:
-            found = read_deep(path)
-        except ValueError as error:
-            raise ImageError(f"{path}: {error}") from error
-    if found is None:
-        return None
-    if found.one_channel and not keep_grey:
-        raise ImageError(
-            f"{path}: holds one channel, not R, G and B; read it as data (keep_grey=True, "
-            "--space data), or export it as RGB"
-        )
-    pixels = turn(found.pixels, found.orientation)
-    encoding = "linear" if pixels.dtype.kind == "f" else "srgb"
-    if pixels.shape[2] in (1, 3):
-        return pixels, encoding
-    color, alpha = pixels[..., :-1], pixels[..., -1:]
-    peak = np.iinfo(pixels.dtype).max if encoding == "srgb" else 1
-    if (alpha >= peak).all():
-        return color, encoding
-    ground = "black" if found.associated else "white"
-    warn(f"{path}: transparent pixels are shown over {ground}")
-    if found.associated:
-        return color, encoding
-    share = np.divide(alpha, peak, dtype=np.float32)
-    return 1 - share * (1 - np.divide(color, peak, dtype=np.float32)), encoding
+    return to_floats(pixels, "image", keep_grey=True, copy=copy, encoding="linear")
 
 
 def save_image(
@@ -291,9 +218,10 @@ def save_image(
     path = Path(path)
     bits = bits_of(path, bits)
     said = encoding_of(image, encoding)
-    ready = isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.size
-    if ready and bits == 8 and said != "linear" and image.shape[2:] in ((1,), (3,)):  # type: ignore[union-attr]
-        return write_pixels(path, np.asarray(image), bits)  # large pictures need no copy
+    if bits == 8 and said != "linear" and getattr(image, "dtype", None) == np.uint8:
+        array = np.asarray(image)
+        if array.size and array.shape[2:] in ((1,), (3,)):
+            return write_pixels(path, array, bits)  # large pictures need no copy
     floats = to_floats(image, "image", keep_grey=True, copy=False)
     kind = dtype_of(path, bits)
     if said != "linear" and kind != np.float32 and MAX_PIXEL < floats.mean() <= 255:
@@ -326,18 +254,18 @@ def bits_of(path: Path, bits: int | None = None) -> int:
     if bits is not None and bits not in known_bits:
         shown = " or ".join(map(str, sorted(known_bits)))
         raise ImageError(f"{path}: bits is {bits}; a {suffix} file has {shown}")
-    if suffix in (".exr", ".hdr") and not is_installed():
+    if suffix in (".exr", ".hdr") and not has_openimageio():
         raise ImageError(f"{path}: {ADVICE}")
     return bits or known_bits[0]
 
 
-def dtype_of(path: Path, bits: int) -> Any:
+def dtype_of(path: Path, bits: int) -> type[np.generic]:
     """Return the type of the values of a file: uint8, uint16, or float32 for linear light."""
     floats = path.suffix.lower() in FLOAT_SUFFIXES or bits == 32
-    return np.float32 if floats else {8: np.uint8, 16: np.uint16}[bits]
+    return np.float32 if floats else np.uint8 if bits == 8 else np.uint16
 
 
-def to_file(pixels: NDArray[Any], encoding: str | None, kind: Any) -> NDArray[Any]:
+def to_file(pixels: NDArray[np.floating], encoding: str | None, kind: type[np.generic]) -> Pixels:
     """Convert float pixels to the values of a file.
 
     Parameters
@@ -356,10 +284,10 @@ def to_file(pixels: NDArray[Any], encoding: str | None, kind: Any) -> NDArray[An
         light = to_linear(pixels) if encoding == "srgb" else pixels
         return np.asarray(light, np.float32)
     coded = to_coded(np.maximum(pixels, 0)) if encoding == "linear" else pixels
-    return np.rint(np.clip(coded, 0, 1) * np.iinfo(kind).max).astype(kind)
+    return np.rint(np.clip(coded, 0, 1) * peak_of(np.dtype(kind))).astype(kind)
 
 
-def write_pixels(path: Path, pixels: NDArray[Any], bits: int) -> None:
+def write_pixels(path: Path, pixels: Pixels, bits: int) -> None:
     """Write pixels (H, W, C) of the type of `dtype_of`, completely or not at all.
 
     Raises
@@ -376,15 +304,15 @@ def write_pixels(path: Path, pixels: NDArray[Any], bits: int) -> None:
             else:
                 flat = pixels[..., 0] if pixels.shape[2] == 1 else pixels
                 Image.fromarray(flat).save(temporary, **SAVE_OPTIONS[path.suffix.lower()])
-    except (OSError, ValueError) as error:
-        message = str(error)
+    except (ImportError, OSError, ValueError) as error:
+        message = reason_of(error)
         if not message.startswith(f"{path}: "):  # errors of atomic_write are clear already
             reason = getattr(error, "strerror", None) or message
             message = f"{path}: cannot be written ({reason}); choose another path"
         raise ImageError(message) from error
 
 
-def to_8bit(image: NDArray[Any], out: NDArray[Any] | None = None) -> NDArray[Any]:
+def to_8bit(image: Pixels, out: Pixels | None = None) -> Pixels:
     """Scale, clamp and round an image to 8 bits, and return the values as floats.
 
     Parameters
@@ -438,12 +366,10 @@ def sample(name: str) -> NDArray[np.float32]:
     Raises
     ------
     ImageError
-        If the name is unknown, or scikit-image is not installed.
+        If the name is unknown.
     """
     if name not in SAMPLES:
         raise ImageError(f"sample {name!r} is unknown; use one of {', '.join(SAMPLES)}")
     # find_spec finds the folder without the slow import of scikit-image.
-    package = importlib.util.find_spec("skimage")
-    if package is None or package.origin is None:
-        raise ImageError("scikit-image, which holds the samples, is missing; install scikit-image")
-    return load_image(Path(package.origin).parent / "data" / SAMPLES[name])
+    [folder] = find_spec("skimage").submodule_search_locations  # type: ignore[union-attr, misc]
+    return load_image(Path(folder) / "data" / SAMPLES[name])

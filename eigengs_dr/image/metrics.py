@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .color import RGB_TO_YCBCR, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_linear, to_pu21
 from .io import to_8bit
+from .pixels import Pixels, peak_of
 from .strips import map_threads, strips
 
 MAX_PSNR = 100.0
@@ -105,7 +105,7 @@ def psnrs_by_rows(
 
 
 def _sums_by_rows(
-    read: Callable[[slice], NDArray[Any]], image: NDArray[Any], spaces: Sequence[str]
+    read: Callable[[slice], Pixels], image: Pixels, spaces: Sequence[str]
 ) -> list[float]:
     """Return the sums of the squared errors in several spaces, see `psnrs_by_rows`."""
 
@@ -117,7 +117,7 @@ def _sums_by_rows(
     return [float(total) for total in sums]
 
 
-def _sum_squares(a: NDArray[np.float64], b: NDArray[np.float64], space: str) -> float:
+def _sum_squares(a: NDArray[np.floating], b: NDArray[np.floating], space: str) -> float:
     """Return the sum of the squared differences of two images in a space; overwrite both."""
     if space == "rgb":
         for image in (a, b):
@@ -165,7 +165,7 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
 
     Images are clamped to [0, 1]. The window is Gaussian, 11 pixels wide with sigma 1.5. The mean is
     taken over the channels and over the pixels whose window lies inside the image. If a side is
-    shorter than 11 pixels, the image is mirrored at its borders and border pixels count too.
+    shorter than 11 pixels, the window shrinks to the largest odd size that fits.
 
     Parameters
     ----------
@@ -190,17 +190,13 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
 
     Notes
     -----
-    The result equals that of `skimage.metrics.structural_similarity` to 7 digits. By strips of rows
-    4096x4096 pixels take 5.4 s and no memory that counts; scikit-image takes 10.3 s and 726 MiB.
-    512x512 pixels take 0.16 s, in scikit-image 0.06 s (2 cores).
+    The result equals that of `skimage.metrics.structural_similarity` to 7 digits, which returns no
+    contrast-structure term: `ms_ssim` would need a second way. By strips of rows 4096x4096 pixels
+    take 5.4 s and no memory that counts; scikit-image takes 10.3 s and 726 MiB. 512x512 pixels take
+    0.16 s, in scikit-image 0.06 s (2 cores).
     """
     x, y = _pair(a, b)
-    mirrored = WINDOW // 2 - window_radius(x.shape[:2])
-    if mirrored:
-        border = [(mirrored, mirrored), (mirrored, mirrored), (0, 0)]
-        x, y = (np.pad(image, border, "symmetric") for image in (x, y))
-    whole, _ = similarity(x, y, lambda rows: np.clip(rows, 0, 1, out=rows))
-    return float(whole.mean())
+    return float(_similarity(x, y, lambda rows: np.clip(rows, 0, 1))[0].mean())
 
 
 def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
@@ -255,24 +251,23 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
 
     product = np.ones(3)
     for weight in weights[:-1]:
-        product *= np.maximum(similarity(x, y, convert)[1], 0) ** weight
+        product *= np.maximum(_similarity(x, y, convert)[1], 0) ** weight
         x, y = halve(x), halve(y)
-    product *= np.maximum(similarity(x, y, convert)[0], 0) ** weights[-1]
+    product *= np.maximum(_similarity(x, y, convert)[0], 0) ** weights[-1]
     return float(product.mean())
 
 
-def _scaled(image: NDArray[Any]) -> NDArray[Any]:
+def _scaled(image: Pixels) -> Pixels:
     """Scale integers to [0, 1] by their type; floats stay as they are."""
-    if image.dtype.kind == "f":
+    kind = image.dtype.kind
+    if kind == "f":
         return image
-    if image.dtype.kind == "b":
-        return image.astype(np.float64)
-    if image.dtype.kind == "u" and image.itemsize <= 2:
-        return image / np.float64(np.iinfo(image.dtype).max)
+    if kind == "b" or (kind == "u" and image.itemsize <= 2):
+        return image / np.float64(peak_of(image.dtype))
     raise ValueError(f"pixels are {image.dtype}; expected uint8, uint16 or floats in [0, 1]")
 
 
-def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
+def _pair(a: ArrayLike, b: ArrayLike) -> tuple[Pixels, Pixels]:
     """Return both images as RGB of one shape (H, W, 3) without a copy; grey is replicated."""
     x, y = (_scaled(np.asarray(image)) for image in (a, b))
     if x.shape != y.shape:
@@ -291,17 +286,12 @@ WINDOW = 11
 SIGMA = 1.5
 """Standard deviation of that window, in pixels."""
 
-Convert = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Convert = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 """Changes the values of some rows of an image, in double precision."""
 
 
-def window_radius(sides: tuple[int, ...]) -> int:
-    """Return the radius of the window: that of `WINDOW`, or the largest that fits the image."""
-    return min(WINDOW // 2, (min(sides) - 1) // 2)
-
-
-def similarity(
-    x: NDArray[Any], y: NDArray[Any], convert: Convert
+def _similarity(
+    x: Pixels, y: Pixels, convert: Convert
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return mean SSIM and mean contrast-structure term per channel of two (H, W, 3) images.
 
@@ -309,7 +299,7 @@ def similarity(
     precision. Only pixels whose window lies inside the image count.
     """
     height, width = x.shape[:2]
-    radius = window_radius((height, width))
+    radius = min(WINDOW // 2, (min(height, width) - 1) // 2)
     taps = gaussian_taps(SIGMA, radius / SIGMA)
     rows, columns = height - 2 * radius, width - 2 * radius
 
@@ -323,7 +313,7 @@ def similarity(
 
 
 def _similarity_sums(
-    x: NDArray[np.float64], y: NDArray[np.float64], taps: NDArray[np.float64]
+    x: NDArray[np.floating], y: NDArray[np.floating], taps: NDArray[np.float64]
 ) -> tuple[float, float]:
     """Return the sums of SSIM and of its contrast-structure term over two planes (H, W)."""
     c1, c2 = 0.01**2, 0.03**2
@@ -336,17 +326,11 @@ def _similarity_sums(
     return float((luminance * structure).sum()), float(structure.sum())
 
 
-def halve(image: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the means of the 2x2 blocks of an image (H, W, 3); drop an odd last row or column."""
-    height, width = image.shape[0] // 2, image.shape[1] // 2
-    result = np.empty((height, width, 3))
-
-    def fill(rows: slice) -> None:
-        part = image[2 * rows.start : 2 * rows.stop, : 2 * width].astype(np.float64)
-        np.mean(part.reshape(-1, 2, width, 2, 3), axis=(1, 3), out=result[rows])
-
-    map_threads(fill, strips(height, 2 * width))
-    return result
+def halve(image: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the means of the 2x2 blocks of an image (H, W, C); drop an odd last row or column."""
+    even = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
+    quarters = (even[row::2, column::2] for row in (0, 1) for column in (0, 1))
+    return np.asarray(sum(quarters, np.zeros(1)) / 4)
 
 
 TRUNCATION = 4.0
@@ -373,7 +357,7 @@ def gaussian_taps(deviation: float, truncation: float = TRUNCATION) -> NDArray[n
     return np.asarray(half / (2 * half.sum() - half[0]))
 
 
-def blur(plane: NDArray[Any], taps: NDArray[np.float64]) -> NDArray[Any]:
+def blur(plane: NDArray[np.floating], taps: NDArray[np.float64]) -> NDArray[np.floating]:
     """Blur the last two axes of an array; return only the pixels whose window lies inside.
 
     Parameters
@@ -392,7 +376,7 @@ def blur(plane: NDArray[Any], taps: NDArray[np.float64]) -> NDArray[Any]:
     return _along_rows(across, taps)
 
 
-def _along_rows(plane: NDArray[Any], taps: NDArray[Any]) -> NDArray[Any]:
+def _along_rows(plane: NDArray[np.floating], taps: NDArray[np.floating]) -> NDArray[np.floating]:
     """Blur the axis before the last; a view with swapped axes blurs the other one."""
     radius = len(taps) - 1
     height = plane.shape[-2] - 2 * radius

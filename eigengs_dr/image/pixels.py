@@ -27,8 +27,17 @@ MAX_LIGHT = 1e9
 single precision."""
 
 
+Pixels = NDArray[Any]
+"""Pixels (H, W, C) of any dtype that an image may have."""
+
+
 class ImageError(ValueError):
     """An image cannot be used; one line names the image, the reason and what to do."""
+
+
+def reason_of(error: BaseException) -> str:
+    """Return the first line of an error, or its type."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 class EncodedImage(NamedTuple):
@@ -42,16 +51,6 @@ class EncodedImage(NamedTuple):
 
     pixels: Any
     encoding: str
-
-
-def is_bitmap(image: Any) -> bool:
-    """Return whether an object is a ``mitsuba.Bitmap``; this module does not know Mitsuba."""
-    return hasattr(image, "srgb_gamma") and hasattr(image, "component_format")
-
-
-def is_tensor(image: Any) -> bool:
-    """Return whether an object is an array of Dr.Jit."""
-    return type(image).__module__.startswith("drjit.")
 
 
 def check_encoding(encoding: str | None) -> None:
@@ -89,9 +88,10 @@ def encoding_of(image: Any, encoding: str | None = None) -> str | None:
     check_encoding(encoding)
     if encoding is not None:
         return encoding
-    if is_bitmap(image):
+    if hasattr(image, "srgb_gamma") and hasattr(image, "component_format"):  # a mitsuba.Bitmap
         return "srgb" if image.srgb_gamma() else "linear"
-    if is_tensor(image) and tuple(getattr(image, "shape", ()))[2:] == (3,):
+    is_tensor = type(image).__module__.startswith("drjit.")
+    if is_tensor and tuple(getattr(image, "shape", ()))[2:] == (3,):
         warn(
             "a Dr.Jit tensor does not say what its pixels are; say encoding='linear' for light, as "
             "of mitsuba.render, or encoding='srgb'"
@@ -99,10 +99,22 @@ def encoding_of(image: Any, encoding: str | None = None) -> str | None:
     return None
 
 
+def peak_of(dtype: np.dtype[Any]) -> int:
+    """Return the value of white: the largest integer, or 1 for floats and bool."""
+    return int(np.iinfo(dtype).max) if dtype.kind == "u" else 1
+
+
 def to_floats(
-    image: ArrayLike, name: str, keep_grey: bool = False, copy: bool = True
+    image: ArrayLike,
+    name: str,
+    keep_grey: bool = False,
+    copy: bool = True,
+    encoding: str | None = None,
 ) -> NDArray[np.float32]:
-    """Scale to float32 and replicate grey to RGB; errors call the image `name`."""
+    """Scale to float32 and replicate grey to RGB; errors call the image `name`.
+
+    The range of the pixels is checked by the encoding, and not at all without one.
+    """
     try:
         array = np.asarray(image)
     except ValueError:  # rows of unequal length
@@ -129,35 +141,30 @@ def to_floats(
             f"the first at [{row}, {column}]; replace them, as with np.nan_to_num"
         )
     channels = array.shape[2] if keep_grey else 3
+    pixels = array
     as_it_is = array.dtype == np.float32 and array.shape[2] == channels
-    if as_it_is and not copy and array.flags.c_contiguous:
-        return array
-    peak = np.iinfo(array.dtype).max if kind == "u" else 1
-    pixels = np.empty((*array.shape[:2], channels), np.float32)
+    if copy or not as_it_is or not array.flags.c_contiguous:
+        pixels = np.empty((*array.shape[:2], channels), np.float32)
 
-    def fill(rows: slice) -> None:
-        with np.errstate(over="ignore"):  # callers clamp or refuse the infinities
-            pixels[rows] = np.divide(array[rows], peak, dtype=np.float32)
+        def fill(rows: slice) -> None:
+            with np.errstate(over="ignore"):  # the infinities are clamped or refused later
+                pixels[rows] = np.divide(array[rows], peak_of(array.dtype), dtype=np.float32)
 
-    map_threads(fill, strips(*pixels.shape[:2]))
+        map_threads(fill, strips(*pixels.shape[:2]))
+    if encoding is not None:
+        _check_range(pixels, name, encoding)
     return pixels
 
 
-def check_light(pixels: NDArray[np.float32], name: str) -> NDArray[np.float32]:
-    """Refuse light or data whose squares would leave single precision."""
+def _check_range(pixels: NDArray[np.float32], name: str, encoding: str) -> None:
+    """Refuse sRGB far outside [0, 1], and light whose squares would leave single precision."""
     low, high = float(pixels.min()), float(pixels.max())
-    if max(-low, high) > MAX_LIGHT:
-        raise ImageError(f"{name}: pixels run from {low:g} to {high:g}; scale it first")
-    return pixels
-
-
-def check_range(pixels: NDArray[np.float32], name: str) -> NDArray[np.float32]:
-    """Refuse pixels far outside [0, 1]."""
-    low, high = float(pixels.min()), float(pixels.max())
-    if low < MIN_PIXEL or high > MAX_PIXEL:
+    if encoding == "linear":
+        if max(-low, high) > MAX_LIGHT:
+            raise ImageError(f"{name}: pixels run from {low:g} to {high:g}; scale it first")
+    elif low < MIN_PIXEL or high > MAX_PIXEL:
         hint = "divide by 255" if 2 < high <= 255 and low >= 0 else "scale it"
         light = ", or say encoding='linear' for light" if low >= 0 else ""
         raise ImageError(
             f"{name}: pixels run from {low:g} to {high:g}, not 0 to 1; {hint} first{light}"
         )
-    return pixels

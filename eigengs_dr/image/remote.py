@@ -11,14 +11,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from types import ModuleType
 from typing import Any
 
 from .formats import FLOAT_SUFFIXES, SAVE_OPTIONS
-from .pixels import ImageError
+from .pixels import ImageError, reason_of
 
 
-def is_url(name: Any) -> bool:
+def is_url(name: object) -> bool:
     """Whether a name is a URL, as in ``s3://bucket/a.png`` or ``zip://a.png::all.zip``."""
     return isinstance(name, str) and "://" in name
 
@@ -46,18 +45,17 @@ def list_urls(url: str) -> list[str]:
     ImageError
         If the place cannot be read, or has no such file.
     """
+    fsspec = _fsspec()
     try:
-        system, path = _fsspec().core.url_to_fs(url)
+        system, path = fsspec.core.url_to_fs(url)
         if glob.has_magic(path):
             names = [name for name in system.glob(path) if not system.isdir(name)]
         elif system.isdir(path):
             names = [name for name in system.ls(path, detail=False) if _is_image(name)]
         else:
             return [url]
-    except ImageError:
-        raise
     except Exception as error:  # each store raises its own types
-        raise ImageError(f"{url}: cannot be listed ({_reason(error)}); check the URL") from error
+        raise ImageError(f"{url}: cannot be listed ({reason_of(error)}); check the URL") from error
     if not names:
         raise ImageError(f"{url}: holds no images; check the URL")
     outer = url.partition("::")[2]
@@ -76,7 +74,6 @@ def local_copy(url: str) -> Iterator[Path]:
     Yields
     ------
     Path
-        It has the suffix of the URL.
 
     Raises
     ------
@@ -85,33 +82,27 @@ def local_copy(url: str) -> Iterator[Path]:
     OSError
         If the file cannot be read, which may pass; the message names the URL.
     """
-    suffix = PurePosixPath(url.partition("::")[0].partition("?")[0]).suffix
     with TemporaryDirectory() as folder:
-        file = Path(folder) / f"image{suffix}"
+        file = Path(folder) / "image"
         system = _fsspec()
         try:
             with system.open(url, "rb") as remote:
                 file.write_bytes(remote.read())
         except Exception as error:  # each store raises its own types
-            raise OSError(f"{url}: cannot be read ({_reason(error)})") from error
+            raise OSError(f"{url}: cannot be read ({reason_of(error)})") from error
         yield file
 
 
-def _fsspec() -> ModuleType:
+def _fsspec() -> Any:
     try:
         import fsspec
     except ImportError:
         raise ImageError(
             "images behind URLs need fsspec; type: pip install 'eigengs-dr[cluster]'"
         ) from None
-    module: ModuleType = fsspec
-    return module
+    return fsspec
 
 
 def _is_image(name: str) -> bool:
     path = PurePosixPath(name)
     return path.suffix.lower() in (*SAVE_OPTIONS, *FLOAT_SUFFIXES) and not path.name.startswith(".")
-
-
-def _reason(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]

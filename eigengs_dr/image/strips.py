@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,12 +97,12 @@ def available_cores() -> int:
 
 
 def with_border(
-    read: Callable[[slice], NDArray[Any]],
+    read: Callable[[slice], NDArray[np.floating]],
     rows: slice,
     height: int,
     border: int,
-    mode: Any = "symmetric",
-) -> NDArray[Any]:
+    mode: Literal["symmetric", "constant"] = "symmetric",
+) -> NDArray[np.floating]:
     """Return rows of an image with the pixels around them, beyond the image too.
 
     Parameters
