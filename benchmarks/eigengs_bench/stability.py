@@ -23,7 +23,7 @@ from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.refine import trace_steps
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.fitting.start import initialize, mean_picture
-from eigengs_dr.gaussian.covariance import condition_number
+from eigengs_dr.gaussian.covariance import max_deviation
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import RGB_TO_YCBCR, rgb_to_ycbcr
 from eigengs_dr.image.metrics import MAX_PSNR
@@ -107,7 +107,7 @@ def _score(followed: list[Moment], image: Image) -> Row:
     half = picture_of(_round_to_half(last.gaussians)) + added
     row: Row = {
         "finite": all(finite),
-        "condition": max(float(condition_number(kept["factor"]).max()) for kept in arrays),
+        "condition": max(_condition(*kept["factor"].T) for kept in arrays),
         "tiling": tiling(last.picture, image),
         "gaussians": len(first.gaussians),
         "seconds": last.seconds,
@@ -119,6 +119,13 @@ def _score(followed: list[Moment], image: Image) -> Row:
         row[f"drop_{space}"] = float(np.max(seen) - seen[-1])
         row[f"half_{space}"] = decibels(half, image, space)
     return row
+
+
+def _condition(a: Image, b: Image, c: Image) -> float:
+    """Return the largest condition number of covariances with the factors a, b, c."""
+    # The determinant of a covariance, the product of its eigenvalues, is 1 / (a c)^2.
+    deviation = max_deviation(*(entries.astype(np.float64) for entries in (a, b, c)))
+    return float(np.square(np.square(deviation) * a * c).max())
 
 
 def _round_to_half(gaussians: Gaussians) -> Gaussians:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,7 +118,7 @@ def find_map(maps: Sequence[TextureMap], name: str) -> int:
     return names.index(name)
 
 
-def show_sums(space: str, sums: NDArray[Any]) -> NDArray[Any]:
+def show_sums(space: str, sums: NDArray[np.floating]) -> NDArray[np.floating]:
     """Convert sums of Gaussians of a space to what people look at.
 
     Parameters

@@ -7,8 +7,6 @@ Functions of the Cholesky factor take Dr.Jit arrays and are differentiable.
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
@@ -52,29 +50,6 @@ def max_deviation(a: Array, b: Array, c: Array) -> NDArray[np.float64]:
     middle = 0.5 * (ia * ia + t * t + ic * ic)
     root = np.sqrt(np.maximum(middle * middle - (ia * ic) ** 2, 0))
     return np.asarray(np.sqrt(middle + root), np.float64)
-
-
-def condition_number(factor: Array) -> NDArray[np.float64]:
-    """Return the condition numbers of covariances: the ratio of the eigenvalues.
-
-    ``F^T F`` has the trace t, the determinant ``d = (a c)^2`` and the larger eigenvalue
-    ``l = (t + sqrt(t^2 - 4 d)) / 2``. The condition number is ``l^2 / d``.
-
-    Parameters
-    ----------
-    factor : ndarray, shape (N, 3)
-        a, b, c.
-
-    Returns
-    -------
-    ndarray of float64, shape (N,)
-        At least 1.
-    """
-    a, b, c = np.asarray(factor, np.float64).T
-    trace = a * a + b * b + c * c
-    # This product equals t^2 - 4 d, but does not cancel to a negative number for round Gaussians.
-    root = np.sqrt(((a - c) ** 2 + b * b) * ((a + c) ** 2 + b * b))
-    return np.asarray((0.5 * (trace + root) / (a * c)) ** 2, np.float64)
 
 
 def outline(factor: Array, points: int = 25) -> NDArray[np.float64]:
@@ -133,7 +108,7 @@ def log_shapes(factor: Array) -> NDArray[np.float64]:
 # ---------------------------------------------------------------------------------------------
 
 
-def cholesky_from_factor(a: Float, b: Float, c: Float) -> tuple[Any, Any, Any]:
+def cholesky_from_factor(a: Float, b: Float, c: Float) -> tuple[Float, Float, Float]:
     """Return l1, l2, l3 of ``L = [[l1, 0], [l2, l3]]`` with ``Sigma = L L^T``.
 
     Parameters
@@ -150,7 +125,7 @@ def cholesky_from_factor(a: Float, b: Float, c: Float) -> tuple[Any, Any, Any]:
     return l1, -b / (a * c * c * l1), 1 / (a * c * l1)
 
 
-def factor_from_cholesky(l1: Float, l2: Float, l3: Float) -> tuple[Any, Any, Any]:
+def factor_from_cholesky(l1: Float, l2: Float, l3: Float) -> tuple[Float, Float, Float]:
     """Return a, b, c with ``F^T F = (L L^T)^-1``; inverse of `cholesky_from_factor`.
 
     Parameters

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..image.color import MAX_CHANNELS, SPACES
+from ..image.formats import FLOAT_SUFFIXES, SAVE_OPTIONS
 from ..storage import npz
 from ..storage.atomic import reader_of
 from ..storage.npz import BadValue, Field
@@ -27,9 +30,6 @@ CUTOFF = 3.0
 """Default cutoff, in standard deviations. At the cutoff a Gaussian has ``exp(-cutoff^2 / 2)`` of
 its amplitude: 1.1 % at 3, 0.034 % at 4, 3.7e-6 at 5."""
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".hdr", ".webp")
-"""Suffixes of pictures, which a set is not."""
-
 MAX_CUTOFF = 12.0
 """Largest cutoff, in standard deviations. The fast exponential needs a bound, and ``exp(-72)`` is
 below single precision."""
@@ -41,18 +41,19 @@ PLAIN_COUNT = 1 << 20
 """Number of Gaussians from which on a set is stored without compression, which would save 9 % of
 the bytes for 20 times the time."""
 
-LAYOUT: dict[str, Field] = {
+ARRAYS: dict[str, Field] = {
     "mean": Field("f4", 2, MAX_ENTRIES),
     "factor": Field("f4", 2, MAX_ENTRIES),
     "color": Field("f4", 2, MAX_ENTRIES),
     "background": Field("f4", 1),
-    "size": Field("i8", 1),
-    "space": Field("U", 0),
 }
-"""Arrays of a file of version 1, with their types and numbers of dimensions."""
+"""Arrays of a set, with their types and numbers of dimensions."""
 
-CUTOFF_FIELD = Field("f8", 0)
-"""The array that version 2 added; sets of version 1 have the cutoff `CUTOFF`."""
+LAYOUT: dict[str, Field] = ARRAYS | {"size": Field("i8", 1), "space": Field("U", 0)}
+"""What a file of version 1 holds. Sets of this version have the cutoff `CUTOFF`."""
+
+CUTOFF_FIELD = {"cutoff": Field("f8", 0)}
+"""What version 2 added."""
 
 MAPS: dict[str, Field] = {
     "names": Field("U", 1, MAX_MAPS),
@@ -122,7 +123,7 @@ def check_suffix(path: str | os.PathLike[str]) -> None:
     suffix = Path(path).suffix.lower()
     if suffix == ".egs":
         raise ValueError(f"{path}: only eigengs_dr.pack writes .egs files; save as .npz")
-    if suffix in IMAGE_SUFFIXES:
+    if suffix in (*SAVE_OPTIONS, *FLOAT_SUFFIXES):
         raise ValueError(f"{path}: a set is no image; save as .npz, its picture by save_image")
 
 
@@ -175,43 +176,44 @@ def read_head(path: Path) -> SetHead:
         If the file cannot be opened.
     """
     kind, version, layout = _layout_of(path)
-    small = {name: field for name, field in layout.items() if name not in _LARGE}
-    found = npz.read(path, kind, version, small)
+    small = {name: field for name, field in layout.items() if name not in ARRAYS}
     shape = npz.read_shapes(path, kind, version, {"color": LAYOUT["color"]})["color"]
-    size, space, cutoff, maps = _properties(path, found)
-    if maps:
-        try:
+    with _errors_of(path):
+        size, space, cutoff, maps = _properties(npz.read(path, kind, version, small))
+        if maps:
             check_maps(maps, shape[1])
-        except BadValue as error:
-            raise ValueError(f"{path}: {error}") from None
     return SetHead(shape[0], shape[1], size, space, cutoff, maps)
 
 
-_LARGE = ("mean", "factor", "color", "background")
+@contextmanager
+def _errors_of(path: Path) -> Iterator[None]:
+    """Put the name of a file before the errors of its values."""
+    try:
+        yield
+    except BadValue as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def _layout_of(path: Path) -> tuple[str, int, dict[str, Field]]:
     """Return the format of an ``.npz`` file, its highest version, and its arrays."""
     if npz.format_of(path) == MATERIAL:
         shared = {name: field for name, field in LAYOUT.items() if name != "space"}
-        return MATERIAL, VERSIONS[MATERIAL], shared | {"cutoff": CUTOFF_FIELD} | MAPS
+        return MATERIAL, VERSIONS[MATERIAL], shared | CUTOFF_FIELD | MAPS
     first = npz.read_version(path, FORMAT, VERSIONS[FORMAT]) < 2
-    return FORMAT, VERSIONS[FORMAT], LAYOUT if first else LAYOUT | {"cutoff": CUTOFF_FIELD}
+    return FORMAT, VERSIONS[FORMAT], LAYOUT if first else LAYOUT | CUTOFF_FIELD
 
 
-def _properties(
-    path: Path, found: Arrays
-) -> tuple[tuple[int, int], str, float, tuple[TextureMap, ...]]:
+def _properties(found: Arrays) -> tuple[tuple[int, int], str, float, tuple[TextureMap, ...]]:
     """Return the size, the space, the cutoff and the maps of what was read."""
     size, cutoff = tuple(found["size"].tolist()), float(found.get("cutoff", np.array(CUTOFF)))
     if "names" not in found:
         return size, str(found["space"]), cutoff, ()
     columns = [found[name].tolist() for name in MAPS]
     if len({len(column) for column in columns}) > 1:
-        raise ValueError(f"{path}: names, spaces, channels and weights differ in length")
+        raise BadValue("names, spaces, channels and weights differ in length")
     maps = tuple(TextureMap(*row) for row in zip(*columns, strict=True))
     if not maps:
-        raise ValueError(f"{path}: maps are none; give each name once")
+        raise BadValue("maps are none; give each name once")
     return size, "data", cutoff, maps
 
 
@@ -247,10 +249,8 @@ def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
         names = ", ".join(m.name for m in maps)
         raise ValueError(f"{path}: holds the maps {names}; choose one with {option}")
     data = read(path)
-    try:
+    with _errors_of(path):
         return data if name is None else data.map_data(name)
-    except BadValue as error:
-        raise ValueError(f"{path}: {error}") from None
 
 
 def read_figures(path: Path) -> FitFigures | None:
@@ -267,23 +267,16 @@ def read_figures(path: Path) -> FitFigures | None:
 
 def read(path: Path, sections: int | None = None) -> SetData:
     """Read and check a set; parameters and errors as for `eigengs_dr.Gaussians.load`."""
-    data = _read(path, sections)
-    try:
+    with _errors_of(path):
+        if reader := reader_of(path):
+            data: SetData = reader.read_set(path, sections)
+        elif sections is not None:
+            raise BadValue("has no sections; pass sections only for .egs files")
+        else:
+            found = npz.read(path, *_layout_of(path))
+            data = SetData({name: found[name] for name in ARRAYS}, *_properties(found))
         check(data)
-    except BadValue as error:
-        raise ValueError(f"{path}: {error}") from None
     return data
-
-
-def _read(path: Path, sections: int | None) -> SetData:
-    if reader := reader_of(path):
-        data: SetData = reader.read_set(path, sections)
-        return data
-    if sections is not None:
-        raise ValueError(f"{path}: has no sections; pass sections only for .egs files")
-    kind, version, layout = _layout_of(path)
-    found = npz.read(path, kind, version, layout)
-    return SetData({name: found[name] for name in _LARGE}, *_properties(path, found))
 
 
 def check(data: SetData) -> None:
@@ -311,7 +304,7 @@ def check(data: SetData) -> None:
             raise BadValue(f"{name} holds values that are not finite")
     if not (factor[:, [0, 2]] > 0).all():
         raise BadValue("factor has a or c <= 0; both must be positive")
-    if len(size) != 2 or not all(side == int(side) and 1 <= side <= 1 << 16 for side in size):
+    if len(size) != 2 or not all(1 <= side <= 1 << 16 for side in size):
         raise BadValue(f"size is {size}, expected two sides from 1 to 65536")
     if not 0 < cutoff <= MAX_CUTOFF:
         raise BadValue(f"cutoff is {cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}")
@@ -388,27 +381,18 @@ def crop(
         It renders as the region does in the whole set, up to rounding. The Gaussians keep their
         order. The set may be empty: then the region shows the background alone.
     """
-    x, y = scale
-    seen = touches(data, corner, (size[0] / x, size[1] / y))
-    arrays = {name: values[seen] for name, values in data.arrays.items() if name != "background"}
-    arrays["background"] = data.arrays["background"]
-    shifted = (arrays["mean"].astype(np.float64) - corner) * scale
-    arrays["mean"] = shifted.astype(np.float32)
-    arrays["factor"] = (arrays["factor"] / np.array([x, y, y])).astype(np.float32)
-    return data._replace(arrays=arrays, size=size)
-
-
-def touches(
-    data: SetData, corner: tuple[float, float], size: tuple[float, float]
-) -> NDArray[np.bool_]:
-    """Return which Gaussians touch a region, by its corner and its size in native pixels."""
     mean = data.arrays["mean"]
     seen = np.ones(len(mean), bool)
     for axis, reach in enumerate(reaches(data)):
-        half = 0.5 * size[axis]
+        half = 0.5 * size[axis] / scale[axis]
         away = np.abs(mean[:, axis] - np.float32(corner[axis] + half))
         seen &= away <= reach * np.float32(1.001) + np.float32(half + 1)
-    return seen
+    arrays = {name: values[seen] for name, values in data.arrays.items() if name != "background"}
+    arrays["background"] = data.arrays["background"]
+    x, y = scale
+    arrays["mean"] = ((arrays["mean"].astype(np.float64) - corner) * scale).astype(np.float32)
+    arrays["factor"] = (arrays["factor"] / np.array([x, y, y])).astype(np.float32)
+    return data._replace(arrays=arrays, size=size)
 
 
 def reaches(data: SetData) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from operator import index
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,9 +20,13 @@ from ..backend.arrays import Float, types_in, types_of, upload, upload_rows
 from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..backend.selection import BackendError, select
+from ..image.color import check_size
 from ..storage.npz import BadValue
 from .channels import TextureMap, find_map, slices
-from .file import CUTOFF, SetData, check, read, write
+from .file import CUTOFF, Arrays, SetData, check, read, write
+
+Rows = Float
+"""Several rows of Dr.Jit floats: an Array2f, Array3f or ArrayXf."""
 
 MIN_DEVIATION = 0.25
 """Smallest standard deviation along an axis of the factor, in pixels. A narrower Gaussian can fall
@@ -71,10 +74,10 @@ class Gaussians:
     (1, 1)
     """
 
-    mean: Any
-    factor: Any
-    color: Any
-    background: Any
+    mean: Rows
+    factor: Rows
+    color: Rows
+    background: Rows
     width: int
     height: int
     space: str = "ycbcr"
@@ -82,7 +85,6 @@ class Gaussians:
     maps: tuple[TextureMap, ...] = ()
 
     @classmethod
-    @exclusive()
     def from_arrays(
         cls,
         mean: ArrayLike,
@@ -122,50 +124,34 @@ class Gaussians:
         ValueError
             If shapes do not fit each other, or a value is not finite or out of range.
         """
-        arrays = {"mean": mean, "factor": factor, "color": color}
-        if background is not None:
-            arrays["background"] = background
-        kind = np.dtype(dtype)
-        if kind not in (np.float32, np.float64):
-            raise ValueError(f"Gaussians: dtype is {kind}; give numpy.float32 or numpy.float64")
-        checked = {k: np.asarray(v, kind) for k, v in arrays.items()}
-        checked.setdefault("background", np.zeros(checked["color"].shape[1:], kind))
-        try:
-            size = tuple(index(side) for side in size)  # type: ignore[assignment]
-        except TypeError:
-            raise ValueError(
-                f"Gaussians: size is {size}; give whole pixels, as (640, 480)"
-            ) from None
-        try:
-            check(SetData(checked, size, space, cutoff, tuple(maps)))
-        except BadValue as error:
-            raise ValueError(f"Gaussians: {error}") from None
-        types = types_in(select(backend), 8 * kind.itemsize)
-        return cls(
-            mean=types.Float2(*_columns(types, checked["mean"])),
-            factor=types.Float3(*_columns(types, checked["factor"])),
-            color=types.FloatX(_columns(types, checked["color"])),
-            background=types.FloatX(_columns(types, checked["background"][None])),
-            width=size[0],
-            height=size[1],
-            space=space,
-            cutoff=float(cutoff),  # a NumPy scalar would promote Dr.Jit arrays to float64
-            maps=tuple(maps),
-        )
+        arrays = _arrays(mean, factor, color, background)
+        return cls.from_data(SetData(arrays, size, space, cutoff, tuple(maps)), backend, dtype)
 
     @classmethod
+    @exclusive()
     def from_data(
         cls, data: SetData, backend: str | None = None, dtype: DTypeLike = np.float32
     ) -> Gaussians:
         """Create a set from the content of a file; for the arguments see `from_arrays`."""
-        arrays: dict[str, Any] = data.arrays
-        return cls.from_arrays(
-            **arrays,
-            size=data.size,
+        kind = np.dtype(dtype)
+        if kind not in (np.float32, np.float64):
+            raise ValueError(f"Gaussians: dtype is {kind}; give numpy.float32 or numpy.float64")
+        arrays = {name: np.asarray(values, kind) for name, values in data.arrays.items()}
+        width, height = check_size(data.size)
+        try:
+            check(data._replace(arrays=arrays, size=(width, height)))
+        except BadValue as error:
+            raise ValueError(f"Gaussians: {error}") from None
+        types = types_in(select(backend), 8 * kind.itemsize)
+        return cls(
+            mean=types.Float2(upload_rows(types.Float, arrays["mean"].T)),
+            factor=types.Float3(upload_rows(types.Float, arrays["factor"].T)),
+            color=types.FloatX(upload_rows(types.Float, arrays["color"].T)),
+            background=types.FloatX(upload_rows(types.Float, arrays["background"][:, None])),
+            width=width,
+            height=height,
             space=data.space,
-            backend=backend,
-            cutoff=data.cutoff,
-            dtype=dtype,
+            cutoff=float(data.cutoff),  # a NumPy scalar would promote Dr.Jit arrays to float64
             maps=data.maps,
         )
 
@@ -175,15 +161,16 @@ class Gaussians:
         return SetData(self.to_arrays(), size, self.space, self.cutoff, self.maps)
 
     @exclusive()
-    def to_arrays(self) -> dict[str, NDArray[Any]]:
+    def to_arrays(self) -> Arrays:
         """Return mean (N, 2), factor (N, 3), color (N, C) and background (C,) as NumPy arrays."""
-        n = len(self)
-        return {
-            "mean": _rows(self.mean, n),
-            "factor": _rows(self.factor, n),
-            "color": _rows(self.color, n),
-            "background": _rows(self.background, 1)[0],
-        }
+
+        def stacked(rows: Rows, count: int) -> NDArray[np.floating]:
+            columns = [np.broadcast_to(dr.detach(row).numpy(), count) for row in rows]
+            return np.stack(columns, axis=1)
+
+        parameters = {"mean": self.mean, "factor": self.factor, "color": self.color}
+        arrays = {name: stacked(rows, len(self)) for name, rows in parameters.items()}
+        return arrays | {"background": stacked(self.background, 1)[0]}
 
     def __reduce__(self) -> tuple:
         """Travel to another process as NumPy arrays, without derivatives."""
@@ -227,15 +214,14 @@ class Gaussians:
         """
         if isinstance(selection, str):
             return self._map(selection)
-        types = types_of(self.mean)
         kept = np.atleast_1d(np.arange(len(self), dtype=np.uint32)[selection])
         if not kept.size:
             raise ValueError("Gaussians: the selection is empty; select at least one Gaussian")
+        types = types_of(self.mean)
         chosen = upload(types.UInt, kept)
 
-        def pick(rows: Any) -> Any:
-            whole = [broadcast(row, len(self)) for row in rows]
-            return type(rows)([dr.gather(types.Float, row, chosen) for row in whole])
+        def pick(rows: Rows) -> Rows:
+            return type(rows)([dr.gather(types.Float, row, chosen) for row in whole(rows, self)])
 
         return replace(self, mean=pick(self.mean), factor=pick(self.factor), color=pick(self.color))
 
@@ -244,12 +230,8 @@ class Gaussians:
             number = find_map(self.maps, name)
         except BadValue as error:
             raise KeyError(f"Gaussians: {error}") from None
-        own = slices(self.maps)[number]
-
-        def take(rows: Any) -> Any:
-            return type(rows)([rows[k] for k in range(own.start, own.stop)])
-
-        color, background = take(self.color), take(self.background)
+        own, kind = slices(self.maps)[number], type(self.color)
+        color, background = kind(list(self.color)[own]), kind(list(self.background)[own])
         space = self.maps[number].space
         return replace(self, color=color, background=background, space=space, maps=())
 
@@ -287,8 +269,12 @@ class Gaussians:
         )
 
     @exclusive()
-    def bounded(self, size: tuple[Any, Any] | None = None) -> Gaussians:
-        """Clip every parameter to its bounds, see `eigengs_dr.gaussian.gaussians.clip_parameters`.
+    def bounded(self, size: tuple[Float, Float] | None = None) -> Gaussians:
+        """Clip every parameter to its bounds.
+
+        A mean lies in the image. a and c lie between 1 / (twice the longer side) and
+        1 / `MIN_DEVIATION`, and b within +-1 / `MIN_DEVIATION`. A mean that is not finite becomes
+        the centre of the image, a and c become 1 / `MIN_DEVIATION`, b and colours become 0.
 
         Parameters
         ----------
@@ -298,9 +284,23 @@ class Gaussians:
         types = types_of(self.mean)
         if size is None:
             size = dr.opaque(types.Float, self.width), dr.opaque(types.Float, self.height)
-        parameters = self.mean, self.factor, self.color, self.background
-        mean, factor, color, background = clip_parameters(*parameters, *size)
-        return replace(self, mean=mean, factor=factor, color=color, background=background)
+        # In double precision, because cuda divides approximately in single.
+        longer = dr.float64_array_t(types.Float)(dr.maximum(*size))
+        low, high = types.Float(0.5 / longer), 1 / MIN_DEVIATION
+
+        def inside(x: Float, low: Float, high: Float, otherwise: Float) -> Float:
+            return dr.select(dr.isfinite(x), dr.clip(x, low, high), otherwise)
+
+        a, b, c = self.factor
+        mean = [inside(x, 0.0, side, 0.5 * side) for x, side in zip(self.mean, size, strict=True)]
+        factor = inside(a, low, high, high), inside(b, -high, high, 0.0), inside(c, low, high, high)
+        return replace(
+            self,
+            mean=types.Float2(mean),
+            factor=types.Float3(*factor),
+            color=dr.select(dr.isfinite(self.color), self.color, 0),
+            background=dr.select(dr.isfinite(self.background), self.background, 0),
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the set as an ``.npz`` file in single precision, completely or not at all.
@@ -346,7 +346,21 @@ class Gaussians:
         return cls.from_data(read(Path(path), sections), backend, dtype)
 
 
-def _received(data: SetData, backend: str, kind: Any) -> Gaussians:
+def _arrays(
+    mean: ArrayLike, factor: ArrayLike, color: ArrayLike, background: ArrayLike | None
+) -> Arrays:
+    """Return the arrays of a set by their names; the background is 0 by default."""
+    color = np.asarray(color)
+    background = np.zeros(color.shape[1:]) if background is None else np.asarray(background)
+    return {
+        "mean": np.asarray(mean),
+        "factor": np.asarray(factor),
+        "color": color,
+        "background": background,
+    }
+
+
+def _received(data: SetData, backend: str, kind: DTypeLike) -> Gaussians:
     """Return a set that came from another process, perhaps of a machine with a GPU."""
     try:
         return Gaussians.from_data(data, backend, kind)
@@ -354,56 +368,9 @@ def _received(data: SetData, backend: str, kind: Any) -> Gaussians:
         return Gaussians.from_data(data, None, kind)
 
 
-def clip_parameters(
-    mean: Any, factor: Any, color: Any, background: Any, width: Float, height: Float
-) -> tuple[Any, Any, Any, Any]:
-    """Return the parameters of Gaussians within their bounds.
-
-    A mean lies in the image. a and c lie between 1 / (twice the longer side) and
-    1 / `MIN_DEVIATION`, and b within +-1 / `MIN_DEVIATION`. A mean that is not finite becomes the
-    centre of the image, a and c become 1 / `MIN_DEVIATION`, b and colours become 0.
-
-    Parameters
-    ----------
-    mean, factor, color, background
-        See `eigengs_dr.Gaussians`.
-    width, height : Float, shape (1,)
-        Native size in pixels.
-    """
-    types = types_of(mean)
-    # In double precision, because cuda divides approximately in single.
-    longer = dr.float64_array_t(types.Float)(dr.maximum(width, height))
-    low, high = types.Float(0.5 / longer), 1 / MIN_DEVIATION
-
-    def inside(x: Float, low: Any, high: Any, otherwise: Any) -> Any:
-        return dr.select(dr.isfinite(x), dr.clip(x, low, high), otherwise)
-
-    a, b, c = factor
-    return (
-        types.Float2(
-            inside(mean[0], 0.0, width, 0.5 * width), inside(mean[1], 0.0, height, 0.5 * height)
-        ),
-        types.Float3(
-            inside(a, low, high, high), inside(b, -high, high, 0.0), inside(c, low, high, high)
-        ),
-        dr.select(dr.isfinite(color), color, 0),
-        dr.select(dr.isfinite(background), background, 0),
-    )
-
-
-def broadcast(row: Any, count: int) -> Any:
-    """Repeat a row with a single entry `count` times."""
-    return row + dr.zeros(type(row), count)
-
-
-def _columns(types: Any, array: NDArray[Any]) -> list:
-    return upload_rows(types.Float, array.T)
-
-
-def _rows(rows: Any, count: int) -> NDArray[Any]:
-    """Stack Dr.Jit rows, which may have a single entry, to an array of shape (count, rows)."""
-    columns = [np.broadcast_to(dr.detach(row).numpy(), count) for row in rows]
-    return np.stack(columns, axis=1)
+def whole(rows: Rows, gaussians: Gaussians) -> list[Float]:
+    """Return rows with an entry for each Gaussian; a row may have a single one for all."""
+    return [row + dr.zeros(type(row), len(gaussians)) for row in rows]
 
 
 @exclusive()
@@ -438,13 +405,9 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     if len(sets) == 1:
         return first
 
-    def join(name: str) -> Any:
-        parts = [getattr(g, name) for g in sets]
-        rows = [
-            dr.concat([broadcast(part[k], len(g)) for part, g in zip(parts, sets, strict=True)])
-            for k in range(len(parts[0]))
-        ]
-        return type(parts[0])(*rows) if name != "color" else type(parts[0])(rows)
+    def join(name: str) -> Rows:
+        parts = zip(*(whole(getattr(g, name), g) for g in sets), strict=True)
+        return type(getattr(first, name))([dr.concat(part) for part in parts])
 
     return replace(
         first,
@@ -466,16 +429,10 @@ def like(
 
     For the arrays and errors see `eigengs_dr.Gaussians.from_arrays`.
     """
-    return Gaussians.from_arrays(
-        mean,
-        factor,
-        color,
-        background,
-        size=(gaussians.width, gaussians.height),
-        space=gaussians.space,
-        backend=types_of(gaussians.mean).backend,
-        cutoff=gaussians.cutoff,
-    )
+    size = gaussians.width, gaussians.height
+    arrays = _arrays(mean, factor, color, background)
+    data = SetData(arrays, size, gaussians.space, gaussians.cutoff)
+    return Gaussians.from_data(data, types_of(gaussians.mean).backend)
 
 
 class Fitted(Protocol):
@@ -514,7 +471,7 @@ FIELDS = {"mean": 2, "factor": 3, "color": 0, "background": 0}
 
 
 @exclusive()
-def to_tensors(gaussians: Gaussians) -> dict[str, Any]:
+def to_tensors(gaussians: Gaussians) -> dict[str, Rows]:
     """Return the parameters of a set as tensors; differentiable.
 
     Parameters
@@ -538,15 +495,15 @@ def to_tensors(gaussians: Gaussians) -> dict[str, Any]:
     tensors = {}
     for name in FIELDS:
         rows = getattr(gaussians, name)
-        count = 1 if name == "background" else len(gaussians)
-        whole = type(rows)([row + dr.zeros(types.Float, count) for row in rows])
-        tensors[name] = types.Tensor(dr.ravel(whole, order="F"), (count, len(rows)))
+        rows = list(rows) if name == "background" else whole(rows, gaussians)
+        joint = dr.ravel(types.FloatX(rows), order="F")
+        tensors[name] = types.Tensor(joint, (dr.width(joint) // len(rows), len(rows)))
     tensors["background"] = tensors["background"][0]
     return tensors
 
 
 @exclusive()
-def from_tensors(tensors: Mapping[str, Any], like: Gaussians) -> Gaussians:
+def from_tensors(tensors: Mapping[str, Rows], like: Gaussians) -> Gaussians:
     """Create a set from tensors; differentiable. The inverse of `to_tensors`.
 
     Parameters
@@ -592,7 +549,7 @@ def from_tensors(tensors: Mapping[str, Any], like: Gaussians) -> Gaussians:
     return replace(like, **{name: _columns_of(getattr(like, name), t) for name, t in given.items()})
 
 
-def _columns_of(like: Any, tensor: Any) -> Any:
+def _columns_of(like: Rows, tensor: Rows) -> Rows:
     """Return the columns of a tensor as a nested array with the type of `like`."""
     types = types_of(like)
     number = tensor.shape[-1]
@@ -603,10 +560,9 @@ def _columns_of(like: Any, tensor: Any) -> Any:
 
 def scale_channels(gaussians: Gaussians, factors: Sequence[float]) -> Gaussians:
     """Multiply colours and background by a factor for each channel."""
-    FloatX = types_of(gaussians.mean).FloatX
 
-    def scale(rows: Any) -> Any:
-        return FloatX([row * float(f) for row, f in zip(rows, factors, strict=True)])
+    def scale(rows: Rows) -> Rows:
+        return type(rows)([row * float(f) for row, f in zip(rows, factors, strict=True)])
 
     return replace(gaussians, color=scale(gaussians.color), background=scale(gaussians.background))
 
