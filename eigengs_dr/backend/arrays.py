@@ -38,7 +38,6 @@ class ArrayTypes(NamedTuple):
     Bool: type
     Float2: type
     Float3: type
-    Float4: type
     UInt2: type
     FloatX: type
     Tensor: type
@@ -93,7 +92,6 @@ def _types(module: str, bits: int) -> ArrayTypes:
         Bool=names.Bool,
         Float2=of("Array2f"),
         Float3=of("Array3f"),
-        Float4=of("Array4f"),
         UInt2=names.Array2u,
         FloatX=of("ArrayXf"),
         Tensor=of("TensorXf"),

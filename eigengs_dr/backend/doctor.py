@@ -84,10 +84,14 @@ def describe(found: dict[str, Any]) -> str:
     lines = [f"python   {found['python']} on {found['platform']}"]
     for name in ("llvm", "cuda"):
         trial = found[name]
-        if trial["works"]:
-            lines.append(f"{name}     works: {_details(name, trial)}")
-        else:
+        if not trial["works"]:
             lines.append(f"{name}     does not work: {trial['problem']}")
+            continue
+        versions, detail = trial["versions"], f"; {UNTESTED_ON_GPU}"
+        if name == "llvm":
+            library = f"LLVM {versions['libllvm']} at {versions['libllvm_path']}"
+            detail = f", {library}, {trial['threads']} threads on {trial['cpu']}"
+        lines.append(f"{name}     works: Dr.Jit {versions['drjit']}{detail}")
     lines.append("libLLVM  found:" if found["libllvm"] else "libLLVM  none found")
     used = found["llvm"]["versions"]["libllvm_path"] if found["llvm"]["works"] else None
     for library in found["libllvm"]:
@@ -95,15 +99,6 @@ def describe(found: dict[str, Any]) -> str:
         lines.append(f"           {library['version'] or '?':>3}  {library['path']} ({note})")
     lines.append(f"mitsuba  {_mitsuba_line(**found['mitsuba'])}")
     return "\n".join(lines)
-
-
-def _details(name: str, trial: dict[str, Any]) -> str:
-    """Describe the software and hardware of a backend that works."""
-    versions = trial["versions"]
-    if name == "cuda":
-        return f"Dr.Jit {versions['drjit']}; {UNTESTED_ON_GPU}"
-    library = f"LLVM {versions['libllvm']} at {versions['libllvm_path']}"
-    return f"Dr.Jit {versions['drjit']}, {library}, {trial['threads']} threads on {trial['cpu']}"
 
 
 def _mitsuba_line(version: str | None, variants: list[str] | None) -> str:

@@ -381,17 +381,13 @@ def _write_openimageio(path: Path, pixels: Pixels, bits: int) -> None:
     suffix = path.suffix.lower()
     if suffix == ".hdr":  # it has three channels
         pixels = np.broadcast_to(pixels, (*pixels.shape[:2], 3))
-    height, width, channels = pixels.shape
     kind = "uint16" if pixels.dtype == np.uint16 else ("half" if bits == 16 else "float")
     if kind == "half":
         pixels = np.clip(pixels, -MAX_HALF, MAX_HALF)
-    spec = oiio.ImageSpec(width, height, channels, kind)
-    spec.channelnames = ("R", "G", "B") if channels == 3 else ("Y",)
+    image = oiio.ImageBuf(np.ascontiguousarray(pixels))
+    image.set_write_format(kind)
+    image.specmod().channelnames = ("R", "G", "B") if pixels.shape[2] == 3 else ("Y",)
     if suffix == ".exr":
-        spec.attribute("compression", "zip")
-    file = oiio.ImageOutput.create(str(path))
-    if not file:
-        raise OSError(oiio.geterror().strip())
-    written = file.open(str(path), spec) and file.write_image(np.ascontiguousarray(pixels))
-    if not (file.close() and written):
-        raise OSError(file.geterror().strip())
+        image.specmod().attribute("compression", "zip")
+    if not image.write(str(path)):
+        raise OSError(image.geterror().strip())
