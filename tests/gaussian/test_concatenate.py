@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from _helpers.sets import COUNT, NAMES, check_equal, random_scene
+from _helpers.sets import COUNT, NAMES, random_scene
 from eigengs_dr.backend.selection import select
 from eigengs_dr.gaussian.gaussians import concatenate
 
@@ -13,28 +13,20 @@ from eigengs_dr.gaussian.gaussians import concatenate
 def test_concatenation(backend):
     """Splats one after the other, backgrounds added."""
     parts = [random_scene(seed, count) for seed, count in ((0, COUNT), (1, 3), (2, 1))]
-    joined = concatenate([p.on(backend) for p in parts])
+    sets = [p.on(backend) for p in parts]
+    sets[1].factor = select(backend).Array3f(
+        *parts[1].factor[0].tolist()
+    )  # values that all splats share
+    parts[1].factor[:] = parts[1].factor[0]
+    joined = concatenate(sets)
     expected = {name: np.concatenate([getattr(p, name) for p in parts]) for name in NAMES[:3]}
     background = 3 * parts[0].background.astype(np.float32)
     assert len(joined) == COUNT + 4
     found = joined.to_arrays()
     np.testing.assert_allclose(found.pop("background"), background, rtol=1e-6)
     for name, value in found.items():
-        np.testing.assert_array_equal(value, expected[name])
-
-
-def test_concatenation_of_one(backend):
-    gaussians = random_scene().on(backend)
-    check_equal(concatenate([gaussians]), gaussians.to_arrays())
-
-
-def test_concatenation_of_values_that_all_splats_share(backend):
-    scene = random_scene()
-    gaussians = replace(scene.on(backend), factor=select(backend).Array3f(0.5, 0.25, 0.75))
-    joined = concatenate([gaussians, gaussians])
-    np.testing.assert_array_equal(
-        joined.to_arrays()["factor"], np.tile([0.5, 0.25, 0.75], (2 * COUNT, 1))
-    )
+        np.testing.assert_array_equal(value, np.float32(expected[name]))
+    assert concatenate(sets[:1]) is sets[0]
 
 
 def test_concatenation_of_nothing():

@@ -50,29 +50,22 @@ def test_files_of_attached_and_of_shared_values(backend, tmp_path):
     check_equal(Gaussians.load(tmp_path / "x.npz"), gaussians.to_arrays())
 
 
-def test_files_of_double_precision(backend, tmp_path):
-    random_scene().on(backend, 64).save(tmp_path / "x.npz")
-    check_equal(Gaussians.load(tmp_path / "x.npz"), arrays_of(random_scene()))
-
-
 def test_the_suffix_is_free(tmp_path):
     random_scene().on("llvm").save(tmp_path / "fit.bin")
     check_equal(Gaussians.load(tmp_path / "fit.bin"), arrays_of(random_scene()))
 
 
-@pytest.mark.parametrize("failure", [OSError("disk full"), KeyboardInterrupt()])
-def test_saving_that_fails_leaves_the_old_file(tmp_path, monkeypatch, failure):
-    path = tmp_path / "x.npz"
+def test_saving_that_fails_leaves_the_old_file(tmp_path):
+    resource = pytest.importorskip("resource")
+    path, limits = tmp_path / "x.npz", resource.getrlimit(resource.RLIMIT_FSIZE)
     random_scene(0).on("llvm").save(path)
     before = path.read_bytes()
-
-    def half(file, **arrays):
-        file.write(b"PK half of a file")
-        raise failure
-
-    monkeypatch.setattr(np, "savez_compressed", half)
-    with pytest.raises(type(failure)):
-        random_scene(1).on("llvm").save(path)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (500, limits[1]))  # as a disk that is full
+    try:
+        with pytest.raises(OSError, match=r"x\.npz"):
+            random_scene(1).on("llvm").save(path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["x.npz"]
 
@@ -82,13 +75,9 @@ def test_saving_where_nothing_can_be_saved(tmp_path):
     for path in (tmp_path / "missing" / "x.npz", tmp_path):
         with pytest.raises(OSError):
             gaussians.save(path)
+        with pytest.raises(OSError):
+            Gaussians.load(path)
     assert os.listdir(tmp_path) == []
-
-
-@pytest.mark.parametrize("path", ["missing.npz", "."])
-def test_loading_what_cannot_be_opened(tmp_path, path):
-    with pytest.raises(OSError):
-        Gaussians.load(tmp_path / path)
 
 
 @pytest.mark.parametrize("cutoff", [2.0, 3.0, 4.5])
@@ -100,9 +89,3 @@ def test_the_cutoff_is_kept(path, cutoff):
     assert found.cutoff == cutoff
     np.testing.assert_array_equal(render(found).numpy(), render(gaussians).numpy())
     assert np.array_equal(render(found).numpy(), render(found, cutoff=3).numpy()) == (cutoff == 3)
-
-
-def test_a_loaded_set_renders_the_same(backend, path):
-    gaussians = random_scene().on(backend)
-    gaussians.save(path)
-    np.testing.assert_array_equal(render(Gaussians.load(path, backend)), render(gaussians))

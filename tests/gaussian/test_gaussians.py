@@ -79,12 +79,17 @@ BAD = [
     ("size", (5, 1 << 17), "size is"),
     ("space", "hsv", "space is 'hsv'"),
     ("space", "a\nb", "space is"),
+    ("color", 5.0, "color has shape"),
+    ("color", np.ones((COUNT, 0)), "color"),
+    ("size", (8.75, 9), "whole pixels"),
 ]
 
 
 @pytest.mark.parametrize(("name", "value", "message"), BAD)
 def test_arrays_that_make_no_set(name, value, message):
     good = {**arrays_of(random_scene()), "size": SIZE, "space": "data"}
+    if name == "color":
+        good.pop("background")
     with pytest.raises(ValueError, match=message) as error:
         Gaussians.from_arrays(**{**good, name: value})
     assert "\n" not in str(error.value)
@@ -96,21 +101,6 @@ def test_arrays_that_make_no_set(name, value, message):
 def test_channels_that_a_space_has_not(space, channels):
     with pytest.raises(ValueError, match=f"space '{space}' has"):
         Gaussians.from_arrays(**arrays_of(random_scene(channels=channels)), size=SIZE, space=space)
-
-
-def test_a_colour_that_is_a_number():
-    with pytest.raises(ValueError, match="color has shape"):
-        Gaussians.from_arrays([[1, 1]], [[1, 0, 1]], 5.0, size=SIZE, space="data")
-
-
-def test_no_channels():
-    with pytest.raises(ValueError, match="color"):
-        Gaussians.from_arrays([[1, 1]], [[1, 0, 1]], [[]], size=SIZE, space="data")
-
-
-def test_a_size_that_is_no_integer():
-    with pytest.raises((ValueError, TypeError)):
-        Gaussians.from_arrays([[1, 1]], [[1, 0, 1]], [[1]], size=(8.75, 9), space="data")
 
 
 # --- Selection --------------------------------------------------------------------------------
@@ -165,13 +155,6 @@ def test_scaled(backend):
     np.testing.assert_allclose(found["mean"], scene.mean * [2, 3], rtol=1e-6)
     np.testing.assert_allclose(found["factor"], scene.factor / [2, 3, 3], rtol=1e-6)
     np.testing.assert_array_equal(found["color"], np.float32(scene.color))
-
-
-def test_scaled_there_and_back(backend):
-    scene = random_scene()
-    back = scene.on(backend).scaled(7, 90).scaled(*SIZE)
-    for name, value in back.to_arrays().items():
-        np.testing.assert_allclose(value, getattr(scene, name), rtol=1e-6)
 
 
 @pytest.mark.parametrize("size", [(0, 1), (1, 0), (-1, -1)])

@@ -41,19 +41,6 @@ def test_equals_scikit_image(dtype):
     np.testing.assert_allclose(result, rgb2ycbcr(image) / 255, atol=PRECISION[dtype])
 
 
-def test_known_colours_of_bt601():
-    colours = {
-        (0, 0, 0): (16, 128, 128),
-        (1, 1, 1): (235, 128, 128),
-        (1, 0, 0): (81.481, 90.203, 240),
-        (0, 1, 0): (144.553, 53.797, 34.214),
-        (0, 0, 1): (40.966, 240, 109.786),
-    }
-    rgb = np.array(list(colours), np.float64)
-    expected = np.array(list(colours.values())) / 255
-    np.testing.assert_allclose(rgb_to_ycbcr(rgb), expected, atol=1e-12)
-
-
 @given(images)
 def test_round_trip(image):
     for dtype, precision in PRECISION.items():
@@ -164,15 +151,9 @@ def test_importing_the_colours_loads_no_drjit():
 # --- What a render holds -----------------------------------------------------------------------
 
 
-def test_decode_leaves_other_spaces_alone():
+def test_decode_of_other_spaces():
     channels = [np.zeros(2), np.ones(2), np.ones(2), np.zeros(2)]
-    for space in SPACES:
-        if space != "ycbcr":
-            assert decode(space, channels) == channels
-            assert decode(space, channels[:1]) == channels[:1]
-
-
-def test_decode_errors_say_what_to_do():
+    assert all(decode(space, channels) == channels for space in SPACES if space != "ycbcr")
     with pytest.raises(ValueError, match="use one of ycbcr, rgb, linear, data"):
         decode("hsv", [np.zeros(1)] * 3)
     with pytest.raises(ValueError, match="needs 3 channels, not 1"):

@@ -43,25 +43,6 @@ def test_hilbert_order_visits_every_pixel_once(height, width):
     assert sorted(order) == list(range(height * width))
 
 
-@pytest.mark.parametrize("side", [1, 2, 4, 8, 32])
-def test_hilbert_curve_steps_to_neighbours(side):
-    row, column = np.divmod(hilbert_order(side, side), side)
-    assert (np.abs(np.diff(row)) + np.abs(np.diff(column)) == 1).all()
-
-
-@pytest.mark.parametrize("side", [4, 16])
-def test_hilbert_curve_stays_in_a_quarter(side):
-    """Any quarter of the curve is a quarter of the square, and a quarter of that again."""
-    order = hilbert_order(side, side)
-    block = side
-    while block > 1:
-        block //= 2
-        parts = order.reshape(-1, block * block)
-        row, column = np.divmod(parts, side)
-        assert (np.ptp(row, axis=1) == block - 1).all()
-        assert (np.ptp(column, axis=1) == block - 1).all()
-
-
 def test_squares_of_a_large_image_are_cut_from_one_curve():
     """The order does not depend on the side of the squares, and the squares overhang the image."""
     height, width = SQUARE + 3, 2 * SQUARE - 5

@@ -7,7 +7,6 @@ import pytest
 from scipy.signal import correlate2d
 from skimage import color, metrics
 
-from eigengs_dr.image import strips
 from eigengs_dr.image.metrics import ms_ssim, psnr, ssim
 
 SIZES = [(1, 1), (1, 9), (2, 3), (10, 11), (12, 40), (23, 22), (45, 50)]
@@ -38,9 +37,10 @@ def test_psnr_of_a_uniform_error(rng):
 
 
 @pytest.mark.parametrize("space", ["rgb", "ycbcr"])
-def test_psnr_of_equal_images_is_infinite(rng, space):
-    image = rng.random((3, 4, 3))
+def test_psnr_of_equal_images_and_of_nan(rng, space):
+    image = rng.random((2, 2, 3))
     assert psnr(image, image, space=space) == math.inf
+    assert math.isnan(psnr(image, np.where(np.eye(2)[..., None] > 0, np.nan, image), space))
 
 
 def test_psnr_rgb_sees_eight_bits_only():
@@ -60,20 +60,6 @@ def test_psnr_equals_scikit_image(rng):
     assert psnr(a, b, space="ycbcr") == pytest.approx(expected)
 
 
-def test_psnr_reads_higher_in_ycbcr(rng):
-    image = np.full((64, 64, 3), 0.5)
-    white = noisy(rng, image, 0.05)
-    assert psnr(image, white, "ycbcr") - psnr(image, white) == pytest.approx(4.94, abs=0.1)
-    grey = image + 0.05 * rng.standard_normal((64, 64, 1))
-    assert psnr(image, grey, "ycbcr") - psnr(image, grey) == pytest.approx(6.09, abs=0.02)
-
-
-def test_psnr_of_nan_is_nan():
-    image = np.zeros((2, 2, 3))
-    broken = np.where(np.eye(2)[..., None] > 0, np.nan, image)
-    assert math.isnan(psnr(image, broken)) and math.isnan(psnr(image, broken, "ycbcr"))
-
-
 def test_ssim_equals_its_definition(rng):
     a = picture(rng, 20, 17)
     b = np.clip(noisy(rng, a, 0.05), 0, 1)
@@ -82,13 +68,12 @@ def test_ssim_equals_its_definition(rng):
     assert ssim(a, b) == pytest.approx(np.mean(expected), abs=1e-12)
 
 
-@pytest.mark.parametrize("metric", [ssim, ms_ssim])
-def test_similarity_does_not_depend_on_the_strips(rng, metric, monkeypatch):
-    a = picture(rng, 190, 177).astype(np.float32)
-    b = noisy(rng, a, 0.05).astype(np.float32)
-    whole = metric(a, b)
-    monkeypatch.setattr(strips, "STRIP_PIXELS", 7 * 177)
-    assert metric(a, b) == pytest.approx(whole, abs=1e-12)
+def test_ssim_of_several_strips_equals_scikit_image(rng):
+    a = picture(rng, 610, 900).astype(np.float32)
+    b = np.clip(noisy(rng, a, 0.05), 0, 1).astype(np.float32)
+    settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    expected = metrics.structural_similarity(a, b, data_range=1, channel_axis=2, **settings)
+    assert ssim(a, b) == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -98,14 +83,6 @@ def test_similarity_of_any_size(rng, metric, size):
     assert metric(a, a) == pytest.approx(1, abs=1e-12)
     assert metric(a, b) < 1
     assert metric(a, b) == pytest.approx(metric(b, a), abs=1e-12)
-
-
-@pytest.mark.parametrize("metric", [ssim, ms_ssim])
-def test_similarity_falls_with_noise(rng, metric):
-    image = picture(rng)
-    noise = rng.standard_normal(image.shape)
-    values = [metric(image, image + sigma * noise) for sigma in (0, 0.02, 0.05, 0.1, 0.2)]
-    assert values == sorted(values, reverse=True) and len(set(values)) == len(values)
 
 
 def test_ssim_of_constant_images_is_the_luminance_term():
@@ -132,12 +109,6 @@ def test_ms_ssim_equals_its_definition(rng, size, scales):
 def test_ms_ssim_takes_negative_correlation_as_zero(rng):
     image = picture(rng)
     assert ms_ssim(image, 1 - image) == 0
-
-
-def test_ms_ssim_forgives_fine_noise_more_than_ssim(rng):
-    image = picture(rng, 176, 176)
-    fine = noisy(rng, image, 0.1)
-    assert ms_ssim(image, fine) > ssim(image, fine)
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim, ms_ssim])

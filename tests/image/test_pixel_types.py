@@ -9,17 +9,6 @@ from eigengs_dr.image.io import read_file
 LIGHT = np.linspace(0.1, 0.9, 16 * 16 * 3, dtype=np.float32).reshape(16, 16, 3)
 
 
-def test_metrics_scale_integers_by_their_type():
-    rng = np.random.default_rng(0)
-    a, b = (rng.integers(0, 256, (176, 176, 3), dtype=np.uint8) for _ in range(2))
-    for measure in (eg.psnr, eg.ssim, eg.ms_ssim):
-        expected = measure(a / 255, b / 255)
-        assert measure(a, b) == pytest.approx(expected, abs=1e-6)
-        assert measure(a.astype(np.uint16) * 257, b / 255) == pytest.approx(expected, abs=1e-6)
-        with pytest.raises(ValueError, match="pixels are int64"):
-            measure(a.astype(np.int64), b)
-
-
 @pytest.mark.parametrize(
     ("name", "other"),
     [

@@ -19,10 +19,3 @@ def test_unknown_sample():
     with pytest.raises(ImageError, match="use one of astronaut, ") as error:
         sample("lena")
     one_line(error)
-
-
-def test_sample_without_scikit_image(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ImageError, match="install scikit-image") as error:
-        sample("astronaut")
-    one_line(error)
