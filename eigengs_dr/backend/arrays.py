@@ -32,13 +32,13 @@ Bool = Any
 class ArrayTypes(NamedTuple):
     """The array types of one backend and one float precision."""
 
-    Float: type
     Int: type
     UInt: type
     Bool: type
+    UInt2: type
+    Float: type
     Float2: type
     Float3: type
-    UInt2: type
     FloatX: type
     Tensor: type
     backend: str
@@ -79,25 +79,11 @@ def types_in(module: ModuleType, bits: int = 32) -> ArrayTypes:
 
 @cache
 def _types(module: str, bits: int) -> ArrayTypes:
-    names = sys.modules[module]
     suffix = "64" if bits == 64 else ""
-
-    def of(name: str) -> type:
-        return getattr(names, name + suffix)
-
-    return ArrayTypes(
-        Float=of("Float"),
-        Int=names.Int32,
-        UInt=names.UInt32,
-        Bool=names.Bool,
-        Float2=of("Array2f"),
-        Float3=of("Array3f"),
-        UInt2=names.Array2u,
-        FloatX=of("ArrayXf"),
-        Tensor=of("TensorXf"),
-        backend=module.split(".")[1],
-        bits=bits,
-    )
+    names = ["Int32", "UInt32", "Bool", "Array2u"]
+    names += [name + suffix for name in ("Float", "Array2f", "Array3f", "ArrayXf", "TensorXf")]
+    found = [getattr(sys.modules[module], name) for name in names]
+    return ArrayTypes._make([*found, module.split(".")[1], bits])
 
 
 def release_memory() -> None:

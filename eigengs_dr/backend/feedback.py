@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from inspect import signature
@@ -70,20 +70,16 @@ def progress_bar(progress: Any = None, name: str = "") -> Iterator[Callable[...,
     from tqdm.auto import tqdm
 
     with tqdm(desc=name, delay=DELAY, leave=False) as bar:
-        label = name
 
         def show(*values: Any) -> None:
-            nonlocal label
             if isinstance(values[0], str):
-                if values[0] != label:
-                    label = values[0]
+                label, *values = values  # type: ignore[assignment]
+                if label != bar.desc:
                     bar.set_description_str(label, refresh=False)
                     if bar.n:  # else it would be shown at once
                         bar.reset()
-                values = values[1:]
-            done, total, *rest = values
+            done, bar.total, *rest = values
             row = rest[0] if rest else None
-            bar.total = total
             psnr = row.get("psnr_rgb") if isinstance(row, dict) else getattr(row, "psnr_rgb", None)
             if psnr is not None:
                 bar.set_postfix_str(f"psnr_rgb {psnr:.2f} dB", refresh=False)
@@ -99,6 +95,9 @@ def _is_watched() -> bool:
         return True
     return sys.stderr is not None and sys.stderr.isatty()
 
+
+Handler = Any
+"""What `signal.getsignal` returns."""
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Signals that ask a program to end: Ctrl-C sends SIGINT, schedulers and ``kill`` send SIGTERM."""
@@ -123,28 +122,14 @@ def defer_interrupts() -> Iterator[Callable[[], bool]]:
     ...     interrupted()
     False
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    handlers = {number: signal.getsignal(number) for number in SIGNALS}
-    # Python cannot restore a handler that is None; an ignored signal stays ignored.
-    handlers = {n: old for n, old in handlers.items() if old not in (None, signal.SIG_IGN)}
-    received = []
-
-    def remember(number: int, frame: Any) -> None:
-        received.append(number)
-        restore()
-
-    def restore() -> None:
-        for number, old in handlers.items():
-            signal.signal(number, old)
-
-    for number in handlers:
-        signal.signal(number, remember)
-    try:
+    received: list[bool] = []
+    with _first_signal(SIGNALS, _is_heard, lambda: received.append(True)):
         yield lambda: bool(received)
-    finally:
-        restore()
+
+
+def _is_heard(handler: Handler) -> bool:
+    # Python cannot restore a handler that is None; an ignored signal stays ignored.
+    return handler not in (None, signal.SIG_IGN)
 
 
 @contextmanager
@@ -159,20 +144,43 @@ def terminate_as_interrupt() -> Iterator[None]:
     KeyboardInterrupt
         At SIGTERM.
     """
-    main = threading.current_thread() is threading.main_thread()
-    if not main or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
-        yield
-        return
 
-    def interrupt(number: int, frame: Any) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    def interrupt() -> None:
         raise KeyboardInterrupt
 
-    signal.signal(signal.SIGTERM, interrupt)
+    with _first_signal([signal.SIGTERM], lambda handler: handler == signal.SIG_DFL, interrupt):
+        yield
+
+
+@contextmanager
+def _first_signal(
+    numbers: Iterable[signal.Signals],
+    replaced: Callable[[Handler], bool],
+    react: Callable[[], None],
+) -> Iterator[None]:
+    """Call a function at the first signal in a block; a second one has its usual effect.
+
+    In the main thread alone, and for signals whose handler may be replaced.
+    """
+    handlers = {number: signal.getsignal(number) for number in numbers}
+    handlers = {number: old for number, old in handlers.items() if replaced(old)}
+    if threading.current_thread() is not threading.main_thread():
+        handlers = {}
+
+    def restore() -> None:
+        for number, old in handlers.items():
+            signal.signal(number, old)
+
+    def handle(number: int, frame: Any) -> None:
+        restore()
+        react()
+
+    for number in handlers:
+        signal.signal(number, handle)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        restore()
 
 
 OWN = ("eigengs_dr", "contextlib", "functools")

@@ -139,6 +139,8 @@ def version_of(package: str) -> str | None:
 
 def _import_drjit() -> ModuleType:
     """Import Dr.Jit; if libatomic is missing, say so more clearly than Dr.Jit does."""
+    if "drjit" in sys.modules:
+        return sys.modules["drjit"]
     try:
         with _silent_stderr():
             return importlib.import_module("drjit")
@@ -163,19 +165,15 @@ def _cpu_model() -> str:
 @contextmanager
 def _silent_stderr() -> Iterator[None]:
     """Hide what Dr.Jit prints about a libLLVM that fails; `BackendError` says what to do."""
-    if "drjit" in sys.modules:
-        yield
-        return
     try:
         saved = os.dup(2)
     except OSError:  # some daemons close standard error
         yield
         return
-    null = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, 2)
+    with open(os.devnull, "w") as null:
+        os.dup2(null.fileno(), 2)
     try:
         yield
     finally:
         os.dup2(saved, 2)
         os.close(saved)
-        os.close(null)

@@ -137,6 +137,7 @@ class Gaussians:
         if kind not in (np.float32, np.float64):
             raise ValueError(f"Gaussians: dtype is {kind}; give numpy.float32 or numpy.float64")
         arrays = {name: np.asarray(values, kind) for name, values in data.arrays.items()}
+        arrays.setdefault("background", np.zeros(arrays["color"].shape[1:], kind))
         width, height = check_size(data.size)
         try:
             check(data._replace(arrays=arrays, size=(width, height)))
@@ -349,15 +350,9 @@ class Gaussians:
 def _arrays(
     mean: ArrayLike, factor: ArrayLike, color: ArrayLike, background: ArrayLike | None
 ) -> Arrays:
-    """Return the arrays of a set by their names; the background is 0 by default."""
-    color = np.asarray(color)
-    background = np.zeros(color.shape[1:]) if background is None else np.asarray(background)
-    return {
-        "mean": np.asarray(mean),
-        "factor": np.asarray(factor),
-        "color": color,
-        "background": background,
-    }
+    """Return the arrays of a set by their names."""
+    given = {"mean": mean, "factor": factor, "color": color, "background": background}
+    return {name: np.asarray(values) for name, values in given.items() if values is not None}
 
 
 def _received(data: SetData, backend: str, kind: DTypeLike) -> Gaussians:
