@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.feedback import warn
-from .pixels import EncodedImage, ImageError, Pixels, peak_of, reason_of
-from .strips import map_threads, strips
+from .pixels import EncodedImage, ImageError, peak_of, reason_of, scale
+from .strips import Pixels, by_strips
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -145,8 +145,8 @@ def _read_deep(path: Path, kind: str | None) -> Pixels | None:
     return None if kind is None else _read_openimageio(path, kind)
 
 
-def write_deep(path: Path, pixels: Pixels, bits: int) -> None:
-    """Write pixels (H, W, C): float32, or uint16 for PNG and TIFF files of 16 bits.
+def write_file(path: Path, pixels: Pixels, bits: int) -> None:
+    """Write pixels (H, W, C): float32, uint16 for PNG and TIFF files of 16 bits, or uint8.
 
     Raises
     ------
@@ -156,7 +156,11 @@ def write_deep(path: Path, pixels: Pixels, bits: int) -> None:
     suffix = path.suffix.lower()
     grey = pixels.shape[2] == 1
     flat = pixels[..., 0] if grey else pixels
-    if suffix in TIFF_SUFFIXES:
+    if bits == 8 or (suffix == ".png" and grey):
+        from PIL import Image
+
+        Image.fromarray(flat).save(path, **SAVE_OPTIONS[suffix])
+    elif suffix in TIFF_SUFFIXES:
         import tifffile
 
         kind = "minisblack" if grey else "rgb"
@@ -164,10 +168,6 @@ def write_deep(path: Path, pixels: Pixels, bits: int) -> None:
     elif suffix == ".pfm":
         header = f"{'Pf' if grey else 'PF'}\n{pixels.shape[1]} {pixels.shape[0]}\n-1.0\n"
         path.write_bytes(header.encode() + pixels[::-1].astype("<f4").tobytes())
-    elif suffix == ".png" and grey:
-        from PIL import Image
-
-        Image.fromarray(flat).save(path)
     else:
         _write_openimageio(path, pixels, bits)
 
@@ -264,15 +264,13 @@ def picture_pixels(image: Image) -> tuple[Pixels, bool]:
 
 def over_white(pixels: Pixels) -> NDArray[np.float32]:
     """Show colours with alpha, the last channel, over white."""
-    height, width, channels = pixels.shape
-    shown = np.empty((height, width, channels - 1), np.float32)
+    peak = peak_of(pixels.dtype)
 
-    def show(rows: slice) -> None:
-        part = np.divide(pixels[rows], peak_of(pixels.dtype), dtype=np.float32)
-        shown[rows] = 1 - part[..., -1:] * (1 - part[..., :-1])
+    def show(rows: Pixels) -> NDArray[np.float32]:
+        rows = scale(rows, peak)
+        return 1 - rows[..., -1:] * (1 - rows[..., :-1])
 
-    map_threads(show, strips(height, width))
-    return shown
+    return by_strips(show, pixels, channels=pixels.shape[2] - 1)
 
 
 # ---------------------------------------------------------------------------------------------

@@ -19,13 +19,12 @@ from .formats import (
     SAVE_OPTIONS,
     decode_file,
     has_openimageio,
-    write_deep,
+    write_file,
 )
 from .pixels import (
     MAX_PIXEL,
     EncodedImage,
     ImageError,
-    Pixels,
     check_encoding,
     encoding_of,
     peak_of,
@@ -33,7 +32,7 @@ from .pixels import (
     to_floats,
 )
 from .remote import is_url, local_copy
-from .strips import by_strips, map_threads, strips
+from .strips import Pixels, by_strips
 
 SUFFIXES = (*SAVE_OPTIONS, *FLOAT_SUFFIXES)
 """Suffixes of image files."""
@@ -174,10 +173,7 @@ def check_data(image: Any, copy: bool = True) -> NDArray[np.float32]:
     For parameters, result and errors see `check_image`; integers are scaled to [0, 1], and nothing
     is converted to sRGB.
     """
-    if isinstance(image, (str, os.PathLike)):
-        image = load_image(image, keep_grey=True)  # type: ignore[arg-type]
-    pixels = image.pixels if isinstance(image, EncodedImage) else image
-    return to_floats(pixels, "image", keep_grey=True, copy=copy, encoding="linear")
+    return read_floats(image, keep_grey=True, copy=copy, encoding="linear").pixels
 
 
 def save_image(
@@ -229,13 +225,7 @@ def save_image(
             f"{path}: pixels run from {floats.min():g} to {floats.max():g}, and 1 is white; "
             "divide by 255, or say encoding='linear' for light"
         )
-    pixels = np.empty(floats.shape, kind)
-
-    def fill(rows: slice) -> None:
-        pixels[rows] = to_file(floats[rows], said, kind)
-
-    map_threads(fill, strips(*floats.shape[:2]))
-    write_pixels(path, pixels, bits)
+    write_pixels(path, by_strips(lambda part: to_file(part, said, kind), floats, kind), bits)
 
 
 def bits_of(path: Path, bits: int | None = None) -> int:
@@ -295,15 +285,9 @@ def write_pixels(path: Path, pixels: Pixels, bits: int) -> None:
     ImageError
         If a package is missing, or the file cannot be written.
     """
-    from PIL import Image
-
     try:
         with atomic_write(path) as temporary:
-            if bits > 8:
-                write_deep(temporary, pixels, bits)
-            else:
-                flat = pixels[..., 0] if pixels.shape[2] == 1 else pixels
-                Image.fromarray(flat).save(temporary, **SAVE_OPTIONS[path.suffix.lower()])
+            write_file(temporary, pixels, bits)
     except (ImportError, OSError, ValueError) as error:
         message = reason_of(error)
         if not message.startswith(f"{path}: "):  # errors of atomic_write are clear already

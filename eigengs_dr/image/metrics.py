@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from .color import RGB_TO_YCBCR, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_linear, to_pu21
 from .io import to_8bit
-from .pixels import Pixels, peak_of
-from .strips import map_threads, strips
+from .pixels import peak_of
+from .strips import Pixels, map_threads, strips
 
 MAX_PSNR = 100.0
 """Upper bound of reported PSNRs, in dB: above it, only rounding errors differ."""

@@ -7,13 +7,14 @@ and a ``mitsuba.Bitmap`` tells itself; of other arrays the caller says it by ``e
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.feedback import warn
-from .strips import map_threads, strips
+from .strips import Pixels, by_strips
 
 ENCODINGS = ("srgb", "linear")
 """Names of what pixels are."""
@@ -25,10 +26,6 @@ error."""
 MAX_LIGHT = 1e9
 """Largest absolute value of light and of data, with 1 for white; squares of errors stay far inside
 single precision."""
-
-
-Pixels = NDArray[Any]
-"""Pixels (H, W, C) of any dtype that an image may have."""
 
 
 class ImageError(ValueError):
@@ -104,6 +101,12 @@ def peak_of(dtype: np.dtype[Any]) -> int:
     return int(np.iinfo(dtype).max) if dtype.kind == "u" else 1
 
 
+def scale(pixels: Pixels, peak: int) -> NDArray[np.float32]:
+    """Divide pixels by the value of white."""
+    with np.errstate(over="ignore"):  # the infinities are clamped or refused later
+        return np.divide(pixels, peak, dtype=np.float32)
+
+
 def to_floats(
     image: ArrayLike,
     name: str,
@@ -141,16 +144,10 @@ def to_floats(
             f"the first at [{row}, {column}]; replace them, as with np.nan_to_num"
         )
     channels = array.shape[2] if keep_grey else 3
-    pixels = array
+    pixels: NDArray[np.float32] = array
     as_it_is = array.dtype == np.float32 and array.shape[2] == channels
     if copy or not as_it_is or not array.flags.c_contiguous:
-        pixels = np.empty((*array.shape[:2], channels), np.float32)
-
-        def fill(rows: slice) -> None:
-            with np.errstate(over="ignore"):  # the infinities are clamped or refused later
-                pixels[rows] = np.divide(array[rows], peak_of(array.dtype), dtype=np.float32)
-
-        map_threads(fill, strips(*pixels.shape[:2]))
+        pixels = by_strips(partial(scale, peak=peak_of(array.dtype)), array, channels=channels)
     if encoding is not None:
         _check_range(pixels, name, encoding)
     return pixels

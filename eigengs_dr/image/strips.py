@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ and with smaller ones threads wait for each other and borders of filters are com
 
 MAX_THREADS = 8
 """Largest number of threads: Python lets only one of them start an operation at a time."""
+
+Pixels = NDArray[Any]
+"""Pixels (H, W, C) of any dtype that an image may have."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -66,21 +69,28 @@ def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> li
 
 
 def by_strips(
-    function: Callable[[NDArray[np.float32]], NDArray[np.float32]], image: NDArray[np.float32]
-) -> NDArray[np.float32]:
+    function: Callable[[Pixels], Pixels],
+    image: Pixels,
+    dtype: type[np.generic] = np.float32,
+    channels: int | None = None,
+) -> Pixels:
     """Apply a function of single pixels to an image without large temporary arrays.
 
     Parameters
     ----------
     function : callable
-        Returns an array of the shape of its argument.
-    image : ndarray of float32, shape (H, W, C)
+        ``function(rows)`` returns rows of the result, or one channel for all.
+    image : ndarray, shape (H, W, C)
+    dtype : dtype, optional
+        Type of the result.
+    channels : int, optional
+        Channels of the result, by default those of the image.
 
     Returns
     -------
-    ndarray of float32, shape (H, W, C)
+    ndarray of type `dtype`, shape (H, W, channels)
     """
-    result = np.empty(image.shape, np.float32)
+    result = np.empty((*image.shape[:2], channels or image.shape[2]), dtype)
 
     def fill(rows: slice) -> None:
         result[rows] = function(image[rows])
