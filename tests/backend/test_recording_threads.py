@@ -130,19 +130,6 @@ def test_a_program_dropped_during_a_recording_is_freed_after_it(backend, in_thre
         assert dr.all(call(Float(3, 4)) == Float(6, 8))
 
 
-def test_a_descent_that_another_thread_drops_during_a_recording(backend):
-    Float = select(backend).Float
-    drop = [half_read(backend)].clear
-
-    def drops(x):
-        run_in_thread(drop)
-        return 2 * x
-
-    with freeze_program(drops) as call:
-        for x in (1, 2, 3):
-            assert dr.all(call(Float(x, x)) == 2 * x)
-
-
 DROP_WHILE_RECORDING = """
     import drjit as dr
     from _helpers.waves import default, start
@@ -187,10 +174,7 @@ def test_a_descent_dropped_in_another_thread_is_freed_by_the_thread_that_compute
         run_in_thread(dropped.clear)
         assert len(recording._retired) == 2  # the program, and the set of the caller
     assert not recording._retired
-
-
-def test_a_descent_dropped_at_rest_is_freed_at_once(backend):
-    half_read(backend).close()
+    half_read(backend).close()  # at rest, at once
     assert not recording._retired
 
 

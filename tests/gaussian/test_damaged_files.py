@@ -75,14 +75,10 @@ def test_files_cut_off_anywhere(path):
         check_refused(path, content[:length])
 
 
-@pytest.mark.parametrize("size", [0, 1, 22, 1000, 100_000])
-def test_files_of_random_bytes(path, size):
-    check_refused(path, np.random.default_rng(size).bytes(size))
-
-
-@pytest.mark.parametrize("start", [b"PK\x03\x04", b"PK\x05\x06", b"\x93NUMPY\x01\x00"])
-def test_files_that_start_well(path, start):
-    check_refused(path, start + np.random.default_rng(0).bytes(500))
+@pytest.mark.parametrize("start", [b"", b"PK\x03\x04", b"PK\x05\x06", b"\x93NUMPY\x01\x00"])
+@pytest.mark.parametrize("size", [0, 22, 500, 100_000])
+def test_files_of_random_bytes(path, start, size):
+    check_refused(path, start + np.random.default_rng(size).bytes(size))
 
 
 HOSTILE = {

@@ -129,9 +129,8 @@ def test_refuses_an_unknown_space():
         ms_ssim(*pair, space="rgb")
 
 
-@pytest.mark.parametrize("channels", [1, 3])
-def test_psnr_of_data_clamps_and_rounds_nothing(channels):
-    a, b = np.random.default_rng(0).normal(size=(2, 9, 7, channels))
+def test_psnr_of_data_clamps_and_rounds_nothing():
+    a, b = np.random.default_rng(0).normal(size=(2, 9, 7, 1))
     expected = -10 * np.log10(np.mean((a - b) ** 2))
     assert psnr(a, b, "data") == pytest.approx(expected, abs=1e-12)
 
