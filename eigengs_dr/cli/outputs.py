@@ -71,11 +71,11 @@ def name_pictures(
     inputs: Sequence[Path | str], output: Path | None, folder: bool = False
 ) -> list[Path | None]:
     """Name a picture for each input, as `name_outputs`; None for each without an output."""
-    from ..image.io import SAVE_OPTIONS
+    from ..image.formats import PICTURE_SUFFIXES
 
     if output is None:
         return [None for _ in inputs]
-    return list(name_outputs(inputs, output, list(SAVE_OPTIONS), folder))
+    return list(name_outputs(inputs, output, PICTURE_SUFFIXES, folder))
 
 
 def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | str]) -> None:

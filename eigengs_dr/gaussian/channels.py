@@ -104,18 +104,19 @@ def slices(maps: Sequence[TextureMap]) -> list[slice]:
     return [slice(end - m.channels, end) for end, m in zip(ends, maps, strict=True)]
 
 
-def find_map(maps: Sequence[TextureMap], name: str) -> int:
-    """Return the index of a map.
+def find_map(maps: Sequence[TextureMap], name: str) -> tuple[TextureMap, slice]:
+    """Return a map and its channels among those of all.
 
     Raises
     ------
     BadValue
         If there is none; the message lists the names.
     """
-    names = [m.name for m in maps]
-    if name not in names:
-        raise BadValue(f"map {name!r} is not in it; it has {', '.join(names) or 'no maps'}")
-    return names.index(name)
+    for found, own in zip(maps, slices(maps), strict=True):
+        if found.name == name:
+            return found, own
+    names = ", ".join(m.name for m in maps)
+    raise BadValue(f"map {name!r} is not in it; it has {names or 'no maps'}")
 
 
 def show_sums(space: str, sums: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..image.color import MAX_CHANNELS, SPACES
-from ..image.formats import FLOAT_SUFFIXES, SAVE_OPTIONS
+from ..image.formats import SUFFIXES
 from ..storage import npz
 from ..storage.atomic import reader_of
 from ..storage.npz import BadValue, Field
 from .channels import MAX_CHANNELS as MAX_MAPS
-from .channels import TextureMap, check_maps, find_map, slices
+from .channels import TextureMap, check_maps, find_map
 
 FORMAT = "eigengs_dr.gaussians"
 MATERIAL = "eigengs_dr.material"
@@ -103,10 +103,9 @@ class SetData(NamedTuple):
         BadValue
             If there is no such map.
         """
-        number = find_map(self.maps, name)
-        own = slices(self.maps)[number]
+        found, own = find_map(self.maps, name)
         parts = {k: self.arrays[k][..., own] for k in ("color", "background")}
-        return self._replace(arrays=self.arrays | parts, space=self.maps[number].space, maps=())
+        return self._replace(arrays=self.arrays | parts, space=found.space, maps=())
 
 
 class FitFigures(NamedTuple):
@@ -123,7 +122,7 @@ def check_suffix(path: str | os.PathLike[str]) -> None:
     suffix = Path(path).suffix.lower()
     if suffix == ".egs":
         raise ValueError(f"{path}: only eigengs_dr.pack writes .egs files; save as .npz")
-    if suffix in (*SAVE_OPTIONS, *FLOAT_SUFFIXES):
+    if suffix in SUFFIXES:
         raise ValueError(f"{path}: a set is no image; save as .npz, its picture by save_image")
 
 

@@ -22,7 +22,7 @@ from ..backend.recording import exclusive
 from ..backend.selection import BackendError, select
 from ..image.color import check_size
 from ..storage.npz import BadValue
-from .channels import TextureMap, find_map, slices
+from .channels import TextureMap, find_map
 from .file import CUTOFF, Arrays, SetData, check, read, write
 
 Rows = Float
@@ -228,13 +228,12 @@ class Gaussians:
 
     def _map(self, name: str) -> Gaussians:
         try:
-            number = find_map(self.maps, name)
+            found, own = find_map(self.maps, name)
         except BadValue as error:
             raise KeyError(f"Gaussians: {error}") from None
-        own, kind = slices(self.maps)[number], type(self.color)
+        kind = type(self.color)
         color, background = kind(list(self.color)[own]), kind(list(self.background)[own])
-        space = self.maps[number].space
-        return replace(self, color=color, background=background, space=space, maps=())
+        return replace(self, color=color, background=background, space=found.space, maps=())
 
     @exclusive()
     def scaled(self, width: int, height: int) -> Gaussians:

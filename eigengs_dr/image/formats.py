@@ -26,33 +26,30 @@ from .strips import Pixels, by_strips
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-FLOAT_SUFFIXES = (".exr", ".hdr", ".pfm")
-"""Suffixes of files that hold floats, whatever is written."""
-
-TIFF_SUFFIXES = (".tif", ".tiff")
-
 BITS: dict[str, tuple[int, ...]] = {
+    ".png": (8, 16),
+    ".jpg": (8,),
+    ".jpeg": (8,),
+    ".webp": (8,),
+    ".tif": (8, 16, 32),
+    ".tiff": (8, 16, 32),
+    ".bmp": (8,),
+    ".ppm": (8,),
     ".exr": (32, 16),
     ".hdr": (32,),
     ".pfm": (32,),
-    ".png": (8, 16),
-    ".tif": (8, 16, 32),
-    ".tiff": (8, 16, 32),
 }
-"""Bits of a value that a file may have, by its suffix; the first is the default. 32 are floats, and
-so are 16 in an EXR file. An HDR file stores 8 bits of a value and an exponent."""
+"""Suffixes of files that are written, with the bits of a value; the first number is the default. 32
+are floats, and so are 16 in an EXR file. An HDR file stores 8 bits of a value and an exponent."""
 
-SAVE_OPTIONS: dict[str, dict[str, Any]] = {
-    ".png": {},
-    ".jpg": {"quality": 95},
-    ".jpeg": {"quality": 95},
-    ".webp": {"quality": 95},
-    ".tif": {},
-    ".tiff": {},
-    ".bmp": {},
-    ".ppm": {},
-}
-"""Suffixes of files that Pillow writes, with the options that it receives."""
+SUFFIXES = tuple(BITS)
+
+PICTURE_SUFFIXES = tuple(suffix for suffix, bits in BITS.items() if 8 in bits)
+"""Suffixes of files of 8 bits, which Pillow writes."""
+
+TIFF_SUFFIXES = (".tif", ".tiff")
+
+LOSSY = (".jpg", ".jpeg", ".webp")
 
 MAX_PIXELS = 1 << 29
 """Largest number of pixels of a file; a damaged header may claim more than memory holds."""
@@ -159,7 +156,8 @@ def write_file(path: Path, pixels: Pixels, bits: int) -> None:
     if bits == 8 or (suffix == ".png" and grey):
         from PIL import Image
 
-        Image.fromarray(flat).save(path, **SAVE_OPTIONS[suffix])
+        options: dict[str, Any] = {"quality": 95} if suffix in LOSSY else {}
+        Image.fromarray(flat).save(path, **options)
     elif suffix in TIFF_SUFFIXES:
         import tifffile
 
@@ -242,7 +240,7 @@ def image_errors(path: Path) -> Iterator[None]:
                 f"has more than {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels; scale it down first, "
                 "or fit it in blocks"
             ),
-            ImportError: reason,
+            ImportError: ADVICE,
         }
         damaged = f"damaged or unsupported ({reason}); export it again"
         said = next((text for kind, text in known.items() if isinstance(error, kind)), damaged)
@@ -335,17 +333,10 @@ def has_openimageio() -> bool:
     return find_spec("OpenImageIO") is not None
 
 
-def _openimageio() -> Any:
-    try:
-        import OpenImageIO
-    except ImportError:
-        raise ImportError(ADVICE) from None
-    return OpenImageIO
-
-
 def _read_openimageio(path: Path, kind: str) -> Pixels:
     """Read a file of one image; alpha is not multiplied into the colours, except in EXR."""
-    oiio = _openimageio()
+    import OpenImageIO as oiio
+
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     file = oiio.ImageInput.open(str(path), config)
@@ -375,7 +366,8 @@ def _read_openimageio(path: Path, kind: str) -> Pixels:
 
 def _write_openimageio(path: Path, pixels: Pixels, bits: int) -> None:
     """Write an EXR or HDR file, or a PNG of 16 bits; 16-bit floats are clamped to +-65,504."""
-    oiio = _openimageio()
+    import OpenImageIO as oiio
+
     suffix = path.suffix.lower()
     if suffix == ".hdr":  # it has three channels
         pixels = np.broadcast_to(pixels, (*pixels.shape[:2], 3))

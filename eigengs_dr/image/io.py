@@ -15,8 +15,7 @@ from .color import to_coded, to_linear
 from .formats import (
     ADVICE,
     BITS,
-    FLOAT_SUFFIXES,
-    SAVE_OPTIONS,
+    SUFFIXES,
     decode_file,
     has_openimageio,
     write_file,
@@ -33,9 +32,6 @@ from .pixels import (
 )
 from .remote import is_url, local_copy
 from .strips import Pixels, by_strips
-
-SUFFIXES = (*SAVE_OPTIONS, *FLOAT_SUFFIXES)
-"""Suffixes of image files."""
 
 
 def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]:
@@ -240,7 +236,7 @@ def bits_of(path: Path, bits: int | None = None) -> int:
     if suffix not in SUFFIXES:
         known = " ".join(SUFFIXES)
         raise ImageError(f"{path}: image suffix {suffix!r} is unknown; use one of {known}")
-    known_bits = BITS.get(suffix, (8,))
+    known_bits = BITS[suffix]
     if bits is not None and bits not in known_bits:
         shown = " or ".join(map(str, sorted(known_bits)))
         raise ImageError(f"{path}: bits is {bits}; a {suffix} file has {shown}")
@@ -251,7 +247,7 @@ def bits_of(path: Path, bits: int | None = None) -> int:
 
 def dtype_of(path: Path, bits: int) -> type[np.generic]:
     """Return the type of the values of a file: uint8, uint16, or float32 for linear light."""
-    floats = path.suffix.lower() in FLOAT_SUFFIXES or bits == 32
+    floats = 8 not in BITS[path.suffix.lower()] or bits == 32
     return np.float32 if floats else np.uint8 if bits == 8 else np.uint16
 
 
@@ -288,7 +284,9 @@ def write_pixels(path: Path, pixels: Pixels, bits: int) -> None:
     try:
         with atomic_write(path) as temporary:
             write_file(temporary, pixels, bits)
-    except (ImportError, OSError, ValueError) as error:
+    except ImportError:
+        raise ImageError(f"{path}: {ADVICE}") from None
+    except (OSError, ValueError) as error:
         message = reason_of(error)
         if not message.startswith(f"{path}: "):  # errors of atomic_write are clear already
             reason = getattr(error, "strerror", None) or message

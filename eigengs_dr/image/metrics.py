@@ -64,8 +64,8 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     >>> round(psnr(np.zeros((4, 4, 3)), np.full((4, 4, 3), 0.1), space="ycbcr"), 2)
     26.09
     """
-    x, _ = _pair(a, b)
-    return psnr_from_mse(squared_error(a, b, space) / x.size)
+    total = squared_error(a, b, space)
+    return psnr_from_mse(total / (3 * math.prod(np.shape(a)[:2])))
 
 
 def squared_error(a: ArrayLike, b: ArrayLike, space: str) -> float:
@@ -260,12 +260,8 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
 
 def _scaled(image: Pixels) -> Pixels:
     """Scale integers to [0, 1] by their type; floats stay as they are."""
-    kind = image.dtype.kind
-    if kind == "f":
-        return image
-    if kind == "b" or (kind == "u" and image.itemsize <= 2):
-        return image / np.float64(peak_of(image.dtype))
-    raise ValueError(f"pixels are {image.dtype}; expected uint8, uint16 or floats in [0, 1]")
+    peak = peak_of(image.dtype)
+    return image if image.dtype.kind == "f" else image / np.float64(peak)
 
 
 def _pair(a: ArrayLike, b: ArrayLike) -> tuple[Pixels, Pixels]:

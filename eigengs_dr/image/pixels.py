@@ -97,8 +97,18 @@ def encoding_of(image: Any, encoding: str | None = None) -> str | None:
 
 
 def peak_of(dtype: np.dtype[Any]) -> int:
-    """Return the value of white: the largest integer, or 1 for floats and bool."""
-    return int(np.iinfo(dtype).max) if dtype.kind == "u" else 1
+    """Return the value of white: the largest integer, or 1 for floats and bool.
+
+    Raises
+    ------
+    ValueError
+        If pixels have another type.
+    """
+    if dtype.kind in "bf":
+        return 1
+    if dtype.kind == "u" and dtype.itemsize <= 2:
+        return int(np.iinfo(dtype).max)
+    raise ValueError(f"pixels are {dtype}; expected uint8, uint16 or floats in [0, 1]")
 
 
 def scale(pixels: Pixels, peak: int) -> NDArray[np.float32]:
@@ -131,12 +141,12 @@ def to_floats(
     if array.size == 0:
         raise ImageError(f"{name}: shape {array.shape} has no pixels; check how it was cropped")
 
-    kind = array.dtype.kind
-    if kind not in "bf" and not (kind == "u" and array.itemsize <= 2):
-        expected = "expected uint8, uint16 or floats in [0, 1]"
-        raise ImageError(f"{name}: pixels are {array.dtype}; {expected}")
+    try:
+        peak = peak_of(array.dtype)
+    except ValueError as error:
+        raise ImageError(f"{name}: {error}") from None
     # The extremes are finite only if all pixels are; they need no array of flags.
-    if kind == "f" and not (np.isfinite(array.min()) and np.isfinite(array.max())):
+    if array.dtype.kind == "f" and not (np.isfinite(array.min()) and np.isfinite(array.max())):
         bad = np.argwhere(~np.isfinite(array).all(axis=2))
         row, column = bad[0].tolist()
         raise ImageError(
@@ -147,7 +157,7 @@ def to_floats(
     pixels: NDArray[np.float32] = array
     as_it_is = array.dtype == np.float32 and array.shape[2] == channels
     if copy or not as_it_is or not array.flags.c_contiguous:
-        pixels = by_strips(partial(scale, peak=peak_of(array.dtype)), array, channels=channels)
+        pixels = by_strips(partial(scale, peak=peak), array, channels=channels)
     if encoding is not None:
         _check_range(pixels, name, encoding)
     return pixels

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from .formats import FLOAT_SUFFIXES, SAVE_OPTIONS
+from .formats import SUFFIXES
 from .pixels import ImageError, reason_of
 
 
@@ -105,4 +105,4 @@ def _fsspec() -> Any:
 
 def _is_image(name: str) -> bool:
     path = PurePosixPath(name)
-    return path.suffix.lower() in (*SAVE_OPTIONS, *FLOAT_SUFFIXES) and not path.name.startswith(".")
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")

@@ -8,8 +8,8 @@ from hypothesis.extra import numpy as hnp
 
 from _helpers.errors import one_line
 from _helpers.files import BYTES, property_of
+from eigengs_dr.image.formats import PICTURE_SUFFIXES
 from eigengs_dr.image.io import (
-    SAVE_OPTIONS,
     ImageError,
     check_image,
     load_image,
@@ -35,7 +35,7 @@ def test_lossless_round_trip(tmp_path_factory, suffix, image):
     np.testing.assert_array_equal(load_image(path), check_image(image))
 
 
-@pytest.mark.parametrize("suffix", SAVE_OPTIONS)
+@pytest.mark.parametrize("suffix", PICTURE_SUFFIXES)
 def test_every_suffix_is_written_in_its_format(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     image = np.full((8, 8, 3), (0.2, 0.4, 0.6))
