@@ -8,7 +8,7 @@ and 11 ns a pixel of float32 with 7 taps along both axes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -77,44 +77,11 @@ def squared_error(a: ArrayLike, b: ArrayLike, space: str) -> float:
     if space not in PSNR_SPACES:
         raise ValueError(f"space {space!r} is unknown; use one of {', '.join(PSNR_SPACES)}")
     x, y = _pair(a, b)
-    return _sums_by_rows(x.__getitem__, y, [space])[0]
 
+    def squares(rows: slice) -> float:
+        return _sum_squares(x[rows].astype(np.float64), y[rows].astype(np.float64), space)
 
-def psnrs_by_rows(
-    read: Callable[[slice], NDArray[np.floating]],
-    image: NDArray[np.floating],
-    spaces: Sequence[str],
-) -> list[float]:
-    """Compute `psnr` in several spaces, between an image and another that is read by strips.
-
-    Parameters
-    ----------
-    read : callable
-        ``read(rows)`` returns rows of the first image; several threads call it at once.
-    image : ndarray of float, shape (H, W, 3) or (H, W, 1)
-        The second image.
-    spaces : sequence of str
-        See `psnr`.
-
-    Returns
-    -------
-    list of float
-        One PSNR for each space, in decibels.
-    """
-    return [psnr_from_mse(total / image.size) for total in _sums_by_rows(read, image, spaces)]
-
-
-def _sums_by_rows(
-    read: Callable[[slice], Pixels], image: Pixels, spaces: Sequence[str]
-) -> list[float]:
-    """Return the sums of the squared errors in several spaces, see `psnrs_by_rows`."""
-
-    def squares(rows: slice) -> list[float]:
-        a, b = read(rows), image[rows]
-        return [_sum_squares(a.astype(np.float64), b.astype(np.float64), space) for space in spaces]
-
-    sums = np.sum(map_threads(squares, strips(*image.shape[:2])), axis=0)
-    return [float(total) for total in sums]
+    return sum(map_threads(squares, strips(*x.shape[:2])))
 
 
 def _sum_squares(a: NDArray[np.floating], b: NDArray[np.floating], space: str) -> float:
