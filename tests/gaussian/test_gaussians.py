@@ -81,7 +81,7 @@ BAD = [
     ("space", "a\nb", "space is"),
     ("color", 5.0, "color has shape"),
     ("color", np.ones((COUNT, 0)), "color"),
-    ("size", (8.75, 9), "whole pixels"),
+    ("size", (8.0, 9), "whole pixels"),
 ]
 
 

@@ -38,11 +38,6 @@ def test_sets_compare_by_identity():
     assert a == a and a != b
 
 
-def test_a_size_that_is_not_whole_is_refused():
-    with pytest.raises(ValueError, match="whole pixels"):
-        eg.Gaussians.from_arrays([[1, 1]], [[1, 0, 1]], [[1, 1, 1]], size=(8.0, 8.0))
-
-
 def test_a_tiff_that_claims_too_many_pixels_is_refused_before_it_is_decoded(tmp_path):
     eg.save_image(tmp_path / "a.tif", LIGHT, bits=16)
     content = bytearray((tmp_path / "a.tif").read_bytes())
