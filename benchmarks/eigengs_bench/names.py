@@ -26,7 +26,7 @@ NATURAL, CATS, SAMPLES = "natural256", "cats256", "samples"
 
 PRESETS = ("default", "gaussianimage", "eigengs")
 TABLES = ("main", "ablation", "cross", "reach")
-PICTURES = ("iterations", "colors", "curves", "tiles", "radii", "split", "cross")
+PICTURES = ("curves", "tiles")
 PARTS = ("pixels", "splats", "threads", "small")
 KODAK_COUNTS = (5_000, 10_000, 30_000, 50_000, 70_000)  # Gaussians of published tables
 SOLVE_STEPS = 10  # of the colour solve of a fit, by default

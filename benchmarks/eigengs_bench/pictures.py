@@ -1,43 +1,29 @@
-"""The paper's curves, histograms and rows of pictures, with our fits, and tiles side by side.
+"""The paper's curves with our fits, and tiles side by side.
 
-All pictures but the tiles have the size of the model, 256x256 pixels, and its number of Gaussians.
-The row of a curve has "psnr_ycbcr" every `EVERY` steps; that of a set of pictures says its file.
+Curves have the size of the model, 256x256 pixels, and its number of Gaussians. The row of a curve
+has "psnr_ycbcr" every `EVERY` steps; that of a picture says its file.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from PIL import Image as pillow
 
+import eigengs_dr as eg
 from eigengs_bench import report as fr
 from eigengs_bench.cases import CASES
-from eigengs_bench.clock import Image, Moment, descent
-from eigengs_bench.images import images_of, is_present, model_for
-from eigengs_bench.names import CATS, NATURAL, PICTURES
+from eigengs_bench.clock import Image, descent
+from eigengs_bench.images import images_of, is_trained, model_for
+from eigengs_bench.names import PICTURES, PRESETS, SAMPLES
 from eigengs_bench.rows import Job, Row, Task, code_name
 from eigengs_bench.stability import moments, tiling
-from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.gaussian.gaussians import Gaussians
-from eigengs_dr.image.io import sample, to_8bit
-from eigengs_dr.image.metrics import psnr
-from eigengs_dr.image.resize import GAP, center_crop, join_pictures, resample, text_line
-from eigengs_dr.raster.render import picture_of
+from eigengs_dr.image.io import to_8bit
+from eigengs_dr.image.resize import center_crop, join_pictures, text_line
 from eigengs_dr.storage.atomic import atomic_write
-from eigengs_dr.viewer.pictures import overlay
 
 COMPONENTS = 300  # a channel of the models that are trained, as in the paper's comparisons
-PHOTO = "coffee"  # photo of scikit-image that the basis "natural" was not trained on
-# The presets that are compared, and what stands above their pictures.
-METHODS = {
-    "gaussianimage": "gaussianimage: random start",
-    "eigengs": "eigengs: start from the basis",
-    "default": "default: placed by the image, colours solved",
-}
 # Sets of the chart of PSNR, and their titles.
 PANELS = {
     "faces256": "faces",
@@ -47,86 +33,81 @@ PANELS = {
     "kodak": 'Kodak, basis "natural"',
     "samples": 'samples, basis "natural"',
 }
-NEEDS = {"radii": [CATS], "split": [CATS], "cross": [CATS, NATURAL]}
-CREDIT = "Images: AFHQ, NAVER Corp., CC BY-NC 4.0"  # of all pictures of cats
 EVERY = 50  # iterations between two points of a curve
-MAGNIFIED, STRETCHED = 8, 20  # factors of errors before they are added to mid-grey
-MARGIN = 0.08  # around the middle of a picture, in its sides: Gaussians there reach into it
-# Longer side of a picture, and heights of the letters below it and above a row, in pixels.
-CELL, LETTERS, HEADING = 160, 13, 15
-
-Cell = tuple[str, NDArray[Any]]  # the line below a picture, and the picture: RGB, not clamped
+STRETCHED = 20  # factor of errors before they are added to mid-grey
+LETTERS = 13  # height of the letters below a picture, in pixels
 
 
 def run(task: Task, wanted: Sequence[str]) -> list[Row]:
-    """Draw pictures into the folder; by default those whose sets of images are there."""
-    chosen = wanted or [p for p in PICTURES if all(is_present(task, s) for s in NEEDS.get(p, []))]
-    functions = (_iterations, _colors, _curves, _tiles, _radii, _split, _cross)
-    makers = dict(zip(PICTURES, functions, strict=True))
-    return [row for name in chosen for row in makers[name](task)]
+    """Measure curves of the sets that are there, and draw tiles into the folder."""
+    jobs: list[Job] = []
+    if "curves" in (wanted or PICTURES):
+        kodak = task.data is not None and (task.data / "kodak").is_dir()
+        present = [n for n in PANELS if is_trained(task, n) or (n == "kodak" and kodak)]
+        jobs += [job for name in present or [SAMPLES] for job in _curves(task, name)]
+    if "tiles" in (wanted or PICTURES):
+        jobs.append(({"file": "tiles.png", "iterations": task.iterations}, partial(_tiles, task)))
+    return task.measure("pictures", jobs)
 
 
-def summarize(rows: Sequence[Row]) -> fr.Section:
-    """List the pictures, and draw the curves and the histograms."""
-    files = [row for row in rows if "file" in row]
-    lines = [(row["file"], row["caption"]) for row in files]
-    charts: dict[str, Figure] = {}
-    if curves := [row for row in rows if "psnr_ycbcr" in row]:
-        charts["curves"] = _curves_chart(curves)
-    if histograms := [row for row in rows if "radii" in row]:
-        charts["radii"] = _radii_chart(histograms)
-    codes = [code_name(row["run"]) for row in rows]
-    return fr.Section([fr.table("Pictures", ("file", "caption"), lines, codes)], charts)
-
-
-def preset_descent(
-    task: Task, image: Image, model: EigenGS, preset: str, marks: Sequence[int], **options: Any
-) -> Iterator[Moment]:
-    """Fit by a preset with the number of Gaussians of a model; "eigengs" starts from it."""
-    start, count = model if preset == "eigengs" else None, len(model.gaussians)
-    shared = {"gaussians": count, "backend": task.backend, "preset": preset, "start": start}
-    return descent(image, task.iterations, marks, **shared, **options)
-
-
-def to_size(image: Image, model: EigenGS) -> Image:
-    """Bring the largest centred part of an image to the size of a model."""
-    return center_crop(image, model.gaussians.width, model.gaussians.height)
-
-
-# ---------------------------------------------------------------------------------------------
-#  Curves and histograms
-# ---------------------------------------------------------------------------------------------
-
-
-def _curves(task: Task) -> list[Row]:
-    """Measure PSNR over iterations of every preset: the paper's figure of curves."""
-    present = [name for name in PANELS if is_present(task, name)]
-    return task.measure("pictures", [job for name in present for job in _curve_jobs(task, name)])
-
-
-def _curve_jobs(task: Task, name: str) -> Iterator[Job]:
-    model = EigenGS.load("natural", task.backend)
+def _curves(task: Task, name: str) -> Iterator[Job]:
+    """Measure PSNR over iterations of every preset; "eigengs" starts from a model."""
+    model = eg.EigenGS.load("natural", task.backend)
     if name not in ("kodak", "samples"):
         model = model_for(task, name, name, COMPONENTS)
+    shapes = model.gaussians
     marks = sorted({*range(0, task.iterations + 1, EVERY), task.iterations})
 
     def work(image: Image, preset: str) -> Row:
-        moments = preset_descent(task, image, model, preset, marks)
-        return {"psnr_ycbcr": [psnr(m.picture, image, "ycbcr") for m in moments], "marks": marks}
+        start, count = model if preset == "eigengs" else None, len(shapes)
+        options = {"gaussians": count, "backend": task.backend, "preset": preset, "start": start}
+        found = descent(image, task.iterations, marks, **options)
+        return {"psnr_ycbcr": [eg.psnr(m.picture, image, "ycbcr") for m in found], "marks": marks}
 
     for file, image in images_of(task, name):
-        for preset in METHODS:
+        for preset in PRESETS:
             label = {"set": name, "image": file, "preset": preset, "iterations": task.iterations}
-            yield label, partial(work, to_size(image, model), preset)
+            yield label, partial(work, center_crop(image, shapes.width, shapes.height), preset)
 
 
-def _curves_chart(rows: Sequence[Row]) -> Figure:
+def _tiles(task: Task) -> Row:
+    """Show the middle of a slow gradient by every preset, where Gaussians show as round tiles."""
+    case = CASES["smooth"]._replace(iterations=task.iterations)
+    image = case.image()
+    middle = (slice(len(image) // 3, 2 * len(image) // 3),) * 2
+    columns = []
+    for preset in PRESETS:
+        picture = moments(case, image, preset, task.backend)[-1].picture
+        error = 0.5 + STRETCHED * (picture - image)
+        parts = [np.clip(part[middle], 0, 1) for part in (picture, error)]
+        text = text_line(f"{preset}: {tiling(picture, image):.2f}", parts[0].shape[1], LETTERS)
+        columns.append(join_pictures([parts[0], text, parts[1]], 0, 0))
+    codes = to_8bit(join_pictures(columns, 1)).astype(np.uint8)
+    with atomic_write(task.folder / "tiles.png") as temporary:  # small, of 256 colours
+        pillow.fromarray(codes).quantize(256).save(temporary, optimize=True)
+    return {
+        "file": "tiles.png",
+        "caption": f"The middle of a slow gradient after {task.iterations:,} steps, its tiling in "
+        f"8-bit levels, and its errors times {STRETCHED}",
+    }
+
+
+def summarize(rows: Sequence[Row]) -> fr.Section:
+    """List the pictures, and draw the curves."""
+    lines = [(row["file"], row["caption"]) for row in rows if "file" in row]
+    curves = [row for row in rows if "psnr_ycbcr" in row]
+    codes = [code_name(row["run"]) for row in rows]
+    charts = {"curves": _chart(curves)} if curves else {}
+    return fr.Section([fr.table("Pictures", ("file", "caption"), lines, codes)], charts)
+
+
+def _chart(rows: Sequence[Row]) -> Figure:
     """Draw lines in the colours of the presets, one panel a set: means over its images."""
     names = list(dict.fromkeys(row["job"]["set"] for row in rows))
     figure = fr.new_figure(2.8 * len(names) + 0.6, 3.2)
     axes = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
     for axis, name in zip(axes, names, strict=True):
-        for preset in METHODS:
+        for preset in PRESETS:
             job = {"set": name, "preset": preset}
             some = [row for row in rows if job.items() <= row["job"].items()]
             # A fit that has failed is None in a file, and NaN here.
@@ -135,232 +116,3 @@ def _curves_chart(rows: Sequence[Row]) -> Figure:
         title = PANELS[name]
         fr.label_axes(axis, "iterations", "PSNR (YCbCr) / dB", "", axis is axes[0], title=title)
     return figure
-
-
-def _radii(task: Task) -> list[Row]:
-    """Measure how large Gaussians are, with and without the split by frequency."""
-
-    def work(split: bool) -> Row:
-        model, found = model_for(task, CATS, CATS, COMPONENTS, split=split), []
-        for _, image in images_of(task, CATS):
-            *_, last = preset_descent(task, image, model, "eigengs", [task.iterations])
-            found.append(radii_of(last.gaussians).round(3))
-        return {"radii": np.stack(found), "low": model.low}
-
-    jobs: list[Job] = [
-        (
-            {"radii": title, "images": task.images, "iterations": task.iterations},
-            partial(work, split),
-        )
-        for title, split in (("no split", False), ("frequency-aware split", True))
-    ]
-    return task.measure("pictures", jobs)
-
-
-def radii_of(gaussians: Gaussians) -> NDArray[np.float64]:
-    """Geometric mean of the standard deviations of every Gaussian, in pixels, shape (N,)."""
-    factor = gaussians.to_arrays()["factor"].astype(np.float64)
-    return 1 / np.sqrt(factor[:, 0] * factor[:, 2])  # det F = a c
-
-
-def _radii_chart(rows: Sequence[Row]) -> Figure:
-    """Draw histograms of radii side by side: Gaussians for low frequencies, and all others."""
-    figure = fr.new_figure(3.8 * len(rows), 3.2)
-    axes = figure.subplots(1, len(rows), squeeze=False, sharex=True, sharey=True)[0]
-    bins = np.linspace(0, 1.05 * max(np.max(row["radii"]) for row in rows), 60)
-    for axis, row in zip(axes, rows, strict=True):
-        low, high = np.split(np.array(row["radii"]), [row["low"]], axis=1)
-        name = "high frequencies" if low.size else "all"
-        for part, label, color in ((high, name, "#1e5aa0"), (low, "low frequencies", "#d66014")):
-            if part.size:
-                weights = np.full(part.size, 1 / len(part))
-                label = f"{label}: {part.shape[1]:,} Gaussians"
-                axis.hist(part.ravel(), bins, weights=weights, color=color, label=label, alpha=0.8)
-        axis.margins(y=0.35)  # room for the legend
-        title = row["job"]["radii"]
-        fr.label_axes(axis, "radius / pixels", "Gaussians of an image", "", title=title)
-        axis.set_yscale("log")
-    return figure
-
-
-# ---------------------------------------------------------------------------------------------
-#  Rows of pictures
-# ---------------------------------------------------------------------------------------------
-
-
-def _drawn(
-    task: Task, file: str, caption: str, make: Callable[[], list[tuple[str, Sequence[Cell]]]]
-) -> list[Row]:
-    """Draw rows of pictures into a file, once; cats have a line of credit."""
-
-    def work() -> Row:
-        rows = make()
-        save_strip(task.folder / file, strip(rows, CREDIT if file.startswith("cats") else ""))
-        return {"file": file, "caption": caption}
-
-    return task.measure("pictures", [({"file": file, "iterations": task.iterations}, work)])
-
-
-def _iterations(task: Task) -> list[Row]:
-    """Show the first iterations of every preset: the paper's figures of convergence."""
-    marks = [n for n in (0, 10, 100) if n < task.iterations] + [task.iterations]
-
-    def make(image: Image, model: EigenGS) -> list[tuple[str, Sequence[Cell]]]:
-        rows: list[tuple[str, Sequence[Cell]]] = []
-        for preset, heading in METHODS.items():
-            cells = [_cell_of(m, image) for m in preset_descent(task, image, model, preset, marks)]
-            rows.append((heading, [*cells, ("photo", image)]))
-        return rows
-
-    shipped = EigenGS.load("natural", task.backend)
-    subjects = [
-        (f"iterations-{PHOTO}.jpg", 'a photo and the basis "natural"', sample(PHOTO), shipped)
-    ]
-    if is_present(task, CATS):
-        [(_, cat)] = images_of(task, CATS, 1)
-        model = model_for(task, CATS, CATS, COMPONENTS)
-        subjects.append(("cats-iterations.png", "a cat and a basis of other cats", cat, model))
-    found = []
-    for file, words, image, model in subjects:
-        caption = f"Iterations of every preset: {words}, {_size(model)}; PSNR in YCbCr"
-        found += _drawn(task, file, caption, partial(make, to_size(image, model), model))
-    return found
-
-
-def _colors(task: Task) -> list[Row]:
-    """Compare fits in YCbCr and in RGB: the paper's figures of colour spaces."""
-    model = EigenGS.load("natural", task.backend)
-    image, marks = (
-        to_size(sample(PHOTO), model),
-        sorted({min(10, task.iterations), task.iterations}),
-    )
-
-    def make() -> list[tuple[str, Sequence[Cell]]]:
-        rows: list[tuple[str, Sequence[Cell]]] = []
-        for space, heading in {"ycbcr": "YCbCr", "rgb": "RGB"}.items():
-            cells: list[Cell] = [("photo", image)]
-            for moment in preset_descent(task, image, model, "default", marks, space=space):
-                one, other = (psnr(moment.picture, image, s) for s in ("ycbcr", "rgb"))
-                error = 0.5 + MAGNIFIED * (moment.picture - image)
-                line = f"iteration {moment.iteration:,}: {one:.1f} / {other:.1f}"
-                cells += [(line, moment.picture), (f"{MAGNIFIED} x its error", error)]
-            rows.append((f"fitted in {heading}; PSNR in YCbCr / in RGB, in dB", cells))
-        return rows
-
-    caption = f"A photo fitted in YCbCr and in RGB by the preset default: {_size(model)}"
-    return _drawn(task, "colors.jpg", caption, make)
-
-
-def _tiles(task: Task) -> list[Row]:
-    """Show the middle of a slow gradient by every preset, where Gaussians show as round tiles."""
-
-    def make() -> list[tuple[str, Sequence[Cell]]]:
-        case = CASES["smooth"]._replace(iterations=task.iterations)
-        image = case.image()
-        middle = (slice(len(image) // 3, 2 * len(image) // 3),) * 2
-        shown, errors = [], []
-        for preset in METHODS:
-            picture = moments(case, image, preset, task.backend)[-1].picture
-            shown.append((f"{preset}: {tiling(picture, image):.2f}", picture[middle]))
-            errors.append(("", (0.5 + STRETCHED * (picture - image))[middle]))
-        return [("", shown), (f"their errors times {STRETCHED}", errors)]
-
-    steps = f"{task.iterations:,} steps"
-    caption = f"The middle of a slow gradient after {steps}, and its tiling in 8-bit levels"
-    return _drawn(task, "tiles.png", caption, make)
-
-
-def _split(task: Task) -> list[Row]:
-    """Show what Gaussians for low and for high frequencies make: the paper's figure of both."""
-
-    def make() -> list[tuple[str, Sequence[Cell]]]:
-        model = model_for(task, CATS, CATS, COMPONENTS, split=True)
-        [(_, image)] = images_of(task, CATS, 1)
-        encoded = model.encode(image)
-        whole, low = picture_of(encoded), picture_of(encoded[: model.low])
-        high, outlines = 0.5 + whole - low, "their outlines in the middle, x 2"
-        top = [
-            ("photo", image),
-            (f"{model.low:,} for low frequencies", low),
-            (f"{len(encoded) - model.low:,} for high, around grey", high),
-        ]
-        bottom = [
-            (f"both: {psnr(whole, image, 'ycbcr'):.1f} dB", whole),
-            (outlines, _outlines(encoded[: model.low], low)),
-            (outlines, _outlines(encoded[model.low :], high)),
-        ]
-        return [("", top), ("", bottom)]
-
-    caption = "A cat encoded by a model with the frequency-aware split, and outlines of Gaussians"
-    return _drawn(task, "cats-split.png", caption, make)
-
-
-def _cross(task: Task) -> list[Row]:
-    """Show cats projected on bases of other images: the paper's figure of cross-dataset starts."""
-
-    def make() -> list[tuple[str, Sequence[Cell]]]:
-        bases = {
-            "cats": model_for(task, CATS, CATS, COMPONENTS),
-            "ImageNet": model_for(task, NATURAL, NATURAL, COMPONENTS),
-            '"natural"': EigenGS.load("natural", task.backend),
-        }
-        rows: list[tuple[str, Sequence[Cell]]] = []
-        for _, image in images_of(task, CATS, 3):
-            cells: list[Cell] = [("photo", image)]
-            for words, model in bases.items():
-                shown = picture_of(model.encode(image, "projected"))
-                cells.append((f"{words}: {psnr(shown, image, 'ycbcr'):.1f} dB", shown))
-            rows.append(("", cells))
-        return rows
-
-    caption = "Cats at iteration 0: projected on bases of cats, of ImageNet, and the one that ships"
-    return _drawn(task, "cats-cross.png", caption, make)
-
-
-def _cell_of(moment: Moment, image: Image) -> Cell:
-    reached = psnr(moment.picture, image, "ycbcr")
-    return f"iteration {moment.iteration:,}: {reached:.1f} dB", moment.picture
-
-
-def _size(model: EigenGS) -> str:
-    shapes = model.gaussians
-    return f"{len(shapes):,} Gaussians, {shapes.width}x{shapes.height} pixels"
-
-
-def _outlines(gaussians: Gaussians, picture: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Outlines over the middle quarter of a picture, which has room for all of them."""
-    height, width = picture.shape[:2]
-    away = np.abs(gaussians.to_arrays()["mean"] / (width, height) - 0.5)
-    near = gaussians[(away < 0.25 + MARGIN).all(axis=1)]
-    large = picture.repeat(4, axis=0).repeat(4, axis=1)
-    return overlay(near, large)[height : 3 * height, width : 3 * width]
-
-
-def strip(rows: Sequence[tuple[str, Sequence[Cell]]], credit: str = "") -> NDArray[Any]:
-    """Put rows of pictures below each other, each below its heading; RGB on white, not clamped."""
-    drawn = []
-    for heading, cells in rows:
-        row = join_pictures([_labelled(*cell) for cell in cells], 1, GAP)
-        above = [text_line(heading, row.shape[1], HEADING)] if heading else []
-        drawn.append(join_pictures([*above, row], 0, 2))
-    if credit:
-        drawn.append(text_line(credit, drawn[0].shape[1], LETTERS))
-    return join_pictures(drawn, 0, GAP)
-
-
-def _labelled(caption: str, picture: NDArray[Any]) -> NDArray[Any]:
-    height, width = picture.shape[:2]
-    scale = CELL / max(height, width)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    scaled = resample(np.clip(picture, 0, 1).astype(np.float32), *size)
-    return join_pictures([scaled, text_line(caption, size[0], LETTERS)], 0, 0)
-
-
-def save_strip(path: Path, picture: NDArray[Any]) -> None:
-    """Write a strip, small: a .jpg of moderate quality, or a .png of 256 colours."""
-    image = pillow.fromarray(to_8bit(picture).astype(np.uint8))
-    with atomic_write(path) as temporary:
-        if path.suffix == ".png":
-            image.quantize(256).save(temporary, optimize=True)
-        else:
-            image.save(temporary, quality=88)

@@ -25,7 +25,7 @@ INK = "#222222"
 # Titles, and the modules of this package that make tables and charts of their rows.
 QUESTIONS = {
     "tables": "The methods",
-    "pictures": "The paper's curves and pictures",
+    "pictures": "The paper's curves, and tiles",
     "pareto": "Speed against accuracy",
     "stability": "Where methods fail",
     "kodak": "The Kodak photos, beside published figures",
@@ -108,10 +108,14 @@ def frame_of(rows: Iterable[Row], key: str = "") -> pd.DataFrame:
 
 
 def table(
-    caption: str, columns: Iterable[str], lines: Iterable[Sequence[Any]], codes: Iterable[str] = ()
+    caption: str,
+    columns: Iterable[str],
+    lines: Iterable[Sequence[Any]],
+    codes: Iterable[str] = (),
+    name: str = "",
 ) -> Table:
     """Make a table of lines of texts; `codes` names the code of all rows behind it."""
-    return Table(caption + remark(codes), pd.DataFrame(list(lines), columns=list(columns)))
+    return Table(caption + remark(codes), pd.DataFrame(list(lines), columns=list(columns)), name)
 
 
 def grouped(caption: str, frame: pd.DataFrame, by: list[str], columns: Mapping[str, Any]) -> Table:
