@@ -23,21 +23,6 @@ def test_a_mistyped_option_says_the_right_one(name, photo):
         getattr(eg, name)(photo, zzz=5)
 
 
-def test_a_foreign_file_beside_the_photo_is_said_to_be_foreign(
-    photo, tmp_path, monkeypatch, capsys
-):
-    from eigengs_dr.cli.main import main
-
-    monkeypatch.chdir(tmp_path)
-    eg.save_image("photo.png", photo)
-    np.savez("photo.npz", data=np.zeros(3))
-    with pytest.raises(SystemExit):
-        main(["fit", "photo.png"])
-    assert "photo.npz: exists and is no set of Gaussians" in capsys.readouterr().err
-    [row] = eg.fit_many(["photo.png"], ".", iterations=0)
-    assert "exists and is no set of Gaussians" in row.error
-
-
 def test_arrays_of_other_shapes_are_refused_by_name(photo):
     g = eg.fit(photo, 20, iterations=0).gaussians
     with pytest.raises(ValueError, match=r"mean has shape \(7, 2\), expected \(20, 2\)"):

@@ -28,14 +28,9 @@ def sections_of(docstring):
 
 
 @names
-def test_public_names_can_be_found_and_imported(name):
-    assert name in dir(eigengs_dr)
-    assert getattr(eigengs_dr, name).__module__.startswith("eigengs_dr.")
-
-
-@names
 def test_public_names_are_documented(name):
     """Functions tell their parameters and what they return, records and classes their fields."""
+    assert name in dir(eigengs_dr)
     thing = getattr(eigengs_dr, name)
     docstring = thing.__doc__
     assert docstring.strip()

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from _helpers.command import said
 from _helpers.scene_sets import save_halves
 
 mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
-from eigengs_dr.cli.main import main  # noqa: E402
 
 pytestmark = pytest.mark.mitsuba
 
@@ -36,17 +36,11 @@ def folder(tmp_path_factory):
     return save_halves(tmp_path_factory.mktemp("sets"))
 
 
-def run(*arguments):
-    return CliRunner().invoke(main, ["scene", *map(str, arguments)])
-
-
 def rendered(name, folder, tmp_path, *options):
     """Linear radiance of a scene, shape (H, W, C), by the command."""
     path = tmp_path / f"{name}.exr"
     options = [*SMALL, "-D", f"folder={folder}", *options]
-    result = run(SCENES / f"{name}.xml", "-o", path, *options)
-    assert result.exit_code == 0, result.output
-    assert result.output == ""
+    assert said("scene", SCENES / f"{name}.xml", "-o", path, *options) == ""
     pixels = np.array(mi.Bitmap(str(path)))
     assert pixels.shape == (32, 32, 3)
     assert np.isfinite(pixels).all()
@@ -89,36 +83,23 @@ def test_ball_shows_both_colours(folder, tmp_path):
     assert (ball[..., 2] > 1.5 * ball[..., 0]).sum() > 10
 
 
-def test_assets_are_what_scenes_name(monkeypatch, tmp_path):
+def test_assets_are_what_scenes_name(tmp_path):
+    """And what is there is kept: nothing is fitted here."""
     assets = importlib.import_module("assets")
-    made = {}
-    monkeypatch.setattr(
-        assets, "fitted", lambda folder, name, image, *rest: made.update({name: image})
-    )
-    materials = {}
-    monkeypatch.setattr(
-        assets, "fitted_material", lambda folder, name, maps, *rest: materials.update({name: maps})
-    )
-    assets.main(tmp_path)
     named = {
-        name
+        f"{name}.npz"
         for path in SCENES.glob("*.xml")
         for name in re.findall(r"\$folder/([\w-]+)\.npz", path.read_text())
     }
-    assert {*made, *materials} == named
-    made |= materials["tiles"]
-    for image in made.values():
+    for name in named:
+        (tmp_path / name).write_text("kept")
+    assets.main(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == named
+    assert all(path.read_text() == "kept" for path in tmp_path.iterdir())
+    color, roughness, normals = assets.tiles()
+    for image in (color, roughness, normals):
         assert 0 <= np.min(image) < np.max(image) <= 1
-    normals = 2 * made["normal"] - 1
-    assert np.allclose(np.linalg.norm(normals, axis=2), 1)
-    assert made["roughness"].ndim == 2
-
-
-def test_assets_keep_what_is_there(tmp_path):
-    assets = importlib.import_module("assets")
-    (tmp_path / "x.npz").write_text("kept")
-    assets.fitted(tmp_path, "x", None, 1, "rgb")
-    assert (tmp_path / "x.npz").read_text() == "kept"
+    assert np.allclose(np.linalg.norm(2 * normals - 1, axis=2), 1) and roughness.ndim == 2
 
 
 def test_measurement_of_the_plane(folder, monkeypatch, tmp_path):

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from PIL import Image as pillow
 from PIL import ImageDraw
 
+import eigengs_dr as eg
 from eigengs_bench.clock import Image
 from eigengs_dr.gaussian.covariance import factor_from_covariance
-from eigengs_dr.image.io import sample
 from eigengs_dr.image.resize import center_crop
 
 Shapes = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -43,7 +43,7 @@ class Case(NamedTuple):
 
 def photo(width: int = SIDE, height: int = SIDE) -> Image:
     """Bring a photo of a cat to a size in pixels; enlarged, it is smooth."""
-    return np.clip(center_crop(sample("chelsea"), width, height), 0, 1)
+    return np.clip(center_crop(eg.sample("chelsea"), width, height), 0, 1)
 
 
 def flat(red: float, green: float, blue: float) -> Image:

@@ -22,22 +22,19 @@ from eigengs_bench.names import (
 from eigengs_bench.rows import FILE, Task, code_state
 from eigengs_bench.rows import record as record_rows
 from eigengs_dr.backend.selection import select
+from eigengs_dr.cli import options
 from eigengs_dr.cli.console import bar
-from eigengs_dr.cli.options import FOLDER, backend_option, number, quiet_option
+from eigengs_dr.cli.options import number
 from eigengs_dr.cli.outputs import check_outputs, describe_run
 
 MANUAL = Path(__file__).parents[2] / "docs" / "rows.jsonl"
 """The rows behind the figures of the manual, in a checkout."""
 
-folder_option = click.option(
-    "-o",
-    "--output",
-    type=click.Path(file_okay=False, path_type=Path),
-    default="build/bench",
-    metavar="FOLDER",
-    help="For rows, models and charts; the same command goes on.",
+FOLDER = Path("build/bench")
+folder_option = options.output(
+    f"For rows, models and charts; the same command goes on.  [default: {FOLDER}]", "FOLDER", False
 )
-data_argument = click.argument("data", type=FOLDER, required=False, metavar="[DATA]")
+data_argument = click.argument("data", type=options.folder, required=False, metavar="[DATA]")
 
 
 def several(name: str, to: str, values: Any, text: str, default: Any = ()) -> Any:
@@ -67,32 +64,24 @@ def question(bench: str, usual: tuple[str, ...] = ()) -> Any:
         @click.option(
             "--record", is_flag=True, help="Add the rows to docs/rows.jsonl, for the manual."
         )
-        @backend_option
-        @quiet_option
-        @click.pass_context
+        @options.shared("backend", "quiet")
         @wraps(command)
-        def wrapped(
-            context: click.Context,
-            output: Path,
-            record: bool,
-            quiet: bool,
-            backend: str | None,
-            **settings: Any,
-        ) -> None:
+        def wrapped(run: options.Run, output: Path | None, record: bool, **settings: Any) -> None:
+            folder = output or FOLDER
             shared = {name: settings.pop(name) for name in Task._fields if name in settings}
             if "names" in settings:
                 settings["names"] = settings["names"] or (usual if shared["data"] else (SAMPLES,))
                 if not shared["data"] and set(settings["names"]) - {SAMPLES}:
                     raise ValueError("--set needs DATA, the folder of the set, for all but samples")
-            output.mkdir(parents=True, exist_ok=True)
-            check_outputs([output / FILE], [])
-            select(backend)
-            run = {**describe_run(context, backend), **code_state()}
+            folder.mkdir(parents=True, exist_ok=True)
+            check_outputs([folder / FILE], [])
+            select(run.backend)
+            about = {**describe_run(run.context, run.backend), **code_state()}
             module = import_module(f"eigengs_bench.{bench}")
-            with bar(quiet) as show:
-                task = Task(output, run, backend=backend, progress=show, **shared)
+            with bar(run.quiet) as show:
+                task = Task(folder, about, backend=run.backend, progress=show, **shared)
                 rows = module.run(task, **settings)
-            _save(module.summarize(rows), output, quiet)
+            _save(module.summarize(rows), folder, run)
             if record:
                 record_rows(MANUAL, rows)
 
@@ -101,15 +90,14 @@ def question(bench: str, usual: tuple[str, ...] = ()) -> Any:
     return decorate
 
 
-def _save(section: Any, output: Path, quiet: bool) -> None:
+def _save(section: Any, output: Path, run: options.Run) -> None:
     """Write the charts of a section as SVG into a folder; print its tables."""
     from eigengs_bench.report import as_text, save_figure
 
     for name, figure in section.charts.items():
         save_figure(output / f"{name}.svg", figure)
-    if not quiet:
-        click.echo("\n\n".join(map(as_text, section.tables)))
-        click.echo("".join(f"\nchart: {output / name}.svg" for name in section.charts))
+    run.tell("\n\n".join(map(as_text, section.tables)))
+    run.tell("".join(f"\nchart: {output / name}.svg" for name in section.charts))
 
 
 @click.group("bench")
@@ -217,7 +205,7 @@ def stability() -> None:
 
 
 @question("kodak")
-@click.argument("data", type=FOLDER, metavar="DATA")
+@click.argument("data", type=options.folder, metavar="DATA")
 @several("--counts", "counts", click.IntRange(min=1), "Gaussians", KODAK_COUNTS)
 @several("--steps", "steps", click.IntRange(min=0), "Steps of a fit", (1000,))
 @number("--solve-steps", "Steps of the colour solve.", SOLVE_STEPS, 1)
@@ -264,10 +252,10 @@ def texture() -> None:
 
 
 @main.command()
-@click.argument("folder", type=FOLDER, metavar="FOLDER")
-@click.option("-o", "--output", type=click.Path(file_okay=False, path_type=Path), required=True)
-@quiet_option
-def report(folder: Path, output: Path, quiet: bool) -> None:
+@click.argument("folder", type=options.folder, metavar="FOLDER")
+@options.output("For README.md and its charts.", "REPORT")
+@options.shared("quiet")
+def report(run: options.Run, folder: Path, output: Path) -> None:
     """Write README.md and its charts: all questions that the rows of a folder answer.
 
     Every section names the commands, days, machines, versions and commits behind its figures.
@@ -275,5 +263,4 @@ def report(folder: Path, output: Path, quiet: bool) -> None:
     from eigengs_bench.report import write_report
 
     write_report(folder, output)
-    if not quiet:
-        click.echo(f"wrote {output / 'README.md'}")
+    run.tell(f"wrote {output / 'README.md'}")

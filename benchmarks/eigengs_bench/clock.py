@@ -10,13 +10,12 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+import eigengs_dr as eg
 from eigengs_dr.fitting.descent import FitProblem, descend
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO, Schedule
 from eigengs_dr.fitting.start import initialize, mean_picture
-from eigengs_dr.gaussian.gaussians import Gaussians
-from eigengs_dr.image.metrics import MAX_PSNR, ms_ssim, psnr, ssim
-from eigengs_dr.raster.render import picture_of
+from eigengs_dr.image.metrics import MAX_PSNR
 
 Image = NDArray[np.float32]  # RGB, shape (H, W, 3), 1 is white
 
@@ -26,7 +25,7 @@ class Moment(NamedTuple):
 
     iteration: int
     seconds: float
-    gaussians: Gaussians
+    gaussians: eg.Gaussians
     picture: Image
 
 
@@ -51,7 +50,7 @@ def follow(
         dr.eval(current)
         dr.sync_thread()  # steps run asynchronously
         spent += time.perf_counter() - resumed
-        picture = picture_of(current)
+        picture = eg.picture_of(current)
         yield Moment(iteration, spent, current, picture + (0 if mean_image is None else mean_image))
         resumed = time.perf_counter()
 
@@ -74,13 +73,13 @@ def warm_up(begin: Callable[[], FitProblem], schedule: Schedule, iterations: int
 
 def decibels(picture: Image, image: Image, space: str) -> float:
     """Return a PSNR for a row, in dB, at most `MAX_PSNR`; a fit that failed has NaN."""
-    return min(psnr(picture, image, space), MAX_PSNR)
+    return min(eg.psnr(picture, image, space), MAX_PSNR)
 
 
 def judge(picture: Image, image: Image) -> dict[str, float]:
     """Return psnr_ycbcr, psnr_rgb, ssim and ms_ssim of a picture."""
     found = {f"psnr_{space}": decibels(picture, image, space) for space in ("ycbcr", "rgb")}
-    return {**found, "ssim": ssim(picture, image), "ms_ssim": ms_ssim(picture, image)}
+    return {**found, "ssim": eg.ssim(picture, image), "ms_ssim": eg.ms_ssim(picture, image)}
 
 
 def score(moment: Moment, image: Image) -> dict[str, Any]:

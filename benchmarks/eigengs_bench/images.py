@@ -6,13 +6,11 @@ on, in ``test/``; or, where nothing is trained, with the images themselves.
 
 from pathlib import Path
 
+import eigengs_dr as eg
 from eigengs_bench.clock import Image
 from eigengs_bench.names import SAMPLES, SETS
 from eigengs_bench.rows import Task
-from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 from eigengs_dr.image.folder import image_files
-from eigengs_dr.image.io import load_image, sample
 from eigengs_dr.image.resize import center_crop
 
 SAMPLE_NAMES = ("chelsea", "coffee", "astronaut")
@@ -26,10 +24,10 @@ def images_of(task: Task, name: str, count: int | None = None) -> list[tuple[str
     """
     count, sides = task.images if count is None else count, SETS[name][1:3]
     if name == SAMPLES:
-        return [(photo, center_crop(sample(photo), *sides)) for photo in SAMPLE_NAMES[:count]]
+        return [(photo, center_crop(eg.sample(photo), *sides)) for photo in SAMPLE_NAMES[:count]]
     folder, found = Path(task.data or "") / SETS[name].folder, []
     for file in image_files(folder / "test" if (folder / "test").is_dir() else folder)[:count]:
-        picture = load_image(file)
+        picture = eg.load_image(file)
         upright = picture.shape[0] > picture.shape[1]
         size = (min(sides), max(sides)) if upright else sides
         found.append((file.name, center_crop(picture, *size)))
@@ -60,7 +58,7 @@ def model_for(
     components: int,
     space: str = "ycbcr",
     split: bool | str = "auto",
-) -> EigenGS:
+) -> eg.EigenGS:
     """Load a model of the training images of the set `source`, for images of the set `name`.
 
     It is trained first if it is not in ``models/`` of the task's folder. `components` are those of
@@ -74,7 +72,7 @@ def model_for(
         models.mkdir(parents=True, exist_ok=True)
         basis = models / f"{stem}-basis.npz"
         if not basis.exists():
-            Eigenbasis.from_images(
+            eg.Eigenbasis.from_images(
                 Path(task.data or "") / SETS[source].folder / "train",
                 (used.width, used.height),
                 MAX_COMPONENTS,
@@ -82,7 +80,7 @@ def model_for(
                 progress=lambda done, total, row: task.progress(basis.stem, done, total or 0),
             ).save(basis)
         task.progress(path.stem, 0, 1)
-        kept = Eigenbasis.load(basis).truncated(components)
-        EigenGS.fit(kept, used.gaussians, frequency_aware=split, backend=task.backend).save(path)
+        kept = eg.Eigenbasis.load(basis).truncated(components)
+        eg.EigenGS.fit(kept, used.gaussians, frequency_aware=split, backend=task.backend).save(path)
     # Weights are stored in half precision: the file is used in the first run too.
-    return EigenGS.load(path, task.backend)
+    return eg.EigenGS.load(path, task.backend)

@@ -11,6 +11,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+import eigengs_dr as eg
 from eigengs_bench.clock import interleaved
 from eigengs_bench.report import Section, number, table
 from eigengs_bench.rows import Row, Task
@@ -18,21 +19,17 @@ from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.descent import FitProblem, descend
 from eigengs_dr.fitting.descent import run as descend_to_end
-from eigengs_dr.fitting.options import PRESETS, FitOptions
-from eigengs_dr.fitting.placement.adaptive import place_adaptive
+from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.refine import refine
 from eigengs_dr.fitting.schedule import Relocation
-from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.fitting.start import start_for
 from eigengs_dr.fitting.target import make_target
-from eigengs_dr.gaussian.gaussians import Gaussians
-from eigengs_dr.image.color import rgb_to_ycbcr
-from eigengs_dr.image.io import sample
+from eigengs_dr.image.resize import center_crop
 from eigengs_dr.raster.binning.lists import TileLists, build_lists
 from eigengs_dr.raster.binning.tiles import Grid
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, KernelParameters, kernel_radius
 from eigengs_dr.raster.reference import render_plain
-from eigengs_dr.raster.render import bin_gaussians, decode_parameters, rasterize, render, to_tensor
+from eigengs_dr.raster.render import bin_gaussians, decode_parameters, rasterize, to_tensor
 
 # The scene: Gaussians of equal size, spread evenly at random over a square picture.
 SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
@@ -77,7 +74,7 @@ def summarize(rows: Sequence[Row]) -> Section:
     ]
     columns = ("cutoff", "forward, ms", "and reverse, ms", "largest error", "RMS error")
     caption = "Time of a picture, and what its cutoff leaves out (1 is white)"
-    return Section([figures, table(caption, columns, lines)._replace(name="cutoffs")])
+    return Section([figures, table(caption, columns, lines, name="cutoffs")])
 
 
 def _measure(task: Task) -> Row:
@@ -89,10 +86,10 @@ def _measure(task: Task) -> Row:
     return figures | {"cutoffs": cutoff_figures(scene)}
 
 
-def random_scene(types: ArrayTypes) -> Gaussians:
+def random_scene(types: ArrayTypes) -> eg.Gaussians:
     """Make the scene that is timed."""
     generator = np.random.default_rng(0)
-    return Gaussians.from_arrays(
+    return eg.Gaussians.from_arrays(
         generator.uniform(0, SIDE, (COUNT, 2)),
         np.tile([1 / SIGMA, 0, 1 / SIGMA], (COUNT, 1)),
         generator.uniform(0, 1, (COUNT, 3)),
@@ -103,7 +100,7 @@ def random_scene(types: ArrayTypes) -> Gaussians:
 
 
 def kernel_figures(
-    types: ArrayTypes, scene: Gaussians, progress: Callable[..., None] = lambda *_: None
+    types: ArrayTypes, scene: eg.Gaussians, progress: Callable[..., None] = lambda *_: None
 ) -> Row:
     """Time both renderers, the lists and the peak on a scene."""
     plain_forward, plain_step, _ = programs(scene, CUTOFF, plain=True)
@@ -134,7 +131,7 @@ def kernel_figures(
 
 
 def programs(
-    scene: Gaussians, cutoff: float, plain: bool
+    scene: eg.Gaussians, cutoff: float, plain: bool
 ) -> tuple[Any, Any, Callable[[], NDArray[Any]]]:
     """Make frozen programs that draw a scene, forward and with reverse, and what shows it.
 
@@ -194,7 +191,7 @@ def _peak(q: Any) -> Any:
     return sum(sums)
 
 
-def pixels_inside(scene: Gaussians) -> int:
+def pixels_inside(scene: eg.Gaussians) -> int:
     """Count pairs of a Gaussian and a pixel of the picture inside its cutoff ellipse."""
     mean = scene.to_arrays()["mean"].astype(np.float64)
     reach = int(CUTOFF * SIGMA) + 1
@@ -206,16 +203,19 @@ def pixels_inside(scene: Gaussians) -> int:
     return int((dx2[:, :, None] + dy2[:, None, :] <= (CUTOFF * SIGMA) ** 2).sum())
 
 
+def start_of(types: ArrayTypes) -> tuple[FitProblem, FitOptions]:
+    """Return the start of a refinement of a photo, and its options."""
+    options = FitOptions(gaussians=COUNT, iterations=FIT_STEPS, backend=types.backend)
+    return start_for(make_target(photo(), options.space), options), options
+
+
 def growth_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
     """Time every step of a refinement: Gaussians stretch, and a poor renderer slows down."""
-    target = rgb_to_ycbcr(photo())
-    mean, factor = place_adaptive(target, COUNT, np.random.default_rng(0))
-    start = Gaussians.from_arrays(
-        mean, factor, np.zeros((COUNT, 3)), size=(SIDE, SIDE), backend=types.backend
-    ).bounded()
-    start = solve(start, target).gaussians
-    ends, sets = [], descend(FitProblem(start, target), PRESETS["default"].schedule, STEPS)
-    for step, _ in enumerate(sets):
+    problem, options = start_of(types)
+    ends = []
+    for step, _ in enumerate(
+        descend(problem._replace(control=None), options.method.schedule, STEPS)
+    ):
         dr.sync_thread()
         ends.append(time.perf_counter())
         if step % 10 == 0:
@@ -232,23 +232,20 @@ def growth_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
 
 def photo() -> NDArray[np.float32]:
     """Return the middle of a photo, of the size of the scene."""
-    whole = sample("astronaut")
-    top, left = ((side - SIDE) // 2 for side in whole.shape[:2])
-    return whole[top : top + SIDE, left : left + SIDE]
+    return center_crop(eg.sample("astronaut"), SIDE, SIDE)
 
 
 def fit_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
     """Time a refinement, its steps alone, and a round of relocation."""
-    options = FitOptions(gaussians=COUNT, iterations=FIT_STEPS, backend=types.backend)
-    problem = start_for(make_target(photo(), options.space), options)
+    problem, options = start_of(types)
     control, schedule = problem.control, options.method.schedule
     assert control
     move = Relocation(schedule.relocate_share, schedule.noise)
 
-    def whole() -> Gaussians:
+    def whole() -> eg.Gaussians:
         return refine(problem, photo(), schedule, FIT_STEPS).gaussians
 
-    def steps() -> Gaussians:
+    def steps() -> eg.Gaussians:
         return descend_to_end(problem._replace(control=None), schedule, FIT_STEPS)
 
     moved = steps()
@@ -260,12 +257,12 @@ def fit_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
     }
 
 
-def cutoff_figures(scene: Gaussians) -> list[Row]:
+def cutoff_figures(scene: eg.Gaussians) -> list[Row]:
     """Time pictures by cutoff; errors are of all pixels, against float64 at `WIDEST`."""
     module = select(types_of(scene.mean).backend)
     colors = {key: module.ArrayXf64(getattr(scene, key)) for key in ("color", "background")}
     shapes = {"mean": module.Array2f64(scene.mean), "factor": module.Array3f64(scene.factor)}
-    exact = render(replace(scene, **shapes, **colors), cutoff=WIDEST).numpy()
+    exact = eg.render(replace(scene, **shapes, **colors), cutoff=WIDEST).numpy()
     rows, timed = list[Row](), dict[str, Any]()
     for cutoff in CUTOFFS:
         forward, step, shown = programs(scene, cutoff, plain=False)

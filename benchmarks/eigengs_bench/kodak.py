@@ -15,13 +15,12 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+import eigengs_dr as eg
 from eigengs_bench import report as fr
 from eigengs_bench.clock import Image, decibels
 from eigengs_bench.images import images_of
 from eigengs_bench.names import SOLVE_STEPS
 from eigengs_bench.rows import Job, Row, Task
-from eigengs_dr.fitting.fit import fit
-from eigengs_dr.image.metrics import ms_ssim
 
 SET = "kodak"
 
@@ -66,7 +65,7 @@ def _jobs(
     def compile_programs() -> None:
         for _, photo in photos[:1]:
             small = np.ascontiguousarray(photo[:SMALL, :SMALL])
-            fit(small, FEW, WARM_UP, space=COLOR, backend=task.backend)
+            eg.fit(small, FEW, WARM_UP, space=COLOR, backend=task.backend)
 
     def work(image: Image, count: int, iterations: int) -> Row:
         compile_programs()
@@ -82,12 +81,12 @@ def _jobs(
 
 def _measure(task: Task, image: Image, count: int, iterations: int, solve_steps: int) -> Row:
     shared: Row = {"space": COLOR, "backend": task.backend}
-    found = fit(image, count, iterations, solve_steps=solve_steps, **shared)
+    found = eg.fit(image, count, iterations, solve_steps=solve_steps, **shared)
     return {
         "psnr_float": decibels(np.clip(found.image, 0, 1), image, "data"),
         "psnr_rgb": decibels(found.image, image, "rgb"),
         "psnr_ycbcr": decibels(found.image, image, "ycbcr"),
-        "ms_ssim": ms_ssim(found.image, image),
+        "ms_ssim": eg.ms_ssim(found.image, image),
         "seconds": found.seconds,
         "taken": found.iterations,
     }

@@ -16,12 +16,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+import eigengs_dr as eg
 from eigengs_bench import report as fr
 from eigengs_bench.clock import Image, decibels, follow, score, warm_up
 from eigengs_bench.images import images_of
 from eigengs_bench.rows import Row, Task
 from eigengs_dr.fitting.descent import FitProblem
-from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.options import FitOptions, max_gaussians_for
 from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO
 from eigengs_dr.fitting.start import initialize
@@ -93,11 +93,11 @@ def _fit(task: Task, image: Image, count: int) -> Row:
 
 
 def _search(task: Task, image: Image, target: float) -> Row:
-    search = partial(fit, image, target_psnr=target, target_space="ycbcr", backend=task.backend)
+    search = partial(eg.fit, image, target_psnr=target, target_space="ycbcr", backend=task.backend)
     search(iterations=min(MIN_PHASE_RATIO, task.iterations))  # untimed, to compile
     found = search(iterations=task.iterations)
     count = len(found.gaussians)
-    usual = fit(image, count, task.iterations, backend=task.backend)
+    usual = eg.fit(image, count, task.iterations, backend=task.backend)
     return {
         "gaussians": count,
         **{key: getattr(found, key) for key in ("stopped", "iterations", "seconds")},

@@ -15,12 +15,12 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
+import eigengs_dr as eg
 from eigengs_bench import report as fr
 from eigengs_bench.clock import Image, descent, score, warm_up
 from eigengs_bench.images import images_of, is_trained, model_for
 from eigengs_bench.names import SETS
 from eigengs_bench.rows import Job, Row, Task
-from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.start import initialize
 from eigengs_dr.gaussian.file import CUTOFF
@@ -44,7 +44,7 @@ class Variant(NamedTuple):
     gaussians: int | None = None
     preset: str = "default"
     init: str = "auto"
-    start: EigenGS | None = None
+    start: eg.EigenGS | None = None
     solve_steps: int = 10
     cutoff: float = CUTOFF
 
@@ -60,10 +60,10 @@ def variants(task: Task, name: str) -> list[Variant]:
     Their models are trained where they are missing; sets without images to train on use the basis
     that ships, in one size.
     """
-    count, models = SETS[name].gaussians, dict[int, EigenGS]()
+    count, models = SETS[name].gaussians, dict[int, eg.EigenGS]()
     if is_trained(task, name):
         models = {k: model_for(task, name, name, k) for k in (DEFAULT_COMPONENTS, *COMPONENTS)}
-    basis = models.pop(DEFAULT_COMPONENTS, None) or EigenGS.load("natural", task.backend)
+    basis = models.pop(DEFAULT_COMPONENTS, None) or eg.EigenGS.load("natural", task.backend)
     return [
         Variant("preset", "default", count),
         Variant("preset", "gaussianimage", count, "gaussianimage"),

@@ -21,15 +21,12 @@ from numpy.typing import NDArray
 from PIL import Image as pillow
 from scipy.interpolate import PchipInterpolator
 
+import eigengs_dr as eg
 from eigengs_bench import report as fr
 from eigengs_bench.clock import Image, judge
 from eigengs_bench.images import images_of
 from eigengs_bench.rows import Job, Row, Task
-from eigengs_dr.codec.packing import pack
-from eigengs_dr.fitting.fit import fit
-from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.io import to_8bit
-from eigengs_dr.raster.render import picture_of
 
 OURS = "packed Gaussians"
 PIXELS = (256, 128, 64, 32, 16, 8)  # pixels a Gaussian of the fits that are packed
@@ -60,7 +57,7 @@ class Codec(NamedTuple):
 
     def set_to(self, setting: int) -> dict[str, Any]:
         """Return the options of a file with a setting."""
-        if self.settings is RATIOS:
+        if self.kind == "JPEG2000":
             return {**self.options, "quality_mode": "rates", "quality_layers": [setting]}
         return {**self.options, "quality": setting}
 
@@ -98,17 +95,17 @@ def _jobs(task: Task, name: str, images: list[tuple[str, Image]]) -> Iterator[Jo
 
 
 def _packed(task: Task, image: Image, count: int) -> Row:
-    made = partial(fit, image, count, backend=task.backend)
+    made = partial(eg.fit, image, count, backend=task.backend)
     made(iterations=min(WARM_UP, task.iterations))
     started = time.perf_counter()
     fitted = made(iterations=task.iterations)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "fit.egs"
-        receipt = pack(fitted.gaussians, path, image, BUDGET)
+        receipt = eg.pack(fitted.gaussians, path, image, BUDGET)
         seconds = {"seconds": time.perf_counter() - started}
-        picture_of(Gaussians.load(path, task.backend))  # compiles
+        eg.picture_of(eg.Gaussians.load(path, task.backend))  # compiles
         loaded = time.perf_counter()
-        shown = picture_of(Gaussians.load(path, task.backend))
+        shown = eg.picture_of(eg.Gaussians.load(path, task.backend))
         seconds["decode_seconds"] = time.perf_counter() - loaded
     return {"points": [_point(count, receipt.bytes, shown, image) | seconds]}
 
@@ -177,7 +174,7 @@ def _table(name: str, points: pd.DataFrame) -> fr.Table:
         "the codec's, mean over the images"
     )
     columns = ("codec", *(f"{level:g} dB" for level in LEVELS), "BD-rate", "s", "s to decode")
-    return fr.table(caption, columns, lines, points.code)._replace(name=name)
+    return fr.table(caption, columns, lines, points.code, name)
 
 
 def _compared(sizes: pd.DataFrame, codec: str) -> str:
@@ -236,22 +233,22 @@ def at_equal_slope(points: pd.DataFrame) -> pd.DataFrame:
 def _published(points: pd.DataFrame) -> fr.Table:
     """Lay out the BD-rate of the means of ours and of the codecs against published means."""
     known = pd.read_csv(str(files("eigengs_bench") / "published_rate.csv"))
-    measured = {name: at_equal_slope(part) for name, part in points.groupby("codec", sort=False)}
+    here = {"source": "measured here, at equal slope"}
+    measured = {
+        name: at_equal_slope(part).assign(**here)
+        for name, part in points.groupby("codec", sort=False)
+    }
     lines = [
         (name, f"{100 * bd_rate(measured[OURS], part):+.0f} %", part.source.iloc[0])
-        for name, part in [*known.groupby("method", sort=False)]
-    ]
-    lines += [
-        (name, f"{100 * bd_rate(measured[OURS], part):+.0f} %", "measured here, at equal slope")
-        for name, part in measured.items()
+        for name, part in [*known.groupby("method", sort=False), *measured.items()]
         if name != OURS
     ]
     caption = (
         f"kodak, {fr.counted(points.image)}: BD-rate of our mean curve at equal slope, against "
         "published mean curves; above 0 ours takes more bits"
     )
-    found = fr.table(caption, ("method", "BD-rate of ours", "source"), lines, points.code)
-    return found._replace(name="published")
+    columns = ("method", "BD-rate of ours", "source")
+    return fr.table(caption, columns, lines, points.code, "published")
 
 
 def _chart(points: pd.DataFrame, name: str) -> Figure:

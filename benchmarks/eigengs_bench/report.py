@@ -108,10 +108,14 @@ def frame_of(rows: Iterable[Row], key: str = "") -> pd.DataFrame:
 
 
 def table(
-    caption: str, columns: Iterable[str], lines: Iterable[Sequence[Any]], codes: Iterable[str] = ()
+    caption: str,
+    columns: Iterable[str],
+    lines: Iterable[Sequence[Any]],
+    codes: Iterable[str] = (),
+    name: str = "",
 ) -> Table:
     """Make a table of lines of texts; `codes` names the code of all rows behind it."""
-    return Table(caption + remark(codes), pd.DataFrame(list(lines), columns=list(columns)))
+    return Table(caption + remark(codes), pd.DataFrame(list(lines), columns=list(columns)), name)
 
 
 def grouped(caption: str, frame: pd.DataFrame, by: list[str], columns: Mapping[str, Any]) -> Table:

@@ -14,12 +14,11 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from datetime import datetime, timezone
-from functools import partial
-from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import eigengs_dr
 from eigengs_dr.cli.outputs import plain
 from eigengs_dr.storage.atomic import atomic_write
 
@@ -100,24 +99,16 @@ def record(path: Path, rows: Iterable[Row]) -> None:
         job = {k: v for k, v in row["job"].items() if k != "at"}
         kept = {k: v for k, v in row["run"]["versions"].items() if v and not k.endswith("_path")}
         run = {k: row["run"][k] for k in RECORDED} | {"versions": kept}
-        known[_key(row["bench"], job)] = _rounded(row | {"job": job, "run": run})
+        text = json.dumps(row | {"run": run})
+        rounded = json.loads(text, parse_float=lambda number: float(f"{float(number):.5g}"))
+        known[_key(row["bench"], job)] = rounded | {"job": job}
     lines = map(json.dumps, known.values())
     with atomic_write(path) as temporary:
         temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 
 
-def _rounded(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: item if key == "job" else _rounded(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_rounded(item) for item in value]
-    return float(f"{value:.5g}") if isinstance(value, float) else value
-
-
-def code_state() -> Row:
+def code_state(folder: Path = Path(eigengs_dr.__file__).parent) -> Row:
     """Find the commit of the code, and whether all but docs/ is clean; None each without git."""
-    spec = find_spec("eigengs_dr")
-    folder = Path(str(spec and spec.origin)).parent
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(folder), *arguments]
@@ -142,20 +133,20 @@ def code_name(run: Row) -> str:
 def alone(title: str, work: Callable[..., Row], *arguments: Any) -> Callable[[], Row]:
     """Return what measures in a new process, which has the peak of its memory for itself.
 
-    `ValueError` names what is measured if memory runs out.
+    It raises `ValueError` with the title if memory runs out.
     """
-    return partial(_alone, title, work, *arguments)
 
+    def measure() -> Row:
+        try:
+            with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+                return pool.submit(work, *arguments).result()
+        except BrokenProcessPool:
+            raise ValueError(
+                f"{title}: its process was ended, as it is where memory runs out; "
+                "free some, or leave the case out"
+            ) from None
 
-def _alone(title: str, work: Callable[..., Row], *arguments: Any) -> Row:
-    try:
-        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-            return pool.submit(work, *arguments).result()
-    except BrokenProcessPool:
-        raise ValueError(
-            f"{title}: its process was ended, as it is where memory runs out; "
-            "free some, or leave the case out"
-        ) from None
+    return measure
 
 
 def peak_gib() -> float | None:

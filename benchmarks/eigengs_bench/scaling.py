@@ -16,18 +16,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import drjit as dr
 import numpy as np
 
+import eigengs_dr as eg
 from eigengs_bench.clock import Image
 from eigengs_bench.rows import Job, Row, Task, alone, peak_gib
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.descent import FitProblem, descend
-from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
-from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import rgb_to_ycbcr
-from eigengs_dr.image.io import sample
 from eigengs_dr.image.resize import center_crop
 
 if TYPE_CHECKING:  # the processes that are measured load neither pandas nor matplotlib
@@ -124,11 +122,11 @@ def measure_descent(case: Case, steps: int, backend: str | None) -> Row:
     }
 
 
-def _place(target: Image, count: int, backend: str) -> tuple[Gaussians, float]:
+def _place(target: Image, count: int, backend: str) -> tuple[eg.Gaussians, float]:
     started = time.perf_counter()
     mean, factor = place_adaptive(target, count, np.random.default_rng(0))
     color, size = np.zeros((count, 3)), (target.shape[1], target.shape[0])
-    placed = Gaussians.from_arrays(mean, factor, color, size=size, backend=backend).bounded()
+    placed = eg.Gaussians.from_arrays(mean, factor, color, size=size, backend=backend).bounded()
     dr.eval(placed)
     dr.sync_thread()
     return placed, time.perf_counter() - started
@@ -156,7 +154,7 @@ def time_steps(problem: FitProblem, steps: int) -> tuple[float, float]:
     return median_ms, mean_ms
 
 
-def measure_fits(case: Case, steps: int, backend: str | None) -> Row:
+def measure_fits(case: Case, steps: int, backend: str | None, enough: float = FIT_SECONDS) -> Row:
     """Fit images of one size, one after the other."""
     columns = 8
     photos = mosaic(columns * case.width, columns * case.height)
@@ -165,17 +163,17 @@ def measure_fits(case: Case, steps: int, backend: str | None) -> Row:
         for top in range(0, photos.shape[0], case.height)
         for left in range(0, photos.shape[1], case.width)
     ]
-    fit(images[0], case.gaussians, steps, backend=backend)  # compiles
+    eg.fit(images[0], case.gaussians, steps, backend=backend)  # compiles
     done, started, seconds = 0, time.perf_counter(), 0.0
-    while seconds < FIT_SECONDS:
-        fit(images[done % len(images)], case.gaussians, steps, backend=backend)
+    while seconds < enough:
+        eg.fit(images[done % len(images)], case.gaussians, steps, backend=backend)
         done, seconds = done + 1, time.perf_counter() - started
     return {"images_per_second": done / seconds, "images": done, "peak_gib": peak_gib()}
 
 
 def mosaic(width: int, height: int) -> Image:
     """Fill an image with photos of scikit-image, side by side."""
-    photos = [center_crop(sample(name), CELL, CELL) for name in PHOTOS]
+    photos = [center_crop(eg.sample(name), CELL, CELL) for name in PHOTOS]
     image = np.empty((height, width, 3), np.float32)
     for i, top in enumerate(range(0, height, CELL)):
         for j, left in enumerate(range(0, width, CELL)):

@@ -5,29 +5,25 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from typing import Any
 
-import drjit as dr
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 
+import eigengs_dr as eg
 from eigengs_bench import report as fr
 from eigengs_bench.cases import Case, chosen_cases
 from eigengs_bench.clock import Image, Moment, decibels, follow
 from eigengs_bench.rows import Job, Row, Task, alone, code_name, peak_gib
-from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.refine import trace_steps
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.fitting.start import initialize, mean_picture
 from eigengs_dr.gaussian.covariance import max_deviation
-from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import RGB_TO_YCBCR, rgb_to_ycbcr
 from eigengs_dr.image.metrics import MAX_PSNR
-from eigengs_dr.raster.render import picture_of
 
 BASIS = "natural"  # where presets that need a basis start
 TOLERANCE = 0.01  # decibels that an end may lie below its start
@@ -49,15 +45,15 @@ def measure_cell(case: Case, preset: str, backend: str | None) -> Row:
     """Run a case by a preset and score it: one cell.
 
     "needs", alone, says what a preset lacks. Else "finite" is true if all parameters and pixels are
-    finite at all marks of `trace_steps`; start, end and half are PSNRs of the first and of the last
-    moment and of the last set in half precision, drop is the loss from the best moment to the last;
+    finite at all marks of `trace_steps`; start and end are PSNRs of the first and of the last
+    moment, drop is the loss from the best moment to the last;
     "condition" is the highest of a covariance, "peak_gib" the memory of a case in its own process,
     "shorter_ycbcr" the PSNR at the end of a run of the shorter number of steps of the case.
     """
     image = case.image()
     most = image.shape[0] * image.shape[1]
     encodes = PRESETS[preset].mean == "dense" and case.place is None
-    if encodes and len(EigenGS.load(BASIS, backend).gaussians) > most:
+    if encodes and len(eg.EigenGS.load(BASIS, backend).gaussians) > most:
         return {"needs": f"a basis with at most {most} Gaussians"}
     followed = moments(case, image, preset, backend)
     memory = {"peak_gib": peak_gib()} if case.alone else {}  # before the judgement takes its own
@@ -80,7 +76,7 @@ def moments(case: Case, image: Image, preset: str, backend: str | None = None) -
         start = partial(_start, case, image, method.solves, backend)
         return list(follow(start, schedule, case.iterations, marks))
     encodes = method.mean == "dense"
-    model, count = (EigenGS.load(BASIS, backend), None) if encodes else (None, case.gaussians)
+    model, count = (eg.EigenGS.load(BASIS, backend), None) if encodes else (None, case.gaussians)
     options = FitOptions(gaussians=count, start=model, preset=preset, backend=backend)
     mean_image = mean_picture(options, image.shape[1], image.shape[0])
     begin = partial(initialize, image, options)
@@ -93,7 +89,7 @@ def _start(case: Case, image: Image, solves: bool, backend: str | None) -> FitPr
     mean, factor = case.place(image, case.gaussians, generator)
     size, shape = (image.shape[1], image.shape[0]), (case.gaussians, 3)
     colors = np.zeros(shape) if solves else generator.uniform(0, 1, shape)
-    start = Gaussians.from_arrays(mean, factor, colors, size=size, backend=backend).bounded()
+    start = eg.Gaussians.from_arrays(mean, factor, colors, size=size, backend=backend).bounded()
     return FitProblem(solve(start, target).gaussians if solves else start, target)
 
 
@@ -102,9 +98,6 @@ def _score(followed: list[Moment], image: Image) -> Row:
     arrays = [moment.gaussians.to_arrays() for moment in followed]
     finite = [np.isfinite(moment.picture).all() for moment in followed]
     finite += [np.isfinite(values).all() for kept in arrays for values in kept.values()]
-    # What a descent adds to its set, the dense mean, is not stored with it.
-    added = last.picture - picture_of(last.gaussians)
-    half = picture_of(_round_to_half(last.gaussians)) + added
     row: Row = {
         "finite": all(finite),
         "condition": max(_condition(*kept["factor"].T) for kept in arrays),
@@ -117,7 +110,6 @@ def _score(followed: list[Moment], image: Image) -> Row:
         seen = [decibels(m.picture, image, space) for m in followed]
         row[f"start_{space}"], row[f"end_{space}"] = float(seen[0]), float(seen[-1])
         row[f"drop_{space}"] = float(np.max(seen) - seen[-1])
-        row[f"half_{space}"] = decibels(half, image, space)
     return row
 
 
@@ -126,14 +118,6 @@ def _condition(a: Image, b: Image, c: Image) -> float:
     # The determinant of a covariance, the product of its eigenvalues, is 1 / (a c)^2.
     deviation = max_deviation(*(entries.astype(np.float64) for entries in (a, b, c)))
     return float(np.square(np.square(deviation) * a * c).max())
-
-
-def _round_to_half(gaussians: Gaussians) -> Gaussians:
-    def half(name: str) -> Any:
-        values = getattr(gaussians, name)
-        return type(values)(dr.float16_array_t(type(values))(values))
-
-    return replace(gaussians, **{k: half(k) for k in ("mean", "factor", "color", "background")})
 
 
 # ---------------------------------------------------------------------------------------------
@@ -231,12 +215,6 @@ def _ratio(row: Row) -> str:
     return fr.number(value, 0) if value is None or value < 1e5 else f"{value:.1e}"
 
 
-def _half(row: Row) -> str:
-    if row.get("half_rgb") is None:
-        return fr.MISSING
-    return fr.number(round(row["end_rgb"] - row["half_rgb"], 2) + 0.0, 2)  # no "-0.00"
-
-
 def _cost(row: Row) -> str:
     memory = row.get("peak_gib")
     return fr.number(row.get("seconds"), 1) + (f" ({memory:.1f} GiB)" if memory else "")
@@ -246,7 +224,6 @@ def _cost(row: Row) -> str:
 FIGURES: tuple[tuple[str, Callable[[Row], str]], ...] = (
     ("PSNR in dB, YCbCr, at the end, from the start", _ends),
     ("dB from the best moment to the last, YCbCr", lambda row: fr.number(row.get("drop_ycbcr"), 2)),
-    ("dB that half precision takes, 8-bit RGB", _half),
     ("Highest condition number of a covariance", _ratio),
     ("Tiling, 8-bit levels", lambda row: fr.number(row.get("tiling"), 2)),
     ("Seconds, and the peak of memory", _cost),

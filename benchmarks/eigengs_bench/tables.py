@@ -13,17 +13,16 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
+import eigengs_dr as eg
 from eigengs_bench import report as fr
 from eigengs_bench.clock import Image, follow, score, warm_up
 from eigengs_bench.images import images_of, is_trained, model_for
 from eigengs_bench.names import NATURAL, SETS, TABLES
 from eigengs_bench.rows import Job, Row, Task
-from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO
 from eigengs_dr.fitting.start import initialize, mean_picture
-from eigengs_dr.image.metrics import psnr
 
 # Where the paper's tables look, and 0 and 10 beside.
 ITERATIONS = (0, 10, 100, 500, 1000, 5000, 10000)
@@ -88,7 +87,7 @@ def _preparation(task: Task, name: str, picture: Image) -> Ready:
 
     @cache
     def ready(method: Method) -> tuple[Callable[..., FitProblem], Image | None]:
-        model: EigenGS | None = None
+        model: eg.EigenGS | None = None
         if method.source:
             split = {"split": True, "whole": False}.get(method.split, "auto")
             model = model_for(task, name, method.source, method.components, method.space, split)
@@ -145,7 +144,7 @@ def _reach(start: Callable[[int], FitProblem], image: Image, goal: Row) -> Row:
     for depth in SOLVE_STEPS:
         steps = 1000 if depth == SOLVE_STEPS[-1] else 0
         for moment in follow(partial(start, depth), schedule, steps, range(steps + 1)):
-            reached = psnr(moment.picture, image, "ycbcr")
+            reached = eg.psnr(moment.picture, image, "ycbcr")
             if reached >= goal["psnr_ycbcr"]:
                 where = {"solve_steps": depth, "iteration": moment.iteration}
                 share = moment.seconds / goal["seconds"]

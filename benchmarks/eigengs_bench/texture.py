@@ -8,13 +8,11 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+import eigengs_dr as eg
 from eigengs_bench.clock import interleaved
 from eigengs_bench.report import Section, table
 from eigengs_bench.rows import Row, Task
-from eigengs_dr.fitting.fit import fit
 from eigengs_dr.image.color import to_linear
-from eigengs_dr.image.io import sample
-from eigengs_dr.raster.render import picture_of, render
 
 SIDE, TEXELS, SPP = 512, 1024, 16  # of the picture, of the bitmap, and samples a pixel
 COUNTS = (500, 5_000, 20_000)  # Gaussians of the textures
@@ -28,8 +26,7 @@ def run(task: Task, variant: str) -> list[Row]:
 
     `ratio_N` is rendering with N Gaussians over rendering with a bitmap, `ratio_prefiltered` with
     5,000 and the prefilter, `ratio_step` picture and gradient of all parameters by `prb`.
-    `change_N` and `change_filtered_N` take over N changed shapes, without and with prefilter;
-    `difference` is the largest between texture and `eigengs_dr.render` at texel centres.
+    `change_N` and `change_filtered_N` take over N changed shapes, without and with prefilter.
     """
     job: Row = {"variant": variant, "at": time.time()}  # each call measures anew
     return task.measure("texture", [(job, partial(measure, variant, task.progress))])
@@ -48,13 +45,12 @@ def summarize(rows: Sequence[Row]) -> Section:
     ]
     over = f"Time of a picture over that with a bitmap of {TEXELS:,} x {TEXELS:,} texels"
     after = "Time to take over a change of all shapes"
+    columns = ("lookup", *(f"{n:,} Gaussians" for n in CHANGED))
     return Section(
         [
             table("Texture", ("figure", "value"), lines),
-            table(over, ("texture", "over a bitmap"), costs)._replace(name="costs"),
-            table(after, ("lookup", *(f"{n:,} Gaussians" for n in CHANGED)), changes)._replace(
-                name="changes"
-            ),
+            table(over, ("texture", "over a bitmap"), costs, name="costs"),
+            table(after, columns, changes, name="changes"),
         ]
     )
 
@@ -67,12 +63,12 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
 
     mi.set_variant(variant)
     register_plugins()
-    picture, sets = sample("coffee")[:400, 100:500], {}
+    picture, sets = eg.sample("coffee")[:400, 100:500], {}
     counts = sorted({*COUNTS, *CHANGED})
     for count in counts:
-        sets[count] = fit(picture, count, STEPS).gaussians
+        sets[count] = eg.fit(picture, count, STEPS).gaussians
         progress("fits", len(sets), len(counts))
-    coded = np.clip(picture_of(sets[SETTLED], TEXELS, TEXELS), 0, 1)
+    coded = np.clip(eg.picture_of(sets[SETTLED], TEXELS, TEXELS), 0, 1)
     data = mi.TensorXf(to_linear(coded).astype(np.float32))
     plain = ball(mi, {"type": "bitmap", "data": data, "raw": True})
     scenes = {f"gaussians_{n}": ball(mi, texture_of(sets[n])) for n in COUNTS}
@@ -96,7 +92,6 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
         **{f"ratio_{n}": timed[f"gaussians_{n}"] / timed["bitmap"] for n in COUNTS},
         "ratio_prefiltered": timed["prefiltered"] / timed["bitmap"],
         "ratio_step": timed["step_gaussians"] / timed["step_bitmap"],
-        "difference": _difference(mi, sets[SETTLED], texture_of(sets[SETTLED], raw=True)),
     }
 
 
@@ -145,12 +140,3 @@ def _change(mi: Any, texture: Any) -> Any:
     parameters["factor"] = factor * dr.opaque(mi.Float, 1 + 1e-6)
     parameters.update()
     return texture.packed
-
-
-def _difference(mi: Any, gaussians: Any, texture: dict[str, Any]) -> float:
-    width, height = gaussians.width, gaussians.height
-    index = dr.arange(mi.UInt32, width * height)
-    si = dr.zeros(mi.SurfaceInteraction3f, width * height)
-    si.uv = (mi.Point2f(index % width, index // width) + 0.5) / mi.Point2f(width, height)
-    found = np.stack([np.array(c) for c in mi.load_dict(texture).eval_3(si)], -1)
-    return float(np.abs(found.reshape(height, width, -1) - render(gaussians).numpy()).max())

@@ -6,6 +6,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import click
@@ -38,13 +39,13 @@ class Program(click.Group):
         arguments = sys.argv[1:] if args is None else list(args)
         extra.update(prog_name=NAME, standalone_mode=False, obj=list(arguments))
         try:
-            with _notes():
+            with warnings.catch_warnings():
+                warnings.simplefilter("always", UserWarning)
+                # One line for each, without the line of code that raised it.
+                warnings.showwarning = lambda message, *_: say(f"note: {message}")
                 sys.exit(super().main(arguments, *rest, **extra))
         except click.exceptions.NoArgsIsHelpError as error:
             error.show()
-        except click.Abort:
-            say("interrupted")
-            sys.exit(INTERRUPTED)
         except click.ClickException as error:
             say(f"error: {error.format_message()}")
         except OSError as error:
@@ -53,7 +54,7 @@ class Program(click.Group):
         except (ValueError, BackendError, ClusterError) as error:
             say(f"error: {error}")
         except RuntimeError as error:
-            # Dr.Jit raises this error for a second Ctrl-C while it traces a program.
+            # Click raises one for Ctrl-C, and Dr.Jit while it traces a program.
             if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
                 raise
             say("interrupted")
@@ -84,6 +85,16 @@ def bar(quiet: bool) -> Iterator[Callable[..., None]]:
         yield show or (lambda *values: None)
 
 
+@contextmanager
+def about(name: Path | str) -> Iterator[None]:
+    """Put the name of a file before the errors of values in a block, unless they begin with it."""
+    try:
+        yield
+    except ValueError as error:
+        text = str(error)
+        raise ValueError(text if text.startswith(str(name)) else f"{name}: {text}") from None
+
+
 def table(rows: Sequence[Sequence[str]]) -> list[str]:
     """Return rows of cells as lines, with the first column to the left and others to the right."""
     first, *others = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -91,15 +102,6 @@ def table(rows: Sequence[Sequence[str]]) -> list[str]:
         f"{row[0]:{first}}" + "".join(f"  {c:>{w}}" for c, w in zip(row[1:], others, strict=True))
         for row in rows
     ]
-
-
-@contextmanager
-def _notes() -> Iterator[None]:
-    """Show each warning in one line, without the line of code that raised it."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", UserWarning)
-        warnings.showwarning = lambda message, *_: say(f"note: {message}")
-        yield
 
 
 @contextmanager

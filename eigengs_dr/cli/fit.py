@@ -8,45 +8,24 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
+
+import eigengs_dr as eg
 
 from ..backend.selection import select
 from ..fitting import memory
 from ..fitting.options import INITS, PIXELS_PER_FIRST_GAUSSIAN, PRESETS, FitOptions, default_count
 from ..image.color import SPACES, rendered_as
 from ..image.metrics import float_space, target_key
-from .console import FAILED, INTERRUPTED, MISSED, bar, open_cluster, say
-from .options import (
-    ANY_PATH,
-    IMAGES,
-    LEVEL_COUNTS,
-    MapFile,
-    backend_option,
-    choice,
-    cluster_option,
-    encoding_option,
-    maps_option,
-    number,
-    quiet_option,
-    report_option,
-)
-from .outputs import (
-    check_outputs,
-    describe_run,
-    keeps_result,
-    name_outputs,
-    name_pictures,
-    write_report,
-)
-
-if TYPE_CHECKING:
-    from ..eigenbasis.eigengs import EigenGS
-    from ..fitting.fit import Fit
+from . import options
+from .console import FAILED, INTERRUPTED, MISSED, about, bar, open_cluster, say
+from .options import MapFile
+from .outputs import check_outputs, keeps_result, name_outputs, name_pictures
 
 Record = dict[str, Any]
-"""The figures of one image, for its line and for the report."""
+"""The figures of one image, for its lines in the terminal and for the report."""
 
 DEFAULT_BASIS = "natural"
 """Name of the model from which the preset "eigengs" starts by default."""
@@ -54,57 +33,31 @@ DEFAULT_BASIS = "natural"
 NOT_OF_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "cluster")
 """Options of the command that maps do not take."""
 
-FIGURES = ("gaussians", "iterations", "stopped", "seconds", "psnr_ycbcr", "psnr_rgb")
-"""Figures that every fit has."""
-
 
 @click.command()
-@click.argument("images", nargs=-1, type=IMAGES, metavar="IMAGE...")
-@click.option(
-    "-o", "--output", type=ANY_PATH, help=".npz file or folder.  [default: the current folder]"
+@click.argument("images", nargs=-1, type=options.images, metavar="IMAGE...")
+@options.output(".npz file or folder.  [default: the current folder]", "OUT", required=False)
+@options.maps("A map of a material by name, instead of IMAGE; repeat for more.")
+@options.number("--gaussians", "Number of Gaussians.  [default: 5000]")
+@options.value("--target-psnr", "DB", float, "Find the fewest for this PSNR.")
+@options.choice("--target-space", ["rgb", "ycbcr"], "Space of --target-psnr for images.")
+@options.number("--max-gaussians", "Limit for --target-psnr.")
+@options.value("--blocks", "SIZE", int, "Fit by blocks.  [default: 1024 where memory needs it]")
+@options.level_counts("Levels of detail, each 4 times larger, or the Gaussians up to each.")
+@options.number("--iterations", "Steps of optimisation.", 1000)
+@options.choice("--init", INITS, "Initial placement of the Gaussians.")
+@options.value("--basis", "NAME|FILE", str, "Model to start from: natural, or a file.")
+@options.choice("--preset", PRESETS, "Our method, or that of a paper.")
+@options.choice(
+    "--space", SPACES, "Textures take linear, light above 1 log, normal maps normal, values data."
 )
-@maps_option("A map of a material by name, instead of IMAGE; repeat for more.")
-@number("--gaussians", "Number of Gaussians.  [default: 5000]")
-@click.option("--target-psnr", type=float, metavar="DB", help="Find the fewest for this PSNR.")
-@choice("--target-space", ["rgb", "ycbcr"], "Space of --target-psnr for images.")
-@number("--max-gaussians", "Limit for --target-psnr.")
-@click.option(
-    "--blocks",
-    type=int,
-    metavar="SIZE",
-    help="Fit by blocks of so many pixels a side.  [default: where memory needs it, of 1024]",
-)
-@click.option(
-    "--levels",
-    type=LEVEL_COUNTS,
-    help="Levels of detail, each 4 times larger, or the Gaussians up to each: 5000,7000,9000.",
-)
-@number("--iterations", "Steps of optimisation.", 1000)
-@choice("--init", list(INITS), "Initial placement of the Gaussians.")
-@click.option(
-    "--basis",
-    metavar="NAME|FILE",
-    help="Start from a model: one of the package, such as natural, or its file.",
-)
-@choice("--preset", list(PRESETS), "Our method, or that of a paper.")
-@choice(
-    "--space",
-    list(SPACES),
-    "Colour space; linear for textures, log for light above 1, normal for normal maps, data for "
-    "other values.",
-)
-@encoding_option
-@number("--seed", "Seed of --init random.", 0)
-@click.option("--preview", type=ANY_PATH, help="Picture (or folder) of photo, fit and outlines.")
+@options.encoding
+@options.number("--seed", "Seed of --init random.", 0)
+@options.value("--preview", "FILE", options.path, "Picture (or folder) of photo, fit and outlines.")
 @click.option("--overwrite", is_flag=True, help="Fit images whose results exist again.")
-@cluster_option
-@backend_option
-@report_option
-@quiet_option
-@click.pass_context
+@options.shared("cluster", "backend", "report", "quiet")
 def fit(
-    context: click.Context,
-    /,
+    run: options.Run,
     images: tuple[Path | str, ...],
     output: Path | None,
     maps: dict[str, MapFile],
@@ -112,10 +65,7 @@ def fit(
     blocks: int | None,
     preview: Path | None,
     overwrite: bool,
-    cluster: str | None,
-    report: Path | None,
-    quiet: bool,
-    **settings: Any,
+    **choices: Any,
 ) -> None:
     """Fit images by sums of Gaussians.
 
@@ -155,67 +105,51 @@ def fit(
       eigengs-dr fit huge.tif -o huge.npz --blocks 1024
       eigengs-dr fit --map albedo=a.jpg --map roughness=r.jpg --map normal=n.jpg -o bark.npz
     """
-    options = FitOptions(**settings, start=_model(settings, basis))
     if maps:
-        _check_maps(context, images, output)
+        _check_maps(run.context, images, output)
     elif not images:
         raise click.UsageError("no image is given; name image files, or maps with --map")
-    inputs = [m.path for m in maps.values()] or [f for source in images for f in _expand(source)]
-    several = not maps and (len(inputs) > 1 or inputs != list(images))
-    if cluster and (preview or not (several or blocks)):
+    start = _model(basis, choices["preset"], run.backend)
+    settings = FitOptions(**choices, backend=run.backend, start=start)
+    files = [m.path for m in maps.values()] or [f for given in images for f in _expand(given)]
+    several = not maps and (len(files) > 1 or files != list(images))
+    if run.cluster and (preview or not (several or blocks)):
         raise ValueError("--cluster takes several images, or --blocks, and no --preview")
-    named = inputs if several else inputs[:1]
+    named = files if several else files[:1]
     outputs = name_outputs(named, output, [".npz"], several)
     pictures = name_pictures(named, preview, several)
-    models = [Path(basis)] if basis and Path(basis).is_file() else []
-    check_outputs([*outputs, *pictures, report], [*inputs, *models])
-    if not several and keeps_result(outputs[0], overwrite, quiet, bool(maps)):
+    check_outputs([*outputs, *pictures, run.report], [*files, *([basis] if basis else [])])
+    if several and blocks:
+        raise ValueError("--blocks fits one image; run the command for each image")
+    if not several and keeps_result(outputs[0], overwrite, run.quiet, bool(maps)):
         return
     if not (several or maps):
-        blocks = blocks or _plan_memory(inputs[0], options, preview, quiet)
-    if blocks and (reason := _refuse_blocks(options, preview, several)):
-        raise ValueError(reason)
-    if not cluster:
-        select(options.backend)
-    if options.method.mean == "dense":
+        blocks = blocks or _plan_memory(run, files[0], settings, preview)
+    if blocks and not _has_blocks(settings, preview):
+        raise ValueError(
+            "--blocks needs the preset and the init that are the default; leave --target-psnr, "
+            "--levels and --preview out"
+        )
+    if not run.cluster:
+        select(run.backend)
+    if settings.method.mean == "dense":
         say("note: the file holds the Gaussians alone; the mean image stays in the basis")
-    with open_cluster(cluster) as client:
+    with open_cluster(run.cluster) as client:
         if several:
-            measured = report is not None
-            records, interrupted = _fit_several(
-                inputs, outputs, pictures, options, overwrite, quiet, measured, client
-            )
+            records = _fit_several(run, files, outputs, pictures, settings, overwrite, client)
+        elif blocks:
+            records = [_fit_by_blocks(run, files[0], outputs[0], blocks, settings, client)]
         else:
-            if blocks:
-                record = _fit_by_blocks(inputs[0], outputs[0], blocks, options, quiet, client)
-            else:
-                record = _fit_one(maps or inputs[0], outputs[0], pictures[0], options, quiet)
-            records, interrupted = [record], record["stopped"] == "interrupted"
-    if report:
-        figures = {"images": records} if several else records[0]
-        choices = _decisive(options, basis) | {"block": blocks}
-        write_report(report, describe_run(context, options.backend) | choices | figures)
-    context.exit(INTERRUPTED if interrupted else _exit_code(records, options))
+            records = [_fit_whole(run, maps or files[0], outputs[0], pictures[0], settings)]
+    decisive = {k: v for k, v in vars(settings).items() if k not in ("backend", "start")}
+    if start is not None:
+        decisive["basis"] = basis or DEFAULT_BASIS
+    figures = {"images": records} if several else records[0]
+    run.write_report(decisive | {"block": blocks} | figures)
+    run.context.exit(_exit_code(records, len(named), settings))
 
 
-def _expand(source: Path | str) -> Sequence[Path | str]:
-    """Replace a folder, a pattern or a URL by the images that it stands for."""
-    from ..image.folder import list_images
-
-    return [source] if isinstance(source, Path) and source.is_file() else list_images(source)
-
-
-def _model(settings: dict[str, Any], basis: str | None) -> EigenGS | None:
-    """Return the model to start from: that of --basis, or what the preset of the paper needs."""
-    paper = PRESETS[settings["preset"]].mean == "dense"
-    if basis is None and not paper:
-        return None
-    from ..eigenbasis.eigengs import EigenGS
-
-    return EigenGS.load(basis or DEFAULT_BASIS, settings["backend"])
-
-
-def _check_maps(context: click.Context, images: Sequence[Any], output: Path | None) -> None:
+def _check_maps(context: click.Context, images: Sequence[Path | str], output: Path | None) -> None:
     """Refuse images and options that do not go with maps."""
     if images:
         raise ValueError(f"{images[0]}: an image without a name; with --map give names to all")
@@ -229,13 +163,18 @@ def _check_maps(context: click.Context, images: Sequence[Any], output: Path | No
         raise ValueError("--map needs -o, the .npz file to write")
 
 
-def _decisive(options: FitOptions, basis: str | None) -> dict[str, Any]:
-    """Return the settings for a report."""
-    settings = dict(vars(options))
-    del settings["backend"]  # the report names the backend that was used
-    if settings.pop("start") is not None:
-        settings["basis"] = basis or DEFAULT_BASIS
-    return settings
+def _model(basis: str | None, preset: str, backend: str | None) -> eg.EigenGS | None:
+    """Return the model to start from: that of --basis, or what the preset of the paper needs."""
+    if basis is None and PRESETS[preset].mean != "dense":
+        return None
+    return eg.EigenGS.load(basis or DEFAULT_BASIS, backend)
+
+
+def _expand(source: Path | str) -> Sequence[Path | str]:
+    """Replace a folder, a pattern or a URL by the images that it stands for."""
+    from ..image.folder import list_images
+
+    return [source] if isinstance(source, Path) and source.is_file() else list_images(source)
 
 
 # ---------------------------------------------------------------------------------------------
@@ -243,106 +182,83 @@ def _decisive(options: FitOptions, basis: str | None) -> dict[str, Any]:
 # ---------------------------------------------------------------------------------------------
 
 
-def _fit_one(
+def _fit_whole(
+    run: options.Run,
     source: Path | str | dict[str, MapFile],
     output: Path,
     picture: Path | None,
-    options: FitOptions,
-    quiet: bool,
+    settings: FitOptions,
 ) -> Record:
     """Fit one image or maps, write its files, and return its figures."""
-    import eigengs_dr as eg
-
-    from ..fitting.fit import FitInterrupted
-
-    started = time.perf_counter()
+    started, choices = time.perf_counter(), dict(vars(settings))
     maps = source if isinstance(source, dict) else {}
-    name = output.name if isinstance(source, dict) else Path(source).name
-    settings = dict(vars(options))
+    name = (output if isinstance(source, dict) else Path(source)).name
     if maps:
-        settings["space"] = {name: m.space for name, m in maps.items() if m.space}
-    with bar(quiet) as show:
+        choices["space"] = {name: m.space for name, m in maps.items() if m.space}
+    with bar(run.quiet) as show, about("--map" if maps else str(source)):
         show(f"{name}: load", 0, 1)
-        image = load_maps(maps, options.encoding) if maps else _load(source, options)
+        image = load_images(source, settings.space, settings.encoding)
         loaded = time.perf_counter()
         try:
-            result = eg.fit(image, progress=partial(show, name), **settings)
-        except FitInterrupted as interrupt:
+            result = eg.fit(image, progress=partial(show, name), **choices)
+        except eg.FitInterrupted as interrupt:
             result = interrupt.result
             say(f"interrupted; the best fit so far is in {output}")
-        except ValueError as error:
-            raise error if maps else ValueError(f"{source}: {error}") from None
-        replace(result, source="" if maps else name).save(output)
+        replace(result, source=name).save(output)
         show(f"{name}: measure", 0, 1)
-        record = {
-            "input": {name: str(m.path) for name, m in maps.items()} if maps else str(source),
-            "output": str(output),
-            "width": result.gaussians.width,
-            "height": result.gaussians.height,
-            **_figures(result),
-            **(_maps_of(result) if maps else _measure(image, result)),
-            "seconds_load": loaded - started,
-        }
+        record = {"input": {name: m.path for name, m in maps.items()} or source, "output": output}
+        record |= _figures(result) | _similarity(image, result)
         if picture:
-            eg.save_image(picture, _compare(image, result))
-    record["seconds_total"] = time.perf_counter() - started
-    if not quiet:
-        click.echo(_summary(str(output if maps else source), record, options.target_space, picture))
-    return record
+            eg.save_image(picture, _comparison(image, result))
+    times = {"seconds_load": loaded - started, "seconds_total": time.perf_counter() - started}
+    title = str(output if maps else source)
+    run.tell(_summary(title, record | times, settings.target_space, picture))
+    return record | times
 
 
-def _load(path: Any, options: FitOptions) -> Any:
-    from ..image.io import read_file
-
-    return read_file(path, rendered_as(options.space) is None, options.encoding)
-
-
-def load_maps(maps: dict[str, MapFile], encoding: str | None) -> dict[str, Any]:
-    """Read the images of maps; grey data keep one channel."""
+def load_images(source: Path | str | dict[str, MapFile], space: str, encoding: str | None) -> Any:
+    """Read an image, or the images of maps by their names; grey data keep one channel."""
     from ..gaussian.channels import usual_space
     from ..image.io import read_file
 
-    data = {name: rendered_as(m.space or usual_space(name)) is None for name, m in maps.items()}
-    return {
-        name: read_file(m.path, data[name], None if data[name] else encoding)
-        for name, m in maps.items()
-    }
+    if isinstance(source, dict):
+        return {
+            name: load_images(m.path, m.space or usual_space(name), encoding)
+            for name, m in source.items()
+        }
+    return read_file(source, rendered_as(space) is None, encoding)
 
 
-def _figures(result: Fit) -> Record:
-    """Return the figures of a fit."""
-    found = {name: getattr(result, name) for name in FIGURES[1:]}
-    trace = {"seconds_init": result.seconds_init, "trace": result.trace}
-    return {"gaussians": len(result.gaussians), **found, **trace}
+NO_FIGURES = ("gaussians", "image", "mean_image", "maps", "source", "resumed")
+"""Attributes of results that are no figures of a report."""
 
 
-def _maps_of(result: Fit) -> Record:
-    """Return the figures of the maps of a fit."""
-    maps = result.gaussians.maps
-    return {
-        "maps": [
-            {"name": m.name, "space": m.space, "channels": m.channels, **result.maps[m.name]}
-            for m in maps
-        ]
-    }
+def _figures(result: eg.Fit | eg.LargeFit) -> Record:
+    """Return the figures that a result has."""
+    g = result.gaussians
+    found = {"gaussians": len(g), "width": g.width, "height": g.height, "space": g.space}
+    found |= {name: value for name, value in vars(result).items() if name not in NO_FIGURES}
+    if maps := getattr(result, "maps", {}):
+        found["maps"] = [m._asdict() | maps[m.name] for m in g.maps]
+    return found
 
 
-def _measure(image: Any, result: Fit) -> Record:
-    """Compare a fit with its image; data are in the unit of the fit."""
-    import eigengs_dr as eg
-
+def _similarity(image: Any, result: eg.Fit) -> Record:
+    """Compare a fit with its image; data are in the unit of the fit, and maps have none."""
     from ..fitting.target import unit_of
     from ..viewer.pictures import displayed
 
+    if result.maps:
+        return {}
     space = result.gaussians.space
     image = displayed(image, space)
     unit = unit_of(image, space)
-    seen, shown = image / unit, result.image / unit
-    ms_ssim = eg.ms_ssim(seen, shown, space="ycbcr" if rendered_as(space) else "data")
-    return {"space": space, "ssim": eg.ssim(seen, shown), "ms_ssim": ms_ssim}
+    pair = image / unit, result.image / unit
+    ms_ssim = eg.ms_ssim(*pair, space="ycbcr" if rendered_as(space) else "data")
+    return {"ssim": eg.ssim(*pair), "ms_ssim": ms_ssim}
 
 
-def _compare(image: Any, result: Fit) -> Any:
+def _comparison(image: Any, result: eg.Fit) -> Any:
     """Show image, fit and outlines side by side, a row for each map."""
     import numpy as np
 
@@ -361,28 +277,29 @@ def _compare(image: Any, result: Fit) -> Any:
 def _summary(name: str, record: Record, target_space: str, picture: Path | None = None) -> str:
     """Describe a fit for a terminal."""
     blocks = f" in {record['blocks']} blocks" if "blocks" in record else ""
-    whole = "seconds_total" in record
     lines = [
         f"{name}: {record['width']}x{record['height']}{blocks}, {record['gaussians']:,} Gaussians, "
         f"{record['iterations']} iterations in {record['seconds']:.1f} s"
-        + (f" ({record['seconds_total']:.1f} s with loading and measuring)" if whole else "")
     ]
+    if "seconds_total" in record:
+        lines[0] += f" ({record['seconds_total']:.1f} s with loading and measuring)"
     for m in record.get("maps", []):
         figure, value = _target_figure(m, target_space)
         lines.append(
             f"  {m['name']} in {m['space']} (channels: {m['channels']}), {figure} {value:.2f} dB"
         )
     if "maps" not in record:
-        lines.append(
-            f"  psnr_{float_space(record['space'])} {record['psnr_ycbcr']:.2f} dB, "
-            f"psnr_rgb {record['psnr_rgb']:.2f} dB"
-        )
+        lines.append(_psnrs(record["space"], record["psnr_ycbcr"], record["psnr_rgb"]))
     if "ssim" in record:
         lines[-1] += f", SSIM {record['ssim']:.4f}, MS-SSIM {record['ms_ssim']:.4f}"
     lines.append(f"  wrote {record['output']}")
     if picture:
         lines.append(f"  wrote {picture} (photo, fit and outlines side by side)")
     return "\n".join(lines)
+
+
+def _psnrs(space: str, floats: float, rgb: float) -> str:
+    return f"  psnr_{float_space(space)} {floats:.2f} dB, psnr_rgb {rgb:.2f} dB"
 
 
 def _target_figure(record: Record, target_space: str) -> tuple[str, float]:
@@ -392,20 +309,22 @@ def _target_figure(record: Record, target_space: str) -> tuple[str, float]:
     return name, record[key]
 
 
-def _exit_code(records: list[Record], options: FitOptions) -> int:
+def _exit_code(records: list[Record], expected: int, settings: FitOptions) -> int:
     """Say which fits missed the target; return the exit code of the command."""
     stops = [record["stopped"] for record in records]
+    if "interrupted" in stops or len(records) < expected:
+        return INTERRUPTED
     if "failed" in stops:
         return FAILED
     for record in records:
         if record["stopped"] != "out of reach":
             continue
-        spaces = record.get("maps") or [{"space": options.space, **record}]
-        found = [(*_target_figure(m, options.target_space), m.get("name")) for m in spaces]
+        spaces = record.get("maps") or [{"space": settings.space} | record]
+        found = [(*_target_figure(m, settings.target_space), m.get("name")) for m in spaces]
         figure, value, name = min(found, key=lambda entry: entry[1])
         say(
-            f"{record['output' if name else 'input']}: {options.target_psnr:g} dB {figure} are out "
-            f"of reach: {record['gaussians']} Gaussians have {value:.2f}"
+            f"{record['output' if name else 'input']}: {settings.target_psnr:g} dB {figure} are "
+            f"out of reach: {record['gaussians']} Gaussians have {value:.2f}"
             + (f" in {name}" if name else "")
             + "; lower --target-psnr, or raise --max-gaussians or --iterations"
         )
@@ -418,83 +337,51 @@ def _exit_code(records: list[Record], options: FitOptions) -> int:
 
 
 def _fit_several(
-    inputs: Sequence[Path | str],
+    run: options.Run,
+    files: Sequence[Path | str],
     outputs: list[Path],
     pictures: Sequence[Path | None],
-    options: FitOptions,
+    settings: FitOptions,
     overwrite: bool,
-    quiet: bool,
-    measured: bool,
     client: Any,
-) -> tuple[list[Record], bool]:
-    """Fit images into a folder; return the records of what is done, and whether Ctrl-C came.
-
-    What failed is said at once. Measured fits have SSIM and a trace, except on a cluster.
-    """
-    import eigengs_dr as eg
-
+) -> list[Record]:
+    """Fit images into a folder; return the records of what is done. What failed is said at once."""
     started, folder = time.perf_counter(), outputs[0].parent
-    records: dict[str, Record] = {}
-    places = {output.stem: place for place, output in enumerate(outputs)}
+    picture_of = {path.stem: picture for path, picture in zip(outputs, pictures, strict=True)}
 
     def note(done: int, total: int | None, row: eg.ImageRow) -> None:
-        picture = pictures[places[row.name]]
-        records[row.name] = record = _record(row, picture, options, measured)
-        if record["stopped"] == "failed":
-            say(f"error: {record['error']}")
-        show(folder.name, done, total, record)
+        if row.error:
+            say(f"error: {row.error}")
+        picture = picture_of[row.name]
+        if picture and row.result and row.input:
+            image = load_images(row.input, settings.space, settings.encoding)
+            eg.save_image(picture, _comparison(image, row.result))
+        show(folder.name, done, total, row)
 
-    interrupted = False
-    with bar(quiet) as show:
+    with bar(run.quiet) as show:
         try:
-            eg.fit_many(
-                inputs,
-                folder,
-                overwrite=overwrite,
-                progress=note,
-                client=client,
-                **vars(options),
+            rows = eg.fit_many(
+                files, folder, overwrite=overwrite, progress=note, client=client, **vars(settings)
             )
-        except KeyboardInterrupt:
-            done = f"{len(records)} of {len(inputs)} images are done"
+        except eg.RunInterrupted as stop:
+            rows = stop.rows
+            done = f"{len(rows)} of {len(files)} images are done"
             say(f"interrupted; {done}; the same command fits the others")
-            interrupted = True
-    ordered = sorted(records.values(), key=lambda record: places[record["name"]])
-    if not quiet:
-        space = float_space(options.space)
-        click.echo(_summary_of_all(ordered, folder, time.perf_counter() - started, space))
-    return ordered, interrupted
+    run.tell(_summary_of_all(rows, folder, time.perf_counter() - started, settings.space))
+    known = [{k: v for k, v in vars(row).items() if v not in (None, "")} for row in rows]
+    return [{"stopped": record["status"]} | record for record in known]
 
 
-def _record(row: Any, picture: Path | None, options: FitOptions, measured: bool) -> Record:
-    """Return the figures of one image of several, and write its picture."""
-    import eigengs_dr as eg
-
-    record = {"name": row.name, "input": str(row.input), "output": str(row.output)}
-    if row.status != "done":
-        return record | {"stopped": row.status} | ({"error": row.error} if row.error else {})
-    record |= {name: getattr(row, name) for name in ("width", "height", *FIGURES)}
-    if row.result is None or not (picture or measured):  # a worker keeps the result
-        return record
-    try:
-        image = _load(row.input, options)
-        if picture:
-            eg.save_image(picture, _compare(image, row.result))
-        return record | (_figures(row.result) | _measure(image, row.result) if measured else {})
-    except (ValueError, OSError) as error:
-        return record | {"stopped": "failed", "error": str(error)}
-
-
-def _summary_of_all(records: list[Record], folder: Path, seconds: float, space: str) -> str:
+def _summary_of_all(rows: list[eg.ImageRow], folder: Path, seconds: float, space: str) -> str:
     """Describe a run for a terminal."""
-    fitted = [record for record in records if "psnr_rgb" in record]
-    counts = Counter(record["stopped"] for record in records)
+    fitted = [row for row in rows if row.status == "done"]
+    counts = Counter(row.status for row in rows)
     others = "".join(f", {counts[k]} {k}" for k in ("skipped", "failed") if counts[k])
     text = f"{len(fitted)} image{'s' * (len(fitted) != 1)} fitted{others} in {seconds:.1f} s"
     if fitted:
-        ycbcr, rgb = (sum(r[key] for r in fitted) / len(fitted) for key in FIGURES[-2:])
-        text += f" ({len(fitted) / seconds:.2g} images/s)"
-        text += f"\n  mean psnr_{space} {ycbcr:.2f} dB, psnr_rgb {rgb:.2f} dB"
+        pairs = [(row.psnr_ycbcr, row.psnr_rgb) for row in fitted]
+        floats, rgb = (sum(values) / len(fitted) for values in zip(*pairs, strict=True))
+        text += f" ({len(fitted) / seconds:.2g} images/s)\n  mean{_psnrs(space, floats, rgb)[1:]}"
     if counts["skipped"]:
         text += "\n  --overwrite fits the skipped images, whose results exist, again"
     return f"{text}\n  wrote {folder}" if fitted else text
@@ -511,23 +398,14 @@ COMFORTABLE = 0.5
 """Share of the usable memory up to which an image is fitted as a whole."""
 
 
-def _refuse_blocks(options: FitOptions, preview: Path | None, several: bool = False) -> str:
-    """Return why these options have no fit by blocks, or nothing."""
-    if options.preset != "default" or options.placement != "adaptive":
-        return "--blocks needs the preset and the init that are the default"
-    if several:
-        return "--blocks fits one image; run the command for each image"
-    excluded = {
-        "--target-psnr": options.target_psnr,
-        "--levels": options.levels,
-        "--preview": preview,
-    }
-    name = next((name for name, value in excluded.items() if value is not None), None)
-    return f"--blocks and {name} exclude each other; leave one of them out" if name else ""
+def _has_blocks(settings: FitOptions, preview: Path | None) -> bool:
+    """Return whether these options have a fit by blocks."""
+    usual = settings.preset == "default" and settings.placement == "adaptive"
+    return usual and settings.target_psnr is None and settings.levels is None and preview is None
 
 
 def _plan_memory(
-    path: Path | str, options: FitOptions, preview: Path | None, quiet: bool
+    run: options.Run, path: Path | str, settings: FitOptions, preview: Path | None
 ) -> int | None:
     """Return the side of blocks where a fit of the whole image takes too much memory, else None.
 
@@ -546,51 +424,41 @@ def _plan_memory(
     if size is None:
         return None
     height, width, channels = size
-    count = options.gaussians or default_count(width * height)
-    if options.target_psnr is not None:  # the first try of the search
+    count = settings.gaussians or default_count(width * height)
+    if settings.target_psnr is not None:  # the first try of the search
         count = max(1, width * height // PIXELS_PER_FIRST_GAUSSIAN)
-    problem = width, height, channels if rendered_as(options.space) is None else 3, count
+    problem = width, height, channels if rendered_as(settings.space) is None else 3, count
     needed, usable = memory.estimate_memory(*problem), memory.usable_memory()
-    if usable and needed > COMFORTABLE * usable and not _refuse_blocks(options, preview):
+    if usable and needed > COMFORTABLE * usable and _has_blocks(settings, preview):
         say(f"{path}: a fit of the whole takes too much memory; it is fitted by blocks")
         return BLOCK_SIDE
-    try:
+    with about(path):
         line = memory.check_memory(*problem)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    if needed >= NOTABLE and not quiet:
+    if needed >= NOTABLE and not run.quiet:
         say(line)
     return None
 
 
 def _fit_by_blocks(
-    path: Path | str, output: Path, side: int, options: FitOptions, quiet: bool, client: Any
+    run: options.Run, path: Path | str, output: Path, side: int, settings: FitOptions, client: Any
 ) -> Record:
     """Fit one image by blocks into a file; after an interrupt, blocks that are done wait there."""
-    import eigengs_dr as eg
-
     names = ("gaussians", "iterations", "space", "solve_steps", "cutoff", "backend", "encoding")
-    settings = {name: getattr(options, name) for name in names}
-    started = time.perf_counter()
-    record: Record = {"input": str(path), "output": str(output), "stopped": "interrupted"}
-    with bar(quiet) as show:
+    choices = {name: getattr(settings, name) for name in names}
+    with bar(run.quiet) as show:
 
         def progress(done: int, total: int, row: Record) -> None:
             show(f"{Path(path).name}: {row['stage']}", done, total)
 
         try:
             result = eg.fit_large(
-                path, output, block=side, progress=progress, client=client, **settings
+                path, output, block=side, progress=progress, client=client, **choices
             )
         except KeyboardInterrupt:
             say(
                 f"interrupted; finished blocks are in {output}.checkpoint; the same command goes on"
             )
-            return record | {"seconds": time.perf_counter() - started}
-    found = {"stopped": "iterations", "blocks_resumed": result.resumed, "space": options.space}
-    found |= {"width": result.gaussians.width, "height": result.gaussians.height}
-    found |= {"gaussians": len(result.gaussians), "blocks": result.blocks}
-    record |= found | {name: getattr(result, name) for name in FIGURES if name not in found}
-    if not quiet:
-        click.echo(_summary(str(path), record, options.target_space))
-    return record
+            run.context.exit(INTERRUPTED)
+    record = {"input": path, "output": output, "stopped": "iterations", **_figures(result)}
+    run.tell(_summary(str(path), record, settings.target_space))
+    return record | {"blocks_resumed": result.resumed}

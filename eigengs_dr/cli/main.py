@@ -5,7 +5,6 @@ Commands import heavy modules when they run, so that ``--help`` and mistakes ans
 
 import json
 from importlib.metadata import entry_points
-from typing import Any
 
 import click
 
@@ -21,7 +20,13 @@ from .view import view
 
 
 class Benchmarks(click.Group):
-    """The commands of the benchmarks, loaded when one of them is used."""
+    """Measure speed and accuracy, and draw tables and charts.
+
+    \b
+    Examples:
+      eigengs-dr bench kernels
+      eigengs-dr bench tables data/ -o results/ --set natural256 --images 3
+    """  # the benchmarks are loaded when one of their commands is used
 
     def list_commands(self, context: click.Context) -> list[str]:
         """Return the names of the commands."""
@@ -32,21 +37,14 @@ class Benchmarks(click.Group):
         return _load().get_command(context, name)
 
 
-HELP = """Measure speed and accuracy, and draw tables and charts.
-
-\b
-Examples:
-  eigengs-dr bench kernels
-  eigengs-dr bench tables data/ -o results/ --set natural256 --images 3
-"""
-
-bench = Benchmarks("bench", help=HELP)
+bench = Benchmarks("bench", help=Benchmarks.__doc__)
 
 
-def _load() -> Any:
+def _load() -> click.Group:
     """Load the group of commands that the installed benchmarks offer."""
     for entry in entry_points(group="eigengs_dr.commands", name="bench"):
-        return entry.load()
+        group: click.Group = entry.load()
+        return group
     raise click.UsageError(
         "the benchmarks are not installed; in a checkout of eigengs-dr, run: "
         "pip install ./benchmarks"
@@ -54,7 +52,7 @@ def _load() -> Any:
 
 
 @click.command()
-@options.json_option
+@options.as_json
 @click.pass_context
 def doctor(context: click.Context, as_json: bool) -> None:
     """Show what works on this machine and what to install.

@@ -2,6 +2,8 @@
 
 import glob
 import re
+from collections.abc import Callable, Iterable
+from functools import wraps
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,6 +13,7 @@ from ..image.color import SPACES
 from ..image.pixels import ENCODINGS
 from ..image.remote import is_url
 from ..storage.atomic import refuse_url
+from .outputs import describe_run, write_json
 
 EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
 
@@ -20,83 +23,77 @@ MAX_PIXELS = 1 << 29
 MAX_SIDE = 1 << 17
 """Longest side of a picture to render into a TIFF file."""
 
+Option = Callable[[Callable[..., Any]], Callable[..., Any]]
+"""What adds an option to a command."""
 
-class PathOrUrl(click.Path):
-    """A path, or a URL, which is passed as text."""
-
-    def convert(self, value: Any, parameter: Any, context: Any) -> Any:
-        """Return a `Path`, or the text of a URL."""
-        return value if is_url(value) else super().convert(value, parameter, context)
+# Each function below parses the text of an option or an argument; its name stands in the help.
 
 
-class ImageSource(PathOrUrl):
-    """An image file, a folder of images, a pattern such as "a/*.png", or a URL of one of them."""
-
-    def convert(self, value: Any, parameter: Any, context: Any) -> Any:
-        """Return a `Path`, or the text of a URL; a pattern need not exist."""
-        pattern = glob.has_magic(str(value)) and not (is_url(value) or Path(value).exists())
-        return Path(value) if pattern else super().convert(value, parameter, context)
+def path(text: str) -> Path:
+    """Parse a file or a folder to write; a URL would become a strange folder of this one."""
+    refuse_url(text)
+    return Path(text)
 
 
-class OutputPath(click.Path):
-    """A file or a folder to write, which is no URL."""
-
-    def convert(self, value: Any, parameter: Any, context: Any) -> Any:
-        """Return a Path; a URL would become a strange folder of this one."""
-        try:
-            refuse_url(value)
-        except OSError as error:
-            self.fail(str(error), parameter, context)
-        return super().convert(value, parameter, context)
+def image(text: str) -> Path | str:
+    """Parse an image file, or its URL."""
+    return text if is_url(text) else EXISTING.convert(text, None, None)
 
 
-IMAGE = PathOrUrl(exists=True, dir_okay=False, path_type=Path)
-IMAGES = ImageSource(exists=True, path_type=Path)
-FOLDER = PathOrUrl(exists=True, file_okay=False, path_type=Path)
-ANY_PATH = OutputPath(path_type=Path)
+def images(text: str) -> Path | str:
+    """Parse an image file, a folder of images, a pattern such as "a/*.png", or their URL."""
+    if is_url(text):
+        return text
+    pattern = glob.has_magic(text) and not Path(text).exists()
+    return click.Path(exists=not pattern, path_type=Path).convert(text, None, None)
 
 
-class Numbers(click.ParamType):
-    """Whole numbers with a sign between them, whose text matches a pattern."""
-
-    def __init__(self, name: str, pattern: str, expected: str) -> None:
-        self.name, self._pattern, self._expected = name, pattern, expected
-
-    def convert(self, value: Any, parameter: Any, context: Any) -> Any:
-        """Parse the text of an option as one number or several."""
-        if not isinstance(value, str):  # the default
-            return value
-        if not re.fullmatch(self._pattern, value):
-            self.fail(f"{value}: expected {self._expected}", parameter)
-        numbers = tuple(map(int, re.split("[,x]", value)))
-        return numbers if len(numbers) > 1 else numbers[0]
+def folder(text: str) -> Path | str:
+    """Parse a folder that exists, or its URL."""
+    kind = click.Path(exists=True, file_okay=False, path_type=Path)
+    return text if is_url(text) else kind.convert(text, None, None)
 
 
-class Size(Numbers):
-    """Width and height in pixels, as in "1024x768"."""
-
-    def __init__(self) -> None:
-        super().__init__("WxH", r"\d+x\d+", "width and height, such as 1024x768")
-
-    def convert(self, value: Any, parameter: Any, context: Any) -> tuple[int, int]:
-        """Parse the text of an option as two numbers."""
-        return check_pixels(*super().convert(value, parameter, context))
+def size(text: str) -> tuple[int, int]:
+    """Parse width and height in pixels, as in "1024x768"."""
+    width, height = _numbers(text, r"\d+x\d+", "width and height, such as 1024x768")
+    return check_pixels(width, height, by_parts=True)
 
 
-COUNTS = Numbers("K", r"(?=.*[1-9])\d+(,\d+,\d+)?", "a number above 0, or three such as 230,60,60")
-"""One number for all channels, or three."""
+def scale(text: str) -> float:
+    """Parse a factor on a size."""
+    if not 0 < (factor := float(text)) <= MAX_SIDE:
+        raise click.BadParameter(f"{text}: expected a number above 0, such as 2 or 0.5")
+    return factor
 
-LEVEL_COUNTS = Numbers(
-    "N|N,N,...", r"\d{1,18}(,\d{1,18})*", "a number, or several such as 5000,7000,9000"
-)
-"""A number of levels, or the numbers of Gaussians up to each."""
 
-REGION = Numbers(
-    "X,Y,W,H",
-    r"\d+,\d+,0*[1-9]\d*,0*[1-9]\d*",
-    "left, top, width and height, such as 100,50,640,480",
-)
-"""A part of an image, in pixels."""
+def region(text: str) -> tuple[int, ...]:
+    """Parse a part of an image, in pixels."""
+    expected = "left, top, width and height, such as 100,50,640,480"
+    return _numbers(text, r"\d+,\d+,0*[1-9]\d*,0*[1-9]\d*", expected)
+
+
+def counts(text: str) -> int | tuple[int, ...]:
+    """Parse one number for all channels, or three."""
+    expected = "a number above 0, or three such as 230,60,60"
+    return _one_or_more(_numbers(text, r"(?=.*[1-9])\d+(,\d+,\d+)?", expected))
+
+
+def levels(text: str) -> int | tuple[int, ...]:
+    """Parse a number of levels, or the numbers of Gaussians up to each."""
+    expected = "a number, or several such as 5000,7000,9000"
+    return _one_or_more(_numbers(text, r"\d{1,18}(,\d{1,18})*", expected))
+
+
+def _numbers(text: str, pattern: str, expected: str) -> tuple[int, ...]:
+    """Parse whole numbers with a sign between them, whose text matches a pattern."""
+    if not re.fullmatch(pattern, text):
+        raise click.BadParameter(f"{text}: expected {expected}")
+    return tuple(map(int, re.split("[,x]", text)))
+
+
+def _one_or_more(numbers: tuple[int, ...]) -> int | tuple[int, ...]:
+    return numbers if len(numbers) > 1 else numbers[0]
 
 
 class MapFile(NamedTuple):
@@ -107,35 +104,29 @@ class MapFile(NamedTuple):
     space: str | None
 
 
-class MapOption(click.ParamType):
-    """A name and a file, as in "albedo=bark.jpg", or a name, a space and a file."""
+def map_file(text: str) -> MapFile:
+    """Parse a name and a file, as in "albedo=bark.jpg", or a name, a space and a file."""
+    from ..gaussian.channels import NAME
 
-    name = "NAME[:SPACE]=FILE"
-
-    def convert(self, value: Any, parameter: Any, context: Any) -> MapFile:
-        """Parse the text of an option."""
-        from ..gaussian.channels import NAME
-
-        left, sign, file = value.partition("=")
-        name, colon, space = left.partition(":")
-        if not (sign and file and NAME.fullmatch(name)):
-            self.fail(f"{value}: expected a name and a file, such as albedo=bark.jpg", parameter)
-        if colon and space not in SPACES:
-            self.fail(f"{value}: space {space!r} is not in {', '.join(SPACES)}", parameter)
-        if not is_url(file) and not Path(file).is_file():
-            self.fail(f"{file}: no such file", parameter)
-        return MapFile(name, file if is_url(file) else Path(file), space or None)
+    left, sign, file = text.partition("=")
+    name, colon, space = left.partition(":")
+    if not (sign and file and NAME.fullmatch(name)):
+        raise click.BadParameter(f"{text}: expected a name and a file, such as albedo=bark.jpg")
+    if colon and space not in SPACES:
+        raise click.BadParameter(f"{text}: space {space!r} is not in {', '.join(SPACES)}")
+    if not is_url(file) and not Path(file).is_file():
+        raise click.BadParameter(f"{file}: no such file")
+    return MapFile(name, file if is_url(file) else Path(file), space or None)
 
 
 def by_name(
     context: click.Context, parameter: click.Parameter, maps: tuple[MapFile, ...]
 ) -> dict[str, MapFile]:
     """Return maps by their names; a name may occur once."""
-    found = {item.name: item for item in maps}
     names = [item.name for item in maps]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise click.UsageError(f"--map {twice} is given twice; give each name once")
-    return found
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise click.UsageError(f"--map {twice[0]} is given twice; give each name once")
+    return dict(zip(names, maps, strict=True))
 
 
 def check_pixels(width: int, height: int, by_parts: bool = False) -> tuple[int, int]:
@@ -143,56 +134,95 @@ def check_pixels(width: int, height: int, by_parts: bool = False) -> tuple[int, 
 
     A picture that is written by parts may be larger than one that is held in memory.
     """
-    if by_parts:
-        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-            raise click.UsageError(f"{width}x{height}: expected sides of 1 to {MAX_SIDE:,} pixels")
-    elif width < 1 or height < 1 or width * height > MAX_PIXELS:
-        raise click.UsageError(
-            f"{width}x{height}: expected 1 to {MAX_PIXELS:,} pixels, or a .tif file"
-        )
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise click.UsageError(f"{width}x{height}: expected sides of 1 to {MAX_SIDE:,} pixels")
+    if width * height > MAX_PIXELS and not by_parts:
+        most = f"at most {MAX_PIXELS:,} pixels, or a .tif file"
+        raise click.UsageError(f"{width}x{height}: expected {most}")
     return width, height
 
 
-def choice(name: str, values: list[str], text: str) -> Any:
-    """Make an option that takes one of several words; the first is the default."""
-    return click.option(name, type=click.Choice(values), default=values[0], help=text)
+def value(name: str, metavar: str | None, kind: Any, text: str, default: object = None) -> Option:
+    """Make an option that takes a value of a type of click, or one that a function parses."""
+    return click.option(name, metavar=metavar, type=kind, help=text, default=default)
 
 
-def number(name: str, text: str, default: float | None = None, least: int | None = None) -> Any:
+def choice(name: str, values: Iterable[str], text: str, optional: bool = False) -> Option:
+    """Make an option that takes one of several words; by default the first, or None."""
+    words = list(values)
+    return value(name, None, click.Choice(words), text, None if optional else words[0])
+
+
+def number(name: str, text: str, default: int | None = None, least: int | None = None) -> Option:
     """Make an option that takes a whole number, from `least` on if that is given."""
-    kind = int if least is None else click.IntRange(min=least)
-    return click.option(name, type=kind, metavar="N", default=default, help=text)
+    return value(name, "N", int if least is None else click.IntRange(min=least), text, default)
 
 
-def output(text: str, metavar: str | None = None) -> Any:
+def output(text: str, metavar: str, required: bool = True) -> Option:
     """Make the option of the file or folder to write."""
-    kind: Any = {"type": ANY_PATH, "metavar": metavar, "help": text}
-    return click.option("-o", "--output", required=True, **kind)
+    return click.option("-o", "--output", required=required, type=path, metavar=metavar, help=text)
 
 
-backend_option = click.option(
-    "--backend",
-    type=click.Choice(["llvm", "cuda"]),
-    help="Processor.  [default: cuda if present]",
-)
-seed_option = number("--seed", "Seed of random numbers.", 0, 0)
-report_option = click.option("--report", type=ANY_PATH, help="JSON file of all figures.")
-quiet_option = click.option("--quiet", is_flag=True, help="Show no progress and no summary.")
-json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-cluster_option = click.option(
-    "--cluster",
-    metavar="local[:N]|tcp://HOST:PORT|FILE",
-    help="Work on N processes here, or on a Dask cluster.",
-)
-encoding_option = click.option(
-    "--encoding",
-    type=click.Choice(ENCODINGS),
-    help="What the pixels are.  [default: linear in files of floats, else srgb]",
-)
-
-
-def maps_option(text: str) -> Any:
+def maps(text: str) -> Option:
     """Make the option that names image files of maps."""
-    return click.option(
-        "--map", "maps", multiple=True, type=MapOption(), callback=by_name, help=text
-    )
+    many: Any = {"multiple": True, "type": map_file, "callback": by_name}
+    return click.option("--map", "maps", metavar="NAME[:SPACE]=FILE", help=text, **many)
+
+
+def level_counts(text: str) -> Option:
+    """Make the option of the levels of detail."""
+    return value("--levels", "N|N,N,...", levels, text)
+
+
+as_json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+encoding = choice(
+    "--encoding", ENCODINGS, "What pixels are.  [default: linear in float files, else srgb]", True
+)
+
+SHARED: dict[str, Option] = {
+    "cluster": value(
+        "--cluster", "local[:N]|tcp://HOST:PORT|FILE", str, "N processes here, or a Dask cluster."
+    ),
+    "backend": choice(
+        "--backend", ["llvm", "cuda"], "Processor.  [default: cuda if present]", True
+    ),
+    "report": value("--report", "FILE", path, "JSON file of all figures."),
+    "quiet": click.option("--quiet", is_flag=True, help="Show no progress and no summary."),
+}
+"""Options that become fields of a `Run`."""
+
+
+class Run(NamedTuple):
+    """One run of a command: its context, and the options that commands share."""
+
+    context: click.Context
+    quiet: bool
+    backend: str | None = None
+    report: Path | None = None
+    cluster: str | None = None
+
+    def tell(self, text: str) -> None:
+        """Write the summary of a command, unless it is quiet."""
+        if not self.quiet:
+            click.echo(text)
+
+    def write_report(self, figures: dict[str, object], backend: str | None = None) -> None:
+        """Write the figures and the machine, on a backend or that of the option, as JSON."""
+        if self.report:
+            write_json(self.report, describe_run(self.context, backend or self.backend) | figures)
+
+
+def shared(*names: str) -> Option:
+    """Add options of `SHARED` to a command, which gets them as its first argument, a `Run`."""
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        @click.pass_context
+        @wraps(command)
+        def call(context: click.Context, /, **given: Any) -> Any:
+            return command(Run(context, **{name: given.pop(name) for name in names}), **given)
+
+        for name in reversed(names):
+            call = SHARED[name](call)
+        return call
+
+    return decorate

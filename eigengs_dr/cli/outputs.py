@@ -1,7 +1,6 @@
 """Names of output files, checked before the work starts, and reports of all figures as JSON."""
 
 import json
-import math
 import os
 import shlex
 from collections.abc import Iterable, Sequence
@@ -43,8 +42,8 @@ def name_outputs(
     Raises
     ------
     ValueError
-        If the file has another suffix, the output of several inputs is a file, an input occurs
-        twice, or two inputs have one output.
+        If the file has another suffix, the output of several inputs is a file, or two inputs have
+        one output.
     OSError
         If the folder cannot be created.
     """
@@ -55,14 +54,10 @@ def name_outputs(
         return [output]
     if not output.is_dir() and (output.exists() or output.suffix.lower() in suffixes):
         raise ValueError(f"{output}: is a file; several images, or a folder of them, need a folder")
-    real = [os.path.realpath(path) for path in inputs]
-    twice = next((path for k, path in enumerate(inputs) if real[k] in real[:k]), None)
-    if twice:
-        raise ValueError(f"{twice}: is given twice; give it once")
     names = [stem_of(path) + suffixes[0] for path in inputs]
-    duplicate = next((name for name in names if names.count(name) > 1), None)
-    if duplicate:
-        raise ValueError(f"{output / duplicate}: two images have this name; rename one of them")
+    if twice := [name for name in names if names.count(name) > 1]:
+        advice = "give an image once, or rename one of them"
+        raise ValueError(f"{output / twice[0]}: two images have this name; {advice}")
     output.mkdir(parents=True, exist_ok=True)
     return [output / name for name in names]
 
@@ -128,42 +123,27 @@ def keeps_result(output: Path, overwrite: bool, quiet: bool, maps: bool) -> bool
     return not overwrite
 
 
-def describe_run(context: click.Context, backend: str | None) -> dict[str, Any]:
+def describe_run(context: click.Context, backend: str | None) -> dict[str, object]:
     """Return the command as typed and the machine, for a report."""
     return {"command": shlex.join([NAME, *context.obj]), **describe(backend)}
 
 
-def write_report(path: str | os.PathLike[str] | None, figures: dict[str, Any]) -> None:
-    """Write figures as JSON, all or nothing.
-
-    Parameters
-    ----------
-    path : str, os.PathLike or None
-        The file to write; None writes nothing.
-    figures : dict
-        Strings, numbers (NumPy's too), lists and dictionaries. Infinity (the PSNR of two equal
-        images) and NaN become null, because JSON has neither.
+def write_json(path: Path, figures: dict[str, object]) -> None:
+    """Write figures as JSON, all or nothing; see `plain`.
 
     Raises
     ------
     OSError
         If the file cannot be written; an existing file is then unchanged.
     """
-    if path is None:
-        return
-    text = json.dumps(plain(figures), indent=2, allow_nan=False)
     with atomic_write(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(plain(figures), indent=2) + "\n", encoding="utf-8")
 
 
-def plain(value: Any) -> Any:
-    """Convert a value to types of JSON: arrays to lists, infinity and NaN to None."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+def plain(value: object) -> Any:
+    """Convert a value to types of JSON: arrays to lists, paths to texts, infinity and NaN to None.
+
+    Infinity is the PSNR of two equal images; JSON has neither.
+    """
+    text = json.dumps(value, default=lambda v: v.tolist() if hasattr(v, "tolist") else str(v))
+    return json.loads(text, parse_constant=lambda name: None)

@@ -1,6 +1,5 @@
 """The command ``eigengs-dr render``: render Gaussians to a picture."""
 
-import math
 from functools import partial
 from pathlib import Path
 
@@ -16,20 +15,18 @@ from .outputs import check_outputs, name_outputs
 @click.argument("file", type=options.EXISTING, metavar="X.npz")
 @options.output("Picture to write.", "Y.png")
 @click.option("--map", "name", metavar="NAME", help="The map of a material to draw.")
-@click.option(
-    "--region", type=options.REGION, help="Left, top, width, height: a part of the image."
+@options.value(
+    "--region", "X,Y,W,H", options.region, "Left, top, width, height: a part of the image."
 )
-@click.option("--scale", type=float, metavar="S", help="Factor on the native size, such as 0.5.")
-@click.option("--size", type=options.Size(), help="Width and height in pixels, such as 1024x768.")
+@options.value("--scale", "S", options.scale, "Factor on the native size, such as 0.5.")
+@options.value("--size", "WxH", options.size, "Width and height in pixels, such as 1024x768.")
 @options.number("--first", "Draw the first N Gaussians alone; for fits with --levels.", least=1)
-@click.option(
-    "--bits",
-    type=click.Choice(["8", "16", "32"]),
-    help="Bits of a value; 32 are floats.  [default: 32 in .exr, .hdr and .pfm, else 8]",
+@options.choice(
+    "--bits", ["8", "16", "32"], "Bits of a value.  [default: 32 in .exr, .hdr, .pfm, else 8]", True
 )
-@options.backend_option
-@options.quiet_option
+@options.shared("backend", "quiet")
 def render(
+    run: options.Run,
     file: Path,
     output: Path,
     name: str | None,
@@ -38,8 +35,6 @@ def render(
     size: tuple[int, int] | None,
     first: int | None,
     bits: str | None,
-    backend: str | None,
-    quiet: bool,
 ) -> None:
     """Render a fitted image at any size, or a region of it.
 
@@ -66,7 +61,7 @@ def render(
     [output] = name_outputs([file], output, SUFFIXES)
     depth = bits_of(output, int(bits) if bits else None)
     check_outputs([output], [file])
-    select(backend)
+    select(run.backend)
     from ..blocks.draw import save_region
     from ..gaussian.file import read_map
 
@@ -84,18 +79,9 @@ def render(
             f"{file}: --region {left},{top},{width},{height} is not inside the image of "
             f"{data.size[0]}x{data.size[1]} pixels"
         )
-    by_parts = output.suffix.lower() in TIFF_SUFFIXES
-    size = options.check_pixels(*(size or _scaled(width, height, scale)), by_parts)
-    with bar(quiet) as show:
-        save_region(output, data, region, size, backend, partial(show, output.name), depth)
-    if not quiet:
-        click.echo(f"{file}: {count:,} Gaussians\n  wrote {output} ({size[0]}x{size[1]})")
-
-
-def _scaled(width: int, height: int, scale: float | None) -> tuple[int, int]:
-    """Return the scaled width and height in pixels."""
-    scale = 1.0 if scale is None else scale
-    if not (math.isfinite(scale) and scale > 0):
-        raise click.UsageError(f"--scale {scale}: expected a number above 0, such as 2 or 0.5")
-    scale = min(scale, options.MAX_PIXELS)
-    return max(1, round(width * scale)), max(1, round(height * scale))
+    if size is None:
+        size = max(1, round(width * (scale or 1))), max(1, round(height * (scale or 1)))
+    options.check_pixels(*size, output.suffix.lower() in TIFF_SUFFIXES)
+    with bar(run.quiet) as show:
+        save_region(output, data, region, size, run.backend, partial(show, output.name), depth)
+    run.tell(f"{file}: {count:,} Gaussians\n  wrote {output} ({size[0]}x{size[1]})")

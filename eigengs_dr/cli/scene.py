@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -20,64 +21,53 @@ from ..backend.selection import select
 from ..storage.atomic import atomic_write
 from . import options
 from .console import MISSED, bar, table
-from .outputs import check_outputs, describe_run, name_outputs, write_report
+from .outputs import check_outputs, name_outputs
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from ..scene.convert import ConvertedScene
 
 
 SUFFIXES = (".png", ".exr")
 """Suffixes of pictures: PNG is clamped sRGB, EXR is linear."""
 
-MADE = "build/scenes/"
-"""Folder of the sets that the scenes of the repository use."""
 
-RESERVED = ("path", "parallel", "optimize")
-"""Names of arguments of `mitsuba.load_file`, which no scene parameter can have."""
-
-
-class Definition(click.ParamType):
-    """A parameter of a scene and its value, as in "spp=16"."""
-
-    name = "KEY=VALUE"
-
-    def convert(self, value: Any, param: Any, context: Any) -> tuple[str, str]:
-        """Parse the text of an option as a name and a value."""
-        key, sign, text = value.partition("=")
-        if not (key and sign):
-            self.fail(f"{value}: expected a name and a value, such as spp=16", param, context)
-        if key in RESERVED:
-            self.fail(f"{key}: Mitsuba reserves this name; rename it in the scene", param)
-        return key, text
+def definition(text: str) -> tuple[str, str]:
+    """Parse a parameter of a scene and its value, as in "spp=16"."""
+    key, sign, value = text.partition("=")
+    if not (key and sign):
+        raise click.BadParameter(f"{text}: expected a name and a value, such as spp=16")
+    return key, value
 
 
+variant_option = options.value(
+    "--variant",
+    "NAME",
+    str,
+    "Mitsuba variant.  [default: cuda_ad_rgb with a GPU, else llvm_ad_rgb]",
+)
+many: Any = {"multiple": True, "callback": lambda context, option, given: dict(given)}
 definitions_option = click.option(
-    "-D",
-    "definitions",
-    multiple=True,
-    type=Definition(),
-    help="Set a <default> of the scene; repeat for more.",
+    "-D", "definitions", type=definition, metavar="KEY=VALUE", help="Set a <default>.", **many
 )
 
 
 @click.command()
 @click.argument("scenes", nargs=-1, required=True, type=options.EXISTING, metavar="SCENE.xml...")
-@options.output(".png or .exr file, or a folder.")
-@click.option(
-    "--variant",
-    metavar="NAME",
-    help="Mitsuba variant.  [default: cuda_ad_rgb if there is a GPU, else llvm_ad_rgb]",
-)
+@options.output(".png or .exr file, or a folder.", "OUT")
+@variant_option
 @options.number("--spp", "Samples per pixel.  [default: from the scene]", least=1)
 @definitions_option
-@options.quiet_option
+@options.shared("quiet")
 def scene(
+    run: options.Run,
     scenes: tuple[Path, ...],
     output: Path,
     variant: str | None,
     spp: int | None,
-    definitions: tuple[tuple[str, str], ...],
-    quiet: bool,
+    definitions: dict[str, str],
 ) -> None:
     """Render Mitsuba scenes with Gaussian textures.
 
@@ -94,21 +84,29 @@ def scene(
     """
     outputs = name_outputs(scenes, output, SUFFIXES)
     check_outputs(outputs, scenes)
-    mi = load_mitsuba(variant, quiet)
+    mi = load_mitsuba(variant, run.quiet)
+    from ..scene.convert import render_in_passes
+
     for path, target in zip(scenes, outputs, strict=True):
         started = time.perf_counter()
-        with explained(path), bar(quiet) as show:
-            pixels, samples = _render(mi, path, spp, dict(definitions), partial(show, str(path)))
+        with explained(path), bar(run.quiet) as show:
+            found = mi.load_file(str(path), **definitions)
+            if not isinstance(found, mi.Scene):
+                raise ValueError(
+                    "the file holds no scene; its root must be <scene version='3.0.0'>"
+                )
+            if not found.sensors():
+                raise ValueError("the scene has no sensor; add one")
+            pixels, samples = render_in_passes(found, 0, spp, partial(show, str(path)))
         _write(mi, target, pixels)
-        if not quiet:
-            height, width = pixels.shape[:2]
-            click.echo(
-                f"{path}: {width}x{height}, samples per pixel: {samples}, "
-                f"{time.perf_counter() - started:.1f} s\n  wrote {target}"
-            )
+        height, width = pixels.shape[:2]
+        run.tell(
+            f"{path}: {width}x{height}, samples per pixel: {samples}, "
+            f"{time.perf_counter() - started:.1f} s\n  wrote {target}"
+        )
 
 
-def load_mitsuba(variant: str | None, quiet: bool) -> Any:
+def load_mitsuba(variant: str | None, quiet: bool) -> ModuleType:
     """Import Mitsuba, set a variant and register the plugins."""
     backend = variant.partition("_")[0] if variant else None
     module = select(backend if backend in ("llvm", "cuda") else None)
@@ -130,21 +128,7 @@ def load_mitsuba(variant: str | None, quiet: bool) -> Any:
     return mi
 
 
-def _render(
-    mi: Any, path: Path, spp: int | None, parameters: dict[str, str], show: Callable[..., None]
-) -> tuple[Any, int]:
-    """Render a scene in passes; return its pixels, shape (H, W, C), and the samples per pixel."""
-    from ..scene.convert import render_in_passes
-
-    scene = mi.load_file(str(path), **parameters)
-    if not isinstance(scene, mi.Scene):
-        raise ValueError("the file holds no scene; its root must be <scene version='3.0.0'>")
-    if not scene.sensors():
-        raise ValueError("the scene has no sensor; add one")
-    return render_in_passes(scene, 0, spp, show)
-
-
-def _write(mi: Any, path: Path, pixels: Any) -> None:
+def _write(mi: ModuleType, path: Path, pixels: NDArray[np.float32]) -> None:
     """Write a picture, all or nothing."""
     if path.suffix.lower() == ".png":
         channels = pixels.shape[2] if pixels.shape[2] <= 4 else 3  # AOVs follow the colours
@@ -171,14 +155,12 @@ def explained(path: Path) -> Iterator[None]:
         while cause.__cause__:  # the outer error of Dr.Jit only says "see above"
             cause = cause.__cause__
         if isinstance(cause, KeyboardInterrupt):
-            raise click.Abort from error
+            raise KeyboardInterrupt from error
         text = re.sub(r"\[\w+\.cpp:\d+\] ", "", str(cause))
         # For an error in a plugin, Mitsuba prints the whole traceback; its last line says why.
         where, _, trace = text.partition("Traceback (most recent call last):")
         if trace:
             text = where + re.sub(r"^\w+: (\[Errno \d+\] )?", "", trace.strip().splitlines()[-1])
-        if MADE in text:
-            text += "; run 'make scenes' first, which makes the sets of these scenes"
         raise ValueError(f"{path}: {text or type(cause).__name__}") from error
 
 
@@ -186,34 +168,22 @@ def explained(path: Path) -> Iterator[None]:
 @click.argument("scene", type=options.EXISTING, metavar="SCENE.xml")
 @options.output("New or empty folder.", "FOLDER")
 @click.option(
-    "--target-psnr",
-    "--psnr",
-    "target_psnr",
-    type=float,
-    default=40.0,
-    metavar="DB",
-    help="With which each camera sees each texture.",
+    "--target-psnr", "--psnr", "target_psnr", metavar="DB", default=40.0, help="As cameras see it."
 )
 @options.number("--iterations", "Steps of optimisation for each number of Gaussians.", 100, 0)
-@options.number(
-    "--spp", "Samples per pixel; 0 renders nothing.  [default: from the scene]", least=0
-)
-@click.option("--variant", metavar="NAME", help="Mitsuba variant, as for eigengs-dr scene.")
+@options.number("--spp", "Samples a pixel; 0 renders nothing.  [default: from the scene]", least=0)
+@variant_option
 @definitions_option
-@options.report_option
-@options.quiet_option
-@click.pass_context
+@options.shared("report", "quiet")
 def convert(
-    context: click.Context,
+    run: options.Run,
     scene: Path,
     output: Path,
     target_psnr: float,
     iterations: int,
     spp: int | None,
     variant: str | None,
-    definitions: tuple[tuple[str, str], ...],
-    report: Path | None,
-    quiet: bool,
+    definitions: dict[str, str],
 ) -> None:
     """Replace every bitmap of a Mitsuba scene by as many Gaussians as its cameras resolve.
 
@@ -221,7 +191,7 @@ def convert(
     after, and 8 times their difference. If a rendering misses the PSNR, the command says so and
     exits with code 1. Environment maps, alpha masks, bump maps, images of two values, values above
     1 and images that no camera sees stay as they are; the command says why. Other files stay where
-    they are, and the new scene names them relative to options.FOLDER.
+    they are, and the new scene names them relative to FOLDER.
 
     \b
     Examples:
@@ -229,51 +199,39 @@ def convert(
       eigengs-dr convert room.xml -o room-gaussians/ --target-psnr 36 --spp 64
       eigengs-dr scene room-gaussians/scene.xml -o room.png
     """
-    check_outputs([report], [scene])
-    mi = load_mitsuba(variant, quiet)
+    check_outputs([run.report], [scene])
+    mi = load_mitsuba(variant, run.quiet)
     from ..scene.convert import convert_scene
 
     started = time.perf_counter()
-    with explained(scene), bar(quiet) as show:
+    with explained(scene), bar(run.quiet) as show:
         found = convert_scene(
-            scene, output, target_psnr, iterations, spp, dict(definitions), progress=show
+            scene, output, target_psnr, iterations, spp, definitions, progress=show
         )
-    run = describe_run(context, mi.variant().partition("_")[0])
-    write_report(report, run | _figures(found))
-    if not quiet:
-        click.echo(_table(found))
-        click.echo(f"wrote {found.scene} in {time.perf_counter() - started:.1f} s")
+    before = sum(texture.bytes for texture in found.textures)
+    after = sum(texture.gaussian_bytes for texture in found.textures)
+    figures: dict[str, object] = {"output": found.scene, "bytes_before": before, "bytes": after}
+    figures["textures"] = [texture._asdict() for texture in found.textures]
+    figures["left"] = [{"name": name, "reason": reason} for name, reason in found.left]
+    figures["psnr_rgb"] = found.psnr
+    run.write_report(figures, mi.variant().partition("_")[0])
+    seconds = time.perf_counter() - started
+    run.tell(f"{_table(found, before, after)}\nwrote {found.scene} in {seconds:.1f} s")
     if any(psnr < target_psnr for psnr in found.psnr):
-        context.exit(MISSED)
+        run.context.exit(MISSED)
 
 
-def _figures(found: ConvertedScene) -> dict[str, Any]:
-    return {
-        "output": str(found.scene),
-        "textures": [texture._asdict() for texture in found.textures],
-        "left": [{"name": name, "reason": reason} for name, reason in found.left],
-        "bytes_before": sum(texture.bytes for texture in found.textures),
-        "bytes": sum(texture.gaussian_bytes for texture in found.textures),
-        "psnr_rgb": found.psnr,
-    }
-
-
-def _table(found: ConvertedScene) -> str:
+def _table(found: ConvertedScene, before: int, after: int) -> str:
     """Lay out the textures, what stayed, and how close the renderings are."""
     rows = [("texture", "texels", "bytes", "Gaussians", "bytes", "PSNR seen")]
     for t in found.textures:
-        size, psnr = f"{t.width}x{t.height}", f"{t.psnr:.1f} dB"
-        cells = size, f"{t.bytes:,}", f"{t.gaussians:,}", f"{t.gaussian_bytes:,}", psnr
-        rows.append((t.names[0], *cells))
+        figures = f"{t.bytes:,}", f"{t.gaussians:,}", f"{t.gaussian_bytes:,}", f"{t.psnr:.1f} dB"
+        rows.append((t.names[0], f"{t.width}x{t.height}", *figures))
         rows += [(name, "(the same set)", "", "", "", "") for name in t.names[1:]]
     lines = table(rows)
-    if found.textures:
-        before = sum(t.bytes for t in found.textures)
-        after = sum(t.gaussian_bytes for t in found.textures)
+    if before:
         lines.append(f"memory: {after:,} of {before:,} bytes ({after / before:.3f})")
     lines += [f"left alone: {name}: {reason}" for name, reason in found.left]
-    lines += [
-        f"camera {k}: psnr_rgb {psnr:.1f} dB between the renderings"
-        for k, psnr in enumerate(found.psnr, 1)
-    ]
+    psnrs = enumerate(found.psnr, 1)
+    lines += [f"camera {k}: psnr_rgb {psnr:.1f} dB between the renderings" for k, psnr in psnrs]
     return "\n".join(lines)

@@ -8,7 +8,7 @@ import click
 from ..backend.selection import select
 from . import options
 from .console import INTERRUPTED, bar, open_cluster, say
-from .outputs import check_outputs, describe_run, name_outputs, name_pictures, write_report
+from .outputs import check_outputs, name_outputs, name_pictures
 
 FREQUENCY_AWARE: dict[str, bool | str] = {"auto": "auto", "yes": True, "no": False}
 """Values of the option, by the word on the command line."""
@@ -18,47 +18,22 @@ MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
 
 
 @click.command()
-@click.argument("folder", type=options.FOLDER, metavar="FOLDER")
+@click.argument("folder", type=options.folder, metavar="FOLDER")
 @options.output("Model to write.", "MODEL.npz")
-@click.option("--size", type=options.Size(), default="256x256", help="Crop and resize to this.")
-@click.option("--components", type=options.COUNTS, default=300, help="Limit, or one per channel.")
-@click.option(
-    "--energy",
-    type=click.FloatRange(0, 1, min_open=True),
-    metavar="SHARE",
-    help="Keep this share of variance.",
-)
-@click.option(
-    "--target-psnr",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="DB",
-    help="Keep the fewest for this mean PSNR.",
-)
+@options.value("--size", "WxH", options.size, "Crop and resize to this.", "256x256")
+@options.value("--components", "K|Y,CB,CR", options.counts, "Limit, or one per channel.", "300")
+@options.value("--energy", "SHARE", float, "Keep this share of variance.")
+@options.value("--target-psnr", "DB", float, "Keep the fewest for this mean PSNR.")
 @options.number("--gaussians", "Up to one per pixel.  [default: 5000]", least=1)
-@options.choice(
-    "--frequency-aware", list(FREQUENCY_AWARE), "Reserve a tenth for the first components."
-)
+@options.choice("--frequency-aware", FREQUENCY_AWARE, "Reserve a tenth for the first components.")
 @options.choice("--preset", ["default", "eigengs"], "Solve, or train (paper).")
 @options.number("--iterations", "Training steps.  [default: 0; eigengs: 15000]", least=0)
 @options.choice("--space", ["ycbcr", "rgb"], "Space of the components.")
-@options.seed_option
-@click.option("--preview", type=options.ANY_PATH, help="Picture of the components.")
-@options.cluster_option
-@options.backend_option
-@options.report_option
-@options.quiet_option
-@click.pass_context
+@options.number("--seed", "Seed of random numbers.", 0, least=0)
+@options.value("--preview", "FILE", options.path, "Picture of the components.")
+@options.shared("cluster", "backend", "report", "quiet")
 def train(
-    context: click.Context,
-    /,
-    folder: Path | str,
-    output: Path,
-    cluster: str | None,
-    backend: str | None,
-    preview: Path | None,
-    report: Path | None,
-    quiet: bool,
-    **settings: Any,
+    run: options.Run, folder: Path | str, output: Path, preview: Path | None, **choices: Any
 ) -> None:
     """Train a model on a folder of images, or on its URL.
 
@@ -85,39 +60,32 @@ def train(
 
     [output] = name_outputs([folder], output, [".npz"])
     [picture] = name_pictures([folder], preview)
-    check_outputs([output, picture, report], list_images(folder))
-    select(backend)
-    width, height = settings["size"]
-    settings["gaussians"] = settings["gaussians"] or default_count(width * height)
-    settings["frequency_aware"] = FREQUENCY_AWARE[settings["frequency_aware"]]
-    chosen = TrainOptions(**settings)
+    check_outputs([output, picture, run.report], list_images(folder))
+    select(run.backend)
+    width, height = options.check_pixels(*choices["size"])
+    choices["gaussians"] = choices["gaussians"] or default_count(width * height)
+    choices["frequency_aware"] = FREQUENCY_AWARE[choices["frequency_aware"]]
+    settings = TrainOptions(**choices)
     try:
-        with open_cluster(cluster) as client, bar(quiet) as show:
-            result = training.train(folder, output, chosen, backend, show, client)
+        with open_cluster(run.cluster) as client, bar(run.quiet) as show:
+            result = training.train(folder, output, settings, run.backend, show, client)
     except training.Interrupted as error:
         say(f"interrupted; {error}")
-        context.exit(INTERRUPTED)
+        run.context.exit(INTERRUPTED)
     if picture:
         save_image(picture, component_sheet(result.model, result.basis))
-    record = {"input": str(folder), "output": str(output), **dict.fromkeys(MEASURED)}
-    record |= result.figures
-    choices = vars(chosen) | {"most_components": chosen.components}
-    write_report(report, describe_run(context, backend) | choices | record)
-    if not quiet:
-        click.echo(_summary(record, picture))
-
-
-def _summary(record: dict[str, Any], preview: Path | None) -> str:
-    """Describe a training for a terminal."""
-    components = "+".join(map(str, record["components"]))
-    text = (
-        f"{record['input']}: {record['images']} images, {components} components, "
-        f"{record['gaussians']} Gaussians in {record['seconds']:.1f} s; "
-        f"{'split' if record['frequency_aware'] else 'not split'} ({record['split_reason']})\n  "
-    )
-    if record["psnr_pca"] is None:
-        text += "no image was held out, so no psnr was measured; use at least 10 images"
+    found: dict[str, Any] = dict.fromkeys(MEASURED) | result.figures
+    record = {"input": folder, "output": output, "most_components": settings.components} | found
+    run.write_report(vars(settings) | record)
+    components = "+".join(map(str, found["components"]))
+    split = "split" if found["frequency_aware"] else "not split"
+    if found["psnr_pca"] is None:
+        measured = "no image was held out, so no psnr was measured; use at least 10 images"
     else:
-        text += "held out: " + ", ".join(f"{name} {record[name]:.2f} dB" for name in MEASURED)
-    wrote = f"{record['output']} and {preview}" if preview else record["output"]
-    return f"{text}\n  wrote {wrote}"
+        measured = "held out: " + ", ".join(f"{name} {found[name]:.2f} dB" for name in MEASURED)
+    run.tell(
+        f"{folder}: {found['images']} images, {components} components, "
+        f"{found['gaussians']} Gaussians in {found['seconds']:.1f} s; "
+        f"{split} ({found['split_reason']})\n  {measured}\n"
+        f"  wrote {output}" + (f" and {picture}" if picture else "")
+    )

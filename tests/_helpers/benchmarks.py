@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from _helpers.families import family
 
@@ -12,7 +11,6 @@ pytest.importorskip("eigengs_bench", reason="pip install ./benchmarks")
 
 from eigengs_bench.names import SETS, ImageSet
 from eigengs_bench.rows import Task
-from eigengs_dr.cli.main import main
 from eigengs_dr.image.io import save_image
 
 RUN = {
@@ -25,11 +23,6 @@ RUN = {
     "commit": "a" * 40,
     "clean": True,
 }
-
-
-def run(*arguments):
-    """Call the program with its arguments."""
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def task_in(folder, backend=None, data=None, **settings):
@@ -47,7 +40,6 @@ def data(tmp_path, monkeypatch):
             path.mkdir(parents=True, exist_ok=True)
             save_image(path / f"{k:02}.png", image)
         monkeypatch.setitem(SETS, name, ImageSet(name, 32, 32, 60))
-    monkeypatch.setattr("eigengs_bench.images.MAX_COMPONENTS", 8)
     return folder
 
 

@@ -1,5 +1,6 @@
 """Descents under observation, programs in turns, sets of images and their models."""
 
+import time
 from functools import partial
 
 import numpy as np
@@ -10,7 +11,6 @@ from _helpers.families import family, small_model
 from eigengs_bench import clock, images
 from eigengs_bench.names import PRESETS as NAMES
 from eigengs_bench.names import SETS, ImageSet
-from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.start import initialize
@@ -26,26 +26,24 @@ def test_pictures_and_figures_are_those_of_fit(backend, preset):
     assert [m.iteration for m in moments] == [row["iteration"] for row in trace] == [0, 10, 20]
     for moment, row in zip(moments, trace, strict=True):
         scored = clock.score(moment, image)
-        assert all(scored[key] == row[key] for key in ("iteration", "psnr_rgb", "psnr_ycbcr"))
+        for key in ("psnr_rgb", "psnr_ycbcr"):  # the device sums in another order
+            assert scored[key] == pytest.approx(row[key], abs=1e-3)
     assert tuple(PRESETS) == NAMES
 
 
-def test_the_clock_starts_before_the_start_and_stops_for_the_observer(backend, monkeypatch):
-    """Every look at the clock is a second; the observer's looks are not counted."""
-    ticks = iter(range(1000))
-    monkeypatch.setattr(clock.time, "perf_counter", lambda: float(next(ticks)))
+def test_the_clock_starts_before_the_start_and_stops_for_the_observer(backend):
+    pause, began = 0.05, time.perf_counter()
 
     def start():
-        for _ in range(50):
-            next(ticks)
+        time.sleep(pause)
         return initialize(one_image(), FitOptions(gaussians=30, init="grid", backend=backend))
 
     seconds = []
     for moment in clock.follow(start, PRESETS["default"].schedule, 2, {0, 1, 2}):
         seconds.append(moment.seconds)
-        for _ in range(100):
-            next(ticks)
-    assert seconds == [51, 52, 53]
+        time.sleep(pause)
+    assert pause < seconds[0] < seconds[1] < seconds[2]
+    assert seconds[2] < time.perf_counter() - began - 3 * pause
 
 
 def test_rows_have_at_most_100_decibels():
@@ -75,13 +73,14 @@ def test_images_are_the_first_ones_at_the_size_of_their_set(tmp_path, monkeypatc
         images.images_of(task, "cars256")
 
 
-def test_models_are_trained_once_on_the_training_images(tmp_path, backend, data, monkeypatch):  # noqa: F811
+def test_models_are_trained_once_on_the_training_images(tmp_path, backend, data):  # noqa: F811
     arguments = (task_in(tmp_path, backend, data), "cats256", "natural256", 4, "rgb")
     model = images.model_for(*arguments, True)
     assert model.components == (4, 4, 4)
     assert len(model.gaussians) == 60 and model.low == 6 and model.gaussians.space == "rgb"
     expected = family(16, seed=1)[2:].mean(axis=(0, 1, 2))
     assert np.allclose(model.mean_image.mean(axis=(1, 2)), expected, atol=5e-3)
-    monkeypatch.setattr(Eigenbasis, "from_images", None)
+    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "models").iterdir()}
     images.model_for(*arguments, True)
     images.model_for(*arguments)  # another model of the same basis
+    assert files.items() <= {p: p.stat().st_mtime_ns for p in files}.items() and len(files) == 2

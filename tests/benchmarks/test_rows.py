@@ -7,7 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from _helpers.benchmarks import RUN, moment, row, run, task_in
+from _helpers.benchmarks import RUN, row, task_in
+from _helpers.command import assert_refused, run, succeeded
 from eigengs_bench import report as fr
 from eigengs_bench import rows
 
@@ -57,15 +58,6 @@ def test_a_line_that_was_cut_short_is_measured_again(tmp_path):
     assert done == ["a", "b", "b"]
 
 
-def test_what_was_measured_before_an_interrupt_is_kept(tmp_path):
-    def stop():
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        task_in(tmp_path).measure("it", [*jobs([], "a"), ({"image": "b"}, stop)])
-    assert [row["job"]["image"] for row in rows.read(tmp_path / rows.FILE)] == ["a"]
-
-
 def test_rows_of_two_machines_do_not_mix(tmp_path):
     task = task_in(tmp_path)
     task.measure("it", jobs([], "a"))
@@ -98,20 +90,18 @@ def git(folder, *arguments):
     subprocess.run(["git", "-C", folder, *identity, *arguments], check=True, capture_output=True)
 
 
-def test_the_commit_is_that_of_the_package(tmp_path, monkeypatch):
+def test_the_commit_is_that_of_the_package(tmp_path):
     package = tmp_path / "eigengs_dr"
     package.mkdir()
     (package / "__init__.py").touch()
-    spec = type("Spec", (), {"origin": str(package / "__init__.py")})
-    monkeypatch.setattr(rows, "find_spec", lambda name: spec)
-    assert rows.code_state() == {"commit": None, "clean": None}  # no git
+    assert rows.code_state(package) == {"commit": None, "clean": None}  # no git
     git(tmp_path, "init")
     git(tmp_path, "add", ".")
     git(tmp_path, "commit", "-m", "one")
-    state = rows.code_state()
+    state = rows.code_state(package)
     assert len(state["commit"]) == 40 and state["clean"] is True
     (package / "__init__.py").write_text("1")
-    assert rows.code_state() == {"commit": state["commit"], "clean": False}
+    assert rows.code_state(package) == {"commit": state["commit"], "clean": False}
 
 
 def test_memory_is_that_of_a_process_alone():
@@ -124,64 +114,30 @@ def test_cells():
     assert fr.number(None) == fr.number(float("nan")) == "-"
     assert fr.number(12345.678, 2) == "12,345.68" and fr.number(float("inf")) == "inf"
     assert fr.mean(pd.Series([1.0, 3.0, None]), 2) == "2.00 (1 failed)"
-    assert fr.median(pd.Series([1.0, 2.0, 9.0])) == "2.00"
     assert fr.extent(pd.Series([12.0, 37.0, 55.0]), 0) == "12 to 55"
-    assert (fr.counted(pd.Series([1, 1])), fr.counted(pd.Series([1, 2]))) == ("1 image", "2 images")
-    shown = fr.table("It", ("name", "dB"), [("one", "1.00"), ("eleven", "11.50")])
-    assert fr.as_text(shown).split("\n")[2] == "name       dB"
     assert fr.as_text(fr.table("It", ("name",), [])) == "It: none"
     assert fr.smallest({100: 30.0, 400: 34.0}, 32.0) == pytest.approx(200)
     assert np.isnan(fr.smallest({100: 30.0, 400: 34.0}, 35.0))
 
 
-def test_lists_in_rows_become_lines():
-    made = [row({"image": "a"}, moments=[moment(0, 30.0), moment(9, None)]), row({})]
-    frame = fr.frame_of(made, "moments")
-    assert list(frame.iteration) == [0, 9] and set(frame.image) == {"a"}
-    assert frame.psnr_ycbcr.isna().tolist() == [False, True]
-
-
 def test_the_report_has_what_rows_answer(tmp_path):
-    told = run("bench", "report", tmp_path, "-o", tmp_path / "out")
-    assert told.exit_code == 2 and "holds no rows" in told.stderr
+    report = ("bench", "report", tmp_path, "-o", tmp_path / "out")
+    assert_refused(run(*report), "holds no rows")
     job = {"image": "a", "gaussians": 5000, "iterations": 1000, "timed": True}
     figures = {"psnr_float": 33.0, "psnr_rgb": 32.9, "ms_ssim": 0.9, "seconds": 9.0}
     task_in(tmp_path).measure("kodak", [(job, lambda: figures)])
-    assert run("bench", "report", tmp_path, "-o", tmp_path / "out").exit_code == 0
+    succeeded(run(*report))
     text = (tmp_path / "out" / "README.md").read_text()
     assert "| 5,000" in text and "33.00" in text and "GaussianImage" in text
     assert "commit aaaaaaaaa" in text and "a CPU" in text
     assert (tmp_path / "out" / "kodak-gaussians.svg").read_bytes()[:5] == b"<?xml"
 
 
-def test_help_loads_nothing_slow():
-    code = """
-import sys
-from eigengs_dr.cli.main import main
-try:
-    main(["bench", "--help"])
-except SystemExit:
-    print([m for m in ("pandas", "matplotlib", "drjit") if m in sys.modules])
-"""
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.splitlines()[-1] == "[]" and "stability" in told.stdout
-
-
-def test_what_to_install_is_said_where_the_benchmarks_are_missing(monkeypatch):
-    monkeypatch.setattr("eigengs_dr.cli.main.entry_points", lambda **names: [])
-    for arguments in (["bench"], ["bench", "kernels"]):
-        told = run(*arguments)
-        assert told.exit_code == 2
-        assert told.stderr.count("\n") == 1 and "pip install ./benchmarks" in told.stderr
-    assert run("--help").exit_code == 0
-
-
 def test_mistakes_are_told_before_the_work(tmp_path):
     (tmp_path / "file").touch()
     for command in ("pareto", "rate", "number", "stability", "pictures", "tables"):
-        told = run("bench", command, "-o", tmp_path / "file")
-        assert told.exit_code == 2 and "is a file" in told.stderr
-    told = run("bench", "pareto", "-o", tmp_path / "out", "--set", "kodak")
-    assert told.exit_code == 2 and "needs DATA" in told.stderr
-    told = run("bench", "stability", "-o", tmp_path / "out", "--case", "nothing")
-    assert "case 'nothing' is unknown; use one of photo, constant" in told.stderr
+        assert_refused(run("bench", command, "-o", tmp_path / "file"), "File exists")
+    output = ["-o", tmp_path / "out"]
+    assert_refused(run("bench", "pareto", *output, "--set", "kodak"), "needs DATA")
+    said = "case 'nothing' is unknown; use one of photo, constant"
+    assert_refused(run("bench", "stability", *output, "--case", "nothing"), said)

@@ -1,4 +1,4 @@
-"""The command `fit`: results, reports, and one line and exit code 2 for every mistake."""
+"""The command `fit` of one image: results, reports, and one line for every mistake."""
 
 import json
 import shutil
@@ -12,90 +12,107 @@ import eigengs_dr as eg
 from _helpers.command import assert_refused, previewed, run, smooth_pixels, succeeded
 from _helpers.halves import picture
 from eigengs_dr.backend.selection import BackendError, select
-from eigengs_dr.fitting import fit as fit_module
+from eigengs_dr.cli.fit import DEFAULT_BASIS
+from eigengs_dr.cli.main import main
+from eigengs_dr.eigenbasis.eigengs import SHIPPED
+
+QUICK = ("--gaussians", 20, "--iterations", 1)
 
 
 def test_fit_says_what_it_did(fitted):
     folder, result = fitted
-    for word in ("50 Gaussians", "5 iterations", "psnr_ycbcr", "psnr_rgb", folder / "both.png"):
-        assert str(word) in result.stdout
+    for word in ("50 Gaussians", "5 iterations", "psnr_ycbcr", "psnr_rgb"):
+        assert word in result.stdout
+    photo, fit, outlines = previewed(folder / "both.png")
+    assert photo.shape == fit.shape == outlines.shape == (24, 32, 3)
+    assert np.array_equal(photo, smooth_pixels(32, 24))
+    assert np.abs(fit.astype(int) - photo).mean() < 30
+    assert outlines.mean() > fit.mean() + 20
+    assert f"{folder / 'both.png'} (photo, fit and outlines side by side)" in result.stdout
 
 
 def test_fit_report(fitted):
     folder, _ = fitted
     report = json.loads((folder / "fit.json").read_text())
     expected = {"gaussians": 50, "width": 32, "height": 24, "seed": 0, "stopped": "iterations"}
+    expected |= {"input": str(folder / "photo.png"), "output": str(folder / "fit.npz")}
     assert {key: report[key] for key in expected} == expected
-    assert report["input"] == str(folder / "photo.png")
-    assert report["output"] == str(folder / "fit.npz")
     assert report["command"].startswith("eigengs-dr fit ")
     assert "--iterations 5" in report["command"]
-    assert report["backend"] in ("llvm", "cuda")
-    assert report["threads"] >= 1
-    assert report["versions"]["drjit"]
-    assert report["iterations"] == 5
+    assert report["backend"] in ("llvm", "cuda") and report["threads"] >= 1
+    assert report["versions"]["drjit"] and report["iterations"] == 5
     assert report["psnr_ycbcr"] > report["psnr_rgb"] > 15
-    assert 0 < report["ssim"] <= 1
-    assert 0 < report["ms_ssim"] <= 1
+    assert 0 < report["ssim"] <= 1 and 0 < report["ms_ssim"] <= 1
     assert 0 <= report["seconds_init"] <= report["seconds"]
+    assert report["seconds_load"] + report["seconds"] <= report["seconds_total"]
     assert {"iteration", "seconds", "psnr_ycbcr", "psnr_rgb"} <= set(report["trace"][-1])
 
 
-def test_fit_preview_is_photo_fit_and_outlines(fitted):
-    folder, result = fitted
-    photo, fit, outlines = previewed(folder / "both.png")
-    assert photo.shape == fit.shape == outlines.shape == (24, 32, 3)
-    assert np.array_equal(photo, smooth_pixels(32, 24))
-    assert np.abs(fit.astype(int) - photo).mean() < 30
-    assert outlines.mean() > fit.mean() + 20
-    assert "both.png (photo, fit and outlines side by side)" in result.stdout
+def test_the_report_of_an_exact_fit_has_no_infinity(tmp_path):
+    """Nor does a small image get more Gaussians than pixels, in the current folder by default."""
+    Image.new("RGB", (6, 4)).save(tmp_path / "x.png")
+    report = tmp_path / "r.json"
+    command = ["fit", tmp_path / "x.png", "-o", tmp_path, "--iterations", 0, "--report", report]
+    assert succeeded(run(*command, "--quiet")).output == ""
+    assert json.loads(report.read_text())["psnr_rgb"] is None
+    assert len(eg.Gaussians.load(tmp_path / "x.npz")) == 24
 
 
-def test_quiet(photo, tmp_path):
-    result = run(
-        "fit", photo, "-o", tmp_path / "x.npz", "--gaussians", 9, "--iterations", 1, "--quiet"
-    )
-    assert succeeded(result).output == ""
+def test_a_note_is_one_line(tmp_path):
+    Image.fromarray(smooth_pixels(20, 12, 4), "RGBA").save(tmp_path / "x.png")
+    said = succeeded(run("fit", tmp_path / "x.png", "-o", tmp_path / "x.npz", *QUICK)).stderr
+    assert said.startswith("eigengs-dr: note: ") and said.count("\n") == 1 and "white" in said
 
 
-def test_fit_uses_at_most_one_gaussian_a_pixel_by_default(tmp_path):
-    Image.fromarray(smooth_pixels(6, 4)).save(tmp_path / "small.png")
-    arguments = ["-o", tmp_path / "x.npz", "--iterations", 0]
-    succeeded(run("fit", tmp_path / "small.png", *arguments))
-    info = json.loads(run("info", tmp_path / "x.npz", "--json").stdout)
-    assert info["gaussians"] == 24
+MISTAKES = {
+    "few": (["--gaussians", 0], ["gaussians"]),
+    "text": (["--gaussians", "many"], ["gaussians"]),
+    "many": (["--gaussians", 1025], ["photo.png: gaussians is 1025"]),
+    "steps": (["--iterations", -1], ["iterations"]),
+    "init": (["--init", "nowhere"], ["init"]),
+    "seed": (["--seed", -1], ["seed"]),
+    "both": (["--target-psnr", 30, "--gaussians", 9], ["exclude each other"]),
+    "space alone": (["--target-space", "ycbcr"], ["belong to target_psnr"]),
+    "most alone": (["--max-gaussians", 50], ["belong to target_psnr"]),
+    "levels": (["--gaussians", 64, "--levels", 9], ["photo.png: levels is 9"]),
+    "levels, init": (["--levels", 2, "--init", "grid"], ["levels"]),
+    "levels, target": (["--levels", 2, "--target-psnr", 30], ["levels"]),
+    "counts": (["--gaussians", 65, "--levels", "16,40,64"], ["16"]),
+    "signs": (["--levels", "16;40"], ["16;40: expected a number, or several"]),
+    "cluster": (["--cluster", "local"], ["--cluster takes several images"]),
+    "blocks, target": (["--blocks", 64, "--target-psnr", 30], ["--blocks needs", "--target-psnr"]),
+    "blocks, levels": (["--blocks", 64, "--levels", 2], ["--blocks needs", "--levels"]),
+    "blocks, preview": (["--blocks", 64, "--preview", "x.png"], ["--blocks needs", "--preview"]),
+    "blocks, init": (["--blocks", 64, "--init", "random"], ["--blocks needs"]),
+    "small blocks": (["--blocks", 5], ["at least 32"]),
+    "no blocks": (["--blocks", -1], ["at least 32"]),
+    "basis": (["--basis", "nowhere"], ["'nowhere'", "natural"]),
+    "basis, folder": (["--basis", "."], ["neither a file"]),
+    "no folder": (["-o", "gone/x.npz"], ["gone"]),
+    "no folder, report": (["--report", "gone/r.json"], ["gone"]),
+    "no folder, preview": (["--preview", "gone/p.png"], ["gone"]),
+    "a folder": (["--report", "."], ["is a folder"]),
+    "suffix": (["-o", "x.png"], ["x.png", ".npz"]),
+    "suffix of a picture": (["--preview", "p.txt"], [".png"]),
+    "twice": (["--report", "existing.npz"], ["existing.npz", "is written"]),
+    "the image": (["--preview", "photo.png"], ["photo.png", "is read"]),
+}
 
 
-def test_fit_several_images_into_folders(photo, tmp_path):
-    other = tmp_path / "other.png"
-    Image.fromarray(smooth_pixels(20, 30)).save(other)
-    settings = ["--gaussians", 20, "--iterations", 1, "--report", tmp_path / "r.json"]
-    folders = ["-o", tmp_path / "fits", "--preview", tmp_path / "previews"]
-    succeeded(run("fit", photo, other, *folders, *settings))
-    assert sorted(path.name for path in (tmp_path / "fits").glob("*.npz")) == [
-        "other.npz",
-        "photo.npz",
-    ]
-    assert (tmp_path / "previews" / "other.png").exists()
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert [row["width"] for row in report["images"]] == [32, 20]
-    assert "versions" in report
+@pytest.mark.parametrize("case", MISTAKES)
+def test_mistakes(photo, existing, case, monkeypatch):
+    monkeypatch.chdir(existing.parent)
+    pixels = photo.read_bytes()
+    options, words = MISTAKES[case]
+    assert_refused(run("fit", "photo.png", "-o", existing, "--overwrite", *options), *words)
+    assert photo.read_bytes() == pixels
 
 
-@pytest.mark.parametrize(
-    ("option", "value", "word"),
-    [
-        ("--gaussians", 0, "gaussians"),
-        ("--gaussians", -5, "gaussians"),
-        ("--gaussians", "many", "gaussians"),
-        ("--gaussians", 1025, "1025"),
-        ("--iterations", -1, "iterations"),
-        ("--init", "nowhere", "init"),
-        ("--seed", -1, "seed"),
-    ],
-)
-def test_bad_settings(photo, existing, option, value, word):
-    assert_refused(run("fit", photo, "-o", existing, "--overwrite", option, value), word)
+@pytest.mark.parametrize("content", [None, b"", b"this is text, not a picture\n"])
+def test_files_that_are_no_images(tmp_path, existing, content):
+    if content is not None:
+        (tmp_path / "x.png").write_bytes(content)
+    assert_refused(run("fit", tmp_path / "x.png", "-o", existing, "--overwrite"), "x.png")
 
 
 def test_cuda_without_gpu(photo, existing):
@@ -108,31 +125,42 @@ def test_cuda_without_gpu(photo, existing):
         pytest.skip("this machine has a GPU")
 
 
-def test_interrupted_fit_is_kept(photo, tmp_path, monkeypatch):
-    complete = fit_module.fit_image
+@pytest.fixture
+def interrupts(photo, tmp_path):
+    """What Ctrl-C raises: functions of the library, their errors and what the command says."""
+    kept = replace(eg.fit(photo, 20, iterations=1), stopped="interrupted")
+    rows = eg.fit_many([smooth_pixels(32, 32)] * 2, gaussians=20, iterations=1)
+    out = tmp_path / "x.npz"
+    return {
+        "early": ("fit", KeyboardInterrupt(), "interrupted"),
+        "whole": ("fit", eg.FitInterrupted(kept), f"interrupted; the best fit so far is in {out}"),
+        "many": ("fit_many", eg.RunInterrupted(rows[:1]), "interrupted; 1 of 2 images are done"),
+        "blocks": ("fit_large", KeyboardInterrupt(), f"interrupted; finished blocks are in {out}"),
+    }
+
+
+@pytest.mark.parametrize("case", ["early", "whole", "many", "blocks"])
+def test_interrupts(photo, tmp_path, interrupts, case, monkeypatch):
+    function, error, words = interrupts[case]
 
     def interrupted(*arguments, **settings):
-        result = complete(*arguments, **settings)
-        raise eg.FitInterrupted(replace(result, stopped="interrupted"))
+        raise error
 
-    monkeypatch.setattr(fit_module, "fit_image", interrupted)
-    settings = ["--gaussians", 20, "--iterations", 1, "--report", tmp_path / "r.json"]
-    result = run("fit", photo, "-o", tmp_path / "x.npz", *settings)
-    assert result.exit_code == 130
-    assert result.stderr.count("\n") == 1
-    assert "interrupted" in result.stderr
-    assert json.loads((tmp_path / "r.json").read_text())["stopped"] == "interrupted"
-    assert succeeded(run("info", tmp_path / "x.npz"))
-
-
-def test_interrupted_before_there_is_a_fit(photo, existing, monkeypatch):
-    def interrupted(*arguments, **settings):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(fit_module, "fit_image", interrupted)
-    result = run("fit", photo, "-o", existing, "--overwrite")
-    assert result.exit_code == 130
-    assert result.stderr.strip() == "eigengs-dr: interrupted"
+    monkeypatch.setattr(eg, function, interrupted)
+    shutil.copy(photo, tmp_path / "b.png")
+    images, out = [photo], tmp_path / "x.npz"
+    if case == "many":
+        images, out = [photo, tmp_path / "b.png"], tmp_path / "out"
+    blocks = ["--blocks", 32] if case == "blocks" else []
+    told = run("fit", *images, "-o", out, *blocks, "--report", tmp_path / "r.json")
+    assert told.exit_code == 130
+    assert told.stderr.strip().startswith(f"eigengs-dr: {words}")
+    assert told.stderr.strip().count("\n") == 0
+    if case == "whole":
+        assert json.loads((tmp_path / "r.json").read_text())["stopped"] == "interrupted"
+        assert len(eg.Gaussians.load(out)) == 20
+    if case == "many":
+        assert len(json.loads((tmp_path / "r.json").read_text())["images"]) == 1
 
 
 def test_command_finds_few_or_says_that_it_cannot(tmp_path):
@@ -144,95 +172,12 @@ def test_command_finds_few_or_says_that_it_cannot(tmp_path):
     told = json.loads(report.read_text())
     assert told["stopped"] == "met" and told["psnr_rgb"] >= 26
     assert told["gaussians"] == len(eg.Gaussians.load(out))
-
     result = run(*base, "--target-psnr", 60, "--max-gaussians", 50)
     assert result.exit_code == 1
     assert "60 dB psnr_rgb are out of reach: 50 Gaussians have" in result.stderr
     assert len(eg.Gaussians.load(out)) == 50
-
     assert run(*base, "--target-psnr", 26, "--target-space", "ycbcr").exit_code == 0
     assert json.loads(report.read_text())["psnr_ycbcr"] >= 26
-
-    for option in (
-        ("--target-space", "ycbcr"),
-        ("--max-gaussians", 50),
-        ("--levels", 2, "--target-space", "ycbcr"),
-    ):
-        alone = run(*base, *option)
-        assert alone.exit_code == 2 and "belong to target_psnr" in alone.stderr
-
-    both = run(*base, "--target-psnr", 30, "--gaussians", 9)
-    assert both.exit_code == 2
-    assert "exclude each other" in both.stderr
-
-
-# --- What one would try first -------------------------------------------------------------------
-
-QUICK = ("--gaussians", 20, "--iterations", 1)
-
-
-def test_without_output_the_current_folder_is_used(photo, tmp_path, monkeypatch):
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
-    succeeded(run("fit", photo, *QUICK))
-    assert len(eg.Gaussians.load(tmp_path / "here" / "photo.npz")) == 20
-
-
-def test_a_folder_is_fitted(photo, tmp_path):
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for name in ("a.png", "b.png"):
-        shutil.copy(photo, folder / name)
-    succeeded(run("fit", folder, "-o", tmp_path / "fits", *QUICK))
-    assert sorted(p.name for p in (tmp_path / "fits").iterdir()) == [
-        "a.npz",
-        "b.npz",
-        "manifest.jsonl",
-    ]
-
-
-def test_a_folder_of_one_image_is_fitted(photo, tmp_path):
-    folder, report = tmp_path / "photos", tmp_path / "r.json"
-    folder.mkdir()
-    shutil.copy(photo, folder / "a.png")
-    outputs = ["-o", tmp_path / "fits", "--preview", tmp_path / "previews", "--report", report]
-    succeeded(run("fit", folder, *outputs, *QUICK))
-    assert sorted(p.name for p in (tmp_path / "fits").iterdir()) == ["a.npz", "manifest.jsonl"]
-    assert [p.name for p in (tmp_path / "previews").iterdir()] == ["a.png"]
-    assert len(json.loads(report.read_text())["images"]) == 1
-
-
-def test_several_images_are_not_written_to_a_file(photo, tmp_path):
-    other = tmp_path / "other.png"
-    shutil.copy(photo, other)
-    assert_refused(run("fit", photo, other, "-o", tmp_path / "out.npz", *QUICK), "need a folder")
-    assert not (tmp_path / "out.npz").exists()
-
-
-def test_the_report_has_all_of_the_time(fitted):
-    report = json.loads((fitted[0] / "fit.json").read_text())
-    assert report["seconds_init"] <= report["seconds"] <= report["seconds_total"]
-    assert report["seconds_load"] + report["seconds"] <= report["seconds_total"]
-
-
-def test_a_bad_image_does_not_end_a_folder(photo, tmp_path):
-    """It is named at once, and in the report; the others are fitted."""
-    folder, report = tmp_path / "photos", tmp_path / "r.json"
-    folder.mkdir()
-    for name in ("a.png", "c.png"):
-        shutil.copy(photo, folder / name)
-    (folder / "b.png").write_text("no image")
-    result = run("fit", folder, "-o", tmp_path / "fits", "--report", report, *QUICK)
-    assert result.exit_code == 2
-    assert "b.png" in result.stderr and result.stderr.count("\n") == 1
-    assert sorted(p.name for p in (tmp_path / "fits").iterdir()) == [
-        "a.npz",
-        "c.npz",
-        "manifest.jsonl",
-    ]
-    images = json.loads(report.read_text())["images"]
-    assert [image["stopped"] for image in images] == ["iterations", "failed", "iterations"]
-    assert "b.png" in images[1]["error"]
 
 
 @pytest.mark.parametrize("options", [[], ["-o", "photo.npz"], ["--overwrite"], ["--blocks", 32]])
@@ -242,6 +187,7 @@ def test_a_model_is_never_replaced(trained, photo, tmp_path, monkeypatch, option
     before = (tmp_path / "photo.npz").read_bytes()
     reason = "photo.npz: exists and is no set of Gaussians; choose another name with -o"
     assert_refused(run("fit", photo, *options, *QUICK), reason)
+    assert_refused(run("fit", photo, "--basis", "photo.npz"), "photo.npz: is read too")
     assert (tmp_path / "photo.npz").read_bytes() == before
 
 
@@ -260,3 +206,65 @@ def test_a_result_is_kept(photo, tmp_path, monkeypatch, options):
     assert not (tmp_path / "r.json").exists()
     succeeded(run(*command, 2, "--overwrite"))
     assert (tmp_path / "photo.npz").read_bytes() != before
+
+
+# --- From an eigenbasis ---
+
+
+def test_fit_from_an_eigenbasis(trained, photo, tmp_path):
+    file, report = trained[0] / "m.npz", tmp_path / "r.json"
+    command = ["fit", photo, "-o", tmp_path / "x.npz", "--basis", file, "--report", report]
+    succeeded(run(*command, "--iterations", 30))
+    told, image = json.loads(report.read_text()), eg.load_image(photo)
+    assert (told["gaussians"], told["basis"]) == (60, str(file))
+    model = eg.EigenGS.load(file)
+    encoded = eg.psnr(image, eg.render(model.encode(image)).numpy(), space="ycbcr")
+    assert told["trace"][0]["psnr_ycbcr"] == pytest.approx(encoded, abs=0.1)
+    assert told["psnr_ycbcr"] > encoded
+    for options, words in (
+        (["--gaussians", 50], ["50", "60"]),
+        (["--space", "rgb"], ["'rgb'", "'ycbcr'"]),
+        (["--init", "grid"], ["start"]),
+        (["--basis", tmp_path / "x.npz"], ["eigengs_dr.gaussians"]),
+    ):
+        assert_refused(run(*command, "--overwrite", *options), *words)
+    [option] = [p for p in main.commands["fit"].params if p.name == "basis"]
+    assert DEFAULT_BASIS in SHIPPED and DEFAULT_BASIS in option.help
+
+
+def test_the_papers_form_lacks_the_mean_image(trained, photo, tmp_path):
+    folder, _ = trained
+    options = ["--preset", "eigengs", "--basis", folder / "m.npz", "--iterations", 2]
+    outputs = ["-o", tmp_path / "x.npz", "--preview", tmp_path / "both.png"]
+    result = succeeded(run("fit", photo, *outputs, *options))
+    assert result.stderr.count("\n") == 1 and "note: " in result.stderr
+    assert "mean image stays in the basis" in result.stderr
+    _, fit, _ = previewed(tmp_path / "both.png")
+    saved = eg.render(eg.Gaussians.load(tmp_path / "x.npz")).numpy()
+    assert np.abs(np.clip(saved, 0, 1) * 255 - fit).mean() > 20  # the preview has it
+
+
+# --- Levels of detail ---
+
+
+def test_levels(photo, tmp_path):
+    fitted, small, page, report = (tmp_path / f"a.{end}" for end in ("npz", "egs", "html", "json"))
+    base = ["fit", photo, "-o", fitted, "--overwrite", "--quiet", "--iterations", 5]
+    succeeded(run(*base, "--gaussians", 64, "--levels", 2))
+    succeeded(run("pack", fitted, "-o", small, "--levels", 2))
+    assert json.loads(run("info", small, "--json").stdout)["sections"] == [16, 48]
+    out = tmp_path / "b.png"
+    succeeded(run("render", fitted, "-o", out, "--first", 16))
+    expected = eg.picture_of(eg.Gaussians.load(fitted)[:16]).clip(0, 1)
+    assert np.abs(eg.load_image(out) - expected).max() < 0.003
+    said = "--first is 65; the file has 64 Gaussians"
+    assert_refused(run("render", fitted, "-o", out, "--first", 65), said)
+
+    succeeded(run(*base, "--levels", "16,40,64", "--report", report))
+    assert json.loads(report.read_text())["levels"] == [16, 40, 64]
+    succeeded(run("pack", fitted, "-o", small, "--levels", "16,40,64"))
+    assert json.loads(run("info", small, "--json").stdout)["sections"] == [16, 24, 24]
+    succeeded(run("view", fitted, "-o", page, "--levels", "16,40,64"))
+    assert '"levels": [16, 40, 64]' in page.read_text()
+    assert_refused(run("pack", fitted, "-o", small, "--levels", "16,40"), "levels 16, 40")
+    assert_refused(run("view", fitted, "-o", page, "--levels", "40,16,64"), "levels 40, 16, 64")

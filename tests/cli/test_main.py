@@ -1,44 +1,48 @@
-"""The help of all commands."""
+"""The help of all commands, and the program around them."""
 
 import subprocess
 import sys
 
 import pytest
 
-from _helpers.command import run, succeeded
+from _helpers.command import run, said
+from _helpers.process import run_python
 from eigengs_dr.cli.main import main
 
 
-@pytest.mark.parametrize(
-    "command", [[], ["fit"], ["train"], ["render"], ["info"], ["doctor"], ["bench"]]
-)
+@pytest.mark.parametrize("command", [None, *main.commands])
 def test_help_has_an_example(command):
-    text = succeeded(run(*command, "--help")).stdout
-    assert "Example" in text
-    assert "eigengs-dr " + " ".join(command) in text
+    words = [command] if command else []
+    text = said(*words, "--help")
+    assert "Example" in text and " ".join(["eigengs-dr", *words]) in text
 
 
-def test_help_loads_nothing_heavy():
-    script = (
-        "import sys; from eigengs_dr.cli.main import main\n"
-        "try: main(['train', '--help'])\n"
-        "except SystemExit: print(*(n for n in ('drjit', 'scipy', 'PIL') if n in sys.modules))"
-    )
-    process = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert process.stdout.splitlines()[-1] == ""
-
-
-def test_render_says_what_it_wrote(fitted, tmp_path):
-    target = tmp_path / "y.png"
-    told = succeeded(run("render", fitted[0] / "fit.npz", "-o", target)).stdout
-    assert str(target) in told and "32x24" in told
-    assert succeeded(run("render", fitted[0] / "fit.npz", "-o", target, "--quiet")).stdout == ""
+@pytest.mark.parametrize("command", ["train", "bench"])
+def test_help_loads_nothing_heavy(command):
+    code = f"""
+import sys
+from eigengs_dr.cli.main import main
+try:
+    main(["{command}", "--help"])
+except SystemExit:
+    print(*(n for n in ("drjit", "scipy", "PIL", "pandas", "matplotlib") if n in sys.modules))
+"""
+    assert run_python(code).stdout.splitlines()[-1] == ""
 
 
 def test_python_m():
     command = [sys.executable, "-m", "eigengs_dr", "--help"]
     found = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "eigengs-dr fit" in found.stdout
+
+
+def test_what_to_install_is_said_where_the_benchmarks_are_missing(monkeypatch):
+    monkeypatch.setattr("eigengs_dr.cli.main.entry_points", lambda **names: [])
+    for arguments in (["bench"], ["bench", "kernels"]):
+        told = run(*arguments)
+        assert told.exit_code == 2
+        assert told.stderr.count("\n") == 1 and "pip install ./benchmarks" in told.stderr
+    assert run("--help").exit_code == 0
 
 
 def test_closed_standard_error(photo, tmp_path, monkeypatch):

@@ -1,21 +1,13 @@
 """Materials on the command line: fit --map, render --map, info, pack, and mistakes."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import eigengs_dr as eg
+from _helpers.command import assert_refused, run, said, succeeded
 from _helpers.materials import images
-from eigengs_dr.cli.main import main
-from eigengs_dr.fitting.fit import FitInterrupted
-
-
-def run(*arguments):
-    """Call the program with its arguments."""
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")
@@ -37,19 +29,17 @@ def maps(folder, *names):
 @pytest.fixture(scope="module")
 def fitted(folder):
     """The file of a fit, with a preview and a report."""
-    file = folder / "m.npz"
-    files = ("-o", file, "--preview", folder / "p.png", "--report", folder / "r.json")
-    settings = ("--gaussians", 8, "--iterations", 5)
-    result = run("fit", *maps(folder), *files, *settings)
-    assert result.exit_code == 0, result.output
-    assert "albedo in linear (channels: 3)" in result.output
-    return file
+    files = ("-o", folder / "m.npz", "--preview", folder / "p.png", "--report", folder / "r.json")
+    told = said("fit", *maps(folder), *files, "--gaussians", 8, "--iterations", 5)
+    assert "albedo in linear (channels: 3)" in told
+    return folder / "m.npz"
 
 
 def test_fit(fitted, folder):
     report = json.loads((folder / "r.json").read_text())
     assert [m["name"] for m in report["maps"]] == ["albedo", "roughness", "normal"]
     assert report["gaussians"] == 8 and report["trace"][0]["maps"]["normal"]["psnr_rgb"] > 10
+    assert report["input"]["albedo"] == str(folder / "albedo.png")
     material = eg.Gaussians.load(fitted)
     for m in report["maps"]:
         psnr = eg.psnr(images(24)[m["name"]], eg.picture_of(material)[m["name"]])
@@ -58,117 +48,81 @@ def test_fit(fitted, folder):
 
 
 def test_render(fitted, tmp_path):
-    result = run("render", fitted, "-o", tmp_path / "r.png", "--map", "roughness", "--quiet")
-    assert result.exit_code == 0, result.output
-    found = eg.load_image(tmp_path / "r.png", keep_grey=True)
+    target = tmp_path / "r.png"
+    assert said("render", fitted, "-o", target, "--map", "roughness", "--quiet") == ""
     expected = eg.picture_of(eg.Gaussians.load(fitted))["roughness"]
+    found = eg.load_image(target, keep_grey=True)
     np.testing.assert_allclose(found, np.clip(expected, 0, 1), atol=1 / 255)
 
 
 def test_info(fitted, tmp_path):
-    facts = json.loads(run("info", fitted, "--json", "--preview", tmp_path / "p.png").output)
+    facts = json.loads(said("info", fitted, "--json", "--preview", tmp_path / "p.png"))
     assert (facts["kind"], facts["gaussians"], facts["channels"]) == ("material", 8, 7)
-    assert [(m["name"], m["space"]) for m in facts["maps"]] == [
-        ("albedo", "linear"),
-        ("roughness", "data"),
-        ("normal", "normal"),
-    ]
+    spaces = {"albedo": "linear", "roughness": "data", "normal": "normal"}
+    assert {m["name"]: m["space"] for m in facts["maps"]} == spaces
     assert eg.load_image(tmp_path / "p.png").shape[0] == 24
-    text = run("info", fitted).output
+    text = said("info", fitted)
     assert "roughness" in text and "weight" in text
 
 
 def test_pack(fitted, folder, tmp_path):
     target = tmp_path / "m.egs"
-    result = run("pack", fitted, "-o", target, *maps(folder), "--max-psnr-drop", 3)
-    assert result.exit_code == 0, result.output
-    assert "roughness" in result.output
-    facts = json.loads(run("info", target, "--json").output)
+    assert "roughness" in said("pack", fitted, "-o", target, *maps(folder), "--max-psnr-drop", 3)
+    facts = json.loads(said("info", target, "--json"))
     assert (facts["kind"], facts["gaussians"], len(facts["maps"])) == ("material", 8, 3)
-    result = run("render", target, "-o", tmp_path / "n.png", "--map", "normal", "--quiet")
-    assert result.exit_code == 0, result.output
+    succeeded(run("render", target, "-o", tmp_path / "n.png", "--map", "normal"))
 
 
-def test_an_interrupted_fit_is_kept(folder, tmp_path, monkeypatch):
-    result = replace(eg.fit(images(24), 5, iterations=0), stopped="interrupted")
-
-    def pressed(*arguments, **settings):
-        raise FitInterrupted(result)
-
-    monkeypatch.setattr("eigengs_dr.fit", pressed)
-    result_of_run = run("fit", *maps(folder), "-o", tmp_path / "m.npz", "--gaussians", 9)
-    assert result_of_run.exit_code == 130
-    assert "interrupted; the best fit so far" in result_of_run.output
-    assert len(eg.Gaussians.load(tmp_path / "m.npz")) == 5
-
-
-def test_a_result_is_kept(fitted, folder, tmp_path):
-    """A material, as a set, and what is no material is never replaced."""
-    file, set_file = tmp_path / "m.npz", tmp_path / "set.npz"
-    file.write_bytes(fitted.read_bytes())
+def test_what_is_no_material_is_never_replaced(fitted, folder, tmp_path):
+    set_file = tmp_path / "set.npz"
     eg.Gaussians.load(fitted)["albedo"].save(set_file)
-    command = ["fit", *maps(folder), "--gaussians", 9, "--iterations", 1, "-o"]
-    again = run(*command, file)
-    assert again.exit_code == 0 and file.read_bytes() == fitted.read_bytes()
-    assert again.stderr == f"eigengs-dr: {file}: exists and is kept; --overwrite fits it again\n"
     before = set_file.read_bytes()
-    other = run(*command, set_file, "--overwrite")
-    assert other.exit_code == 2 and set_file.read_bytes() == before
-    assert "set.npz: exists and is no material; choose another name with -o" in other.stderr
-    assert run(*command, file, "--overwrite").exit_code == 0
-    assert len(eg.Gaussians.load(file)) == 9
+    reason = "set.npz: exists and is no material; choose another name with -o"
+    assert_refused(run("fit", *maps(folder), "-o", set_file, "--overwrite"), reason)
+    assert set_file.read_bytes() == before
+    kept = run("fit", *maps(folder), "-o", fitted)
+    assert kept.exit_code == 0 and f"{fitted}: exists and is kept" in kept.stderr
 
 
 def test_out_of_reach(folder, tmp_path):
     settings = ("--target-psnr", 90, "--max-gaussians", 20, "--iterations", 5)
     result = run("fit", *maps(folder, "albedo"), "-o", tmp_path / "m.npz", *settings)
-    assert (
-        result.exit_code == 1
-        and "90 dB psnr_rgb are out of reach: 20 Gaussians have" in result.output
-    )
+    assert result.exit_code == 1
+    assert "90 dB psnr_rgb are out of reach: 20 Gaussians have" in result.output
     assert (tmp_path / "m.npz").exists()
 
 
+FIT = ["fit", "--map", "albedo={0}/albedo.png", "-o", "x.npz"]
 MISTAKES = {
-    "size": (["--map", "other={0}/other.png"], "differ in size: albedo 24x24, other 8x9"),
-    "name": (["--map", "1={0}/other.png"], "expected a name and a file"),
-    "no file": (["--map", "ao={0}/ao.png"], "no such file"),
-    "space": (["--map", "ao:hsv={0}/other.png"], "space 'hsv' is not in"),
-    "twice": (["--map", "albedo={0}/other.png"], "--map albedo is given twice"),
-    "an image": (["{0}/other.png"], "an image without a name"),
-    "colour": (["--space", "rgb"], "--space and --map exclude each other"),
-    "basis": (["--basis", "natural"], "--basis and --map exclude each other"),
-    "suffix": (["-o", "x.egs"], "the name must end in .npz"),
+    "size": ([*FIT, "--map", "b={0}/other.png"], "differ in size: albedo 24x24, b 8x9"),
+    "name": ([*FIT, "--map", "1={0}/other.png"], "expected a name and a file"),
+    "no file": ([*FIT, "--map", "ao={0}/ao.png"], "no such file"),
+    "space": ([*FIT, "--map", "ao:hsv={0}/other.png"], "space 'hsv' is not in"),
+    "twice": ([*FIT, "--map", "albedo={0}/other.png"], "--map albedo is given twice"),
+    "an image": ([*FIT, "{0}/other.png"], "an image without a name"),
+    "colour": ([*FIT, "--space", "rgb"], "--space and --map exclude each other"),
+    "basis": ([*FIT, "--basis", "natural"], "--basis and --map exclude each other"),
+    "suffix": ([*FIT, "-o", "x.egs"], "the name must end in .npz"),
     "channels": (
-        [w for k in range(5) for w in ("--map", f"n{k}:normal={{0}}/normal.png")],
+        [*FIT, *(w for k in range(5) for w in ("--map", f"n{k}:normal={{0}}/normal.png"))],
         "the maps have 18 channels, at most 16 share shapes",
     ),
+    "no output": (FIT[:3], "--map needs -o"),
+    "nothing": (["fit"], "no image is given"),
+    "no map": (["render", "{1}", "-o", "x.png"], "holds the maps albedo, roughness, normal"),
+    "unknown": (["render", "{1}", "-o", "x.png", "--map", "ao"], "map 'ao' is not in it; it"),
+    "image": (["pack", "{1}", "-o", "x.egs", "--image", "{0}/albedo.png"], "--map"),
+    "one of three": (
+        ["pack", "{1}", "-o", "x.egs", "--map", "albedo={0}/albedo.png"],
+        "give one of each",
+    ),
+    "levels": (["pack", "{1}", "-o", "x.egs", "--levels", 2], "a material has no levels"),
 }
 
 
 @pytest.mark.parametrize("case", MISTAKES)
-def test_mistakes(folder, tmp_path, case, monkeypatch):
+def test_mistakes(fitted, folder, tmp_path, case, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    given, words = MISTAKES[case]
-    arguments = [word.format(folder) for word in given]
-    output = [] if "-o" in arguments else ["-o", "m.npz"]
-    result = run("fit", *maps(folder, "albedo"), *output, *arguments)
-    assert result.exit_code == 2, result.output
-    assert words in result.output and len(result.output.strip().splitlines()) == 1
-    assert not list(tmp_path.iterdir())
-
-
-def test_more_mistakes(fitted, folder, tmp_path):
-    for arguments, words in (
-        (["fit", *maps(folder)], "--map needs -o"),
-        (["fit"], "no image is given"),
-        (["render", fitted, "-o", tmp_path / "x.png"], "holds the maps albedo, roughness, normal"),
-        (["render", fitted, "-o", tmp_path / "x.png", "--map", "ao"], "map 'ao' is not in it; it"),
-        (["pack", fitted, "-o", tmp_path / "x.egs", "--image", folder / "albedo.png"], "--map"),
-        (["pack", fitted, "-o", tmp_path / "x.egs", *maps(folder, "albedo")], "give one of each"),
-        (["pack", fitted, "-o", tmp_path / "x.egs", "--levels", 2], "a material has no levels"),
-    ):
-        result = run(*arguments)
-        assert result.exit_code == 2, result.output
-        assert words in result.output and len(result.output.strip().splitlines()) == 1
+    arguments, words = MISTAKES[case]
+    assert_refused(run(*(str(word).format(folder, fitted) for word in arguments)), words)
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""The command `render`."""
+"""The command `render`: sizes, spaces, and and files of floats and of 16 bits."""
 
 import json
 
@@ -6,28 +6,57 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from _helpers.command import assert_refused, previewed, run, smooth_pixels, succeeded
+from _helpers.command import assert_refused, previewed, run, said, smooth_pixels, succeeded
+from eigengs_dr.gaussian.file import read
+from eigengs_dr.image.color import to_coded
+from eigengs_dr.image.io import load_image, save_image
+
+FEW = ["--gaussians", 200, "--iterations", 30, "--quiet"]
 
 
 @pytest.mark.parametrize(
     ("options", "size"),
     [([], (32, 24)), (["--scale", "2"], (64, 48)), (["--size", "10x7"], (10, 7))],
 )
-def test_render_sizes(fitted, tmp_path, options, size):
-    folder, _ = fitted
-    succeeded(run("render", folder / "fit.npz", "-o", tmp_path / "y.png", *options))
-    assert Image.open(tmp_path / "y.png").size == size
-
-
-def test_render_is_what_was_fitted(fitted, tmp_path):
-    folder, _ = fitted
-    succeeded(run("render", folder / "fit.npz", "-o", tmp_path / "y.png"))
-    _, fit, _ = previewed(folder / "both.png")
-    assert np.abs(fit.astype(int) - np.asarray(Image.open(tmp_path / "y.png"))).max() <= 1
+def test_sizes(fitted, tmp_path, options, size):
+    target = tmp_path / "y.png"
+    told = said("render", fitted[0] / "fit.npz", "-o", target, *options)
+    assert Image.open(target).size == size
+    assert str(target) in told and "{}x{}".format(*size) in told
+    assert said("render", fitted[0] / "fit.npz", "-o", target, "--quiet") == ""
 
 
 @pytest.mark.parametrize(
-    ("color", "channels", "modes"),
+    "options",
+    [
+        ["--scale", "2", "--size", "10x10"],
+        *(["--scale", word] for word in ("0", "-1", "nan", "inf", "1e9")),
+        *(["--size", word] for word in ("10", "0x10", "10x-1", "99999999999x10", "25600x25600")),
+        *(["--region", word] for word in ("1,2,3", "a,b,c,d", "0,0,0,5", "-1,0,5,5", "9,0,24,9")),
+    ],
+)
+def test_bad_sizes(fitted, tmp_path, options):
+    result = run("render", fitted[0] / "fit.npz", "-o", tmp_path / "y.png", *options)
+    assert_refused(result, "exclude each other" if len(options) > 2 else options[1])
+    assert not (tmp_path / "y.png").exists()
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+@pytest.mark.parametrize("region", [(3, 5, 14, 10), (31, 23, 1, 1)])
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_region_is_the_crop_of_the_whole(fitted, tmp_path, scale, region, suffix):
+    part, whole = tmp_path / f"y.{suffix}", tmp_path / "whole.png"
+    options = ["--region", ",".join(map(str, region)), "--scale", scale]
+    succeeded(run("render", fitted[0] / "fit.npz", "-o", part, *options))
+    succeeded(run("render", fitted[0] / "fit.npz", "-o", whole, "--scale", scale))
+    left, top, width, height = (scale * side for side in region)
+    found = np.asarray(Image.open(part)).astype(int)
+    box = left, top, left + width, top + height
+    assert np.abs(found - np.asarray(Image.open(whole).crop(box)).astype(int)).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("space", "channels", "modes"),
     [
         ("linear", 3, ("RGB", "RGB")),
         ("linear", 1, ("L", "RGB")),
@@ -35,20 +64,19 @@ def test_render_is_what_was_fitted(fitted, tmp_path):
         ("data", 1, ("L", "L")),
     ],
 )
-def test_spaces_of_textures(tmp_path, color, channels, modes):
+def test_spaces_of_textures(tmp_path, space, channels, modes):
     """What `render` and `info` draw is the fit of the preview, as the report has it."""
     pixels = smooth_pixels(32, 32, channels)
     Image.fromarray(pixels if channels == 3 else pixels[..., 0]).save(tmp_path / "a.png")
-    assert Image.open(tmp_path / "a.png").mode == modes[0]
     outputs = ["-o", tmp_path / "a.npz", "--preview", tmp_path / "both.png"]
     settings = ["--gaussians", 100, "--iterations", 20, "--report", tmp_path / "a.json"]
-    result = succeeded(run("fit", tmp_path / "a.png", "--space", color, *outputs, *settings))
+    told = said("fit", tmp_path / "a.png", "--space", space, *outputs, *settings)
     report = json.loads((tmp_path / "a.json").read_text())
-    assert report["space"] == color
-    assert ("psnr_data" if color == "data" else "psnr_ycbcr") in result.stdout
+    assert report["space"] == space
+    assert ("psnr_data" if space == "data" else "psnr_ycbcr") in told
     assert report["psnr_rgb"] > 25 and 0.9 < report["ms_ssim"] <= 1
-    info = json.loads(run("info", tmp_path / "a.npz", "--json").stdout)
-    assert (info["space"], info["channels"]) == (color, 1 if modes[1] == "L" else 3)
+    info = json.loads(said("info", tmp_path / "a.npz", "--json"))
+    assert (info["space"], info["channels"]) == (space, 1 if modes[1] == "L" else 3)
     succeeded(run("info", tmp_path / "a.npz", "--preview", tmp_path / "info.png"))
     succeeded(run("render", tmp_path / "a.npz", "-o", tmp_path / "y.png"))
     drawn, shown = (Image.open(tmp_path / n) for n in ("y.png", "info.png"))
@@ -60,33 +88,93 @@ def test_spaces_of_textures(tmp_path, color, channels, modes):
     assert -10 * np.log10(np.mean(error**2)) == pytest.approx(report["psnr_rgb"], abs=0.02)
 
 
-@pytest.mark.parametrize("keep", [0, 10, 0.5, 0.95])
-def test_truncated_model(fitted, existing, tmp_path, keep):
-    folder, _ = fitted
-    content = (folder / "fit.npz").read_bytes()
-    model = tmp_path / "cut.npz"
-    model.write_bytes(content[: keep if isinstance(keep, int) else int(keep * len(content))])
-    assert_refused(run("info", model), "cut.npz")
-    assert_refused(run("render", model, "-o", tmp_path / "y.png"), "cut.npz")
-    assert not (tmp_path / "y.png").exists()
+# --- Files of floats and of 16 bits ---
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["--scale", "2", "--size", "10x10"],
-        ["--scale", "0"],
-        ["--scale", "-1"],
-        ["--scale", "nan"],
-        ["--scale", "inf"],
-        ["--scale", "1e9"],
-        ["--size", "10"],
-        ["--size", "0x10"],
-        ["--size", "10x-1"],
-        ["--size", "99999999999x10"],
-    ],
-)
-def test_bad_render_sizes(fitted, tmp_path, options):
-    folder, _ = fitted
-    assert_refused(run("render", folder / "fit.npz", "-o", tmp_path / "y.png", *options))
-    assert not (tmp_path / "y.png").exists()
+@pytest.fixture(scope="module")
+def sky(tmp_path_factory):
+    """A folder with an EXR file of light up to 50, and its fit."""
+    folder = tmp_path_factory.mktemp("sky")
+    light = smooth_pixels(32, 24).astype(np.float32) / 100
+    light[5:9, 7:11] = 50
+    save_image(folder / "sky.exr", light)
+    command = ["fit", folder / "sky.exr", "-o", folder / "sky.npz", "--space", "log", *FEW]
+    succeeded(run(*command, "--report", folder / "r.json", "--preview", folder / "p.png"))
+    return folder, light
+
+
+def test_fit_of_light(sky, tmp_path):
+    folder, _ = sky
+    figures = json.loads((folder / "r.json").read_text())
+    assert figures["psnr_ycbcr"] > 25 and figures["encoding"] is None
+    assert load_image(folder / "p.png").shape[1] > 32
+    assert read(folder / "sky.npz").space == "log"
+    command = ["pack", folder / "sky.npz", "-o", tmp_path / "y.egs", "--image", folder / "sky.exr"]
+    assert "psnr in log" in said(*command)
+
+
+@pytest.mark.parametrize(("name", "bits"), [("y.exr", 32), ("y.tif", 32), ("h.exr", 16)])
+def test_light_is_written(sky, tmp_path, name, bits):
+    folder, light = sky
+    succeeded(run("render", folder / "sky.npz", "-o", tmp_path / name, "--bits", bits))
+    found = load_image(tmp_path / name)
+    assert found.shape == light.shape
+    assert found.max() == pytest.approx(50, rel=0.2)
+    assert np.median(found) == pytest.approx(np.median(light), rel=0.05)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_16_bits_of_srgb_are_written(sky, tmp_path, suffix):
+    folder, light = sky
+    path = tmp_path / f"y{suffix}"
+    succeeded(run("render", folder / "sky.npz", "-o", path, "--bits", 16))
+    found = load_image(path)
+    assert len(np.unique(found)) > 300  # more than 8 bits have
+    assert np.median(found) == pytest.approx(np.median(np.clip(to_coded(light), 0, 1)), rel=0.05)
+
+
+def test_codes_become_light_in_exr_and_an_encoding_can_be_said(tmp_path):
+    save_image(tmp_path / "a.png", smooth_pixels(32, 24))
+    command = ["fit", tmp_path / "a.png", "-o", tmp_path / "a.npz", "--overwrite", *FEW]
+    succeeded(run(*command))
+    for name in ("y.png", "y.exr"):
+        succeeded(run("render", tmp_path / "a.npz", "-o", tmp_path / name))
+    codes = to_coded(load_image(tmp_path / "y.exr"))
+    np.testing.assert_allclose(load_image(tmp_path / "y.png"), np.clip(codes, 0, 1), atol=0.003)
+    succeeded(run(*command, "--space", "linear", "--encoding", "linear"))
+    succeeded(run("render", tmp_path / "a.npz", "-o", tmp_path / "y.exr"))
+    means = [float(load_image(tmp_path / name).mean()) for name in ("a.png", "y.exr")]
+    assert means[0] == pytest.approx(means[1], rel=0.02)
+
+
+def test_data_of_16_bits(tmp_path):
+    y, x = np.mgrid[:24, :32]
+    heights = (30_000 + 200 * x + 90 * y).astype(np.uint16)
+    save_image(tmp_path / "a.png", heights, bits=16)
+    succeeded(run("fit", tmp_path / "a.png", "-o", tmp_path / "a.npz", "--space", "data", *FEW))
+    succeeded(run("render", tmp_path / "a.npz", "-o", tmp_path / "y.png", "--bits", 16))
+    found = np.rint(load_image(tmp_path / "y.png", keep_grey=True) * 65535)[..., 0]
+    assert np.abs(found - heights).mean() < 60  # a step of 8 bits is 257
+
+
+def test_data_beyond_1_have_one_psnr(tmp_path):
+    """The trace, the report, rows of many images and a fit by blocks measure in one unit."""
+    folder, reports = tmp_path / "photos", []
+    folder.mkdir()
+    save_image(folder / "a.pfm", 2 * smooth_pixels(64, 64).astype(np.float32)[..., 0] - 250)
+    for image, more in (
+        (folder / "a.pfm", ["-o", tmp_path / "one.npz"]),
+        (folder / "a.pfm", ["-o", tmp_path / "blocks.npz", "--blocks", 32]),
+        (folder, ["-o", tmp_path / "many"]),
+    ):
+        report = tmp_path / "r.json"
+        succeeded(run("fit", image, "--space", "data", "--report", report, *more, *FEW))
+        found = json.loads(report.read_text())
+        reports.append(found["images"][0] if "images" in found else found)
+    one, blocks, several = reports
+    assert one["psnr_ycbcr"] == one["trace"][-1]["psnr_ycbcr"] > 25
+    assert several["psnr_ycbcr"] == one["psnr_ycbcr"]
+    assert blocks["psnr_ycbcr"] == pytest.approx(one["psnr_ycbcr"], abs=2)
+    goal = ["--target-psnr", 30, "--iterations", 60, "--space", "data", "-o", tmp_path / "few.npz"]
+    told = said("fit", folder / "a.pfm", *goal)
+    assert float(told.split("psnr_data ")[1].split(" dB")[0]) >= 30

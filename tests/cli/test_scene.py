@@ -1,36 +1,21 @@
-"""The command `scene`."""
+"""The commands `scene` and `convert`."""
 
+import json
 import sys
 
 import numpy as np
 import pytest
 
-from _helpers import command
-from _helpers.command import assert_refused
+from _helpers.command import assert_refused, run, said
 from _helpers.scene_sets import save_halves
 
 mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
 
+from _helpers.bitmap_scenes import save_images, sky  # noqa: E402
+
 pytestmark = pytest.mark.mitsuba
 
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    """The command sets a variant; the variant before is set again."""
-    before = mi.variant()
-    yield
-    if before:
-        mi.set_variant(before)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return save_halves(tmp_path_factory.mktemp("sets"))
-
-
-def run(*arguments):
-    return command.run("scene", *arguments)
-
+LLVM = ("--variant", "llvm_ad_rgb")
 
 EMPTY = """
 <scene version="3.0.0">
@@ -50,6 +35,15 @@ EMPTY = """
 """
 
 
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    """The commands set a variant; the variant before is set again."""
+    before = mi.variant()
+    yield
+    if before:
+        mi.set_variant(before)
+
+
 @pytest.fixture
 def scene(tmp_path):
     """Write a scene of which one line is given."""
@@ -63,104 +57,109 @@ def scene(tmp_path):
 
 
 def test_says_what_it_did(scene, tmp_path):
-    result = run(scene(), "-o", tmp_path / "x.png", "--variant", "llvm_ad_rgb")
-    assert result.exit_code == 0, result.output
-    assert "8x6, samples per pixel: 2" in result.stdout
-    assert f"wrote {tmp_path / 'x.png'}" in result.stdout
+    told = said("scene", scene(), "-o", tmp_path / "x.png", *LLVM)
+    assert "8x6, samples per pixel: 2" in told and f"wrote {tmp_path / 'x.png'}" in told
     assert np.allclose(mi.Bitmap(str(tmp_path / "x.png")), 187.5, atol=0.5)  # 0.5, dithered
 
 
 def test_several_scenes_into_a_folder(scene, tmp_path):
     scenes = [scene(name="a.xml"), scene(name="b.xml")]
-    result = run(*scenes, "-o", tmp_path / "out", "-D", "light=1", "--spp", 1)
-    assert result.exit_code == 0, result.output
+    said("scene", *scenes, "-o", tmp_path / "out", "-D", "light=1", "--spp", 1)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.png", "b.png"]
 
 
 def test_passes_make_one_picture(scene, tmp_path, monkeypatch):
     monkeypatch.setattr("eigengs_dr.scene.convert.SAMPLES_PER_PASS", 8 * 6 * 2)
-    result = run(scene(), "-o", tmp_path / "x.exr", "--spp", 5)
-    assert "samples per pixel: 5" in result.stdout
+    told = said("scene", scene(), "-o", tmp_path / "x.exr", "--spp", 5)
+    assert "samples per pixel: 5" in told
     assert np.allclose(mi.Bitmap(str(tmp_path / "x.exr")), 0.5)
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ('<shape type="rectangl"/>', ["rectangl", "line 14"]),
-        ('<shape type="sphere">', ["mismatch"]),
-        ('<shape type="sphere"><float name="size" value="$x"/></shape>', ["undefined", "$x"]),
-        (
-            '<texture type="gaussian_texture"><string name="filename" value="no.npz"/></texture>',
-            ["No such file or directory", "no.npz"],
-        ),
-        (
-            '<texture type="gaussian_texture"><float name="prefilter" value="1"/></texture>',
-            ["gaussian_texture: give one of filename"],
-        ),
-    ],
-)
-def test_broken_scene(line, words, scene, tmp_path):
-    path = scene(line)
-    result = run(path, "-o", tmp_path / "x.png", "--variant", "llvm_ad_rgb")
-    assert_refused(result, path, *words)
-    assert "Traceback" not in result.stderr
-    assert "cpp" not in result.stderr
-    assert not (tmp_path / "x.png").exists()
-
-
-def test_mistake_that_shows_while_rendering(scene, folder, tmp_path):
-    path = scene(
+BROKEN = [
+    ('<shape type="rectangl"/>', ["rectangl", "line 14"]),
+    ('<shape type="sphere"><float name="size" value="$x"/></shape>', ["undefined", "$x"]),
+    (
+        '<texture type="gaussian_texture"><string name="filename" value="no.npz"/></texture>',
+        ["No such file or directory", "no.npz"],
+    ),
+    (
+        '<texture type="gaussian_texture"><float name="prefilter" value="1"/></texture>',
+        ["gaussian_texture: give one of filename"],
+    ),
+    (
         '<shape type="sphere"><bsdf type="normalmap"><bsdf type="diffuse"/>'
         '<texture type="gaussian_texture" name="normalmap"><boolean name="raw" value="true"/>'
-        f'<string name="filename" value="{folder / "roughness.npz"}"/></texture>'
-        "</bsdf></shape>"
-    )
-    result = run(path, "-o", tmp_path / "x.png", "--variant", "llvm_ad_rgb")
-    assert_refused(result, "a lookup of three channels")
+        '<string name="filename" value="FOLDER/roughness.npz"/></texture></bsdf></shape>',
+        ["a lookup of three channels"],  # which shows while it renders
+    ),
+]
+
+
+@pytest.mark.parametrize(("line", "words"), BROKEN)
+def test_broken_scene(line, words, scene, tmp_path):
+    if "FOLDER" in line:
+        line = line.replace("FOLDER", str(save_halves(tmp_path)))
+    path = scene(line)
+    result = run("scene", path, "-o", tmp_path / "x.png", *LLVM)
+    assert_refused(result, path, *words)
+    assert "Traceback" not in result.stderr and "cpp" not in result.stderr
+    assert not (tmp_path / "x.png").exists()
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", ["No document element"]),
-        ('<scene version="3.0.0"/>', ["no sensor"]),
-        ('<scene version="3.0.0"><sensor type="perspective"/></scene>', ["ntegrator"]),
-        ('<shape version="3.0.0" type="sphere"/>', ["holds no scene"]),
+        ("", "No document element"),
+        ('<scene version="3.0.0"/>', "no sensor"),
+        ('<scene version="3.0.0"><sensor type="perspective"/></scene>', "ntegrator"),
+        ('<shape version="3.0.0" type="sphere"/>', "holds no scene"),
     ],
 )
 def test_no_scene(text, words, scene, tmp_path):
-    assert_refused(run(scene(text=text), "-o", tmp_path / "x.png"), *words)
+    assert_refused(run("scene", scene(text=text), "-o", tmp_path / "x.png"), words)
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         (["-D", "spp"], ["spp=16"]),
-        (["-D", "path=x"], ["path", "rename"]),
+        (["-D", "path=x"], ["path"]),
         (["-D", "other=1"], ["$other"]),
         (["--variant", "llvm"], ["--variant llvm", "llvm_ad_rgb"]),
         (["--spp", "0"], ["--spp"]),
+        (["-o", "no/x.png"], ["cannot create a file"]),
+        (["-o", "x.jpg"], [".png or .exr"]),
+        (["no.xml"], ["no.xml"]),
     ],
 )
 def test_mistaken_options(options, words, scene, tmp_path):
-    assert_refused(run(scene(), "-o", tmp_path / "x.png", *options), *words)
-
-
-def test_mistaken_files(scene, tmp_path):
-    assert_refused(run(tmp_path / "no.xml", "-o", tmp_path / "x.png"), "no.xml")
-    assert_refused(run(scene(), "-o", tmp_path / "no" / "x.png"), "cannot create a file")
-    assert_refused(run(scene(), "-o", tmp_path / "x.jpg"), ".png or .exr")
+    assert_refused(run("scene", scene(), "-o", tmp_path / "x.png", *options), *words)
 
 
 def test_without_mitsuba(scene, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    assert_refused(run(scene(), "-o", tmp_path / "x.png"), "pip install 'mitsuba==3.9.*'")
+    result = run("scene", scene(), "-o", tmp_path / "x.png")
+    assert_refused(result, "pip install 'mitsuba==3.9.*'")
 
 
-def test_sets_that_were_not_made_yet(scene, tmp_path):
-    """The scenes of the repository need `make scenes` once."""
-    line = """<shape type="rectangle"><bsdf type="diffuse"><texture type="gaussian_texture"
-        name="reflectance"><string name="filename" value="build/scenes/none.npz"/></texture>
-        </bsdf></shape>"""
-    assert_refused(run(scene(line), "-o", tmp_path / "x.png"), "none.npz", "make scenes")
+def test_convert(tmp_path):
+    scene = sky(save_images(tmp_path))
+    settings = ("--psnr", 25, "--iterations", 5, "-D", "spp=2", *LLVM)
+    told = said("convert", scene, "-o", tmp_path / "new", *settings, "--report", tmp_path / "r")
+    for words in ("32x32", "(the same set)", "memory: ", "left alone: leaf.png", "camera 1: "):
+        assert words in told
+    report = json.loads((tmp_path / "r").read_text())
+    assert report["bytes"] < report["bytes_before"] and len(report["left"]) == 4
+    assert (tmp_path / "new" / "scene.xml").exists()
+    assert_refused(run("convert", scene, "-o", tmp_path / "new"), "exists and is not empty")
+
+
+def test_mistakes_of_convert(scene, tmp_path):
+    bad = scene(text="<scene version='3.0.0'><shape></scene>")
+    for arguments, words in (
+        ([bad, "-o", tmp_path / "new"], "scene.xml: "),
+        ([tmp_path / "none.xml", "-o", tmp_path / "new"], "does not exist"),
+        ([bad, "-o", tmp_path / "a" / "b"], "cannot create a folder"),
+    ):
+        assert_refused(run("convert", *arguments), words)
+        assert list(tmp_path.iterdir()) == [bad]
