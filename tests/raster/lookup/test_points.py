@@ -12,6 +12,7 @@ from _helpers.sets import SIZE, few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.lookup.points import (
+    Packed,
     cell_side,
     fold,
     gradient_terms,
@@ -19,7 +20,7 @@ from eigengs_dr.raster.lookup.points import (
     sum_at_points,
     value_terms,
 )
-from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, pack_parameters
+from eigengs_dr.raster.parameters import pack_parameters
 from eigengs_dr.raster.render import decode_parameters, render
 
 POINTS = 400
@@ -47,25 +48,21 @@ def exact_at(scene, points, cutoff):
     return scene.background + weight @ scene.color, off_edge
 
 
-def arrays_of(gaussians, points):
-    """Packed parameters, shape, background, and x and y of points, as lookups take them."""
+def arrays_of(gaussians, points, cutoff):
+    """Packed parameters, shape, and x and y of points, as lookups take them."""
     p = decode_parameters(gaussians)
-    rows, background = [*p.shape, *p.color], p.background
     types = types_of(gaussians.mean)
     x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
-    return pack_parameters(rows), [dr.detach(r) for r in rows[:NUM_SHAPE_PARAMS]], background, x, y
+    packed = Packed(pack_parameters([*p.shape, *p.color]), gaussians.channels, cutoff)
+    return packed, [dr.detach(r) for r in p.shape], x, y
 
 
 def look_up(gaussians, points, cutoff, side=4, terms=value_terms, number=1):
     """Rows of sums at points, without the background."""
-    packed, shape, _, x, y = arrays_of(gaussians, points)
-    size, channels = (gaussians.width, gaussians.height), gaussians.channels
-    cells = list_cells(shape, *size, kernel_radius(cutoff), side)
-    active = types_of(x).Bool(True)
-    term = terms(kernel_radius(cutoff))
-    return sum_at_points(
-        cells, packed, NUM_SHAPE_PARAMS + channels, x, y, active, term, number * channels
-    )
+    packed, shape, x, y = arrays_of(gaussians, points, cutoff)
+    cells = list_cells(shape, gaussians.width, gaussians.height, packed.radius, side)
+    count, active = number * gaussians.channels, types_of(x).Bool(True)
+    return sum_at_points(cells, packed, x, y, active, terms(packed.radius), count)
 
 
 def stacked(rows):
@@ -110,8 +107,8 @@ class TestValues:
             scene = random_scene(0, count, size)._replace(
                 mean=rng.uniform(0, 1, (count, 2)) * size, factor=np.tile([0.3, 0, 0.3], (count, 1))
             )
-            _, shape, *_ = arrays_of(scene.on(backend), some_points(size=size))
-            ends = np.array(list_cells(shape, *size, kernel_radius(3), 4).ends).reshape(-1, 2)
+            packed, shape, *_ = arrays_of(scene.on(backend), some_points(size=size), 3)
+            ends = np.array(list_cells(shape, *size, packed.radius, 4).ends).reshape(-1, 2)
             lengths.append(np.mean(ends[:, 1].astype(int) - ends[:, 0]))
         assert lengths[1] < 1.4 * lengths[0]  # fewer cells lie at the border
 
@@ -163,11 +160,11 @@ class TestDerivatives:
     def test_gradient_reaches_the_point(self, backend):
         """The loop hands on derivatives of where it is evaluated, which geometry may have."""
         gaussians = random_scene(8).on(backend, bits=64)
-        packed, shape, _, x, y = arrays_of(gaussians, some_points())
-        cells = list_cells(shape, *SIZE, kernel_radius(WIDE), 4)
-        active = types_of(x).Bool(True)
+        packed, shape, x, y = arrays_of(gaussians, some_points(), WIDE)
+        cells = list_cells(shape, *SIZE, packed.radius, 4)
         dr.enable_grad(x, y)
-        sums = sum_at_points(cells, packed, 8, x, y, active, value_terms(kernel_radius(WIDE)), 3)
+        active = types_of(x).Bool(True)
+        sums = sum_at_points(cells, packed, x, y, active, value_terms(packed.radius))
         dr.backward(dr.sum(sums[0]))
         rows = look_up(gaussians, some_points(), WIDE, terms=gradient_terms, number=3)
         np.testing.assert_allclose(np.array(dr.grad(x)), np.array(rows[1]), atol=1e-9)

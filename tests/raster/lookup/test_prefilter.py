@@ -1,5 +1,7 @@
 """Sums seen through a footprint, against brute force: a fine picture, its copies, a weighed sum."""
 
+from dataclasses import replace
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.evaluate import widen
 from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, arrange
+from eigengs_dr.raster.lookup.points import Packed
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
 from eigengs_dr.raster.parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, pack_parameters
@@ -25,19 +28,21 @@ FOOTPRINTS = [
 """Covariances in pixels squared: small, round, leaning, a long one, and the largest there is."""
 
 
-def filtered(gaussians, wrap, points, covariance, cutoff=CUTOFF):
-    """Rows of what `sum_prefiltered` gives, without the background."""
+def arguments(gaussians, wrap, points, covariance, cutoff=CUTOFF):
+    """What `sum_prefiltered` takes."""
     p = decode_parameters(gaussians)
-    rows = [*p.shape, *p.color]
     types = types_of(gaussians.mean)
-    shape = [dr.detach(r) for r in rows[:NUM_SHAPE_PARAMS]]
+    shape = [dr.detach(r) for r in p.shape]
     sizes = classify_by_size(shape, gaussians.width, gaussians.height, cutoff, wrap)
+    packed = Packed(pack_parameters([*p.shape, *p.color]), gaussians.channels, cutoff)
     x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
     footprint = [types.Float(float(covariance[k])) for k in ((0, 0), (0, 1), (1, 1))]
-    number = NUM_SHAPE_PARAMS + gaussians.channels
-    return sum_prefiltered(
-        sizes, pack_parameters(rows), number, x, y, footprint, types.Bool(True), cutoff
-    )
+    return sizes, packed, x, y, footprint, types.Bool(True)
+
+
+def filtered(*given):
+    """Rows of what `sum_prefiltered` gives, without the background."""
+    return sum_prefiltered(*arguments(*given))
 
 
 class TestSumFiltered:
@@ -85,7 +90,7 @@ class TestSumFiltered:
         exact = np.where(distance <= 2, np.exp(-0.5 * distance**2), 0) @ scene.color
         sure = (np.abs(distance - 2) > 0.02).all(axis=1)
         near = np.diag([0.01, 0.01])
-        found = stacked(filtered(scene.on(backend), "mirror", points, near, cutoff=2.0))
+        found = stacked(filtered(scene.on(backend), "mirror", points, near, 2.0))
         assert sure.sum() > 30
         assert np.abs(exact[sure]).max() > 0.1
         np.testing.assert_allclose(found[sure], exact[sure], atol=0.05 * np.abs(exact).max())
@@ -197,15 +202,10 @@ class TestSumFiltered:
 @pytest.mark.parametrize("variance", [0.0, 0.1, 1.0, 9.0])
 def test_lists_in_order_give_the_same(backend, variance):
     """Copies of the parameters in the order of the lists, with the inverse factor."""
-    gaussians = random_scene(4).on(backend)
+    gaussians, points = random_scene(4).on(backend), some_points(300)
+    covariance = variance * np.array([[1, 0.5], [0.5, 0.7]])
+    sizes, packed, *rest = arguments(gaussians, "repeat", points, covariance)
     p = decode_parameters(gaussians)
-    rows = [*p.shape, *p.color]
-    sizes = classify_by_size([dr.detach(r) for r in p.shape], *SIZE, CUTOFF, "repeat")
-    arranged = arrange(sizes.listed[0][1].splat, p.shape, p.color)
-    types = types_of(p.shape[0])
-    points = np.float32(np.random.default_rng(0).uniform(0, SIZE, (300, 2)))
-    x, y = (types.Float(np.ascontiguousarray(c)) for c in points.T)
-    blur = [types.Float(v) for v in (variance, 0.5 * variance, 0.7 * variance)]
-    arguments = sizes, pack_parameters(rows), len(rows), x, y, blur, types.Bool(True), CUTOFF
-    found, expected = sum_prefiltered(*arguments, arranged), sum_prefiltered(*arguments)
+    copies = replace(packed, arranged=arrange(sizes.listed[0][1].splat, p.shape, p.color))
+    found, expected = (sum_prefiltered(sizes, q, *rest) for q in (copies, packed))
     np.testing.assert_allclose(np.array(found), np.array(expected), atol=2e-5)

@@ -10,10 +10,11 @@ from _helpers.footprints import CUTOFF, brute_force, some_points, stacked, tiled
 from _helpers.sets import SIZE, random_scene
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.raster.lookup import pyramid as coarsen
+from eigengs_dr.raster.lookup.points import Packed
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
 from eigengs_dr.raster.lookup.pyramid import is_minified, pyramid_mean, sum_pyramid
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
-from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, pack_parameters
+from eigengs_dr.raster.parameters import pack_parameters
 from eigengs_dr.raster.render import decode_parameters
 
 FOOTPRINTS = [
@@ -27,14 +28,17 @@ FOOTPRINTS = [
 """Covariances in pixels squared that a lattice of one pixel serves, or a coarser one."""
 
 
-def lattice_of(gaussians, wrap, cutoff=CUTOFF):
+def arrays_of(gaussians, wrap, cutoff=CUTOFF):
+    """What `build_pyramid` takes."""
     p = decode_parameters(gaussians)
-    rows = [*p.shape, *p.color]
-    shape = [dr.detach(r) for r in rows[:NUM_SHAPE_PARAMS]]
+    shape = [dr.detach(r) for r in p.shape]
     sizes = classify_by_size(shape, gaussians.width, gaussians.height, cutoff, wrap)
-    return coarsen.build_pyramid(
-        sizes, pack_parameters(rows), NUM_SHAPE_PARAMS + gaussians.channels, cutoff
-    )
+    packed = pack_parameters([*p.shape, *p.color])
+    return sizes, Packed(packed, gaussians.channels, cutoff)
+
+
+def lattice_of(*given):
+    return coarsen.build_pyramid(*arrays_of(*given))
 
 
 def looked_up(lattice, points, covariance):
@@ -149,16 +153,12 @@ def test_levels_end_where_points_are_few(backend, size, levels):
 @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
 def test_the_finest_level_is_the_filtered_sum(backend, wrap):
     """At every pixel, although most are rendered and only the border is looked up."""
-    gaussians = random_scene(3).on(backend)
-    p = decode_parameters(gaussians)
-    rows = [*p.shape, *p.color]
-    sizes = classify_by_size([dr.detach(r) for r in p.shape], *SIZE, CUTOFF, wrap)
-    number, packed = len(rows), pack_parameters(rows)
-    types = types_of(packed)
+    sizes, packed = arrays_of(random_scene(3).on(backend), wrap)
+    types = types_of(packed.values)
     index = dr.arange(types.UInt, SIZE[0] * SIZE[1])
     x, y = types.Float(index % SIZE[0]) + 0.5, types.Float(index // SIZE[0]) + 0.5
     blur = [types.Float(coarsen.SAMPLE_DEVIATION**2 * k) for k in (1, 0, 1)]
-    expected = sum_prefiltered(sizes, packed, number, x, y, blur, types.Bool(True), CUTOFF)
-    lattice = coarsen.build_pyramid(sizes, packed, number, CUTOFF)
-    found = np.array(lattice.values)[: 4 * SIZE[0] * SIZE[1]].reshape(-1, 4)[:, : len(p.color)]
+    expected = sum_prefiltered(sizes, packed, x, y, blur, types.Bool(True))
+    found = np.array(coarsen.build_pyramid(sizes, packed).values)
+    found = found[: 4 * SIZE[0] * SIZE[1]].reshape(-1, 4)[:, : packed.channels]
     np.testing.assert_allclose(found, np.stack([np.array(e) for e in expected], 1), atol=1e-5)
