@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..image.io import check_image, read_file
 from ..image.pixels import ImageError
 from ..plugins import register_plugins  # first: its error says what to install
+from ..plugins.versions import texture_kind
 
 # isort: split
 import mitsuba as mi
@@ -123,7 +124,7 @@ def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
         props = node.props
         if props.plugin_name() == "envmap":
             left.append((_label(props, None, ""), "an environment map takes no texture"))
-        if node.type != mi.ObjectType.Texture or props.plugin_name() != "bitmap":
+        if node.type != texture_kind() or props.plugin_name() != "bitmap":
             continue
         # A texture with an id is a child of the scene too, where it has no use.
         above = [(p, s) for p, s in parents.get(index, []) if nodes[p].type != mi.ObjectType.Scene]
