@@ -113,25 +113,6 @@ class TestIntegrators:
         for key, value in parameters:
             assert np.abs(np.array(dr.grad(value))).max() > 1e-4, key
 
-    @pytest.mark.parametrize("integrator", ["direct", "prb"])
-    def test_forward_mode_agrees_with_reverse(self, integrator):
-        """Not of "path", whose loop Dr.Jit cannot carry derivatives of another loop into."""
-        expected = gradients(
-            small_scene(wall(gaussians()), integrator, SIDE, SPP), mi.TensorXf(upstream())
-        )["color"]
-        scene = small_scene(wall(gaussians()), integrator, SIDE, SPP)
-        parameters = of_texture(scene)
-        key, along = f"{TEXTURE}.color", mi.Float(0)
-        dr.enable_grad(along)
-        direction = direction_like(expected)
-        parameters[key] = mi.TensorXf(parameters[key]) + along * mi.TensorXf(direction)
-        parameters.update()
-        # To what the texture made of its parameters, before the integrator isolates itself.
-        dr.forward(along, dr.ADFlag.ClearEdges)
-        image = scene.integrator().render_forward(scene, parameters, seed=SEED, spp=SPP)
-        found = (np.array(image) * upstream()).sum()
-        assert found == pytest.approx((expected * direction).sum(), rel=1e-3)
-
     def along_parameters(self, integrator, names, prefilter=0.0):
         """A picture whose parameters depend on one variable, and this variable."""
         scene = small_scene(wall(gaussians(), prefilter=prefilter), integrator, SIDE, 8)
@@ -218,16 +199,6 @@ class TestBroken:
         np.testing.assert_allclose(
             np.array(optimizer["t.color"]), [[1, 2, 3], [0, 99, -1], [1, 0, 1]]
         )
-
-    def test_a_set_is_read_back(self):
-        g = gaussians("linear")
-        scene = small_scene(wall(g), "direct", SIDE, 1)
-        parameters = mi.traverse(scene)
-        parameters[f"{TEXTURE}.color"] = 2 * parameters[f"{TEXTURE}.color"]
-        found = gaussians_of(parameters, TEXTURE, g)
-        assert (found.width, found.height, found.space) == (*SIZE, "linear")
-        np.testing.assert_array_equal(found.to_arrays()["mean"], g.to_arrays()["mean"])
-        np.testing.assert_array_equal(found.to_arrays()["color"], 2 * g.to_arrays()["color"])
 
 
 class TestModel:

@@ -93,12 +93,6 @@ class TestValues:
         found = found.reshape(SIZE[1], SIZE[0], 3) + gaussians.to_arrays()["background"]
         np.testing.assert_allclose(found, render(gaussians).numpy(), atol=1e-6)
 
-    def test_in_double_precision(self, backend):
-        scene = random_scene(4)
-        exact, _ = exact_at(scene, some_points(), WIDE)
-        found = stacked(look_up(scene.on(backend, bits=64), some_points(), WIDE))
-        np.testing.assert_allclose(found + scene.background, exact, atol=1e-12)
-
     def test_costs_what_overlaps_and_not_what_there_is(self, backend):
         """64 times the splats on 64 times the area: a point has hardly more of them to look at."""
         lengths = []
