@@ -13,6 +13,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from eigengs_dr.backend.arrays import Bool
 from eigengs_dr.backend.recording import collector_off, guest
@@ -172,7 +173,7 @@ def gaussian_texture() -> type:
 
         def _color(self, si: Interaction, active: Bool) -> list:
             """Look up the channels, decoded and clamped unless `raw`; 0 where uv is not finite."""
-            where = (self.wrap, self.angle, str(self.to_uv))
+            where = (self.wrap, self.angle, *np.array(self.to_uv.matrix).flat)
             sums = reused(self.table, where, si, self.inputs, lambda: self._look_up(si))[self.part]
             background = self.table.background[self.part]
             shown = show_all(self, [s + b for s, b in zip(sums, background, strict=True)])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -200,6 +200,7 @@ SHAPES = ("mean", "factor")
 """Parameters whose change requires new lists of the Gaussians. Maps share them."""
 
 
+@dataclass(eq=False)
 class Source:
     """The parameters of a texture, and the Gaussians that they stand for.
 
@@ -210,6 +211,8 @@ class Source:
     Attributes
     ----------
     start : Gaussians
+    read : dict of str to TensorXf
+        The parameters at the start.
     tensors : dict of str to TensorXf
         The parameters, which `mitsuba.traverse` shows.
     weights : list of TensorXf, shape (N + 1, k)
@@ -219,18 +222,15 @@ class Source:
         The channels of the texture among those of the file.
     """
 
-    def __init__(
-        self,
-        start: Gaussians,
-        tensors: Arrays,
-        weights: Sequence[Any] = (),
-        file: SharedFile | None = None,
-        part: slice = slice(None),
-    ) -> None:
-        self.start, self.weights, self.file, self.part = start, weights, file, part
-        self.read = tensors
+    start: Gaussians
+    read: Arrays
+    weights: Sequence[Any] = ()
+    file: SharedFile | None = None
+    part: slice = field(default_factory=lambda: slice(None))
+
+    def __post_init__(self) -> None:
         # Own objects, so that each texture has its own gradient, of one memory.
-        self.tensors = {name: type(t)(t) for name, t in tensors.items()}
+        self.tensors = {name: type(t)(t) for name, t in self.read.items()}
 
     def is_that_of_file(self) -> bool:
         """Return whether the parameters have the memory of the file: nobody has changed them."""
@@ -344,7 +344,3 @@ class _Derived(dr.CustomOp):
         found = dr.grad(target)
         dr.clear_grad(target)
         return found
-
-    def name(self) -> str:
-        """Return the name for graphs of Dr.Jit."""
-        return "gaussian_texture"

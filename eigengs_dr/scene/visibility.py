@@ -237,19 +237,15 @@ def _find(scene: Any, texture: str | Texture) -> tuple[Texture, list]:
     ValueError
         If the scene has no texture of this name, or no shape uses it.
     """
-    entries = mi.traverse(scene).properties
-    textures = {
-        key.rpartition(".")[0]: entry[2]
-        for key, entry in entries.items()
-        if isinstance(entry[2], texture_class())
-    }
-    if not isinstance(texture, str):
-        node = texture
-    elif texture not in textures:
-        known = ", ".join(name for name, t in textures.items() if t.is_spatially_varying())
-        raise ValueError(f"texture {texture!r} is not in the scene; it has {known or 'none'}")
-    else:
-        node = textures[texture]
+    node = texture
+    if isinstance(texture, str):
+        entries = mi.traverse(scene).properties.items()
+        nodes = {key.rpartition(".")[0]: entry[2] for key, entry in entries}
+        nodes = {key: n for key, n in nodes.items() if isinstance(n, texture_class())}
+        if texture not in nodes:
+            known = ", ".join(name for name, t in nodes.items() if t.is_spatially_varying())
+            raise ValueError(f"texture {texture!r} is not in the scene; it has {known or 'none'}")
+        node = nodes[texture]
     shapes = [shape for shape in scene.shapes() if node in mi.traverse(shape).hierarchy]
     if not shapes:
         raise ValueError(f"{_name(texture)} belongs to no shape; name the texture of a shape")

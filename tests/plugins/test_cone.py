@@ -71,12 +71,6 @@ class TestCone:
         expected = np.array([1, 1 / np.cos(tilt)]) * PIXEL * 0.001 * t
         np.testing.assert_allclose(width.ravel(), expected, rtol=1e-2)
 
-    def test_follows_the_scale_of_uv(self):
-        si = facing()
-        si.dp_du = mi.Vector3f(4, 0, 0)  # a uv unit is 4 m
-        width, _, _ = seen(si, 0.001)
-        np.testing.assert_allclose(width.ravel(), [PIXEL * 0.01 / 4, PIXEL * 0.01], rtol=1e-2)
-
     def test_follows_a_turn_of_to_uv(self):
         """Against the plain product of matrices, for a transform that is no scale."""
         si, linear = facing(0.8), np.array([[0.6, 0.9], [-0.3, 1.1]])

@@ -228,14 +228,6 @@ class TestModel:
             found = picture(tex.eval_3(texel_centres((32, 32))), (32, 32))
             np.testing.assert_allclose(found, eg.render(expected).numpy(), atol=1e-4)
 
-    def test_coefficients_may_be_given(self, saved):
-        path, model = saved
-        table = np.full((3, max(model.components)), 0.1, np.float32)
-        tex = mi.load_dict(
-            {"type": "gaussian_texture", "model": path, "coefficients": mi.TensorXf(table)}
-        )
-        np.testing.assert_array_equal(np.array(mi.traverse(tex)["coefficients"]), table)
-
     @pytest.mark.parametrize("integrator", ["direct", "prb"])
     def test_gradients_are_finite_differences(self, saved, integrator):
         bsdf = {"type": "diffuse", "reflectance": {"type": "gaussian_texture", "model": saved[0]}}

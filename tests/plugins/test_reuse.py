@@ -28,13 +28,6 @@ def lookups(monkeypatch):
     return made
 
 
-def of_sets(prefilter):
-    """A material of two sets."""
-    number = texture_of(gaussians("data", channels=1), prefilter=prefilter)
-    colour = texture_of(gaussians(), prefilter=prefilter)
-    return {"type": "principled", "base_color": colour, "roughness": number}
-
-
 @pytest.fixture
 def of_files(tmp_path):
     """The same material of the maps of one file, or of a file for each map."""
@@ -54,28 +47,23 @@ def of_files(tmp_path):
     return make
 
 
-@pytest.mark.parametrize("prefilter", [0.0, 0.05])
-def test_renderings_are_those_without_reuse(monkeypatch, lookups, prefilter):
-    scene = small_scene(of_sets(prefilter))
-    found, few = np.array(mi.render(scene, spp=8)), len(lookups)
-    monkeypatch.setattr(reuse, "_is_traced", lambda: False)
-    expected = np.array(mi.render(scene, spp=8))
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-    assert few < len(lookups) - few
-
-
 class TestMapsOfAFile:
     """Their lookups are one; pictures and derivatives are those of a file for each map."""
 
     @pytest.mark.parametrize("prefilter", [0.0, 0.05])
-    def test_renderings(self, lookups, of_files, prefilter):
-        pictures, counts = [], []
-        for shared in (True, False):
+    def test_renderings(self, monkeypatch, lookups, of_files, prefilter):
+        """With fewer lookups than of a file for each map, and these fewer than without reuse."""
+        pictures, counts = [], [0]
+        for shared, traced in ((True, True), (False, True), (False, False)):
+            if not traced:
+                monkeypatch.setattr(reuse, "_is_traced", lambda: False)
             scene = small_scene(of_files(shared, prefilter)["bsdf"])
             pictures.append(np.array(mi.render(scene, spp=8)))
             counts.append(len(lookups))
-        np.testing.assert_allclose(*pictures, atol=1e-6)
-        assert 2 * counts[0] == counts[1] - counts[0]
+        one, each, all_of_them = np.diff(counts)
+        assert 2 * one == each and each < all_of_them
+        for found in pictures[:2]:
+            np.testing.assert_allclose(found, pictures[2], atol=1e-6)
 
     @pytest.mark.parametrize("prefilter", [0.0, 0.05])
     def test_frozen_renderings(self, of_files, prefilter):

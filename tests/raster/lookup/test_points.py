@@ -1,7 +1,5 @@
 """Sums at scattered points: values, slopes and gradients, against float64 without any lists."""
 
-import math
-
 import drjit as dr
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.lookup.points import (
     Packed,
-    cell_side,
     fold,
     gradient_terms,
     list_cells,
@@ -106,17 +103,6 @@ class TestValues:
             lengths.append(np.mean(ends[:, 1].astype(int) - ends[:, 0]))
         assert lengths[1] < 1.4 * lengths[0]  # fewer cells lie at the border
 
-    def test_splats_that_are_not_finite_are_not_seen(self, backend):
-        scene = random_scene(5)
-        broken = scene.factor.copy()
-        broken[3, 0], broken[4, 2] = np.nan, np.inf
-        others = np.setdiff1d(np.arange(len(broken)), [3, 4])
-        np.testing.assert_allclose(
-            stacked(look_up(scene._replace(factor=broken).on(backend), some_points(), 3.0)),
-            stacked(look_up(scene.permuted(others).on(backend), some_points(), 3.0)),
-            atol=1e-6,
-        )
-
 
 class TestDerivatives:
     def test_slopes_are_finite_differences(self, backend):
@@ -197,10 +183,3 @@ class TestFold:
     def test_what_is_not_finite_becomes_the_first_place(self, backend, wrap):
         found, _ = self.folded(backend, [np.nan, np.inf, -np.inf], wrap)
         np.testing.assert_array_equal(found, 0.5 if wrap == "clamp" else 0)
-
-
-@pytest.mark.parametrize(("count", "side"), [(1, 256), (500, 8), (5000, 4), (65536, 1)])
-def test_cells_are_about_as_wide_as_splats_are_apart(count, side):
-    found = cell_side(256, 256, count)
-    assert found == side
-    assert math.log2(found) == int(math.log2(found))
