@@ -13,7 +13,6 @@ import eigengs_dr as eg  # noqa: E402
 from _helpers.texture import at, gaussians, picture, texel_centres, texture  # noqa: E402
 from _helpers.variants import BOTH_RGB, in_variants, on_both  # noqa: E402
 from eigengs_dr.image.color import to_linear  # noqa: E402
-from eigengs_dr.plugins import texture_of  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -86,33 +85,6 @@ class TestValues:
         found = picture([texture(g).eval(texel_centres())[0]])[..., 0]
         np.testing.assert_allclose(found, light, atol=1e-5)
 
-    @in_variants(SPECTRAL)
-    def test_spectral_integrates_to_the_colour(self, variant):
-        g = gaussians("rgb")
-        lit = {
-            "type": "scene",
-            "integrator": {"type": "direct", "bsdf_samples": 1, "emitter_samples": 0},
-            "sensor": {
-                "type": "orthographic",
-                "to_world": mi.ScalarTransform4f().look_at([0, 0, 2], [0, 0, 0], [0, 1, 0]),
-                "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}},
-            },
-            "wall": {
-                "type": "rectangle",
-                "bsdf": {
-                    "type": "diffuse",
-                    "reflectance": {**texture_of(g), "to_uv": flat_middle()},
-                },
-            },
-            "light": {"type": "constant"},
-        }
-        scene = mi.load_dict(lit)
-        colour = np.array(mi.render(scene, spp=512)).mean(axis=(0, 1))
-        mi.set_variant(variant.replace("spectral", "rgb"))
-        expected = np.array(texture(g, to_uv=flat_middle()).eval(at(0.5, 0.5))).ravel()
-        mi.set_variant(variant)
-        np.testing.assert_allclose(colour, expected, rtol=0.02)
-
     @pytest.mark.parametrize("seed", range(3))
     def test_a_saved_set_is_the_same_texture(self, tmp_path, seed):
         g = gaussians("ycbcr", seed=seed)
@@ -121,11 +93,6 @@ class TestValues:
         np.testing.assert_array_equal(
             picture(loaded.eval(texel_centres())), picture(texture(g).eval(texel_centres()))
         )
-
-
-def flat_middle():
-    """A uv transform under which all of [0, 1]^2 sees almost one point."""
-    return mi.ScalarTransform4f().translate([0.5, 0.5, 0]) @ mi.ScalarTransform4f().scale(1e-4)
 
 
 class TestWhere:

@@ -108,19 +108,6 @@ class TestSampling:
         )
         assert test.run(), test.messages
 
-    def test_follows_the_parameters(self):
-        tex = texture(gaussians("linear"))
-        point = mi.Point2f(0.2, 0.2)
-        assert np.array(tex.pdf_position(point)) == pytest.approx(1, abs=0.3)
-        parameters = mi.traverse(tex)
-        bright = np.array(parameters["color"])
-        near = np.argsort(np.hypot(*(np.array(parameters["mean"]) - 0.8 * np.array(SIZE)).T))[:4]
-        bright[near] = 1
-        parameters["color"] = mi.TensorXf(bright)
-        parameters["background"] = mi.TensorXf(np.zeros(3, np.float32))
-        parameters.update()
-        assert np.array(tex.pdf_position(point)) < 0.5
-
     def test_what_is_below_zero_is_not_sampled(self):
         """Of a raw texture, whose values are not clamped."""
         g = gaussians("linear")

@@ -9,6 +9,7 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
+from _helpers.texture import at, gaussians, texture  # noqa: E402
 from _helpers.variants import on_both  # noqa: E402
 from eigengs_dr.plugins import color as spectrum  # noqa: E402
 
@@ -69,6 +70,14 @@ def test_basis_is_smooth():
 def test_round_trip(colors):
     back = to_srgb(evaluate(colors, FINE), FINE)
     np.testing.assert_allclose(back, colors, rtol=0, atol=3e-4)
+
+
+def test_a_texture_shows_its_colour():
+    tex = texture(gaussians("rgb"))
+    si = at(0.3, 0.6, len(FINE))
+    si.wavelengths = mi.Spectrum(mi.Float(FINE.astype(np.float32)))
+    back = to_srgb(np.array(tex.eval(si))[:1], FINE)
+    np.testing.assert_allclose(back[:, 0], np.array(tex.eval_3(si))[:, 0], rtol=0, atol=3e-4)
 
 
 def test_spectra_of_colors_are_reflectances():

@@ -77,15 +77,6 @@ class TestSumFiltered:
         assert np.abs(exact[sure]).max() > 0.1
         np.testing.assert_allclose(found[sure], exact[sure], atol=0.05 * np.abs(exact).max())
 
-    def test_far_from_borders_it_is_exact(self, backend):
-        scene = random_scene(2)
-        scene = scene._replace(mean=scene.mean % np.array(SIZE) * 0.2 + 0.4 * np.array(SIZE))
-        points = some_points() * 0.2 + 0.4 * np.array(SIZE)
-        covariance = np.array([[0.6, 0.2], [0.2, 0.5]])
-        exact = brute_force(scene, "repeat", points, covariance)
-        found = stacked(filtered(scene.on(backend), "repeat", points, covariance))
-        np.testing.assert_allclose(found + scene.background, exact, atol=2e-3)
-
     @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
     def test_without_a_footprint_it_is_the_sum(self, backend, wrap):
         scene, points = random_scene(3), some_points()

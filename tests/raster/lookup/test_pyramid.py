@@ -91,15 +91,6 @@ class TestLookup:
         for covariance in ([0, 0, 0], [0.5, 0, 100], [50, 49.9, 50]):
             assert not np.array(is_minified(lattice, [Float(c) for c in covariance])).any()
 
-    def test_inactive_lanes_are_zero(self, backend):
-        lattice = lattice_of(inner_scene().on(backend), "repeat")
-        types = types_of(lattice.values)
-        four = [types.Float(4), types.Float(0), types.Float(4)]
-        active = types.Bool([True, False])
-        rows = sum_pyramid(lattice, types.Float([5, 5]), types.Float([5, 5]), four, active)
-        assert (stacked(rows)[1] == 0).all()
-        assert (stacked(rows)[0] != 0).all()
-
 
 class TestMean:
     @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
