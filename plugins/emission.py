@@ -31,13 +31,7 @@ from eigengs_dr.raster.lookup.points import (
     sum_at_points,
     value_terms,
 )
-from eigengs_dr.raster.parameters import (
-    EXP2_SCALE,
-    NUM_SHAPE_PARAMS,
-    kernel_covariance,
-    pack_parameters,
-    unpack_parameters,
-)
+from eigengs_dr.raster.parameters import EXP2_SCALE, kernel_covariance, pack_parameters
 
 from .color import brightness, show_all
 from .versions import Texture
@@ -79,11 +73,9 @@ def make_survey(texture: Texture) -> Survey:
     """
     with dr.suspend_grad():
         table, size = texture.table, (texture.width, texture.height)
-        number = NUM_SHAPE_PARAMS + table.packed.channels
-        index = dr.arange(mi.UInt32, len(texture.source.start))
-        rows = unpack_parameters(dr.detach(table.packed.values), index, number)
-        dr.eval(rows)
-        shape, color = rows[:NUM_SHAPE_PARAMS], rows[NUM_SHAPE_PARAMS:][texture.part]
+        shape, color = dr.detach(table.packed).gather_all()
+        color = color[texture.part]
+        dr.eval(shape, color)
         smallest = _smallest_deviation(shape, color)
         columns, lines, spacing = _grid(texture, smallest)
         cells, deviation = table.cells, RESOLVED * spacing
@@ -92,7 +84,7 @@ def make_survey(texture: Texture) -> Survey:
             shape, amplitude = widen(shape, kernel_covariance([variance, zero, variance]))
             dr.eval(shape)
             color = [amplitude * c for c in color]
-            side = max(cell_side(*size, dr.width(index)), round(deviation))
+            side = max(cell_side(*size, dr.width(shape)), round(deviation))
             cells = list_cells(shape, *size, table.packed.radius, side)
         packed = Packed(pack_parameters([*shape, *color]), len(color), texture.cutoff)
         index = dr.arange(mi.UInt32, columns * lines)

@@ -8,7 +8,7 @@ import drjit as dr
 
 from ...backend.arrays import Bool, Float, UInt, rcp, rsqrt
 from ..evaluate import falloff, weights, widen
-from ..parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_covariance
+from ..parameters import EXP2_SCALE, kernel_covariance
 from .points import Packed, Terms, in_list_order
 
 MAX_FOOTPRINT = 0.4
@@ -111,11 +111,11 @@ def filtered_terms(packed: Packed, footprint: list) -> Terms:
         return _arranged_terms(footprint, packed.radius)
     scaled = kernel_covariance(footprint)
 
-    def terms(splat: list, x: Float, y: Float) -> list:
-        shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], scaled)
+    def terms(shape: list, color: list, x: Float, y: Float) -> list:
+        shape, amplitude = widen(shape, scaled)
         (w,) = weights(shape, x, y, (1, 1), packed.radius)
         w = w * amplitude
-        return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
+        return [w * c for c in color]
 
     return terms
 
@@ -151,8 +151,8 @@ def _arranged_terms(footprint: list, radius: float) -> Terms:
     fxx, fxy, fyy = kernel_covariance(footprint)
     own = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0)
 
-    def terms(splat: list, x: Float, y: Float) -> list:
-        mean_x, mean_y, p, t, r = splat[:NUM_SHAPE_PARAMS]
+    def terms(shape: list, color: list, x: Float, y: Float) -> list:
+        mean_x, mean_y, p, t, r = shape
         dx, dy = x - mean_x, y - mean_y
         xy, yy = dr.fma(t, r, fxy), dr.fma(r, r, fyy)
         across = dr.fma(r * r, fxx, t * dr.fma(t, fyy, -2 * r * fxy))
@@ -160,6 +160,6 @@ def _arranged_terms(footprint: list, radius: float) -> Terms:
         scale = rsqrt(dr.fma(pp, yy, own + dr.maximum(across, 0)))
         along = dr.fma(yy, dx, -xy * dy) * scale
         w = falloff(dr.fma(along, along, dy * dy) * rcp(yy), radius * radius) * scale
-        return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
+        return [w * c for c in color]
 
     return terms

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 
@@ -26,8 +26,8 @@ from ..parameters import (
     unpack_parameters,
 )
 
-Terms = Callable[[list, Float, Float], list]
-"""``terms(parameters, x, y)`` returns what a Gaussian contributes to each sum at a point."""
+Terms = Callable[[list, list, Float, Float], list]
+"""``terms(shape, color, x, y)`` returns what a Gaussian contributes to each sum at a point."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,17 @@ class Packed:
     def radius(self) -> float:
         """The cutoff in the units of the kernels."""
         return kernel_radius(self.cutoff)
+
+    def gather(self, index: UInt, active: Bool = True) -> tuple[list, list]:
+        """Return the shape and the channels of the Gaussians `index`."""
+        number = NUM_SHAPE_PARAMS + self.channels
+        rows = unpack_parameters(self.values, index, number, active)
+        return rows[:NUM_SHAPE_PARAMS], rows[NUM_SHAPE_PARAMS:]
+
+    def gather_all(self) -> tuple[list, list]:
+        """Return the shape and the channels of all Gaussians."""
+        stride = -(-(NUM_SHAPE_PARAMS + self.channels) // 4) * 4
+        return self.gather(dr.arange(types_of(self.values).UInt, dr.width(self.values) // stride))
 
 
 @dataclass(frozen=True)
@@ -226,15 +237,13 @@ def sum_range(
 ) -> list:
     """Sum the Gaussians ``index[begin:end]`` with another range at each point."""
     types = types_of(packed.values)
-    number = NUM_SHAPE_PARAMS + packed.channels
+    ordered = packed.arranged is not None
+    source = replace(packed, values=packed.arranged) if ordered else packed
 
     def add(i: UInt, end: UInt, x: Float, y: Float, sums: list) -> tuple:
         here = i < end
-        if packed.arranged is None:
-            source, n = packed.values, gather_index(types, index, i, here)
-        else:
-            source, n = packed.arranged, i
-        parts = terms(unpack_parameters(source, n, number, here), x, y)
+        n = i if ordered else gather_index(types, index, i, here)
+        parts = terms(*source.gather(n, here), x, y)
         return i + 1, end, x, y, [s + t for s, t in zip(sums, parts, strict=True)]
 
     # max_iterations=-1 tells Dr.Jit that the loop is a pure sum: its gradient needs no storage.
@@ -251,9 +260,9 @@ def sum_range(
 def value_terms(radius: float) -> Terms:
     """Return the `Terms` of the values ``c_n w_n(x)``."""
 
-    def terms(splat: list, x: Float, y: Float) -> list:
-        (w,) = weights(splat[:NUM_SHAPE_PARAMS], x, y, (1, 1), radius)
-        return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
+    def terms(shape: list, color: list, x: Float, y: Float) -> list:
+        (w,) = weights(shape, x, y, (1, 1), radius)
+        return [w * c for c in color]
 
     return terms
 
@@ -265,13 +274,13 @@ def gradient_terms(radius: float) -> Terms:
     `eigengs_dr.raster.parameters.EXP2_SCALE`.
     """
 
-    def terms(splat: list, x: Float, y: Float) -> list:
-        mean_x, mean_y, a, b, c = splat[:NUM_SHAPE_PARAMS]
-        (w,) = weights(splat[:NUM_SHAPE_PARAMS], x, y, (1, 1), radius)
+    def terms(shape: list, color: list, x: Float, y: Float) -> list:
+        mean_x, mean_y, a, b, c = shape
+        (w,) = weights(shape, x, y, (1, 1), radius)
         dx, dy = x - mean_x, y - mean_y
         u, v = dr.fma(a, dx, b * dy), c * dy
         steep = -2 * LN2 * w
         along = (w, steep * a * u, steep * dr.fma(b, u, c * v))
-        return [k * color for color in splat[NUM_SHAPE_PARAMS:] for k in along]
+        return [k * value for value in color for k in along]
 
     return terms

@@ -14,12 +14,7 @@ import drjit as dr
 
 from ...backend.arrays import Bool, Float, UInt, rcp, rsqrt, types_of
 from ..evaluate import weights, widen
-from ..parameters import (
-    NUM_SHAPE_PARAMS,
-    gather_index,
-    kernel_covariance,
-    unpack_parameters,
-)
+from ..parameters import gather_index, kernel_covariance, unpack_parameters
 from .footprint import filtered_terms, inside_share
 from .points import Packed, cell_range, sum_range
 from .size_classes import FOOTPRINT_REACH, SizeClasses
@@ -127,7 +122,6 @@ def _sum_copies(
     lanes of a packet then wait once for the longest sum.
     """
     types, cutoff = types_of(packed.values), packed.cutoff
-    number = NUM_SHAPE_PARAMS + packed.channels
     scaled = kernel_covariance(footprint)
     (left, right), (top, bottom) = bounds
     bottom = dr.select(active, bottom, top - 1)
@@ -177,14 +171,14 @@ def _sum_copies(
         (k, i, j), (x, y) = place, point
         here = (n < end) & (j <= bottom)
         index = gather_index(types, sizes.splat, n, here)
-        splat = unpack_parameters(packed.values, index, number, here)
+        shape, color = packed.gather(index, here)
         px, py, sign = _local(sizes, i, j, x, y)
         seen = [scaled[0], scaled[1] * sign, scaled[2]]
-        shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], seen)
+        shape, amplitude = widen(shape, seen)
         (w,) = weights(shape, px, py, (1, 1), packed.radius)
         part = inside_share(shape, seen, px, py, sizes.width, sizes.height)
         w = dr.select(here, w * amplitude * part, 0)
-        sums = [dr.fma(w, c, s) for c, s in zip(splat[NUM_SHAPE_PARAMS:], sums, strict=True)]
+        sums = [dr.fma(w, c, s) for c, s in zip(color, sums, strict=True)]
         n = n + 1
         ran = n >= end
         row = dr.select(ran, row + 1, row)

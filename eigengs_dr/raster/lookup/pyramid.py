@@ -24,7 +24,6 @@ from ..binning.tiles import Grid
 from ..evaluate import falloff, widen
 from ..parameters import (
     EXP2_SCALE,
-    NUM_SHAPE_PARAMS,
     KernelParameters,
     kernel_covariance,
     kernel_radius,
@@ -267,14 +266,13 @@ def _finest(sizes: SizeClasses, packed: Packed, x: Float, y: Float, blur: list) 
     """
     types = types_of(packed.values)
     width, height = sizes.width, sizes.height
-    number = NUM_SHAPE_PARAMS + packed.channels
-    count = dr.width(packed.values) // (-(-number // 4) * 4)
-    rows = unpack_parameters(packed.values, dr.arange(types.UInt, count), number)
-    shape, amplitude = widen(rows[:NUM_SHAPE_PARAMS], kernel_covariance(blur))
-    color = [amplitude * c for c in rows[NUM_SHAPE_PARAMS:]]
+    shape, color = packed.gather_all()
+    shape, amplitude = widen(shape, kernel_covariance(blur))
+    color = [amplitude * c for c in color]
     grid = Grid(width, height)
-    fixed = [dr.detach(s) + dr.zeros(types.Float, count) for s in shape]
-    lists = build_lists(fixed, packed.radius, grid, adjoint=dr.grad_enabled(packed.values))
+    lists = build_lists(
+        dr.detach(shape), packed.radius, grid, adjoint=dr.grad_enabled(packed.values)
+    )
     parameters = KernelParameters(shape, color, [types.Float(0) for _ in color])
     image = to_tensor(rasterize(parameters, lists, packed.cutoff), grid, len(color)).array
     border = math.ceil(FOOTPRINT_REACH * SAMPLE_DEVIATION * FINEST)
