@@ -127,23 +127,21 @@ def _sum_copies(
     bottom = dr.select(active, bottom, top - 1)
     classes = dr.width(sizes.table) // 8
 
-    def rows(i: UInt, j: UInt, k: UInt) -> tuple:
-        """Return the rows of cells [first, last] of the size class k under the footprint."""
-        square, _, _, ny, inverse, origin = unpack_parameters(sizes.table, types.UInt(k), 6)
-        _, y0, _ = _local(sizes, i, j, dr.detach(x), dr.detach(y))
-        reach = cutoff * dr.sqrt(footprint[2] + square)
-        first = dr.maximum(dr.floor((y0 - reach - origin) * inverse), 0)
-        last = dr.minimum(dr.floor((y0 + reach - origin) * inverse), ny - 1)
-        return types.Int(first), types.Int(last)
+    def next_run(fresh: Bool, row: UInt, stop: UInt, place: tuple, valid: Bool) -> tuple:
+        """Return the range [begin, end) in `splat` of a row of cells, the row and the last one.
 
-    def run(i: UInt, j: UInt, k: UInt, row: UInt, valid: Bool) -> tuple:
-        """Return the range [begin, end) in `splat` of a row of cells in the widened ellipse."""
-        square, first, nx, _, inverse, origin = unpack_parameters(sizes.table, types.UInt(k), 6)
+        Where `fresh`, the row is the first one of the size class under the footprint.
+        """
+        k, i, j = place
+        square, cells, nx, ny, inverse, origin = unpack_parameters(sizes.table, types.UInt(k), 6)
         x0, y0, sign = _local(sizes, i, j, dr.detach(x), dr.detach(y))
         xx, xy, yy = footprint[0] + square, footprint[1] * sign, footprint[2] + square
+        reach = cutoff * dr.sqrt(yy)
+        first = types.Int(dr.maximum(dr.floor((y0 - reach - origin) * inverse), 0))
+        last = types.Int(dr.minimum(dr.floor((y0 + reach - origin) * inverse), ny - 1))
+        row, stop = dr.select(fresh, first, row), dr.select(fresh, last, stop)
         side = rcp(inverse)
         low = dr.fma(types.Float(row), side, origin) - y0
-        reach = cutoff * dr.sqrt(yy)
         low, high = dr.maximum(low, -reach), dr.minimum(low + side, reach)
         # At height dy the ellipse of footprint + size^2 spans lean * dy - half to lean * dy + half.
         lean, ratio = xy * rcp(yy), rcp(yy)
@@ -154,24 +152,24 @@ def _sum_copies(
             return dr.safe_sqrt(free * (cutoff**2 - dy * dy * ratio))
 
         at_right, at_left = dr.clip(peak, low, high), dr.clip(-peak, low, high)
-        begin = (x0 + lean * at_left - half(at_left) - origin) * inverse
-        end = (x0 + lean * at_right + half(at_right) - origin) * inverse
-        begin = types.Int(dr.clip(dr.floor(begin), 0, nx - 1))
-        end = types.Int(dr.clip(dr.floor(end), 0, nx - 1))
-        cell = types.Int(first) + row * types.Int(nx)
-        valid = valid & (low <= high)
-        return (
-            dr.gather(types.UInt, sizes.starts, types.UInt(cell + begin), valid),
-            dr.gather(types.UInt, sizes.starts, types.UInt(cell + end + 1), valid),
+        left_end = (x0 + lean * at_left - half(at_left) - origin) * inverse
+        right_end = (x0 + lean * at_right + half(at_right) - origin) * inverse
+        begin, end = (
+            types.Int(cells) + row * types.Int(nx) + types.Int(dr.clip(dr.floor(v), 0, nx - 1))
+            for v in (left_end, right_end)
         )
+        valid = valid & (row <= stop) & (j <= bottom) & (low <= high)
+        begin, end = (
+            dr.gather(types.UInt, sizes.starts, types.UInt(v), valid) for v in (begin, end + 1)
+        )
+        return begin, end, row, stop
 
     def add(
         n: UInt, end: UInt, row: UInt, stop: UInt, place: tuple, point: tuple, sums: list
     ) -> tuple:
         (k, i, j), (x, y) = place, point
         here = (n < end) & (j <= bottom)
-        index = gather_index(types, sizes.splat, n, here)
-        shape, color = packed.gather(index, here)
+        shape, color = packed.gather(gather_index(types, sizes.splat, n, here), here)
         px, py, sign = _local(sizes, i, j, x, y)
         seen = [scaled[0], scaled[1] * sign, scaled[2]]
         shape, amplitude = widen(shape, seen)
@@ -187,18 +185,15 @@ def _sum_copies(
         k = dr.select(fresh, k + 1, k)
         k, i = dr.select(k >= classes, 0, k), dr.select(k >= classes, i + 1, i)
         i, j = dr.select(i > right, left, i), dr.select(i > right, j + 1, j)
-        first, last = rows(i, j, k)
-        row, stop = dr.select(fresh, first, row), dr.select(fresh, last, stop)
-        begin, new_end = run(i, j, k, row, ran & (row <= stop) & (j <= bottom))
+        begin, new_end, row, stop = next_run(fresh, row, stop, (k, i, j), ran)
         n, end = dr.select(ran, begin, n), dr.select(ran, new_end, end)
         return n, end, row, stop, (k, i, j), point, sums
 
-    k = types.Int(0) + dr.zeros(types.Int, dr.width(x))
-    row, stop = rows(left, top, k)
-    begin, end = run(left, top, k, row, active & (row <= stop))
+    zero = dr.zeros(types.Int, dr.width(x))
+    start = next_run(types.Bool(True), zero, zero, (zero, left, top), active)
     sums = [types.Float(0) for _ in range(packed.channels)]
     return dr.while_loop(
-        (begin, end, row, stop, (k, left, top), (x, y), sums),
+        (*start, (zero, left, top), (x, y), sums),
         lambda n, end, row, stop, place, *rest: place[2] <= bottom,
         add,
         label="sum footprints",
