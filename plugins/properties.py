@@ -81,15 +81,8 @@ def _from_arrays(props: Properties, backend: str) -> Gaussians:
     if props["space"] not in SPACES:
         raise ValueError(f"gaussian_texture: space {props['space']!r} is not in {SPACES}")
     mean, factor, color, background = (np.array(props[key]) for key in FIELDS)
-    return Gaussians.from_arrays(
-        mean,
-        factor,
-        color,
-        background.ravel(),
-        size=(width, height),
-        space=props["space"],
-        backend=backend,
-    )
+    size, space, flat = (width, height), props["space"], background.ravel()
+    return Gaussians.from_arrays(mean, factor, color, flat, size=size, space=space, backend=backend)
 
 
 def _path(props: Properties, key: str) -> str:

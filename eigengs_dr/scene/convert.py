@@ -6,7 +6,6 @@ import os
 import secrets
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,8 +57,7 @@ class ConvertedTexture(NamedTuple):
     psnr: float
 
 
-@dataclass(frozen=True)
-class ConvertedScene:
+class ConvertedScene(NamedTuple):
     """Result of `eigengs_dr.convert_scene`.
 
     Attributes
@@ -77,7 +75,7 @@ class ConvertedScene:
     scene: Path
     textures: list[ConvertedTexture]
     left: list[tuple[str, str]]
-    psnr: list[float] = field(default_factory=list)
+    psnr: list[float]
 
 
 @shows_progress
