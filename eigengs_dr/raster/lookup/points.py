@@ -121,8 +121,8 @@ def list_cells(shape: list, width: int, height: int, radius: float, side: int) -
 
 
 MAX_ARRANGED = 1 << 20
-"""Largest number of entries of lists whose parameters are copied; the copies take 32 MiB, or 96 with 16
-channels."""
+"""Largest number of entries of lists whose parameters are copied; the copies take 32 MiB, or with
+16 channels 96."""
 
 
 def in_list_order(splat: UInt, rows: list) -> Float | None:
