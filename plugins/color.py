@@ -118,7 +118,7 @@ def mean_weights() -> tuple[float, float, float]:
     return red, green, blue
 
 
-def upload_table() -> Any:
+def upload_table() -> Float:
     """Upload the basis for `upsample`, in the current variant (LLVM or CUDA).
 
     Returns
@@ -132,7 +132,7 @@ def upload_table() -> Any:
     return upload(mi.Float, intervals.T.astype(np.float32).ravel())
 
 
-def upsample(rgb: Any, wavelengths: Any, table: Any) -> Any:
+def upsample(rgb: Any, wavelengths: Any, table: Float) -> Any:
     """Return the reflectance spectrum of a colour, s = b + (r - b) R + (g - b) G.
 
     This form keeps greys exactly grey in floating point. The function evaluates nothing, so
@@ -167,7 +167,7 @@ def upsample(rgb: Any, wavelengths: Any, table: Any) -> Any:
     return type(wavelengths)(result)
 
 
-def show(texture: Texture, value: Float) -> Any:
+def show(texture: Texture, value: Float) -> Float:
     """Clamp and decode a channel, unless raw.
 
     The clamp conserves energy; light that may exceed 1 has no upper bound. Gradients ignore the
@@ -189,29 +189,26 @@ def show_all(texture: Texture, values: list) -> list:
     return [show(texture, value) for value in values]
 
 
-def slope_of(texture: Texture, value: Float) -> Any:
-    """Return the derivative of `show` for a channel that it does not clamp."""
-    if texture.space == "log" and not texture.raw:
-        return (from_log(value) + 1 / LOG_SLOPE) * math.log1p(LOG_SLOPE)
-    if texture.raw or texture.space not in ("ycbcr", "rgb"):
-        return type(value)(1)
-    curved = 2.4 / 1.055 * dr.power((dr.maximum(value, 0.04045) + 0.055) * (1 / 1.055), 1.4)
-    return dr.select(value <= 0.04045, 1 / 12.92, curved)
-
-
-def is_shown(texture: Texture, value: Float) -> Any:
-    """Return whether `show` does not clamp a channel."""
+def slope_of(texture: Texture, value: Float) -> Float:
+    """Return the derivative of `show` for a channel, but 0 where it clamps."""
+    slope = type(value)(1)
     if texture.raw:
-        return type(value)(0) == 0
-    return (value >= 0) & ((value <= 1) | (texture.space in UNBOUNDED))
+        return slope
+    if texture.space == "log":
+        slope = (from_log(value) + 1 / LOG_SLOPE) * math.log1p(LOG_SLOPE)
+    elif texture.space in ("ycbcr", "rgb"):
+        curved = 2.4 / 1.055 * dr.power((dr.maximum(value, 0.04045) + 0.055) * (1 / 1.055), 1.4)
+        slope = dr.select(value <= 0.04045, 1 / 12.92, curved)
+    shown = (value >= 0) & ((value <= 1) | (texture.space in UNBOUNDED))
+    return dr.select(shown, slope, 0)
 
 
-def luminance(color: list) -> Any:
+def luminance(color: list) -> Float:
     """Return the luminance of three channels, or the one channel there is."""
     return color[0] if len(color) == 1 else mi.luminance(mi.Color3f(*color))
 
 
-def brightness(texture: Texture, color: list) -> Any:
+def brightness(texture: Texture, color: list) -> Float:
     """Return what the texture reflects or emits in the mean: of wavelengths, where it has spectra.
 
     Parameters
@@ -231,6 +228,6 @@ def brightness(texture: Texture, color: list) -> Any:
     return luminance(color)
 
 
-def keep_finite(x: Float) -> Any:
+def keep_finite(x: Float) -> Float:
     """Replace values that are not finite, which an optimiser may leave, by 0."""
     return dr.select(dr.isfinite(x), x, 0)

@@ -13,55 +13,33 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from eigengs_dr.backend.arrays import Bool
 from eigengs_dr.backend.recording import collector_off, guest
 from eigengs_dr.image.color import rendered_as
-from eigengs_dr.raster.lookup.footprint import arrange
-from eigengs_dr.raster.lookup.points import (
-    cell_side,
-    fold,
-    gradient_terms,
-    in_list_order,
-    list_cells,
-    sum_at_points,
-)
-from eigengs_dr.raster.lookup.pyramid import build_pyramid, pyramid_mean
-from eigengs_dr.raster.lookup.size_classes import classify_by_size
-from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, pack_parameters
+from eigengs_dr.raster.lookup.points import fold, gradient_terms, sum_at_points
+from eigengs_dr.raster.parameters import KernelParameters
 from eigengs_dr.raster.render import decode_parameters
 
-from .color import (
-    STEP,
-    is_shown,
-    keep_finite,
-    luminance,
-    show_all,
-    slope_of,
-    upload_table,
-    upsample,
+from . import properties
+from .color import STEP, luminance, show_all, slope_of, upload_table, upsample
+from .cone import footprint_inputs, seen_metric
+from .emission import Emission, Survey, emission_of, make_survey, outside_of_recordings
+from .lookup import (
+    list_gaussians,
+    make_table,
+    reused,
+    sum_here,
+    sum_over_footprint,
+    table_of_file,
 )
-from .cone import footprint_inputs
-from .emission import emission_of, make_survey, outside_of_recordings
-from .lookup import reused, sum_here, sum_over_footprint
-from .parameters import derived
-from .properties import (
-    cutoff,
-    file_name,
-    prefilter,
-    prepare,
-    raw,
-    read_transform,
-    source_of,
-    wrap_mode,
-)
+from .parameters import SHAPES, Arrays
 from .versions import Interaction, Properties, Texture, register_texture, texture_class
 
 
 def gaussian_texture() -> type:
     """Return the class of the texture, a `mitsuba.Texture` of the current variant."""
-    if mi.variant().startswith("scalar"):
-        return _Refusal
 
     class GaussianTexture(texture_class()):  # type: ignore[misc]
         """A sum of Gaussians over uv, ``(u, v) = (x / width, y / height)``, row 0 at v = 0.
@@ -73,7 +51,7 @@ def gaussian_texture() -> type:
         ----------
         filename : str
             Path of a set from ``eigengs-dr fit`` or `Gaussians.save`, or of a material. Textures
-            of one file share the memory of means, shapes and lists until one of them changes.
+            of one file share memory and lookups, each until one of its parameters changes.
         map : str
             With the `filename` of a material: the name of the map, such as "roughness".
         first : int
@@ -99,81 +77,55 @@ def gaussian_texture() -> type:
         @guest()  # a thread of Mitsuba, whose caller may hold the lock
         def __init__(self, props: Properties) -> None:
             super().__init__(props)
-            self.source = source_of(props)
-            self.file = file_name(props)
-            self.raw = raw(props)
-            self.cutoff = cutoff(props, self.source.start.cutoff)
-            self.angle, self.follows = prefilter(props)
+            self.source = properties.source_of(props)
+            start = self.source.start
+            self.file = properties.file_name(props)
+            self.raw = properties.raw(props)
+            self.cutoff = properties.cutoff(props, start.cutoff)
+            self.angle, self.follows = properties.prefilter(props)
             self.inputs = ("uv", *(footprint_inputs() if self.filtered() else ()))
-            self.wrap = wrap_mode(props)
-            self.to_uv = read_transform(props)
-            self.width, self.height = self.source.start.width, self.source.start.height
-            self.space, self.channels = self.source.start.space, self.source.start.channels
+            self.wrap = properties.wrap_mode(props)
+            self.to_uv = properties.to_uv(props)
+            self.width, self.height = start.width, start.height
+            self.space, self.channels = start.space, start.channels
             self.spectra = upload_table() if mi.is_spectral else None
             self.parameters_changed([])
 
         def traverse(self, callback: Any) -> None:
-            self.source.put(callback)
+            for name, tensor in self.source.tensors.items():
+                callback.put(name, tensor, mi.ParamFlags.Differentiable)
             callback.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
 
         def parameters_changed(self, keys: list[str]) -> None:
-            self.transform = prepare(self.to_uv)
+            properties.check_invertible(self.to_uv)
+            self.transform = mi.Transform3f(self.to_uv)
+            dr.make_opaque(self.transform)  # another transform compiles no other programs
             if set(keys) != {"to_uv"}:
-                self._take_over(not keys or any(key in self.source.shaping for key in keys))
+                self._take_over(not keys or any(key in SHAPES for key in keys))
             sampled = getattr(self, "emission", None) is not None
-            self.survey: Any = None
-            self.emission: Any = None
+            self.survey: Survey | None = None
+            self.emission: Emission | None = None
             if sampled:  # a frozen rendering cannot make it
                 self._emission()
 
         def _take_over(self, moved: bool) -> None:
             """Take over the Gaussians; with new lists if they have moved."""
-            inputs = self.source.inputs()
+            source, settings = self.source, (self.cutoff, self.wrap, self.filtered())
+            if source.file and source.is_that_of_file():
+                self.table, self.part = table_of_file(source.file, *settings), source.part
+                return
+
+            def decode(inputs: Arrays) -> KernelParameters:
+                return decode_parameters(source.gaussians(inputs))
+
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
             if moved:
-                fixed = self.source.gaussians(dr.detach(inputs))
-                self._list(list(decode_parameters(fixed).shape))
-            found = derived(inputs, self._prepare)
-            self.packed, self.background = found["packed"], found["background"]
-            self.arranged = found["arranged"]
-            if self.filtered():
-                self.pyramid = replace(self.levels, values=found["values"])
-                self.average = found["average"]
-
-        def _prepare(self, inputs: dict[str, Any]) -> dict[str, Any]:
-            """Compute what lookups read from the parameters."""
-            parameters = decode_parameters(self.source.gaussians(inputs))
-            shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
-            found: dict[str, Any] = {"background": [keep_finite(b) for b in parameters.background]}
-            found["packed"] = pack_parameters([*shape, *color])
-            if not self.filtered():
-                found["arranged"] = in_list_order(self.cells.splat, [*shape, *color])
-                dr.eval(found)
-                return found
-            found["arranged"] = arrange(self.cells.splat, shape, color)
-            dr.eval(found)
-            number = NUM_SHAPE_PARAMS + self.channels
-            pyramid = build_pyramid(self.sizes, found["packed"], number, self.cutoff)
-            self.levels = replace(pyramid, values=None)
-            found |= {"values": pyramid.values, "average": pyramid_mean(pyramid)}
-            dr.eval(found["average"])
-            return found
-
-        def _list(self, shape: list) -> None:
-            """List the Gaussians near every cell."""
-            size = (self.width, self.height)
-            listed = self.source.listed
-            if self.filtered():
-                self.sizes = listed(
-                    ("sizes", self.cutoff, self.wrap),
-                    lambda: classify_by_size(shape, *size, self.cutoff, self.wrap),
-                )
-                _, self.cells = self.sizes.listed[0]  # slopes and the survey look at points
+                shape = decode(dr.detach(source.tensors)).shape
+                lists = list_gaussians(shape, (self.width, self.height), *settings)
             else:
-                side, radius = cell_side(*size, dr.width(shape)), kernel_radius(self.cutoff)
-                self.cells = listed(
-                    ("cells", radius), lambda: list_cells(shape, *size, radius, side)
-                )
+                lists = self.table.cells, self.table.sizes
+            self.table = make_table(lists, self.cutoff, source.tensors, decode)
+            self.part = slice(None)
 
         # --- Lookups -----------------------------------------------------------------------------
 
@@ -206,40 +158,45 @@ def gaussian_texture() -> type:
 
         @collector_off()
         def eval_1_grad(self, si: Interaction, active: Bool = True) -> Any:
-            (x, sx), (y, sy), active = self._point(si, active)
-            terms = gradient_terms(kernel_radius(self.cutoff))
-            number = NUM_SHAPE_PARAMS + self.channels
-            count = 3 * self.channels
-            sums = sum_at_points(self.cells, self.packed, number, x, y, active, terms, count)
-            coded = [s + b for s, b in zip(sums[::3], self.background, strict=True)]
-            slope = [dr.select(is_shown(self, c), slope_of(self, c), 0) for c in coded]
-            du = luminance([s * k for s, k in zip(slope, sums[1::3], strict=True)])
-            dv = luminance([s * k for s, k in zip(slope, sums[2::3], strict=True)])
-            du, dv = du * sx * self.width, dv * sy * self.height
-            return mi.Vector2f(*self.transform.pull_back(du, dv))
+            (x, sx), (y, sy), inside = self.point(si.uv)
+            packed = replace(self.table.packed, arranged=None)  # the copies have no gradients
+            cells, terms = self.table.cells, gradient_terms(packed.radius)
+            count = 3 * packed.channels
+            sums = sum_at_points(cells, packed, x, y, inside & active, terms, count)
+            values, along, down = (sums[k::3][self.part] for k in range(3))
+            background = self.table.background[self.part]
+            slope = [slope_of(self, v + b) for v, b in zip(values, background, strict=True)]
+            du = luminance([s * k for s, k in zip(slope, along, strict=True)]) * sx * self.width
+            dv = luminance([s * k for s, k in zip(slope, down, strict=True)]) * sy * self.height
+            m = self.transform.matrix
+            return mi.Vector2f(m[0, 0] * du + m[1, 0] * dv, m[0, 1] * du + m[1, 1] * dv)
 
         def _color(self, si: Interaction, active: Bool) -> list:
-            """Look up the channels, decoded and clamped unless `raw`."""
-            color = reused(self, si, self.inputs, lambda: self._look_up(si))
-            return [dr.select(active, c, 0) for c in color]
+            """Look up the channels, decoded and clamped unless `raw`; 0 where uv is not finite."""
+            where = (self.wrap, self.angle, *np.array(self.to_uv.matrix).flat)
+            sums = reused(self.table, where, si, self.inputs, lambda: self._look_up(si))[self.part]
+            background = self.table.background[self.part]
+            shown = show_all(self, [s + b for s, b in zip(sums, background, strict=True)])
+            _, _, inside = self.point(si.uv)
+            return [dr.select(inside & active, s, 0) for s in shown]
 
         def _look_up(self, si: Interaction) -> list:
-            """Look up the channels in all lanes; 0 where uv is not finite."""
-            (x, sx), (y, sy), valid = self._point(si, True)
-            if self.filtered():
-                sums = sum_over_footprint(self, si, (x, sx), (y, sy), valid)
-            else:
-                sums = sum_here(self, x, y, valid)
-            sums = [s + b for s, b in zip(sums, self.background, strict=True)]
-            return [dr.select(valid, s, 0) for s in show_all(self, sums)]
+            """Sum all channels of the table, in all lanes."""
+            (x, sx), (y, sy), inside = self.point(si.uv)
+            if not self.filtered():
+                return sum_here(self.table, x, y, inside)
+            # B of a transform with the rows of B^-1
+            turned = self.transform.inverse_transpose
+            inverse = tuple(turned[j, i] for i in range(2) for j in range(2))
+            seen = seen_metric(si, inverse, self.angle)
+            return sum_over_footprint(self.table, (x, sx), (y, sy), inside, seen)
 
-        def _point(self, si: Interaction, active: Bool) -> tuple:
-            """Fold uv into the image: x, y in pixels with their slopes, active if uv is finite."""
-            u, v = self.transform.apply(si.uv)
-            active = mi.Bool(active) & dr.isfinite(u) & dr.isfinite(v)
+        def point(self, uv: Any) -> tuple:
+            """Fold uv into the image: x, y in pixels with their slopes; whether uv is finite."""
+            u, v = self.transform @ uv
             x = fold(u * self.width, self.width, self.wrap)
             y = fold(v * self.height, self.height, self.wrap)
-            return x, y, active
+            return x, y, dr.isfinite(u) & dr.isfinite(v)
 
         # --- Sampling ----------------------------------------------------------------------------
 
@@ -275,13 +232,13 @@ def gaussian_texture() -> type:
         def max(self) -> float:
             return float(self._surveyed().largest[0])
 
-        def _surveyed(self) -> Any:
+        def _surveyed(self) -> Survey:
             """Return the survey of the brightness; the first call after a change makes it."""
             if self.survey is None:
                 self.survey = outside_of_recordings(lambda: make_survey(self))
             return self.survey
 
-        def _emission(self) -> Any:
+        def _emission(self) -> Emission:
             """Return the distribution of emission; the first call after a change makes it."""
             if self.emission is None:
                 self.emission = emission_of(self._surveyed())
@@ -319,14 +276,11 @@ def _name(texture: Texture) -> str:
     return f"gaussian_texture {texture.id()!r}" if texture.id() else "gaussian_texture"
 
 
-class _Refusal:
-    """The class for scalar variants, which raises an error."""
-
-    def __init__(self, props: Properties) -> None:
-        raise RuntimeError(
-            f"gaussian_texture does not support the variant {mi.variant()}; "
-            "use mi.set_variant('llvm_ad_rgb') or another llvm or cuda variant"
-        )
+def _refuse(props: Properties) -> Texture:
+    raise RuntimeError(
+        f"gaussian_texture does not support the variant {mi.variant()}; "
+        "use mi.set_variant('llvm_ad_rgb') or another llvm or cuda variant"
+    )
 
 
 def register_plugins() -> None:
@@ -357,4 +311,5 @@ def _follow() -> None:
 
 @cache
 def _register(variant: str) -> None:
-    register_texture("gaussian_texture", gaussian_texture())
+    scalar = variant.startswith("scalar")
+    register_texture("gaussian_texture", _refuse if scalar else gaussian_texture())

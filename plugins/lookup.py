@@ -1,32 +1,141 @@
-"""Lookups of ``gaussian_texture``: the sum of Gaussians at a point, or over a footprint.
+"""What lookups of ``gaussian_texture`` read, and the lookups: at a point, or over a footprint.
 
 Values come from parameters in the order of the lists, and derivatives from the parameters
 themselves: reading copies is faster, but adding to copies is slower. Dr.Jit leaves the values of
 the second sum out, because nobody needs them.
 
-A material that asks twice for the colour of a point pays once. A BSDF looks its textures up in its
-evaluation and again in its sampling, often in one recorded program. Dr.Jit merges equal gathers of
-a bitmap, but not equal loops.
+A material that asks twice about a point pays once. A BSDF looks its textures up in its evaluation
+and again in its sampling, often in one recorded program. Dr.Jit merges equal gathers of a bitmap,
+but not equal loops. Textures of the maps of one file share a table, so they share lookups too:
+the weights of the Gaussians are summed once for all channels.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.arrays import Bool, Float
-from eigengs_dr.raster.lookup.footprint import bound_covariance
-from eigengs_dr.raster.lookup.points import sum_at_points, value_terms
+from eigengs_dr.raster.lookup.footprint import arrange, bound_covariance
+from eigengs_dr.raster.lookup.points import (
+    Cells,
+    Packed,
+    cell_side,
+    in_list_order,
+    list_cells,
+    sum_at_points,
+    value_terms,
+)
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered, where_any
-from eigengs_dr.raster.lookup.pyramid import is_minified, sum_pyramid
-from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, kernel_radius
+from eigengs_dr.raster.lookup.pyramid import (
+    GaussianPyramid,
+    build_pyramid,
+    is_minified,
+    levels_of,
+    pyramid_mean,
+    sum_pyramid,
+)
+from eigengs_dr.raster.lookup.size_classes import SizeClasses, classify_by_size
+from eigengs_dr.raster.parameters import KernelParameters, kernel_radius, pack_parameters
 
-from .cone import seen_metric
-from .versions import Interaction, Texture
+from .color import keep_finite
+from .parameters import Arrays, SharedFile, derived
+from .versions import Interaction
+
+Lists = tuple[Cells, SizeClasses | None]
+"""The Gaussians near every point of an image, and with a prefilter those near every footprint."""
+
+
+def list_gaussians(
+    shape: list, size: tuple[int, int], cutoff: float, wrap: str, filtered: bool
+) -> Lists:
+    """List Gaussians for lookups at points or, if `filtered`, over footprints.
+
+    Parameters
+    ----------
+    shape : list of 5 Float, shape (N,)
+        See `eigengs_dr.raster.parameters.KernelParameters`.
+    size : (int, int)
+    cutoff, wrap, filtered
+        See the properties of the texture.
+    """
+    if filtered:
+        sizes = classify_by_size(shape, *size, cutoff, wrap)
+        return sizes.listed[0][1], sizes  # slopes and the survey look at points
+    side = cell_side(*size, dr.width(shape))
+    return list_cells(shape, *size, kernel_radius(cutoff), side), None
+
+
+@dataclass(frozen=True)
+class Table:
+    """What lookups read.
+
+    Attributes
+    ----------
+    cells, sizes
+        See `Lists`.
+    packed : Packed
+    background : list of Float, shape (1,)
+    pyramid : GaussianPyramid or None
+        None without a prefilter.
+    average : list of Float, shape (1,)
+        Mean of the sums; empty without a prefilter.
+    """
+
+    cells: Cells
+    sizes: SizeClasses | None
+    packed: Packed
+    background: list
+    pyramid: GaussianPyramid | None
+    average: list
+
+
+def make_table(
+    lists: Lists, cutoff: float, inputs: Arrays, decode: Callable[[Arrays], KernelParameters]
+) -> Table:
+    """Compute what lookups read; derivatives flow back to the `inputs` of `decode`."""
+    cells, sizes = lists
+
+    def compute(inputs: Arrays) -> Arrays:
+        parameters = decode(inputs)
+        shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
+        found = {
+            "packed": pack_parameters([*shape, *color]),
+            "background": [keep_finite(b) for b in parameters.background],
+        }
+        if sizes is None:
+            found["arranged"] = in_list_order(cells.splat, [*shape, *color])
+            dr.eval(found)
+            return found
+        found["arranged"] = arrange(cells.splat, shape, color)
+        dr.eval(found)
+        pyramid = build_pyramid(sizes, Packed(found["packed"], len(color), cutoff))
+        found |= {"values": pyramid.values, "average": pyramid_mean(pyramid)}
+        dr.eval(found["average"])
+        return found
+
+    found = derived(inputs, compute)
+    background, pyramid = found["background"], None
+    channels = len(background)
+    if sizes is not None:
+        levels = levels_of(sizes.width, sizes.height)
+        pyramid = GaussianPyramid(sizes.wrap, channels, levels, found["values"])
+    packed = Packed(found["packed"], channels, cutoff, found["arranged"])
+    return Table(cells, sizes, packed, background, pyramid, found.get("average", []))
+
+
+def table_of_file(file: SharedFile, cutoff: float, wrap: str, filtered: bool) -> Table:
+    """Return the table of all channels of a file; the first call for these settings makes it."""
+    key = (cutoff, wrap, filtered)
+    if key not in file.tables:
+        parameters, size = file.parameters(), (file.gaussians.width, file.gaussians.height)
+        lists = list_gaussians(parameters.shape, size, *key)
+        file.tables[key] = make_table(lists, cutoff, {}, lambda _: parameters)
+    return file.tables[key]
 
 
 class _Lookups(threading.local):
@@ -39,18 +148,22 @@ class _Lookups(threading.local):
 
     def __init__(self) -> None:
         self.scope = -1
-        self.found: dict[tuple, tuple[Any, Any]] = {}
+        self.found: dict[tuple, tuple[list, list]] = {}
 
 
 _lookups = _Lookups()
 
 
-def reused(texture: Texture, si: Interaction, inputs: tuple, look_up: Callable[[], list]) -> list:
+def reused(
+    table: Table, where: tuple, si: Interaction, inputs: tuple, look_up: Callable[[], list]
+) -> list:
     """Return the result of a lookup, from an earlier one with the same inputs if there is one.
 
     Parameters
     ----------
-    texture : mitsuba.Texture
+    table : Table
+    where : tuple
+        Properties of the texture on which the lookup depends.
     si : mitsuba.SurfaceInteraction3f
     inputs : tuple of str
         Attributes of `si` on which the lookup depends.
@@ -62,20 +175,18 @@ def reused(texture: Texture, si: Interaction, inputs: tuple, look_up: Callable[[
     list of Float
         Never shared where there are gradients: they must not cross `drjit.isolate_grad`.
     """
-    if dr.grad_enabled(texture.packed) or not _is_traced():
+    if dr.grad_enabled(table.packed.values) or not _is_traced():
         return look_up()
     backend = dr.backend_v(mi.Float)
     if dr.detail.scope(backend) != _lookups.scope:
         _lookups.found.clear()
-    # The values keep their indices, so that no other variable has them.
-    values = [texture.packed, *(getattr(si, name) for name in inputs)]
-    key = (id(texture), *dr.detail.collect_indices(values))
-    entry = _lookups.found.get(key)
-    if entry is None:
-        entry = look_up(), values
-        _lookups.found[key] = entry
+    # The arrays keep their indices, so that no other variable has them.
+    arrays = [table.packed.values, *(getattr(si, name) for name in inputs)]
+    key = (where, *dr.detail.collect_indices(arrays))
+    if key not in _lookups.found:
+        _lookups.found[key] = look_up(), arrays
     _lookups.scope = dr.detail.scope(backend)
-    return entry[0]
+    return _lookups.found[key][0]
 
 
 def _is_traced() -> bool:
@@ -87,13 +198,12 @@ def _is_traced() -> bool:
     return dr.flag(dr.JitFlag.SymbolicScope) and not dr.flag(dr.JitFlag.FreezingScope)
 
 
-def sum_here(texture: Texture, x: Float, y: Float, active: Bool) -> list:
+def sum_here(table: Table, x: Float, y: Float, active: Bool) -> list:
     """Sum the Gaussians at a point.
 
     Parameters
     ----------
-    texture : mitsuba.Texture
-        A ``gaussian_texture`` without a prefilter.
+    table : Table
     x, y : Float
         In pixels, inside the image.
     active : Bool
@@ -103,32 +213,28 @@ def sum_here(texture: Texture, x: Float, y: Float, active: Bool) -> list:
     list of Float
         One sum for each channel, without the background.
     """
-    count, terms = texture.channels, value_terms(kernel_radius(texture.cutoff))
-    number = NUM_SHAPE_PARAMS + count
 
-    def look_up(packed: Float, x: Float, y: Float, arranged: Float) -> list:
-        return sum_at_points(texture.cells, packed, number, x, y, active, terms, count, arranged)
+    def look_up(table: Table, x: Float, y: Float) -> list:
+        terms = value_terms(table.packed.radius)
+        return sum_at_points(table.cells, table.packed, x, y, active, terms)
 
-    if not dr.grad_enabled(texture.packed):
-        return look_up(texture.packed, x, y, texture.arranged)
-    packed, px, py = dr.detach((texture.packed, x, y))
-    value = look_up(packed, px, py, texture.arranged)
-    return _with_gradient(value, look_up(texture.packed, x, y, None))
+    return _with_gradient(look_up, table, x, y)
 
 
 def sum_over_footprint(
-    texture: Texture, si: Interaction, column: tuple, row: tuple, active: Bool
+    table: Table, column: tuple, row: tuple, active: Bool, seen: tuple[list, Bool]
 ) -> list:
     """Average the sum of Gaussians over the footprint around a point.
 
     Parameters
     ----------
-    texture : mitsuba.Texture
-        A ``gaussian_texture`` with a prefilter.
-    si : mitsuba.SurfaceInteraction3f
+    table : Table
+        With a pyramid.
     column, row : tuple of 2 Float
         x and y in pixels, with their slopes, from `eigengs_dr.raster.lookup.points.fold`.
     active : Bool
+    seen : tuple
+        From `eigengs_dr.plugins.cone.seen_metric`.
 
     Returns
     -------
@@ -138,35 +244,32 @@ def sum_over_footprint(
     # The slopes of `fold` turn a footprint in mirrored images. They also take away its width along
     # an axis on which the point lies outside of a clamped image.
     (x, sx), (y, sy) = column, row
-    sx, sy = sx * texture.width, sy * texture.height
-    inverse, valid = seen_metric(si, texture.transform.inverse, texture.angle)
+    assert table.sizes and table.pyramid
+    sx, sy = sx * table.sizes.width, sy * table.sizes.height
+    inverse, valid = seen
     unit, blind = bound_covariance(inverse)
-    sizes = (sx * sx, sx * sy, sy * sy)
-    footprint = [dr.select(valid, f * s, 0) for f, s in zip(unit, sizes, strict=True)]
+    squares = (sx * sx, sx * sy, sy * sy)
+    footprint = [dr.select(valid, f * s, 0) for f, s in zip(unit, squares, strict=True)]
     blind &= valid & (sx * sy != 0)
-    distant = is_minified(texture.pyramid, footprint)
+    distant = is_minified(table.pyramid, footprint)
     near, wide = active & ~distant, active & distant & ~blind
-    count, cutoff = texture.channels, texture.cutoff
-    number = NUM_SHAPE_PARAMS + count
 
-    def look_up(source: tuple, x: Float, y: Float, arranged: Float) -> list:
-        packed, pyramid, average = source
-        sharp = sum_prefiltered(
-            texture.sizes, packed, number, x, y, footprint, near, cutoff, arranged
-        )
-        far = where_any(
-            wide, lambda: sum_pyramid(pyramid, x, y, footprint, wide), count, pyramid.values
-        )
+    def look_up(table: Table, x: Float, y: Float) -> list:
+        assert table.sizes and table.pyramid
+        pyramid = table.pyramid
+        sharp = sum_prefiltered(table.sizes, table.packed, x, y, footprint, near)
+        far = where_any(wide, lambda: sum_pyramid(pyramid, x, y, footprint, wide), table.packed)
         seen = [dr.select(distant, f, n) for f, n in zip(far, sharp, strict=True)]
-        return [dr.select(blind, m, s) for m, s in zip(average, seen, strict=True)]
+        return [dr.select(blind, m, s) for m, s in zip(table.average, seen, strict=True)]
 
-    source = (texture.packed, texture.pyramid, texture.average)
-    if not dr.grad_enabled(texture.packed):
-        return look_up(source, x, y, texture.arranged)
-    fixed, px, py = dr.detach((source, x, y))
-    value = look_up(fixed, px, py, texture.arranged)
-    return _with_gradient(value, look_up(source, x, y, None))
+    return _with_gradient(look_up, table, x, y)
 
 
-def _with_gradient(values: list, carriers: list) -> list:
+def _with_gradient(look_up: Callable[..., list], table: Table, x: Float, y: Float) -> list:
+    """Return the values of fast lookups with the derivatives of lookups that have some."""
+    if not dr.grad_enabled(table.packed.values):
+        return look_up(table, x, y)
+    values = look_up(*dr.detach((table, x, y)))
+    slow = replace(table, packed=replace(table.packed, arranged=None))
+    carriers = look_up(slow, x, y)
     return [dr.replace_grad(v, c) for v, c in zip(values, carriers, strict=True)]

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 from weakref import WeakValueDictionary
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from eigengs_dr.backend.arrays import types_of, upload
 from eigengs_dr.eigenbasis.eigengs import EigenGS
+from eigengs_dr.gaussian.channels import slices
 from eigengs_dr.gaussian.gaussians import (
     FIELDS,
     Fitted,
@@ -23,6 +25,8 @@ from eigengs_dr.gaussian.gaussians import (
     set_of,
     to_tensors,
 )
+from eigengs_dr.raster.parameters import KernelParameters
+from eigengs_dr.raster.render import decode_parameters
 
 Arrays = dict[str, Any]
 
@@ -64,7 +68,7 @@ def texture_of(gaussians: Gaussians | Fitted, **properties: Any) -> dict[str, An
     }
 
 
-def gaussians_of(parameters: Any, texture: str, like: Gaussians) -> Gaussians:
+def gaussians_of(parameters: Mapping[str, Any], texture: str, like: Gaussians) -> Gaussians:
     """Read a set back from the parameters of a texture, differentiably.
 
     Parameters
@@ -106,52 +110,47 @@ def keep_in_bounds(parameters: Any, texture: str, like: Gaussians) -> None:
         parameters[f"{texture}.{name}"] = bounded[name]
 
 
-def _found(parameters: Any, texture: str) -> dict[str, Any]:
+def _found(parameters: Mapping[str, Any], texture: str) -> Arrays:
     keys = {name: f"{texture}.{name}" for name in FIELDS}
     return {name: parameters[key] for name, key in keys.items() if key in parameters}
 
 
 # ---------------------------------------------------------------------------------------------
-#  Files that several textures of a scene use: read once, with one set of lists
-#
-#  Textures of the maps of a material have the same means and shapes. While no texture changes
-#  them, all textures of a file use one array of means, one of shapes, and the same lists.
+#  Where the Gaussians of a texture come from
 # ---------------------------------------------------------------------------------------------
 
 
-SHAPES = ("mean", "factor")
-"""Parameters that the maps of a material share."""
-
-
 class SharedFile:
-    """The content of a file, and what textures of it share.
+    """The content of a file, which is read once for all textures of a scene that use it.
+
+    Textures of the maps of a material have the same means and shapes. While no texture changes
+    its parameters, all textures of a file read the same tables.
 
     Attributes
     ----------
     gaussians : Gaussians
         The set, perhaps with maps.
-    tensors : dict of str to TensorXf
-        Mean (N, 2) and factor (N, 3).
-    lists : dict
-        Lists of Gaussians that a texture has made.
+    tables : dict
+        What lookups of all channels read, by the properties that it depends on.
     """
 
     def __init__(self, path: str, backend: str, first: int | None) -> None:
         self.path = path
         whole = Gaussians.load(path, backend)
         self.gaussians = whole if first is None else whole[:first]
-        self.tensors = {name: to_tensors(self.gaussians)[name] for name in SHAPES}
-        self.lists: dict[Any, Any] = {}
+        self.tables: dict[tuple, Any] = {}
+        self.shared = to_tensors(self.gaussians)
 
-    def map(self, name: str | None) -> Gaussians:
-        """Return the set of a map, or of the whole file.
+    def source(self, name: str | None) -> Source:
+        """Return a map, or the whole file, as the source of a texture.
 
         Raises
         ------
         ValueError
             If the file holds maps and no name is given, has no such map, or holds no maps.
         """
-        names = [m.name for m in self.gaussians.maps]
+        maps = self.gaussians.maps
+        names = [m.name for m in maps]
         if not names and name is not None:
             raise ValueError(
                 f"gaussian_texture: {self.path} holds one image and no map {name!r}; leave map out"
@@ -161,17 +160,22 @@ class SharedFile:
             raise ValueError(
                 f"gaussian_texture: {self.path} {missing} map = one of {', '.join(names)}"
             )
-        return self.gaussians if name is None else self.gaussians[name]
+        if name is None:
+            return Source(self.gaussians, self.shared, file=self)
+        gaussians = self.gaussians[name]
+        tensors = to_tensors(gaussians) | {key: self.shared[key] for key in SHAPES}
+        return Source(gaussians, tensors, file=self, part=slices(maps)[names.index(name)])
 
-    def holds(self, tensors: dict[str, Any]) -> bool:
-        """Return whether tensors have the memory of the file: nobody has changed them."""
-        return all(tensors[k].array.index == self.tensors[k].array.index for k in SHAPES)
-
-    def listed(self, key: Any, build: Callable[[], Any]) -> Any:
-        """Return the lists of a kind; the first call makes them."""
-        if key not in self.lists:
-            self.lists[key] = build()
-        return self.lists[key]
+    def parameters(self) -> KernelParameters:
+        """Return the parameters of all channels, decoded map by map."""
+        names = [m.name for m in self.gaussians.maps]
+        parts = [decode_parameters(self.gaussians[n]) for n in names]
+        if not parts:
+            return decode_parameters(self.gaussians)
+        color = [c for part in parts for c in part.color]
+        return KernelParameters(
+            parts[0].shape, color, [b for part in parts for b in part.background]
+        )
 
 
 _files: WeakValueDictionary[tuple, SharedFile] = WeakValueDictionary()
@@ -192,36 +196,49 @@ def shared_file(path: str, backend: str, first: int | None) -> SharedFile:
     return found
 
 
-@dataclass(init=False)
-class FromSet:
-    """The parameters mean (N, 2), factor (N, 3), color (N, C) and background (C,) of a set.
+SHAPES = ("mean", "factor")
+"""Parameters whose change requires new lists of the Gaussians. Maps share them."""
 
-    Units are native pixels and the space of the set, as in `eigengs_dr.Gaussians`.
+
+@dataclass(eq=False)
+class Source:
+    """The parameters of a texture, and the Gaussians that they stand for.
+
+    They are mean (N, 2), factor (N, 3), color (N, C) and background (C,) of a set, in native pixels
+    and the space of the set; or coefficients (C, k) of an `eigengs_dr.EigenGS` model, with
+    ``colors = mean colors + coefficients x weights`` for every channel.
+
+    Attributes
+    ----------
+    start : Gaussians
+    read : dict of str to TensorXf
+        The parameters at the start.
+    tensors : dict of str to TensorXf
+        The parameters, which `mitsuba.traverse` shows.
+    weights : list of TensorXf, shape (N + 1, k)
+        Those of a model, one for each channel.
+    file : SharedFile or None
+    part : slice
+        The channels of the texture among those of the file.
     """
 
     start: Gaussians
-    tensors: dict[str, Any]
+    read: Arrays
+    weights: Sequence[Any] = ()
+    file: SharedFile | None = None
+    part: slice = field(default_factory=lambda: slice(None))
 
-    shaping = ("mean", "factor")
-    """Parameters whose change requires new lists of the Gaussians."""
+    def __post_init__(self) -> None:
+        # Own objects, so that each texture has its own gradient, of one memory.
+        self.tensors = {name: type(t)(t) for name, t in self.read.items()}
 
-    def __init__(self, gaussians: Gaussians, shared: SharedFile | None = None) -> None:
-        self.start, self.shared = gaussians, shared
-        self.tensors = to_tensors(gaussians)
-        if shared is not None:  # own objects, so that each has its own gradient, of one memory
-            self.tensors |= {name: type(t)(t) for name, t in shared.tensors.items()}
+    def is_that_of_file(self) -> bool:
+        """Return whether the parameters have the memory of the file: nobody has changed them."""
+        unchanged = (t.array.index == self.read[k].array.index for k, t in self.tensors.items())
+        return not dr.grad_enabled(self.tensors) and all(unchanged)
 
-    def put(self, callback: Any) -> None:
-        """Show the parameters to `mitsuba.traverse`."""
-        for name, tensor in self.tensors.items():
-            callback.put(name, tensor, mi.ParamFlags.Differentiable)
-
-    def inputs(self) -> dict[str, Any]:
-        """Return the parameters by name."""
-        return self.tensors
-
-    def gaussians(self, inputs: dict[str, Any]) -> Gaussians:
-        """Return the set of some `inputs`; gradients flow back to them.
+    def gaussians(self, inputs: Arrays) -> Gaussians:
+        """Return the set of some `tensors`; gradients flow back to them.
 
         Raises
         ------
@@ -229,88 +246,44 @@ class FromSet:
             If the shapes of the parameters do not match.
         """
         try:
+            if self.weights:
+                return self._reconstruct(inputs["coefficients"])
             return from_tensors(inputs, self.start)
         except ValueError as error:
             raise ValueError(f"gaussian_texture: {error}") from error
 
-    def listed(self, key: Any, build: Callable[[], Any]) -> Any:
-        """Return lists of the Gaussians: those of the file while means and shapes are the file's.
-
-        `key` tells lists of one file apart, and `build` makes them.
-        """
-        if self.shared is not None and self.shared.holds(self.tensors):
-            return self.shared.listed(key, build)
-        return build()
-
-
-@dataclass(init=False)
-class FromModel:
-    """The parameter coefficients (C, k) of an `eigengs_dr.EigenGS` model.
-
-    ``colors = mean colors + coefficients x weights`` for every channel; shapes do not change. A
-    channel with fewer components than others ignores the rest of its row.
-    """
-
-    start: Gaussians
-    weights: list[Any]
-    coefficients: Any
-
-    shaping = ()
-
-    def listed(self, key: Any, build: Callable[[], Any]) -> Any:
-        """Make lists of the Gaussians; see `FromSet.listed`."""
-        return build()
-
-    def __init__(self, model: EigenGS, coefficients: Any = None) -> None:
-        self.start = model.gaussians
-        channels, most = len(model.weights), max(model.components)
-        weights = np.zeros((channels, most, len(self.start) + 1), np.float32)
-        for padded, own in zip(weights, model.weights, strict=True):
-            padded[: len(own)] = own
-        self.weights = [upload(mi.TensorXf, w.T) for w in weights]
-        if coefficients is None:
-            coefficients = np.zeros((channels, most), np.float32)
-        self.coefficients = upload(mi.TensorXf, coefficients)
-
-    def put(self, callback: Any) -> None:
-        """Show the coefficients to `mitsuba.traverse`."""
-        callback.put("coefficients", self.coefficients, mi.ParamFlags.Differentiable)
-
-    def inputs(self) -> dict[str, Any]:
-        """Return the coefficients by their name."""
-        return {"coefficients": self.coefficients}
-
-    def gaussians(self, inputs: dict[str, Any]) -> Gaussians:
-        """Return the set of some `inputs`; gradients flow back to them.
-
-        Raises
-        ------
-        ValueError
-            If the coefficients have the wrong shape.
-        """
-        start, expected = self.start, (len(self.weights), self.weights[0].shape[1])
-        coefficients = inputs["coefficients"]
-        found = tuple(coefficients.shape)
+    def _reconstruct(self, coefficients: Any) -> Gaussians:
+        """Return the set of some coefficients of a model."""
+        start, found = self.start, tuple(coefficients.shape)
+        expected = (len(self.weights), self.weights[0].shape[1])
         if found != expected:
-            raise ValueError(
-                f"gaussian_texture: coefficients has shape {found}, expected {expected}"
-            )
-        types = types_of(start.mean)
-        count = len(start)
+            raise ValueError(f"coefficients has shape {found}, expected {expected}")
+        # An optimiser may leave values that are not finite; times zero weights, they give NaN.
+        finite = dr.select(dr.isfinite(coefficients), coefficients, 0)
+        types, count = types_of(start.mean), len(start)
         colors, background = [], []
-        splat, last = dr.arange(types.UInt, count), types.UInt(count)
-        for c, weights in enumerate(self.weights):
-            row = dr.gather(types.Float, coefficients.array, _run(c, expected[1]))
-            # An optimiser may leave values that are not finite; times zero weights, they give NaN.
-            row = mi.TensorXf(dr.select(dr.isfinite(row), row, 0), (expected[1], 1))
-            change = (weights @ row).array
-            colors.append(start.color[c] + dr.gather(types.Float, change, splat))
-            background.append(start.background[c] + dr.gather(types.Float, change, last))
+        for channel, weights in enumerate(self.weights):
+            change = (weights @ finite[channel]).array
+            added = dr.gather(types.Float, change, dr.arange(types.UInt, count))
+            colors.append(start.color[channel] + added)
+            last = dr.gather(types.Float, change, types.UInt(count))
+            background.append(start.background[channel] + last)
         return replace(start, color=types.FloatX(colors), background=types.FloatX(background))
 
 
-def _run(row: int, length: int) -> Any:
-    return dr.arange(mi.UInt32, length) + row * length
+def model_source(model: EigenGS, coefficients: NDArray[np.float32] | None) -> Source:
+    """Return the coefficients of a model, by default 0, as the source of a texture.
+
+    A channel with fewer components than others ignores the rest of its row.
+    """
+    channels, most = len(model.weights), max(model.components)
+    weights = np.zeros((channels, len(model.gaussians) + 1, most), np.float32)
+    for padded, own in zip(weights, model.weights, strict=True):
+        padded[:, : len(own)] = own.T
+    if coefficients is None:
+        coefficients = np.zeros((channels, most), np.float32)
+    tensors = {"coefficients": upload(mi.TensorXf, coefficients)}
+    return Source(model.gaussians, tensors, [upload(mi.TensorXf, w) for w in weights])
 
 
 # ---------------------------------------------------------------------------------------------
@@ -365,13 +338,9 @@ class _Derived(dr.CustomOp):
         dr.set_grad(self.outputs, self.grad_out())
         self.set_grad_in("inputs", self._walk(dr.ADMode.Backward, self.outputs, self.inputs))
 
-    def _walk(self, mode: Any, source: Arrays, target: Arrays) -> Arrays:
+    def _walk(self, mode: dr.ADMode, source: Arrays, target: Arrays) -> Arrays:
         dr.enqueue(mode, source)
         dr.traverse(mode, dr.ADFlag.ClearInterior | dr.ADFlag.ClearInput)
         found = dr.grad(target)
         dr.clear_grad(target)
         return found
-
-    def name(self) -> str:
-        """Return the name for graphs of Dr.Jit."""
-        return "gaussian_texture"

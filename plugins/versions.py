@@ -1,11 +1,17 @@
-"""The one place for what differs between versions of Mitsuba."""
+"""The one place for what differs between versions of Mitsuba.
+
+After 3.9, `mitsuba.Texture` may become `mitsuba.Field`, and 3.10 has footprints of rays.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+
+from eigengs_dr.backend.arrays import Float
 
 Texture = Any
 """A ``mitsuba.Texture`` of the current variant."""
@@ -17,23 +23,24 @@ Properties = Any
 """``mitsuba.Properties``."""
 
 
-def texture_class() -> Any:
-    """Return the base class of textures: `mitsuba.Texture`, perhaps `mitsuba.Field` after 3.9."""
-    return mi.Texture if hasattr(mi, "Texture") else mi.Field
+def _renamed(holder: Any, before: str, after: str) -> Any:
+    return getattr(holder, before if hasattr(holder, before) else after)
 
 
-def register_texture(name: str, create: Any) -> None:
-    """Register a texture with the current variant.
+def texture_class() -> type:
+    """Return the base class of textures."""
+    found: type = _renamed(mi, "Texture", "Field")
+    return found
 
-    Parameters
-    ----------
-    name : str
-        Type of the plugin in scenes.
-    create : callable
-        Makes the texture from `mitsuba.Properties`.
-    """
-    register = mi.register_texture if hasattr(mi, "register_texture") else mi.register_field
-    register(name, create)
+
+def texture_kind() -> Any:
+    """Return the member of `mitsuba.ObjectType` that stands for textures."""
+    return _renamed(mi.ObjectType, "Texture", "Field")
+
+
+def register_texture(name: str, create: Callable[[Properties], Texture]) -> None:
+    """Register a texture with the current variant, by the type of the plugin in scenes."""
+    _renamed(mi, "register_texture", "register_field")(name, create)
 
 
 def has_footprints() -> bool:
@@ -41,7 +48,7 @@ def has_footprints() -> bool:
     return hasattr(mi.SurfaceInteraction3f, "footprint")
 
 
-def footprint_of(si: Interaction) -> tuple | None:
+def footprint_of(si: Interaction) -> tuple[Float, ...] | None:
     """Return the footprint that the renderer found, without gradients.
 
     Parameters

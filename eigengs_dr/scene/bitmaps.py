@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..image.io import check_image, read_file
 from ..image.pixels import ImageError
 from ..plugins import register_plugins  # first: its error says what to install
+from ..plugins.versions import Properties, texture_kind
 
 # isort: split
 import mitsuba as mi
@@ -95,12 +96,16 @@ def parse(scene: Any, parameters: Mapping[str, str] | None = None) -> Parsed:
     if state.root.props.plugin_name() != "scene":
         raise ValueError("holds no scene; its root must be <scene version='3.0.0'>")
     for node in state.nodes:
-        for key in node.props.keys():  # noqa: SIM118  it is no mapping
-            if key == "filename" or key.endswith("_filename"):
-                path = folder / node.props[key]
-                if path.exists():
-                    node.props[key] = str(path)
+        for key in file_keys(node.props):
+            path = folder / node.props[key]
+            if path.exists():
+                node.props[key] = str(path)
     return Parsed(config, state, folder)
+
+
+def file_keys(props: Properties) -> list[str]:
+    """Return the properties that name files."""
+    return [key for key in props.keys() if key == "filename" or key.endswith("_filename")]  # noqa: SIM118
 
 
 def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
@@ -123,7 +128,7 @@ def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
         props = node.props
         if props.plugin_name() == "envmap":
             left.append((_label(props, None, ""), "an environment map takes no texture"))
-        if node.type != mi.ObjectType.Texture or props.plugin_name() != "bitmap":
+        if node.type != texture_kind() or props.plugin_name() != "bitmap":
             continue
         # A texture with an id is a child of the scene too, where it has no use.
         above = [(p, s) for p, s in parents.get(index, []) if nodes[p].type != mi.ObjectType.Scene]
@@ -138,7 +143,7 @@ def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
     return uses, left
 
 
-def _label(props: Any, parent: Any, slot: str) -> str:
+def _label(props: Properties, parent: Properties | None, slot: str) -> str:
     """Name a bitmap by its file and where it is."""
     file = Path(str(props["filename"])).name if "filename" in props else "a bitmap in memory"
     if parent is None:
@@ -146,7 +151,7 @@ def _label(props: Any, parent: Any, slot: str) -> str:
     return f"{file} ({parent.id() or parent.plugin_name()}.{slot})"
 
 
-def _reason(props: Any, slots: list[tuple[str, str]]) -> str:
+def _reason(props: Properties, slots: list[tuple[str, str]]) -> str:
     """Say why a bitmap stays a bitmap by its properties, or nothing."""
     if not slots:
         return "nothing uses it"

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +20,7 @@ from ..image.color import to_coded
 from ..image.io import save_image
 from ..image.metrics import psnr
 from ..storage.atomic import refuse_url
-from .bitmaps import KEPT, Parsed, Use, parse, read_pixels, uses_of
+from .bitmaps import KEPT, Parsed, Use, file_keys, parse, read_pixels, uses_of
 from .fit_scene import SceneFit, fit_for_scene
 
 SCENE = "scene.xml"
@@ -58,8 +57,7 @@ class ConvertedTexture(NamedTuple):
     psnr: float
 
 
-@dataclass(frozen=True)
-class ConvertedScene:
+class ConvertedScene(NamedTuple):
     """Result of `eigengs_dr.convert_scene`.
 
     Attributes
@@ -77,7 +75,7 @@ class ConvertedScene:
     scene: Path
     textures: list[ConvertedTexture]
     left: list[tuple[str, str]]
-    psnr: list[float] = field(default_factory=list)
+    psnr: list[float]
 
 
 @shows_progress
@@ -155,7 +153,11 @@ def convert_scene(
         before = mi.parser.instantiate(parsed.config, parsed.state)
         made = dict[int, str]()
         textures = list[ConvertedTexture]()
-        for group in _by_image(uses, progress):
+        groups: dict[tuple[str, bool], list[Use]] = {}
+        for use in uses:
+            groups.setdefault((use.file, use.raw), []).append(use)
+        for number, group in enumerate(groups.values()):
+            progress("textures", number, len(groups))
             file = _file_name(group[0], {texture.file for texture in textures})
             found = _convert(before, parsed, group, target_psnr, iterations)
             if isinstance(found, str):
@@ -164,6 +166,7 @@ def convert_scene(
             found.gaussians.save(work / file)
             made |= {use.node: file for use in group}
             textures.append(_describe(group, file, found))
+        progress("textures", len(groups), len(groups))
         _rewrite(again, made, target)
         (work / SCENE).write_text(_to_xml(again), encoding="utf-8")
         seen = list[float]()
@@ -201,17 +204,6 @@ def _workplace(target: Path) -> Path:
 
 
 # --- The textures --------------------------------------------------------------------------------
-
-
-def _by_image(uses: list[Use], progress: Progress) -> Iterator[list[Use]]:
-    """Yield the uses of each image, and show progress."""
-    groups: dict[tuple[str, bool], list[Use]] = {}
-    for use in uses:
-        groups.setdefault((use.file, use.raw), []).append(use)
-    for number, group in enumerate(groups.values()):
-        progress("textures", number, len(groups))
-        yield group
-    progress("textures", len(groups), len(groups))
 
 
 def _convert(
@@ -276,11 +268,10 @@ def _rewrite(parsed: Parsed, made: dict[int, str], target: Path) -> None:
             props.set_plugin_name("gaussian_texture")
             props["filename"] = made[index]
             continue
-        for key in list(props.keys()):
-            if key == "filename" or key.endswith("_filename"):
-                path = Path(props[key])
-                if path.is_absolute() and path.exists():
-                    props[key] = os.path.relpath(path, target.resolve())
+        for key in file_keys(props):
+            path = Path(props[key])
+            if path.is_absolute() and path.exists():
+                props[key] = os.path.relpath(path, target.resolve())
 
 
 def _to_xml(parsed: Parsed) -> str:

@@ -30,6 +30,7 @@ from ..image.color import to_coded, to_linear
 from ..image.io import check_data, check_image
 from ..image.metrics import psnr as psnr_of
 from ..plugins.cone import PIXEL
+from ..plugins.versions import Texture
 from ..raster.render import render
 from .target import MARGIN, error_weights, seen_by, smoothest_target
 from .visibility import Visibility, visibility
@@ -81,7 +82,7 @@ class SceneFit(NamedTuple):
 @exclusive()
 def fit_for_scene(
     scene: Any,
-    texture: Any,
+    texture: str | Texture | Sequence[str | Texture],
     image: ArrayLike,
     target_psnr: float = 40.0,
     space: str = "linear",
@@ -171,8 +172,9 @@ def fit_for_scene(
     looks = np.minimum(PIXEL / found.footprint[found.seen], 1) ** 2  # pixels per texel, at most 1
     start = max(1, int(looks.sum()) // PIXELS)
     gaussians, reached, tried = _search_count(attempt, target_psnr, start, max_gaussians)
-    placed = _move(gaussians, corner, fine_width, fine_height).scaled(width, height)
-    return SceneFit(placed, reached, found, tried)
+    mean = gaussians.mean + type(gaussians.mean)(*corner)  # of the crop
+    placed = replace(gaussians, mean=mean, width=fine_width, height=fine_height)
+    return SceneFit(placed.scaled(width, height), reached, found, tried)
 
 
 def _resized(values: Image, texels: float) -> Image:
@@ -192,12 +194,6 @@ def _crop_to_seen(values: Image, found: Visibility) -> tuple[Image, Visibility, 
     lookups = [rows[:, texels] for rows in found.pixel_to_texel]
     cut = Visibility(found.footprint[part], lookups)
     return np.ascontiguousarray(values[part]), cut, (int(kept[1][0]), int(kept[0][0]))
-
-
-def _move(gaussians: Gaussians, corner: tuple[int, int], width: int, height: int) -> Gaussians:
-    """Shift a set to a corner (column, row) of a larger image."""
-    mean = gaussians.mean + type(gaussians.mean)(*corner)
-    return replace(gaussians, mean=mean, width=width, height=height)
 
 
 # --- The number ----------------------------------------------------------------------------------
@@ -233,7 +229,7 @@ def _fit(
 
 
 def _reaches_seen(
-    mean: NDArray[Any], factor: NDArray[Any], seen: NDArray[np.bool_]
+    mean: NDArray[np.floating], factor: NDArray[np.floating], seen: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Return which Gaussians may reach a seen texel, by their longer axes; at least one."""
     column = mean[:, 0].astype(int).clip(0, seen.shape[1] - 1)
@@ -258,7 +254,7 @@ def _search_count(
     tried: list[tuple[int, float]] = []
     low, high, best = 0, most, None
     count = min(start, most)
-    while True:
+    while best is None or (high > CLOSE * low and high - low > 1):
         gaussians, reached = attempt(count)
         lowest = min(reached)
         tried.append((len(gaussians), lowest))
@@ -273,7 +269,6 @@ def _search_count(
             low = count
         if best is None:
             count = min(2 * count, most)
-        elif high <= CLOSE * low or high - low <= 1:
-            return *best, tried
         else:
             count = round((low * high) ** 0.5) if low else high // 2
+    return *best, tried

@@ -15,11 +15,12 @@ chosen by what the cameras see, and errors are weighed by how much of a pixel a 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, zoom
+from scipy.sparse import csr_array
+from skimage.measure import block_reduce
 
 from ..fitting.target import dark_weight
 from ..image.color import to_coded
@@ -50,42 +51,23 @@ def extrapolate(values: Image, seen: NDArray[np.bool_]) -> Image:
     ndarray of float32, shape (H, W, C)
         Equal to `values` at seen texels.
     """
-    known = seen[..., None].astype(np.float32)
-    level = np.where(seen[..., None], values, np.float32(0)), known
-    levels = [level]
+    known = seen[..., None]
+    levels = [(np.where(known, values, np.float32(0)), known.astype(np.float32))]
     while max(levels[-1][1].shape) > 1:
-        levels.append(_pull(*levels[-1]))
+        mean, share = levels[-1]
+        weight = _sum_of_blocks(share)
+        mean = _sum_of_blocks(mean * share) / np.maximum(weight, np.float32(1e-9))
+        levels.append((mean, np.minimum(weight, 1)))
     filled = levels[-1][0]
     for mean, share in reversed(levels[:-1]):
-        filled = share * mean + (1 - share) * _push(filled, mean.shape[:2])
-    return np.where(seen[..., None], values, filled)
+        height, width = mean.shape[:2]
+        filled = zoom(filled, (2, 2, 1), order=1, mode="nearest", grid_mode=True)[:height, :width]
+        filled = share * mean + (1 - share) * filled
+    return np.where(known, values, filled)
 
 
-def _pull(mean: Image, share: Image) -> tuple[Image, Image]:
-    """Halve an image: means of its known parts, and how much of 2x2 texels is known, up to 1."""
-    height, width = share.shape[:2]
-    blocks = ((height + 1) // 2, 2, (width + 1) // 2, 2)
-    odd = ((0, height % 2), (0, width % 2), (0, 0))
-
-    def total(image: Image) -> Image:
-        result: Image = np.pad(image, odd).reshape(*blocks, -1).sum(axis=(1, 3))
-        return result
-
-    weight = total(share)
-    mean = (total(mean * share) / np.maximum(weight, 1e-9)).astype(np.float32)
-    return mean, np.minimum(weight, 1).astype(np.float32)
-
-
-def _push(image: Image, shape: tuple[int, ...]) -> Image:
-    """Double an image by linear interpolation between centres of texels, and crop it."""
-    for axis in (0, 1):
-        side = image.shape[axis]
-        at = (np.arange(shape[axis], dtype=np.float32) - 0.5) / 2
-        first = np.floor(at).astype(int)
-        part = (at - first).reshape([-1 if k == axis else 1 for k in range(3)])
-        low, high = (image.take(n.clip(0, side - 1), axis) for n in (first, first + 1))
-        image = low + part * (high - low)
-    return image
+def _sum_of_blocks(image: Image) -> Image:
+    return np.asarray(block_reduce(image, (2, 2, 1), np.sum), np.float32)
 
 
 def back_project(whole: Image, found: Visibility, share: float) -> Image:
@@ -150,7 +132,7 @@ EVEN = 2.0
 """Standard deviation in texels of the blur of the weights, because rays hit texels unevenly."""
 
 
-def seen_by(texels: Image, rows: Any, space: str) -> NDArray[Any]:
+def seen_by(texels: Image, rows: csr_array, space: str) -> NDArray[np.floating]:
     """Return what the pixels of a camera see of a texture.
 
     Parameters

@@ -18,10 +18,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 
-from ..backend.arrays import upload
+from ..backend.arrays import Float, upload
 from ..plugins.cone import PIXEL
+from ..plugins.properties import WRAPS, to_uv
+from ..plugins.versions import Interaction, Texture, texture_class
 from ..raster.lookup.points import fold
 
 SPACING = 0.5
@@ -45,10 +47,9 @@ class View(NamedTuple):
     scene: Any
     sensor: Any
     shapes: list
-    to_uv: NDArray[np.float64]
+    to_texels: Any
     wrap: str
-    width: int
-    height: int
+    size: tuple[int, int]
 
 
 class Hits(NamedTuple):
@@ -57,7 +58,7 @@ class Hits(NamedTuple):
     The half axes are the singular values of J; `side` counts the rays along a side of a pixel.
     """
 
-    pixel: NDArray[Any]
+    pixel: NDArray[np.uint32]
     x: Floats
     y: Floats
     short: Floats
@@ -83,58 +84,47 @@ def _trace(view: View, pixels: NDArray[np.uint32], side: int) -> Hits:
     step = max(1, BATCH // side**2)
     parts = []
     for first in range(0, len(pixels), step):
-        pixel, where = _film_positions(view.sensor, pixels[first : first + step], side)
-        hit, *values = _trace_to(view, where)
+        hit, *values = _trace_batch(view, pixels[first : first + step], side)
         chosen = np.flatnonzero(hit.numpy())
-        parts.append([array.numpy()[chosen] for array in (pixel, *values)])
+        parts.append([array.numpy()[chosen] for array in values])
     pixel, x, y, short, long = (np.concatenate(c) for c in zip(*parts, strict=True))
     return Hits(pixel, x, y, short, long, side)
 
 
-def _film_positions(sensor: Any, pixels: NDArray[np.uint32], side: int) -> tuple[Any, Any]:
-    """Return the pixel of every ray, and its position on the film, in [0, 1]."""
-    columns, rows = sensor.film().crop_size()
+def _trace_batch(view: View, pixels: NDArray[np.uint32], side: int) -> tuple:
+    """Trace ``side * side`` rays through each pixel: return hit or not, and arrays of `Hits`."""
+    columns, rows = view.sensor.film().crop_size()
     ray = dr.arange(mi.UInt32, len(pixels) * side * side)
     across = dr.opaque(mi.UInt32, side)  # one program for every number of rays
     pixel = dr.gather(mi.UInt32, upload(mi.UInt32, pixels), ray // (across * across))
     inside = ray % (across * across)
     x = pixel % columns + (mi.Float(inside % across) + 0.5) / across
     y = pixel // columns + (mi.Float(inside // across) + 0.5) / across
-    return pixel, mi.Point2f(x / columns, y / rows)
-
-
-def _trace_to(view: View, where: Any) -> tuple:
-    """Trace rays from positions on the film: return their hits, positions and half axes."""
+    film = mi.Point2f(x / columns, y / rows)
     with dr.suspend_grad():
-        ray, _ = view.sensor.sample_ray_differential(0.0, 0.5, where, mi.Point2f(0.5))
+        ray, _ = view.sensor.sample_ray_differential(0.0, 0.5, film, mi.Point2f(0.5))
         ray.has_differentials = True  # a batch of sensors computes them but leaves this False
         si = view.scene.ray_intersect(ray, mi.RayFlags.All, True)
         si.compute_uv_partials(ray)
         hit = mi.Bool(False)
         for shape in view.shapes:
             hit |= si.shape == mi.ShapePtr(shape)
-        values = _on_texture(si, view)
-        hit &= si.is_valid() & dr.isfinite(values[-1]) & (values[-1] > 0)
-        dr.eval(hit, values)
-        return hit, *values
+        x, y, short, long = _on_texture(si, view)
+        hit &= si.is_valid() & dr.isfinite(long) & (long > 0)
+        dr.eval(hit, x, y, short, long)
+    return hit, pixel, x, y, short, long
 
 
-def _on_texture(si: Any, view: View) -> tuple:
+def _on_texture(si: Interaction, view: View) -> tuple[Float, Float, Float, Float]:
     """Return the position (x, y) of a hit and the singular values of J, all in texels."""
-    to_x, to_y = (view.to_uv * [[view.width], [view.height]]).tolist()
-
-    def along(row: list[float], uv: Any) -> Any:
-        return row[0] * uv.x + row[1] * uv.y
-
-    x, _ = fold(along(to_x, si.uv) + to_x[2], view.width, view.wrap)
-    y, _ = fold(along(to_y, si.uv) + to_y[2], view.height, view.wrap)
-    ux, uy = along(to_x, si.duv_dx), along(to_x, si.duv_dy)
-    vx, vy = along(to_y, si.duv_dx), along(to_y, si.duv_dy)
+    at = view.to_texels @ si.uv
+    right, down = (view.to_texels @ mi.Vector2f(d) for d in (si.duv_dx, si.duv_dy))
+    (x, _), (y, _) = (fold(v, side, view.wrap) for v, side in zip(at, view.size, strict=True))
     # Eigenvalues of J J^T; the determinant gives the smaller one, as a difference would cancel.
-    xx, xy, yy = ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy
-    half = 0.5 * (xx - yy)
+    xx, yy = right.x * right.x + down.x * down.x, right.y * right.y + down.y * down.y
+    xy, half = right.x * right.y + down.x * down.y, 0.5 * (xx - yy)
     long = dr.sqrt(0.5 * (xx + yy) + dr.sqrt(half * half + xy * xy))
-    return x, y, dr.abs(ux * vy - uy * vx) / long, long
+    return x, y, dr.abs(right.x * down.y - down.x * right.y) / long, long
 
 
 PIXEL_REACH = 0.75
@@ -143,9 +133,6 @@ than half a diagonal."""
 
 NEIGHBOURS = 1.5
 """Texels added to this radius, because bilinear lookups read neighbours, also diagonal ones."""
-
-WRAPS = ("repeat", "mirror", "clamp")
-"""Names of the ways to continue an image outside of its borders."""
 
 
 class Visibility(NamedTuple):
@@ -163,7 +150,7 @@ class Visibility(NamedTuple):
     """
 
     footprint: NDArray[np.float32]
-    pixel_to_texel: list[Any]
+    pixel_to_texel: list[csr_array]
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -179,7 +166,7 @@ class Visibility(NamedTuple):
 
 def visibility(
     scene: Any,
-    texture: Any,
+    texture: str | Texture | Sequence[str | Texture],
     width: int,
     height: int,
     wrap_mode: str | Sequence[str] = "repeat",
@@ -214,14 +201,15 @@ def visibility(
     for mode in wraps:
         if mode not in WRAPS:
             raise ValueError(f"wrap_mode {mode!r} is unknown; use one of {', '.join(WRAPS)}")
-    found = [_find(scene, name) for name in textures]
-    uses = [
-        (shapes, *_mapping(node, mode)) for (node, shapes), mode in zip(found, wraps, strict=True)
-    ]
+    uses = []
+    for name, mode in zip(textures, wraps, strict=True):
+        node, shapes = _find(scene, name)
+        scaled = mi.ScalarTransform3f().scale([width, height]) @ to_uv(mi.traverse(node))
+        uses.append((shapes, mi.Transform3f(scaled), getattr(node, "wrap", mode)))
     footprint = np.full(height * width, np.inf, np.float32)
     lookups = []
-    for sensor, (shapes, to_uv, wrap) in product(scene.sensors(), uses):
-        hits = trace_samples(View(scene, sensor, shapes, to_uv, wrap, width, height))
+    for sensor, (shapes, to_texels, wrap) in product(scene.sensors(), uses):
+        hits = trace_samples(View(scene, sensor, shapes, to_texels, wrap, (width, height)))
         if hits is None:
             continue
         np.minimum(footprint, _min_footprint(hits, width, height), out=footprint)
@@ -237,11 +225,11 @@ def visibility(
 # --- The texture in its scene --------------------------------------------------------------------
 
 
-def _name(texture: Any) -> str:
+def _name(texture: object) -> str:
     return repr(texture) if isinstance(texture, str) else "the texture"
 
 
-def _find(scene: Any, texture: Any) -> tuple[Any, list]:
+def _find(scene: Any, texture: str | Texture) -> tuple[Texture, list]:
     """Find the texture of a name, and the shapes that use it.
 
     Raises
@@ -249,32 +237,19 @@ def _find(scene: Any, texture: Any) -> tuple[Any, list]:
     ValueError
         If the scene has no texture of this name, or no shape uses it.
     """
-    entries = mi.traverse(scene).properties
-    textures = {
-        key.rpartition(".")[0]: entry[2]
-        for key, entry in entries.items()
-        if isinstance(entry[2], mi.Texture)
-    }
-    if not isinstance(texture, str):
-        node = texture
-    elif texture not in textures:
-        known = ", ".join(name for name, t in textures.items() if t.is_spatially_varying())
-        raise ValueError(f"texture {texture!r} is not in the scene; it has {known or 'none'}")
-    else:
-        node = textures[texture]
+    node = texture
+    if isinstance(texture, str):
+        entries = mi.traverse(scene).properties.items()
+        nodes = {key.rpartition(".")[0]: entry[2] for key, entry in entries}
+        nodes = {key: n for key, n in nodes.items() if isinstance(n, texture_class())}
+        if texture not in nodes:
+            known = ", ".join(name for name, t in nodes.items() if t.is_spatially_varying())
+            raise ValueError(f"texture {texture!r} is not in the scene; it has {known or 'none'}")
+        node = nodes[texture]
     shapes = [shape for shape in scene.shapes() if node in mi.traverse(shape).hierarchy]
     if not shapes:
         raise ValueError(f"{_name(texture)} belongs to no shape; name the texture of a shape")
     return node, shapes
-
-
-def _mapping(node: Any, wrap_mode: str) -> tuple[NDArray[np.float64], str]:
-    """Return the rows of ``to_uv``, shape (2, 3), and the wrap mode of a texture."""
-    wrap_mode = getattr(node, "wrap", wrap_mode)
-    parameters = mi.traverse(node)
-    if "to_uv" not in parameters:
-        return np.eye(2, 3), wrap_mode
-    return np.array(parameters["to_uv"].matrix, np.float64)[:2, [0, 1, -1]], wrap_mode
 
 
 # --- Maps ----------------------------------------------------------------------------------------
@@ -297,7 +272,7 @@ def _min_footprint(hits: Hits, width: int, height: int) -> NDArray[np.float32]:
     return np.where(away.ravel() <= reach[nearest], footprint[nearest], np.float32(np.inf))
 
 
-def _rows(hits: Hits, width: int, height: int) -> Any:
+def _rows(hits: Hits, width: int, height: int) -> csr_array:
     """Return the bilinear shares of texels in pixels; see `Visibility.pixel_to_texel`."""
     pixels, row, count = np.unique(hits.pixel, return_inverse=True, return_counts=True)
     left, top = np.floor(hits.x - 0.5), np.floor(hits.y - 0.5)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-from _helpers.texture import at, gaussians, texel_centres, texture  # noqa: E402
+from _helpers.texture import at, gaussians, texture  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -24,15 +24,3 @@ class TestClamp:
         assert np.array(value) == pytest.approx(1 if sign > 0 else 0, abs=1e-6)
         dr.backward(dr.square(value - 0.5))
         assert (np.sign(np.array(dr.grad(parameters["background"]))) == sign).all()
-
-    def test_a_descent_comes_back(self):
-        g = gaussians("linear")
-        g.background = dr.full(type(g.background), 3.0, (3, 1))
-        tex = texture(g)
-        parameters = mi.traverse(tex)
-        optimizer = mi.ad.Adam(lr=0.2, params={"background": parameters["background"]})
-        for _ in range(40):
-            parameters.update(optimizer)
-            dr.backward(dr.mean(dr.square(tex.eval_1(texel_centres()) - 0.5)))
-            optimizer.step()
-        assert np.array(optimizer["background"]) == pytest.approx(0.5, abs=0.1)

@@ -2,13 +2,12 @@
 
 from types import SimpleNamespace
 
-import drjit as dr
 import numpy as np
 import pytest
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 from _helpers.texture import at, gaussians, texture  # noqa: E402
-from eigengs_dr.plugins import cone, properties  # noqa: E402
+from eigengs_dr.plugins import properties  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -82,18 +81,3 @@ def test_it_tells_the_scene(new):
     assert texture(g, prefilter=True).filtered() and texture(g, prefilter=0.1).filtered()
     assert not texture(g).filtered()
     assert "prefilter = true" in str(texture(g, prefilter=True))
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_metric_is_the_inverse_covariance(seed):
-    rng = np.random.default_rng(seed)
-    footprint, linear = rng.normal(size=(2, 2)), rng.normal(size=(2, 2))
-    inverse = np.linalg.inv(linear)
-    entries, present = cone.footprint_metric(
-        tuple(mi.Float(v) for v in footprint.ravel()), tuple(inverse.ravel().tolist())
-    )
-    side = linear @ footprint * cone.PIXEL
-    expected = np.linalg.inv(side @ side.T)
-    found = np.ravel([np.array(e) for e in entries])
-    np.testing.assert_allclose(found, expected[[0, 0, 1], [0, 1, 1]], rtol=2e-3)
-    assert dr.all(present)

@@ -12,7 +12,7 @@ mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 import eigengs_dr as eg  # noqa: E402
 from _helpers.texture import at, backend, gaussians, picture, small_scene, texel_centres, texture  # noqa: E402
 from eigengs_dr.gaussian.gaussians import MIN_DEVIATION  # noqa: E402
-from eigengs_dr.plugins import gaussians_of, keep_in_bounds, texture_of  # noqa: E402
+from eigengs_dr.plugins import keep_in_bounds, texture_of  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -113,25 +113,6 @@ class TestIntegrators:
         for key, value in parameters:
             assert np.abs(np.array(dr.grad(value))).max() > 1e-4, key
 
-    @pytest.mark.parametrize("integrator", ["direct", "prb"])
-    def test_forward_mode_agrees_with_reverse(self, integrator):
-        """Not of "path", whose loop Dr.Jit cannot carry derivatives of another loop into."""
-        expected = gradients(
-            small_scene(wall(gaussians()), integrator, SIDE, SPP), mi.TensorXf(upstream())
-        )["color"]
-        scene = small_scene(wall(gaussians()), integrator, SIDE, SPP)
-        parameters = of_texture(scene)
-        key, along = f"{TEXTURE}.color", mi.Float(0)
-        dr.enable_grad(along)
-        direction = direction_like(expected)
-        parameters[key] = mi.TensorXf(parameters[key]) + along * mi.TensorXf(direction)
-        parameters.update()
-        # To what the texture made of its parameters, before the integrator isolates itself.
-        dr.forward(along, dr.ADFlag.ClearEdges)
-        image = scene.integrator().render_forward(scene, parameters, seed=SEED, spp=SPP)
-        found = (np.array(image) * upstream()).sum()
-        assert found == pytest.approx((expected * direction).sum(), rel=1e-3)
-
     def along_parameters(self, integrator, names, prefilter=0.0):
         """A picture whose parameters depend on one variable, and this variable."""
         scene = small_scene(wall(gaussians(), prefilter=prefilter), integrator, SIDE, 8)
@@ -219,16 +200,6 @@ class TestBroken:
             np.array(optimizer["t.color"]), [[1, 2, 3], [0, 99, -1], [1, 0, 1]]
         )
 
-    def test_a_set_is_read_back(self):
-        g = gaussians("linear")
-        scene = small_scene(wall(g), "direct", SIDE, 1)
-        parameters = mi.traverse(scene)
-        parameters[f"{TEXTURE}.color"] = 2 * parameters[f"{TEXTURE}.color"]
-        found = gaussians_of(parameters, TEXTURE, g)
-        assert (found.width, found.height, found.space) == (*SIZE, "linear")
-        np.testing.assert_array_equal(found.to_arrays()["mean"], g.to_arrays()["mean"])
-        np.testing.assert_array_equal(found.to_arrays()["color"], 2 * g.to_arrays()["color"])
-
 
 class TestModel:
     @pytest.fixture
@@ -256,14 +227,6 @@ class TestModel:
             )
             found = picture(tex.eval_3(texel_centres((32, 32))), (32, 32))
             np.testing.assert_allclose(found, eg.render(expected).numpy(), atol=1e-4)
-
-    def test_coefficients_may_be_given(self, saved):
-        path, model = saved
-        table = np.full((3, max(model.components)), 0.1, np.float32)
-        tex = mi.load_dict(
-            {"type": "gaussian_texture", "model": path, "coefficients": mi.TensorXf(table)}
-        )
-        np.testing.assert_array_equal(np.array(mi.traverse(tex)["coefficients"]), table)
 
     @pytest.mark.parametrize("integrator", ["direct", "prb"])
     def test_gradients_are_finite_differences(self, saved, integrator):
@@ -305,24 +268,3 @@ class TestModel:
         gaussians().save(tmp_path / "x.npz")
         with pytest.raises(RuntimeError, match=r"x\.npz"):
             mi.load_dict({"type": "gaussian_texture", "model": str(tmp_path / "x.npz")})
-
-
-def test_optimising_colours_finds_a_picture():
-    """The whole loop: photographs of one texture, recovered in another."""
-    truth, start = gaussians("linear"), gaussians("linear")
-    truth.color *= 5
-    start.color *= 0
-    target = mi.render(small_scene(wall(truth), "prb", SIDE), spp=256)
-    scene = small_scene(wall(start), "prb", SIDE)
-    parameters = of_texture(scene)
-    key = f"{TEXTURE}.color"
-    optimizer = mi.ad.Adam(lr=0.02, params={key: parameters[key]})
-    for seed in range(40):
-        parameters.update(optimizer)
-        image = mi.render(scene, params=parameters, spp=16, seed=seed)
-        dr.backward(dr.mean(dr.square(image - target), axis=None))
-        optimizer.step()
-        keep_in_bounds(optimizer, TEXTURE, start)
-    found = gaussians_of(optimizer, TEXTURE, start)
-    truth, grey, found = (eg.render(g).numpy() for g in (truth, gaussians("linear")[:1], found))
-    assert np.square(found - truth).mean() < 0.3 * np.square(grey - truth).mean()

@@ -4,8 +4,11 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from _helpers.materials import material
+from _helpers.sets import SIZE
+
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-from _helpers.texture import at, gaussians, small_scene, texture  # noqa: E402
+from _helpers.texture import at, backend, gaussians, small_scene, texture  # noqa: E402
 from eigengs_dr.plugins import gaussian_texture, texture_of  # noqa: E402
 from eigengs_dr.plugins import lookup as reuse  # noqa: E402
 
@@ -17,27 +20,97 @@ def lookups(monkeypatch):
     """The lookups that are made, instead of found."""
     made, plain = [], reuse.reused
 
-    def counted(texture, si, inputs, look_up):
-        return plain(texture, si, inputs, lambda: made.append(1) or look_up())
+    def counted(*inputs):
+        *depends, look_up = inputs
+        return plain(*depends, lambda: made.append(1) or look_up())
 
     monkeypatch.setattr(gaussian_texture, "reused", counted)
     return made
 
 
-def material(prefilter=0.0):
-    number = texture_of(gaussians("data", channels=1), prefilter=prefilter)
-    colour = texture_of(gaussians(), prefilter=prefilter)
-    return {"type": "principled", "base_color": colour, "roughness": number}
+@pytest.fixture
+def of_files(tmp_path):
+    """The same material of the maps of one file, or of a file for each map."""
+    whole = material(size=SIZE, backend=backend())
+    whole.save(tmp_path / "m.npz")
+
+    def make(shared, prefilter=0.0):
+        def texture(name):
+            file = {"filename": str(tmp_path / "m.npz"), "map": name}
+            source = {"type": "gaussian_texture", **file} if shared else texture_of(whole[name])
+            return {**source, "prefilter": prefilter}
+
+        coat = {"type": "principled", "base_color": texture("albedo")}
+        coat["roughness"] = texture("roughness")
+        return {"type": "normalmap", "normalmap": texture("normal"), "bsdf": coat}
+
+    return make
 
 
-@pytest.mark.parametrize("prefilter", [0.0, 0.05])
-def test_renderings_are_those_without_reuse(monkeypatch, lookups, prefilter):
-    scene = small_scene(material(prefilter))
-    found, few = np.array(mi.render(scene, spp=8)), len(lookups)
-    monkeypatch.setattr(reuse, "_is_traced", lambda: False)
-    expected = np.array(mi.render(scene, spp=8))
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-    assert few < len(lookups) - few
+class TestMapsOfAFile:
+    """Their lookups are one; pictures and derivatives are those of a file for each map."""
+
+    @pytest.mark.parametrize("prefilter", [0.0, 0.05])
+    def test_renderings(self, monkeypatch, lookups, of_files, prefilter):
+        """With fewer lookups than of a file for each map, and these fewer than without reuse."""
+        pictures, counts = [], [0]
+        for shared, traced in ((True, True), (False, True), (False, False)):
+            if not traced:
+                monkeypatch.setattr(reuse, "_is_traced", lambda: False)
+            scene = small_scene(of_files(shared, prefilter)["bsdf"])
+            pictures.append(np.array(mi.render(scene, spp=8)))
+            counts.append(len(lookups))
+        one, each, all_of_them = np.diff(counts)
+        assert 2 * one == each and each < all_of_them
+        for found in pictures[:2]:
+            np.testing.assert_allclose(found, pictures[2], atol=1e-6)
+
+    @pytest.mark.parametrize("prefilter", [0.0, 0.05])
+    def test_frozen_renderings(self, of_files, prefilter):
+        frozen = dr.freeze(lambda scene, seed: mi.render(scene, spp=4, seed=seed))
+        scenes = [small_scene(of_files(shared, prefilter)) for shared in (True, False)]
+        parameters = [mi.traverse(scene) for scene in scenes]
+        for step in range(4):
+            for p in parameters[: step > 1 and 2]:  # in the file's values first, then in others
+                key = next(k for k, _ in p if k.endswith("roughness.color"))
+                p[key] = 1.1 * p[key]
+                p.update()
+            found = np.array(frozen(scenes[0], mi.UInt32(step)))
+            expected = np.array(mi.render(scenes[1], spp=4, seed=step))
+            np.testing.assert_allclose(found, expected, atol=1e-6)
+
+    @pytest.mark.parametrize(
+        ("mode", "prefilter"), [("forward", 0.0), ("backward", 0.0), ("backward", 0.05)]
+    )
+    def test_derivatives_of_one_map(self, of_files, mode, prefilter):
+        """The map that has them has lookups of its own; the others still share theirs."""
+        results = []
+        for shared in (True, False):
+            scene = small_scene(of_files(shared, prefilter), "prb")
+            parameters, along = mi.traverse(scene), mi.Float(0)
+            key = next(k for k, _ in parameters if k.endswith("base_color.color"))
+            dr.enable_grad(along)
+            parameters[key] = mi.TensorXf(parameters[key]) * (1 + along)
+            parameters.update()
+            image = mi.render(scene, parameters, spp=8)
+            if mode == "forward":
+                dr.forward(along)
+                results.append(np.array(dr.grad(image)))
+            else:
+                dr.backward(dr.sum(dr.square(image), axis=None))
+                results.append(np.array(dr.grad(along)))
+        assert np.abs(results[0]).max() > 1e-3
+        np.testing.assert_allclose(*results, rtol=1e-4, atol=1e-5)
+
+    def test_other_mappings_are_other_lookups(self, lookups, of_files):
+        coat = of_files(True)["bsdf"]
+        coat["roughness"]["to_uv"] = mi.ScalarTransform4f().scale(2)
+        coat["base_color"]["wrap_mode"] = "clamp"
+        counts = []
+        for bsdf in (of_files(True)["bsdf"], coat):
+            mi.render(small_scene(bsdf), spp=1)
+            counts.append(len(lookups))
+        assert counts[1] == 3 * counts[0]
 
 
 def test_a_branch_that_ended_lends_nothing():

@@ -9,6 +9,7 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
+from _helpers.texture import at, gaussians, texture  # noqa: E402
 from _helpers.variants import on_both  # noqa: E402
 from eigengs_dr.plugins import color as spectrum  # noqa: E402
 
@@ -61,12 +62,6 @@ def test_basis_is_smooth():
     assert np.abs(np.diff(spectra, axis=1)).sum(axis=1).max() < 2.2
 
 
-def test_basis_is_shared_and_read_only():
-    assert spectrum.basis()[1] is spectrum.basis()[1]
-    with pytest.raises(ValueError, match="read-only"):
-        spectrum.basis()[1][0, 0] = 1
-
-
 @pytest.mark.parametrize(
     "colors",
     [np.eye(3), 1 - np.eye(3), np.random.default_rng(0).uniform(size=(3, 50))],
@@ -75,6 +70,14 @@ def test_basis_is_shared_and_read_only():
 def test_round_trip(colors):
     back = to_srgb(evaluate(colors, FINE), FINE)
     np.testing.assert_allclose(back, colors, rtol=0, atol=3e-4)
+
+
+def test_a_texture_shows_its_colour():
+    tex = texture(gaussians("rgb"))
+    si = at(0.3, 0.6, len(FINE))
+    si.wavelengths = mi.Spectrum(mi.Float(FINE.astype(np.float32)))
+    back = to_srgb(np.array(tex.eval(si))[:1], FINE)
+    np.testing.assert_allclose(back[:, 0], np.array(tex.eval_3(si))[:, 0], rtol=0, atol=3e-4)
 
 
 def test_spectra_of_colors_are_reflectances():
@@ -125,64 +128,6 @@ def test_derivatives_in_both_modes_are_the_basis():
     value.grad = mi.Spectrum(*weight)
     dr.backward_to(rgb)
     np.testing.assert_allclose(np.array(rgb.grad)[:, 0], basis @ weight, rtol=0, atol=1e-5)
-
-
-def define_texture():
-    """A texture of one colour that upsamples, to be called through a BSDF in C++."""
-
-    class Colored(mi.Texture):
-        def __init__(self, props):
-            mi.Texture.__init__(self, props)
-            self.color = mi.Color3f(*COLOR)
-            self.table = spectrum.upload_table()
-
-        def eval(self, si, active=True):
-            return spectrum.upsample(self.color, si.wavelengths, self.table)
-
-        def is_spatially_varying(self):
-            return True
-
-        def traverse(self, callback):
-            callback.put("color", self.color, mi.ParamFlags.Differentiable)
-
-    return Colored
-
-
-def test_inside_a_symbolic_call():
-    mi.register_texture("spectrum_test", lambda props: define_texture()(props))
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "light": {"type": "constant"},
-            "sensor": {
-                "type": "perspective",
-                "to_world": mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
-                "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}},
-                "sampler": {"type": "independent"},
-                "fov": 20,
-            },
-            "shape": {
-                "type": "rectangle",
-                "bsdf": {"type": "diffuse", "reflectance": {"type": "spectrum_test"}},
-            },
-            # A second kind of BSDF, so that the call is one of several
-            "other": {
-                "type": "sphere",
-                "center": [9, 0, 0],
-                "bsdf": {"type": "conductor"},
-            },
-        }
-    )
-    key = "shape.bsdf.reflectance.color"
-    params = mi.traverse(scene)
-    dr.enable_grad(params[key])
-    integrator = mi.load_dict({"type": "path", "max_depth": 2})
-    image = mi.render(scene, params, integrator=integrator, spp=2048, seed=1)
-    mean = dr.mean(image, axis=(0, 1))
-    np.testing.assert_allclose(np.array(mean), COLOR, rtol=0, atol=0.02)
-    dr.backward(mean[0])
-    # Linear, and it round-trips: red of the image depends on red of the colour alone.
-    np.testing.assert_allclose(np.array(params[key].grad)[:, 0], [1, 0, 0], rtol=0, atol=0.04)
 
 
 def test_import_needs_no_variant():

@@ -4,17 +4,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.ndimage import laplace
 from scipy.sparse import csr_array
 
 pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
 
 import eigengs_dr as eg
-from _helpers.poster import NAME, albedo, bitmap, blocks, board, camera, photo, scene_of
+from _helpers.poster import NAME, albedo, bitmap, board, camera, photo, scene_of
 from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.plugins import texture_of
 from eigengs_dr.scene import fit_scene as scenefit
-from eigengs_dr.scene.target import BLURS, error_weights, smoothest_target
+from eigengs_dr.scene.target import error_weights
 from eigengs_dr.scene.visibility import Visibility
 
 pytestmark = pytest.mark.mitsuba
@@ -23,22 +22,6 @@ BOUND, STEPS = 33.0, 30
 
 
 class TestTarget:
-    def test_is_the_smoothest_that_is_close_enough(self):
-        image, found = photo(), Visibility(np.full((48, 48), 2.4, np.float32), [blocks(48, 6)])
-        asked = []
-
-        def is_close(target, after):
-            asked.append(target)
-            return len(asked) > after
-
-        assert smoothest_target(image, found, lambda t: is_close(t, 1)) is asked[1]
-        assert len(asked) == 2
-        np.testing.assert_array_equal(
-            smoothest_target(image, found, lambda t: is_close(t, np.inf)), image
-        )
-        bends = [np.square(laplace(t.mean(axis=2))).sum() for t in asked[2:]]
-        assert len(bends) == len(BLURS) and bends == sorted(bends)
-
     def test_errors_count_by_the_root_of_the_pixels(self):
         times, side = np.array([1, 4]), 40
         counts = np.repeat(times, side // 2)[None].repeat(side, axis=0)
@@ -52,17 +35,6 @@ class TestTarget:
         assert (weight[30:] == 0).all() and weight.shape == grey.shape
         np.testing.assert_allclose(weight[10, 35] / weight[10, 5], 2, rtol=1e-3)
 
-    def test_splats_that_touch_nothing_seen_are_left_out(self):
-        seen = np.zeros((40, 40), bool)
-        seen[:, :10] = True
-        mean = np.array([[5, 5], [12, 5], [20, 5], [20, 5], [60, 5]], float)
-        factor = np.array([[1, 0, 1], [1, 0, 1], [1, 0, 1], [0.2, 0.1, 1], [1, 0, 1]])
-        kept = scenefit._reaches_seen(mean, factor, seen)
-        np.testing.assert_array_equal(kept, [True, True, False, True, False])
-        np.testing.assert_array_equal(
-            scenefit._reaches_seen(mean[[2, 4]], factor[[2, 4]], seen), [1, 0]
-        )
-
 
 class TestSearch:
     @given(st.integers(1, 5000), st.integers(1, 5000))
@@ -75,10 +47,6 @@ class TestSearch:
         assert threshold <= len(best) <= max(threshold * scenefit.CLOSE, threshold)
         counts = [count for count, _ in tried]
         assert len(set(counts)) == len(counts) < 30
-
-    def test_the_most_may_be_too_few(self):
-        with pytest.raises(ValueError, match=r"^70 Gaussians reach 20\.0 dB, .* see 31 dB;"):
-            scenefit._search_count(lambda count: (range(count), (20.0, 40.0)), 31.0, 3, 70)
 
 
 def seen_by_a_renderer(found, scene, place, image):

@@ -37,12 +37,6 @@ class TestTarget:
         bend = np.abs(laplace(extrapolate(values, seen).mean(axis=2)))
         assert bend[:, 24:].max() < 0.05 < np.abs(laplace(values.mean(axis=2)))[:, 24:].max()
 
-    def test_an_even_blur_is_gaussian(self):
-        image = photo()
-        expected = gaussian_filter(image, (2.0, 2.0, 0), mode="nearest")
-        found = _blur_by(np.full((48, 48), 2.0))(image)
-        np.testing.assert_allclose(found, expected, atol=1e-6)
-
     def test_an_uneven_blur_is_each_in_its_place(self):
         image, deviation = photo(), np.full((48, 48), np.inf)
         deviation[:, :16], deviation[:, 16:32] = 1.0, 5.0

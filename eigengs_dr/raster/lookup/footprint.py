@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import drjit as dr
 
-from ...backend.arrays import Float, UInt, rcp, rsqrt
+from ...backend.arrays import Bool, Float, UInt, rcp, rsqrt
 from ..evaluate import falloff, weights, widen
-from ..parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_covariance
-from .points import in_list_order
+from ..parameters import EXP2_SCALE, kernel_covariance
+from .points import Packed, Terms, in_list_order
 
 MAX_FOOTPRINT = 0.4
 """Largest standard deviation of a footprint, in widths and heights of the texture. A footprint that
@@ -18,7 +17,7 @@ has it in all directions gets the mean of the texture: it would keep at most
 ``exp(-(2 pi MAX_FOOTPRINT)^2 / 2)`` = 4 % of the coarsest wave of a repeating texture."""
 
 
-def bound_covariance(metric: list) -> tuple[list, Any]:
+def bound_covariance(metric: list) -> tuple[list, Bool]:
     """Invert the metric of a footprint, and shorten its axes to at most `MAX_FOOTPRINT`.
 
     A symmetric 2x2 matrix M with the eigenvalues p > q has
@@ -51,7 +50,9 @@ def bound_covariance(metric: list) -> tuple[list, Any]:
     return covariance, blind
 
 
-def inside_share(shape: list, footprint: list, x: Float, y: Float, width: int, height: int) -> Any:
+def inside_share(
+    shape: list, footprint: list, x: Float, y: Float, width: int, height: int
+) -> Float:
     """Return the part of the product of a footprint and a Gaussian that lies in the image.
 
     The product is a Gaussian with the mean ``x - Sigma_f Sigma'^-1 (x - mu)`` and the covariance
@@ -82,7 +83,7 @@ def inside_share(shape: list, footprint: list, x: Float, y: Float, width: int, h
 
     def strip(
         center: Float, along: Float, across: Float, other: Float, variance: Float, side: int
-    ) -> Any:
+    ) -> Float:
         left = dr.fma(a, along, b * across), c * across
         rest = dr.maximum(variance - dr.fma(left[0], left[0], left[1] * left[1]), 1e-6)
         steep = rsqrt(rest) * (math.sqrt(0.5) / EXP2_SCALE)
@@ -93,7 +94,7 @@ def inside_share(shape: list, footprint: list, x: Float, y: Float, width: int, h
     return strip(x, fxx, fxy, shift_x, fxx, width) * strip(y, fxy, fyy, shift_y, fyy, height)
 
 
-def quick_erf(x: Float) -> Any:
+def quick_erf(x: Float) -> Float:
     """Return the error function to 0.005 at a fifth of its cost.
 
     The odd polynomial of degree 7 has the slope 0 at both ends of [-2, 2].
@@ -104,21 +105,23 @@ def quick_erf(x: Float) -> Any:
     return x * p
 
 
-def widened_values(footprint: list, radius: float) -> Any:
-    """Return the `terms` of `sum_at_points` for the filtered sum, without borders."""
+def filtered_terms(packed: Packed, footprint: list) -> Terms:
+    """Return the `Terms` of the filtered sum, without borders; `packed` may come from `arrange`."""
+    if packed.arranged is not None:
+        return _arranged_terms(footprint, packed.radius)
     scaled = kernel_covariance(footprint)
 
-    def terms(splat: list, x: Float, y: Float) -> list:
-        shape, amplitude = widen(splat[:NUM_SHAPE_PARAMS], scaled)
-        (w,) = weights(shape, x, y, (1, 1), radius)
+    def terms(shape: list, color: list, x: Float, y: Float) -> list:
+        shape, amplitude = widen(shape, scaled)
+        (w,) = weights(shape, x, y, (1, 1), packed.radius)
         w = w * amplitude
-        return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
+        return [w * c for c in color]
 
     return terms
 
 
-def arrange(splat: UInt, shape: list, color: list) -> Any:
-    """Copy the parameters of a set to the order of lists, for `arranged_values`.
+def arrange(splat: UInt, shape: list, color: list) -> Float | None:
+    """Copy the parameters of a set to the order of lists, for `filtered_terms`.
 
     Parameters
     ----------
@@ -138,8 +141,8 @@ def arrange(splat: UInt, shape: list, color: list) -> Any:
     return in_list_order(splat, rows)
 
 
-def arranged_values(footprint: list, radius: float) -> Any:
-    """Return the same as `widened_values` for the parameters of `arrange`, in fewer operations.
+def _arranged_terms(footprint: list, radius: float) -> Terms:
+    """Return the same terms for the parameters of `arrange`, in fewer operations.
 
     With ``Sigma' = [[xx, xy], [xy, yy]]`` and its determinant D, the exponent
     ``d^T Sigma'^-1 d`` is ``((yy dx - xy dy)^2 / D + dy^2) / yy``; see
@@ -148,8 +151,8 @@ def arranged_values(footprint: list, radius: float) -> Any:
     fxx, fxy, fyy = kernel_covariance(footprint)
     own = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0)
 
-    def terms(splat: list, x: Float, y: Float) -> list:
-        mean_x, mean_y, p, t, r = splat[:NUM_SHAPE_PARAMS]
+    def terms(shape: list, color: list, x: Float, y: Float) -> list:
+        mean_x, mean_y, p, t, r = shape
         dx, dy = x - mean_x, y - mean_y
         xy, yy = dr.fma(t, r, fxy), dr.fma(r, r, fyy)
         across = dr.fma(r * r, fxx, t * dr.fma(t, fyy, -2 * r * fxy))
@@ -157,6 +160,6 @@ def arranged_values(footprint: list, radius: float) -> Any:
         scale = rsqrt(dr.fma(pp, yy, own + dr.maximum(across, 0)))
         along = dr.fma(yy, dx, -xy * dy) * scale
         w = falloff(dr.fma(along, along, dy * dy) * rcp(yy), radius * radius) * scale
-        return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
+        return [w * c for c in color]
 
     return terms

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import drjit as dr
 
@@ -19,7 +18,54 @@ from ...backend.arrays import Bool, Float, UInt, types_of
 from ..binning.lists import build_lists
 from ..binning.tiles import Grid
 from ..evaluate import LN2, weights
-from ..parameters import NUM_SHAPE_PARAMS, gather_index, pack_parameters, unpack_parameters
+from ..parameters import (
+    NUM_SHAPE_PARAMS,
+    gather_index,
+    kernel_radius,
+    pack_parameters,
+    unpack_parameters,
+)
+
+Terms = Callable[[list, list, Float, Float], list]
+"""``terms(shape, color, x, y)`` returns what a Gaussian contributes to each sum at a point."""
+
+
+@dataclass(frozen=True)
+class Packed:
+    """Parameters of Gaussians, as sums read them.
+
+    Attributes
+    ----------
+    values : Float
+        From `eigengs_dr.raster.parameters.pack_parameters`: 5 of the shape, then the channels; may
+        carry gradients.
+    channels : int
+    cutoff : float
+        Standard deviations.
+    arranged : Float or None
+        Copies in the order of lists, from `in_list_order`, which take the place of `values`.
+    """
+
+    values: Float
+    channels: int
+    cutoff: float
+    arranged: Float | None = None
+
+    @property
+    def radius(self) -> float:
+        """The cutoff in the units of the kernels."""
+        return kernel_radius(self.cutoff)
+
+    def gather(self, index: UInt, active: Bool = True) -> tuple[list, list]:
+        """Return the shape and the channels of the Gaussians `index`."""
+        number = NUM_SHAPE_PARAMS + self.channels
+        rows = unpack_parameters(self.values, index, number, active)
+        return rows[:NUM_SHAPE_PARAMS], rows[NUM_SHAPE_PARAMS:]
+
+    def gather_all(self) -> tuple[list, list]:
+        """Return the shape and the channels of all Gaussians."""
+        stride = -(-(NUM_SHAPE_PARAMS + self.channels) // 4) * 4
+        return self.gather(dr.arange(types_of(self.values).UInt, dr.width(self.values) // stride))
 
 
 @dataclass(frozen=True)
@@ -29,9 +75,6 @@ class Cells:
     Attributes
     ----------
     grid : Grid
-        Cells of the image, enlarged by `margin` on every side.
-    margin : int
-        In pixels.
     splat : UInt32, shape (capacity,)
         Indices of Gaussians, cell after cell.
     ends : UInt32, shape (2 * cells,)
@@ -39,9 +82,8 @@ class Cells:
     """
 
     grid: Grid
-    margin: int
-    splat: Any
-    ends: Any
+    splat: UInt
+    ends: UInt
 
 
 def cell_side(width: int, height: int, count: int) -> int:
@@ -54,10 +96,8 @@ def cell_side(width: int, height: int, count: int) -> int:
     return 1 << max(0, round(math.log2(0.8 * spacing)))
 
 
-def list_cells(
-    shape: list, width: int, height: int, radius: float, side: int, margin: int = 0
-) -> Cells:
-    """List the Gaussians of every cell of an image and its margin.
+def list_cells(shape: list, width: int, height: int, radius: float, side: int) -> Cells:
+    """List the Gaussians of every cell of an image.
 
     Parameters
     ----------
@@ -69,29 +109,23 @@ def list_cells(
         Cutoff in the units of the factor.
     side : int
         Side of a cell, in pixels.
-    margin : int, optional
-        Width of the border around the image that has cells too, in pixels.
-
-    Returns
-    -------
-    Cells
     """
-    grid = Grid(width + 2 * margin, height + 2 * margin, (side, side))
-    moved = [shape[0] + margin, shape[1] + margin, *shape[2:]]
+    grid = Grid(width, height, (side, side))
     # Lists are built for pixel centres; half a pixel of padding makes them valid for all points.
-    lists = build_lists(moved, radius, grid, pad=0.5, adjoint=False)
+    lists = build_lists(shape, radius, grid, pad=0.5, adjoint=False)
     types = types_of(shape[0])
     ends = dr.empty(types.UInt, 2 * grid.tiles)
     dr.scatter(ends, types.UInt2(lists.begin, lists.end), lists.order)
     dr.eval(lists.splat, ends)
-    return Cells(grid, margin, lists.splat, ends)
+    return Cells(grid, lists.splat, ends)
 
 
 MAX_ARRANGED = 1 << 20
-"""Largest number of entries of lists whose parameters are copied; the copies take 32 MiB."""
+"""Largest number of entries of lists whose parameters are copied; the copies take 32 MiB, or with
+16 channels 96."""
 
 
-def in_list_order(splat: UInt, rows: list) -> Any:
+def in_list_order(splat: UInt, rows: list) -> Float | None:
     """Copy parameters to the order of the lists, for lookups without gradients.
 
     A lookup then reads neighbours in memory and needs no index. The adjoint would be slower, since
@@ -116,7 +150,7 @@ def in_list_order(splat: UInt, rows: list) -> Any:
     return pack_parameters(unpack_parameters(packed, splat, len(rows)))
 
 
-def fold(x: Float, side: int, wrap: str) -> tuple[Any, Any]:
+def fold(x: Float, side: int, wrap: str) -> tuple[Float, Float]:
     """Move a coordinate into the image.
 
     Parameters
@@ -150,30 +184,24 @@ def fold(x: Float, side: int, wrap: str) -> tuple[Any, Any]:
     return dr.select(odd, side - local, local), dr.select(odd, -one, one)
 
 
-def cell_range(cells: Cells, x: Float, y: Float, active: Bool) -> tuple[Any, Any]:
-    """Return begin and end of the list of the cell at a point; both are 0 outside the cells."""
-    types = types_of(x)
-    grid = cells.grid
-    column = types.Int(dr.floor((x + cells.margin) * (1 / grid.tile[0])))
-    row = types.Int(dr.floor((y + cells.margin) * (1 / grid.tile[1])))
+def cell_range(cells: Cells, x: Float, y: Float, active: Bool) -> tuple[UInt, UInt]:
+    """Return begin and end of the list of the cell at a point of the image; else both are 0."""
+    types, grid = types_of(x), cells.grid
     # The last cells include the right and the lower border.
-    column = dr.select(x == grid.width - cells.margin, grid.nx - 1, column)
-    row = dr.select(y == grid.height - cells.margin, grid.ny - 1, row)
-    inside = active & (column >= 0) & (column < grid.nx) & (row >= 0) & (row < grid.ny)
-    ends = dr.gather(types.UInt2, cells.ends, types.UInt(row * grid.nx + column), inside)
+    column = dr.minimum(types.UInt(x * (1 / grid.tile[0])), grid.nx - 1)
+    row = dr.minimum(types.UInt(y * (1 / grid.tile[1])), grid.ny - 1)
+    ends = dr.gather(types.UInt2, cells.ends, row * grid.nx + column, active)
     return ends[0], ends[1]
 
 
 def sum_at_points(
     cells: Cells,
-    packed: Float,
-    number: int,
+    packed: Packed,
     x: Float,
     y: Float,
     active: Bool,
-    terms: Callable[[list, Any, Any], list],
-    count: int,
-    arranged: Float = None,
+    terms: Terms,
+    count: int | None = None,
 ) -> list:
     """Sum the contributions of the Gaussians near a point.
 
@@ -183,63 +211,45 @@ def sum_at_points(
     Parameters
     ----------
     cells : Cells
-    packed : Float
-        Parameters from `eigengs_dr.raster.parameters.pack_parameters`; may carry gradients.
-    number : int
-        Number of parameters of one Gaussian.
+    packed : Packed
     x, y : Float
-        In pixels, x to the right and y down.
+        In pixels, x to the right and y down; inside the image.
     active : Bool
     terms : callable
-        ``terms(parameters, x, y)`` returns the contributions of a Gaussian as a list of Float.
-    count : int
-        Length of this list.
-    arranged : Float, optional
-        Parameters from `in_list_order`, which take the place of `packed`.
+        See `Terms`.
+    count : int, optional
+        Number of sums, by default the number of channels.
 
     Returns
     -------
     list of `count` Float
     """
-    ends = cell_range(cells, x, y, active)
-    return sum_range(cells.splat, ends, packed, number, x, y, terms, count, arranged)
+    return sum_range(cells.splat, cell_range(cells, x, y, active), packed, x, y, terms, count)
 
 
 def sum_range(
-    splat: UInt,
-    ends: tuple[Any, Any],
-    packed: Float,
-    number: int,
+    index: UInt,
+    ends: tuple[UInt, UInt],
+    packed: Packed,
     x: Float,
     y: Float,
-    terms: Callable[[list, Any, Any], list],
-    count: int,
-    arranged: Float = None,
+    terms: Terms,
+    count: int | None = None,
 ) -> list:
-    """Sum the contributions of the Gaussians ``splat[begin:end]``, as `sum_at_points` does.
+    """Sum the Gaussians ``index[begin:end]`` with another range at each point."""
+    types = types_of(packed.values)
+    ordered = packed.arranged is not None
+    source = replace(packed, values=packed.arranged) if ordered else packed
 
-    Parameters
-    ----------
-    splat : UInt32
-    ends : tuple of 2 UInt32
-        Begin and end of the range of each point.
-    packed, number, x, y, terms, count, arranged
-        As for `sum_at_points`.
-    """
-    types = types_of(packed)
-
-    def add(i: UInt, end: Any, x: Float, y: Float, sums: list) -> tuple:
+    def add(i: UInt, end: UInt, x: Float, y: Float, sums: list) -> tuple:
         here = i < end
-        if arranged is None:
-            source, index = packed, gather_index(types, splat, i, here)
-        else:
-            source, index = arranged, i
-        gaussian = unpack_parameters(source, index, number, here)
-        return i + 1, end, x, y, [s + t for s, t in zip(sums, terms(gaussian, x, y), strict=True)]
+        n = i if ordered else gather_index(types, index, i, here)
+        parts = terms(*source.gather(n, here), x, y)
+        return i + 1, end, x, y, [s + t for s, t in zip(sums, parts, strict=True)]
 
     # max_iterations=-1 tells Dr.Jit that the loop is a pure sum: its gradient needs no storage.
     return dr.while_loop(
-        (*ends, x, y, [types.Float(0) for _ in range(count)]),
+        (*ends, x, y, [types.Float(0) for _ in range(count or packed.channels)]),
         lambda i, end, *rest: i < end,
         add,
         label="sum at points",
@@ -248,30 +258,30 @@ def sum_range(
     )[-1]
 
 
-def value_terms(radius: float) -> Callable[[list, Any, Any], list]:
-    """Return the `terms` of `sum_at_points` for the values ``c_n w_n(x)``."""
+def value_terms(radius: float) -> Terms:
+    """Return the `Terms` of the values ``c_n w_n(x)``."""
 
-    def terms(splat: list, x: Float, y: Float) -> list:
-        (w,) = weights(splat[:NUM_SHAPE_PARAMS], x, y, (1, 1), radius)
-        return [w * c for c in splat[NUM_SHAPE_PARAMS:]]
+    def terms(shape: list, color: list, x: Float, y: Float) -> list:
+        (w,) = weights(shape, x, y, (1, 1), radius)
+        return [w * c for c in color]
 
     return terms
 
 
-def gradient_terms(radius: float) -> Callable[[list, Any, Any], list]:
-    """Return the `terms` of `sum_at_points` for values and derivatives along x and y.
+def gradient_terms(radius: float) -> Terms:
+    """Return the `Terms` of values and derivatives along x and y: three for each channel.
 
-    Each channel has three terms. ``grad w = -2 ln(2) w F^T F (x - mu)`` with F in the units of the
-    kernels, see `eigengs_dr.raster.parameters.EXP2_SCALE`.
+    ``grad w = -2 ln(2) w F^T F (x - mu)`` with F in the units of the kernels, see
+    `eigengs_dr.raster.parameters.EXP2_SCALE`.
     """
 
-    def terms(splat: list, x: Float, y: Float) -> list:
-        mean_x, mean_y, a, b, c = splat[:NUM_SHAPE_PARAMS]
-        (w,) = weights(splat[:NUM_SHAPE_PARAMS], x, y, (1, 1), radius)
+    def terms(shape: list, color: list, x: Float, y: Float) -> list:
+        mean_x, mean_y, a, b, c = shape
+        (w,) = weights(shape, x, y, (1, 1), radius)
         dx, dy = x - mean_x, y - mean_y
         u, v = dr.fma(a, dx, b * dy), c * dy
         steep = -2 * LN2 * w
         along = (w, steep * a * u, steep * dr.fma(b, u, c * v))
-        return [k * color for color in splat[NUM_SHAPE_PARAMS:] for k in along]
+        return [k * value for value in color for k in along]
 
     return terms

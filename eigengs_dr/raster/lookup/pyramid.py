@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 
@@ -25,14 +24,14 @@ from ..binning.tiles import Grid
 from ..evaluate import falloff, widen
 from ..parameters import (
     EXP2_SCALE,
-    NUM_SHAPE_PARAMS,
     KernelParameters,
-    gather_run,
     kernel_covariance,
     kernel_radius,
+    pack_parameters,
     unpack_parameters,
 )
 from ..render import rasterize, to_tensor
+from .points import Packed
 from .prefilter import sum_prefiltered
 from .size_classes import FOOTPRINT_REACH, SizeClasses
 
@@ -70,46 +69,30 @@ class GaussianPyramid:
 
     Attributes
     ----------
-    width, height : int
-        Size of the image, in pixels.
     wrap : {"repeat", "mirror", "clamp"}
         Continuation of the image outside its borders.
     channels : int
-        At most 4.
     levels : tuple of Level
         From fine to coarse.
-    values : Float, shape (4 * points,)
-        B at the points of all levels, row after row, 4 numbers per point; carries gradients.
+    values : Float, shape (points * stride,)
+        B at the points of all levels, row after row, as from
+        `eigengs_dr.raster.parameters.pack_parameters`; carries gradients.
     """
 
-    width: int
-    height: int
     wrap: str
     channels: int
     levels: tuple[Level, ...]
-    values: Any
-
-
-def count_points(level: Level) -> int:
-    """Return the number of points of a level."""
-    return level.nx * level.ny
+    values: Float
 
 
 def pyramid_mean(lattice: GaussianPyramid) -> list:
     """Return the mean of every channel over the image: a list of Float, shape (1,)."""
-    types = types_of(lattice.values)
-    level = lattice.levels[-1]
-    rows = gather_run(
-        types,
-        lattice.values,
-        dr.arange(types.UInt, count_points(level)) + level.first,
-        4,
-        True,
-    )
-    return [dr.mean(row) for row in rows[: lattice.channels]]
+    level, UInt = lattice.levels[-1], types_of(lattice.values).UInt
+    index = dr.arange(UInt, level.nx * level.ny) + level.first
+    return [dr.mean(row) for row in unpack_parameters(lattice.values, index, lattice.channels)]
 
 
-def is_minified(lattice: GaussianPyramid, footprint: list) -> Any:
+def is_minified(lattice: GaussianPyramid, footprint: list) -> Bool:
     """Return whether a footprint is wide enough in all directions for the finest level.
 
     Parameters
@@ -121,9 +104,12 @@ def is_minified(lattice: GaussianPyramid, footprint: list) -> Any:
     -------
     Bool
     """
+    return _smallest_variance(footprint) >= _min_variance(lattice.levels[0])
+
+
+def _smallest_variance(footprint: list) -> Float:
     xx, xy, yy = footprint
-    smallest = 0.5 * (xx + yy) - dr.sqrt(dr.fma(0.25 * (xx - yy), xx - yy, xy * xy))
-    return smallest >= _min_variance(lattice.levels[0])
+    return 0.5 * (xx + yy) - dr.sqrt(dr.fma(0.25 * (xx - yy), xx - yy, xy * xy))
 
 
 def _min_variance(level: Level) -> float:
@@ -155,9 +141,8 @@ def sum_pyramid(
         One sum for each channel.
     """
     types = types_of(lattice.values)
-    xx, xy, yy = (dr.detach(f) for f in footprint)
-    smallest = 0.5 * (xx + yy) - dr.sqrt(dr.fma(0.25 * (xx - yy), xx - yy, xy * xy))
-    first, nx, ny, dx, dy = _pick(types, lattice.levels, smallest)
+    xx, xy, yy = footprint = dr.detach(footprint)
+    first, nx, ny, dx, dy = _pick(types, lattice.levels, _smallest_variance(footprint))
     # In spacings of the level; the values are already blurred by SAMPLE_DEVIATION^2.
     u, v = x * rcp(dx) - 0.5, y * rcp(dy) - 0.5
     xx = dr.maximum(xx * dr.square(rcp(dx)) - SAMPLE_DEVIATION**2, SAMPLE_DEVIATION**2)
@@ -176,14 +161,15 @@ def sum_pyramid(
         middle = dr.fma(lean, down, dr.detach(u))
         return types.Int(dr.ceil(middle - half)), types.Int(dr.floor(middle + half))
 
-    def add(i: UInt, stop: Any, j: UInt, u: Float, v: Any, sums: list) -> tuple:
+    def add(i: UInt, stop: UInt, j: UInt, u: Float, v: Float, sums: list) -> tuple:
         here = i <= stop
         across, down = types.Float(i) - u, types.Float(j) - v
         q = inverse[0] * across * across + (inverse[1] * across + inverse[2] * down) * down
         w = falloff(dr.maximum(q, 0), 2 * kernel_radius(SAMPLE_REACH) ** 2) * scale
         column, row = (_fold(types, k, n, lattice.wrap) for k, n in ((i, nx), (j, ny)))
-        seen = gather_run(types, lattice.values, first + row * types.UInt(nx) + column, 4, here)
-        sums = [dr.fma(w, c, s) for c, s in zip(seen, sums, strict=False)]
+        point = first + row * types.UInt(nx) + column
+        seen = unpack_parameters(lattice.values, point, lattice.channels, here)
+        sums = [dr.fma(w, c, s) for c, s in zip(seen, sums, strict=True)]
         i = i + 1
         ran = i > stop
         j = dr.select(ran, j + 1, j)
@@ -203,21 +189,19 @@ def sum_pyramid(
     )[-1]
 
 
-def _pick(types: ArrayTypes, levels: tuple[Level, ...], smallest: Any) -> list:
+def _pick(types: ArrayTypes, levels: tuple[Level, ...], smallest: Float) -> list:
     """Return first, nx, ny, dx, dy of the coarsest level for footprints with this variance."""
     kinds = (types.UInt, types.Float, types.Float, types.Float, types.Float)
-    rows = [(t.first, t.nx, t.ny, t.dx, t.dy) for t in levels]
-    picked = [kind(number) for kind, number in zip(kinds, rows[0], strict=True)]
-    for level, row in zip(levels[1:], rows[1:], strict=True):
+    picked: list = []
+    for level in levels:
+        row = (level.first, level.nx, level.ny, level.dx, level.dy)
+        values = [kind(number) for kind, number in zip(kinds, row, strict=True)]
         fits = smallest >= _min_variance(level)
-        picked = [
-            dr.select(fits, kind(number), before)
-            for kind, number, before in zip(kinds, row, picked, strict=True)
-        ]
+        picked = [dr.select(fits, *v) for v in zip(values, picked or values, strict=True)]
     return picked
 
 
-def _fold(types: ArrayTypes, index: UInt, count: Any, wrap: str) -> Any:
+def _fold(types: ArrayTypes, index: UInt, count: Float, wrap: str) -> UInt:
     """Move the index of a point into the level; points lie half a spacing inside the borders."""
     k = types.Float(index)
     if wrap == "repeat":
@@ -231,7 +215,19 @@ FINEST, FEWEST = 1, 8
 number of points along the shorter side of the coarsest level."""
 
 
-def build_pyramid(sizes: SizeClasses, packed: Float, number: int, cutoff: float) -> GaussianPyramid:
+def levels_of(width: int, height: int) -> tuple[Level, ...]:
+    """Return the levels of the pyramid of an image."""
+    levels: list[Level] = []
+    spacing, first = FINEST, 0
+    while not levels or min(width, height) >= FEWEST * spacing:
+        nx, ny = math.ceil(width / spacing), math.ceil(height / spacing)
+        levels.append(Level(first, nx, ny, width / nx, height / ny))
+        first += nx * ny
+        spacing *= 2
+    return tuple(levels)
+
+
+def build_pyramid(sizes: SizeClasses, packed: Packed) -> GaussianPyramid:
     """Evaluate a sum of Gaussians at the points of all levels; differentiable.
 
     Cost: a rendering of the blurred Gaussians for the finest level, and one
@@ -240,64 +236,50 @@ def build_pyramid(sizes: SizeClasses, packed: Float, number: int, cutoff: float)
 
     Parameters
     ----------
-    sizes, packed, number, cutoff
-        As for `eigengs_dr.raster.lookup.prefilter.sum_prefiltered`.
-
-    Returns
-    -------
-    GaussianPyramid
+    sizes : SizeClasses
+    packed : Packed
     """
-    types = types_of(packed)
-    width, height = sizes.width, sizes.height
-    pyramid = GaussianPyramid(width, height, sizes.wrap, number - NUM_SHAPE_PARAMS, (), None)
-    parts: list = []
-    spacing = FINEST
-    while not parts or min(width, height) >= FEWEST * spacing:
-        nx, ny = math.ceil(width / spacing), math.ceil(height / spacing)
-        level = Level(sum(map(count_points, pyramid.levels)), nx, ny, width / nx, height / ny)
-        index = dr.arange(types.UInt, nx * ny)
-        x = (types.Float(index % nx) + 0.5) * level.dx
-        y = (types.Float(index // nx) + 0.5) * level.dy
-        blur = [types.Float((SAMPLE_DEVIATION * level.dx) ** 2), types.Float(0)]
-        blur.append(types.Float((SAMPLE_DEVIATION * level.dy) ** 2))
+    types = types_of(packed.values)
+    levels, parts = levels_of(sizes.width, sizes.height), list[Float]()
+    for number, level in enumerate(levels):
+        index = dr.arange(types.UInt, level.nx * level.ny)
+        x = (types.Float(index % level.nx) + 0.5) * level.dx
+        y = (types.Float(index // level.nx) + 0.5) * level.dy
+        blur = [types.Float((SAMPLE_DEVIATION * d) ** 2) for d in (level.dx, 0, level.dy)]
         if parts:
-            finer = replace(pyramid, levels=(replace(pyramid.levels[-1], first=0),))
-            seen = sum_pyramid(replace(finer, values=parts[-1]), x, y, blur, types.Bool(True))
+            finer = (replace(levels[number - 1], first=0),)
+            pyramid = GaussianPyramid(sizes.wrap, packed.channels, finer, parts[-1])
+            seen = sum_pyramid(pyramid, x, y, blur, types.Bool(True))
         else:
-            seen = _finest(sizes, packed, number, (x, y), blur, cutoff)
-        parts.append(_interleaved(types, seen, nx * ny))
-        pyramid = replace(pyramid, levels=(*pyramid.levels, level))
-        spacing *= 2
+            seen = _finest(sizes, packed, x, y, blur)
+        parts.append(pack_parameters(seen))
+        dr.eval(parts[-1])
     values = dr.concat(parts)
     dr.eval(values)
-    return replace(pyramid, values=values)
+    return GaussianPyramid(sizes.wrap, packed.channels, levels, values)
 
 
-def _finest(
-    sizes: SizeClasses, packed: Float, number: int, points: tuple, blur: list, cutoff: float
-) -> list:
+def _finest(sizes: SizeClasses, packed: Packed, x: Float, y: Float, blur: list) -> list:
     """Return the blurred sum at all pixels: widen all Gaussians once, and render them.
 
     At the border, copies of the image and the part of a Gaussian inside the image count too.
     """
-    types = types_of(packed)
+    types = types_of(packed.values)
     width, height = sizes.width, sizes.height
-    count = dr.width(packed) // (-(-number // 4) * 4)
-    rows = unpack_parameters(packed, dr.arange(types.UInt, count), number)
-    shape, amplitude = widen(rows[:NUM_SHAPE_PARAMS], kernel_covariance(blur))
-    color = [amplitude * c for c in rows[NUM_SHAPE_PARAMS:]]
-    grid, radius = Grid(width, height), kernel_radius(cutoff)
-    fixed = [dr.detach(s) + dr.zeros(types.Float, count) for s in shape]
-    lists = build_lists(fixed, radius, grid, adjoint=dr.grad_enabled(packed))
+    shape, color = packed.gather_all()
+    shape, amplitude = widen(shape, kernel_covariance(blur))
+    color = [amplitude * c for c in color]
+    grid = Grid(width, height)
+    lists = build_lists(
+        dr.detach(shape), packed.radius, grid, adjoint=dr.grad_enabled(packed.values)
+    )
     parameters = KernelParameters(shape, color, [types.Float(0) for _ in color])
-    image = to_tensor(rasterize(parameters, lists, cutoff), grid, len(color)).array
-    x, y = points
+    image = to_tensor(rasterize(parameters, lists, packed.cutoff), grid, len(color)).array
     border = math.ceil(FOOTPRINT_REACH * SAMPLE_DEVIATION * FINEST)
     edge = (x < border) | (x > width - border) | (y < border) | (y > height - border)
     ring = dr.compress(edge)
-    near = [dr.gather(types.Float, v, ring) for v in points]
-    everywhere = types.Bool(True)
-    seen = sum_prefiltered(sizes, packed, number, near[0], near[1], blur, everywhere, cutoff)
+    near_x, near_y = (dr.gather(types.Float, v, ring) for v in (x, y))
+    seen = sum_prefiltered(sizes, packed, near_x, near_y, blur, types.Bool(True))
     dr.eval(seen)  # once for all channels
     index = dr.arange(types.UInt, width * height)
     result = []
@@ -307,11 +289,3 @@ def _finest(
         inner = dr.gather(types.Float, image, index * len(color) + k)
         result.append(dr.select(edge, whole, inner))
     return result
-
-
-def _interleaved(types: ArrayTypes, rows: list, count: int) -> Any:
-    """Store the values of all channels point after point, 4 numbers per point."""
-    padded = [*rows, *[types.Float(0)] * (4 - len(rows))]
-    flat = dr.ravel(types.FloatX([row + dr.zeros(types.Float, count) for row in padded]), order="F")
-    dr.eval(flat)
-    return flat

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from ...backend.arrays import types_of, upload
+from ...backend.arrays import Float, UInt, types_of, upload
 from ...gaussian.covariance import max_deviation
 from ..evaluate import widen
 from ..parameters import EXP2_SCALE, kernel_radius
@@ -44,13 +43,11 @@ class SizeClasses:
         Size of the image, in pixels.
     wrap : {"repeat", "mirror", "clamp"}
         Continuation of the image outside its borders.
-    count : int
-        Number of classes.
     splat : UInt32, shape (entries,)
         Indices of Gaussians: class after class, row after row, cell after cell.
     starts : UInt32, shape (cells + 1,)
         Index in `splat` of the first Gaussian of each cell.
-    table : Float, shape (8 * count,)
+    table : Float, shape (8 * classes,)
         For each class: s^2, first cell, columns, rows, 1 / side of a cell, origin of the cells, and
         two zeros.
     listed : list of (float, Cells)
@@ -62,11 +59,10 @@ class SizeClasses:
     width: int
     height: int
     wrap: str
-    count: int
-    splat: Any
-    starts: Any
-    table: Any
-    listed: list
+    splat: UInt
+    starts: UInt
+    table: Float
+    listed: list[tuple[float, Cells]]
 
 
 def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: str) -> SizeClasses:
@@ -118,16 +114,22 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
         width,
         height,
         wrap,
-        len(table),
         upload(types.UInt, splat.astype(np.uint32)),
         upload(types.UInt, np.asarray(starts, np.uint32)),
         upload(types.Float, np.asarray(table or np.zeros((1, 8)), np.float32).ravel()),
-        _listed([_cells_for(shape, width, height, cutoff, s) for s in LISTED_FOOTPRINTS]),
+        _list_widened(shape, width, height, kernel_radius(cutoff)),
     )
 
 
-def _listed(levels: list[Cells]) -> list[tuple[float, Cells]]:
-    """Join the lists of several cells in one array."""
+def _list_widened(shape: list, width: int, height: int, radius: float) -> list[tuple[float, Cells]]:
+    """List the Gaussians widened by each of `LISTED_FOOTPRINTS`, all in one array."""
+    Float = types_of(shape[0]).Float
+    side = max(4, cell_side(width, height, dr.width(shape)))
+    levels = []
+    for spread in LISTED_FOOTPRINTS:
+        variance = dr.opaque(Float, (spread / EXP2_SCALE) ** 2)
+        widened, _ = widen(shape, [variance, Float(0), variance])
+        levels.append(list_cells(widened, width, height, radius, side))
     splat = dr.concat([cells.splat for cells in levels])
     dr.eval(splat)
     listed, first = [], 0
@@ -137,13 +139,3 @@ def _listed(levels: list[Cells]) -> list[tuple[float, Cells]]:
         first += dr.width(cells.splat)
     dr.eval(listed)
     return listed
-
-
-def _cells_for(shape: list, width: int, height: int, cutoff: float, spread: float) -> Cells:
-    types = types_of(shape[0])
-    variance = dr.opaque(types.Float, (spread / EXP2_SCALE) ** 2)
-    widened, _ = widen(shape, [variance, types.Float(0), variance])
-    side = max(4, cell_side(width, height, dr.width(shape)))
-    # Footprints at a border look at copies of the image from as far outside as they reach.
-    margin = math.ceil(FOOTPRINT_REACH * spread)
-    return list_cells(widened, width, height, kernel_radius(cutoff), side, margin)
