@@ -111,8 +111,6 @@ def _describe_model(model: Any) -> dict[str, Any]:
     size = model.gaussians.width, model.gaussians.height
     facts = _describe_set(model.gaussians, len(model.gaussians), size)
     facts |= {"components": list(model.components), "frequency_aware": model.low > 0}
-    if model.split_reason:
-        facts["split_reason"] = model.split_reason
     if model.low:
         facts["low_gaussians"] = model.low
         facts["high_gaussians"] = len(model.gaussians) - model.low

@@ -113,7 +113,7 @@ def _summary(record: dict[str, Any], preview: Path | None) -> str:
     text = (
         f"{record['input']}: {record['images']} images, {components} components, "
         f"{record['gaussians']} Gaussians in {record['seconds']:.1f} s; "
-        f"{'split' if record['frequency_aware'] else 'not split'} ({record['split_reason']})\n  "
+        f"{'split' if record['frequency_aware'] else 'not split'}\n  "
     )
     if record["psnr_pca"] is None:
         text += "no image was held out, so no psnr was measured; use at least 10 images"
