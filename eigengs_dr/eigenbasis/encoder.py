@@ -53,7 +53,7 @@ class Encoder:
         A target is in dB. The ridge on the diagonal of ``Psi~^T Psi~`` makes the real error smaller
         than the estimate.
         """
-        pixels = self.resized(image)
+        pixels = resample(image, self.gaussians.width, self.gaussians.height)
         return self._coefficients(pixels, self._correlate(pixels), False, target_psnr)
 
     def reconstruct(
@@ -71,8 +71,8 @@ class Encoder:
     def encode(self, image: Planes, colors: str, mean: str, target_psnr: float | None) -> Gaussians:
         """Encode a checked image (H, W, 3) of any size; see `eigengs_dr.EigenGS.encode`."""
         check_encoding(colors, mean, target_psnr)
-        pixels, centred = self.resized(image), mean == "dense"
-        correlations = self._correlate(pixels)
+        pixels = resample(image, self.gaussians.width, self.gaussians.height)
+        correlations, centred = self._correlate(pixels), mean == "dense"
         if centred:
             correlations -= self._dense_mean_correlations
         if colors == "exact":
@@ -82,12 +82,6 @@ class Encoder:
             if not centred:
                 columns += self._mean_colors
         return self._colored(columns, (image.shape[1], image.shape[0]))
-
-    def resized(self, pixels: Planes) -> Planes:
-        """Return an image at the size of the model."""
-        width, height = self.gaussians.width, self.gaussians.height
-        same = pixels.shape[:2] == (height, width)
-        return pixels if same else resample(pixels, width, height)
 
     def _correlate(self, pixels: Planes) -> Columns:
         """Return ``[A 1]^T x`` of all channels of an image of the model's size, shape (N + 1, C).
