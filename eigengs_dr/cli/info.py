@@ -119,8 +119,6 @@ def _describe_model(model: eg.EigenGS) -> Facts:
     size = g.width, g.height
     facts = _describe_set(SetHead(len(g), g.channels, size, g.space, g.cutoff, g.maps))
     facts |= {"components": list(model.components), "frequency_aware": model.low > 0}
-    if model.split_reason:
-        facts["split_reason"] = model.split_reason
     if model.low:
         facts |= {"low_gaussians": model.low, "high_gaussians": len(g) - model.low}
         facts["low_components"] = model.low_components

@@ -86,6 +86,6 @@ def train(
     run.tell(
         f"{folder}: {found['images']} images, {components} components, "
         f"{found['gaussians']} Gaussians in {found['seconds']:.1f} s; "
-        f"{split} ({found['split_reason']})\n  {measured}\n"
+        f"{split}\n  {measured}\n"
         f"  wrote {output}" + (f" and {picture}" if picture else "")
     )

@@ -22,14 +22,14 @@ from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image
 from ..image.pixels import EncodedImage
 from ..image.resize import resample
-from .encoder import Encoder, check_encoding
 from .model_file import read_members, write_model
 from .pca.truncation import TruncationCurve, curve_from_eigenvalues, name_components
 
-if TYPE_CHECKING:  # training and runs over many images are imported where they are called
+if TYPE_CHECKING:  # what trains, encodes and runs over many images is imported where it is called
     from ..collection.manifest import ImageRow
     from ..collection.sources import Images
     from ..image.folder import Source
+    from .encoder import Encoder
     from .pca.basis import Eigenbasis
 
 Planes = NDArray[np.float32]
@@ -56,15 +56,13 @@ class EigenGS:
     low, low_components : int
         The first `low` Gaussians serve the first `low_components` of each channel alone; both are
         0 if all Gaussians serve all components.
-    split_reason : str
-        Why the Gaussians are split or not; empty in a file of version 1.
     variance : ndarray of float64, shape (C,) or (0,)
         See `eigengs_dr.Eigenbasis`; empty in a file of version 1.
     held_out : ndarray of float64, shape (n + 1,) or (0,)
         Mean PSNR in dB of PCA with 0, 1, ..., n components, for images held out of the training;
         see `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`. Empty if no image was held out.
     figures : dict of str to float
-        See `eigengs_dr.eigenbasis.components.solve.ComponentFit`; not saved.
+        See `eigengs_dr.eigenbasis.components.solve.fit_model`; not saved.
     """
 
     gaussians: Gaussians
@@ -73,14 +71,12 @@ class EigenGS:
     mean_image: Planes
     low: int = 0
     low_components: int = 0
-    split_reason: str = ""
     variance: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     held_out: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     figures: dict[str, float] = field(default_factory=dict)
 
     @classmethod
     @shows_progress
-    @exclusive()
     def fit(
         cls,
         basis: Eigenbasis | Source,
@@ -91,7 +87,6 @@ class EigenGS:
         iterations: int | None = None,
         backend: str | None = None,
         progress: Any = None,
-        client: Any = None,
     ) -> EigenGS:
         """Fit one set of Gaussians to the mean image and all components of an eigenbasis.
 
@@ -103,7 +98,7 @@ class EigenGS:
             Number of Gaussians, at most one per pixel.
         frequency_aware : {"auto", True, False}, optional
             Whether a tenth of the Gaussians serve the first 50 components alone, and the others
-            the rest; for "auto" see `eigengs_dr.eigenbasis.components.solve.wants_split`.
+            the rest; "auto" does so from 512 pixels on, the longer side.
         seed : int, optional
         preset : {"default", "eigengs"}, optional
             "default" places Gaussians on a grid and solves for all weights by one factorisation.
@@ -115,9 +110,6 @@ class EigenGS:
         progress : bool or callable, optional
             By default a bar, in a terminal or a notebook, after two seconds; False shows none.
             ``progress(step, steps, {})`` after every round of training.
-        client : distributed.Client, optional
-            Solve for the weights on the workers of this Dask cluster; their number does not change
-            the result, see `eigengs_dr.eigenbasis.components.solve.find_weights`.
 
         Raises
         ------
@@ -125,14 +117,13 @@ class EigenGS:
             If an argument is out of range.
         BackendError
             If the backend does not work.
-        ClusterError
-            If the cluster cannot be used, or is lost.
         """
-        from .options import TrainOptions, fit_model
+        from .components.solve import fit_model
+        from .options import TrainOptions
         from .pca.basis import Eigenbasis
 
         if not isinstance(basis, Eigenbasis):
-            basis = Eigenbasis.from_images(basis, seed=seed, client=client, progress=False)
+            basis = Eigenbasis.from_images(basis, progress=False)
         options = TrainOptions(
             size=(basis.width, basis.height),
             gaussians=gaussians,
@@ -141,7 +132,7 @@ class EigenGS:
             iterations=iterations,
             seed=seed,
         )
-        return cls(**fit_model(basis, options, backend, progress, client=client))
+        return cls(**fit_model(basis, options, backend, progress))
 
     def __repr__(self) -> str:
         size = f"{len(self.gaussians)} Gaussians, {self.gaussians.width}x{self.gaussians.height}"
@@ -245,9 +236,8 @@ class EigenGS:
         ValueError
             As `project`; also if an option is unknown, or a target comes with exact colours.
         """
-        check_encoding(colors, mean, target_psnr)
         pixels = check_image(image, copy=False)
-        return self.encoder.encode([pixels], colors, mean, target_psnr)[0]
+        return self.encoder.encode(pixels, colors, mean, target_psnr)
 
     @shows_progress
     def encode_many(
@@ -283,6 +273,7 @@ class EigenGS:
             See `encode` and `eigengs_dr.fit_many`.
         """
         from ..collection.run import Job, run_images
+        from .encoder import check_encoding
 
         check_encoding(colors, mean, target_psnr)
         job = Job(partial(_encode_all, model=self, options=(colors, mean, target_psnr)))
@@ -325,6 +316,8 @@ class EigenGS:
     @cached_property
     def encoder(self) -> Encoder:
         """The functions of `eigengs_dr.eigenbasis.encoder`, with what they compute once."""
+        from .encoder import Encoder
+
         return Encoder(self.gaussians, self.weights, self.mean_image, self.low)
 
 

@@ -21,11 +21,11 @@ from ..image.remote import is_url
 from ..image.resize import center_crop
 from ..raster.render import render
 from ..storage.checkpoint import Checkpoint
-from .components.solve import State
+from .components.bands import State
+from .components.solve import fit_model
 from .eigengs import EigenGS
-from .options import TrainOptions, fit_model
-from .pca.basis import Eigenbasis, check_components
-from .pca.stream import PCAOptions, find_state
+from .options import TrainOptions
+from .pca.basis import Eigenbasis
 from .pca.truncation import TruncationCurve
 
 HELD_OUT = 10
@@ -49,8 +49,8 @@ class Training(NamedTuple):
 
     The figures are ``seconds``, ``pca_seconds``, ``shape_seconds``, ``weight_seconds`` (of the last
     run alone if ``resumed``), ``images``, ``iterations``, ``components`` (of each channel),
-    ``gaussians``, ``frequency_aware``, ``split_reason``, ``psnr_held_out`` (`held_out` of the
-    model), those of `eigengs_dr.eigenbasis.components.solve.ComponentFit`, and of images held out
+    ``gaussians``, ``frequency_aware``, ``psnr_held_out`` (`held_out` of the
+    model), those of `eigengs_dr.eigenbasis.components.solve.fit_model`, and of images held out
     the mean psnr_ycbcr of PCA, ``psnr_pca``, of projected colours, ``psnr_init``, and of exact
     colours, ``psnr_solved``.
     """
@@ -84,9 +84,8 @@ def train(
     progress : callable, optional
         ``progress(stage, done, total)``.
     client : distributed.Client, optional
-        Find components and weights on the workers of this Dask cluster, see
-        `eigengs_dr.Eigenbasis.from_images` and `eigengs_dr.EigenGS.fit`. The images and the
-        checkpoint must lie on a file system that they share.
+        Find components on the workers of this Dask cluster, see
+        `eigengs_dr.Eigenbasis.from_images`. The images must lie on a file system that they share.
 
     Raises
     ------
@@ -129,7 +128,6 @@ def train(
             "components": list(model.components),
             "gaussians": len(model.gaussians),
             "frequency_aware": model.low > 0,
-            "split_reason": model.split_reason,
             "psnr_held_out": model.held_out.tolist(),
             "iterations": steps,
             "pca_seconds": pca_seconds,
@@ -160,7 +158,7 @@ class Run(NamedTuple):
 
 
 def _basis(files: list[Path | str], run: Run) -> Eigenbasis:
-    """Find the components, or read them from the checkpoint, which keeps the states of shards."""
+    """Find the components, or read them from the checkpoint, which keeps the first shards too."""
     settings, checkpoint = run.settings, run.checkpoint
     if (path := checkpoint.folder / "basis.npz").exists():
         return Eigenbasis.load(path)
@@ -169,11 +167,15 @@ def _basis(files: list[Path | str], run: Run) -> Eigenbasis:
         run.progress("components", done, len(files))
         run.stop_if_interrupted()
 
-    most = check_components(settings.components)
-    options = PCAOptions(settings.size, settings.space, most, settings.seed)
-    state = find_state(files, options, advance, run.client, checkpoint.folder)
-    basis = Eigenbasis.from_state(
-        state, settings.size, settings.components, settings.energy, settings.space
+    basis = Eigenbasis.from_images(
+        files,
+        settings.size,
+        settings.components,
+        settings.energy,
+        settings.space,
+        advance,
+        run.client,
+        checkpoint.folder,
     )
     if settings.target_psnr is not None:
         if (curve := _curve(basis, run)) is None:
@@ -210,7 +212,7 @@ def _model(basis: Eigenbasis, run: Run) -> EigenGS:
     states: list[State] = []
     while (state := checkpoint.load(f"shapes-{len(states)}")) is not None:
         states.append(state)
-    members = fit_model(basis, run.settings, run.backend, advance, states, save, run.client)
+    members = fit_model(basis, run.settings, run.backend, advance, states, save)
     return EigenGS(**members, held_out=np.zeros(0) if curve is None else curve.psnr)
 
 

@@ -94,7 +94,6 @@ def test_info_of_the_basis_that_ships(tmp_path):
     found = facts_of("natural")
     assert found["file"] == str(SHIPPED["natural"])
     assert found["components"] == found["truncation"][-1]["components"] == [230, 60, 60]
-    assert found["split_reason"]
     assert_refused(run("info", tmp_path / "natural"), tmp_path / "natural", "No such file")
     assert_refused(run("info", tmp_path), tmp_path, "Is a directory")
 

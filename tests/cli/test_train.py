@@ -40,9 +40,9 @@ def test_target_psnr(tmp_path):
     report, model = tmp_path / "r.json", tmp_path / "m.npz"
     small = ["--size", "32x32", "--components", 6, "--gaussians", 60, "--target-psnr", 21]
     text = said("train", photos, "-o", model, "--report", report, *small)
-    assert "not split (32 pixels a side; auto measures from 512 on)" in text
+    assert " s; not split\n" in text
     figures = json.loads(report.read_text())
-    assert (figures["target_psnr"], figures["split_reason"][:2]) == (21, "32")
+    assert figures["target_psnr"] == 21
     assert figures["psnr_held_out"][-1] >= 21 > figures["psnr_held_out"][-2]
     rows = json.loads(said("info", model, "--json"))["truncation"]
     assert rows[0]["components"] == [0, 0, 0] and rows[0]["variance"] == 0

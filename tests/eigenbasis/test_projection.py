@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy.linalg import cho_factor, cho_solve
 
 import eigengs_dr as eg
 from _helpers.families import family, small_model, splits
-from eigengs_dr.image.color import RGB_TO_YCBCR, YCBCR_OFFSET, to_planes
+from eigengs_dr.image.color import to_planes
 
 
 @pytest.fixture(scope="module")
@@ -53,40 +52,6 @@ def test_an_image_of_a_subspace_needs_no_more(backend):
     assert [len(w) for w in found] == [2, 0, 1]
     np.testing.assert_allclose(np.concatenate(found), np.concatenate(only), atol=2e-3)
     assert [len(w) for w in model.project(shown(model, (only[1],) * 3), 55)] == [0, 0, 0]
-
-
-@splits
-@pytest.mark.parametrize("mean", ["gaussians", "dense"])
-def test_encode_is_as_before_without_a_target(backend, others, split, mean):
-    """The same bits as least squares on all components, written out."""
-    model = small_model(backend, split)
-    equations = model.encoder.equations
-    black = np.outer(np.append(equations.coverage, 32**2), YCBCR_OFFSET)
-    seen = equations.correlate(np.moveaxis(others[0], 2, 0)) @ RGB_TO_YCBCR.T + black
-    planes = to_planes(others[0], "ycbcr").reshape(3, 32, 32)
-    np.testing.assert_allclose(seen, equations.correlate(planes), rtol=1e-6)
-    if mean == "dense":
-        seen -= equations.correlate(model.mean_image)
-    arrays = model.gaussians.to_arrays()
-    start = np.vstack([arrays["color"], arrays["background"]]).astype(np.float64)
-    if mean == "gaussians":
-        seen = seen - equations.product(start)
-    columns = []
-    for c, weights in enumerate(model.weights):
-        rows = weights.astype(np.float64)
-        gram = rows @ equations.product(rows.T)
-        gram += np.eye(len(gram)) * (1e-9 * np.trace(gram) / len(gram) + 1e-30)
-        right = np.einsum("jn,n->j", weights, seen[:, c].astype(np.float32))
-        a = cho_solve(cho_factor(gram, lower=True), right).astype(np.float32)
-        columns.append(np.einsum("j,jn->n", a, weights))
-    curve_from_eigenvalues = np.stack(columns, axis=1).astype(np.float64)
-    if mean == "gaussians":
-        curve_from_eigenvalues = start + curve_from_eigenvalues
-    found = model.encode(others[0], "projected", mean).to_arrays()
-    np.testing.assert_array_equal(found["color"], curve_from_eigenvalues[:-1].astype(np.float32))
-    np.testing.assert_array_equal(
-        found["background"], curve_from_eigenvalues[-1].astype(np.float32)
-    )
 
 
 def test_encode_with_a_dense_mean(backend, others):

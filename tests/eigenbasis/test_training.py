@@ -10,9 +10,7 @@ from _helpers.trainings import checkpoint_of, settings
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.eigenbasis.options import TrainOptions
 from eigengs_dr.eigenbasis.training import train
-from eigengs_dr.image.io import ImageError, load_image
-from eigengs_dr.image.metrics import psnr
-from eigengs_dr.raster.render import render
+from eigengs_dr.image.io import ImageError
 
 FIGURES = {
     "seconds",
@@ -44,15 +42,6 @@ def test_end_to_end(folder, output):
     assert not checkpoint_of(output).exists()
 
 
-def test_the_file_encodes_as_what_was_trained(folder, output):
-    trained = train(folder, output, settings())
-    model = EigenGS.load(output)
-    image = load_image(folder / "009.png")
-    for colors in ("exact", "projected"):
-        pictures = [render(m.encode(image, colors)).numpy() for m in (model, trained.model)]
-        assert psnr(*pictures, "ycbcr") > 50
-
-
 @pytest.mark.parametrize(
     "changed",
     [
@@ -72,18 +61,17 @@ def test_other_settings(folder, output, changed):
     EigenGS.load(output)
 
 
-def test_a_model_that_cannot_be_written(folder, output, monkeypatch):
-    def full(model, path):
-        raise OSError("no space left")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(EigenGS, "save", full)
-        with pytest.raises(OSError, match="no space"):
-            train(folder, output, settings())
-    assert sorted(path.name for path in output.parent.iterdir()) == [
+def test_a_model_that_cannot_be_written(folder, output):
+    """The work is kept."""
+    output.mkdir()
+    with pytest.raises(OSError, match=r"model\.npz"):
+        train(folder, output, settings())
+    assert {path.name for path in output.parent.iterdir()} == {
+        "model.npz",
         "model.npz.checkpoint",
         "photos",
-    ]
+    }
+    output.rmdir()
     assert train(folder, output, settings()).figures["resumed"]
 
 
@@ -126,19 +114,6 @@ def test_images_of_other_sizes(folder, output):
     assert EigenGS.load(output).mean_image.shape == (3, 12, 20)
 
 
-@pytest.mark.parametrize(
-    ("count", "channels", "preset"),
-    [(12, 1, "default"), (12, 1, "eigengs"), (1, 3, "default")],
-    ids=["grey", "grey eigengs", "single"],
-)
-def test_channels_in_which_nothing_varies(tmp_path, output, count, channels, preset):
-    folder = random_fields(tmp_path / "flat", count, channels=channels)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a single image has no components, as is said
-        train(folder, output, settings(preset=preset, iterations=3))
-    assert EigenGS.load(output).components[1:] == (0, 0)
-
-
 @pytest.mark.parametrize("count", [1, 4])
 def test_fewer_splats_than_components(folder, output, count):
     assert train(folder, output, settings(gaussians=count)).figures["psnr_solved"] > 10
@@ -149,28 +124,26 @@ def test_fewer_splats_than_components(folder, output, count):
     [
         ({"gaussians": 1025}, "gaussians is 1025; a basis of 32x32 takes 1 to 1024"),
         ({"gaussians": 0}, "gaussians is 0"),
+        ({"gaussians": 2.5}, "gaussians is 2.5"),
         ({"iterations": -1}, "iterations is -1"),
         ({"seed": -1}, "seed is -1"),
-        ({"preset": "none"}, "preset 'none'"),
+        ({"preset": "none"}, "preset 'none' is unknown; use one of default, eigengs"),
         ({"preset": "eigengs", "iterations": 0}, "iterations is 0"),
-        ({"frequency_aware": "maybe"}, "frequency_aware is 'maybe'"),
+        ({"frequency_aware": "maybe"}, "is 'maybe'; use 'auto', True or False"),
         ({"space": "lab"}, "space 'lab' is unknown; use one of ycbcr, rgb"),
         ({"size": (0, 1)}, "size is 0x1"),
         ({"components": -1}, "components is -1"),
         ({"components": (3, 4)}, "expected a number, or three"),
         ({"energy": 1.5}, "energy is 1.5"),
+        ({"target_psnr": 20, "energy": 0.9}, "give one of them"),
+        ({"target_psnr": np.nan}, "target_psnr is nan"),
     ],
     ids=str,
 )
-def test_wrong_settings_leave_nothing(folder, output, changed, words):
+def test_wrong_settings_are_refused(changed, words):
+    """Before an image is read."""
     with pytest.raises(ValueError, match=words):
-        train(folder, output, settings(**changed))
-    assert list(output.parent.iterdir()) == [folder]
-
-
-def test_wrong_numbers_are_refused_before_an_image_is_read(tmp_path, output):
-    with pytest.raises(ValueError, match="gaussians is 1025"):
-        train(tmp_path / "gone", output, settings(gaussians=1025))
+        settings(**changed)
 
 
 def test_train_to_a_target(trained, tmp_path):
@@ -190,7 +163,3 @@ def test_train_without_images_for_a_target(tmp_path):
         warnings.simplefilter("ignore")
         train(photos, tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=20))
     assert [path.name for path in tmp_path.iterdir()] == ["few"]
-    with pytest.raises(ValueError, match="give one of them"):
-        train(photos, tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=20, energy=0.9))
-    with pytest.raises(ValueError, match="target_psnr is nan"):
-        train(tmp_path / "gone", tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=np.nan))

@@ -7,16 +7,12 @@ is the mean squared error of the rendered components, with each channel scaled t
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from itertools import islice
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
-from ...backend.arrays import ArrayTypes, types_in, types_of, upload
+from ...backend.arrays import ArrayTypes, Float, types_in, types_of, upload
 from ...backend.recording import freeze_program
 from ...backend.selection import select
 from ...fitting.parameterization import CHOLESKY, Adan
@@ -26,80 +22,45 @@ from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint
 from ...raster.binning.lists import TileLists
 from ...raster.binning.tiles import Grid
-from ...raster.kernels import residual, sum_lanes
+from ...raster.kernels import residual
 from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
 from ...raster.render import bin_gaussians, to_tiles
+from .bands import FrequencyBand, Planes, State
 
-Planes = NDArray[np.float32]
+
+def joint_shapes(state: State, band: FrequencyBand, backend: str | None = None) -> Gaussians:
+    """Return the Gaussians of a state, with one channel of zeros, in the space "data"."""
+    types = types_in(select(backend))
+    rows = [upload(types.Float, row) for row in state["rows"][0, :NUM_SHAPE_PARAMS]]
+    return decode_shapes(rows, band.size)
 
 
-class JointState(NamedTuple):
-    """State of a joint training of N Gaussians and P components after some steps.
+def joint_weights(state: State, band: FrequencyBand) -> list[Planes]:
+    """Return the weights of the components of a state without the scaling.
 
-    Attributes
-    ----------
-    step : int
-        Number of finished steps.
-    loss : float
-        Mean squared error over all pixels of the scaled components, before the update of the last
-        step; NaN before the first step.
-    size : (int, int)
-        Width and height in pixels.
-    bounds : ndarray of float32, shape (C, 2)
-        Smallest and largest value of all components of a channel; 0 for a channel without any.
-    counts : tuple of C ints
-        Number of components of each channel.
-    rows : ndarray of float32, shape (5, 5 + P, N)
-        Variables; then m, v, n and the last gradient of `eigengs_dr.fitting.parameterization.Adan`.
-        The first 5 rows of each are the mean and the factor in `CHOLESKY` coordinates; each other
-        row holds the scaled weights of one component.
+    The scaled weight ``w_nj`` of Gaussian n in component j and the bounds of the channel give
+    ``psi'_nj = w_nj (max - min)`` and ``beta_j = min``.
+
+    Returns
+    -------
+    list of C ndarrays of float32, shape (k_c, N + 1)
+        Row j holds psi'_nj of all Gaussians, then the background beta_j.
     """
-
-    step: int
-    loss: float
-    size: tuple[int, int]
-    bounds: NDArray[np.float32]
-    counts: tuple[int, ...]
-    rows: NDArray[np.float32]
-
-    def gaussians(self, backend: str | None = None) -> Gaussians:
-        """Return N Gaussians with one channel of zeros, in the space "data"."""
-        types = types_in(select(backend))
-        return decode_shapes(
-            [upload(types.Float, row) for row in self.rows[0, :NUM_SHAPE_PARAMS]], self.size
-        )
-
-    def weights(self) -> tuple[Planes, ...]:
-        """Return the weights of the components without the scaling.
-
-        The scaled weight ``w_nj`` of Gaussian n in component j and the bounds of the channel give
-        ``psi'_nj = w_nj (max - min)`` and ``beta_j = min``.
-
-        Returns
-        -------
-        tuple of C ndarrays of float32, shape (k_c, N + 1)
-            Row j holds psi'_nj of all Gaussians, then the background beta_j.
-        """
-        parts = np.split(self.rows[0, NUM_SHAPE_PARAMS:], np.cumsum(self.counts)[:-1])
-        return tuple(
-            np.pad(part * (high - low), [(0, 0), (0, 1)], constant_values=low)
-            for part, (low, high) in zip(parts, self.bounds, strict=True)
-        )
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the state as plain arrays, for a checkpoint."""
-        return {name: np.asarray(value) for name, value in self._asdict().items()}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> JointState:
-        """Rebuild a state from the result of `arrays`; the next steps then give equal bits."""
-        width, height = arrays["size"].tolist()
-        counts = tuple(arrays["counts"].tolist())
-        step, loss = int(arrays["step"]), float(arrays["loss"])
-        return cls(step, loss, (width, height), arrays["bounds"], counts, arrays["rows"])
+    ends = np.cumsum([len(planes) for planes in band.components])
+    parts = np.split(state["rows"][0, NUM_SHAPE_PARAMS:], ends[:-1])
+    return [
+        np.pad(part * (high - low), [(0, 0), (0, 1)], constant_values=low)
+        for part, (low, high) in zip(parts, _bounds(band), strict=True)
+    ]
 
 
-def decode_shapes(rows: Any, size: tuple[int, int]) -> Gaussians:
+def _bounds(band: FrequencyBand) -> list[tuple[np.float32, np.float32]]:
+    """Return the smallest and largest value of all components of each channel."""
+    none = np.zeros(1, np.float32)
+    return [(p.min(), p.max()) for p in (c if len(c) else none for c in band.components)]
+
+
+def decode_shapes(rows: Sequence[Float], size: tuple[int, int]) -> Gaussians:
     """Decode rows of variables to Gaussians with one channel of zeros; differentiable.
 
     Parameters
@@ -134,14 +95,12 @@ OPTIMIZER = Adan()
 
 
 def train_jointly(
-    components: tuple[Planes, ...],
-    count: int,
+    band: FrequencyBand,
     seed: int,
     steps: int,
-    *,
     backend: str | None = None,
-    state: JointState | None = None,
-) -> Iterator[JointState]:
+    state: State | None = None,
+) -> Iterator[State]:
     """Fit Gaussians and their weights to the principal components of all channels.
 
     With the scaled components ``Phi_j`` and the value ``g_n(x)`` of Gaussian n at a pixel, the loss
@@ -155,127 +114,118 @@ def train_jointly(
 
     Parameters
     ----------
-    components : tuple of C ndarrays of float32, shape (k_c, H, W)
-        Components; a channel may have none.
-    count : int
-        Number of Gaussians, N.
+    band : FrequencyBand
     seed : int
         Seed of the random start.
     steps : int
         Total number of steps.
     backend : {"llvm", "cuda"}, optional
-    state : JointState, optional
+    state : dict of str to ndarray, optional
         Resume from this state, without the seed. The result has the bits of an unbroken run.
 
     Yields
     ------
-    JointState
+    dict of str to ndarray
         The state after every `ROUND` steps and after the last step; nothing if `state` has all
-        steps. A state does not change later. Between two states, `KeyboardInterrupt` may become
-        another error, see `eigengs_dr.backend.feedback.defer_interrupts`.
+        steps. Between two states, `KeyboardInterrupt` may become another error, see
+        `eigengs_dr.backend.feedback.defer_interrupts`. "step" is the number of finished steps;
+        "rows", shape (5, 5 + P, N) for P components, the variables, then m, v, n and the last
+        gradient of `eigengs_dr.fitting.parameterization.Adan`. The first 5 rows of each are the
+        mean and the factor in `CHOLESKY` coordinates, each other row the scaled weights of one
+        component.
 
     Raises
     ------
     ValueError
-        If there is no component, sizes differ, or `state` has other components or Gaussians.
+        If there is no component.
 
     Notes
     -----
     A step costs one rendering and one adjoint for each component. Beside the components, it needs
     4 P W H bytes for scaled components, 20 P N for weights and moments, and 20 P N for each state.
     """
-    if sum(map(len, components)) == 0:
-        raise ValueError("components: there are none to fit; give at least one")
-    if len({planes.shape[1:] for planes in components}) > 1:
-        raise ValueError("components: the channels differ in size; give one size to all")
-    counts = tuple(map(len, components))
-    height, width = components[0].shape[1:]
-    if state is None:
-        bounds = [(p.min(), p.max()) if len(p) else (0, 0) for p in components]
-        rows = _start((width, height), count, sum(counts), seed, backend)
-        state = JointState(0, math.nan, (width, height), np.array(bounds, "f4"), counts, rows)
-    elif (state.size, state.counts, state.rows.shape[2]) != ((width, height), counts, count):
-        raise ValueError("state: it has other components or another number of Gaussians; drop it")
-    return _train(components, state, steps, backend)
+    if not any(map(len, band.components)):
+        raise ValueError("the images give no components to train on; use preset 'default'")
+    return _train(band, state or _start(band, seed, backend), steps, backend)
 
 
-def _start(
-    size: tuple[int, int], count: int, components: int, seed: int, backend: str | None
-) -> Planes:
-    """Draw the rows of an initial state, with moments of 0."""
+def _start(band: FrequencyBand, seed: int, backend: str | None) -> State:
+    """Draw an initial state, with moments of 0."""
     generator = np.random.default_rng(seed)
-    mean, factor = place_random(np.empty((size[1], size[0], 1)), count, generator)
+    (width, height), count = band.size, band.number
+    mean, factor = place_random(np.empty((height, width, 1)), count, generator)
     gaussians = Gaussians.from_arrays(
-        mean, factor, np.zeros((count, 1)), size=size, space="data", backend=backend
+        mean, factor, np.zeros((count, 1)), size=band.size, space="data", backend=backend
     )
+    components = sum(map(len, band.components))
     rows = np.zeros((5, NUM_SHAPE_PARAMS + components, count), np.float32)
     variables = CHOLESKY.encode(gaussians)
     rows[0, :NUM_SHAPE_PARAMS] = [v.numpy() for v in (*variables["mean"], *variables["cholesky"])]
     rows[0, NUM_SHAPE_PARAMS:] = generator.uniform(0, 1, (components, count))
-    return rows
+    return {"step": np.array(0), "rows": rows}
 
 
-def _train(
-    components: tuple[Planes, ...], state: JointState, steps: int, backend: str | None
-) -> Iterator[JointState]:
+def _train(band: FrequencyBand, state: State, steps: int, backend: str | None) -> Iterator[State]:
     """Take the remaining steps."""
-    types = types_in(select(backend))
-    shape = _upload(types, state.rows[:, :NUM_SHAPE_PARAMS])
-    groups = list(_groups(types, state))
-    targets = list(_targets(types, components, state))
-    number = sum(state.counts) * math.prod(state.size)
-    radius = kernel_radius(CUTOFF)
+    types, size, start = types_in(select(backend)), band.size, state["rows"]
+    shape = _upload(types, start[:, :NUM_SHAPE_PARAMS])
+    groups = [_upload(types, rows) for rows in _split(start[:, NUM_SHAPE_PARAMS:], axis=1)]
+    scaled = [
+        (planes - low) / (high - low) if high > low else planes * 0
+        for planes, (low, high) in zip(band.components, _bounds(band), strict=True)
+    ]
+    targets = [
+        to_tiles(types, np.moveaxis(planes, 0, 2), Grid(*size))
+        for planes in _split(np.concatenate(scaled), axis=0)
+    ]
+    radius, number = kernel_radius(CUTOFF), sum(planes.size for planes in band.components)
+    scale = dr.opaque(types.Float, 2 / number)
     with freeze_program(_move_group) as move, freeze_program(_move_shape) as move_shape:
-        for step in range(state.step, steps):
+        for step in range(int(state["step"]), steps):
             rate = dr.opaque(types.Float, RATE * 0.5 ** (step // HALVED))
             time = dr.opaque(types.Float, step + 1)
-            current = decode_shapes(shape[0], state.size)
+            current = decode_shapes(shape[0], size)
             values = kernel_shape(current)
             dr.eval(values)
             # New lists in every step are cheaper than larger lists that last several steps.
             lists = bin_gaussians(current)
-            sums = [dr.opaque(types.Float, 0, dr.width(v)) for v in (*values, 0.0)]
-            yields = (step + 1) % ROUND == 0 or step + 1 == steps
-            scale = dr.opaque(types.Float, 2 / number)
+            slopes = [dr.opaque(types.Float, 0, dr.width(v)) for v in values]
             for k, target in enumerate(targets):
-                groups[k], sums = move(
-                    groups[k], target, values, lists, radius, scale, sums, yields, rate, time
+                groups[k], slopes = move(
+                    groups[k], target, values, lists, radius, scale, slopes, rate, time
                 )
-            shape = move_shape(shape, sums[:NUM_SHAPE_PARAMS], state.size, rate, time)
-            if yields:
-                loss = float(sums[-1][0]) / number
+            shape = move_shape(shape, slopes, size, rate, time)
+            if (step + 1) % ROUND == 0 or step + 1 == steps:
                 rows = np.concatenate([_download(o) for o in (shape, *groups)], axis=1)
-                rows = rows[:, : state.rows.shape[1]]  # without the padding of the last group
-                yield state._replace(step=step + 1, loss=loss, rows=rows)
+                rows = rows[:, : start.shape[1]]  # without the padding of the last group
+                yield {"step": np.array(step + 1), "rows": rows}
 
 
 def _move_group(
     group: list,
-    target: Any,
+    target: Float,
     shape: list,
     lists: TileLists,
     radius: float,
-    scale: Any,
-    sums: list,
-    with_error: bool,
-    rate: Any,
-    time: Any,
+    scale: Float,
+    slopes: list,
+    rate: Float,
+    time: Float,
 ) -> tuple[list, list]:
-    """Move the weights of a group; add gradients of shapes (and errors, if wanted) to `sums`."""
+    """Move the weights of a group, and add its gradient of the shapes to `slopes`."""
     rows, *moments = group
     packed = pack_parameters([*shape, *rows])
-    delta, squares = residual(packed, [type(target)(0)] * GROUP, lists, radius, target)
+    delta, _ = residual(packed, [type(target)(0)] * GROUP, lists, radius, target)
     gradient = [g * scale for g in adjoint(packed, delta, GROUP, lists, radius)]
-    error = type(target)(0)
-    if with_error:
-        error = sum(sum_lanes(squares, lists))
-    added = [s + g for s, g in zip(sums, [*gradient[:NUM_SHAPE_PARAMS], error], strict=True)]
-    slopes = type(rows)(gradient[NUM_SHAPE_PARAMS:])
-    rows, moments = OPTIMIZER.step(rows, slopes, tuple(moments), rate, time)
+    added = [s + g for s, g in zip(slopes, gradient[:NUM_SHAPE_PARAMS], strict=True)]
+    own = type(rows)(gradient[NUM_SHAPE_PARAMS:])
+    rows, moments = OPTIMIZER.step(rows, own, tuple(moments), rate, time)
     return [rows, *moments], added
 
 
-def _move_shape(shape: list, gradient: list, size: tuple[int, int], rate: Any, time: Any) -> list:
+def _move_shape(
+    shape: list, gradient: list, size: tuple[int, int], rate: Float, time: Float
+) -> list:
     """Move the means and factors of all Gaussians along the gradient of the kernels' parameters."""
     rows, *moments = shape
     with dr.resume_grad():
@@ -298,22 +248,12 @@ def _download(parts: list) -> Planes:
     return np.stack([dr.detach(part).numpy() for part in parts])
 
 
-def _groups(types: ArrayTypes, state: JointState) -> Iterator[list]:
-    """Upload the state of each group of weights."""
-    for first in range(NUM_SHAPE_PARAMS, state.rows.shape[1], GROUP):
-        rows = state.rows[:, first : first + GROUP]
-        # The padding of the last group stays 0: a zero component with zero weights has no gradient.
-        yield _upload(types, np.pad(rows, [(0, 0), (0, GROUP - rows.shape[1]), (0, 0)]))
+def _split(array: Planes, axis: int) -> Iterator[Planes]:
+    """Yield `GROUP` components after `GROUP` components, the last ones with zeros.
 
-
-def _targets(types: ArrayTypes, components: tuple[Planes, ...], state: JointState) -> Iterator[Any]:
-    """Yield the scaled components of each group, in tile layout."""
-    scaled = (
-        (plane - low) / (high - low) if high > low else plane * 0
-        for planes, (low, high) in zip(components, state.bounds, strict=True)
-        for plane in planes
-    )
-    while group := list(islice(scaled, GROUP)):
-        planes = np.zeros((*group[0].shape, GROUP), np.float32)
-        planes[..., : len(group)] = np.stack(group, axis=-1)
-        yield to_tiles(types, planes, Grid(*state.size))
+    The padding stays 0: a zero component with zero weights has no gradient.
+    """
+    for part in np.split(array, range(GROUP, array.shape[axis], GROUP), axis):
+        missing = np.zeros((array.ndim, 2), int)
+        missing[axis, 1] = GROUP - part.shape[axis]
+        yield np.pad(part, missing)

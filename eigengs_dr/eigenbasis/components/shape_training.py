@@ -11,24 +11,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
 from ...backend.arrays import types_of
 from ...backend.recording import freeze_program
 from ...fitting.descent import pack, rate_table, start_descent, step_program
 from ...fitting.schedule import Schedule, lr_factor
 from ...fitting.solvers.conjugate_gradient import solve
-from ...fitting.start import place_grid
 from ...gaussian.gaussians import Gaussians
 from ...raster.binning.tiles import Grid
 from ...raster.render import bin_gaussians, to_tiles
-
-Planes = NDArray[np.float32]
-State = dict[str, NDArray[Any]]
+from .bands import FrequencyBand, Planes, State, on_grid, shapes_of
 
 ROUND = 25
 """Steps between two restarts of the optimiser; a checkpoint after a round needs the shapes alone.
@@ -52,9 +47,7 @@ WARM_UP = 5
 
 
 def train_shapes(
-    components: tuple[Planes, ...],
-    eigenvalues: tuple[NDArray[np.float64], ...],
-    count: int,
+    band: FrequencyBand,
     seed: int,
     steps: int,
     backend: str | None = None,
@@ -64,12 +57,7 @@ def train_shapes(
 
     Parameters
     ----------
-    components : tuple of C ndarrays of float32, shape (k_c, H, W)
-        Components of each channel.
-    eigenvalues : tuple of C ndarrays, shape (k_c,)
-        Variance along each component.
-    count : int
-        Number of Gaussians.
+    band : FrequencyBand
     seed : int
         Seed of the random combinations; seed and step determine a combination.
     steps : int
@@ -82,54 +70,22 @@ def train_shapes(
     ------
     dict of str to ndarray
         "step", "mean" and "factor", at the start, after every `ROUND` steps and at the end.
-
-    Raises
-    ------
-    ValueError
-        If `state` has another number of Gaussians, or more steps than `steps`.
     """
-    height, width = components[0].shape[1:]
     if state is None:
-        state = on_grid((width, height), count)
+        state = on_grid(band)
         yield state
-    elif (
-        not {"step", "mean", "factor"} <= state.keys()
-        or len(state["mean"]) != count
-        or not 0 <= state["step"] <= steps
-    ):
-        raise ValueError("state: it does not fit this number of Gaussians and steps; drop it")
-    gaussians = shapes_of(state, (width, height), len(components), backend)
-    if not any(len(values) for values in eigenvalues):
+    if not any(map(len, band.components)):
         return
+    gaussians = shapes_of(state, band, backend)
     for first in range(int(state["step"]), steps, ROUND):
         last = min(first + ROUND, steps)
-        gaussians = _round(gaussians, components, eigenvalues, seed, (first, last, steps))
+        gaussians = _round(gaussians, band, seed, (first, last, steps))
         arrays = gaussians.to_arrays()
         yield {"step": np.array(last), "mean": arrays["mean"], "factor": arrays["factor"]}
 
 
-def on_grid(size: tuple[int, int], count: int) -> State:
-    """Return the state before training, `count` Gaussians on a grid of a size (width, height)."""
-    mean, factor = place_grid(np.empty((size[1], size[0], 1)), count, np.random.default_rng(0))
-    return {"step": np.array(0), "mean": mean, "factor": factor}
-
-
-def shapes_of(
-    state: State, size: tuple[int, int], channels: int, backend: str | None = None
-) -> Gaussians:
-    """Return the Gaussians of a state, with colours of 0 in the space "data"."""
-    colors = np.zeros((len(state["mean"]), channels))
-    return Gaussians.from_arrays(
-        state["mean"], state["factor"], colors, size=size, space="data", backend=backend
-    )
-
-
 def _round(
-    gaussians: Gaussians,
-    components: tuple[Planes, ...],
-    eigenvalues: tuple[NDArray[np.float64], ...],
-    seed: int,
-    span: tuple[int, int, int],
+    gaussians: Gaussians, band: FrequencyBand, seed: int, span: tuple[int, int, int]
 ) -> Gaussians:
     """Take the steps from `first` to before `last` of a span, with a new optimiser."""
     first, last, steps = span
@@ -141,7 +97,7 @@ def _round(
     ]
     rates = rate_table(types, SCHEDULE, factors)
     with freeze_program(step_program(SCHEDULE, gaussians)) as take_step:
-        for index, image in enumerate(samples(components, eigenvalues, seed, first, last)):
+        for index, image in enumerate(samples(band, seed, first, last)):
             solved = solve(state.gaussians, image, SOLVE_STEPS).gaussians
             fixed = replace(gaussians, color=solved.color, background=solved.background)
             state = take_step(
@@ -156,13 +112,7 @@ def _round(
     return dr.detach(state.gaussians)
 
 
-def samples(
-    components: tuple[Planes, ...],
-    eigenvalues: tuple[NDArray[np.float64], ...],
-    seed: int,
-    first: int,
-    last: int,
-) -> Planes:
+def samples(band: FrequencyBand, seed: int, first: int, last: int) -> Planes:
     """Draw random combinations of the components, without the mean image.
 
     Returns
@@ -171,7 +121,7 @@ def samples(
         Combination i depends on `seed` and ``first + i`` alone.
     """
     channels = []
-    for c, (planes, values) in enumerate(zip(components, eigenvalues, strict=True)):
+    for c, (planes, values) in enumerate(zip(band.components, band.eigenvalues, strict=True)):
         r = [
             np.random.default_rng([seed, i, c]).normal(size=len(planes)) for i in range(first, last)
         ]

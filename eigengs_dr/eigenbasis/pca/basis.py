@@ -17,8 +17,8 @@ from ...image.folder import Source
 from ...image.io import check_image
 from ...image.resize import resample
 from .basis_file import ENERGY_TOLERANCE, read_basis, write_basis
-from .incremental import EigenState, orient
-from .stream import PCAOptions, find_state
+from .incremental import orient, rank_for
+from .stream import find_states
 from .truncation import (
     CHANNELS,
     TruncationCurve,
@@ -51,8 +51,6 @@ class Eigenbasis:
         Number of training images, m.
     space : {"ycbcr", "rgb"}
         Colour space of the C = 3 channels.
-    examples : ndarray of float32, shape (n, H, W, 3)
-        RGB of up to 16 random training images.
     """
 
     mean: NDArray[np.float32]
@@ -61,7 +59,6 @@ class Eigenbasis:
     variance: NDArray[np.float64]
     count: int
     space: str
-    examples: NDArray[np.float32]
 
     @classmethod
     @shows_progress
@@ -72,7 +69,6 @@ class Eigenbasis:
         components: int | Sequence[int] = 300,
         energy: float | None = None,
         space: str = "ycbcr",
-        seed: int = 0,
         progress: Any = None,
         client: Any = None,
         checkpoint: str | os.PathLike[str] | None = None,
@@ -98,8 +94,6 @@ class Eigenbasis:
             Keep the fewest components with this share of a channel's variance, in (0, 1].
         space : {"ycbcr", "rgb"}
             Space of the channels.
-        seed : int
-            Seed of the random examples.
         progress : bool or callable, optional
             By default a bar, in a terminal or a notebook, after two seconds; False shows none.
             ``progress(done, total, {})`` after every image, on a cluster after every shard; `total`
@@ -126,47 +120,22 @@ class Eigenbasis:
             If images are skipped, cropped or too few, or `components` is too low for the energy.
         """
         size, most = check_size(size), check_components(components, energy)
-        options = PCAOptions(size, space, most, seed)
-        state = find_state(images, options, progress, client, checkpoint)
-        return cls.from_state(state, size, components, energy, space)
-
-    @classmethod
-    def from_state(
-        cls,
-        state: EigenState,
-        size: tuple[int, int],
-        components: int | Sequence[int] = 300,
-        energy: float | None = None,
-        space: str = "ycbcr",
-    ) -> Eigenbasis:
-        """Build the basis of all images of a state; parameters as for `from_images`."""
-        if state.count == 0:
-            raise ValueError("no images were merged; merge at least one block first")
-        most = check_components(components, energy)
-        if energy is None and state.count <= max(most):
-            have = "1 image gives" if state.count == 1 else f"{state.count} images give"
-            warn(f"{have} at most {state.count - 1} components a channel")
-        shape = (size[1], size[0])
+        ranks = [rank_for(k) for k in most]
+        states = find_states(images, size, space, ranks, progress, client, checkpoint)
+        count, shape = states[0].count, (size[1], size[0])
+        if energy is None and count <= max(most):
+            have = "1 image gives" if count == 1 else f"{count} images give"
+            warn(f"{have} at most {count - 1} components a channel")
+        pairs = list(zip(states, most, strict=True))
         basis = cls(
-            mean=state.mean.astype(np.float32).reshape(-1, *shape),
-            components=tuple(
-                orient(rows[:k]).reshape(-1, *shape)
-                for rows, k in zip(state.rows, most, strict=True)
-            ),
-            eigenvalues=tuple(
-                values[:k] / state.count for values, k in zip(state.scatter, most, strict=True)
-            ),
-            variance=state.squares / state.count,
-            count=state.count,
+            mean=np.stack([state.mean for state in states]).astype(np.float32).reshape(-1, *shape),
+            components=tuple(orient(state.rows[:k]).reshape(-1, *shape) for state, k in pairs),
+            eigenvalues=tuple(state.scatter[:k] / count for state, k in pairs),
+            variance=np.array([state.squares for state in states]) / count,
+            count=count,
             space=space,
-            examples=np.stack(
-                [_rgb(planes.reshape(-1, *shape), space) for planes in state.examples]
-            ),
         )
-        if energy is None:
-            return basis
-        ranks = ranks_for_energy(basis.energy(), basis.variance, most, energy, space)
-        return basis.truncated(ranks)
+        return basis if energy is None else basis.truncated(_ranks_for_energy(basis, most, energy))
 
     def __repr__(self) -> str:
         components = name_components(self.space, map(len, self.components))
@@ -183,11 +152,6 @@ class Eigenbasis:
     def height(self) -> int:
         """Height in pixels."""
         return self.mean.shape[1]
-
-    @property
-    def channels(self) -> int:
-        """Number of colour channels, C."""
-        return self.mean.shape[0]
 
     def project(self, image: ArrayLike) -> tuple[NDArray[np.float32], ...]:
         """Return the coefficients w_j of an image, a tuple of C float32 arrays of shape (k_c,).
@@ -216,7 +180,7 @@ class Eigenbasis:
         The result is a tuple of C float64 arrays of shape (k_c,), ascending, at most 1.
         """
         pairs = zip(self.eigenvalues, self.variance, strict=True)
-        return tuple(cumulative_share(values, total) for values, total in pairs)
+        return tuple(np.minimum(np.cumsum(v) / (total or 1), 1) for v, total in pairs)
 
     def truncation_curve(self, images: Iterable[ArrayLike] | None = None) -> TruncationCurve:
         """Return the mean PSNR of images over the number of components.
@@ -269,7 +233,7 @@ class Eigenbasis:
     def _centred(self, image: ArrayLike) -> NDArray[np.float32]:
         """Resample and convert an image and subtract the mean; shape (C, H, W)."""
         pixels = resample(check_image(image), self.width, self.height)
-        planes = to_planes(pixels, self.space) - self.mean.reshape(self.channels, -1)
+        planes = to_planes(pixels, self.space) - self.mean.reshape(len(self.mean), -1)
         return planes.reshape(self.mean.shape)
 
     def _coefficients(self, planes: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
@@ -306,44 +270,16 @@ def check_components(
     return y, cb, cr
 
 
-def ranks_for_energy(
-    energies: Sequence[NDArray[np.float64]],
-    variance: NDArray[np.float64],
-    most: Sequence[int],
-    energy: float,
-    space: str,
-) -> list[int]:
-    """Return the fewest components of each channel that hold a share of its variance.
-
-    Parameters
-    ----------
-    energies : sequence of C ndarrays, shape (k_c,)
-        See `cumulative_share`.
-    variance : ndarray, shape (C,)
-        Total variance of each channel.
-    most : sequence of C ints
-        Components that the caller allows.
-    energy : float
-        The share, in (0, 1].
-    space : {"ycbcr", "rgb"}
-
-    Warns
-    -----
-    UserWarning
-        If `most` is too low for the share.
-    """
+def _ranks_for_energy(basis: Eigenbasis, most: Sequence[int], energy: float) -> list[int]:
+    """Return the fewest components that hold a share of a channel; warn if `most` are too few."""
     ranks = []
-    for name, shares, cap, total in zip(CHANNELS[space], energies, most, variance, strict=True):
-        ranks.append(int(np.searchsorted(shares, energy)) + 1)
-        share = shares[-1] if len(shares) else 0.0
-        if total > 0 and len(shares) == cap and share < energy - ENERGY_TOLERANCE:
+    names, shares = CHANNELS[basis.space], basis.energy()
+    for name, held, cap, total in zip(names, shares, most, basis.variance, strict=True):
+        ranks.append(int(np.searchsorted(held, energy)) + 1)
+        share = held[-1] if len(held) else 0.0
+        if total > 0 and len(held) == cap and share < energy - ENERGY_TOLERANCE:
             warn(
                 f"channel {name}: {cap} components hold {share:.2%} of the variance, "
                 f"less than {energy:.2%}; raise components"
             )
     return ranks
-
-
-def cumulative_share(eigenvalues: NDArray[np.float64], variance: float) -> NDArray[np.float64]:
-    """Return the share of a variance that the first 1, 2, ... eigenvalues hold; shape (k,)."""
-    return np.minimum(np.cumsum(eigenvalues) / (variance or 1), 1)

@@ -2,17 +2,16 @@
 
 A shard is a part of the images, cut by their number alone. Its state is found block by block, in
 this process or on a worker. This process then merges the states of shards in their order, so the
-result has the same bits for any number of workers. The channels are states of their own: a merge
-holds two of them, and a large family fits into 1 GB.
+result has the same bits for any number of workers. The channels are states of their own, and their
+sums lie in files, so a large family fits into 1 GB.
 """
 
 from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from contextlib import closing, nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -20,13 +19,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.executor import Executor, LocalExecutor, completed, executor_for
+from ...backend.executor import completed, executor_for
 from ...backend.feedback import warn
 from ...image.folder import ReadProgress, Source, list_images, read_blocks
 from ...image.pixels import ImageError
 from ...image.remote import is_url
 from ...storage.checkpoint import read_arrays, write_arrays
-from .incremental import EigenState, block_length, empty_state, merge, merge_states, rank_for
+from .incremental import EigenState, block_length, empty_state, merge, merge_states
 
 SHARD = 2048
 """Images of a shard. Merging two states of 375 rows takes 0.2 of the time of a shard of so many
@@ -39,75 +38,56 @@ BLOCKS_OF_SHARD = 4
 Images = Sequence[Any] | NDArray[Any]
 """Files or single images, or one array of images."""
 
-Stored = EigenState | Path
-"""A state of one channel, or its file."""
 
-
-@dataclass(frozen=True)
-class PCAOptions:
-    """What decides a state, beside the images; see `eigengs_dr.Eigenbasis.from_images`.
+class Stream(NamedTuple):
+    """What decides the states of images, beside the images.
 
     Attributes
     ----------
     size : (int, int)
     space : {"ycbcr", "rgb"}
-    components : tuple of 3 ints
-        Most components of each channel. A state keeps some more.
-    seed : int
-
-    Raises
-    ------
-    ValueError
-        If the seed is negative.
+    ranks : sequence of 3 ints
+        Most rows of the state of each channel.
+    length : int
+        Images of a block.
+    progress : callable or None
+        For this process alone.
     """
 
     size: tuple[int, int]
     space: str
-    components: tuple[int, ...]
-    seed: int
-
-    def __post_init__(self) -> None:
-        if self.seed < 0:
-            raise ValueError(f"seed is {self.seed}; expected no negative number")
-
-    @property
-    def ranks(self) -> list[int]:
-        """Most rows of a state, for each channel."""
-        return [rank_for(k) for k in self.components]
+    ranks: Sequence[int]
+    length: int
+    progress: ReadProgress | None
 
 
-def find_state(
+def find_states(
     source: Source,
-    options: PCAOptions,
+    size: tuple[int, int],
+    space: str,
+    ranks: Sequence[int],
     progress: ReadProgress | None = None,
     client: Any = None,
     checkpoint: str | os.PathLike[str] | None = None,
-) -> EigenState:
-    """Find the state of all images of a source.
+) -> list[EigenState]:
+    """Find the state of each channel after all images of a source.
 
     Parameters
     ----------
-    options : PCAOptions
-    source, progress, client, checkpoint
+    ranks : sequence of 3 ints
+        Most rows of the state of each channel.
+    source, size, space, progress, client, checkpoint
         See `eigengs_dr.Eigenbasis.from_images`, also for errors.
-
-    Returns
-    -------
-    EigenState
-        Of 3 channels. Its `lost` bounds what blocks and merges have lost.
     """
     images: Any = list_images(source) if isinstance(source, (str, os.PathLike)) else source
     countable = is_countable(images)
     if client is not None and not countable:
         raise ValueError("the source is no list of files or images; a cluster needs a list")
-    executor = executor_for(client)
+    stream = Stream(size, space, ranks, block_length(size), progress)
     if client is None and not (countable and len(images) > SHARD):
-        return _join(_stream(images, options, block_length(options.size), options.seed, progress))
-    with ExitStack() as stack:
-        if checkpoint is None and client is None:  # the states of all shards would fill the memory
-            checkpoint = stack.enter_context(TemporaryDirectory())
-        folder = None if checkpoint is None else Path(checkpoint).absolute()
-        return _merge_shards(images, options, executor, folder, progress)
+        return _find_states_of_part(images, stream)
+    with nullcontext(checkpoint) if checkpoint else TemporaryDirectory() as folder:
+        return _merge_shards(images, stream, client, Path(folder))
 
 
 def is_countable(source: Any) -> bool:
@@ -120,115 +100,78 @@ def is_countable(source: Any) -> bool:
     )
 
 
-class Shard(NamedTuple):
-    """A task: the images of one shard, and the files of its states, or None."""
+def _merge_shards(images: Images, stream: Stream, client: Any, folder: Path) -> list[EigenState]:
+    """Merge the states of shards in their order.
 
-    number: int
-    images: Images
-    files: list[Path] | None
-
-
-class _Shared(NamedTuple):
-    """What all tasks share; `progress` is for this process alone."""
-
-    options: PCAOptions
-    length: int
-    progress: ReadProgress | None
-
-
-def _merge_shards(
-    images: Images,
-    options: PCAOptions,
-    executor: Executor,
-    folder: Path | None,
-    progress: ReadProgress | None,
-) -> EigenState:
-    """Merge the states of shards in their order, as they end; files in the folder are not remade.
-
-    In the folder ``pca-K-C.npz`` is channel C of shard K, and ``pca-sum-C.npz`` the sum of the
-    first shards, with their number.
+    In the folder, ``pca-C.npz`` is the state of channel C after the first shards, and their number.
     """
-    channels, total = range(len(options.ranks)), len(images)
-    count = -(-total // SHARD)
-    sums = [_read_sum(folder, c) for c in channels]
-    first = min(merged for merged, _ in sums)
-    ready: dict[int, list[Stored]] = {}
-    wanted: list[Shard] = []
-    for k in range(first, count):
-        files = [folder / f"pca-{k:05d}-{c}.npz" for c in channels] if folder else None
-        if files and all(f.exists() or sums[c][0] > k for c, f in enumerate(files)):
-            ready[k] = list(files)
-        else:
-            wanted.append(Shard(k, _absolute(images[k * SHARD : (k + 1) * SHARD]), files))
-    done = min(first * SHARD, total) + sum(_size(k, total) for k in ready)
-    local = isinstance(executor, LocalExecutor)
+    total, report = len(images), stream.progress or (lambda done, total, row: None)
+    files = [folder / f"pca-{c}.npz" for c in range(len(stream.ranks))]
+    merged = [int(read_arrays(file)["shards"]) if file.exists() else 0 for file in files]
+    begun = shard = min(merged)
+    done = min(begun * SHARD, total)
 
-    def advance(within: int, of: int | None, row: dict[str, Any]) -> None:
-        if progress:
-            progress(done + within, total, row)
-
-    length = max(1, block_length(options.size) // (BLOCKS_OF_SHARD if count > 1 else 1))
-    shared = _Shared(options, length, advance if local else None)
-    with closing(completed(executor, make_shard, wanted, shared)) as ended:
-        for shard, (states, notes) in ended:
+    if total > SHARD:
+        stream = stream._replace(length=max(1, stream.length // BLOCKS_OF_SHARD))
+    within = None if client is not None else lambda n, of, row: report(done + n, total, row)
+    stream = stream._replace(progress=within)
+    tasks = (
+        (k, _absolute(images[k * SHARD : (k + 1) * SHARD]))
+        for k in range(begun, -(-total // SHARD))
+    )
+    waiting: dict[int, list[EigenState]] = {}
+    with closing(completed(executor_for(client), make_shard, tasks, stream)) as ended:
+        for (k, part), (states, notes) in ended:
             for note in notes:
                 warn(note)
-            ready[shard.number] = states
-            done += _size(shard.number, total)
-            if progress and not local:
-                progress(done, total, {})
-            first = _add_ready(sums, ready, first, options, folder)
-    _add_ready(sums, ready, first, options, folder)
-    state = _join([_load(stored) for _, stored in sums if stored is not None])
-    if state.count == 0:
+            waiting[k] = states
+            done += len(part)
+            if client is not None:
+                report(done, total, {})
+            while ready := waiting.pop(shard, None):
+                for c, file in enumerate(files):
+                    state = ready.pop(0)  # frees its memory before the next shard
+                    if merged[c] <= shard:
+                        if shard:
+                            state = merge_states(_read(file), state, stream.ranks[c])
+                        write_arrays(file, state.arrays() | {"shards": np.array(shard + 1)})
+                    del state
+                shard += 1
+    result = [_read(file) for file in files]
+    if result[0].count == 0:
         raise ImageError(f"none of {total} images can be read; check the files")
-    return state
+    return result
 
 
-def make_shard(shard: Shard, shared: _Shared) -> tuple[list[Stored], list[str]]:
-    """Find the states of the channels of a shard, and what was said; this runs on a worker."""
-    options, length, progress = shared
-    seed = options.seed + shard.number
-    states = [empty_state(options.size, seed, channels=1) for _ in options.ranks]
-    with _collect_notes(shard.images) as notes:
-        states = _stream(shard.images, options, length, seed, progress)
-    if shard.files is None:
-        return list(states), notes
-    for state, file in zip(states, shard.files, strict=True):
-        write_arrays(file, state.arrays())
-    return list(shard.files), notes
+def make_shard(task: tuple[int, Images], stream: Stream) -> tuple[list[EigenState], list[str]]:
+    """Find the states of a shard of images, and what was said; this runs on a worker.
 
-
-def _stream(
-    images: Any, options: PCAOptions, length: int, seed: int, progress: ReadProgress | None
-) -> list[EigenState]:
-    """Return the state of each channel, block by block."""
-    states = [empty_state(options.size, seed, channels=1) for _ in options.ranks]
-    blocks = read_blocks(images, options.size, options.space, length, progress)
-    with closing(blocks):
-        for block in blocks:
-            for c, rank in enumerate(options.ranks):
-                states[c] = merge(states[c], block[:, c : c + 1], [rank])
-            del block  # before the next is read
-    return states
-
-
-@contextmanager
-def _collect_notes(source: Any) -> Iterator[list[str]]:
-    """Collect the warnings of a block that reads images; that none can be read is a note too.
-
-    A wrong array is an error.
+    A shard of which no file can be read has empty states; a wrong array is an error.
     """
-    notes: list[str] = []
+    _, images = task
+    notes = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:
-            yield notes
+            states = _find_states_of_part(images, stream)
         except ImageError as error:
-            if not isinstance(source, Sequence):
+            if not isinstance(images, Sequence):
                 raise
+            states = [empty_state(stream.size) for _ in stream.ranks]
             notes.append(str(error))
-    notes += [str(note.message) for note in caught]
+    return states, notes + [str(note.message) for note in caught]
+
+
+def _find_states_of_part(images: Any, stream: Stream) -> list[EigenState]:
+    """Find the state of each channel, block by block."""
+    size, space, ranks, length, progress = stream
+    states = [empty_state(size) for _ in ranks]
+    with closing(read_blocks(images, size, space, length, progress)) as blocks:
+        for block in blocks:
+            for c, rank in enumerate(ranks):
+                states[c] = merge(states[c], block[:, c], rank)
+            del block  # before the next is read
+    return states
 
 
 def _absolute(images: Images) -> Images:
@@ -242,70 +185,7 @@ def _absolute(images: Images) -> Images:
     ]
 
 
-# ---------------------------------------------------------------------------------------------
-#  The sum of the first shards, channel by channel
-# ---------------------------------------------------------------------------------------------
-
-Sum = tuple[int, Stored | None]
-"""How many shards are merged, and their state."""
-
-
-def _add_ready(
-    sums: list[Sum],
-    ready: dict[int, list[Stored]],
-    first: int,
-    options: PCAOptions,
-    folder: Path | None,
-) -> int:
-    """Merge the shards that are ready, from `first` on; return the next shard that is needed."""
-    while first in ready:
-        for c, part in enumerate(ready.pop(first)):
-            merged, total = sums[c]
-            if merged == first:
-                state = _load(part)
-                if total is not None:
-                    state = merge_states(_load(total), state, [options.ranks[c]])
-                sums[c] = first + 1, _write_sum(state, first + 1, folder, c)
-            if isinstance(part, Path):
-                part.unlink(missing_ok=True)
-        first += 1
-    return first
-
-
-def _read_sum(folder: Path | None, channel: int) -> Sum:
-    if folder is None or not (file := folder / f"pca-sum-{channel}.npz").exists():
-        return 0, None
-    return int(read_arrays(file)["shards"]), file
-
-
-def _write_sum(state: EigenState, shards: int, folder: Path | None, channel: int) -> Stored:
-    if folder is None:
-        return state
-    file = folder / f"pca-sum-{channel}.npz"
-    write_arrays(file, state.arrays() | {"shards": np.array(shards)})
-    return file
-
-
-def _load(stored: Stored) -> EigenState:
-    return EigenState.from_arrays(read_arrays(stored)) if isinstance(stored, Path) else stored
-
-
-def _size(shard: int, images: int) -> int:
-    return min((shard + 1) * SHARD, images) - shard * SHARD
-
-
-def _join(parts: list[EigenState]) -> EigenState:
-    """Return one state of the states of all channels."""
-
-    def stack(name: str, axis: int = 0) -> NDArray[Any]:
-        return np.concatenate([getattr(part, name) for part in parts], axis=axis)
-
-    return replace(
-        parts[0],
-        mean=stack("mean"),
-        rows=tuple(part.rows[0] for part in parts),
-        scatter=tuple(part.scatter[0] for part in parts),
-        squares=stack("squares"),
-        examples=stack("examples", 1),
-        lost=stack("lost"),
-    )
+def _read(file: Path) -> EigenState:
+    arrays = read_arrays(file)
+    del arrays["shards"]
+    return EigenState.from_arrays(arrays)

@@ -5,13 +5,8 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, small_basis, small_model, splits
-from eigengs_dr.backend.executor import executor_for
-from eigengs_dr.eigenbasis.components.solve import (
-    SharedShapes,
-    find_weights,
-    fit_components,
-    psnr_components,
-)
+from eigengs_dr.eigenbasis.components.solve import fit_model
+from eigengs_dr.eigenbasis.options import TrainOptions
 from eigengs_dr.fitting.solvers.normal_equations import NormalEquations
 
 
@@ -51,38 +46,23 @@ def test_psnr_components_is_the_weighted_error(backend):
     error = 0.0
     for c, values in enumerate(basis.eigenvalues):
         weights = model.weights[c]
-        shapes = model.gaussians.to_arrays()
-        for j, value in enumerate(values):
-            only = eg.Gaussians.from_arrays(
-                shapes["mean"],
-                shapes["factor"],
-                weights[j, :-1, None],
-                weights[j, -1:],
-                size=(SIDE, SIDE),
-                space="data",
-                backend=backend,
-            )
-            plane = eg.render(only).numpy()[..., 0]
-            error += value * np.square(plane - basis.components[c][j]).sum()
-    shapes = SharedShapes.of(model.gaussians, backend=backend)
-    weighted = find_weights(shapes, basis.components, executor_for(), model.weights)
-    found = psnr_components(basis, weighted.errors)
-    assert found == pytest.approx(-10 * np.log10(error / basis.mean.size), abs=0.05)
+        shapes = model.gaussians.to_arrays() | {
+            "color": weights[:, :-1].T,
+            "background": weights[:, -1],
+        }
+        found = eg.Gaussians.from_arrays(**shapes, size=(SIDE, SIDE), space="data", backend=backend)
+        planes = np.moveaxis(eg.render(found).numpy(), 2, 0)
+        error += values @ np.square(planes - basis.components[c]).sum(axis=(1, 2))
+    expected = -10 * np.log10(error / basis.mean.size)
+    assert model.figures["psnr_components"] == pytest.approx(expected, abs=0.05)
 
 
-def test_sides_start_apart(backend):
+def test_bands_start_apart(backend):
     """Each side of the paper's training draws a start of its own."""
     seen = []
-    fit_components(
-        small_basis(), 20, True, "eigengs", 1, 0, backend, save=lambda s: seen.append(s[-1])
+    options = TrainOptions(
+        (SIDE, SIDE), gaussians=20, frequency_aware=True, preset="eigengs", iterations=1
     )
-    assert not np.array_equal(seen[0]["rows"][0, :5, :2], seen[1]["rows"][0, :5, :2])
-
-
-def test_fit_components_default_state(backend):
-    """Without training, what `save` sees is the grid."""
-    seen = []
-    fit_components(
-        small_basis(), SPLATS, True, "default", 0, 0, backend, save=lambda s: seen.append(len(s))
-    )
-    assert seen == [1, 2]
+    fit_model(small_basis(), options, backend, save=lambda states: seen.append(states[-1]))
+    first, second = (state["rows"][0, :5, :2] for state in seen)
+    assert not np.array_equal(first, second)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from _helpers.errors import one_line
-from _helpers.low_rank import HEIGHT, SIZE, WIDTH, assert_same, family
-from eigengs_dr.eigenbasis.pca import stream
+from _helpers.low_rank import SIZE, assert_same, family
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 from eigengs_dr.image.folder import image_files
 from eigengs_dr.image.io import ImageError, save_image
@@ -24,22 +23,6 @@ def test_every_source_gives_the_same_bits(tmp_path, blocks_of):
         assert_same(Eigenbasis.from_images(source, SIZE, 5), first)
 
 
-def test_examples_are_training_images_drawn_with_the_seed(blocks_of):
-    images = family(100)
-    first = Eigenbasis.from_images(images, SIZE, 2, seed=5)
-    assert first.examples.shape == (16, HEIGHT, WIDTH, 3) and first.examples.dtype == np.float32
-    distances = np.abs(first.examples[:, None] - images).max(axis=(2, 3, 4))
-    assert (distances.min(axis=1) < 1e-6).all()
-    assert len(set(distances.argmin(axis=1))) == 16
-    blocks_of(9)
-    np.testing.assert_array_equal(
-        Eigenbasis.from_images(images, SIZE, 2, seed=5).examples, first.examples
-    )
-    assert not np.array_equal(
-        Eigenbasis.from_images(images, SIZE, 2, seed=6).examples, first.examples
-    )
-
-
 def test_interruption_leaves_no_thread(tmp_path):
     for i, image in enumerate(family(30)):
         save_image(tmp_path / f"{i}.png", image)
@@ -52,21 +35,6 @@ def test_interruption_leaves_no_thread(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         Eigenbasis.from_images(tmp_path, SIZE, 2, progress=interrupt)
     assert not [t for t in threading.enumerate() if t.name.startswith("decode")]
-
-
-def test_interruption_of_a_merge_leaves_no_thread(tmp_path, monkeypatch, blocks_of):
-    for i, image in enumerate(family(30)):
-        save_image(tmp_path / f"{i}.png", image)
-
-    def interrupted(*arguments):
-        raise KeyboardInterrupt
-
-    blocks_of(4)
-    monkeypatch.setattr(stream, "merge", interrupted)
-    with pytest.raises(KeyboardInterrupt) as caught:  # its traceback keeps the frames alive
-        Eigenbasis.from_images(tmp_path, SIZE, 2)
-    assert not [t for t in threading.enumerate() if t.name.startswith("decode")]
-    assert caught.type is KeyboardInterrupt
 
 
 def test_mixed_sizes_and_bad_files(tmp_path):
@@ -95,7 +63,6 @@ def test_mixed_sizes_and_bad_files(tmp_path):
         ({"energy": float("nan")}, "energy is nan; expected a share"),
         ({"size": (0, 3)}, "size is 0x3"),
         ({"space": "linear"}, "'linear' is unknown; use one of"),
-        ({"seed": -1}, "seed is -1; expected"),
     ],
 )
 def test_bad_arguments_are_refused_before_an_image_is_read(options, complaint):
