@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import drjit as dr
@@ -26,6 +27,7 @@ def run(task: Task, variant: str) -> list[Row]:
 
     `ratio_N` is rendering with N Gaussians over rendering with a bitmap, `ratio_prefiltered` with
     5,000 and the prefilter, `ratio_step` picture and gradient of all parameters by `prb`.
+    `ratio_maps` is what colour, roughness and normal of one file add over what its colour adds.
     `change_N` and `change_filtered_N` take over N changed shapes, without and with prefilter.
     """
     job: Row = {"variant": variant, "at": time.time()}  # each call measures anew
@@ -82,6 +84,14 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
         "step_bitmap": _step(mi, plain),
         "step_gaussians": _step(mi, settled),
     }
+    fitted = eg.fit(
+        {"albedo": picture, "roughness": picture[..., :1], "normal": picture}, SETTLED, 0
+    )
+    with TemporaryDirectory() as folder:
+        fitted.save(f"{folder}/maps.npz")
+        for count in (0, 1, 3):
+            scene = ball(mi, *_maps(f"{folder}/maps.npz", count))
+            programs[f"maps_{count}"] = partial(mi.render, scene)
     for count in CHANGED:
         for name, given in (("change", 0.0), ("change_filtered", angle)):
             texture = mi.load_dict(texture_of(sets[count], prefilter=given))
@@ -92,17 +102,28 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
         **{f"ratio_{n}": timed[f"gaussians_{n}"] / timed["bitmap"] for n in COUNTS},
         "ratio_prefiltered": timed["prefiltered"] / timed["bitmap"],
         "ratio_step": timed["step_gaussians"] / timed["step_bitmap"],
+        "ratio_maps": (timed["maps_3"] - timed["maps_0"]) / (timed["maps_1"] - timed["maps_0"]),
     }
 
 
-def ball(mi: Any, texture: dict[str, Any]) -> Any:
+def _maps(path: str, count: int) -> tuple[Any, Any, Any]:
+    """Return colour, roughness and normal of a coat, the first `count` as maps of a file."""
+    file = {"type": "gaussian_texture", "filename": path}
+    maps = [file | {"map": name} for name in ("albedo", "roughness", "normal")]
+    grey = {"type": "rgb", "value": 0.5}
+    return *maps[:count], *(grey, 0.3, None)[count:]  # type: ignore[return-value]
+
+
+def ball(mi: Any, texture: dict[str, Any], roughness: Any = 0.3, normal: Any = None) -> Any:
     """Load a ball with a textured coat on a grey floor, under a lamp and the sky."""
     at = mi.ScalarTransform4f()
     camera = at.look_at([0, 1.2, 4.2], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": SIDE, "height": SIDE}
     sampler = {"type": "independent", "sample_count": SPP}
     sensor = {"type": "perspective", "fov": 32, "to_world": camera, "film": film}
-    coat = {"type": "principled", "base_color": texture, "roughness": 0.3}
+    coat = {"type": "principled", "base_color": texture, "roughness": roughness}
+    if normal:
+        coat = {"type": "normalmap", "normalmap": normal, "bsdf": coat}
     floor = at.translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(6)
     light = {"type": "area", "radiance": {"type": "rgb", "value": 20.0}}
     scene = {
@@ -139,4 +160,4 @@ def _change(mi: Any, texture: Any) -> Any:
     factor = dr.detach(parameters["factor"])
     parameters["factor"] = factor * dr.opaque(mi.Float, 1 + 1e-6)
     parameters.update()
-    return texture.packed
+    return texture.table

@@ -318,4 +318,4 @@ def test_texture(monkeypatch):
     for name, value in (small | {"STEPS": 2, "ROUNDS": 1}).items():
         monkeypatch.setattr(texture, name, value)
     found = texture.measure("llvm_ad_rgb")
-    assert found["ratio_20"] > 0 and found["ratio_step"] > 0
+    assert found["ratio_20"] > 0 and found["ratio_step"] > 0 and found["maps_3_ms"] > 0
