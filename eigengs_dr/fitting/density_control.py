@@ -121,8 +121,8 @@ class LevelControl(DensityControl):
 
 ROUND_STEPS = 2
 """Steps of the colour solve in a round of relocation, so that neighbours replace the Gaussians that
-leave. The descent goes on: one step has 0.00 to 0.02 dB less, none 0.03 to 0.08 dB, and three have no
-more (16 crops of 128x128 and 9 training photos of 256x256 pixels, 200 to 1,000 steps)."""
+leave. The descent goes on: one step has 0.00 to 0.02 dB less, none 0.03 to 0.08 dB, and three have
+no more (16 crops of 128x128 and 9 training photos of 256x256 pixels, 200 to 1,000 steps)."""
 
 PRUNE_STEPS = 5
 """Steps of the colour solve in `prune`, after which there may be no descent."""
@@ -281,8 +281,8 @@ def relocate(
 ) -> Gaussians:
     """Move the Gaussians of least use to where they reduce the error most, and perturb all.
 
-    The Gaussians of least `removal_cost` leave: they get the colour 0, and steps of the
-    colour solve adapt the others. Round Gaussians at the peaks of the error that is left then take their
+    The Gaussians of least `removal_cost` leave: they get the colour 0, and steps of the colour
+    solve adapt the others. Round Gaussians at the peaks of the error that is left then take their
     places in the order, except the places of those that are dropped. All of it runs on the device;
     one build of tile lists serves it.
 
