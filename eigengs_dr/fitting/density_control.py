@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, Bool, Float, UInt, make_divisor, types_of
-from ..gaussian.gaussians import Gaussians, concatenate
+from ..gaussian.gaussians import Gaussians, concatenate, take
 from ..raster.binning.lists import TileLists
 from ..raster.kernels import channel_moments
 from ..raster.parameters import detached_shape
@@ -396,17 +396,7 @@ def _without(gaussians: Gaussians, moved: UInt, dropped: int, images: int) -> Ga
     place = image * dr.opaque(types.UInt, leaving) + dr.opaque(types.UInt, leaving - dropped) + rank
     stays = dr.full(types.Bool, True, len(gaussians))
     dr.scatter(stays, types.Bool(False), dr.gather(types.UInt, moved, place))
-    kept = dr.compress(stays)
-
-    def pick(rows: Float) -> Float:
-        return type(rows)([dr.gather(types.Float, row, kept) for row in rows])
-
-    return replace(
-        gaussians,
-        mean=pick(gaussians.mean),
-        factor=pick(gaussians.factor),
-        color=pick(gaussians.color),
-    )
+    return take(gaussians, dr.compress(stays))
 
 
 def relocate_levels(

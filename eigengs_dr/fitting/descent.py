@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, Float, UInt, make_divisor, types_of, upload
 from ..backend.recording import freeze_program, release_later
-from ..gaussian.gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians, take
 from ..raster.adjoint import adjoint_pieces, sum_pieces
 from ..raster.binning.lists import TileLists
 from ..raster.kernels import residual, sum_lanes
@@ -338,18 +338,7 @@ def prefix(gaussians: Gaussians, count: int) -> Gaussians:
     """Return the first `count` Gaussians of a set, differentiably, also in a frozen program."""
     if count == len(gaussians):
         return gaussians
-    types = types_of(gaussians.mean)
-    index = dr.arange(types.UInt, count)
-
-    def take(rows: Float) -> Float:
-        return type(rows)([dr.gather(types.Float, row, index) for row in rows])
-
-    return replace(
-        gaussians,
-        mean=take(gaussians.mean),
-        factor=take(gaussians.factor),
-        color=take(gaussians.color),
-    )
+    return take(gaussians, dr.arange(types_of(gaussians.mean).UInt, count))
 
 
 @dataclass(frozen=True)

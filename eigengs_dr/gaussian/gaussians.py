@@ -16,7 +16,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..backend.arrays import Float, types_in, types_of, upload, upload_rows
+from ..backend.arrays import Float, UInt, types_in, types_of, upload, upload_rows
 from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..backend.selection import BackendError, select
@@ -218,13 +218,7 @@ class Gaussians:
         kept = np.atleast_1d(np.arange(len(self), dtype=np.uint32)[selection])
         if not kept.size:
             raise ValueError("Gaussians: the selection is empty; select at least one Gaussian")
-        types = types_of(self.mean)
-        chosen = upload(types.UInt, kept)
-
-        def pick(rows: Rows) -> Rows:
-            return type(rows)([dr.gather(types.Float, row, chosen) for row in whole(rows, self)])
-
-        return replace(self, mean=pick(self.mean), factor=pick(self.factor), color=pick(self.color))
+        return take(self, upload(types_of(self.mean).UInt, kept))
 
     def _map(self, name: str) -> Gaussians:
         try:
@@ -360,6 +354,17 @@ def _received(data: SetData, backend: str, kind: DTypeLike) -> Gaussians:
         return Gaussians.from_data(data, backend, kind)
     except BackendError:
         return Gaussians.from_data(data, None, kind)
+
+
+def take(gaussians: Gaussians, index: UInt) -> Gaussians:
+    """Return the Gaussians of an index, differentiably, also in a frozen program."""
+    Float = types_of(gaussians.mean).Float
+
+    def pick(rows: Rows) -> Rows:
+        return type(rows)([dr.gather(Float, row, index) for row in whole(rows, gaussians)])
+
+    mean, factor, color = map(pick, (gaussians.mean, gaussians.factor, gaussians.color))
+    return replace(gaussians, mean=mean, factor=factor, color=color)
 
 
 def whole(rows: Rows, gaussians: Gaussians) -> list[Float]:
