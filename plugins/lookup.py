@@ -129,12 +129,15 @@ def make_table(
 
 
 def table_of_file(file: SharedFile, cutoff: float, wrap: str, filtered: bool) -> Table:
-    """Return the table of all channels of a file; the first call for these settings makes it."""
+    """Return the table of all channels of a file; the first call for these settings makes it.
+
+    While Dr.Jit computes it, its thread may make another texture, which then is the first.
+    """
     key = (cutoff, wrap, filtered)
     if key not in file.tables:
         parameters, size = file.parameters(), (file.gaussians.width, file.gaussians.height)
         lists = list_gaussians(parameters.shape, size, *key)
-        file.tables[key] = make_table(lists, cutoff, {}, lambda _: parameters)
+        file.tables.setdefault(key, make_table(lists, cutoff, {}, lambda _: parameters))
     return file.tables[key]
 
 

@@ -191,9 +191,8 @@ def shared_file(path: str, backend: str, first: int | None) -> SharedFile:
     identity = (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns)
     key = (*identity, mi.variant(), backend, first)
     found = _files.get(key)
-    if found is None:
-        found = _files[key] = SharedFile(path, backend, first)
-    return found
+    # While Dr.Jit copies the content, its thread may make another texture, which reads it first.
+    return found or _files.setdefault(key, SharedFile(path, backend, first))
 
 
 SHAPES = ("mean", "factor")

@@ -11,6 +11,7 @@ mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 from _helpers.texture import at, backend, gaussians, small_scene, texture  # noqa: E402
 from eigengs_dr.plugins import gaussian_texture, texture_of  # noqa: E402
 from eigengs_dr.plugins import lookup as reuse  # noqa: E402
+from eigengs_dr.plugins import parameters as files  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -101,6 +102,39 @@ class TestMapsOfAFile:
                 results.append(np.array(dr.grad(along)))
         assert np.abs(results[0]).max() > 1e-3
         np.testing.assert_allclose(*results, rtol=1e-4, atol=1e-5)
+
+    @pytest.mark.parametrize("step", ["list_gaussians", "make_table"])
+    def test_textures_that_are_made_at_once_share_a_table(self, monkeypatch, tmp_path, step):
+        """A thread of Mitsuba that waits for Dr.Jit makes another texture meanwhile."""
+        material(size=SIZE, backend=backend()).save(tmp_path / "m.npz")
+        plain, inner = getattr(reuse, step), []
+
+        def make(file):
+            return reuse.table_of_file(file, 3.0, "repeat", True)
+
+        def nested(*inputs):
+            monkeypatch.setattr(reuse, step, plain)
+            inner.append(make(file))
+            return plain(*inputs)
+
+        monkeypatch.setattr(reuse, step, nested)
+        file = files.shared_file(str(tmp_path / "m.npz"), backend(), None)
+        assert make(file) is inner[0] is make(file)
+
+    def test_textures_that_are_made_at_once_share_a_file(self, monkeypatch, tmp_path):
+        material(size=SIZE, backend=backend()).save(tmp_path / "m.npz")
+        plain, inner = files.SharedFile, []
+
+        def read():
+            return files.shared_file(str(tmp_path / "m.npz"), backend(), None)
+
+        def nested(*inputs):
+            monkeypatch.setattr(files, "SharedFile", plain)
+            inner.append(read())
+            return plain(*inputs)
+
+        monkeypatch.setattr(files, "SharedFile", nested)
+        assert read() is inner[0] is read()
 
     def test_other_mappings_are_other_lookups(self, lookups, of_files):
         coat = of_files(True)["bsdf"]
