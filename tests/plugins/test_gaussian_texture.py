@@ -172,3 +172,16 @@ class TestSlope:
         value = np.array(tex.eval_1(texel_centres()))
         slope = np.array(tex.eval_1_grad(texel_centres()))
         assert (slope[:, value == 0] == 0).all()
+
+
+@pytest.mark.parametrize("prefilter", [0.0, 0.02, 0.2, 0.9])
+def test_lanes_that_are_inactive_or_have_no_uv_are_zero(prefilter):
+    """A point, footprints in lists and in the pyramid, and one that sees the mean alone."""
+    tex = texture(gaussians(), prefilter=prefilter)
+    si = at(mi.Float([0.2, 0.4, 0.4, np.nan, np.inf]), mi.Float([0.3, 0.6, 0.6, 0.9, 0.9]))
+    si.t, si.wi = 1.0, mi.Vector3f(0, 0, 1)
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    one = np.array(tex.eval(si))
+    found = np.array(tex.eval(si, mi.Bool([True, False, True, True, False])))
+    assert one[:, :3].min() > 0 and not one[:, 3:].any()
+    np.testing.assert_allclose(found, one * [1, 0, 1, 1, 1], atol=1e-6)
