@@ -41,13 +41,6 @@ class KernelParameters:
     background: list
 
 
-def kernel_parameters(gaussians: Gaussians) -> KernelParameters:
-    """Return the parameters of a set without decoding its colours; differentiable."""
-    return KernelParameters(
-        kernel_shape(gaussians), list(gaussians.color), list(gaussians.background)
-    )
-
-
 def kernel_shape(gaussians: Gaussians) -> list:
     """Return the 5 shape parameters of a set, see `KernelParameters`; differentiable."""
     return [*gaussians.mean, *[f * EXP2_SCALE for f in gaussians.factor]]
