@@ -400,12 +400,14 @@ def _cut(
     """
     chunk: list[Source] = []
     work = 0
-    for drawn, source in enumerate(sources, 1):
+    for source in sources:
         if source.path is None:  # a copy, as its owner may reuse it
             source = source._replace(image=np.array(source.image))
         chunk.append(source)
         work += _work_of(source, job.steps)
-        longest = MAX_CHUNK if total is None else min(MAX_CHUNK, (total - drawn) // (2 * workers))
+        longest = MAX_CHUNK
+        if total is not None:  # images without work count too, as those that an earlier run did
+            longest = min(MAX_CHUNK, (total - 1 - source.place) // (2 * workers))
         if len(chunk) >= longest or work >= MAX_CHUNK_WORK:
             yield chunk
             chunk, work = [], 0

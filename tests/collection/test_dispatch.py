@@ -102,6 +102,15 @@ def test_images_and_steps_decide_the_chunks(side, iterations, longest):
     assert again[0] == again[1]
 
 
+def test_all_workers_go_on_with_a_run(photos, tmp_path):
+    """What is done already, before the rest, makes no chunk longer."""
+    files = sorted(photos.iterdir())
+    eg.fit_many(files[:8], tmp_path / "fits", **QUICK)
+    executor = Here()
+    eg.fit_many(photos, tmp_path / "fits", client=executor, **QUICK)
+    assert sorted(executor.names) == [["08"], ["09"], ["10"], ["11"]]
+
+
 def test_warnings_of_workers_are_said_here(tmp_path):
     from PIL import Image
 
