@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import ArrayTypes, Bool, Float, UInt, make_divisor, types_of
+from ..backend.arrays import Bool, Float, UInt, make_divisor, types_of
 from ..gaussian.gaussians import Gaussians, concatenate, take
 from ..raster.binning.lists import TileLists
 from ..raster.kernels import channel_moments
@@ -319,7 +319,7 @@ def relocate(
         diagonal = scene.diagonal()
         cost = scene.removal_cost(error, diagonal)
         if part is not None:
-            cost = dr.select(_among(types, own, total), cost, dr.inf)
+            cost = dr.select(_among(dr.arange(types.UInt, total), own), cost, dr.inf)
         moved = _least(cost, leaving, grid.images)
         keep = dr.full(types.Float, 1, total)
         if leaving:
@@ -366,10 +366,10 @@ def relocate(
         return _without(found, moved, how.dropped, grid.images).bounded()
 
 
-def _among(types: ArrayTypes, own: range, total: int) -> Bool:
-    """Return which of so many Gaussians are in a range."""
-    lane = dr.arange(types.UInt, total)
-    return (lane >= dr.opaque(types.UInt, own.start)) & (lane < dr.opaque(types.UInt, own.stop))
+def _among(number: UInt, own: range) -> Bool:
+    """Return which numbers are in a range."""
+    UInt = type(number)
+    return (number >= dr.opaque(UInt, own.start)) & (number < dr.opaque(UInt, own.stop))
 
 
 def _least(cost: Float, number: int, images: int) -> UInt:
@@ -501,7 +501,7 @@ def perturb(
     size = strength * dr.sqrt(error / (dr.pi * amplitude))
     # The comparison is false where the amplitude is 0.
     size = dr.select(size < MAX_NOISE, size, types.Float(MAX_NOISE))
-    moves = (lane >= dr.opaque(types.UInt, own.start)) & (lane < dr.opaque(types.UInt, own.stop))
+    moves = _among(lane, own)
     size = dr.select(moves, size, 0)
     generator = dr.rng(how.seed)
     normal = [generator.normal(types.Float, total // images) for _ in range(5)]

@@ -1,5 +1,6 @@
 """Where Gaussians start, and where they are added.
 
 - ``adaptive``: by the second derivatives of the image; anew, by the error of a fit
-- ``density``: the density that an error asks for, and the peaks of a residual
+- ``density``: the density that an error asks for
+- ``peaks``: where an added Gaussian would reduce a residual most
 """
