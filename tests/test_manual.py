@@ -165,7 +165,9 @@ def test_what_a_traced_figure_is(check, text, traced):
 
 
 def test_figures_of_the_readme_are_of_rows():
-    rows = (FOLDER / "rows.jsonl").read_text()
-    text = (FOLDER.parent / "README.md").read_text()
-    figures = re.findall(r"(\d+\.\d+) dB \|", text)
-    assert figures and all(f'"{figure}"' in rows for figure in figures)
+    pytest.importorskip("eigengs_bench", reason="pip install ./benchmarks")
+    from eigengs_bench import kodak, rows
+
+    [table] = kodak.summarize(rows.read(FOLDER / "rows.jsonl", "kodak")).tables
+    figures = re.findall(r"(\d+\.\d+) dB \|", (FOLDER.parent / "README.md").read_text())
+    assert figures and set(figures) <= set(table.frame["PSNR, float"])

@@ -129,7 +129,6 @@ def tables() -> None:
     main      gaussianimage, default, and eigengs with its own and with the universal basis
     ablation  eigengs in YCbCr or RGB, with and without the frequency-aware split
     cross     eigengs with the basis of other images
-    reach     how soon default has the PSNR that gaussianimage ends with
 
     models/ of FOLDER keeps trained bases and models: about a gigabyte a set.
     """
@@ -233,8 +232,7 @@ def scaling() -> None:
     \b
     pixels   images of 128x128 to 8192x8192 with 0.076 Gaussians a pixel
     splats   100 to 2,000,000 Gaussians on images of one size
-    threads  1, 2, 4, ... threads on images of three sizes
-    small    images a second of whole fits of 100 steps
+    small    images a second of whole fits of 100 steps, one by one and by fit_many
 
     Every size runs in a process of its own. All sizes to 4096x4096 take some ten minutes and 5 GB.
     """

@@ -65,10 +65,11 @@ def descent(
     return follow(begin, chosen.method.schedule, iterations, marks, mean_image)
 
 
-def warm_up(begin: Callable[[], FitProblem], schedule: Schedule, iterations: int) -> None:
-    """Compile the programs of a descent, also programs that place Gaussians anew."""
-    steps = min(MIN_PHASE_RATIO, iterations)
-    list(follow(begin, replace(schedule, redistribute_after=1), steps, (0, steps)))
+def warm_up(image: Image, iterations: int, **options: Any) -> None:
+    """Compile the programs of a fit, also programs that place Gaussians anew."""
+    chosen, steps = FitOptions(**options), min(MIN_PHASE_RATIO, iterations)
+    schedule = replace(chosen.method.schedule, redistribute_after=1)
+    list(follow(partial(initialize, image, chosen), schedule, steps, (0, steps)))
 
 
 def decibels(picture: Image, image: Image, space: str) -> float:

@@ -38,17 +38,12 @@ def is_present(task: Task, name: str) -> bool:
     """Tell whether a set is there, with images to train on where models are trained on them."""
     if task.data is None or name == SAMPLES:
         return task.data is None and name == SAMPLES
-    folder = task.data / SETS[name].folder
-    if name == "kodak":
-        return folder.is_dir()
-    return (folder / "test").is_dir() and is_trained(task, name)
+    return is_trained(task, name) or (name == "kodak" and (task.data / name).is_dir())
 
 
 def is_trained(task: Task, name: str) -> bool:
     """Tell whether the folder of data has images of a set to train on."""
-    if task.data is None or name == SAMPLES:
-        return False
-    return (task.data / SETS[name].folder / "train").is_dir()
+    return bool(task.data) and (Path(task.data or "") / SETS[name].folder / "train").is_dir()
 
 
 def model_for(

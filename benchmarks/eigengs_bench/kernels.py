@@ -1,4 +1,4 @@
-"""How fast the renderer is: against plain Dr.Jit, against the machine, and as Gaussians stretch."""
+"""How fast the renderer is: against plain Dr.Jit, and against the machine."""
 
 import math
 import time
@@ -17,7 +17,6 @@ from eigengs_bench.report import Section, number, table
 from eigengs_bench.rows import Row, Task
 from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.descent import FitProblem, descend
 from eigengs_dr.fitting.descent import run as descend_to_end
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.refine import refine
@@ -36,7 +35,6 @@ SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
 # Tiles of the plain renderer, the best of 4x4, 8x8 and 16x16 in forward and reverse together.
 PLAIN_TILE = (8, 8)
 WARM_UP, ROUNDS = 3, 15  # rounds that compile and settle, and rounds that are measured
-STEPS = 1000  # steps of the refinement behind `growth`
 FIT_STEPS, FIT_ROUNDS = 500, 5  # steps of the refinement behind `fit_over_steps`, and how often
 PEAK_LANES, PEAK_LOOPS, PEAK_UNROLL = 1 << 16, 100, 8  # size of the program that measures the peak
 CUTOFFS = (2.5, 3.0, 3.5, 4.0, 5.0)  # whose time and error are measured
@@ -48,12 +46,10 @@ def run(task: Task) -> list[Row]:
 
     `plain_ms` and `fast_ms` are forward and reverse together, with lists given and programs frozen,
     the ratios plain over fast. `peak_evals_per_ns` counts `exp`, `select` and 3 `fma` without
-    memory; the fractions are evaluations inside the cutoff ellipses over that peak. `growth` is the
-    median time of the steps 900 to 1,000 of a refinement over that of the steps 50 to 150, and
-    `growth_with_lists` the same of the means, in which building lists counts. `fit_over_steps` is
-    the time of a refinement over that of its steps alone, without relocation, second placement and
-    trace, and `round_in_steps` that of a round of relocation over that of such a step. "cutoffs"
-    has time and error of the picture by cutoff.
+    memory; the fractions are evaluations inside the cutoff ellipses over that peak.
+    `fit_over_steps` is the time of a refinement over that of its steps alone, without relocation,
+    second placement and trace, and `round_in_steps` that of a round of relocation over that of such
+    a step. "cutoffs" has time and error of the picture by cutoff.
     """
     job: Row = {"side": SIDE, "gaussians": COUNT, "at": time.time()}  # each call measures anew
     return task.measure("kernels", [(job, partial(_measure, task))])
@@ -80,8 +76,7 @@ def summarize(rows: Sequence[Row]) -> Section:
 def _measure(task: Task) -> Row:
     types = types_in(select(task.backend))
     scene = random_scene(types)
-    show = partial(task.progress, "kernels")
-    figures = {**kernel_figures(types, scene, show), **growth_figures(types, task.progress)}
+    figures = kernel_figures(types, scene, partial(task.progress, "kernels"))
     figures |= fit_figures(types, partial(task.progress, "fit"))
     return figures | {"cutoffs": cutoff_figures(scene)}
 
@@ -203,47 +198,17 @@ def pixels_inside(scene: eg.Gaussians) -> int:
     return int((dx2[:, :, None] + dy2[:, None, :] <= (CUTOFF * SIGMA) ** 2).sum())
 
 
-def start_of(types: ArrayTypes) -> tuple[FitProblem, FitOptions]:
-    """Return the start of a refinement of a photo, and its options."""
-    options = FitOptions(gaussians=COUNT, iterations=FIT_STEPS, backend=types.backend)
-    return start_for(make_target(photo(), options.space), options), options
-
-
-def growth_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
-    """Time every step of a refinement: Gaussians stretch, and a poor renderer slows down."""
-    problem, options = start_of(types)
-    ends = []
-    for step, _ in enumerate(
-        descend(problem._replace(control=None), options.method.schedule, STEPS)
-    ):
-        dr.sync_thread()
-        ends.append(time.perf_counter())
-        if step % 10 == 0:
-            progress("growth", step, STEPS)
-    ms = np.diff(ends) * 1e3
-    early, late = ms[50:150], ms[900:1000]
-    return {
-        "growth": float(np.median(late) / np.median(early)),
-        "growth_with_lists": float(late.mean() / early.mean()),
-        "early_step_ms": float(np.median(early)),
-        "late_step_ms": float(np.median(late)),
-    }
-
-
-def photo() -> NDArray[np.float32]:
-    """Return the middle of a photo, of the size of the scene."""
-    return center_crop(eg.sample("astronaut"), SIDE, SIDE)
-
-
 def fit_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
     """Time a refinement, its steps alone, and a round of relocation."""
-    problem, options = start_of(types)
+    photo = center_crop(eg.sample("astronaut"), SIDE, SIDE)
+    options = FitOptions(gaussians=COUNT, iterations=FIT_STEPS, backend=types.backend)
+    problem = start_for(make_target(photo, options.space), options)
     control, schedule = problem.control, options.method.schedule
     assert control
     move = Relocation(schedule.relocate_share, schedule.noise)
 
     def whole() -> eg.Gaussians:
-        return refine(problem, photo(), schedule, FIT_STEPS).gaussians
+        return refine(problem, photo, schedule, FIT_STEPS).gaussians
 
     def steps() -> eg.Gaussians:
         return descend_to_end(problem._replace(control=None), schedule, FIT_STEPS)

@@ -25,8 +25,8 @@ PAPER_SETS = ("faces256", "cats256", "cars256", "natural256", "cats512")
 NATURAL, CATS, SAMPLES = "natural256", "cats256", "samples"
 
 PRESETS = ("default", "gaussianimage", "eigengs")
-TABLES = ("main", "ablation", "cross", "reach")
+TABLES = ("main", "ablation", "cross")
 PICTURES = ("iterations", "colors", "curves", "tiles", "radii", "split", "cross")
-PARTS = ("pixels", "splats", "threads", "small")
+PARTS = ("pixels", "splats", "small")
 KODAK_COUNTS = (5_000, 10_000, 30_000, 50_000, 70_000)  # Gaussians of published tables
 SOLVE_STEPS = 10  # of the colour solve of a fit, by default

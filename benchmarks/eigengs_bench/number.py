@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import cycle
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -87,7 +86,7 @@ def _fit(task: Task, image: Image, count: int) -> Row:
     def start() -> FitProblem:
         return initialize(image, options)._replace(control=None)
 
-    warm_up(start, options.method.schedule, task.iterations)
+    warm_up(image, task.iterations, gaussians=count, backend=task.backend)
     (moment,) = follow(start, options.method.schedule, task.iterations, (task.iterations,))
     return score(moment, image)
 
@@ -137,7 +136,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
         )
         part, both = part.assign(PSNR=part.target.map("{:g} dB".format)), part.saving.notna()
         part = part.assign(least=part.fixed.where(both), enough=part.gaussians.where(both))
-        tables.append(fr.grouped(caption, part, ["PSNR"], SAVINGS))
+        tables.append(fr.grouped(caption, part, ["PSNR"], SAVINGS)._replace(name=str(name)))
         charts[f"number-{name}"] = _chart(part, str(name))
     return fr.Section(tables, charts)
 
@@ -172,10 +171,7 @@ def _chart(points: pd.DataFrame, name: str) -> Figure:
         label = f"{target:g} dB, {some.saving.count()} of {fr.counted(some.image)}"
         both = some.dropna(subset="saving")
         axis.plot(both.fixed, both.gaussians, marker, color=color, ms=5, alpha=0.8, label=label)
-    sizes = points.dropna(subset="saving")[["fixed", "gaussians"]].to_numpy()
-    ends = (sizes.min() / 1.3, sizes.max() * 1.3) if len(sizes) else (1.0, 10.0)
-    axis.plot(ends, ends, color=fr.INK, lw=1, label="as many")
+    axis.axline((100, 100), (1000, 1000), color=fr.INK, lw=1, label="as many")
     x = "smallest fixed number for a PSNR in YCbCr, Gaussians placed once"
-    equal: Any = {"xlim": ends, "ylim": ends, "aspect": "equal"}
-    fr.label_axes(axis, x, "Gaussians that the search finds", "xy", **equal)
+    fr.label_axes(axis, x, "Gaussians that the search finds", "xy")
     return figure

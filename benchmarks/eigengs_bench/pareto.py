@@ -9,10 +9,8 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 import eigengs_dr as eg
@@ -21,8 +19,7 @@ from eigengs_bench.clock import Image, descent, score, warm_up
 from eigengs_bench.images import images_of, is_trained, model_for
 from eigengs_bench.names import SETS
 from eigengs_bench.rows import Job, Row, Task
-from eigengs_dr.fitting.options import PRESETS, FitOptions
-from eigengs_dr.fitting.start import initialize
+from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.gaussian.file import CUTOFF
 
 # Steps of runs of a method whose rates fall: each number is a run of its own.
@@ -90,7 +87,7 @@ def trace(task: Task, fit: Variant, image: Image) -> Row:
     schedule, iterations = PRESETS[fit.preset].schedule, task.iterations
     options = {k: v for k, v in fit._asdict().items() if k not in ("knob", "value")}
     options["backend"] = task.backend
-    warm_up(partial(initialize, image, FitOptions(**options)), schedule, iterations)
+    warm_up(image, iterations, **options)
     falls = schedule.decay < 1
     marks = sorted({n for n in (HORIZONS if falls else MARKS) if n < iterations} | {iterations})
     runs = [(n, (n,)) for n in marks] if falls else [(iterations, tuple(marks))]
@@ -113,15 +110,14 @@ VARIANTS: dict[str, Any] = {
     "on front": ("front", "first"),
     "as many": ("front_same", "first"),
 }
-# What a knob is, its colour and marker, and its value in the default fit (or that of eigengs).
+# What a knob is, its colour and marker.
 KNOBS = {
-    "init": ("Where Gaussians start", "#8a4f9e", "s", "adaptive"),
-    "solve steps": ("Steps of the colour solve", "#c27c0e", "^", "10"),
-    "cutoff": ("Cutoff in standard deviations", "#7a5c43", "D", "3"),
-    "gaussians": ("Number of Gaussians", "#1f9e89", "v", ""),
-    "components": ("Components a channel of eigengs", "#5a8f3c", "P", "300"),
+    "init": ("Where Gaussians start", "#8a4f9e", "s"),
+    "solve steps": ("Steps of the colour solve", "#c27c0e", "^"),
+    "cutoff": ("Cutoff in standard deviations", "#7a5c43", "D"),
+    "gaussians": ("Number of Gaussians", "#1f9e89", "v"),
+    "components": ("Components a channel of eigengs", "#5a8f3c", "P"),
 }
-LABELS = ("seconds, start included", "PSNR in YCbCr / dB")
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
@@ -182,7 +178,7 @@ def _variants(name: str, fits: pd.DataFrame, points: pd.DataFrame) -> fr.Table:
         "steps; after how many steps a fit is on the front of all fits, and on the front of fits "
         "with as many Gaussians; other settings are the default ones"
     )
-    return fr.grouped(caption, lines, ["fit"], VARIANTS)
+    return fr.grouped(caption, lines, ["fit"], VARIANTS)._replace(name=name)
 
 
 def text_of(value: str | float) -> str:
@@ -191,46 +187,23 @@ def text_of(value: str | float) -> str:
 
 
 def _chart(points: pd.DataFrame, name: str) -> Figure:
-    """Draw all fits of a set (see `points_of`) and their front, and below a panel a setting."""
+    """Draw all fits of a set (see `points_of`) and their fronts."""
     title = f"Speed against accuracy: {name}, images: {points.images.max()}; up and left is better"
-    figure, knobs = fr.new_figure(10, 11.5, title), list(KNOBS)
-    rows: Any = [3 * ["all"], knobs[:3], [*knobs[3:], "."]]
-    axes = figure.subplot_mosaic(rows, height_ratios=(2.4, 1, 1))
-    _overview(axes["all"], points)
-    for knob in knobs:
-        _panel(axes[knob], points, knob)
-    return figure
-
-
-def _overview(axis: Axes, points: pd.DataFrame) -> None:
-    for knob, (title, color, marker, _) in KNOBS.items():
+    figure = fr.new_figure(10, 6, title)
+    axis = figure.subplots()
+    for knob, (text, color, marker) in KNOBS.items():
         if len(some := points[points.knob == knob]):
-            _plot(axis, some, title, color=color, marker=marker, ls="none", ms=5, alpha=0.75)
+            _plot(axis, some, text, color=color, marker=marker, ls="none", ms=5, alpha=0.75)
     for preset, color in fr.COLORS.items():
-        _plot(axis, _line(points, "preset", preset), preset, color=color, marker="o")
+        line = points[points.value == preset].sort_values("iteration")
+        _plot(axis, line, preset, color=color, marker="o")
     same, edge = (points[points[k] == 1].sort_values("seconds") for k in ("front_same", "front"))
     label = f"front of fits with {same.gaussians.max():,} Gaussians"
     _plot(axis, same, label, color=fr.INK, lw=1.2, ls="--")
     _plot(axis, edge, "front: none is better", color=fr.INK, lw=8, alpha=0.18)
-    fr.label_axes(axis, *LABELS)
-
-
-def _panel(axis: Axes, points: pd.DataFrame, knob: str) -> None:
-    title, color, marker, usual = KNOBS[knob]
-    base = "eigengs" if knob == "components" else "default"
-    values = points.value[points.knob == knob].unique()
-    for value, strength in zip(values, np.linspace(0.35, 1, len(values)), strict=True):
-        shade = tuple(1 - float(strength) * (1 - part) for part in to_rgb(color))
-        _plot(axis, _line(points, knob, value), text_of(value), color=shade, marker=marker, ms=4)
-    line = _line(points, "preset", base)
-    usual = usual or text_of(line.gaussians.iloc[0])
-    _plot(axis, line, f"{usual} ({base})", color=fr.INK, lw=2.5)
-    fr.label_axes(axis, *LABELS, title=title)
+    fr.label_axes(axis, "seconds, start included", "PSNR in YCbCr / dB")
+    return figure
 
 
 def _plot(axis: Axes, points: pd.DataFrame, label: str, **style: Any) -> None:
     axis.plot(points.seconds, points.psnr_ycbcr, label=label, **style)
-
-
-def _line(points: pd.DataFrame, knob: str, value: str | float) -> pd.DataFrame:
-    return points[(points.knob == knob) & (points.value == value)].sort_values("iteration")

@@ -6,13 +6,11 @@ The row of a curve has "psnr_ycbcr" every `EVERY` steps; that of a set of pictur
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from PIL import Image as pillow
 
 from eigengs_bench import report as fr
 from eigengs_bench.cases import CASES
@@ -23,11 +21,10 @@ from eigengs_bench.rows import Job, Row, Task, code_name
 from eigengs_bench.stability import moments, tiling
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.gaussians import Gaussians
-from eigengs_dr.image.io import sample, to_8bit
+from eigengs_dr.image.io import sample
 from eigengs_dr.image.metrics import psnr
-from eigengs_dr.image.resize import GAP, center_crop, join_pictures, resample, text_line
+from eigengs_dr.image.resize import center_crop
 from eigengs_dr.raster.render import picture_of
-from eigengs_dr.storage.atomic import atomic_write
 from eigengs_dr.viewer.pictures import overlay
 
 COMPONENTS = 300  # a channel of the models that are trained, as in the paper's comparisons
@@ -38,22 +35,13 @@ METHODS = {
     "eigengs": "eigengs: start from the basis",
     "default": "default: placed by the image, colours solved",
 }
-# Sets of the chart of PSNR, and their titles.
-PANELS = {
-    "faces256": "faces",
-    "cats256": "cats",
-    "cars256": "cars",
-    "natural256": "ImageNet",
-    "kodak": 'Kodak, basis "natural"',
-    "samples": 'samples, basis "natural"',
-}
+CURVES = ("faces256", "cats256", "cars256", "natural256", "kodak", "samples")
 NEEDS = {"radii": [CATS], "split": [CATS], "cross": [CATS, NATURAL]}
 CREDIT = "Images: AFHQ, NAVER Corp., CC BY-NC 4.0"  # of all pictures of cats
 EVERY = 50  # iterations between two points of a curve
 MAGNIFIED, STRETCHED = 8, 20  # factors of errors before they are added to mid-grey
 MARGIN = 0.08  # around the middle of a picture, in its sides: Gaussians there reach into it
-# Longer side of a picture, and heights of the letters below it and above a row, in pixels.
-CELL, LETTERS, HEADING = 160, 13, 15
+CELL, LETTERS = 1.8, 0.35  # sides of a picture, and height of the lines around it, in inches
 
 Cell = tuple[str, NDArray[Any]]  # the line below a picture, and the picture: RGB, not clamped
 
@@ -100,7 +88,7 @@ def to_size(image: Image, model: EigenGS) -> Image:
 
 def _curves(task: Task) -> list[Row]:
     """Measure PSNR over iterations of every preset: the paper's figure of curves."""
-    present = [name for name in PANELS if is_present(task, name)]
+    present = [name for name in CURVES if is_present(task, name)]
     return task.measure("pictures", [job for name in present for job in _curve_jobs(task, name)])
 
 
@@ -132,8 +120,7 @@ def _curves_chart(rows: Sequence[Row]) -> Figure:
             # A fit that has failed is None in a file, and NaN here.
             means = np.mean(np.array([row["psnr_ycbcr"] for row in some], float), axis=0)
             axis.plot(some[0]["marks"], means, label=preset, color=fr.COLORS[preset])
-        title = PANELS[name]
-        fr.label_axes(axis, "iterations", "PSNR (YCbCr) / dB", "", axis is axes[0], title=title)
+        fr.label_axes(axis, "iterations", "PSNR (YCbCr) / dB", "", axis is axes[0], title=name)
     return figure
 
 
@@ -195,7 +182,8 @@ def _drawn(
 
     def work() -> Row:
         rows = make()
-        save_strip(task.folder / file, strip(rows, CREDIT if file.startswith("cats") else ""))
+        credit = CREDIT if file.startswith("cats") else ""
+        fr.save_figure(task.folder / file, strip(rows, credit))
         return {"file": file, "caption": caption}
 
     return task.measure("pictures", [({"file": file, "iterations": task.iterations}, work)])
@@ -336,31 +324,18 @@ def _outlines(gaussians: Gaussians, picture: NDArray[np.float32]) -> NDArray[np.
     return overlay(near, large)[height : 3 * height, width : 3 * width]
 
 
-def strip(rows: Sequence[tuple[str, Sequence[Cell]]], credit: str = "") -> NDArray[Any]:
-    """Put rows of pictures below each other, each below its heading; RGB on white, not clamped."""
-    drawn = []
-    for heading, cells in rows:
-        row = join_pictures([_labelled(*cell) for cell in cells], 1, GAP)
-        above = [text_line(heading, row.shape[1], HEADING)] if heading else []
-        drawn.append(join_pictures([*above, row], 0, 2))
-    if credit:
-        drawn.append(text_line(credit, drawn[0].shape[1], LETTERS))
-    return join_pictures(drawn, 0, GAP)
-
-
-def _labelled(caption: str, picture: NDArray[Any]) -> NDArray[Any]:
-    height, width = picture.shape[:2]
-    scale = CELL / max(height, width)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    scaled = resample(np.clip(picture, 0, 1).astype(np.float32), *size)
-    return join_pictures([scaled, text_line(caption, size[0], LETTERS)], 0, 0)
-
-
-def save_strip(path: Path, picture: NDArray[Any]) -> None:
-    """Write a strip, small: a .jpg of moderate quality, or a .png of 256 colours."""
-    image = pillow.fromarray(to_8bit(picture).astype(np.uint8))
-    with atomic_write(path) as temporary:
-        if path.suffix == ".png":
-            image.quantize(256).save(temporary, optimize=True)
-        else:
-            image.save(temporary, quality=88)
+def strip(rows: Sequence[tuple[str, Sequence[Cell]]], credit: str = "") -> Figure:
+    """Put rows of pictures below each other, each below its heading."""
+    most = max(len(cells) for _, cells in rows)
+    figure = fr.new_figure(CELL * most, (CELL + LETTERS) * len(rows))
+    figure.supxlabel(credit, fontsize=7)
+    parts = figure.subfigures(len(rows), 1, squeeze=False)[:, 0]
+    for part, (heading, cells) in zip(parts, rows, strict=True):
+        part.suptitle(heading, fontsize=9)
+        for axis, (caption, picture) in zip(
+            part.subplots(1, len(cells), squeeze=False)[0], cells, strict=True
+        ):
+            axis.imshow(np.clip(picture, 0, 1))
+            axis.set(xticks=[], yticks=[], frame_on=False)
+            axis.set_xlabel(caption, fontsize=7)
+    return figure

@@ -1,16 +1,16 @@
-"""What size costs: seconds and memory of a fit over pixels, Gaussians and threads.
+"""What size costs: seconds and memory of a fit over pixels and Gaussians, and of small fits.
 
 The row of a descent has place_seconds and solve_seconds, step_ms (median of steps on their own,
 most of which build no lists) and mean_ms (of steps in a row, with lists), and peak_gib, the memory
-of its process with the interpreter and its libraries. The row of whole fits has images_per_second.
+of its process with the interpreter and its libraries. The row of whole fits has images_per_second
+one by one, and many_per_second by `fit_many`.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from functools import partial
-from itertools import islice
+from collections.abc import Callable, Iterator, Sequence
+from itertools import cycle, islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import drjit as dr
@@ -40,24 +40,30 @@ DENSITY = 0.0763  # Gaussians a pixel where the number of pixels varies: 5,000 o
 WARM_UP = 8  # steps that compile programs and settle
 # Small images take more steps, up to as many times: about as many pixels in all.
 MORE_STEPS, PIXELS_IN_ALL = 4, 1 << 27
-FIT_STEPS, FIT_SECONDS = 100, 4.0  # of each whole fit, and of all fits of a size at least
-
-# Sizes by the part that measures them: width, height, numbers of Gaussians.
-SIDES = (128, 256, 512, 1024, 2048, 4096, 8192)
-SPLATS = {
-    (2304, 1536): (100, 300, 1000, 3000, 10_000, 100_000, 1_000_000, 2_000_000),
-    (1024, 1024): (100, 1000, 10_000, 100_000, 200_000),
-}
-THREADED, SMALL = (256, 512, 2048), {64: 300, 128: 1245, 256: 5000}
+# Steps of whole fits, least seconds of all of a size, and how many images a side of a mosaic has.
+FIT_STEPS, FIT_SECONDS, MANY = 100, 4.0, 8
 
 
 class Case(NamedTuple):
-    """An image of the mosaic, the number of its Gaussians, and the threads, 0 for all cores."""
+    """An image of the mosaic, and the number of its Gaussians."""
 
     width: int
     height: int
     gaussians: int
-    threads: int = 0
+
+
+SPLATS = {
+    (2304, 1536): (100, 300, 1000, 3000, 10_000, 100_000, 1_000_000, 2_000_000),
+    (1024, 1024): (100, 1000, 10_000, 100_000, 200_000),
+}
+CASES = {  # by the part that measures them, from small to large
+    "pixels": [
+        Case(side, side, round(DENSITY * side * side))
+        for side in (128, 256, 512, 1024, 2048, 4096, 8192)
+    ],
+    "splats": [Case(*size, count) for size, counts in SPLATS.items() for count in counts],
+    "small": [Case(64, 64, 300), Case(128, 128, 1245), Case(256, 256, 5000)],
+}
 
 
 def run(task: Task, parts: Sequence[str], max_side: int) -> list[Row]:
@@ -68,7 +74,7 @@ def run(task: Task, parts: Sequence[str], max_side: int) -> list[Row]:
 def _jobs(task: Task, parts: Sequence[str], max_side: int) -> Iterator[Job]:
     """Name the measurements; `task.iterations` is the least number of steps behind a mean."""
     for part in parts:
-        for case in cases(part, task.backend):
+        for case in CASES[part]:
             if max(case.width, case.height) <= max_side:
                 most = min(
                     MORE_STEPS * task.iterations, PIXELS_IN_ALL // (case.width * case.height)
@@ -80,29 +86,9 @@ def _jobs(task: Task, parts: Sequence[str], max_side: int) -> Iterator[Job]:
                 yield job, alone(title, work, case, steps, task.backend)
 
 
-def cases(part: str, backend: str | None) -> list[Case]:
-    """List what a part measures, from small to large."""
-    if part == "pixels":
-        return [_square(side) for side in SIDES]
-    if part == "splats":
-        return [Case(*size, count) for size, counts in SPLATS.items() for count in counts]
-    if part == "small":
-        return [Case(side, side, count) for side, count in SMALL.items()]
-    select(backend)
-    cores = dr.thread_count()
-    counts = sorted({cores, *(1 << k for k in range(cores.bit_length()))})
-    return [_square(side)._replace(threads=n) for side in THREADED for n in counts]
-
-
-def _square(side: int) -> Case:
-    return Case(side, side, round(DENSITY * side * side))
-
-
 def measure_descent(case: Case, steps: int, backend: str | None) -> Row:
     """Place Gaussians, solve for their colours, and take steps of the preset "default"."""
     types = types_in(select(backend))
-    if case.threads:
-        dr.set_thread_count(case.threads)
     target = rgb_to_ycbcr(mosaic(case.width, case.height))
     _place(target[:CELL, :CELL], 1, types.backend)  # imports
     placed, place_seconds = _place(target, case.gaussians, types.backend)
@@ -155,20 +141,29 @@ def time_steps(problem: FitProblem, steps: int) -> tuple[float, float]:
 
 
 def measure_fits(case: Case, steps: int, backend: str | None, enough: float = FIT_SECONDS) -> Row:
-    """Fit images of one size, one after the other."""
-    columns = 8
-    photos = mosaic(columns * case.width, columns * case.height)
+    """Fit images of one size one by one, and by `fit_many`; each for `enough` seconds at least."""
+    photos = mosaic(MANY * case.width, MANY * case.height)
     images = [
         photos[top : top + case.height, left : left + case.width].copy()
         for top in range(0, photos.shape[0], case.height)
         for left in range(0, photos.shape[1], case.width)
     ]
-    eg.fit(images[0], case.gaussians, steps, backend=backend)  # compiles
+    turn, options = cycle(images), {"gaussians": case.gaussians, "iterations": steps}
+    options["backend"] = backend
+    one = _rate(lambda: eg.fit(next(turn), **options), enough)
+    many = len(images) * _rate(lambda: eg.fit_many(images, progress=False, **options), enough)
+    figures = {"images_per_second": one, "many_per_second": many, "many_ratio": many / one}
+    return {**figures, "peak_gib": peak_gib()}
+
+
+def _rate(call: Callable[[], Any], enough: float) -> float:
+    """Return calls a second, without the first one, which compiles."""
+    call()
     done, started, seconds = 0, time.perf_counter(), 0.0
     while seconds < enough:
-        eg.fit(images[done % len(images)], case.gaussians, steps, backend=backend)
+        call()
         done, seconds = done + 1, time.perf_counter() - started
-    return {"images_per_second": done / seconds, "images": done, "peak_gib": peak_gib()}
+    return done / seconds
 
 
 def mosaic(width: int, height: int) -> Image:
@@ -196,66 +191,51 @@ FIGURES = {
     "colour solve, s": "solve_seconds",
     "peak, GiB": "peak_gib",
 }
+RATES = {
+    "`fit`, one by one": "images_per_second",
+    "`fit_many`": "many_per_second",
+    "the ratio": "many_ratio",
+}
 CAPTIONS = {
     "pixels": "Time and memory over pixels, at equal density of Gaussians",
     "splats": "Time and memory over Gaussians",
-    "threads": "Time of a step over threads, and the gain of the mean over one thread",
-    "small": f"Small images: fits of {FIT_STEPS} steps, one after the other",
+    "small": f"Small images: fits of {FIT_STEPS} steps, images a second",
 }
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
-    """Lay out seconds and memory over pixels, Gaussians and threads: a table and a chart each."""
+    """Lay out seconds and memory over pixels and Gaussians, and images a second."""
     from eigengs_bench import report as fr
 
     frame = fr.frame_of(rows)
     frame["size"] = [f"{w:,}x{h:,}" for w, h in zip(frame.width, frame.height, strict=True)]
     frame["pixels"] = frame.width * frame.height
     frame["Gaussians"] = frame.gaussians.map("{:,}".format)
-    frame = frame.sort_values(["pixels", "gaussians", "threads"], kind="stable")
+    frame = frame.sort_values(["pixels", "gaussians"], kind="stable")
     tables, charts = [], {}
     for name, part in frame.groupby("part", sort=False):
-        columns: dict[str, Any] = {k: (column, _one) for k, column in FIGURES.items()}
-        by = ["size", "Gaussians"]
-        if name == "threads":
-            first = part.groupby("size").mean_ms.transform("first")
-            part = part.assign(gain=first / part.mean_ms, threads=part.threads.map(str))
-            columns, by = {k: columns[k] for k in list(columns)[:2]}, [*by, "threads"]
-            columns["gain"] = "gain", _one
-        if name == "small":
-            rate = "images_per_second", partial(_one, decimals=1)
-            columns = {"images a second": rate, "peak, GiB": columns["peak, GiB"]}
-        caption = CAPTIONS[str(name)] + (_exponents(part) if name in ("pixels", "splats") else "")
-        tables.append(fr.grouped(caption, part, by, columns)._replace(name=str(name)))
-        if name in ("pixels", "splats"):
-            over = "pixels" if name == "pixels" else "gaussians"
-            charts[f"scaling-{name}"] = _chart(part, over)
+        caption = CAPTIONS[str(name)]
+        shown = RATES if name == "small" else FIGURES
+        if name != "small":
+            x = "pixels" if name == "pixels" else "gaussians"
+            line = "equal density of Gaussians" if name == "pixels" else part["size"]
+            part = part.assign(line=line)
+            caption += _exponents(part, x)
+            charts[f"scaling-{name}"] = _chart(part, x)
+        columns = {title: (column, fr.median) for title, column in shown.items()}
+        found = fr.grouped(caption, part, ["size", "Gaussians"], columns)
+        tables.append(found._replace(name=str(name)))
     return fr.Section(tables, charts)
-
-
-def _one(values: pd.Series, decimals: int = 2) -> str:
-    value = values.iloc[-1]
-    return "-" if np.isnan(value) else f"{value:,.{decimals}f}"
 
 
 def slope(x: Sequence[float], y: Sequence[float]) -> float:
     """Fit the exponent p of ``y ~ x^p`` by least squares of logarithms; NaN for one point."""
-    steps, rises = (np.log(np.asarray(values, float)) for values in (x, y))
-    steps, rises = steps - steps.mean(), rises - rises.mean()
-    return float(steps @ rises / (steps @ steps)) if steps.any() else float("nan")
+    return float(np.polyfit(np.log(x), np.log(y), 1)[0]) if len(x) > 1 else float("nan")
 
 
-def _lines(part: pd.DataFrame) -> Iterator[tuple[str, str, pd.DataFrame]]:
-    """Yield a name, what varies, and the points of each line of a part."""
-    if part.part.iloc[0] == "pixels":
-        yield "equal density of Gaussians", "pixels", part
-    else:
-        for size, some in part.groupby("size", sort=False):
-            yield str(size), "gaussians", some
-
-
-def _exponents(part: pd.DataFrame) -> str:
-    found = [f"{name} {slope(some[x], some.mean_ms):.2f}" for name, x, some in _lines(part)]
+def _exponents(part: pd.DataFrame, x: str) -> str:
+    lines = part.groupby("line", sort=False)
+    found = [f"{name} {slope(some[x], some.mean_ms):.2f}" for name, some in lines]
     return f"; exponents of a step: {', '.join(found)}"
 
 
@@ -264,10 +244,9 @@ def _chart(part: pd.DataFrame, x: str) -> Figure:
     from eigengs_bench import report as fr
 
     figure = fr.new_figure(10, 4.2)
-    axes = figure.subplots(1, 2)
-    for (name, _, some), style in zip(_lines(part), STYLES, strict=False):
-        axes[0].plot(some[x], some.mean_ms, style, ms=4, label=name)
-        axes[1].plot(some[x], some.peak_gib, style, ms=4, label=name)
-    for axis, label in zip(axes, ("a step with lists / ms", "peak of memory / GiB"), strict=True):
+    labels = {"mean_ms": "a step with lists / ms", "peak_gib": "peak of memory / GiB"}
+    for axis, (column, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
+        for (name, some), style in zip(part.groupby("line", sort=False), STYLES, strict=False):
+            axis.plot(some[x], some[column], style, ms=4, label=name)
         fr.label_axes(axis, x, label, "y", xscale="log")
     return figure

@@ -168,7 +168,10 @@ def _fine(plane: NDArray[np.floating]) -> NDArray[np.float64]:
 def summarize(rows: Sequence[Row]) -> fr.Section:
     """Lay the matrix out, and list what is wrong with default; see `defects`."""
     steps = " or ".join(f"{n:,}" for n in sorted({row["job"]["iterations"] for row in rows}))
-    matrix = [_matrix(f"{caption}; {steps} steps", cell, rows) for caption, cell in FIGURES]
+    matrix = [
+        _matrix(f"{caption}; {steps} steps", cell, rows, name)
+        for name, (caption, cell) in FIGURES.items()
+    ]
     found, codes = [(line,) for line in defects(rows)], [code_name(row["run"]) for row in rows]
     caption = "Cells of default that are not finite, or end below their start or a shorter run"
     return fr.Section([*matrix, fr.table(caption, ("cell",), found, codes)])
@@ -190,13 +193,14 @@ def defects(rows: Iterable[Row]) -> list[str]:
     return found
 
 
-def _matrix(caption: str, cell: Callable[[Row], str], rows: Sequence[Row]) -> fr.Table:
+def _matrix(caption: str, cell: Callable[[Row], str], rows: Sequence[Row], name: str) -> fr.Table:
     """Put a figure of every case and preset into a matrix; of equal ones the last is shown."""
     cells = pd.DataFrame([{**row["job"], "cell": cell(row)} for row in rows])
     cells = cells.drop_duplicates(["case", "preset"], keep="last")
     matrix = cells.pivot(index="case", columns="preset", values="cell").fillna(fr.MISSING)
     matrix = matrix.loc[cells.case.unique(), cells.preset.unique()].reset_index()
-    return fr.table(caption, matrix, matrix.to_numpy(), [code_name(row["run"]) for row in rows])
+    codes = [code_name(row["run"]) for row in rows]
+    return fr.table(caption, matrix, matrix.to_numpy(), codes, name)
 
 
 def _ends(row: Row) -> str:
@@ -220,11 +224,14 @@ def _cost(row: Row) -> str:
     return fr.number(row.get("seconds"), 1) + (f" ({memory:.1f} GiB)" if memory else "")
 
 
-# Captions of the tables, and what writes a cell of each.
-FIGURES: tuple[tuple[str, Callable[[Row], str]], ...] = (
-    ("PSNR in dB, YCbCr, at the end, from the start", _ends),
-    ("dB from the best moment to the last, YCbCr", lambda row: fr.number(row.get("drop_ycbcr"), 2)),
-    ("Highest condition number of a covariance", _ratio),
-    ("Tiling, 8-bit levels", lambda row: fr.number(row.get("tiling"), 2)),
-    ("Seconds, and the peak of memory", _cost),
-)
+# Names and captions of the tables, and what writes a cell of each.
+FIGURES: dict[str, tuple[str, Callable[[Row], str]]] = {
+    "ends": ("PSNR in dB, YCbCr, at the end, from the start", _ends),
+    "drops": (
+        "dB from the best moment to the last, YCbCr",
+        lambda row: fr.number(row.get("drop_ycbcr"), 2),
+    ),
+    "conditions": ("Highest condition number of a covariance", _ratio),
+    "tiling": ("Tiling, 8-bit levels", lambda row: fr.number(row.get("tiling"), 2)),
+    "costs": ("Seconds, and the peak of memory", _cost),
+}

@@ -30,11 +30,8 @@ from eigengs_bench import (
 from eigengs_bench.names import SETS, ImageSet
 from eigengs_bench.rows import FILE, read
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.start import initialize
 from eigengs_dr.image.io import load_image, save_image
 from eigengs_dr.image.metrics import psnr
-from eigengs_dr.raster.render import picture_of
 
 
 def answered(out, bench, *arguments):
@@ -60,9 +57,7 @@ def test_tables(data, tmp_path, backend):  # noqa: F811
     rows, text = answered(tmp_path / "out", "tables", *arguments)
     ends = {row["job"]["preset"]: row["moments"][-1] for row in rows if "moments" in row}
     assert set(ends) == {"default", "gaussianimage", "eigengs"}
-    [reached] = [row for row in rows if "share" in row]
-    assert reached["psnr_ycbcr"] >= ends["gaussianimage"]["psnr_ycbcr"]
-    for title in ("Methods, 12 steps", "Bases of other images", "Colour space", "Time until"):
+    for title in ("Methods, 12 steps", "Bases of other images", "Colour space"):
         assert title in text
     # The same figures as those of a fit.
     [found] = [row for row in rows if row["job"].get("preset") == "default"]
@@ -83,22 +78,8 @@ def test_means_of_tables_count_failures():
         for k, value in enumerate((34.0, 36.0, None, 42.0))
     ]
     first, *_ = tables.summarize(made).tables
-    texts = "faces256,default,4,33.0,37.3 (1 failed),31.3 (1 failed),0.500,0.750,1.000,50,25"
-    assert lines_of(first)[1] == tuple(texts.split(","))
-
-
-def test_a_goal_above_the_start_is_reached_by_descent(backend):
-    image = one_image(0)
-
-    def start(depth):
-        options = FitOptions(gaussians=60, init="grid", solve_steps=depth, backend=backend)
-        return initialize(image, options)
-
-    reached = psnr(picture_of(start(10).gaussians), image, "ycbcr")
-    goal = {"psnr_ycbcr": reached + 3, "seconds": 2.0}
-    found = tables._reach(start, image, goal)
-    assert found["solve_steps"] == 10 and found["iteration"] > 0
-    assert tables._reach(start, image, goal | {"psnr_ycbcr": 200.0}) == {"share": None}
+    texts = "faces256,default,4,1.000,33.0,37.3 (1 failed),31.3 (1 failed),0.500,0.750,1.00,50,25"
+    assert lines_of(first)[0] == tuple(texts.split(","))
 
 
 def test_pictures(data, tmp_path, backend):  # noqa: F811
@@ -217,7 +198,7 @@ def test_kodak(tmp_path, monkeypatch, backend):
     error = np.clip(expected, 0, 1).astype(np.float64) - image
     assert found["psnr_float"] == pytest.approx(-10 * np.log10(np.mean(error**2)), abs=1e-6)
     assert "GaussianImage" in text and "measured" in text
-    assert (tmp_path / "out" / "kodak-seconds.svg").exists()
+    assert (tmp_path / "out" / "kodak-gaussians.svg").exists()
     assert {"gaussians", "psnr_float", "source"} <= set(kodak.published())
 
 
@@ -286,7 +267,7 @@ def test_scaling(backend, tmp_path):
     [row], text = answered(tmp_path / "out", "scaling", *arguments)
     assert row["job"]["gaussians"] == 1250 and row["mean_ms"] > 0 and row["place_seconds"] > 0
     assert "exponents of a step" in text
-    assert scaling.measure_fits(scaling.Case(16, 16, 20), 1, backend, 1e-9)["images"] == 1
+    assert scaling.measure_fits(scaling.Case(16, 16, 20), 1, backend, 1e-9)["many_ratio"] > 0
     image = scaling.mosaic(2 * scaling.CELL, scaling.CELL + 8)
     assert image.shape == (scaling.CELL + 8, 2 * scaling.CELL, 3)
     assert scaling.slope([1, 2, 4], [3, 6, 12]) == pytest.approx(1)
@@ -302,7 +283,7 @@ def tiny(monkeypatch):
 def test_kernels(tiny, backend, tmp_path):
     told = said("bench", "kernels", "--backend", backend, "-o", tmp_path)
     [found] = read(tmp_path / FILE)
-    names = "plain_ms", "fast_ms", "step_ratio", "forward_peak_fraction", "growth"
+    names = "plain_ms", "fast_ms", "step_ratio", "forward_peak_fraction"
     for name in (*names, "fit_over_steps", "round_in_steps"):
         assert found[name] > 0 and name in told
     few, many = found["cutoffs"]
