@@ -129,8 +129,8 @@ def _over_gaussians(photos: pd.DataFrame, known: pd.DataFrame) -> Figure:
     shades = cycle((1.0, 0.6, 0.4, 0.3))
     for ((steps, depth), part), alpha in zip(photos.groupby(KIND), shades, strict=False):
         points, label = part.groupby("gaussians").psnr_float.mean(), _name(depth)
-        style = {"ms": 5, "color": "#0b6e99", "alpha": alpha}
-        axis.plot(points, "o-", label=f"{label}, {steps:,} steps", **style)
+        label += f", {steps:,} steps"
+        axis.plot(points, "o-", ms=5, color="#0b6e99", alpha=alpha, label=label)
     for color, (name, part) in zip(
         cycle(OTHERS), known.groupby("method", sort=False), strict=False
     ):

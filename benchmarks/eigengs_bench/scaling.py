@@ -148,8 +148,8 @@ def measure_fits(case: Case, steps: int, backend: str | None, enough: float = FI
         for top in range(0, photos.shape[0], case.height)
         for left in range(0, photos.shape[1], case.width)
     ]
-    turn, options = cycle(images), {"gaussians": case.gaussians, "iterations": steps}
-    options["backend"] = backend
+    turn = cycle(images)
+    options: Any = {"gaussians": case.gaussians, "iterations": steps, "backend": backend}
     one = _rate(lambda: eg.fit(next(turn), **options), enough)
     many = len(images) * _rate(lambda: eg.fit_many(images, progress=False, **options), enough)
     figures = {"images_per_second": one, "many_per_second": many, "many_ratio": many / one}

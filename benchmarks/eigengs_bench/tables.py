@@ -72,7 +72,7 @@ def _jobs(task: Task, name: str, compared: Sequence[Method]) -> Iterator[Job]:
         if method.source:
             split = {"split": True, "whole": False}.get(method.split, "auto")
             model = model_for(task, name, method.source, method.components, method.space, split)
-        options = {"preset": method.preset, "space": method.space, "start": model}
+        options: Row = {"preset": method.preset, "space": method.space, "start": model}
         options |= {"gaussians": count, "backend": task.backend}
         warm_up(pictures[0][1], task.iterations, **options)
         return options
