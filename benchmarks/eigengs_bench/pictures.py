@@ -41,7 +41,7 @@ CREDIT = "Images: AFHQ, NAVER Corp., CC BY-NC 4.0"  # of all pictures of cats
 EVERY = 50  # iterations between two points of a curve
 MAGNIFIED, STRETCHED = 8, 20  # factors of errors before they are added to mid-grey
 MARGIN = 0.08  # around the middle of a picture, in its sides: Gaussians there reach into it
-CELL, LETTERS = 1.8, 0.35  # sides of a picture, and height of the lines around it, in inches
+CELL, LETTERS = 1.8, 0.42  # sides of a picture, and height of the lines around it, in inches
 
 Cell = tuple[str, NDArray[Any]]  # the line below a picture, and the picture: RGB, not clamped
 
