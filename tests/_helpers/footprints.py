@@ -1,6 +1,8 @@
 """Sums seen through a footprint, by brute force."""
 
+import drjit as dr
 import numpy as np
+import pytest
 
 from _helpers.sets import SIZE
 from eigengs_dr.raster.reference import render_exact
@@ -14,6 +16,31 @@ def some_points(count=60, size=SIZE, seed=3):
     """Random points in an image, rounded to float32, shape (count, 2)."""
     points = np.random.default_rng(seed).uniform(0, 1, (count, 2)) * size
     return points.astype(np.float32).astype(np.float64)
+
+
+def exact_at(scene, points, cutoff, margin=1e-4):
+    """The sum in float64 without background, (points, C), and which points are off all edges."""
+    delta = points[:, None] - scene.mean
+    a, b, c = scene.factor.T
+    distance = np.hypot(a * delta[..., 0] + b * delta[..., 1], c * delta[..., 1])
+    weight = np.where(distance <= cutoff, np.exp(-0.5 * distance**2), 0)
+    off_edge = (np.abs(distance / cutoff - 1) > margin).all(axis=1)
+    return weight @ scene.color, off_edge
+
+
+def check_gradient(loss, scene, name, backend):
+    """Check the gradient of ``loss(gaussians)`` in float64 along a random direction."""
+    gaussians = scene.on(backend, bits=64)
+    field = getattr(gaussians, name)
+    dr.enable_grad(field)
+    dr.backward(loss(gaussians))
+    found = np.array(dr.grad(field)).T
+    direction = np.random.default_rng(1).normal(size=found.shape)
+    moved = [scene._replace(**{name: getattr(scene, name) + s * 1e-5 * direction}) for s in (1, -1)]
+    up, down = (np.array(loss(m.on(backend, bits=64))).item() for m in moved)
+    expected = (up - down) / 2e-5
+    assert abs(expected) > 1e-3
+    assert (found * direction).sum() == pytest.approx(expected, rel=1e-4, abs=1e-6)
 
 
 def tiled(scene, wrap, copies=3):

@@ -48,11 +48,6 @@ def test_bad_cutoff(backend, cutoff):
     assert "\n" not in str(error.value)
 
 
-def test_cutoff_that_is_an_integer(backend):
-    gaussians = random_scene().on(backend)
-    np.testing.assert_array_equal(render(gaussians, cutoff=3), render(gaussians, cutoff=3.0))
-
-
 def test_widest_cutoff(backend):
     scene = random_scene(5)
     image = render(scene.on(backend), cutoff=MAX_CUTOFF).numpy()
@@ -72,13 +67,8 @@ def test_size_beyond_32_bits_is_refused_before_it_is_allocated(backend):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("kind", [np.float64, np.float32])
-def test_cutoff_of_numpy(backend, kind):
+@pytest.mark.parametrize("kind", [int, np.float64, np.float32])
+def test_numbers_of_other_types(backend, kind):
     gaussians = random_scene().on(backend)
-    np.testing.assert_array_equal(render(gaussians, cutoff=kind(3)), render(gaussians, cutoff=3.0))
-
-
-def test_size_of_numpy(backend):
-    gaussians = random_scene().on(backend)
-    image = render(gaussians, width=np.int64(10), height=np.int64(8))
-    np.testing.assert_array_equal(image, render(gaussians, width=10, height=8))
+    image = render(gaussians, width=np.int64(10), height=np.int64(8), cutoff=kind(3))
+    np.testing.assert_array_equal(image, render(gaussians, width=10, height=8, cutoff=3.0))

@@ -2,14 +2,14 @@
 
 import drjit as dr
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from _helpers.sets import few, random_scene, scenes
+from _helpers.sets import few, scenes
 from _helpers.tile_lists import GRID, RADIUS, upload
-from eigengs_dr.raster.binning import tiles as granularity
 from eigengs_dr.raster.binning.lists import build_lists
-from eigengs_dr.raster.binning.tiles import GRANULARITY
+from eigengs_dr.raster.binning.tiles import GRANULARITY, Grid
 
 
 def pairs_by_splat(lists):
@@ -32,23 +32,17 @@ def pairs_by_tile(lists, count):
     return found
 
 
-def test_long_lists_have_longer_pieces(backend, monkeypatch):
-    """The same pairs in fewer pieces, where enough of them are left."""
-    scene = random_scene()
-    shape = upload(backend, scene.mean, scene.factor)
-    few = GRANULARITY[backend]._replace(visits=2, long_visits=5)
-    monkeypatch.setitem(GRANULARITY, backend, few)
-    short = build_lists(shape, RADIUS, GRID)
-    monkeypatch.setattr(granularity, "MIN_PIECES", 1)
-    small = build_lists(shape, RADIUS, GRID)
-    monkeypatch.setattr(granularity, "SMALL", 0)
-    long = build_lists(shape, RADIUS, GRID)
-    found, visits = pairs_by_splat(long)
-    before, most = pairs_by_splat(short)
-    np.testing.assert_array_equal(found, before)
-    assert most.max() == 2 and 2 < visits.max() <= 5
-    # In small images, which go in batches, the length of the lists changes nothing.
-    np.testing.assert_array_equal(pairs_by_splat(small)[1], most)
+@pytest.mark.parametrize(
+    ("side", "count", "most"),
+    [(260, 512, "long_visits"), (260, 400, "visits"), (256, 600, "visits")],
+    ids=["long", "short", "small"],
+)
+def test_long_lists_have_longer_pieces(backend, side, count, most):
+    """Where enough pieces are left, and not in small images, which go in batches."""
+    shape = upload(backend, np.full((count, 2), side / 2), np.tile([1e-4, 0, 1e-4], (count, 1)))
+    found, visits = pairs_by_splat(build_lists(shape, RADIUS, Grid(side, side)))
+    assert (found == 1).all()
+    assert visits.max() == getattr(GRANULARITY[backend], most)
 
 
 @few

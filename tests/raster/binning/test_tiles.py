@@ -124,13 +124,9 @@ def test_lists_of_extreme_shapes(backend, shapes, spread):
     assert member.any()
 
 
-def test_a_huge_splat_is_in_all_lists(backend):
-    mean, factor = np.full((COUNT, 2), 5.0), np.tile([1e-15, 0, 1e-15], (COUNT, 1))
-    assert membership(lists_of(backend, mean, factor)).all()
-
-
-def test_an_endless_splat_is_in_all_lists(backend):
-    mean, factor = np.full((COUNT, 2), 5.0), np.tile([1e-25, 0, 1e-25], (COUNT, 1))
+@pytest.mark.parametrize("diagonal", [1e-15, 1e-25], ids=["huge", "endless"])
+def test_a_huge_splat_is_in_all_lists(backend, diagonal):
+    mean, factor = np.full((COUNT, 2), 5.0), np.tile([diagonal, 0, diagonal], (COUNT, 1))
     assert membership(lists_of(backend, mean, factor)).all()
 
 
@@ -163,20 +159,20 @@ def test_splats_that_are_not_finite_are_in_no_list(backend, value, position):
     np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (8, 4), (5, 5)])
-def test_grids(backend, size):
-    grid = Grid(*size)
-    assert grid.nx == -(-size[0] // TILE[0])
+@pytest.mark.parametrize(
+    ("size", "tile"),
+    [
+        *((size, TILE) for size in ((1, 1), (1, 9), (9, 1), (8, 4), (5, 5))),
+        *((SIZE, tile) for tile in ((1, 1), (8, 8), (3, 5))),
+    ],
+)
+def test_grids(backend, size, tile):
+    grid = Grid(*size, tile)
+    assert grid.nx == -(-size[0] // tile[0])
     assert grid.tiles == grid.nx * grid.ny
-    assert grid.pixels == TILE[0] * TILE[1]
+    assert grid.pixels == tile[0] * tile[1]
     scene = random_scene(2)
     check_lists(backend, scene.mean * np.array(size) / SIZE, scene.factor, grid)
-
-
-@pytest.mark.parametrize("tile", [(1, 1), (8, 8), (3, 5)])
-def test_other_tiles(backend, tile):
-    scene = random_scene(3)
-    check_lists(backend, scene.mean, scene.factor, Grid(*SIZE, tile))
 
 
 def test_lanes_are_all_tiles_by_length_within_windows(backend):
@@ -195,14 +191,6 @@ def test_lists_are_deterministic(backend):
     first, second = (lists_of(backend, scene.mean, scene.factor) for _ in range(2))
     for name in ("splat", "begin", "end", "order"):
         np.testing.assert_array_equal(getattr(first, name).numpy(), getattr(second, name).numpy())
-
-
-@few
-@given(scene=scenes())
-def test_padding_only_adds(backend, scene):
-    tight = membership(lists_of(backend, scene.mean, scene.factor))
-    padded = membership(lists_of(backend, scene.mean, scene.factor, pad=1.5))
-    assert not (tight & ~padded).any()
 
 
 @few

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from _helpers.footprints import exact_at, some_points, stacked
 from _helpers.sets import SIZE, few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
@@ -18,31 +19,15 @@ from eigengs_dr.raster.lookup.points import (
     value_terms,
 )
 from eigengs_dr.raster.parameters import pack_parameters
-from eigengs_dr.raster.render import decode_parameters, render
+from eigengs_dr.raster.render import decode_parameters
 
-POINTS = 400
+POINTS = np.concatenate([np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * SIZE, some_points(396)])
+"""Points in the image, its corners among them, shape (points, 2)."""
+
 WIDE = 9.0
 """A cutoff at which a splat's edge is nothing: finite differences may cross it."""
 
 precisions = pytest.mark.parametrize(("bits", "rtol"), [(32, 2e-3), (64, 1e-6)])
-
-
-def some_points(count=POINTS, size=SIZE, seed=3):
-    """Points in the image, its corners among them, shape (count, 2)."""
-    points = np.random.default_rng(seed).uniform(0, 1, (count, 2)) * size
-    points[:4] = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size
-    return points.astype(np.float32).astype(np.float64)
-
-
-def exact_at(scene, points, cutoff):
-    """The sum in float64, shape (points, C), and how far each point is from any edge."""
-    delta = points[:, None] - scene.mean
-    a, b, c = scene.factor.T
-    u, v = a * delta[..., 0] + b * delta[..., 1], c * delta[..., 1]
-    distance = np.hypot(u, v)
-    weight = np.where(distance <= cutoff, np.exp(-0.5 * distance**2), 0)
-    off_edge = (np.abs(distance / cutoff - 1) > 1e-4).all(axis=1)
-    return scene.background + weight @ scene.color, off_edge
 
 
 def arrays_of(gaussians, points, cutoff):
@@ -62,33 +47,22 @@ def look_up(gaussians, points, cutoff, side=4, terms=value_terms, number=1):
     return sum_at_points(cells, packed, x, y, active, terms(packed.radius), count)
 
 
-def stacked(rows):
-    return np.stack([np.array(r) for r in rows], axis=1)
-
-
 class TestValues:
     @few
     @given(scene=scenes())
     def test_sums_all_splats_that_reach_a_point(self, backend, scene):
-        exact, sure = exact_at(scene, some_points(), 3.0)
-        found = stacked(look_up(scene.on(backend), some_points(), 3.0)) + scene.background
+        exact, sure = exact_at(scene, POINTS, 3.0)
+        found = stacked(look_up(scene.on(backend), POINTS, 3.0))
         np.testing.assert_allclose(found[sure], exact[sure], atol=2e-5)
 
     @pytest.mark.parametrize("side", [1, 2, 8, 64])
     def test_does_not_depend_on_the_cells(self, backend, side):
         gaussians = random_scene(1).on(backend)
         np.testing.assert_allclose(
-            stacked(look_up(gaussians, some_points(), 3.0, side)),
-            stacked(look_up(gaussians, some_points(), 3.0)),
+            stacked(look_up(gaussians, POINTS, 3.0, side)),
+            stacked(look_up(gaussians, POINTS, 3.0)),
             atol=1e-6,
         )
-
-    def test_is_what_render_gives_at_pixel_centres(self, backend):
-        gaussians = random_scene(2).on(backend)
-        y, x = (v.ravel() + 0.5 for v in np.mgrid[: SIZE[1], : SIZE[0]])
-        found = stacked(look_up(gaussians, np.stack([x, y], 1), 3.0))
-        found = found.reshape(SIZE[1], SIZE[0], 3) + gaussians.to_arrays()["background"]
-        np.testing.assert_allclose(found, render(gaussians).numpy(), atol=1e-6)
 
     def test_costs_what_overlaps_and_not_what_there_is(self, backend):
         """64 times the splats on 64 times the area: a point has hardly more of them to look at."""
@@ -106,7 +80,7 @@ class TestValues:
 
 class TestDerivatives:
     def test_slopes_are_finite_differences(self, backend):
-        scene, points, step = random_scene(6), some_points(), 1e-5
+        scene, points, step = random_scene(6), POINTS, 1e-5
         rows = stacked(
             look_up(scene.on(backend, bits=64), points, WIDE, terms=gradient_terms, number=3)
         )
@@ -117,8 +91,8 @@ class TestDerivatives:
     @precisions
     @pytest.mark.parametrize("name", ["mean", "factor", "color"])
     def test_gradients_are_finite_differences(self, backend, bits, rtol, name):
-        scene, points = random_scene(7, count=7), some_points()
-        weight = np.random.default_rng(0).normal(size=(POINTS, 3))
+        scene, points = random_scene(7, count=7), POINTS
+        weight = np.random.default_rng(0).normal(size=(len(POINTS), 3))
         gaussians = scene.on(backend, bits=bits)
         dr.enable_grad(getattr(gaussians, name))
         rows = look_up(gaussians, points, WIDE)
@@ -140,13 +114,13 @@ class TestDerivatives:
     def test_gradient_reaches_the_point(self, backend):
         """The loop hands on derivatives of where it is evaluated, which geometry may have."""
         gaussians = random_scene(8).on(backend, bits=64)
-        packed, shape, x, y = arrays_of(gaussians, some_points(), WIDE)
+        packed, shape, x, y = arrays_of(gaussians, POINTS, WIDE)
         cells = list_cells(shape, *SIZE, packed.radius, 4)
         dr.enable_grad(x, y)
         active = types_of(x).Bool(True)
         sums = sum_at_points(cells, packed, x, y, active, value_terms(packed.radius))
         dr.backward(dr.sum(sums[0]))
-        rows = look_up(gaussians, some_points(), WIDE, terms=gradient_terms, number=3)
+        rows = look_up(gaussians, POINTS, WIDE, terms=gradient_terms, number=3)
         np.testing.assert_allclose(np.array(dr.grad(x)), np.array(rows[1]), atol=1e-9)
         np.testing.assert_allclose(np.array(dr.grad(y)), np.array(rows[2]), atol=1e-9)
 

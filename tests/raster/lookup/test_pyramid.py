@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from _helpers.footprints import CUTOFF, brute_force, some_points, stacked, tiled
+from _helpers.footprints import CUTOFF, brute_force, check_gradient, some_points, stacked, tiled
 from _helpers.sets import SIZE, random_scene
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.raster.lookup import pyramid as coarsen
@@ -105,8 +105,7 @@ class TestGradient:
     @pytest.mark.parametrize("name", ["mean", "factor", "color"])
     def test_is_a_finite_difference(self, backend, name):
         """Through the lattice to the splats behind it, in float64."""
-        scene, points = inner_scene(5, 9), some_points(40)
-        weight = np.random.default_rng(0).normal(size=(40, 3))
+        points, weight = some_points(40), np.random.default_rng(0).normal(size=(40, 3))
 
         def loss(gaussians):
             lattice = lattice_of(gaussians, "mirror", 9.0)
@@ -115,18 +114,7 @@ class TestGradient:
             seen = sum(r * Float(w) for r, w in zip(rows, weight.T.copy(), strict=True))
             return dr.sum(seen) + pyramid_mean(lattice)[0]
 
-        gaussians = scene.on(backend, bits=64)
-        dr.enable_grad(getattr(gaussians, name))
-        dr.backward(loss(gaussians))
-        found = np.array(dr.grad(getattr(gaussians, name))).T
-        direction = np.random.default_rng(1).normal(size=found.shape)
-        moved = [
-            scene._replace(**{name: getattr(scene, name) + s * 1e-5 * direction}) for s in (1, -1)
-        ]
-        up, down = (np.array(loss(m.on(backend, bits=64))).item() for m in moved)
-        expected = (up - down) / 2e-5
-        assert abs(expected) > 1e-3
-        assert (found * direction).sum() == pytest.approx(expected, rel=1e-4, abs=1e-6)
+        check_gradient(loss, inner_scene(5, 9), name, backend)
 
 
 @pytest.mark.parametrize(("size", "levels"), [((256, 256), 6), ((7, 300), 1), ((64, 33), 3)])
