@@ -16,8 +16,7 @@ import eigengs_dr as eg
 from _helpers.process import run_python
 from _helpers.waves import default, picture, start
 from eigengs_dr.backend import recording
-from eigengs_dr.backend.recording import collector_off, exclusive, freeze_program
-from eigengs_dr.backend.selection import select
+from eigengs_dr.backend.recording import collector_off, exclusive
 from eigengs_dr.fitting.descent import FitProblem, descend
 
 WAIT = 100
@@ -103,31 +102,6 @@ def half_read(backend):
     next(sets)
     next(sets)
     return sets
-
-
-def frozen_block(Float):
-    """A generator inside the block of a program that has run once."""
-    with freeze_program(lambda x: x + 1) as call:
-        yield call(Float(1))
-
-
-@pytest.mark.parametrize("in_thread", [False, True])
-def test_a_program_dropped_during_a_recording_is_freed_after_it(backend, in_thread):
-    Float = select(backend).Float
-    blocks = [frozen_block(Float)]
-    next(blocks[0])
-    drop = blocks.clear  # Dr.Jit looks into the lists of a closure, not into methods
-
-    def drops(x):
-        run_in_thread(drop) if in_thread else drop()
-        assert len(recording._retired) == 1
-        return 2 * x
-
-    with freeze_program(drops) as call:
-        assert dr.all(call(Float(1, 2)) == Float(2, 4))
-        with exclusive():
-            assert not recording._retired
-        assert dr.all(call(Float(3, 4)) == Float(6, 8))
 
 
 DROP_WHILE_RECORDING = """

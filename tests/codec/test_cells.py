@@ -1,7 +1,6 @@
 """Cells of a plane, coded without their order."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -32,11 +31,3 @@ def test_cells_come_back(cells, evenness, levels):
 
 def test_many_gaussians_in_one_cell():
     coded(np.full((1 << 21, 2), 3), 3, 1)
-
-
-@pytest.mark.parametrize("count", [200, 3000])
-def test_the_order_is_not_stored(count):
-    cells = np.random.default_rng(0).integers(0, 256, (count, 2))
-    # log2(M^N / N!) bits for M cells
-    least = count * (16 - np.log2(count) + np.log2(np.e))
-    assert 8 * len(coded(cells, 8, 64)) < 1.04 * least + 32

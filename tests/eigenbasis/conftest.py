@@ -2,6 +2,7 @@
 
 import pytest
 
+from _helpers.families import family
 from _helpers.photos import SMALL, random_fields
 from eigengs_dr.eigenbasis.options import TrainOptions
 from eigengs_dr.eigenbasis.training import train
@@ -13,6 +14,12 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("trained")
     random_fields(folder / "photos", 30)
     return folder, train(folder / "photos", folder / "model.npz", TrainOptions(**SMALL))
+
+
+@pytest.fixture(scope="session")
+def others():
+    """Images of the family of `small_basis` that it was not made of."""
+    return family(8, seed=1)
 
 
 @pytest.fixture

@@ -22,12 +22,6 @@ from eigengs_dr.image.io import ImageError
 from eigengs_dr.image.resize import resample
 
 
-@pytest.fixture(scope="module")
-def others():
-    """Images of the family that were not trained on."""
-    return family(8, seed=1)
-
-
 def test_one_seed_one_model(backend):
     again = eg.EigenGS.fit(small_basis(), SPLATS, frequency_aware=False, backend=backend)
     for one, two in zip(again.weights, small_model(backend).weights, strict=True):

@@ -4,14 +4,8 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.families import family, small_model, splits
+from _helpers.families import small_model, splits
 from eigengs_dr.image.color import to_planes
-
-
-@pytest.fixture(scope="module")
-def others():
-    """Images of the family of `small_basis` that it was not made of."""
-    return family(6, seed=1)
 
 
 def shown(model, coefficients):

@@ -8,7 +8,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.families import SPLATS, small_model
 from eigengs_dr.eigenbasis.eigengs import SHIPPED, EigenGS
-from train_natural import DEMO
+from train_natural import DEMO, crops
 
 
 def test_shipped_basis(backend):
@@ -20,6 +20,12 @@ def test_shipped_basis(backend):
     projected, exact = (eg.render(model.encode(image, c)).numpy() for c in ("projected", "exact"))
     assert eg.psnr(projected, image, "ycbcr") > 22
     assert eg.psnr(exact, image, "ycbcr") > 27
+
+
+def test_crops_that_the_shipped_basis_is_trained_on():
+    one, two = (list(crops(13, seed=0)) for _ in range(2))
+    assert {crop.shape for crop in one} == {(256, 256, 3)}
+    np.testing.assert_array_equal(one, two)
 
 
 def test_shipped_basis_is_small():

@@ -11,6 +11,7 @@ from _helpers.waves import SIDE, SPLATS, check_sound, figures, picture, presets
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.options import INITS, PRESETS
 from eigengs_dr.image.color import SPACES
+from eigengs_dr.image.io import sample
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import render
 
@@ -23,12 +24,6 @@ def test_fit_improves_on_its_start(backend, init):
     assert len(result.gaussians) == SPLATS
     assert result.image.shape == (SIDE, SIDE, 3)
     assert (result.gaussians.width, result.gaussians.height) == (SIDE, SIDE)
-
-
-def test_fit_is_much_better_than_a_constant(backend):
-    result = fit(picture(), SPLATS, 100, backend=backend)
-    flat = np.broadcast_to(picture().mean(axis=(0, 1)), picture().shape)
-    assert figures(result)[-1] > psnr(picture(), flat, space="ycbcr") + 15
 
 
 def test_trace(backend):
@@ -44,6 +39,18 @@ def test_trace(backend):
     best = max(result.trace, key=lambda row: row["psnr_ycbcr"])
     reached = psnr(picture(), result.image, space="rgb")
     assert best["psnr_rgb"] == pytest.approx(reached, abs=1e-3)
+
+
+def test_a_fit_at_default_settings(backend):
+    """Of a thousand steps: as many Gaussians as asked for, better than its start, the same bits."""
+    image = sample("coffee")[100:148, 200:248]
+    first, second = (fit(image, SPLATS, backend=backend) for _ in range(2))
+    check_sound(first, image)
+    assert (first.iterations, first.stopped, len(first.gaussians)) == (1000, "iterations", SPLATS)
+    assert first.psnr_ycbcr > figures(first)[0] + 3
+    assert figures(first) == figures(second)
+    for name, value in first.gaussians.to_arrays().items():
+        np.testing.assert_array_equal(value, second.gaussians.to_arrays()[name])
 
 
 def test_zero_iterations_keep_the_solved_start(backend):
@@ -143,12 +150,6 @@ def test_the_image_is_left_alone(backend, color):
     np.testing.assert_array_equal(found.image, expected.image)
 
 
-@pytest.mark.parametrize("counts", [(50, 100, 200), (200, 100, 50)], ids=["growing", "shrinking"])
-def test_fits_of_several_sizes_one_after_the_other(backend, counts):
-    for count in counts:
-        check_sound(fit(picture(), count, 3, backend=backend), picture())
-
-
 @presets
 @pytest.mark.parametrize("factor", [10, 1000])
 def test_rates_far_too_high(backend, preset, factor):
@@ -181,6 +182,9 @@ def test_rates_far_too_high(backend, preset, factor):
         ("image", np.zeros((0, 4, 3)), "image"),
         ("image", np.full((4, 4, 3), np.nan), "image"),
         ("image", np.zeros((4, 4, 7)), "image"),
+        ("seed", -1, "seed is -1"),
+        ("gaussians", 2.5, "gaussians is 2.5"),
+        ("iterations", 2.5, "iterations is 2.5"),
     ],
 )
 def test_arguments_out_of_range(name, value, words):
@@ -191,13 +195,6 @@ def test_arguments_out_of_range(name, value, words):
         fit(**arguments)
     assert words in str(error.value)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(("name", "value"), [("seed", -1), ("gaussians", 2.5), ("iterations", 2.5)])
-def test_errors_name_the_argument(name, value):
-    arguments = {"gaussians": SPLATS, "iterations": 3, name: value}
-    with pytest.raises((ValueError, TypeError), match=name):
-        fit(picture(), **arguments)
 
 
 def test_the_repr_is_short(backend):
@@ -212,9 +209,3 @@ def test_a_cutoff_stays_with_its_set(backend):
     shown = render(result.gaussians).numpy()
     np.testing.assert_array_equal(shown, result.image)
     assert not np.array_equal(render(result.gaussians, cutoff=3).numpy(), shown)
-
-
-def test_seeds_of_the_default_preset_give_one_result(backend):
-    sets = [fit(picture(), SPLATS, 0, seed=seed, backend=backend).gaussians for seed in (0, 1)]
-    for first, second in zip(*(g.to_arrays().values() for g in sets), strict=True):
-        np.testing.assert_array_equal(first, second)

@@ -1,7 +1,6 @@
 """How a fit ends: Ctrl-C, signals, errors of the caller, and what it tells meanwhile."""
 
 import signal
-from concurrent.futures import ThreadPoolExecutor
 from unittest.mock import patch
 
 import numpy as np
@@ -31,10 +30,6 @@ def test_interruption_keeps_the_best_so_far(backend, when):
     assert max(figures(result)) == pytest.approx(reached, abs=1e-3)
 
 
-def press_ctrl_c(*arguments):
-    signal.raise_signal(signal.SIGINT)
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals(backend, number):
     """They end the run at the next step, and are the caller's again afterwards."""
@@ -54,23 +49,9 @@ def test_signals(backend, number):
     assert signal.getsignal(number) is before
 
 
-def test_a_loop_over_images_ends(backend):
-    """Ctrl-C in one fit ends the loop around it."""
-    fitted = []
-    with pytest.raises(KeyboardInterrupt):
-        for k in range(3):
-            progress = press_ctrl_c if k == 1 else None
-            fitted.append(fit(picture(), SPLATS, 10, progress=progress, backend=backend))
-    assert len(fitted) == 1
-
-
 def place_and_press(image, count, generator):
-    press_ctrl_c()
+    signal.raise_signal(signal.SIGINT)
     return place_grid(image, count, generator)
-
-
-def place_and_fail(image, count, generator):
-    return 1 / 0
 
 
 @pytest.mark.parametrize("iterations", [0, 1, 60])
@@ -85,27 +66,16 @@ def test_ctrl_c_before_refinement(backend, iterations):
     assert result.stopped == "interrupted"
 
 
-def test_ctrl_c_is_the_callers_after_an_error(backend):
-    before = signal.getsignal(signal.SIGINT)
-    entry = {"grid": place_and_fail}
-    with patch.dict(starting.PLACEMENTS, entry), pytest.raises(ZeroDivisionError):
-        fit(picture(), SPLATS, 10, init="grid", backend=backend)
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_fit_in_a_thread(backend):
-    """Where no signals arrive."""
-    with ThreadPoolExecutor(1) as pool:
-        result = pool.submit(fit, picture(), SPLATS, 10, backend=backend).result()
-    check_sound(result, picture())
-
-
 def test_other_errors_of_the_caller_are_passed_on(backend):
+    """Afterwards, signals are the caller's again."""
+    before = signal.getsignal(signal.SIGINT)
+
     def fail(iteration, iterations, row):
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
         fit(picture(), SPLATS, 10, progress=fail, backend=backend)
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_progress(backend):

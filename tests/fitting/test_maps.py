@@ -5,7 +5,6 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.materials import images
-from eigengs_dr.fitting.maps import combine, read_maps, score_maps
 from eigengs_dr.image.pixels import ImageError
 
 
@@ -26,29 +25,6 @@ def test_each_map_is_fitted_in_its_space():
         assert best["maps"][name]["psnr_rgb"] == pytest.approx(psnr, abs=0.05)
     lengths = np.linalg.norm(2 * result.image["normal"] - 1, axis=2)
     np.testing.assert_allclose(lengths, 1, atol=1e-5)
-
-
-def test_the_measure_is_that_of_the_maps_alone():
-    """Per map, the weighted sums give the PSNR that the separate set has."""
-    result = eg.fit(images(), 50, iterations=0)
-    weights = [m.weight for m in result.gaussians.maps]
-    found = read_maps(images(), {})
-    arrays = result.gaussians.to_arrays()
-    channels = np.repeat(weights, [m.channels for m in result.gaussians.maps])
-    scaled = eg.Gaussians.from_arrays(
-        arrays["mean"],
-        arrays["factor"],
-        arrays["color"] * channels,
-        arrays["background"] * channels,
-        size=(32, 32),
-        space="data",
-    )
-    row = score_maps(scaled, found, weights, 0.0)
-    for name, psnr in figures(result).items():
-        assert row["maps"][name]["psnr_rgb"] == pytest.approx(psnr, abs=0.02)
-    target = combine(found, weights)
-    assert target.values.shape == (32, 32, 7) and target.weight.shape == (32, 32, 7)
-    assert (target.weight[..., 3:] == 1).all()
 
 
 def test_a_weight_favours_its_map():
@@ -78,11 +54,6 @@ def test_goals_of_maps_are_met_by_few():
     assert all(found[name] >= goals[name] - 0.01 for name in goals)
     easier = eg.fit(images(), target_psnr=24, iterations=60)
     assert len(easier.gaussians) < len(result.gaussians)
-
-
-def test_numbers_of_gaussians_are_levels():
-    result = eg.fit(images(), iterations=2, levels=[30, 70])
-    assert len(result.gaussians) == 70
 
 
 def test_levels_are_materials_too():

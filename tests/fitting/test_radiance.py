@@ -22,37 +22,27 @@ def light():
     return np.stack([wall + lamp, wall + 0.8 * lamp, 0.7 * wall + 0.5 * lamp], 2).astype(np.float32)
 
 
-@pytest.mark.parametrize(("color", "space"), [("linear", "radiance"), ("log", "log")])
-def test_light_above_1(light, color, space):
-    result = eg.fit(light, space=color, encoding="linear", **SMALL)
-    assert result.gaussians.space == space
-    rendered = eg.render(result.gaussians).numpy()
-    assert rendered.max() == pytest.approx(light.max(), rel=0.1)
-    found = eg.psnr(to_coded(light), result.image, space="pu21")
-    assert found > 33
-    assert result.trace[-1]["psnr_ycbcr"] == pytest.approx(found, abs=1)
-    np.testing.assert_allclose(
-        result.image, to_coded(np.maximum(rendered, 0)), rtol=1e-4, atol=1e-5
-    )
-
-
-def test_logarithms_leave_less_error(light):
-    figures = [
-        eg.fit(light, space=color, encoding="linear", **SMALL).trace[-1]["psnr_ycbcr"]
-        for color in ("radiance", "log")
-    ]
-    assert figures[1] > figures[0]
-
-
-def test_light_of_a_picture_stays_linear(light):
-    dim = np.minimum(light, 1)
-    assert eg.fit(dim, space="linear", encoding="linear", **SMALL).gaussians.space == "linear"
+def test_light_above_1(light):
+    """Logarithms leave less error than sums of light."""
+    figures = []
+    for color, space in (("linear", "radiance"), ("log", "log")):
+        result = eg.fit(light, space=color, encoding="linear", **SMALL)
+        assert result.gaussians.space == space
+        rendered = eg.render(result.gaussians).numpy()
+        assert rendered.max() == pytest.approx(light.max(), rel=0.1)
+        figures.append(eg.psnr(to_coded(light), result.image, space="pu21"))
+        assert result.trace[-1]["psnr_ycbcr"] == pytest.approx(figures[-1], abs=1)
+        np.testing.assert_allclose(
+            result.image, to_coded(np.maximum(rendered, 0)), rtol=1e-4, atol=1e-5
+        )
+    assert 33 < figures[0] < figures[1]
 
 
 def test_linear_input_is_decoded_once(light):
     dim = np.minimum(light, 1)
     for image, said in ((dim, "linear"), (to_coded(dim), None)):
         result = eg.fit(image, space="linear", encoding=said, **SMALL)
+        assert result.gaussians.space == "linear"
         mean = eg.render(result.gaussians).numpy().mean()
         assert mean == pytest.approx(dim.mean(), rel=0.02)
     dark = eg.fit(dim, space="linear", **SMALL)  # an array counts as sRGB
@@ -125,26 +115,6 @@ def test_pack(tmp_path, light, color):
     loaded = eg.Gaussians.load(tmp_path / "a.egs")
     assert loaded.space == gaussians.space
     assert eg.render(loaded).numpy().max() == pytest.approx(light.max(), rel=0.1)
-
-
-def test_gradients_of_logarithms(light):
-    import drjit as dr
-
-    gaussians = eg.fit(light, space="log", encoding="linear", **SMALL).gaussians
-    dr.enable_grad(gaussians.color)
-    dr.backward(dr.sum(eg.render(gaussians).array))
-    slope = dr.grad(gaussians.color)[0].numpy()
-    n = int(np.abs(slope).argmax())
-    arrays = gaussians.to_arrays()
-    sums = []
-    for step in (-1e-3, 1e-3):
-        color = arrays["color"].copy()
-        color[n, 0] += step
-        moved = eg.Gaussians.from_arrays(
-            **arrays | {"color": color}, size=(48, 40), space="log", backend="llvm"
-        )
-        sums.append(eg.render(moved).numpy().astype(np.float64).sum())
-    assert (sums[1] - sums[0]) / 2e-3 == pytest.approx(slope[n], rel=0.02)
 
 
 def test_the_image_is_not_copied_in_vain():

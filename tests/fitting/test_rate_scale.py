@@ -19,20 +19,17 @@ def factors(color, exponent=0.5, backend="llvm"):
     return rate_scale_of(rows, exponent, len(color)).numpy().reshape(color.shape[:2])
 
 
-def test_rates_fall_with_the_root_of_the_colour(backend):
-    color = np.array([[[0.3, 0.4, 0.0], [0.0, 0.0, 1.0], [-1.5, 0.0, 0.0]]])  # 0.5, 1 and 1.5
-    found = factors(color, backend=backend)
-    np.testing.assert_allclose(found, [[2**0.5, 1, 1.5**-0.5]], rtol=1e-6)
-
-
-def test_bounds():
-    color = np.array([[[0.0], [1e-30], [1.0], [1e6]]])
-    fastest, slowest = MAX_RATE_SCALE, 1 / MAX_RATE_SCALE
-    np.testing.assert_allclose(factors(color), [[fastest, fastest, fastest, slowest]], rtol=1e-6)
-
-
-def test_no_colours_no_difference():
-    np.testing.assert_array_equal(factors(np.zeros((2, 3, 4))), np.ones((2, 3)))
+@pytest.mark.parametrize(
+    ("color", "expected"),
+    [
+        ([[0.3, 0.4, 0.0], [0.0, 0.0, 1.0], [-1.5, 0.0, 0.0]], [2**0.5, 1, 1.5**-0.5]),
+        ([[0.0], [1e-30], [1.0], [1e6]], [MAX_RATE_SCALE] * 3 + [1 / MAX_RATE_SCALE]),
+        ([[0.0], [0.0]], [1, 1]),
+    ],
+)
+def test_rates_fall_with_the_root_of_the_colour(backend, color, expected):
+    """Within bounds, and unless there is no colour at all."""
+    np.testing.assert_allclose(factors(np.array([color]), backend=backend), [expected], rtol=1e-6)
 
 
 @pytest.mark.parametrize("unit", [1e-3, 50.0])

@@ -1,6 +1,5 @@
 """More Gaussians than asked for, which leave in the course of a descent."""
 
-from contextlib import closing, contextmanager
 from dataclasses import replace
 
 import drjit as dr
@@ -9,13 +8,11 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.halves import SIDE, fitted, picture, squared_error
-from eigengs_dr.fitting import descent as module
 from eigengs_dr.fitting.density_control import relocate, removal_cost
 from eigengs_dr.fitting.descent import descend
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.refine import refine
 from eigengs_dr.fitting.schedule import Relocation, relocations, surplus_for
-from eigengs_dr.fitting.search import search_count
 from eigengs_dr.fitting.start import initialize
 from eigengs_dr.raster.render import picture_of
 
@@ -77,32 +74,22 @@ def test_how_many():
 
 def test_a_descent_ends_with_the_number_asked_for(backend):
     """As many in the first phase, more after it, and fewer after each round."""
-    with closing(descend(start_of(picture(), backend), SCHEDULE, STEPS)) as sets:
-        counts = [len(current) for current in sets]
+    counts = [len(g) for g in descend(start_of(picture(), backend), SCHEDULE, STEPS)]
     more = surplus_for(SCHEDULE, COUNT, SIDE * SIDE, STEPS - 10)
     assert more > 0
     assert set(counts[:11]) == {COUNT} and counts[11] == COUNT + more
     assert (np.diff(counts[11:]) <= 0).all() and counts[-1] == COUNT
 
 
-def test_a_recorded_step_serves_all_counts(backend, monkeypatch):
+def test_a_recorded_step_serves_all_counts(backend):
     """The program is recorded with the largest set; without recording the descent is the same."""
-
-    def end():
-        with closing(descend(start_of(picture(), backend), SCHEDULE, STEPS)) as sets:
-            for current in sets:
-                last = current
-        return dr.detach(last).to_arrays()
-
-    recorded = end()
-
-    @contextmanager
-    def unrecorded(function):
-        yield function
-
-    monkeypatch.setattr(module, "freeze_program", unrecorded)
-    for name, values in end().items():
-        np.testing.assert_array_equal(recorded[name], values)
+    ends = []
+    for recorded in (True, False):
+        with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, recorded):
+            *_, last = descend(start_of(picture(), backend), SCHEDULE, STEPS)
+            ends.append(last.to_arrays())
+    for name, values in ends[0].items():
+        np.testing.assert_array_equal(ends[1][name], values)
 
 
 def test_the_trace_shows_sets_of_the_number_asked_for():
@@ -134,32 +121,6 @@ def test_an_interrupt_in_between_leaves_the_number_asked_for(color, monkeypatch)
     best = max(row["psnr_ycbcr"] for row in result.trace)
     assert best >= result.trace[0]["psnr_ycbcr"]
     assert eg.psnr(result.image, image, "ycbcr") == pytest.approx(best, abs=1e-4)
-
-
-def test_an_interrupted_search_has_no_more_than_it_may():
-    """Pressed in the fit, while it has a surplus."""
-    image, most, pressed = eg.sample("coffee")[:64, :64], 100, []
-
-    def measure(gaussians):
-        return {"decibels": eg.psnr(picture_of(gaussians), image)}
-
-    def press(iteration, iterations, row):
-        pressed.extend([iteration] * (iteration == 100))  # at most 80 steps are tries
-
-    result = search_count(
-        start_of(image),
-        measure,
-        "decibels",
-        60.0,
-        most,
-        SCHEDULE,
-        200,
-        progress=press,
-        interrupted=lambda: bool(pressed),
-    )
-    assert (result.stopped, result.iterations) == ("interrupted", 100)
-    assert result.trace[-1]["gaussians"] == most
-    assert max(row["gaussians"] for row in result.trace) == most
 
 
 def test_an_interrupt_after_the_last_round_keeps_the_best_set_before_it():

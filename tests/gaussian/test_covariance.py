@@ -57,11 +57,6 @@ def test_eigenvalues(seed):
     np.testing.assert_allclose(max_deviation(*factor.T), np.sqrt(values[:, 1]), rtol=1e-9)
 
 
-def test_round_gaussians():
-    factor = np.array([[0.5, 0, 0.5], [3.0, 0, 3.0]])
-    np.testing.assert_allclose(max_deviation(*factor.T), [2, 1 / 3])
-
-
 @few
 @seeds
 def test_outlines_are_one_deviation_away(seed):

@@ -34,7 +34,7 @@ def test_files_come_back_bit_equal(backend, tmp_path, space):
     size=st.tuples(st.integers(1, 1 << 16), st.integers(1, 1 << 16)),
 )
 def test_any_numbers_come_back(tmp_path_factory, values, size):
-    path = tmp_path_factory.mktemp("any") / "x.npz"
+    path = tmp_path_factory.mktemp("any") / "x.bin"  # any suffix will do
     factor = np.abs(values[:, 2:5]) + np.float32(1e-30)
     arrays = {"mean": values[:, :2], "factor": factor, "color": values[:, 5:]}
     Gaussians.from_arrays(**arrays, size=size, space="data").save(path)
@@ -48,36 +48,6 @@ def test_files_of_attached_and_of_shared_values(backend, tmp_path):
     dr.enable_grad(gaussians.mean)
     gaussians.save(tmp_path / "x.npz")
     check_equal(Gaussians.load(tmp_path / "x.npz"), gaussians.to_arrays())
-
-
-def test_the_suffix_is_free(tmp_path):
-    random_scene().on("llvm").save(tmp_path / "fit.bin")
-    check_equal(Gaussians.load(tmp_path / "fit.bin"), arrays_of(random_scene()))
-
-
-def test_saving_that_fails_leaves_the_old_file(tmp_path):
-    resource = pytest.importorskip("resource")
-    path, limits = tmp_path / "x.npz", resource.getrlimit(resource.RLIMIT_FSIZE)
-    random_scene(0).on("llvm").save(path)
-    before = path.read_bytes()
-    resource.setrlimit(resource.RLIMIT_FSIZE, (500, limits[1]))  # as a disk that is full
-    try:
-        with pytest.raises(OSError, match=r"x\.npz"):
-            random_scene(1).on("llvm").save(path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["x.npz"]
-
-
-def test_saving_where_nothing_can_be_saved(tmp_path):
-    gaussians = random_scene().on("llvm")
-    for path in (tmp_path / "missing" / "x.npz", tmp_path):
-        with pytest.raises(OSError):
-            gaussians.save(path)
-        with pytest.raises(OSError):
-            Gaussians.load(path)
-    assert os.listdir(tmp_path) == []
 
 
 @pytest.mark.parametrize("cutoff", [2.0, 3.0, 4.5])

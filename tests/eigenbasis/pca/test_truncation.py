@@ -32,12 +32,6 @@ def low_rank(count, noise, seed):
     return (images + noise * drawn.normal(size=images.shape)).astype(np.float32)
 
 
-@pytest.fixture(scope="module")
-def others():
-    """Images of the family of `small_basis` that it was not made of."""
-    return family(6, seed=1)
-
-
 def test_held_out_images_tell_the_rank():
     """Noise of the training images alone is no reason to keep components of it."""
     basis = eg.Eigenbasis.from_images(

@@ -3,23 +3,13 @@
 import numpy as np
 
 from _helpers.placements import covariances_of, generator
-from _helpers.sets import covariances
 from eigengs_dr.fitting.start import place_random
-from eigengs_dr.gaussian.covariance import factor_from_covariance
 
 
 def test_seeds_differ():
     image = np.zeros((20, 30, 3), np.float32)
     first, second = (place_random(image, 50, generator(seed))[0] for seed in (1, 2))
     assert not np.array_equal(first, second)
-
-
-def test_inverse_factor():
-    rng = generator()
-    sigma = covariances(rng.uniform(0.1, 100, (200, 2)), rng.uniform(0, np.pi, 200))
-    factor = factor_from_covariance(sigma[:, 0, 0], sigma[:, 0, 1], sigma[:, 1, 1])
-    np.testing.assert_allclose(covariances_of(factor), sigma, rtol=1e-9, atol=1e-9)
-    assert (factor[:, [0, 2]] > 0).all()
 
 
 def test_random_is_uniform():

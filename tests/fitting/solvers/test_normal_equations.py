@@ -7,9 +7,7 @@ import pytest
 from hypothesis import given
 
 from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
-from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.fitting.solvers.normal_equations import RIDGE, NormalEquations, weight_matrix
-from eigengs_dr.raster.render import render
 
 
 def dense_matrix(scene, cutoff=np.inf):
@@ -32,14 +30,6 @@ def test_splat_matrix(backend, cutoff, scene):
     expected = dense_matrix(scene, cutoff)[:, :-1].T
     away = scene.off_edge(cutoff).ravel()
     np.testing.assert_allclose(matrix[:, away], expected[:, away], atol=1e-5)
-
-
-def test_splat_matrix_renders(backend):
-    """Its transpose times colours is what the renderer draws."""
-    scene = random_scene(3)
-    picture = weight_matrix(scene.on(backend)).T @ scene.color + scene.background
-    rendered = render(scene.on(backend)).numpy().reshape(-1, 3)
-    np.testing.assert_allclose(picture, rendered, atol=2e-6)
 
 
 def test_splats_outside_have_empty_rows(backend):
@@ -101,28 +91,6 @@ def test_solve_minimises_what_it_says(backend):
     assert np.abs(gradient).max() < 1e-3 * np.abs(correlations).max()
 
 
-def test_exact_colours_reproduce_a_rendering(backend):
-    scene = random_scene(5)
-    drawn = np.moveaxis(render(scene.on(backend)).numpy(), 2, 0)
-    equations = NormalEquations(scene.on(backend))
-    correlations = equations.correlate(drawn)
-    error = equations.error(
-        equations.solve(correlations), correlations, np.square(drawn).sum((1, 2))
-    )
-    assert (error / drawn[0].size < 1e-5).all()
-
-
-def test_solve_agrees_with_conjugate_gradients(backend):
-    scene = random_scene(6)
-    target = np.moveaxis(images(), 0, 2)
-    equations = NormalEquations(scene.on(backend))
-    correlations = equations.correlate(images())
-    found = equations.solve(correlations)
-    error = equations.error(found, correlations, np.square(target).sum((0, 1)))
-    iterated = solve(scene.on(backend), target, 200)
-    assert np.sqrt(error.sum() / target.size) == pytest.approx(iterated.residuals[-1], rel=1e-3)
-
-
 def test_error_is_that_of_the_rendering(backend):
     scene = random_scene(7)
     equations = NormalEquations(scene.on(backend))
@@ -170,10 +138,10 @@ def test_blocks_fit_what_is_left(backend):
     np.testing.assert_allclose(found[low:-1], np.linalg.solve(gram, matrix @ left), atol=2e-3)
 
 
-def test_a_matrix_too_large_is_refused(backend, monkeypatch):
-    monkeypatch.setattr("eigengs_dr.fitting.solvers.normal_equations.MAX_WEIGHTS", 100)
-    with pytest.raises(ValueError, match=r"the Gaussians cover [\d,]+ pixels in all, over 100"):
-        NormalEquations(random_scene().on(backend))
+def test_a_matrix_too_large_is_refused(backend):
+    scene = random_scene(size=(4096, 4096))._replace(factor=np.tile([1e-5, 0, 1e-5], (COUNT, 1)))
+    with pytest.raises(ValueError, match="cover 402,653,184 pixels in all, over 268,435,456; use"):
+        NormalEquations(scene.on(backend))
 
 
 def test_many_planes_at_once(backend):
