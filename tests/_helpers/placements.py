@@ -4,6 +4,8 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from _helpers.footprints import matrices
+
 
 def generator(seed=0):
     """A generator of random numbers."""
@@ -11,10 +13,8 @@ def generator(seed=0):
 
 
 def covariances_of(factor):
-    """Covariances of factors, shape (N, 2, 2)."""
-    a, b, c = np.asarray(factor, np.float64).T
-    matrix = np.array([[a, b], [np.zeros_like(a), c]]).transpose(2, 0, 1)
-    return np.linalg.inv(np.einsum("nji,njk->nik", matrix, matrix))
+    """Covariances of factors (N, 3), shape (N, 2, 2)."""
+    return matrices(*np.asarray(factor, np.float64).T)
 
 
 def check_placement(mean, factor, count, size):

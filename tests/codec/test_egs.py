@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import eigengs_dr as eg
-from _helpers.packed import SPACES, STEPS, peak
-from _helpers.sets import COUNT, SIZE, check_equal, few, random_scene, scenes
+from _helpers.packed import STEPS, peak
+from _helpers.sets import COUNT, few, random_scene, scenes
 from eigengs_dr.codec import egs as packed
 from eigengs_dr.codec.quantization import Steps, Symbols, quantize
 from eigengs_dr.codec.weights import SMALL
@@ -84,15 +84,6 @@ def test_files_of_many_and_of_few_gaussians_come_back(path, count, channels):
     before = content(random_scene(0, count, (200, 200), channels), sections=(count,))
     packed.write(path, before)
     assert rows_of(packed.read(path).sections[0]) == rows_of(before.sections[0])
-
-
-@pytest.mark.parametrize(("space", "channels"), SPACES)
-def test_sets_load_as_other_files_do(backend, tmp_path, space, channels):
-    before = content(random_scene(channels=channels), space)
-    packed.write(tmp_path / "x.bin", before)
-    found = eg.Gaussians.load(tmp_path / "x.bin", backend)
-    assert (found.width, found.height, found.space, found.channels) == (*SIZE, space, channels)
-    check_equal(found, packed.read(tmp_path / "x.bin").set_data().arrays)
 
 
 def test_reading_stops_after_the_sections_that_are_asked_for(path):

@@ -128,14 +128,6 @@ def test_any_size_and_aspect(backend, size, others):
     assert eg.psnr(eg.render(encoded), image, "ycbcr") > 25
 
 
-def test_grey_and_bytes(backend):
-    model = small_model(backend)
-    grey = (family(1)[0][..., 1] * 255).astype(np.uint8)
-    same = np.repeat(grey[..., None], 3, axis=2)
-    one, two = (eg.render(model.encode(image)).numpy() for image in (grey, same))
-    np.testing.assert_array_equal(one, two)
-
-
 def test_wrong_arguments(backend):
     model = small_model(backend)
     with pytest.raises(ValueError, match="coefficients have shapes"):
@@ -171,14 +163,6 @@ def test_few_or_equal_images(backend, kind, split):
         picture = eg.render(model.encode(images[0], *options)).numpy()
         assert np.isfinite(picture).all()
     assert fidelity(rendered(model, images[:1], "projected"), images[:1]) > 28
-
-
-def test_rgb(backend, others):
-    model = small_model(backend, space="rgb")
-    assert model.gaussians.space == "rgb"
-    basis = small_basis("rgb")
-    pca = fidelity([basis.reconstruct(basis.project(image)) for image in others], others)
-    assert fidelity(rendered(model, others, "projected"), others) > pca - 0.1
 
 
 def test_fit_refuses():

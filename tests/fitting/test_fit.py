@@ -85,15 +85,6 @@ def test_one_seed_gives_one_result(backend, preset):
     assert (figures(run(0, 6))[0] != figures(first)[0]) == (not eigen)
 
 
-def test_gaussianimage(backend):
-    """From random colours over black, with one rate."""
-    result = fit(picture(), SPLATS, 200, preset="gaussianimage", backend=backend)
-    check_sound(result, picture())
-    assert figures(result) == sorted(figures(result))
-    assert figures(result)[-1] > figures(result)[0] + 2
-    assert result.gaussians.to_arrays()["background"].tolist() == [0, 0, 0]
-
-
 @presets
 @pytest.mark.parametrize("value", [0.0, 0.3, 1.0])
 def test_constant_images(backend, preset, value):

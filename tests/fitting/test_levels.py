@@ -75,18 +75,6 @@ def test_every_level_gains_by_relocation(monkeypatch):
         assert reached(found[:count], image) > reached(left[:count], image) + 0.3
 
 
-def test_all_levels_make_the_image(image, result):
-    """Beside fits of their own, levels lose little; of a plain fit, as many are no image."""
-    plain = eg.fit(image, 256, iterations=150).gaussians
-    order = np.argsort(-removal_cost(plain, rgb_to_ycbcr(image)))
-    for count in level_counts(256, 3)[:-1]:
-        own = reached(eg.fit(image, count, iterations=150).gaussians, image)
-        level = reached(result.gaussians[:count], image)
-        assert level > own - 3
-        assert level > reached(plain[order[:count]], image) + 5
-    assert reached(result.gaussians, image) > reached(plain, image) - 3
-
-
 def test_any_number_between_is_better_than_the_level_before(image, result):
     counts = level_counts(256, 3)
     for low, high in pairwise(counts):
@@ -107,11 +95,6 @@ def test_the_picture_is_that_of_the_whole_set(image, result):
     np.testing.assert_array_equal(result.image, picture_of(result.gaussians))
     best = max(row["psnr_ycbcr"] for row in result.trace)
     assert reached(result.gaussians, image) == pytest.approx(best, abs=1e-3)
-
-
-def test_one_seed_gives_one_result(image):
-    a, b = (fit(image, 64, levels=2, iterations=5) for _ in range(2))
-    np.testing.assert_array_equal(a.image, b.image)
 
 
 def test_one_level_is_a_set_like_any(image):

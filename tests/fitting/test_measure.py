@@ -6,7 +6,6 @@ import pytest
 import eigengs_dr as eg
 from _helpers.sets import random_scene
 from eigengs_dr.fitting.measure import Shown, psnrs
-from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.metrics import float_space
 
 
@@ -37,21 +36,6 @@ def test_what_comes_on_top_counts(backend):
     image = near(picture + base)
     found = psnrs(gaussians, [Shown(image, "ycbcr", base=base)])[0, :, 0]
     np.testing.assert_allclose(found, expected(picture + base, image, "ycbcr"), atol=1e-3)
-
-
-def test_images_of_a_batch_are_for_themselves(backend):
-    """Bit for bit what each has alone."""
-    sets = [random_scene(seed=seed).on(backend, space="ycbcr") for seed in range(3)]
-    images = np.stack([near(eg.picture_of(g), k) for k, g in enumerate(sets)])
-    types = type(sets[0].background)
-    rows = [[g.background[c].numpy()[0] for g in sets] for c in range(3)]
-    whole = concatenate(sets)
-    batch = eg.Gaussians(
-        **{**vars(whole), "background": types([type(sets[0].background[0])(r) for r in rows])}
-    )
-    together = psnrs(batch, [Shown(images, "ycbcr")])
-    for k, (one, image) in enumerate(zip(sets, images, strict=True)):
-        np.testing.assert_array_equal(together[..., k], psnrs(one, [Shown(image, "ycbcr")])[..., 0])
 
 
 def test_a_set_without_error_has_no_finite_psnr(backend):

@@ -6,6 +6,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from _helpers.footprints import matrices
 from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.parameterization import (
@@ -48,12 +49,9 @@ def test_cholesky_coordinates(backend):
     ).to_arrays()
     l1, l2, l3 = variables["cholesky"] + np.array([[CHOLESKY_BOUND], [0], [CHOLESKY_BOUND]])
     lower = np.array([[l1, 0 * l1], [l2, l3]]).transpose(2, 0, 1)
-    a, b, c = moved["factor"].astype(float).T
-    factor = np.array([[a, b], [0 * a, c]]).transpose(2, 0, 1)
-    inverse = np.einsum("nji,njk->nik", factor, factor)
-    np.testing.assert_allclose(
-        np.linalg.inv(inverse), np.einsum("nij,nkj->nik", lower, lower), rtol=1e-4, atol=1e-4
-    )
+    covariance = matrices(*moved["factor"].astype(float).T)
+    expected = np.einsum("nij,nkj->nik", lower, lower)
+    np.testing.assert_allclose(covariance, expected, rtol=1e-4, atol=1e-4)
     expected = (np.tanh(variables["mean"].T) + 1) / 2 * SIZE
     np.testing.assert_allclose(moved["mean"], expected, rtol=1e-5)
 

@@ -128,30 +128,3 @@ def test_light_above_1_is_fitted_without_a_bound_by_default(light, space):
     assert eg.fit(light, space=space, encoding="linear", **SMALL).gaussians.space == "log"
     with pytest.raises(ImageError, match="light above 1; give the space 'log'"):
         eg.fit_large(light, gaussians=200, iterations=2, block=32, space=space, encoding="linear")
-
-
-@pytest.mark.mitsuba
-@pytest.mark.parametrize("emits", [False, True])
-def test_a_texture_of_light_shows_its_radiance(emits):
-    mi = pytest.importorskip("mitsuba")
-    from eigengs_dr.plugins import texture_of
-
-    mi.set_variant("llvm_ad_rgb")
-    eg.register_plugins()
-    bright = np.full((16, 16, 3), (9.0, 3.0, 0.5), np.float32)
-    texture = texture_of(eg.fit(bright, gaussians=4, iterations=30, encoding="linear"))
-    wall = {"type": "rectangle"}
-    if emits:
-        wall["emitter"] = {"type": "area", "radiance": texture}
-    else:
-        wall["bsdf"] = {"type": "diffuse", "reflectance": texture}
-    camera = {
-        "type": "perspective",
-        "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
-    }
-    camera |= {"fov": 20, "film": {"type": "hdrfilm", "width": 4, "height": 4}}
-    scene = {"type": "scene", "integrator": {"type": "direct"}, "camera": camera, "wall": wall}
-    if not emits:
-        scene["sky"] = {"type": "constant"}
-    seen = np.array(mi.render(mi.load_dict(scene), spp=64)).mean(axis=(0, 1))
-    np.testing.assert_allclose(seen, bright[0, 0], rtol=0.02)

@@ -38,12 +38,6 @@ def test_the_unit_of_colours_does_not_matter(unit):
     np.testing.assert_allclose(factors(unit * color), factors(color), rtol=1e-6)
 
 
-def test_sets_of_a_batch_are_for_themselves():
-    color = np.random.default_rng(0).normal(size=(2, 20, 3)) * [[[1.0]], [[9.0]]]
-    alone = [factors(part[None])[0] for part in color]
-    np.testing.assert_array_equal(factors(color), alone)
-
-
 def test_a_descent_starts_with_the_factors_of_its_set(backend):
     gaussians, schedule = random_scene().on(backend), PRESETS["default"].schedule
     found = start_descent(gaussians, schedule).rate_scale.numpy()

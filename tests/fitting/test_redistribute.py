@@ -1,16 +1,14 @@
 """Splats that move to where the error is."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from _helpers.halves import SIDE, fitted, picture
-from eigengs_dr.fitting.descent import descend
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.placement.adaptive import redistribute
-from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO, first_phase
+from eigengs_dr.fitting.schedule import first_phase
 from eigengs_dr.fitting.start import initialize
 from eigengs_dr.raster.render import render
 
@@ -33,28 +31,6 @@ def test_weights_draw_splats():
     weight[SIDE // 2 :] = 1e-3
     result = redistribute(start.gaussians, 60, target, target, weight)
     assert (result.mean.numpy()[1] < SIDE / 2).mean() > 0.7
-
-
-def test_fits_that_are_long_enough_rearrange_once():
-    image = picture()
-    calls = []
-    start = initialize(image, FitOptions(gaussians=60, init="adaptive"))
-
-    def rearrange(gaussians, count):
-        calls.append(count)
-        return start.control.redistribute(gaussians, count)
-
-    schedule = replace(PRESETS["default"].schedule, redistribute_after=2)
-    problem = start._replace(
-        control=SimpleNamespace(
-            redistributes=True, redistribute=rearrange, relocate=start.control.relocate
-        )
-    )
-    for steps, times in ((2 * MIN_PHASE_RATIO - 1, 0), (2 * MIN_PHASE_RATIO, 1)):
-        calls.clear()
-        sets = list(descend(problem, schedule, steps))
-        assert len(sets) == steps + 1
-        assert calls == [60] * times
 
 
 def test_the_first_phase_is_a_tenth_of_a_short_descent():

@@ -36,25 +36,6 @@ def test_the_set_of_a_map_renders_its_channels(backend):
         assert view.mean[0].index == m.mean[0].index  # one memory
 
 
-def test_derivatives_of_a_map_are_those_of_its_channels(backend):
-    dr = pytest.importorskip("drjit")
-    m = material(backend=backend)
-    gradients = []
-    for view in (m["roughness"], replace(m["roughness"], space="data")):
-        view = dr.detach(view)
-        dr.enable_grad(view.mean, view.color)
-        dr.backward(dr.sum(dr.square(eg.render(view).array)))
-        gradients.append([dr.grad(view.mean).numpy(), dr.grad(view.color).numpy()])
-    whole = dr.detach(m)
-    dr.enable_grad(whole.mean, whole.color)
-    image = eg.render(whole)
-    dr.backward(dr.sum(dr.square(image[..., 3].array)))
-    gradients.append([dr.grad(whole.mean).numpy(), dr.grad(whole.color[3]).numpy()[None]])
-    for mean, color in gradients[1:]:
-        np.testing.assert_allclose(mean, gradients[0][0], atol=1e-5)
-        np.testing.assert_allclose(color, gradients[0][1], rtol=1e-4, atol=1e-5)
-
-
 def test_names():
     m = material()
     assert repr(m) == "Gaussians(24, 22x17 pixels, maps albedo, roughness, normal, cutoff=3)"

@@ -54,23 +54,6 @@ def test_only_gaussians_that_touch_are_kept():
     assert (away[~kept] > np.stack(reaches(data), axis=1)[~kept] + 4).any(axis=1).all()
 
 
-def test_reach_is_where_a_gaussian_ends():
-    data = SetData(
-        {
-            "mean": np.array([[30, 20]], np.float32),
-            "factor": np.array([[0.5, 0.3, 0.4]], np.float32),
-            "color": np.ones((1, 1), np.float32),
-            "background": np.zeros(1, np.float32),
-        },
-        (60, 40),
-        "data",
-    )
-    rows, columns = np.nonzero(whole(data)[..., 0])
-    (across,), (down,) = reaches(data)
-    assert np.abs(columns + 0.5 - 30).max() == pytest.approx(across, abs=1)
-    assert np.abs(rows + 0.5 - 20).max() == pytest.approx(down, abs=1)
-
-
 def test_part_without_gaussians_is_background():
     data = random_set(1)
     data.arrays["mean"][:] = 2

@@ -182,36 +182,6 @@ def test_pullback_is_the_derivative_of_weights(types, steep):
         assert error <= precision(types, 3e-6, 1e-13) * size
 
 
-def test_pullback_against_finite_differences(types):
-    shape, x, y = draw()
-    everywhere = 10.0  # a cutoff beyond all points, so that no step crosses the edge
-    keep = squared_distance(shape, x, y).max(axis=0) * EXP2_SCALE**2 < everywhere**2
-    shape, x, y = shape[:, keep], x[keep], y[keep]
-    assert keep.sum() > COUNT / 4
-    upstream = np.random.default_rng(1).normal(size=(TILE[0] * TILE[1], keep.sum()))
-    found = weights_vjp(
-        scaled(types, shape),
-        *upload(types, x, y),
-        TILE,
-        everywhere,
-        pull_with(upload(types, *upstream)),
-    )
-    step = 1e-5
-    for k, derivative in enumerate(found):
-        moved = np.zeros((5, 1))
-        moved[k] = step
-        up, down = (
-            (upstream * np.exp(-0.5 * squared_distance(shape + s * moved, x, y))).sum(axis=0)
-            for s in (1, -1)
-        )
-        exact = (up - down) / (2 * step)
-        ours = derivative.numpy() * (EXP2_SCALE if k > 1 else 1)
-        scale = np.abs(exact).max()
-        np.testing.assert_allclose(
-            ours, exact, rtol=1e-4, atol=precision(types, 1e-5, 1e-7) * scale
-        )
-
-
 class TestWiden:
     @few
     @given(seed=st.integers(0, 1000))

@@ -127,9 +127,10 @@ def test_thousands_of_splats_on_one_pixel(backend):
     assert image[6, 6].min() > 500
 
 
-def test_all_splats_outside(backend):
+@pytest.mark.parametrize("away", [1e3, -1e9, 1e30])
+def test_all_splats_outside(backend, away):
     scene = random_scene(7)
-    scene = scene._replace(mean=scene.mean + 1000)
+    scene = scene._replace(mean=scene.mean + away)
     image = render(scene.on(backend)).numpy()
     np.testing.assert_array_equal(image, np.broadcast_to(np.float32(scene.background), image.shape))
 
@@ -178,9 +179,10 @@ def test_a_value_that_all_splats_share(backend, opaque):
     np.testing.assert_array_equal(image, render(gaussians))
 
 
-def test_a_splat_without_end(backend):
+@pytest.mark.parametrize("diagonal", [1e-15, 1e-25])
+def test_a_splat_without_end(backend, diagonal):
     """Standard deviations far beyond the image are a constant."""
-    scene = random_scene(11, count=1)._replace(factor=np.array([[1e-15, 0, 1e-15]]))
+    scene = random_scene(11, count=1)._replace(factor=np.array([[diagonal, 0, diagonal]]))
     image = render(scene.on(backend)).numpy()
     np.testing.assert_allclose(image, scene.exact(), atol=1e-6)
 

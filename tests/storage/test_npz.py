@@ -32,6 +32,13 @@ def test_arrays_come_back(path, compressed):
     assert npz.sizes_of(path).keys() == {"format", "version", *ARRAYS}
 
 
+def test_a_write_that_fails_leaves_the_old_file(path):
+    before = path.read_bytes()
+    with pytest.raises(TypeError, match="cannot pickle"):
+        npz.write(path, "some.format", 4, {**ARRAYS, "e": np.array([iter, (_ for _ in ())])})
+    assert path.read_bytes() == before and list(path.parent.iterdir()) == [path]
+
+
 @pytest.mark.parametrize(
     ("name", "version", "layout", "message"),
     [

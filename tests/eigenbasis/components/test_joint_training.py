@@ -67,16 +67,6 @@ def loss_of(state, waves, backend):
     return rows, dr.mean(dr.square(image - target))
 
 
-def test_loss_falls(backend):
-    """Until the last step, which follows a round that is not full."""
-    states = list(train_jointly(band(), 0, 2 * ROUND + 1, backend))
-    assert [int(state["step"]) for state in states] == [ROUND, 2 * ROUND, 2 * ROUND + 1]
-    states = [train(backend, 1), *states]
-    losses = [loss_of(state, band(), backend)[1][0] for state in states]
-    assert losses == sorted(losses, reverse=True)
-    assert losses[-1] < 0.9 * losses[0]
-
-
 def test_the_start_is_that_of_the_authors(backend):
     """The first step of Adan moves everything by its rate, but for what has no gradient."""
     state = train(backend, 1, band(splats=1000))

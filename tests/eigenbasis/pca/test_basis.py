@@ -65,10 +65,10 @@ def test_one_block_is_exact(space):
             assert abs(ours @ theirs) > 1 - 1e-6
 
 
-@pytest.mark.parametrize("length", [1, 7, 25, 59])
-def test_blocks_are_exact_while_the_rank_suffices(blocks_of, length):
+@pytest.mark.parametrize(("length", "shard"), [(1, 60), (7, 60), (25, 60), (59, 60), (7, 17)])
+def test_blocks_and_shards_are_exact_while_the_rank_suffices(blocks_of, length, shard):
     images = family(noise=0, directions=8)
-    blocks_of(length)
+    blocks_of(length, shard)
     basis = Eigenbasis.from_images(images, SIZE, 8)
     assert_orthonormal(basis)
     for c, reference in enumerate(exact(images)):

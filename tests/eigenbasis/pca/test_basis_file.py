@@ -39,18 +39,14 @@ def change(key, value):
     ("edit", "complaint"),
     [
         (lambda a: a.pop("mean"), "key 'mean' is missing"),
-        (lambda a: a.pop("components1"), "key 'components1' is missing"),
         (change("mean", np.zeros((2, HEIGHT, WIDTH), "f4")), r"mean has shape \(2, 11, 14\)"),
-        (change("mean", np.zeros((3, 0, 4), "f4")), r"mean has shape \(3, 0, 4\)"),
         (change("mean", np.zeros((3, 4, 4), "f4")), "key 'components0' claims shape"),
         (change("mean", np.zeros((3, HEIGHT, WIDTH))), "key 'mean' is 3-dimensional float64"),
         (change("mean", np.full((3, HEIGHT, WIDTH), np.nan, "f4")), "mean holds values that are"),
         (change("variance", np.ones(2)), r"variance has shape \(2,\)"),
         (change("variance", np.zeros(3)), "eigenvalues0 add up to more than variance 0"),
-        (change("variance", np.array([9, 9, np.inf])), "variance holds values that are not finite"),
         (change("eigenvalues2", np.arange(5.0)), "eigenvalues2 must descend"),
         (change("eigenvalues2", -np.arange(5.0)), "eigenvalues2 must descend and not be negative"),
-        (change("eigenvalues2", np.zeros(4)), r"'components2' claims shape \(5, 11, 14\)"),
         (
             change("eigenvalues2", np.zeros(1 << 20)),
             "eigenvalues2 has 1048576 values, more than pixels",

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from _helpers.low_rank import PIXELS, SIZE, assert_equal, family, planes
+from _helpers.low_rank import PIXELS, SIZE, family, planes
 from eigengs_dr.eigenbasis.pca import incremental
-from eigengs_dr.eigenbasis.pca.incremental import EigenState, empty_state, merge, merge_states
+from eigengs_dr.eigenbasis.pca.incremental import empty_state, merge, merge_states
 
 
 def test_rows_stay_orthonormal_when_variances_differ_much():
@@ -18,18 +18,6 @@ def test_rows_stay_orthonormal_when_variances_differ_much():
         state = merge(state, block, 40)
         overlap = state.rows.astype(np.float64) @ state.rows.T.astype(np.float64)
         assert np.abs(overlap - np.eye(len(state.rows))).max() < 1e-5
-
-
-def test_merging_can_stop_and_go_on():
-    """Arrays hold all of a state, and a merge leaves the state before alone."""
-    blocks, states = np.split(planes(family(40))[:, 0], 5), [empty_state(SIZE)]
-    for block in blocks:
-        states.append(merge(states[-1], block.copy(), 6))
-    again = EigenState.from_arrays(states[2].arrays())
-    for block in blocks[2:]:
-        again = merge(again, block.copy(), 6)
-    assert again.count == 40
-    assert_equal(again, states[-1])
 
 
 def test_merging_nothing_changes_nothing():

@@ -1,11 +1,10 @@
-"""PCA in shards: against scikit-learn, what merges lose, resuming, any order."""
+"""PCA in shards: what merges lose, resuming, any order."""
 
 from contextlib import suppress
 from itertools import count
 
 import numpy as np
 import pytest
-from sklearn.decomposition import PCA
 
 from _helpers.low_rank import SIZE, assert_equal, family, planes
 from eigengs_dr.backend.executor import Done
@@ -15,10 +14,8 @@ from eigengs_dr.image.io import ImageError, save_image
 
 
 @pytest.fixture(autouse=True)
-def small_shards(monkeypatch):
-    """Shards of 20 images in blocks of 5."""
-    monkeypatch.setattr(stream, "SHARD", 20)
-    monkeypatch.setattr(incremental, "MAX_BLOCK", 20)
+def small_shards(blocks_of):
+    blocks_of(20, shard=20)
 
 
 class Backwards:
@@ -39,21 +36,6 @@ def find(images, components=20, **options):
 def assert_same_states(first, second):
     for pair in zip(first, second, strict=True):
         assert_equal(*pair)
-
-
-def test_components_are_those_of_scikit_learn():
-    """Of a family whose rank no merge has to cut."""
-    images = family(110, noise=0)
-    basis = Eigenbasis.from_images(images, SIZE, 16)
-    for c in range(3):
-        channel = planes(images)[:, c].astype(np.float64)
-        reference = PCA(16).fit(channel)
-        np.testing.assert_allclose(basis.mean[c].ravel(), channel.mean(axis=0), atol=1e-6)
-        values = reference.explained_variance_ * 109 / 110
-        np.testing.assert_allclose(basis.eigenvalues[c], values, rtol=1e-4, atol=1e-7)
-        overlap = reference.components_ @ basis.components[c].reshape(16, -1).T
-        np.testing.assert_allclose(np.abs(np.diag(overlap)), 1, atol=1e-4)
-    assert basis.count == 110
 
 
 def test_merges_only_lose():

@@ -1,9 +1,5 @@
 """Lists of splats: complete and tight, against a test of every splat with every tile."""
 
-import subprocess
-import sys
-import textwrap
-
 import drjit as dr
 import numpy as np
 import pytest
@@ -14,7 +10,7 @@ from _helpers.tile_lists import GRID, RADIUS, upload
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.binning.lists import build_lists
-from eigengs_dr.raster.binning.tiles import GRANULARITY, TILE, Grid, for_each_tile
+from eigengs_dr.raster.binning.tiles import TILE, Grid, for_each_tile
 
 EDGE = 1e-3
 """Relative distance to the cutoff within which rounding may decide."""
@@ -87,12 +83,13 @@ def test_lists_are_complete_and_tight(backend, scene):
 
 
 def needles(rng):
-    """Stretched by up to 1:400, at every angle; the last ones with a weak a and a strong b."""
+    """Stretched by up to 1:400, at every angle; some with a weak a and a strong b, and bands."""
     variances = (
         np.stack([10 ** rng.uniform(0, 2, COUNT), 10 ** rng.uniform(-1.2, 0, COUNT)], 1) ** 2
     )
     factor = factors_of(covariances(variances, np.linspace(0, np.pi, COUNT)))
     factor[-6:] = [[a, b, c] for a in (0.01, 0.1) for b, c in ((4, 4), (-4, 4), (4, 0.05))]
+    factor[-8:-6] = [[1, 1, 1e-25], [1, -1, 1e-25]]  # without end
     return factor.astype(np.float32)
 
 
@@ -124,41 +121,6 @@ def test_lists_of_extreme_shapes(backend, shapes, spread):
     assert member.any()
 
 
-@pytest.mark.parametrize("diagonal", [1e-15, 1e-25], ids=["huge", "endless"])
-def test_a_huge_splat_is_in_all_lists(backend, diagonal):
-    mean, factor = np.full((COUNT, 2), 5.0), np.tile([diagonal, 0, diagonal], (COUNT, 1))
-    assert membership(lists_of(backend, mean, factor)).all()
-
-
-@pytest.mark.parametrize("slant", [1.0, -1.0])
-def test_an_endless_band(backend, slant):
-    """``|x + slant y| <= radius`` around the mean, at 45 degrees."""
-    mean = np.tile([[11.0, 8.0]], (COUNT, 1))
-    check_lists(backend, mean, np.tile([1.0, slant, 1e-25], (COUNT, 1)))
-
-
-def test_splats_outside_are_in_no_list(backend):
-    scene = random_scene()
-    angle = np.linspace(0, 2 * np.pi, COUNT)
-    mean = np.stack([np.cos(angle), np.sin(angle)], 1) * 1e3 + 10
-    mean[:4] = [[1e30, 5], [5, -1e30], [-1e9, -1e9], [1e9, 5]]
-    lists = lists_of(backend, mean, scene.factor)
-    assert not membership(lists).any()
-    assert not (lists.end - lists.begin).numpy().any()
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("position", range(5))
-def test_splats_that_are_not_finite_are_in_no_list(backend, value, position):
-    scene = random_scene(1)
-    parameters = np.concatenate([scene.mean, scene.factor], axis=1)
-    expected = membership(lists_of(backend, scene.mean, scene.factor))
-    parameters[3::5, position] = value
-    expected[3::5] = False
-    found = membership(lists_of(backend, parameters[:, :2], parameters[:, 2:]))
-    np.testing.assert_array_equal(found, expected)
-
-
 @pytest.mark.parametrize(
     ("size", "tile"),
     [
@@ -173,24 +135,6 @@ def test_grids(backend, size, tile):
     assert grid.pixels == tile[0] * tile[1]
     scene = random_scene(2)
     check_lists(backend, scene.mean * np.array(size) / SIZE, scene.factor, grid)
-
-
-def test_lanes_are_all_tiles_by_length_within_windows(backend):
-    scene = random_scene(4)
-    lists = lists_of(backend, scene.mean, scene.factor)
-    assert sorted(lists.order.numpy()) == list(range(lists.grid.tiles))
-    length = (lists.end - lists.begin).numpy().astype(int)
-    if GRANULARITY[backend].ordered:  # this image is one window
-        assert (np.diff(length) <= 0).all()
-    else:
-        np.testing.assert_array_equal(lists.order.numpy(), np.arange(lists.grid.tiles))
-
-
-def test_lists_are_deterministic(backend):
-    scene = random_scene(5)
-    first, second = (lists_of(backend, scene.mean, scene.factor) for _ in range(2))
-    for name in ("splat", "begin", "end", "order"):
-        np.testing.assert_array_equal(getattr(first, name).numpy(), getattr(second, name).numpy())
 
 
 @few
@@ -223,25 +167,8 @@ def test_the_walk_visits_the_lists(backend):
 
 
 @pytest.mark.slow
-def test_too_many_entries_are_refused():
-    program = """
-        import numpy as np
-        import eigengs_dr as eg
-
-        count, side = 65537, 1024  # each in all 65536 tiles
-        gaussians = eg.Gaussians.from_arrays(
-            np.full((count, 2), side / 2), np.tile([1e-4, 0, 1e-4], (count, 1)),
-            np.ones((count, 1)), size=(side, side), space="data",
-        )
-        try:
-            eg.render(gaussians)
-        except ValueError as error:
-            print("refused:", error)
-    """
-    found = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(program)],
-        capture_output=True,
-        text=True,
-        timeout=280,
-    )
-    assert found.stdout.startswith("refused:"), found.returncode
+def test_too_many_entries_are_refused(backend):
+    count, side = 65537, 1024  # each in all 65536 tiles
+    mean, factor = np.full((count, 2), side / 2), np.tile([1e-4, 0, 1e-4], (count, 1))
+    with pytest.raises(ValueError, match="65537 Gaussians touch 4295032832 tiles, the limit is"):
+        lists_of(backend, mean, factor, Grid(side, side))
