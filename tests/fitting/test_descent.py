@@ -1,4 +1,4 @@
-"""Descent: the steps, their rates and weights, on any image."""
+"""Descent and refinement: the steps, their rates, weights and lists, on any image."""
 
 from dataclasses import replace
 
@@ -8,12 +8,21 @@ import pytest
 from drjit import JitFlag
 
 import eigengs_dr as eg
-from _helpers.waves import SIDE, default, presets, start
-from eigengs_dr.backend.arrays import types_in
+from _helpers.sets import Scene, random_scene
+from _helpers.waves import SIDE, SPLATS, default, figures, picture, presets, start
+from eigengs_dr.backend.arrays import types_in, upload_rows
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.descent import FitProblem, descend, rate_table
+from eigengs_dr.fitting.descent import (
+    MAX_RATE_SCALE,
+    FitProblem,
+    descend,
+    rate_scale_of,
+    rate_table,
+    start_descent,
+)
 from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.fitting.placement.adaptive import residual
+from eigengs_dr.fitting.refine import refine
 from eigengs_dr.fitting.schedule import lr_factor, next_build
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import bin_gaussians
@@ -133,3 +142,74 @@ def test_weights(backend):
     np.testing.assert_array_equal(colors(other, weight), left)
     np.testing.assert_array_equal(colors(target), plain)
     assert not np.array_equal(left, plain)
+
+
+def factors_of_rates(color, exponent=0.5, backend="llvm"):
+    """Factors (M, N) of the Gaussians of M images, for colours (M, N, C)."""
+    types = types_in(select(backend), 64)
+    rows = upload_rows(types.Float, color.reshape(-1, color.shape[2]).T)
+    return rate_scale_of(rows, exponent, len(color)).numpy().reshape(color.shape[:2])
+
+
+@pytest.mark.parametrize(
+    ("color", "expected"),
+    [
+        ([[0.3, 0.4, 0.0], [0.0, 0.0, 1.0], [-1.5, 0.0, 0.0]], [2**0.5, 1, 1.5**-0.5]),
+        ([[0.0], [1e-30], [1.0], [1e6]], [MAX_RATE_SCALE] * 3 + [1 / MAX_RATE_SCALE]),
+        ([[0.0], [0.0]], [1, 1]),
+    ],
+)
+def test_rates_fall_with_the_root_of_the_colour(backend, color, expected):
+    """Within bounds, and unless there is no colour at all."""
+    np.testing.assert_allclose(
+        factors_of_rates(np.array([color]), backend=backend), [expected], rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("unit", [1e-3, 50.0])
+def test_the_unit_of_colours_does_not_matter(unit):
+    color = np.random.default_rng(0).normal(size=(2, 20, 3))
+    np.testing.assert_allclose(factors_of_rates(unit * color), factors_of_rates(color), rtol=1e-6)
+
+
+def test_a_descent_starts_with_the_factors_of_its_set(backend):
+    gaussians, schedule = random_scene().on(backend), PRESETS["default"].schedule
+    found = start_descent(gaussians, schedule).rate_scale.numpy()
+    color = gaussians.to_arrays()["color"].astype(np.float64)
+    expected = factors_of_rates(color[None], schedule.rate_exponent)[0]
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert start_descent(gaussians, replace(schedule, rate_exponent=0.0)).rate_scale is None
+
+
+@presets
+def test_refinement_descends(backend, preset):
+    gaussians, target = start(backend)
+    result = refine(FitProblem(gaussians, target), picture(), PRESETS[preset].schedule, 100)
+    psnrs = figures(result)
+    assert [row["iteration"] for row in result.trace] == [0, 10, 20, 50, 100]
+    assert psnrs == sorted(psnrs)
+    assert psnrs[-1] > psnrs[0] + 1
+    assert (result.iterations, result.stopped) == (100, "iterations")
+
+
+def test_other_runs_change_nothing(backend):
+    """Programs of other counts, sizes and rates between two equal runs."""
+    gaussians, target = start(backend)
+    first = figures(refine(FitProblem(gaussians, target), picture(), default(), 10))
+    for count in (200, 50, 1):
+        problem = FitProblem(*start(backend, count))
+        refine(problem, picture(), default(rates=default().rates), 10)
+    refine(FitProblem(gaussians, target), picture(), PRESETS["gaussianimage"].schedule, 10)
+    assert figures(refine(FitProblem(gaussians, target), picture(), default(), 10)) == first
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_all_splats_on_one_pixel(backend, seed):
+    rng = np.random.default_rng(seed)
+    mean, factor = np.full((SPLATS, 2), 16.0), np.tile([0.5, 0, 0.5], (SPLATS, 1))
+    color = rng.uniform(0, 1e-3, (SPLATS, 3))
+    gaussians = Scene(mean, factor, color, np.zeros(3), (SIDE, SIDE)).on(backend, space="ycbcr")
+    result = refine(FitProblem(gaussians, rgb_to_ycbcr(picture())), picture(), default(), 60)
+    assert np.isfinite(figures(result)).all()
+    assert all(np.isfinite(v).all() for v in result.gaussians.to_arrays().values())
+    assert figures(result)[-1] > figures(result)[0] + 1

@@ -1,16 +1,12 @@
 """Forms of covariances against linear algebra in double precision."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from _helpers.log_shapes import factors_from_log_shapes
 from _helpers.sets import few
-from eigengs_dr.backend.selection import select
 from eigengs_dr.gaussian.covariance import (
-    cholesky_from_factor,
-    factor_from_cholesky,
     factor_from_covariance,
     log_shapes,
     max_deviation,
@@ -75,20 +71,3 @@ def test_logarithms_there_and_back(seed):
     shape = log_shapes(factor)
     np.testing.assert_allclose(factors_from_log_shapes(shape), factor, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(np.exp(-shape[:, 0]), np.linalg.det(covariance) ** 0.25, rtol=1e-6)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_cholesky_factors(backend, seed):
-    factor, covariance = draw(seed)
-    well = np.linalg.cond(covariance) < 1e4
-    Float = select(backend).Float64
-    given = [Float(np.ascontiguousarray(k)) for k in factor[well].T]
-    l1, l2, l3 = (np.array(v) for v in cholesky_from_factor(*given))
-    expected = np.linalg.cholesky(covariance[well])
-    tolerance = {"rtol": 1e-4, "atol": 1e-6}  # square roots of cuda have 20 bits
-    np.testing.assert_allclose(l1, expected[:, 0, 0], **tolerance)
-    np.testing.assert_allclose(l2, expected[:, 1, 0], **tolerance)
-    np.testing.assert_allclose(l3, expected[:, 1, 1], **tolerance)
-    back = factor_from_cholesky(Float(l1), Float(l2), Float(l3))
-    for found, value in zip(back, given, strict=True):
-        np.testing.assert_allclose(np.array(found), np.array(value), **tolerance)

@@ -1,4 +1,4 @@
-"""Rendering: against a float64 sum over all pairs, of good and of bad numbers."""
+"""Rendering: against a float64 sum over all pairs, of good and of bad numbers and arguments."""
 
 import math
 from dataclasses import replace
@@ -27,10 +27,11 @@ from _helpers.sets import (
 from _helpers.waves import SIDE, SPLATS
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.gaussian.file import CUTOFF
+from eigengs_dr.gaussian.file import CUTOFF, MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.color import rgb_to_ycbcr, ycbcr_to_rgb
 from eigengs_dr.raster.binning.tiles import TILE, Grid
+from eigengs_dr.raster.reference import render_exact
 from eigengs_dr.raster.render import (
     picture_of,
     render,
@@ -227,3 +228,74 @@ def test_tiles_of_any_memory_layout(backend, size, layout):
     np.testing.assert_array_equal(to_tensor(tiles, grid, 5).numpy(), image)
     outside = grid.tiles * grid.pixels - width * height
     assert (tiles.numpy() == 0).sum() == 5 * outside
+
+
+def test_reference_is_the_formula():
+    """``exp(-1/2 d^T Sigma^-1 d)`` with the covariances from which the factors came."""
+    rng = np.random.default_rng(0)
+    covariance = covariances(rng.uniform(0.5, 9, (COUNT, 2)), rng.uniform(0, np.pi, COUNT))
+    mean, color = rng.uniform(-2, 24, (COUNT, 2)), rng.normal(size=(COUNT, 3))
+    found = render_exact(mean, factors_of(covariance), color, np.array([1.0, 2, 3]), *SIZE)
+    row, column = 4, 11
+    d = np.array([column + 0.5, row + 0.5]) - mean
+    weight = np.exp(-0.5 * np.einsum("ni,nij,nj->n", d, np.linalg.inv(covariance), d))
+    np.testing.assert_allclose(found[row, column], [1, 2, 3] + weight @ color, rtol=1e-12)
+    assert found.shape == (SIZE[1], SIZE[0], 3)
+
+
+@pytest.mark.parametrize(
+    ("asked", "size"),
+    [
+        ({}, SIZE),
+        ({"width": 44}, (44, 34)),
+        ({"height": 34}, (44, 34)),
+        ({"width": 44, "height": 34}, (44, 34)),
+        ({"width": 10, "height": 30}, (10, 30)),
+        ({"width": 1}, (1, 1)),
+        ({"height": 1}, (1, 1)),
+    ],
+)
+def test_size_arguments(backend, asked, size):
+    """Positions and lengths scale with each side: means by s, factors by 1 / s."""
+    scene = random_scene(4)
+    image = render(scene.on(backend), **asked).numpy()
+    assert image.shape == (size[1], size[0], 3)
+    sx, sy = size[0] / SIZE[0], size[1] / SIZE[1]
+    larger = scene._replace(
+        mean=scene.mean * [sx, sy], factor=scene.factor / [sx, sy, sy], size=size
+    )
+    clear = larger.off_edge(CUTOFF, 1e-3)
+    np.testing.assert_allclose(image[clear], larger.exact(CUTOFF)[clear], rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("cutoff", [0, -1.0, math.nan, math.inf, np.nextafter(12.0, 13)])
+def test_bad_cutoff(backend, cutoff):
+    with pytest.raises(ValueError, match="cutoff") as error:
+        render(random_scene().on(backend), cutoff=cutoff)
+    assert "\n" not in str(error.value)
+
+
+def test_widest_cutoff(backend):
+    scene = random_scene(5)
+    image = render(scene.on(backend), cutoff=MAX_CUTOFF).numpy()
+    assert (np.abs(image - scene.exact()) <= bound(scene, 1e-5)).all()
+
+
+@pytest.mark.parametrize("asked", [{"width": 0}, {"height": 0}, {"width": -3, "height": 5}])
+def test_bad_size(backend, asked):
+    with pytest.raises(ValueError, match="at least 1") as error:
+        render(random_scene().on(backend), **asked)
+    assert "\n" not in str(error.value)
+
+
+def test_size_beyond_32_bits_is_refused_before_it_is_allocated(backend):
+    with pytest.raises(ValueError, match="37838x37838 pixels and 3 channels has") as error:
+        render(random_scene().on(backend), width=37838, height=37838)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("kind", [int, np.float64, np.float32])
+def test_numbers_of_other_types(backend, kind):
+    gaussians = random_scene().on(backend)
+    image = render(gaussians, width=np.int64(10), height=np.int64(8), cutoff=kind(3))
+    np.testing.assert_array_equal(image, render(gaussians, width=10, height=8, cutoff=3.0))

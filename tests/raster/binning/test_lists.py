@@ -1,4 +1,4 @@
-"""Pieces of the lists: their transpose, Gaussian by Gaussian."""
+"""Pieces of the lists, which are their transpose, and the order of lanes."""
 
 import drjit as dr
 import numpy as np
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from _helpers.sets import few, scenes
 from _helpers.tile_lists import GRID, RADIUS, upload
-from eigengs_dr.raster.binning.lists import build_lists
+from eigengs_dr.raster.binning.lists import PACKET, build_lists, order_lanes
 from eigengs_dr.raster.binning.tiles import GRANULARITY, Grid
 
 
@@ -64,3 +64,20 @@ def test_pieces_are_the_transpose(backend, scene, pad, growth):
     splat = np.empty(len(slot), int)
     splat[slot] = lists.pieces.splat.numpy()
     np.testing.assert_array_equal(splat[: len(owner)], owner)
+
+
+def test_windows_keep_neighbours_together():
+    """Without empty lanes: by window, then by descending length, equal lengths as they were."""
+    window = np.repeat([0, 1, 2], 50)
+    length = np.random.default_rng(0).integers(1, 9, 150)
+    order = order_lanes(length, window)
+    np.testing.assert_array_equal(order, np.lexsort((np.arange(150), -length, window)))
+
+
+def test_empty_packets_are_dealt_out():
+    """Every quarter of the lanes has a quarter of the work."""
+    length = np.concatenate([np.full(64 * PACKET, 8), np.zeros(32 * PACKET, int)])
+    order = order_lanes(length, np.arange(len(length)) // 256)
+    assert sorted(order) == list(range(len(length)))
+    work = length[order].reshape(4, -1).sum(axis=1)
+    assert np.ptp(work) <= PACKET * 8
