@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.footprints import matrices
 from eigengs_dr.blocks.draw import draw
-from eigengs_dr.gaussian.file import SetData, crop, reaches
+from eigengs_dr.gaussian.file import CUTOFF, SetData, crop
 
 
 def random_set(count=200, size=(96, 64), space="ycbcr"):
@@ -50,8 +51,10 @@ def test_only_gaussians_that_touch_are_kept():
     part = crop(data, (40, 30), (8, 8))
     assert 0 < len(part.arrays["mean"]) < len(data.arrays["mean"])
     kept = np.isin(data.arrays["color"][:, 0], part.arrays["color"][:, 0])
-    away = np.abs(data.arrays["mean"] - (44, 34))
-    assert (away[~kept] > np.stack(reaches(data), axis=1)[~kept] + 4).any(axis=1).all()
+    variances = np.diagonal(matrices(*data.arrays["factor"].T.astype(float)), axis1=1, axis2=2)
+    away = np.abs(data.arrays["mean"] - (44, 34)) - CUTOFF * np.sqrt(variances)
+    assert kept[(away <= 4).all(axis=1)].all()
+    assert not kept[(away > 5.1).any(axis=1)].any()
 
 
 def test_part_without_gaussians_is_background():
