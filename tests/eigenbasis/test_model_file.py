@@ -6,6 +6,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.command import said
 from _helpers.families import family, fidelity, rendered, small_basis, small_model, splits
+from _helpers.sets import check_equal
 from eigengs_dr.eigenbasis import model_file as modelfile
 from eigengs_dr.storage import npz as archive
 
@@ -52,8 +53,7 @@ def test_save_and_load(backend, split, path):
     for name in ("low", "low_components", "components"):
         assert getattr(again, name) == getattr(model, name)
     assert again.gaussians.space == model.gaussians.space
-    for name, array in model.gaussians.to_arrays().items():
-        np.testing.assert_array_equal(again.gaussians.to_arrays()[name], array)
+    check_equal(again.gaussians, model.gaussians.to_arrays())
     for one, two in zip(again.weights, model.weights, strict=True):
         largest = np.abs(two).max(axis=1, keepdims=True)
         assert (np.abs(one - two) <= largest * 2**-11).all()

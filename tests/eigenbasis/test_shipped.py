@@ -7,6 +7,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.families import SPLATS, small_model
+from _helpers.sets import check_equal
 from eigengs_dr.eigenbasis.eigengs import SHIPPED, EigenGS
 from train_natural import DEMO, crops
 
@@ -45,7 +46,6 @@ def test_a_model_travels_as_arrays(backend):
     model = small_model(backend)
     assert model.encoder
     again = pickle.loads(pickle.dumps(model))
-    for name, values in model.gaussians.to_arrays().items():
-        np.testing.assert_array_equal(again.gaussians.to_arrays()[name], values)
+    check_equal(again.gaussians, model.gaussians.to_arrays())
     for first, second in zip(model.weights, again.weights, strict=True):
         np.testing.assert_array_equal(first, second)

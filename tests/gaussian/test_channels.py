@@ -7,6 +7,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.materials import MAPS, material
+from _helpers.sets import check_equal
 from eigengs_dr.gaussian.channels import TextureMap, check_maps, slices, usual_space
 from eigengs_dr.gaussian.file import maps_of, read_head, read_map
 from eigengs_dr.raster.reference import render_exact
@@ -68,8 +69,7 @@ def test_a_file_holds_it_all(tmp_path):
     m.save(tmp_path / "m.npz")
     again = eg.Gaussians.load(tmp_path / "m.npz")
     assert again.maps == m.maps
-    for name, values in m.to_arrays().items():
-        np.testing.assert_array_equal(again.to_arrays()[name], values)
+    check_equal(again, m.to_arrays())
     head = read_head(tmp_path / "m.npz")
     assert (head.gaussians, head.size, head.maps) == (24, (22, 17), MAPS)
     assert maps_of(tmp_path / "m.npz") == MAPS

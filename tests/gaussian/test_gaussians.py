@@ -174,8 +174,7 @@ def test_sets_in_double_precision(backend, tmp_path):
     arrays = arrays_of(random_scene())
     arrays = {name: np.asarray(array, np.float64) + 1e-9 for name, array in arrays.items()}
     g = Gaussians.from_arrays(**arrays, size=SIZE, space="data", backend=backend, dtype=np.float64)
-    for name, array in g.to_arrays().items():
-        np.testing.assert_array_equal(array, arrays[name])
+    check_equal(g, arrays)
     single = Gaussians.from_arrays(**arrays, size=SIZE, space="data", backend=backend)
     picture = render(g)
     assert picture.numpy().dtype == np.float64

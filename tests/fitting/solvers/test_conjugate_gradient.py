@@ -6,7 +6,7 @@ import pytest
 from drjit import JitFlag
 from hypothesis import given
 
-from _helpers.sets import SIZE, Scene, few, random_scene, scenes
+from _helpers.sets import SIZE, Scene, check_equal, few, random_scene, scenes
 from _helpers.solves import matrix, noise, rms, roomy, true_residual
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.raster.render import render
@@ -55,8 +55,7 @@ def test_shapes_stay(backend):
     solved = solve(gaussians, noise(), steps=3).gaussians
     for name in ("mean", "factor"):
         np.testing.assert_array_equal(solved.to_arrays()[name], before[name])
-    for name, value in gaussians.to_arrays().items():
-        np.testing.assert_array_equal(value, before[name])
+    check_equal(gaussians, before)
     assert (solved.width, solved.height, solved.space) == (*SIZE, "rgb")
 
 
@@ -106,8 +105,7 @@ def test_solutions_are_bit_equal(backend):
             found.append(solve(gaussians, noise(), steps=4))
     for other in found[1:]:
         assert other.residuals == found[0].residuals
-        for name, value in found[0].gaussians.to_arrays().items():
-            np.testing.assert_array_equal(value, other.gaussians.to_arrays()[name])
+        check_equal(other.gaussians, found[0].gaussians.to_arrays())
 
 
 @pytest.mark.parametrize("warm_start", [False, True])
