@@ -29,6 +29,13 @@ def matrix(scene, cutoff=CUTOFF):
     return np.concatenate([unit.exact(cutoff).reshape(pixels, -1), np.ones((pixels, 1))], axis=1)
 
 
+def best_colors(scene, image, cutoff=CUTOFF):
+    """The colours and the background that fit an image best, in float64, and their error."""
+    a, pixels = matrix(scene, cutoff), image.reshape(-1, image.shape[2]).astype(float)
+    found = np.linalg.lstsq(a, pixels, rcond=None)[0]
+    return found[:-1], found[-1], rms(a @ found - pixels)
+
+
 def noise(channels=3, size=SIZE, seed=0):
     image = np.random.default_rng(seed).uniform(0, 1, (size[1], size[0], channels))
     return image.astype(np.float32)

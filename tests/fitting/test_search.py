@@ -118,58 +118,46 @@ def test_an_image_that_is_fitted_without_error(space, value):
     assert (len(result.gaussians), result.stopped, result.psnr_rgb) == (1, "met", np.inf)
 
 
+SCHEDULE = PRESETS["default"].schedule
+
+
+def searched(measure, iterations=40, most=1000, image=None, schedule=SCHEDULE, progress=None):
+    """Search for 0 dB, from 60 splats, where ``measure(gaussians)`` returns decibels."""
+    image = picture() if image is None else image
+    start = initialize(image, FitOptions(gaussians=60, init="adaptive"))
+    row = lambda gaussians: {"decibels": measure(gaussians)}  # noqa: E731
+    return search_count(start, row, "decibels", 0.0, most, schedule, iterations, progress)
+
+
 def test_a_search_whose_goal_is_not_met_ends():
     """Where every round adds a splat or two, by the steps that it has taken."""
-    start = initialize(picture(), FitOptions(gaussians=60, init="adaptive"))
-    result = search_count(
-        start,
-        lambda gaussians: {"decibels": 18.0},
-        "decibels",
-        20.0,
-        10**5,
-        PRESETS["default"].schedule,
-        40,
-    )
+    result = searched(lambda gaussians: -2.0, most=10**5)
     assert result.stopped == "out of reach" and result.iterations <= 100
 
 
 @pytest.mark.parametrize("octave", [2.5, 4.0, 9.0])
 def test_a_search_learns_what_more_splats_gain(octave):
     """Where only their number counts: the fewest are found at any slope."""
-    start = initialize(picture(), FitOptions(gaussians=60, init="adaptive"))
-    schedule = PRESETS["default"].schedule
-
-    def measure(gaussians):
-        return {"decibels": octave * np.log2(len(gaussians) / 150)}
-
-    result = search_count(start, measure, "decibels", 0.0, 1000, schedule, 40)
+    result = searched(lambda gaussians: octave * np.log2(len(gaussians) / 150))
     assert result.stopped == "met"
     assert 150 <= len(result.gaussians) <= 152
 
 
-def searched(measure):
-    """Search for 0 dB, from 60 splats, with descents that move nothing.
+def searched_at_rest(measure):
+    """Search with descents of 1,000 steps that move nothing.
 
     ``measure(gaussians, steps)`` returns decibels, where `steps` lists those of all descents.
     """
-    start = initialize(picture(), FitOptions(gaussians=60, init="adaptive"))
-    still = replace(
-        PRESETS["default"].schedule,
-        rates=dict.fromkeys(("mean", "factor", "color"), 0.0),
-        relocate_every=0,
-        surplus=0.0,
-    )
+    rates = dict.fromkeys(SCHEDULE.rates, 0.0)
+    still = replace(SCHEDULE, rates=rates, relocate_every=0, surplus=0.0)
     taken, steps = [0], []
 
     def judge(gaussians):
         if taken[-1] > sum(steps):
             steps.append(taken[-1] - sum(steps))
-        return {"decibels": measure(gaussians, steps)}
+        return measure(gaussians, steps)
 
-    def told(step, planned, row):
-        taken.append(step)
-
-    result = search_count(start, judge, "decibels", 0.0, 1000, still, 1000, told)
+    result = searched(judge, 1000, schedule=still, progress=lambda step, *_: taken.append(step))
     assert result.stopped == "met"
     return result, steps
 
@@ -178,7 +166,7 @@ def searched(measure):
 @pytest.mark.parametrize("needed", [60, 150])
 def test_a_search_tries_more_than_once_and_fits_once(octave, needed):
     """Where only their number counts, of which the search begins with 60."""
-    _, steps = searched(lambda g, _: octave * np.log2(len(g) / needed))
+    _, steps = searched_at_rest(lambda g, _: octave * np.log2(len(g) / needed))
     assert steps[:2] == [100, 100]
     assert steps.count(1000) == 1
 
@@ -194,7 +182,7 @@ def test_a_search_adds_nothing_where_steps_lead_to_the_goal():
         settled = sum(count for count in steps if count not in (100, 1000))
         return 4 * np.log2(len(gaussians) / needed) + 0.0005 * settled
 
-    result, _ = searched(measure)
+    result, _ = searched_at_rest(measure)
     after = [row for row in result.trace if row["iteration"] > 1000]
     assert after[0]["decibels"] < 0  # the end of the fit
     assert (np.diff([row["gaussians"] for row in after]) <= 0).all()
@@ -211,16 +199,14 @@ def test_a_search_goes_on_where_the_fit_just_meets_the_goal():
         settled = sum(count for count in steps if count not in (100, 1000))
         return 4 * np.log2(len(gaussians) / needed) + 0.001 + settled / 600
 
-    result, _ = searched(measure)
+    result, _ = searched_at_rest(measure)
     assert len(result.gaussians) < fitted[0]
 
 
 def test_a_search_ends_where_no_place_is_left_to_grow():
     """After four tries of 4 steps and a fit of 40 steps, where nothing is missed."""
     black = np.zeros((SIDE, SIDE, 3), np.float32)
-    start = initialize(black, FitOptions(gaussians=60, init="adaptive"))
-    schedule = PRESETS["default"].schedule
-    result = search_count(start, lambda g: {"decibels": 18.0}, "decibels", 20.0, 1000, schedule, 40)
+    result = searched(lambda gaussians: -2.0, image=black)
     assert result.stopped == "out of reach"
     assert result.iterations <= 56
 

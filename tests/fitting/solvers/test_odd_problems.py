@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from _helpers.sets import COUNT, SIZE, random_scene, scene_of
-from _helpers.solves import matrix, noise, rms, roomy
+from _helpers.solves import best_colors, noise, rms, roomy
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.raster.render import render
 
@@ -16,9 +16,8 @@ from eigengs_dr.raster.render import render
 def test_cutoffs(backend, cutoff):
     scene, image = roomy(), noise()
     solution = solve(replace(scene.on(backend), cutoff=cutoff), image, steps=40)
-    pixels = image.reshape(-1, 3).astype(float)
-    best = np.linalg.lstsq(matrix(scene, cutoff), pixels, rcond=None)[0]
-    np.testing.assert_allclose(solution.gaussians.to_arrays()["color"], best[:-1], atol=1e-4)
+    best, *_ = best_colors(scene, image, cutoff)
+    np.testing.assert_allclose(solution.gaussians.to_arrays()["color"], best, atol=1e-4)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (9, 1), (5, 4), (5, 13)])
@@ -55,9 +54,7 @@ def test_splats_all_the_same(backend):
     """As good as one of them, after any number of steps."""
     found = [scene_of(np.full((COUNT, 8), value)) for value in np.linspace(0.3, 0.7, 21)]
     for scene in (scene_of(np.full((COUNT, 8), 0.52654237)), *found):
-        pixels = noise().reshape(-1, 3).astype(float)
-        a = matrix(scene.permuted([0]))
-        best = rms(a @ np.linalg.lstsq(a, pixels, rcond=None)[0] - pixels)
+        *_, best = best_colors(scene.permuted([0]), noise())
         residuals = solve(scene.on(backend), noise(), steps=40).residuals
         assert residuals[-1] == pytest.approx(best, rel=1e-4)
         assert (np.diff(residuals) <= 1e-6).all()
