@@ -1,4 +1,4 @@
-"""Two pixels, and what Pillow says of a file."""
+"""Two pixels, what Pillow says of a file, and the arrays of a file."""
 
 import numpy as np
 from PIL import Image
@@ -10,3 +10,9 @@ def property_of(path, name):
     """Open a file with Pillow itself and ask it for its mode or format."""
     with Image.open(path) as file:
         return getattr(file, name)
+
+
+def members_of(path):
+    """The arrays of an .npz file, without its format and version."""
+    with np.load(path, allow_pickle=False) as file:
+        return {key: file[key] for key in file if key not in ("format", "version")}

@@ -1,11 +1,10 @@
 """Frozen programs, and what the garbage collector must not do while they are recorded."""
 
 import gc
-import subprocess
-import sys
 
 import pytest
 
+from _helpers.process import run_python
 from eigengs_dr.backend.recording import freeze_program
 from eigengs_dr.backend.selection import select
 
@@ -35,7 +34,7 @@ with freeze_program(program) as call:
 
 
 def test_arrays_of_numpy_in_cycles_do_not_end_the_process():
-    done = subprocess.run([sys.executable, "-c", LITTER], capture_output=True, text=True)
+    done = run_python(LITTER)
     assert (done.returncode, done.stdout) == (0, "[3, 5, 7] True\n"), done.stderr
 
 

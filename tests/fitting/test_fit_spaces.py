@@ -58,14 +58,3 @@ def test_data_is_taken_as_it_is(backend, preset, channels):
     assert result.image.shape == data.shape
     np.testing.assert_array_equal(result.image, render(result.gaussians).numpy())
     assert figures(result)[-1] > figures(result)[0] + 1
-
-
-@pytest.mark.parametrize("init", ["adaptive", "grid", "random"])
-def test_data_of_one_channel(backend, init):
-    """Of two axes or of three; what three equal channels give, if one is enough."""
-    data = picture()[..., 0]
-    one = fit(data, SPLATS, 20, init=init, space="data", backend=backend)
-    same = fit(data[..., None], SPLATS, 20, init=init, space="data", backend=backend)
-    assert one.gaussians.channels == same.gaussians.channels == 1
-    np.testing.assert_array_equal(one.image, same.image)
-    assert figures(one)[-1] > 20

@@ -1,11 +1,11 @@
 """The memory of a fit, said beforehand."""
 
 import json
-import subprocess
 import sys
 
 import pytest
 
+from _helpers.process import run_python
 from eigengs_dr.fitting.memory import check_memory, estimate_memory, usable_memory
 
 
@@ -77,6 +77,5 @@ print(json.dumps(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024))
 @pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss has another unit elsewhere")
 def test_estimate_is_near_the_measured_memory():
     """If this fails after a change of the renderer, measure the constants again."""
-    done = subprocess.run([sys.executable, "-c", FIT], capture_output=True, text=True, check=True)
-    measured = json.loads(done.stdout.splitlines()[-1])
+    measured = json.loads(run_python(FIT).stdout.splitlines()[-1])
     assert estimate_memory(1024, 1024, 3, 80_000) == pytest.approx(measured, rel=0.4)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.files import members_of
 from _helpers.materials import MAPS, material
 from _helpers.sets import check_equal
 from eigengs_dr.gaussian.channels import TextureMap, check_maps, slices, usual_space
@@ -104,10 +105,7 @@ def test_hostile_files(tmp_path, case):
     changes, words = HOSTILE[case]
     path = tmp_path / "m.npz"
     material().save(path)
-    with np.load(path, allow_pickle=False) as file:
-        members = {k: v for k, v in dict(file).items() if k not in ("format", "version")}
-    members |= changes
-    members = {k: v for k, v in members.items() if v is not None}
+    members = {k: v for k, v in (members_of(path) | changes).items() if v is not None}
     npz.write(path, "eigengs_dr.material", 1, members)
     with pytest.raises(ValueError, match=words) as error:
         eg.Gaussians.load(path)

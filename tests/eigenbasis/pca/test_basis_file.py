@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from _helpers.files import members_of
 from _helpers.low_rank import HEIGHT, WIDTH, assert_same, basis_of
 from eigengs_dr.eigenbasis.pca import basis_file as basisfile
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
@@ -24,9 +25,7 @@ def test_saved_and_loaded_is_the_same(tmp_path):
 def test_files_of_version_1_are_read(tmp_path):
     """They have training images too."""
     basis_of("rgb").save(tmp_path / "a.npz")
-    with np.load(tmp_path / "a.npz") as file:
-        arrays = {key: file[key] for key in file if key not in ("format", "version")}
-    arrays["examples"] = np.zeros((16, HEIGHT, WIDTH, 3), "f4")
+    arrays = members_of(tmp_path / "a.npz") | {"examples": np.zeros((16, HEIGHT, WIDTH, 3), "f4")}
     archive.write(tmp_path / "a.npz", basisfile.FORMAT, 1, arrays)
     assert_same(Eigenbasis.load(tmp_path / "a.npz"), basis_of("rgb"))
 
@@ -64,8 +63,7 @@ def change(key, value):
 def test_files_that_do_not_fit_together(tmp_path, edit, complaint):
     path = tmp_path / "a.npz"
     basis_of("rgb").save(path)
-    with np.load(path) as file:
-        arrays = {key: file[key] for key in file if key not in ("format", "version")}
+    arrays = members_of(path)
     edit(arrays)
     archive.write(path, basisfile.FORMAT, basisfile.VERSION, arrays)
     with pytest.raises(ValueError, match=complaint) as error:
