@@ -83,6 +83,8 @@ def test_one_seed_gives_one_result(backend, preset):
     assert figures(first) == figures(second)
     check_equal(second.gaussians, first.gaussians.to_arrays())
     assert (figures(run(0, 6))[0] != figures(first)[0]) == (not eigen)
+    if preset == "gaussianimage":
+        assert not first.gaussians.to_arrays()["background"].any()
 
 
 @presets
