@@ -6,7 +6,7 @@ try:
     import mitsuba  # noqa: F401
 except ImportError as error:
     raise ImportError(
-        f"the plugins need Mitsuba ({error}): pip install 'mitsuba==3.9.*'"
+        f"the plugins need Mitsuba ({error}): pip install 'mitsuba>=3.9,<4'"
     ) from error
 
 from .cone import pixel_angle

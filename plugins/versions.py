@@ -1,6 +1,7 @@
 """The one place for what differs between versions of Mitsuba.
 
-After 3.9, `mitsuba.Texture` may become `mitsuba.Field`, and 3.10 has footprints of rays.
+3.10 has footprints of rays (pull request 1964) and finds plugins by itself (1943, see `entry`).
+Pull request 1885, which is open, turns `mitsuba.Texture` into `mitsuba.Field`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from eigengs_dr.backend.arrays import Float
+from eigengs_dr.backend.arrays import Bool, Float
+from eigengs_dr.image.color import rendered_as
 
 Texture = Any
 """A ``mitsuba.Texture`` of the current variant."""
@@ -39,8 +41,54 @@ def texture_kind() -> Any:
 
 
 def register_texture(name: str, create: Callable[[Properties], Texture]) -> None:
-    """Register a texture with the current variant, by the type of the plugin in scenes."""
-    _renamed(mi, "register_texture", "register_field")(name, create)
+    """Register a texture with the current variant, by the type of the plugin in scenes.
+
+    Parameters
+    ----------
+    name : str
+    create : callable
+        A subclass of `texture_class`, or a function that refuses the properties.
+    """
+    if hasattr(mi, "register_texture"):
+        mi.register_texture(name, create)
+    else:
+        mi.register_field(name, _as_field(create) if isinstance(create, type) else create)
+
+
+def _as_field(texture: Any) -> type:
+    """Return a class of textures with what the class `mitsuba.Field` asks for besides.
+
+    A field says what it holds, and is asked for that by one method for each kind. C++ passes the
+    arguments of a field before `active`, in some of its methods; a texture takes none.
+    """
+    kinds = mi.FieldValueType
+
+    class SurfaceField(texture):
+        def out_type(self) -> Any:
+            if self.channels == 1:
+                return kinds.Float
+            light = rendered_as(self.space) and not self.raw
+            return kinds.Spectrum if mi.is_spectral and light else kinds.Color3
+
+        def domain(self) -> Any:
+            return mi.FieldDomain.Surface
+
+        def supports_jit(self) -> bool:
+            return True
+
+        def supports_surface_queries(self) -> bool:
+            return True
+
+        def eval_1(self, si: Interaction, *rest: Any, active: Bool = True) -> Any:
+            return super().eval_1(si, rest[-1] if rest else active)
+
+        def eval_color3(self, si: Interaction, *rest: Any, active: Bool = True) -> Any:
+            return super().eval_3(si, rest[-1] if rest else active)
+
+        def eval_spec(self, si: Interaction, *rest: Any, active: Bool = True) -> Any:
+            return super().eval(si, rest[-1] if rest else active)
+
+    return SurfaceField
 
 
 def has_footprints() -> bool:

@@ -113,7 +113,7 @@ def load_mitsuba(variant: str | None, quiet: bool) -> ModuleType:
     try:
         import mitsuba as mi
     except ImportError as error:
-        advice = "install it: pip install 'mitsuba==3.9.*'"
+        advice = "install it: pip install 'mitsuba>=3.9,<4'"
         raise ValueError(f"scenes need Mitsuba ({error}); {advice}") from error
     from ..plugins import register_plugins
 

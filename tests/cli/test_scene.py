@@ -139,7 +139,7 @@ def test_mistaken_options(options, words, scene, tmp_path):
 def test_without_mitsuba(scene, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     result = run("scene", scene(), "-o", tmp_path / "x.png")
-    assert_refused(result, "pip install 'mitsuba==3.9.*'")
+    assert_refused(result, "pip install 'mitsuba>=3.9,<4'")
 
 
 def test_convert(tmp_path):

@@ -63,6 +63,14 @@ def test_the_footprint_goes_before_the_angle():
     np.testing.assert_allclose(wide, seen(wider, si), rtol=1e-4)
 
 
+def test_any_two_conjugate_diameters_say_the_same(new):
+    """The ellipse decides, and not the pair of diameters that span it."""
+    tex, si, turn = texture(gaussians("linear"), prefilter=True), interaction(), np.radians(35)
+    turned = pixel() @ [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    found = seen(tex, with_footprint(si, turned))
+    np.testing.assert_allclose(found, seen(tex, with_footprint(si, pixel())), rtol=1e-4)
+
+
 def test_without_a_cone_the_angle_decides():
     tex, si = texture(gaussians("linear"), prefilter=ANGLE), interaction()
     np.testing.assert_allclose(

@@ -2,14 +2,12 @@
 
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import pytest
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 import eigengs_dr as eg  # noqa: E402
 from _helpers.texture import gaussians, texture  # noqa: E402
-from eigengs_dr.plugins import versions  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -44,12 +42,3 @@ class TestFound:
         )
         found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
         assert "give one of filename" in found.stdout, found.stderr
-
-    def test_textures_that_are_called_fields(self, monkeypatch):
-        """As a version after 3.9 may do."""
-        made = {}
-        later = SimpleNamespace(Field=mi.Texture, register_field=made.__setitem__)
-        monkeypatch.setattr(versions, "mi", later)
-        assert versions.texture_class() is mi.Texture
-        versions.register_texture("bark", "create")
-        assert made == {"bark": "create"}
