@@ -78,7 +78,7 @@ def make_survey(texture: Texture) -> Survey:
         dr.eval(shape, color)
         smallest = _smallest_deviation(shape, color)
         columns, lines, spacing = _grid(texture, smallest)
-        cells, deviation = table.cells, RESOLVED * spacing
+        cells, deviation = table.lists.cells, RESOLVED * spacing
         if deviation > 1.001 * smallest:
             variance, zero = dr.opaque(mi.Float, deviation**2), mi.Float(0)
             shape, amplitude = widen(shape, kernel_covariance([variance, zero, variance]))

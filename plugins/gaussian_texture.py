@@ -47,31 +47,44 @@ def gaussian_texture() -> type:
         The Gaussians come from `filename`, from `model`, or from the arrays of a set, as
         `eigengs_dr.plugins.texture_of` writes them.
 
-        Properties
+        Parameters
         ----------
-        filename : str
-            Path of a set from ``eigengs-dr fit`` or `Gaussians.save`, or of a material. Textures
-            of one file share memory and lookups, each until one of its parameters changes.
-        map : str
-            With the `filename` of a material: the name of the map, such as "roughness".
-        first : int
-            With `filename`: number of Gaussians to use, from the first. Any number works for
-            level-of-detail sets. By default all.
-        model, coefficients
-            Path of an `EigenGS` model and, optionally, coefficients (C, k).
-        to_uv : transform
-            Transform of uv before the lookup.
-        wrap_mode : {"repeat", "mirror", "clamp"}
-            Continuation of the texture outside of its borders; by default "repeat".
-        raw : bool
-            Return values without decoding and clamping; by default false.
-        prefilter : float or bool
-            Angle of a pixel in radians, at least 0 and below 1, see
-            `eigengs_dr.plugins.pixel_angle`. Lookups average over the footprint of the pixel; 0,
-            the default, looks at points. Footprints that rays carry (Mitsuba 3.10) go before the
-            angle, and true takes them alone. Slopes of bump maps (`eval_1_grad`) ignore footprints.
-        cutoff : float
-            Radius of a Gaussian in standard deviations; by default the cutoff of the set.
+        filename : string
+            A set of Gaussians, an ``.npz`` or ``.egs`` file; relative to the scene. Textures of one
+            file share memory and lookups, each until one of its parameters changes.
+        map : string
+            With the `filename` of a set with maps: the name of a map, such as ``roughness``.
+        first : integer, default: all
+            With `filename`: use this many Gaussians, from the first; for sets fitted in levels.
+        model : string
+            Instead of `filename`: a model, as ``eigengs-dr train`` writes it.
+        coefficients : tensor (C, k), default: 0
+            With `model`: one row a channel; 0 is the mean image.
+        mean : tensor (N, 2)
+            Instead of `filename`: x, y in pixels.
+        factor : tensor (N, 3)
+            a, b, c in 1 / pixels.
+        color : tensor (N, C)
+            C is 1 or 3, in the space of the set.
+        background : tensor (C,)
+            Value without Gaussians; `texture_of` writes it as (1, C).
+        width, height : integer
+            With `mean`: native size in pixels.
+        space : string
+            With `mean`: ``ycbcr``, ``rgb``, ``linear``, ``data``, ``normal``, ``radiance`` or
+            ``log``; the last two have no upper bound.
+        to_uv : transform, default: identity
+            Applied to uv before the lookup; it must be invertible.
+        wrap_mode : string, default: repeat
+            What lies outside: ``repeat``, ``mirror`` or ``clamp``.
+        raw : boolean, default: false
+            Return values as they are, neither decoded nor clamped.
+        prefilter : float or boolean, default: 0
+            Angle of a pixel in radians, below 1, see `pixel_angle`: lookups average over the
+            footprint of the pixel; 0 looks at points. Footprints that rays carry (Mitsuba 3.10) go
+            before the angle, and ``true`` takes them alone. Slopes of bump maps ignore footprints.
+        cutoff : float, default: that of the set
+            Standard deviations after which a Gaussian ends, above 0 and at most 12.
         """
 
         @guest()  # a thread of Mitsuba, whose caller may hold the lock
@@ -123,7 +136,7 @@ def gaussian_texture() -> type:
                 shape = decode(dr.detach(source.tensors)).shape
                 lists = list_gaussians(shape, (self.width, self.height), *settings)
             else:
-                lists = self.table.cells, self.table.sizes
+                lists = self.table.lists
             self.table = make_table(lists, self.cutoff, source.tensors, decode)
             self.part = slice(None)
 
@@ -160,7 +173,7 @@ def gaussian_texture() -> type:
         def eval_1_grad(self, si: Interaction, active: Bool = True) -> Any:
             (x, sx), (y, sy), inside = self.point(si.uv)
             packed = replace(self.table.packed, arranged=None)  # the copies have no gradients
-            cells, terms = self.table.cells, gradient_terms(packed.radius)
+            cells, terms = self.table.lists.cells, gradient_terms(packed.radius)
             count = 3 * packed.channels
             sums = sum_at_points(cells, packed, x, y, inside & active, terms, count)
             values, along, down = (sums[k::3][self.part] for k in range(3))

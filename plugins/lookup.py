@@ -20,6 +20,7 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.arrays import Bool, Float
+from eigengs_dr.raster.binning.lists import TileLists
 from eigengs_dr.raster.lookup.footprint import arrange, bound_covariance
 from eigengs_dr.raster.lookup.points import (
     Cells,
@@ -36,6 +37,7 @@ from eigengs_dr.raster.lookup.pyramid import (
     build_pyramid,
     is_minified,
     levels_of,
+    list_finest,
     pyramid_mean,
     sum_pyramid,
 )
@@ -46,8 +48,24 @@ from .color import keep_finite
 from .parameters import Arrays, SharedFile, derived
 from .versions import Interaction
 
-Lists = tuple[Cells, SizeClasses | None]
-"""The Gaussians near every point of an image, and with a prefilter those near every footprint."""
+
+@dataclass(frozen=True)
+class Lists:
+    """What lookups need of the shapes of Gaussians, whatever their colours.
+
+    Attributes
+    ----------
+    cells : Cells
+        The Gaussians near every point of an image.
+    sizes : SizeClasses or None
+        The Gaussians near every footprint; None without a prefilter.
+    finest : TileLists or None
+        Those of the finest level of the pyramid; None where nobody will change colours.
+    """
+
+    cells: Cells
+    sizes: SizeClasses | None
+    finest: TileLists | None = None
 
 
 def list_gaussians(
@@ -65,9 +83,9 @@ def list_gaussians(
     """
     if filtered:
         sizes = classify_by_size(shape, *size, cutoff, wrap)
-        return sizes.listed[0][1], sizes  # slopes and the survey look at points
+        return Lists(sizes.listed[0][1], sizes)  # slopes and the survey look at points
     side = cell_side(*size, dr.width(shape))
-    return list_cells(shape, *size, kernel_radius(cutoff), side), None
+    return Lists(list_cells(shape, *size, kernel_radius(cutoff), side), None)
 
 
 @dataclass(frozen=True)
@@ -76,8 +94,7 @@ class Table:
 
     Attributes
     ----------
-    cells, sizes
-        See `Lists`.
+    lists : Lists
     packed : Packed
     background : list of Float, shape (1,)
     pyramid : GaussianPyramid or None
@@ -86,8 +103,7 @@ class Table:
         Mean of the sums; empty without a prefilter.
     """
 
-    cells: Cells
-    sizes: SizeClasses | None
+    lists: Lists
     packed: Packed
     background: list
     pyramid: GaussianPyramid | None
@@ -98,7 +114,11 @@ def make_table(
     lists: Lists, cutoff: float, inputs: Arrays, decode: Callable[[Arrays], KernelParameters]
 ) -> Table:
     """Compute what lookups read; derivatives flow back to the `inputs` of `decode`."""
-    cells, sizes = lists
+    cells, sizes, finest = lists.cells, lists.sizes, lists.finest
+    derivatives = dr.grad_enabled(inputs)
+    if sizes and (finest is None or (derivatives and finest.pieces is None)):
+        shape, size = decode(dr.detach(inputs)).shape, (sizes.width, sizes.height)
+        finest = list_finest(shape, *size, kernel_radius(cutoff), derivatives)
 
     def compute(inputs: Arrays) -> Arrays:
         parameters = decode(inputs)
@@ -107,13 +127,13 @@ def make_table(
             "packed": pack_parameters([*shape, *color]),
             "background": [keep_finite(b) for b in parameters.background],
         }
-        if sizes is None:
+        if sizes is None or finest is None:
             found["arranged"] = in_list_order(cells.splat, [*shape, *color])
             dr.eval(found)
             return found
         found["arranged"] = arrange(cells.splat, shape, color)
         dr.eval(found)
-        pyramid = build_pyramid(sizes, Packed(found["packed"], len(color), cutoff))
+        pyramid = build_pyramid(sizes, Packed(found["packed"], len(color), cutoff), finest)
         found |= {"values": pyramid.values, "average": pyramid_mean(pyramid)}
         dr.eval(found["average"])
         return found
@@ -125,7 +145,8 @@ def make_table(
         levels = levels_of(sizes.width, sizes.height)
         pyramid = GaussianPyramid(sizes.wrap, channels, levels, found["values"])
     packed = Packed(found["packed"], channels, cutoff, found["arranged"])
-    return Table(cells, sizes, packed, background, pyramid, found.get("average", []))
+    kept = replace(lists, finest=finest)
+    return Table(kept, packed, background, pyramid, found.get("average", []))
 
 
 def table_of_file(file: SharedFile, cutoff: float, wrap: str, filtered: bool) -> Table:
@@ -137,7 +158,8 @@ def table_of_file(file: SharedFile, cutoff: float, wrap: str, filtered: bool) ->
     if key not in file.tables:
         parameters, size = file.parameters(), (file.gaussians.width, file.gaussians.height)
         lists = list_gaussians(parameters.shape, size, *key)
-        file.tables.setdefault(key, make_table(lists, cutoff, {}, lambda _: parameters))
+        table = make_table(lists, cutoff, {}, lambda _: parameters)
+        file.tables.setdefault(key, replace(table, lists=lists))
     return file.tables[key]
 
 
@@ -219,7 +241,7 @@ def sum_here(table: Table, x: Float, y: Float, active: Bool) -> list:
 
     def look_up(table: Table, x: Float, y: Float) -> list:
         terms = value_terms(table.packed.radius)
-        return sum_at_points(table.cells, table.packed, x, y, active, terms)
+        return sum_at_points(table.lists.cells, table.packed, x, y, active, terms)
 
     return _with_gradient(look_up, table, x, y)
 
@@ -247,20 +269,21 @@ def sum_over_footprint(
     # The slopes of `fold` turn a footprint in mirrored images. They also take away its width along
     # an axis on which the point lies outside of a clamped image.
     (x, sx), (y, sy) = column, row
-    assert table.sizes and table.pyramid
-    sx, sy = sx * table.sizes.width, sy * table.sizes.height
+    sizes, pyramid = table.lists.sizes, table.pyramid
+    assert sizes and pyramid
+    sx, sy = sx * sizes.width, sy * sizes.height
     inverse, valid = seen
     unit, blind = bound_covariance(inverse)
     squares = (sx * sx, sx * sy, sy * sy)
     footprint = [dr.select(valid, f * s, 0) for f, s in zip(unit, squares, strict=True)]
     blind &= valid & (sx * sy != 0)
-    distant = is_minified(table.pyramid, footprint)
+    distant = is_minified(pyramid, footprint)
     near, wide = active & ~distant, active & distant & ~blind
 
     def look_up(table: Table, x: Float, y: Float) -> list:
-        assert table.sizes and table.pyramid
-        pyramid = table.pyramid
-        sharp = sum_prefiltered(table.sizes, table.packed, x, y, footprint, near)
+        sizes, pyramid = table.lists.sizes, table.pyramid
+        assert sizes and pyramid
+        sharp = sum_prefiltered(sizes, table.packed, x, y, footprint, near)
         far = where_any(wide, lambda: sum_pyramid(pyramid, x, y, footprint, wide), table.packed)
         seen = [dr.select(distant, f, n) for f, n in zip(far, sharp, strict=True)]
         return [dr.select(blind, m, s) for m, s in zip(table.average, seen, strict=True)]

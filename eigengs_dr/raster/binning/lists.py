@@ -109,6 +109,7 @@ def build_lists(
     pad: Float = 0.0,
     growth: float = 1.0,
     adjoint: bool = True,
+    ordered: bool = True,
 ) -> TileLists:
     """List for every tile the Gaussians whose cutoff ellipse touches it.
 
@@ -130,6 +131,8 @@ def build_lists(
         Factor by which an ellipse is enlarged, so that lists stay valid while Gaussians grow.
     adjoint : bool, optional
         Whether to list the tiles of each Gaussian too.
+    ordered : bool, optional
+        Whether lanes are to be ordered by their work, where the backend gains from it.
 
     Returns
     -------
@@ -173,7 +176,7 @@ def build_lists(
     dr.eval(tile)
     transpose = transpose_by_counting if types.backend == "llvm" else transpose_by_sorting
     splat, starts = transpose(types, grid.tiles, tile, last, entries, dr.width(tile))
-    order, begin, end = _lanes(types, grid, starts)
+    order, begin, end = _lanes(types, grid, starts, ordered and share.ordered)
     lists = TileLists(grid, sizes, splat, begin, end, order, image, pieces, dr.width(splat), steep)
     dr.eval(lists)
     return lists
@@ -241,10 +244,10 @@ def _emit_tiles(
     return tiles
 
 
-def _lanes(types: ArrayTypes, grid: Grid, starts: UInt) -> tuple[Any, Any, Any]:
+def _lanes(types: ArrayTypes, grid: Grid, starts: UInt, ordered: bool) -> tuple[Any, Any, Any]:
     """Return the order of the tiles, and the ranges of their lists in this order."""
     tile = dr.arange(types.UInt, grid.tiles)
-    if granularity_of(types).ordered:
+    if ordered:
         length = np.diff(starts.numpy().astype(np.int64))
         x, y = np.arange(grid.nx) // TILE_WINDOW, np.arange(grid.ny) // TILE_WINDOW
         window = (x + y[:, None] * (x[-1] + 1)).ravel()

@@ -112,7 +112,7 @@ def list_cells(shape: list, width: int, height: int, radius: float, side: int) -
     """
     grid = Grid(width, height, (side, side))
     # Lists are built for pixel centres; half a pixel of padding makes them valid for all points.
-    lists = build_lists(shape, radius, grid, pad=0.5, adjoint=False)
+    lists = build_lists(shape, radius, grid, pad=0.5, adjoint=False, ordered=False)
     types = types_of(shape[0])
     ends = dr.empty(types.UInt, 2 * grid.tiles)
     dr.scatter(ends, types.UInt2(lists.begin, lists.end), lists.order)

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 
 from ...backend.arrays import ArrayTypes, Bool, Float, UInt, rcp, rsqrt, types_of
-from ..binning.lists import build_lists
+from ..binning.lists import TileLists, build_lists
 from ..binning.tiles import Grid
 from ..evaluate import falloff, widen
 from ..parameters import (
@@ -227,7 +227,28 @@ def levels_of(width: int, height: int) -> tuple[Level, ...]:
     return tuple(levels)
 
 
-def build_pyramid(sizes: SizeClasses, packed: Packed) -> GaussianPyramid:
+def list_finest(shape: list, width: int, height: int, radius: float, adjoint: bool) -> TileLists:
+    """List the Gaussians of the finest level, for `build_pyramid`; colours do not matter.
+
+    Parameters
+    ----------
+    shape : list of 5 Float, shape (N,)
+    width, height, radius
+        As for `eigengs_dr.raster.lookup.points.list_cells`.
+    adjoint : bool
+        Whether the colours or shapes of the pyramid have derivatives.
+    """
+    blur = _blur(types_of(shape[0]), levels_of(width, height)[0])
+    widened, _ = widen(dr.detach(shape), kernel_covariance(blur))
+    return build_lists(widened, radius, Grid(width, height), adjoint=adjoint)
+
+
+def _blur(types: ArrayTypes, level: Level) -> list:
+    """Return the covariance xx, xy, yy by which the values of a level are blurred."""
+    return [types.Float((SAMPLE_DEVIATION * d) ** 2) for d in (level.dx, 0, level.dy)]
+
+
+def build_pyramid(sizes: SizeClasses, packed: Packed, finest: TileLists) -> GaussianPyramid:
     """Evaluate a sum of Gaussians at the points of all levels; differentiable.
 
     Cost: a rendering of the blurred Gaussians for the finest level, and one
@@ -238,6 +259,8 @@ def build_pyramid(sizes: SizeClasses, packed: Packed) -> GaussianPyramid:
     ----------
     sizes : SizeClasses
     packed : Packed
+    finest : TileLists
+        From `list_finest`.
     """
     types = types_of(packed.values)
     levels, parts = levels_of(sizes.width, sizes.height), list[Float]()
@@ -245,13 +268,13 @@ def build_pyramid(sizes: SizeClasses, packed: Packed) -> GaussianPyramid:
         index = dr.arange(types.UInt, level.nx * level.ny)
         x = (types.Float(index % level.nx) + 0.5) * level.dx
         y = (types.Float(index // level.nx) + 0.5) * level.dy
-        blur = [types.Float((SAMPLE_DEVIATION * d) ** 2) for d in (level.dx, 0, level.dy)]
+        blur = _blur(types, level)
         if parts:
             finer = (replace(levels[number - 1], first=0),)
             pyramid = GaussianPyramid(sizes.wrap, packed.channels, finer, parts[-1])
             seen = sum_pyramid(pyramid, x, y, blur, types.Bool(True))
         else:
-            seen = _finest(sizes, packed, x, y, blur)
+            seen = _finest(sizes, packed, finest, x, y, blur)
         parts.append(pack_parameters(seen))
         dr.eval(parts[-1])
     values = dr.concat(parts)
@@ -259,7 +282,9 @@ def build_pyramid(sizes: SizeClasses, packed: Packed) -> GaussianPyramid:
     return GaussianPyramid(sizes.wrap, packed.channels, levels, values)
 
 
-def _finest(sizes: SizeClasses, packed: Packed, x: Float, y: Float, blur: list) -> list:
+def _finest(
+    sizes: SizeClasses, packed: Packed, lists: TileLists, x: Float, y: Float, blur: list
+) -> list:
     """Return the blurred sum at all pixels: widen all Gaussians once, and render them.
 
     At the border, copies of the image and the part of a Gaussian inside the image count too.
@@ -269,12 +294,8 @@ def _finest(sizes: SizeClasses, packed: Packed, x: Float, y: Float, blur: list) 
     shape, color = packed.gather_all()
     shape, amplitude = widen(shape, kernel_covariance(blur))
     color = [amplitude * c for c in color]
-    grid = Grid(width, height)
-    lists = build_lists(
-        dr.detach(shape), packed.radius, grid, adjoint=dr.grad_enabled(packed.values)
-    )
     parameters = KernelParameters(shape, color, [types.Float(0) for _ in color])
-    image = to_tensor(rasterize(parameters, lists, packed.cutoff), grid, len(color)).array
+    image = to_tensor(rasterize(parameters, lists, packed.cutoff), lists.grid, len(color)).array
     border = math.ceil(FOOTPRINT_REACH * SAMPLE_DEVIATION * FINEST)
     edge = (x < border) | (x > width - border) | (y < border) | (y > height - border)
     ring = dr.compress(edge)

@@ -33,8 +33,9 @@ def arrays_of(gaussians, wrap, cutoff=CUTOFF):
     p = decode_parameters(gaussians)
     shape = [dr.detach(r) for r in p.shape]
     sizes = classify_by_size(shape, gaussians.width, gaussians.height, cutoff, wrap)
-    packed = pack_parameters([*p.shape, *p.color])
-    return sizes, Packed(packed, gaussians.channels, cutoff)
+    packed = Packed(pack_parameters([*p.shape, *p.color]), gaussians.channels, cutoff)
+    size = gaussians.width, gaussians.height
+    return sizes, packed, coarsen.list_finest(shape, *size, packed.radius, True)
 
 
 def lattice_of(*given):
@@ -131,12 +132,12 @@ def test_levels_end_where_points_are_few(backend, size, levels):
 @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
 def test_the_finest_level_is_the_filtered_sum(backend, wrap):
     """At every pixel, although most are rendered and only the border is looked up."""
-    sizes, packed = arrays_of(random_scene(3).on(backend), wrap)
+    sizes, packed, finest = arrays_of(random_scene(3).on(backend), wrap)
     types = types_of(packed.values)
     index = dr.arange(types.UInt, SIZE[0] * SIZE[1])
     x, y = types.Float(index % SIZE[0]) + 0.5, types.Float(index // SIZE[0]) + 0.5
     blur = [types.Float(coarsen.SAMPLE_DEVIATION**2 * k) for k in (1, 0, 1)]
     expected = sum_prefiltered(sizes, packed, x, y, blur, types.Bool(True))
-    found = np.array(coarsen.build_pyramid(sizes, packed).values)
+    found = np.array(coarsen.build_pyramid(sizes, packed, finest).values)
     found = found[: 4 * SIZE[0] * SIZE[1]].reshape(-1, 4)[:, : packed.channels]
     np.testing.assert_allclose(found, np.stack([np.array(e) for e in expected], 1), atol=1e-5)

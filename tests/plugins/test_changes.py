@@ -1,0 +1,131 @@
+"""After a change only what moved is made anew, with the bits of a texture that is made from it."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from _helpers.sets import SIZE
+
+mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
+import eigengs_dr as eg  # noqa: E402
+from _helpers.texture import backend, gaussians, small_scene, texel_centres, texture  # noqa: E402
+from eigengs_dr.plugins import texture_of  # noqa: E402
+
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
+
+COLORS, SHAPES = ("color", "background"), ("mean", "factor")
+CHANGES = [("color",), ("background",), COLORS, ("mean",), ("factor",), (*SHAPES, *COLORS)]
+PREFILTERS = [0.0, 0.02]
+
+
+def views():
+    """Points that are seen from near, and from so far that their footprints are wide."""
+    found = []
+    for distance in (0.5, 20.0):
+        si = texel_centres()
+        si.t, si.wi = distance, mi.Vector3f(0.3, 0, 0.95)
+        si.sh_frame = mi.Frame3f([0, 0, 1])
+        si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+        found.append(si)
+    return found
+
+
+def seen(tex):
+    return np.concatenate([np.array(tex.eval_3(si)) for si in views()])
+
+
+def moved(parameters, names, seed):
+    """Change parameters by a few percent; return the set that has them."""
+    random = np.random.default_rng(seed)
+    for name in names:
+        value = np.array(parameters[name])
+        factor = 1 + 0.1 * random.uniform(-1, 1, value.shape)
+        parameters[name] = mi.TensorXf(np.float32(value * factor))
+    parameters.update()
+    arrays = [np.array(parameters[name]) for name in (*SHAPES, "color")]
+    last = np.array(parameters["background"]).ravel()
+    return eg.Gaussians.from_arrays(*arrays, last, size=SIZE, space="linear", backend=backend())
+
+
+@pytest.mark.parametrize("prefilter", PREFILTERS)
+@pytest.mark.parametrize("first", CHANGES)
+@pytest.mark.parametrize("then", CHANGES)
+def test_lookups_are_those_of_a_new_texture(first, then, prefilter):
+    tex = texture(gaussians("linear"), prefilter=prefilter)
+    parameters, before = mi.traverse(tex), seen(tex)
+    for seed, names in enumerate((first, then)):
+        fresh = texture(moved(parameters, names, seed), prefilter=prefilter)
+        found = seen(tex)
+        np.testing.assert_array_equal(found, seen(fresh))
+        assert np.abs(found - before).max() > 1e-4
+
+
+@pytest.mark.parametrize("prefilter", PREFILTERS)
+@pytest.mark.parametrize("of_file", [False, True])
+def test_colours_alone_keep_the_lists(prefilter, of_file, tmp_path):
+    gaussians("linear").save(tmp_path / "x.npz")
+    file = {"type": "gaussian_texture", "filename": str(tmp_path / "x.npz")}
+    given = file if of_file else texture_of(gaussians("linear"))
+    tex = mi.load_dict({**given, "prefilter": prefilter})
+    parameters, start = mi.traverse(tex), tex.table.lists
+    lists = []
+    for seed in range(3):
+        moved(parameters, COLORS, seed)
+        lists.append(tex.table.lists)
+        assert lists[-1].cells is start.cells and lists[-1].sizes is start.sizes
+        assert lists[-1].finest is lists[0].finest
+    assert (lists[0].finest is not None) == (prefilter > 0)
+    moved(parameters, ("mean",), 3)
+    assert tex.table.lists.cells is not start.cells
+
+
+def derivatives(tex, names, mode):
+    """The gradient of squared lookups, or the change of lookups along a direction."""
+    parameters, along = mi.traverse(tex), mi.Float(0)
+    if mode == "forward":
+        dr.enable_grad(along)
+        for name in names:
+            parameters[name] = mi.TensorXf(parameters[name]) * (1 + along)
+    else:
+        for name in names:
+            dr.enable_grad(parameters[name])
+    parameters.update()
+    values = [tex.eval_3(si) for si in views()]
+    if mode == "forward":
+        dr.forward(along)
+        return [np.array(dr.grad(value)) for value in values]
+    dr.backward(sum(dr.sum(dr.squared_norm(value)) for value in values))
+    return [np.array(dr.grad(parameters[name])) for name in names]
+
+
+@pytest.mark.parametrize("names", [("color",), COLORS, (*SHAPES, *COLORS)])
+@pytest.mark.parametrize(
+    ("mode", "prefilter"), [("forward", 0.0), ("backward", 0.0), ("backward", 0.02)]
+)
+def test_derivatives_are_those_of_a_new_texture(names, mode, prefilter):
+    """Also where nothing had derivatives when lists were made, as when colours have them first."""
+    tex = texture(gaussians("linear"), prefilter=prefilter)
+    fresh = texture(moved(mi.traverse(tex), ("color",), 0), prefilter=prefilter)
+    for found, expected in zip(
+        derivatives(tex, names, mode), derivatives(fresh, names, mode), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+        assert np.abs(found).max() > 1e-4
+
+
+@pytest.mark.parametrize("prefilter", PREFILTERS)
+def test_frozen_renderings_follow(prefilter):
+    frozen = dr.freeze(lambda scene, seed: mi.render(scene, spp=4, seed=seed))
+    wall = {"type": "diffuse", "reflectance": texture_of(gaussians("linear"), prefilter=prefilter)}
+    scene = small_scene(wall)
+    key = "wall.bsdf.reflectance"
+    parameters = mi.traverse(scene)
+    for step, names in enumerate(((), *CHANGES, ("color",), ("color",))):
+        random = np.random.default_rng(step)
+        for name in names:
+            value = np.array(parameters[f"{key}.{name}"])
+            value *= 1 + 0.1 * random.uniform(-1, 1, value.shape)
+            parameters[f"{key}.{name}"] = mi.TensorXf(np.float32(value))
+        parameters.update()
+        found = np.array(frozen(scene, mi.UInt32(step)))
+        np.testing.assert_allclose(found, np.array(mi.render(scene, spp=4, seed=step)), atol=1e-6)
