@@ -40,6 +40,7 @@ exclude_patterns = ["tutorials/*.ipynb"]  # sphinx-gallery offers them, beside t
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "substitution"]
 myst_substitutions = measured.substitutions()  # a name that is not there is a warning
+myst_substitutions["gaussian_texture"] = pages.plugin_parameters()
 myst_heading_anchors = 3
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
