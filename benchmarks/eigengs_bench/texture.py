@@ -1,8 +1,11 @@
 """How fast a texture of Gaussians is in Mitsuba: against a bitmap on the same ball."""
 
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from pathlib import Path
+from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -11,15 +14,19 @@ import numpy as np
 
 import eigengs_dr as eg
 from eigengs_bench.clock import interleaved
-from eigengs_bench.report import Section, table
+from eigengs_bench.report import Section, Table, table
 from eigengs_bench.rows import Row, Task
 from eigengs_dr.image.color import to_linear
+from eigengs_dr.image.resize import resample
+from eigengs_dr.storage.npz import sizes_of
 
 SIDE, TEXELS, SPP = 512, 1024, 16  # of the picture, of the bitmap, and samples a pixel
 COUNTS = (500, 5_000, 20_000)  # Gaussians of the textures
 SETTLED = 5_000  # Gaussians of the texture that is also prefiltered and differentiated
 CHANGED = (5_000, 50_000)  # Gaussians of the textures whose parameters change
 STEPS, WARM_UP, ROUNDS = 100, 2, 9  # of the fits; rounds that compile, and that are measured
+HELD = (1_000, 10_000, 100_000)  # Gaussians of the files that are loaded
+PIXELS = 32  # of the picture of a file, for each of its Gaussians
 
 
 def run(task: Task, variant: str) -> list[Row]:
@@ -28,7 +35,9 @@ def run(task: Task, variant: str) -> list[Row]:
     `ratio_N` is rendering with N Gaussians over rendering with a bitmap, `ratio_prefiltered` with
     5,000 and the prefilter, `ratio_step` picture and gradient of all parameters by `prb`.
     `ratio_maps` is what colour, roughness and normal of one file add over what its colour adds.
-    `change_N` and `change_filtered_N` take over N changed shapes, without and with prefilter.
+    `change_N` and `change_filtered_N` take over N changed shapes, without and with prefilter, and
+    `colors_N` and `colors_filtered_N` N changed colours. `bytes_N` is what a texture holds in
+    memory, `held_N` that over the arrays of its file, `first_N_ms` from file to first lookup.
     """
     job: Row = {"variant": variant, "at": time.time()}  # each call measures anew
     return task.measure("texture", [(job, partial(measure, variant, task.progress))])
@@ -43,18 +52,44 @@ def summarize(rows: Sequence[Row]) -> Section:
     costs.append((f"a step of prb, {SETTLED:,} Gaussians", f"{row['ratio_step']:.2f}"))
     changes = [
         (what, *(f"{row[f'{name}_{n}_ms']:.1f} ms" for n in CHANGED))
-        for what, name in (("points", "change"), ("prefilter", "change_filtered"))
+        for what, name in LOOKUPS.items()
+        if f"{name}_{CHANGED[0]}_ms" in row
     ]
     over = f"Time of a picture over that with a bitmap of {TEXELS:,} x {TEXELS:,} texels"
-    after = "Time to take over a change of all shapes"
+    after = "Time to take over a change of all shapes, or of all colours"
     columns = ("lookup", *(f"{n:,} Gaussians" for n in CHANGED))
     return Section(
         [
             table("Texture", ("figure", "value"), lines),
             table(over, ("texture", "over a bitmap"), costs, name="costs"),
             table(after, columns, changes, name="changes"),
+            _memory(row),
         ]
     )
+
+
+LOOKUPS = {
+    "points": "change",
+    "points, colours alone": "colors",
+    "prefilter": "change_filtered",
+    "prefilter, colours alone": "colors_filtered",
+}
+
+
+def _memory(row: Row) -> Table:
+    """Lay out what textures take in memory, beside bitmaps of the pixels of their pictures."""
+    caption = (
+        f"Memory of a texture of {PIXELS} pixels a Gaussian; seconds from file to first lookup"
+    )
+    columns = ["Gaussians", "arrays of the file", "points", "prefilter", "BC7", "ASTC 6x6"]
+    columns += ["bitmap, mip maps", "points, s", "prefilter, s"]
+    lines = []
+    for n in HELD if f"bytes_{HELD[0]}" in row else ():
+        held = [row[f"bytes_{n}"] / row[f"held_{n}"], row[f"bytes_{n}"], row[f"bytes_filtered_{n}"]]
+        rivals = [PIXELS * n * bits / 8 for bits in (8, 128 / 36, 4 / 3 * 32 * 3)]
+        seconds = [f"{row[f'first_{name}{n}_ms'] / 1e3:.2f}" for name in ("", "filtered_")]
+        lines.append((f"{n:,}", *(f"{b / 1e6:.2g} MB" for b in held + rivals), *seconds))
+    return table(caption, columns, lines, name="memory")
 
 
 def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Row:
@@ -94,11 +129,13 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
             scene = ball(mi, *_maps(f"{folder}/maps.npz", count))
             programs[f"maps_{count}"] = partial(mi.render, scene)
     for count in CHANGED:
-        for name, given in (("change", 0.0), ("change_filtered", angle)):
+        for name, given in (("", 0.0), ("filtered_", angle)):
             texture = mi.load_dict(texture_of(sets[count], prefilter=given))
-            programs[f"{name}_{count}"] = partial(_change, mi, texture)
+            programs[f"change_{name}{count}"] = partial(_change, mi, texture, "factor")
+            programs[f"colors_{name}{count}"] = partial(_change, mi, texture, "color")
     timed = interleaved(programs, WARM_UP, ROUNDS, partial(progress, "texture"))
     return {
+        **hold(mi, angle, progress),
         **{f"{name}_ms": ms for name, ms in timed.items()},
         **{f"ratio_{n}": timed[f"gaussians_{n}"] / timed["bitmap"] for n in COUNTS},
         "ratio_prefiltered": timed["prefiltered"] / timed["bitmap"],
@@ -156,10 +193,59 @@ def _step(mi: Any, scene: Any) -> Callable[[], Any]:
     return step
 
 
-def _change(mi: Any, texture: Any) -> Any:
-    """Change all shapes by a millionth; equal values would be no change for Mitsuba."""
+def _change(mi: Any, texture: Any, name: str) -> Any:
+    """Change a parameter by a millionth; equal values would be no change for Mitsuba."""
     parameters = mi.traverse(texture)
-    factor = dr.detach(parameters["factor"])
-    parameters["factor"] = factor * dr.opaque(mi.Float, 1 + 1e-6)
+    parameters[name] = dr.detach(parameters[name]) * dr.opaque(mi.Float, 1 + 1e-6)
     parameters.update()
     return texture.table
+
+
+def hold(mi: Any, angle: float, progress: Callable[..., None] = lambda *_: None) -> Row:
+    """Measure what textures of files hold in memory, and how long their first lookup takes."""
+    found: Row = {}
+    for done, count in enumerate(HELD):
+        side = round(math.sqrt(PIXELS * count))
+        picture = resample(eg.sample("coffee")[:400, 100:500], side, side)
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "set.npz"
+            eg.fit(picture, count, 0).gaussians.save(path)
+            for name, given in ((str(count), 0.0), (f"filtered_{count}", angle)):
+                firsts = [_first_lookup(mi, path, given) for _ in range(4)]
+                bytes_held = firsts[0][0]
+                found[f"bytes_{name}"] = bytes_held
+                found[f"held_{name}"] = bytes_held / sum(sizes_of(path).values())
+                found[f"first_{name}_ms"] = 1e3 * median(s for _, s in firsts[1:])  # compiled
+        progress("files", done + 1, len(HELD))
+    return found
+
+
+def _first_lookup(mi: Any, path: Path, angle: float) -> tuple[int, float]:
+    """Load a texture and look it up once; return the bytes of its arrays, and the seconds."""
+    started = time.perf_counter()
+    file = {"type": "gaussian_texture", "filename": str(path), "prefilter": angle}
+    texture, si = mi.load_dict(file), dr.zeros(mi.SurfaceInteraction3f)
+    si.uv, si.t, si.wi = mi.Point2f(0.4, 0.6), 1, mi.Vector3f(0, 0, 1)
+    dr.eval(texture.eval_1(si))
+    dr.sync_thread()
+    seconds = time.perf_counter() - started
+    arrays: dict[int, int] = {}
+    _collect(vars(texture), arrays, set())
+    return sum(arrays.values()), seconds
+
+
+def _collect(tree: Any, arrays: dict[int, int], seen: set[int]) -> None:
+    """Add the bytes of the arrays of a tree of objects to `arrays`, by their index."""
+    if tree is None or isinstance(tree, type) or id(tree) in seen:
+        return
+    seen.add(id(tree))
+    if dr.is_tensor_v(tree):
+        tree = tree.array
+    if dr.is_jit_v(tree) and dr.depth_v(tree) == 1:
+        arrays[tree.index] = dr.width(tree) * dr.itemsize_v(tree)
+        return
+    inner = vars(tree) if hasattr(tree, "__dict__") else tree
+    inner = inner.values() if isinstance(inner, dict) else inner
+    if isinstance(inner, Iterable) and not isinstance(inner, str):
+        for one in inner:
+            _collect(one, arrays, seen)

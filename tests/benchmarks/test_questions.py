@@ -296,7 +296,10 @@ def test_texture(monkeypatch):
     from eigengs_bench import texture
 
     small = {"SIDE": 16, "TEXELS": 16, "SPP": 1, "COUNTS": (20,), "SETTLED": 20, "CHANGED": (20,)}
-    for name, value in (small | {"STEPS": 2, "ROUNDS": 1}).items():
+    for name, value in (small | {"STEPS": 2, "ROUNDS": 1, "HELD": (20,)}).items():
         monkeypatch.setattr(texture, name, value)
     found = texture.measure("llvm_ad_rgb")
+    assert found["bytes_filtered_20"] > found["bytes_20"] > 0 and found["first_20_ms"] > 0
+    held = next(t for t in texture.summarize([found]).tables if t.name == "memory")
+    assert len(held.frame) == 1
     assert found["ratio_20"] > 0 and found["ratio_step"] > 0 and found["maps_3_ms"] > 0
