@@ -110,9 +110,10 @@ def gaussian_texture() -> type:
             callback.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
 
         def parameters_changed(self, keys: list[str]) -> None:
-            properties.check_invertible(self.to_uv)
-            self.transform = mi.Transform3f(self.to_uv)
-            dr.make_opaque(self.transform)  # another transform compiles no other programs
+            if not keys or "to_uv" in keys:
+                properties.check_invertible(self.to_uv)
+                self.transform = mi.Transform3f(self.to_uv)
+                dr.make_opaque(self.transform)  # another transform compiles no other programs
             if set(keys) != {"to_uv"}:
                 self._take_over(not keys or any(key in SHAPES for key in keys))
             sampled = getattr(self, "emission", None) is not None

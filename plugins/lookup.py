@@ -281,8 +281,8 @@ def sum_over_footprint(
     near, wide = active & ~distant, active & distant & ~blind
 
     def look_up(table: Table, x: Float, y: Float) -> list:
-        sizes, pyramid = table.lists.sizes, table.pyramid
-        assert sizes and pyramid
+        pyramid = table.pyramid
+        assert pyramid
         sharp = sum_prefiltered(sizes, table.packed, x, y, footprint, near)
         far = where_any(wide, lambda: sum_pyramid(pyramid, x, y, footprint, wide), table.packed)
         seen = [dr.select(distant, f, n) for f, n in zip(far, sharp, strict=True)]
