@@ -88,7 +88,7 @@ def _memory(row: Row) -> Table:
         held = [row[f"bytes_{n}"] / row[f"held_{n}"], row[f"bytes_{n}"], row[f"bytes_filtered_{n}"]]
         rivals = [PIXELS * n * bits / 8 for bits in (8, 128 / 36, 4 / 3 * 32 * 3)]
         seconds = [f"{row[f'first_{name}{n}_ms'] / 1e3:.2f}" for name in ("", "filtered_")]
-        lines.append((f"{n:,}", *(f"{b / 1e6:.2g} MB" for b in held + rivals), *seconds))
+        lines.append((f"{n:,}", *(f"{b / 1e6:.3g} MB" for b in held + rivals), *seconds))
     return table(caption, columns, lines, name="memory")
 
 
