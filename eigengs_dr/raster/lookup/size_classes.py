@@ -26,7 +26,9 @@ FOOTPRINT_REACH = 3.0
 
 LISTED_FOOTPRINTS = (0.7, 4.0)
 """Standard deviations of the footprints for which cells list their Gaussians, in pixels; most
-lookups have such footprints."""
+lookups have such footprints. Cells of the second lists are twice as wide: lists of equal cells took
+1.7 to 2.1 times the memory in all, at 20,000 Gaussians too much for copies in their order (9 % more
+time of a rendering), and at 5,000 saved 2 %."""
 
 
 @dataclass(frozen=True)
@@ -126,10 +128,10 @@ def _list_widened(shape: list, width: int, height: int, radius: float) -> list[t
     Float = types_of(shape[0]).Float
     side = max(4, cell_side(width, height, dr.width(shape)))
     levels = []
-    for spread in LISTED_FOOTPRINTS:
+    for coarseness, spread in enumerate(LISTED_FOOTPRINTS, 1):
         variance = dr.opaque(Float, (spread / EXP2_SCALE) ** 2)
         widened, _ = widen(shape, [variance, Float(0), variance])
-        levels.append(list_cells(widened, width, height, radius, side))
+        levels.append(list_cells(widened, width, height, radius, coarseness * side))
     splat = dr.concat([cells.splat for cells in levels])
     dr.eval(splat)
     listed, first = [], 0
