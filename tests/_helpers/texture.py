@@ -37,6 +37,13 @@ def at(u, v, count=1):
     return si
 
 
+def in_front(si, distance=1.0):
+    """The same points, seen at a right angle from a distance; uv are units of the world."""
+    si.t, si.wi, si.sh_frame = distance, mi.Vector3f(0, 0, 1), mi.Frame3f([0, 0, 1])
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    return si
+
+
 def texel_centres(size=SIZE):
     """Surface interactions at the centres of all texels."""
     v, u = np.mgrid[: size[1], : size[0]] + 0.5

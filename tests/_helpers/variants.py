@@ -15,3 +15,6 @@ BOTH_RGB = on_both("rgb")
 def in_variants(names):
     """Run a test in these variants instead."""
     return pytest.mark.parametrize("variant", names, indirect=True)
+
+
+in_all = in_variants([*BOTH_RGB, *on_both("mono"), *on_both("spectral")])

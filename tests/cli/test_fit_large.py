@@ -1,14 +1,13 @@
 """The command `fit` by blocks, and the memory that it says or refuses."""
 
 import json
-import struct
-import zlib
 
 import pytest
 import tifffile
 from PIL import Image
 
 from _helpers.command import assert_refused, run, succeeded
+from _helpers.files import png
 from _helpers.mosaics import mosaic
 from eigengs_dr.blocks.windows import ORIENTATION, image_size
 from eigengs_dr.fitting import memory
@@ -49,13 +48,8 @@ def test_blocks_are_chosen_where_memory_says_so(photo, tmp_path, monkeypatch):
 
 
 def header(path, width, height, grey=False):
-    """Write a PNG file of any size that ends after its header."""
-    kind = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0 if grey else 2, 0, 0, 0)
-    chunks = [
-        struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
-        for chunk in (kind, b"IDAT")  # no pixels follow
-    ]
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+    """Write a PNG file of any size without pixels."""
+    path.write_bytes(png(width, height, 8, 0 if grey else 2, []))
     return path
 
 

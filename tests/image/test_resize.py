@@ -1,11 +1,11 @@
-"""Images at other sizes: means, constants and edges stay."""
+"""Images at other sizes: means, constants and edges stay; and images beside each other."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eigengs_dr.image.resize import center_crop, resample
+from eigengs_dr.image.resize import center_crop, join_pictures, resample, text_line
 
 sizes = st.tuples(st.integers(1, 40), st.integers(1, 40))
 
@@ -53,3 +53,19 @@ def test_cropping_takes_the_centre_undistorted():
 def test_sizes_without_pixels_are_refused(resize, size):
     with pytest.raises(ValueError, match=r"^size is [^\n]*; both sides must be at least 1 pixel$"):
         resize(np.zeros((4, 4, 3), np.float32), *size)
+
+
+def test_pictures_are_joined_on_white():
+    joint = join_pictures([np.zeros((2, 3, 3)), np.zeros((4, 1, 3))], 1, gap=2)
+    assert joint.shape == (4, 3 + 2 + 1 + 2, 3)
+    black = joint.sum(axis=2) == 0
+    assert black[:2, :3].all() and black[:, 5].all() and black.sum() == 10
+    assert (joint[~black] == 1).all()
+
+
+def test_a_line_holds_its_text():
+    written = text_line("Agjpq", 200, 16)
+    assert written.shape == (20, 200, 3)
+    ink = np.argwhere(written.min(axis=2) < 0.5)
+    assert ink.min() > 0 and ink[:, 0].max() < 19  # nothing is cut off below
+    assert (text_line("", 200, 16) == 1).all()

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from _helpers.errors import one_line
+import eigengs_dr as eg
+from _helpers.errors import one_line, refused
 from _helpers.files import BYTES, property_of
 from eigengs_dr.image.formats import PICTURE_SUFFIXES
 from eigengs_dr.image.io import (
@@ -65,9 +66,8 @@ def test_saving_clamps_and_rounds(tmp_path):
 
 @pytest.mark.parametrize("name", ["a.gif", "a.exrs", "a", "a.npz", ".png"])
 def test_unknown_suffix(tmp_path, name):
-    with pytest.raises(ImageError, match=r"is unknown; use one of \.png") as error:
+    with refused(ImageError, r"is unknown; use one of \.png"):
         save_image(tmp_path / name, BYTES)
-    one_line(error)
     assert not list(tmp_path.iterdir())
 
 
@@ -98,7 +98,15 @@ def test_unwritable_targets(tmp_path):
 
 
 def test_bad_pixels_touch_no_file(tmp_path):
-    for image in (np.full((2, 2), np.nan), np.zeros((2, 2, 5)), np.zeros((0, 0, 3))):
-        with pytest.raises(ImageError):
+    for image, words in (
+        (np.full((2, 2), np.nan), "not finite"),
+        (np.zeros((2, 2, 5)), "shape"),
+        (np.zeros((0, 0, 3)), "no pixels"),
+        (np.linspace(0, 255, 12).reshape(2, 2, 3), "divide by 255"),
+    ):
+        with pytest.raises(ImageError, match=words):
             save_image(tmp_path / "a.png", image)
+    one = eg.Gaussians.from_arrays([[1, 1]], [[1, 0, 1]], [[1, 1, 1]], size=(8, 8))
+    with pytest.raises(ValueError, match="a set is no image"):
+        one.save(tmp_path / "a.png")
     assert not list(tmp_path.iterdir())

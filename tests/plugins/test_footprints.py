@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-from _helpers.texture import at, gaussians, texture  # noqa: E402
+from _helpers.texture import at, gaussians, in_front, texture  # noqa: E402
 from eigengs_dr.plugins import properties  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
@@ -16,8 +16,7 @@ ANGLE, DISTANCE, STRETCH = 0.02, 4.0, (2.0, 0.5)  # and lengths of dp_du and dp_
 
 def interaction(u=0.4, v=0.6):
     """A point that the camera sees at a right angle."""
-    si = at(mi.Float(u), mi.Float(v))
-    si.t, si.wi, si.sh_frame = DISTANCE, mi.Vector3f(0, 0, 1), mi.Frame3f([0, 0, 1])
+    si = in_front(at(mi.Float(u), mi.Float(v)), DISTANCE)
     si.dp_du, si.dp_dv = mi.Vector3f(STRETCH[0], 0, 0), mi.Vector3f(0, STRETCH[1], 0)
     return si
 
@@ -71,17 +70,12 @@ def test_any_two_conjugate_diameters_say_the_same(new):
     np.testing.assert_allclose(found, seen(tex, with_footprint(si, pixel())), rtol=1e-4)
 
 
-def test_without_a_cone_the_angle_decides():
-    tex, si = texture(gaussians("linear"), prefilter=ANGLE), interaction()
-    np.testing.assert_allclose(
-        seen(tex, with_footprint(si, np.zeros((2, 2)))), seen(tex, si), rtol=1e-5
-    )
-
-
-def test_without_a_cone_and_an_angle_it_looks_at_points(new):
-    tex, si = texture(gaussians("linear"), prefilter=True), interaction()
-    found = seen(tex, with_footprint(si, np.zeros((2, 2))))
-    np.testing.assert_allclose(found, seen(texture(gaussians("linear")), si), atol=1e-4)
+@pytest.mark.parametrize(("prefilter", "instead"), [(ANGLE, ANGLE), (True, 0.0)])
+def test_without_a_cone_the_angle_decides(new, prefilter, instead):
+    """And without an angle, lookups at points."""
+    own, other = (texture(gaussians("linear"), prefilter=p) for p in (prefilter, instead))
+    found = seen(own, with_footprint(interaction(), np.zeros((2, 2))))
+    np.testing.assert_allclose(found, seen(other, interaction()), atol=1e-4)
 
 
 def test_it_tells_the_scene(new):

@@ -10,16 +10,11 @@ from _helpers.sets import COUNT, SIZE
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 import eigengs_dr as eg  # noqa: E402
-from _helpers.texture import at, gaussians, picture, texel_centres, texture  # noqa: E402
-from _helpers.variants import BOTH_RGB, in_variants, on_both  # noqa: E402
+from _helpers.texture import at, gaussians, in_front, picture, texel_centres, texture  # noqa: E402
+from _helpers.variants import in_all, in_variants, on_both  # noqa: E402
 from eigengs_dr.image.color import to_linear  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
-
-MONO, SPECTRAL = on_both("mono"), on_both("spectral")
-
-
-in_all = in_variants([*BOTH_RGB, *MONO, *SPECTRAL])
 
 
 def test_first_so_many_of_a_file(tmp_path):
@@ -47,6 +42,20 @@ class TestValues:
         found = picture(texture(g).eval(texel_centres()))
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
+    @pytest.mark.parametrize("space", ["linear", "rgb"])
+    @pytest.mark.parametrize(("outside", "sign"), [(1.7, 1), (-0.4, -1)])
+    def test_derivatives_of_clamped_colours_lead_back_into_the_range(self, space, outside, sign):
+        g = gaussians(space)
+        g.background = dr.full(type(g.background), outside, (3, 1))
+        tex = texture(g)
+        parameters = mi.traverse(tex)
+        dr.enable_grad(parameters["background"])
+        parameters.update()
+        value = tex.eval_1(at(0.5, 0.5))
+        assert np.array(value) == pytest.approx(1 if sign > 0 else 0, abs=1e-6)
+        dr.backward(dr.square(value - 0.5))
+        assert (np.sign(np.array(dr.grad(parameters["background"]))) == sign).all()
+
     @pytest.mark.parametrize("space", ["radiance", "log"])
     def test_light_above_1_is_not_clamped(self, space):
         g = gaussians(space, quiet=False)
@@ -68,17 +77,14 @@ class TestValues:
     def test_one_channel_is_a_number(self, variant):
         g = gaussians("data", channels=1)
         si = texel_centres()
-        si.wavelengths = (
-            550.0 + dr.zeros(type(si.wavelengths), dr.width(si))
-            if (mi.is_spectral)
-            else si.wavelengths
-        )
+        if mi.is_spectral:
+            si.wavelengths = 550.0 + dr.zeros(type(si.wavelengths), dr.width(si))
         expected = eg.render(g).numpy()
         tex = texture(g)
         np.testing.assert_allclose(picture([tex.eval_1(si)]), expected, atol=1e-5)
         np.testing.assert_allclose(picture([tex.eval(si)[0]]), expected, atol=1e-5)
 
-    @in_variants(MONO)
+    @in_variants(on_both("mono"))
     def test_mono_shows_luminance(self, variant):
         g = gaussians("rgb")
         light = to_linear(eg.render(g).numpy()) @ np.float32([0.212671, 0.715160, 0.072169])
@@ -119,9 +125,8 @@ class TestWhere:
         si = at(*(mi.Float(np.float32(k.ravel())) for k in (u, v)))
         expected = np.array(mi.load_dict(bitmap).eval(si))
         for prefilter in (0.0, 1e-6):
-            si.t, si.wi, si.sh_frame = 1.0, mi.Vector3f(0, 0, 1), mi.Frame3f([0, 0, 1])
-            si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
-            found = np.array(texture(g, wrap_mode="clamp", prefilter=prefilter).eval(si))
+            tex = texture(g, wrap_mode="clamp", prefilter=prefilter)
+            found = np.array(tex.eval(in_front(si)))
             np.testing.assert_allclose(found, expected, atol=1e-3)
 
     @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
@@ -129,10 +134,7 @@ class TestWhere:
     def test_no_uv_makes_a_nan(self, wrap, prefilter):
         wild = [1e-30, 1e6, -1e6, 1e30, -1e30, np.inf, -np.inf, np.nan]
         u, v = np.meshgrid(np.float32(wild), np.float32(wild))
-        si = at(mi.Float(u.ravel()), mi.Float(v.ravel()))
-        si.t, si.wi = 10.0, mi.Vector3f(0, 0, 1)
-        si.sh_frame = mi.Frame3f([0, 0, 1])
-        si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+        si = in_front(at(mi.Float(u.ravel()), mi.Float(v.ravel())), 10.0)
         tex = texture(gaussians(), wrap_mode=wrap, prefilter=prefilter)
         found = np.array(tex.eval(si))
         assert np.isfinite(found).all()
@@ -179,9 +181,7 @@ def test_lanes_that_are_inactive_or_have_no_uv_are_zero(prefilter):
     """A point, footprints in lists and in the pyramid, and one that sees the mean alone."""
     tex = texture(gaussians(), prefilter=prefilter)
     si = at(mi.Float([0.2, 0.4, 0.4, np.nan, np.inf]), mi.Float([0.3, 0.6, 0.6, 0.9, 0.9]))
-    si.t, si.wi = 1.0, mi.Vector3f(0, 0, 1)
-    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
-    one = np.array(tex.eval(si))
+    one = np.array(tex.eval(in_front(si)))
     found = np.array(tex.eval(si, mi.Bool([True, False, True, True, False])))
     assert one[:, :3].min() > 0 and not one[:, 3:].any()
     np.testing.assert_allclose(found, one * [1, 0, 1, 1, 1], atol=1e-6)

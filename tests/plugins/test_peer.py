@@ -11,13 +11,10 @@ from _helpers.sets import COUNT, SIZE
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 from _helpers.texture import at, gaussians, small_scene, texture  # noqa: E402
-from _helpers.variants import BOTH_RGB, in_variants, on_both  # noqa: E402
+from _helpers.variants import in_all, in_variants, on_both  # noqa: E402
 from eigengs_dr.plugins import texture_of  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
-
-SPECTRAL = on_both("spectral")
-in_all = in_variants([*BOTH_RGB, *on_both("mono"), *SPECTRAL])
 
 
 @in_all
@@ -48,7 +45,7 @@ def test_no_method_is_missing(variant):
     assert tex.is_spatially_varying() and tex.id() == "bark" and tex.variant_name() == variant
 
 
-@in_variants(SPECTRAL)
+@in_variants(on_both("spectral"))
 def test_sampled_wavelengths_have_their_density(variant):
     tex = texture(gaussians("rgb"))
     si = at(0.3, 0.6)
@@ -150,5 +147,6 @@ def test_copies_of_a_set_are_its_own(space):
     expected = np.array(texture(g).eval(at(0.3, 0.4)))
     g.color *= 2
     for twin in twins:
+        assert g == g and twin != g
         assert (twin.width, twin.height, twin.space, twin.cutoff) == (*SIZE, space, g.cutoff)
         np.testing.assert_array_equal(np.array(texture(twin).eval(at(0.3, 0.4))), expected)

@@ -103,38 +103,27 @@ class TestMapsOfAFile:
         assert np.abs(results[0]).max() > 1e-3
         np.testing.assert_allclose(*results, rtol=1e-4, atol=1e-5)
 
-    @pytest.mark.parametrize("step", ["list_gaussians", "make_table"])
-    def test_textures_that_are_made_at_once_share_a_table(self, monkeypatch, tmp_path, step):
+    @pytest.mark.parametrize(
+        ("module", "step"),
+        [(reuse, "list_gaussians"), (reuse, "make_table"), (files, "SharedFile")],
+    )
+    def test_textures_that_are_made_at_once_share_all(self, monkeypatch, tmp_path, module, step):
         """A thread of Mitsuba that waits for Dr.Jit makes another texture meanwhile."""
         material(size=SIZE, backend=backend()).save(tmp_path / "m.npz")
-        plain, inner = getattr(reuse, step), []
+        plain, inner = getattr(module, step), []
 
-        def make(file):
-            return reuse.table_of_file(file, 3.0, "repeat", True)
-
-        def nested(*inputs):
-            monkeypatch.setattr(reuse, step, plain)
-            inner.append(make(file))
-            return plain(*inputs)
-
-        monkeypatch.setattr(reuse, step, nested)
-        file = files.shared_file(str(tmp_path / "m.npz"), backend(), None)
-        assert make(file) is inner[0] is make(file)
-
-    def test_textures_that_are_made_at_once_share_a_file(self, monkeypatch, tmp_path):
-        material(size=SIZE, backend=backend()).save(tmp_path / "m.npz")
-        plain, inner = files.SharedFile, []
-
-        def read():
-            return files.shared_file(str(tmp_path / "m.npz"), backend(), None)
+        def make():
+            file = files.shared_file(str(tmp_path / "m.npz"), backend(), None)
+            return file, reuse.table_of_file(file, 3.0, "repeat", True)
 
         def nested(*inputs):
-            monkeypatch.setattr(files, "SharedFile", plain)
-            inner.append(read())
+            monkeypatch.undo()
+            inner.extend(make())
             return plain(*inputs)
 
-        monkeypatch.setattr(files, "SharedFile", nested)
-        assert read() is inner[0] is read()
+        monkeypatch.setattr(module, step, nested)
+        for found in (make(), make()):
+            assert all(a is b for a, b in zip(found, inner, strict=True))
 
     def test_other_mappings_are_other_lookups(self, lookups, of_files):
         coat = of_files(True)["bsdf"]

@@ -9,7 +9,7 @@ from _helpers.sets import SIZE
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 import eigengs_dr as eg  # noqa: E402
 from _helpers.texture import gaussians, small_scene  # noqa: E402
-from _helpers.variants import BOTH_RGB, in_variants, on_both  # noqa: E402
+from _helpers.variants import BOTH_RGB, in_all, in_variants  # noqa: E402
 from eigengs_dr.plugins import texture_of  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
@@ -17,10 +17,9 @@ pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 others = [
     pytest.param(name, marks=pytest.mark.slow) for name in ("llvm_ad_mono", "llvm_ad_spectral")
 ]
-in_all = in_variants([*BOTH_RGB, *on_both("mono"), *on_both("spectral")])
 
 SLOTS = ["diffuse", "principled", "roughconductor", "roughdielectric", "plastic", "roughplastic"]
-SLOTS += ["blend", "mask", "normalmap", "bumpmap"]
+SLOTS += ["blend", "mask", "normalmap", "bumpmap", "light"]
 
 
 def slots(g):
@@ -50,12 +49,22 @@ def slots(g):
     }
 
 
+def scene_with(slot):
+    """A scene with a texture in one kind of place."""
+    if slot != "light":
+        return small_scene(slots(gaussians())[slot], "direct")
+    radiance = texture_of(gaussians("linear"))
+    if mi.is_spectral:
+        radiance = {"type": "d65", "of": radiance}  # else it glows at equal energy
+    return small_scene(None, "path", emitter={"type": "area", "radiance": radiance})
+
+
 class TestSlots:
     @in_variants([*BOTH_RGB, *others])
     @pytest.mark.parametrize("name", SLOTS)
     def test_renders_and_differentiates(self, variant, name):
         """In every slot the picture is finite, changes with the texture, and has a gradient."""
-        scene = small_scene(slots(gaussians())[name], "direct")
+        scene = scene_with(name)
         parameters = mi.traverse(scene)
         keys = [k for k, _ in parameters if k.endswith((".color", ".mean"))]
         assert keys
@@ -69,22 +78,6 @@ class TestSlots:
             gradient = np.array(dr.grad(parameters[key]))
             assert np.isfinite(gradient).all()
             assert np.abs(gradient).max() > 0, key
-
-    @in_all
-    def test_lights(self, variant):
-        radiance = texture_of(gaussians("linear"))
-        if mi.is_spectral:
-            radiance = {"type": "d65", "of": radiance}  # else it glows at equal energy
-        emitter = {"type": "area", "radiance": radiance}
-        scene = small_scene(None, "path", emitter=emitter)
-        parameters = mi.traverse(scene)
-        key = next(k for k, _ in parameters if k.endswith(".color"))
-        dr.enable_grad(parameters[key])
-        parameters.update()
-        image = mi.render(scene, params=parameters, spp=4)
-        assert np.isfinite(np.array(image)).all()
-        dr.backward(dr.mean(image))
-        assert np.abs(np.array(dr.grad(parameters[key]))).max() > 0
 
     @in_all
     def test_particles_leave_it_as_paths_find_it(self, variant):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-from _helpers.texture import at, gaussians, texture  # noqa: E402
+from _helpers.texture import at, gaussians, in_front, texture  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -45,9 +45,7 @@ def test_is_a_parameter(before, prefilter):
     parameters["to_uv"] = mi.ScalarTransform3f().rotate(30)
     parameters.update()
     uv = np.random.default_rng(0).uniform(-1, 2, (2, 100)).astype(np.float32)
-    si = at(*(mi.Float(k) for k in uv))
-    si.t, si.wi, si.sh_frame = 5.0, mi.Vector3f(0, 0, 1), mi.Frame3f([0, 0, 1])
-    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    si = in_front(at(*(mi.Float(k) for k in uv)), 5.0)
     for found, expected in (
         (changed.eval(si), turned.eval(si)),
         (changed.eval_1_grad(si), turned.eval_1_grad(si)),
