@@ -3,6 +3,7 @@
 import numpy as np
 
 import eigengs_dr as eg
+from _helpers.poster import camera
 
 CAMERA = """
   <sensor type="perspective">
@@ -106,13 +107,7 @@ def room(mi, folder):
     return {
         "type": "scene",
         "integrator": {"type": "direct"},
-        "sensor": {
-            "type": "perspective",
-            "fov": 40,
-            "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}},
-            "sampler": {"type": "independent", "sample_count": 4},
-        },
+        "sensor": camera([0, 0, 4]),
         "lamp": {"type": "constant"},
         "quad": {
             "type": "ply",

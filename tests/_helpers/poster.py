@@ -13,20 +13,16 @@ FOV, SIDE, TEXELS = 40.0, 24, 32
 NAME = "poster.bsdf.reflectance"
 
 
-def camera(place, side=SIDE, **film):
-    """A camera that looks at the middle of the poster."""
+def camera(place, side=SIDE, *, fov=FOV, target=(0, 0, 0), up=(0, 1, 0), spp=4, **film):
+    """A camera that by default looks at the middle of the poster."""
+    size = {"width": side, "height": side, "rfilter": {"type": "box"}}
     return {
         "type": "perspective",
-        "fov": FOV,
+        "fov": fov,
         "near_clip": 1e-3,
-        "to_world": mi.ScalarTransform4f().look_at(place, [0, 0, 0], [0, 1, 0]),
-        "film": {
-            "type": "hdrfilm",
-            "width": side,
-            "height": side,
-            "rfilter": {"type": "box"},
-            **film,
-        },
+        "to_world": mi.ScalarTransform4f().look_at(place, target, up),
+        "film": {"type": "hdrfilm", **size, **film},
+        "sampler": {"type": "independent", "sample_count": spp},
     }
 
 

@@ -7,6 +7,7 @@ import pytest
 from _helpers.sets import SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
+from _helpers.poster import camera  # noqa: E402
 from eigengs_dr.plugins import texture_of  # noqa: E402
 
 
@@ -64,18 +65,7 @@ def small_scene(bsdf, integrator="path", side=12, spp=32, emitter=None):
         {
             "type": "scene",
             "integrator": {"type": integrator, **depth},
-            "sensor": {
-                "type": "perspective",
-                "fov": 40,
-                "to_world": mi.ScalarTransform4f().look_at([1, 1, 3.5], [0, 0, 0], [0, 1, 0]),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": side,
-                    "height": side,
-                    "rfilter": {"type": "box"},
-                },
-                "sampler": {"type": "independent", "sample_count": spp},
-            },
+            "sensor": camera([1, 1, 3.5], side, spp=spp),
             "wall": wall,
             "floor": {
                 "type": "rectangle",

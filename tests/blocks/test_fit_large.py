@@ -95,13 +95,6 @@ def test_data_of_any_range():
     )
 
 
-def test_one_block_is_the_whole():
-    result = eg.fit_large(mosaic(64), gaussians=200, iterations=20, backend="llvm")
-    whole = eg.fit(mosaic(64), gaussians=200, iterations=20, backend="llvm")
-    assert result.blocks == 1
-    assert result.psnr_rgb == pytest.approx(whole.trace[-1]["psnr_rgb"], abs=0.3)
-
-
 def test_flat_image():
     result = eg.fit_large(np.full((96, 96), 100, np.uint8), block=48, iterations=10)
     assert result.psnr_rgb > 60

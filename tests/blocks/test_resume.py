@@ -1,29 +1,44 @@
 """Fits by blocks that were stopped: no work is lost, and the bits are the same."""
 
+import os
+import signal
+
 import numpy as np
 import pytest
 
 import eigengs_dr as eg
 from _helpers.mosaics import FEW, arrays_of, assert_same_bits, mosaic
-from _helpers.process import python_path, run_python
 
 
 class Stop(Exception):
     """The end of a run from outside."""
 
 
-@pytest.mark.parametrize("stage", ["fit", "density"])
-def test_interrupted_run_goes_on(tmp_path, stage):
+def end():
+    raise Stop
+
+
+def press():
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def stop_after(output, pixels, stage, share, settings=FEW, act=end):
+    """Fit until a share of a stage is done."""
+
+    def stop(done, total, row):
+        if row["stage"] == stage and done and done >= share * total:
+            act()
+
+    with pytest.raises((Stop, KeyboardInterrupt)):
+        eg.fit_large(pixels, output, progress=stop, **settings)
+
+
+@pytest.mark.parametrize(("stage", "act"), [("fit", end), ("density", end), ("fit", press)])
+def test_interrupted_run_goes_on(tmp_path, stage, act):
     pixels, output = mosaic(128), tmp_path / "a.npz"
     settings = FEW | {"iterations": 200 if stage == "density" else 20}
     whole = eg.fit_large(pixels, **settings)
-
-    def stop(done, total, row):
-        if row["stage"] == stage and done >= total / 2:
-            raise Stop
-
-    with pytest.raises(Stop):
-        eg.fit_large(pixels, output, progress=stop, **settings)
+    stop_after(output, pixels, stage, 0.5, settings, act)
     folder = tmp_path / "a.npz.checkpoint"
     assert folder.is_dir() and not output.exists()
     again = eg.fit_large(pixels, output, **settings)
@@ -36,26 +51,15 @@ def test_interrupted_run_goes_on(tmp_path, stage):
 
 def test_a_block_is_kept_before_its_end_is_told(tmp_path):
     """A callable that raises does not lose the block that has just ended."""
-
-    def stop(done, total, row):
-        if row["stage"] == "fit" and done:
-            raise Stop
-
-    with pytest.raises(Stop):
-        eg.fit_large(mosaic(128), tmp_path / "a.npz", progress=stop, **FEW)
+    stop_after(tmp_path / "a.npz", mosaic(128), "fit", 0)
     assert eg.fit_large(mosaic(128), tmp_path / "a.npz", **FEW).resumed == 1
 
 
 def test_a_folder_keeps_the_last_rounds_alone(tmp_path):
     """The Gaussians of an image would else lie on the disk once for every round."""
-    kept = []
-
-    def look(done, total, row):
-        if row["stage"] == "measure":
-            kept.extend(path.name for path in (tmp_path / "a.npz.checkpoint").glob("fit*"))
-
-    eg.fit_large(mosaic(128), tmp_path / "a.npz", progress=look, **FEW)
-    assert set(kept) == {f"fit2-{number}.npz" for number in range(4)}
+    stop_after(tmp_path / "a.npz", mosaic(128), "measure", 0)
+    kept = {path.name for path in (tmp_path / "a.npz.checkpoint").glob("fit*")}
+    assert kept == {f"fit2-{number}.npz" for number in range(4)}
 
 
 @pytest.mark.parametrize("part", [0.3, 0.6, 0.95])
@@ -64,13 +68,7 @@ def test_a_round_with_a_hole_is_taken_again(tmp_path, part):
     settings = FEW | {"gaussians": 200, "block": 32, "iterations": 32}
     whole = eg.fit_large(mosaic(64), **settings)
     output, rows = tmp_path / "a.npz", []
-
-    def stop(done, total, row):
-        if row["stage"] == "fit" and done >= part * total:
-            raise Stop
-
-    with pytest.raises(Stop):
-        eg.fit_large(mosaic(64), output, progress=stop, **settings)
+    stop_after(output, mosaic(64), "fit", part, settings)
     for path in (tmp_path / "a.npz.checkpoint").glob("fit?-2.npz"):
         path.unlink()
 
@@ -82,35 +80,9 @@ def test_a_round_with_a_hole_is_taken_again(tmp_path, part):
     assert rows == sorted(rows) and rows[-1] == 4 * 32
 
 
-def test_ctrl_c_keeps_finished_blocks(tmp_path):
-    code = f"""
-import os, signal
-import eigengs_dr as eg
-from _helpers.mosaics import mosaic
-def stop(done, total, row):
-    if row["stage"] == "fit" and done >= total / 2:
-        os.kill(os.getpid(), signal.SIGINT)
-try:
-    eg.fit_large(mosaic(128), {str(tmp_path / "a.npz")!r}, progress=stop, **{FEW!r})
-except KeyboardInterrupt:
-    print("stopped")
-"""
-    process = run_python(code, PYTHONPATH=python_path())
-    assert process.stdout == "stopped\n", process.stderr
-    result = eg.fit_large(mosaic(128), tmp_path / "a.npz", **FEW)
-    assert result.resumed >= 1
-    assert_same_bits(result, eg.fit_large(mosaic(128), **FEW))
-
-
 def test_folder_of_another_run_is_refused(tmp_path):
     pixels, output = mosaic(128), tmp_path / "a.npz"
-
-    def stop(done, total, row):
-        if row["stage"] == "measure":
-            raise Stop
-
-    with pytest.raises(Stop):
-        eg.fit_large(pixels, output, progress=stop, **FEW)
+    stop_after(output, pixels, "measure", 0)
     with pytest.raises(ValueError, match="with gaussians 700 instead of 701"):
         eg.fit_large(pixels, output, **FEW | {"gaussians": 701})
     with pytest.raises(ValueError, match="interrupted run of another image"):

@@ -12,7 +12,6 @@ from PIL import Image
 import eigengs_dr as eg
 from _helpers.clusters import files_of, folder_of_photos
 from _helpers.command import assert_refused, run, smooth_pixels, succeeded
-from _helpers.families import small_model
 
 QUICK = ("--gaussians", 20, "--iterations", 1)
 
@@ -106,15 +105,6 @@ def test_mistakes(photos, tmp_path, case, monkeypatch):
     arguments, words = MISTAKES[case]
     assert_refused(run("fit", *arguments, *QUICK), words)
     assert not (tmp_path / "memory:").exists() and not list(tmp_path.glob("*/*.npz"))
-
-
-def test_results_are_not_written_to_urls(photos):
-    said = "memory://fits: results cannot be written to URLs; write to a folder"
-    for write in (eg.fit_many, small_model("llvm").encode_many):
-        with pytest.raises(OSError, match=said):
-            write(photos, "memory://fits")
-    with pytest.raises(OSError, match=r"s3://bucket/x\.npz: results cannot be written to URLs"):
-        small_model("llvm").save("s3://bucket/x.npz")
 
 
 # --- On a cluster ---

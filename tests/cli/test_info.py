@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import eigengs_dr as eg
-from _helpers.command import assert_refused, run, said, succeeded
+from _helpers.command import assert_refused, run, said
 from eigengs_dr.eigenbasis.eigengs import SHIPPED
 
 
@@ -96,13 +96,6 @@ def test_info_of_the_basis_that_ships(tmp_path):
     assert found["components"] == found["truncation"][-1]["components"] == [230, 60, 60]
     assert_refused(run("info", tmp_path / "natural"), tmp_path / "natural", "No such file")
     assert_refused(run("info", tmp_path), tmp_path, "Is a directory")
-
-
-def test_info_preview_of_an_image(fitted, tmp_path):
-    folder, _ = fitted
-    succeeded(run("info", folder / "fit.npz", "--preview", tmp_path / "info.png"))
-    succeeded(run("render", folder / "fit.npz", "-o", tmp_path / "render.png"))
-    assert (tmp_path / "info.png").read_bytes() == (tmp_path / "render.png").read_bytes()
 
 
 def test_info_of_something_else(trained, tmp_path):

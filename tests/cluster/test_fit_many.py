@@ -1,4 +1,4 @@
-"""Fits of a folder on two processes: the bits of one, and what survives."""
+"""Fits of a folder, and of blocks, on two processes: the bits of one, and what survives."""
 
 import os
 import signal
@@ -9,6 +9,7 @@ import time
 import dask
 import numpy as np
 import pytest
+import tifffile
 from distributed import Client
 from PIL import Image
 
@@ -22,6 +23,7 @@ from _helpers.clusters import (
     slow_writes,
 )
 from _helpers.families import small_model
+from _helpers.process import run_python
 from eigengs_dr.cluster.executor import connect, local_cluster
 from eigengs_dr.collection.manifest import NAME, read_manifest
 
@@ -172,30 +174,6 @@ def test_a_worker_without_memory(photos, output, expected):
     assert found == {name: expected[name] for name in expected if name != "05.npz"}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 3])
-def test_the_number_of_workers_changes_no_bit(tmp_path, output, workers):
-    """At the default steps; nor does a stop."""
-    photo = np.round(eg.sample("coffee") * 255).astype(np.uint8)
-    photos = tmp_path / "crops"
-    photos.mkdir()
-    for k in range(12):
-        crop = photo[10 * k : 10 * k + 48, 30 * k : 30 * k + 48]
-        Image.fromarray(crop).save(photos / f"{k:02d}.png")
-    here = eg.fit_many(photos, tmp_path / "here", gaussians=300)
-    alone = eg.fit(eg.load_image(photos / "05.png"), gaussians=300)
-    assert here[5].psnr_rgb == max(row["psnr_rgb"] for row in alone.trace)
-
-    def stop(done, total, row):
-        raise KeyboardInterrupt
-
-    with connect(f"local:{workers}") as client:
-        with pytest.raises(eg.RunInterrupted):
-            eg.fit_many(photos, output, client=client, progress=stop, gaussians=300)
-        eg.fit_many(photos, output, client=client, gaussians=300)
-    assert_complete(output, files_of(tmp_path / "here"))
-
-
 def test_encoded_images_are_those_of_this_process(client, photos, output):
     model = small_model("llvm")
     here = model.encode_many(photos)
@@ -207,3 +185,25 @@ def test_encoded_images_are_those_of_this_process(client, photos, output):
         for name, values in expected.items():
             np.testing.assert_array_equal(found[name], values)
             np.testing.assert_array_equal(stored[name], values)
+
+
+def test_blocks_have_the_bits_of_one_process(client, tmp_path):
+    picture = (255 * eg.sample("coffee")[:96, :160]).round().astype(np.uint8)
+    tifffile.imwrite(tmp_path / "x.tif", picture, tile=(16, 16))
+    options = {"iterations": 20, "block": 64, "backend": "llvm"}
+    alone = eg.fit_large(tmp_path / "x.tif", **options).gaussians.to_arrays()
+    shared = eg.fit_large(tmp_path / "x.tif", tmp_path / "x.npz", client=client, **options)
+    for name, value in shared.gaussians.to_arrays().items():
+        np.testing.assert_array_equal(value, alone[name])
+    assert not (tmp_path / "x.npz.checkpoint").exists()
+
+
+def test_importing_the_package_imports_no_dask():
+    code = (
+        "import sys, eigengs_dr as eg\n"
+        "from eigengs_dr.cli import main\n"
+        "eg.fit_many, eg.EigenGS, eg.Eigenbasis\n"
+        "print([name for name in ('dask', 'distributed', 'fsspec') if name in sys.modules])"
+    )
+    result = run_python(code)
+    assert result.stdout.strip() == "[]", result.stderr

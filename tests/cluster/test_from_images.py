@@ -1,8 +1,5 @@
 """The eigenbasis on two processes."""
 
-import os
-import signal
-
 import pytest
 
 from _helpers.low_rank import SIZE, assert_same, family
@@ -27,25 +24,13 @@ def test_the_bits_of_one_process(client, images, tmp_path, stored):
     assert_same(found, Eigenbasis.from_images(images, SIZE, 8))
 
 
-def test_a_worker_that_is_killed(client, images, tmp_path):
-    killed = []
-
-    def kill(done, total, row):
-        assert total == 60
-        if not killed:
-            killed.append(next(iter(client.run(os.getpid).values())))
-            os.kill(killed[0], signal.SIGKILL)
-
-    found = Eigenbasis.from_images(images, SIZE, 8, progress=kill, client=client)
-    assert_same(found, Eigenbasis.from_images(images, SIZE, 8))
-
-
 def test_iterators_are_refused(client, images):
     with pytest.raises(ValueError, match="a cluster needs a list"):
         Eigenbasis.from_images(iter(images), SIZE, 8, client=client)
 
 
-def test_training(client, tmp_path, images):
+def test_training(client, tmp_path, images, monkeypatch):
+    """Names are relative to the folder of the client, where no worker runs."""
     (tmp_path / "photos").mkdir()
     for i, image in enumerate(images):
         save_image(tmp_path / "photos" / f"{i:03d}.png", image)
@@ -55,19 +40,10 @@ def test_training(client, tmp_path, images):
     def progress(stage, done, total):
         stages.append((stage, done, total))
 
-    far = training.train(
-        tmp_path / "photos", tmp_path / "a.npz", settings, progress=progress, client=client
-    )
+    monkeypatch.chdir(tmp_path)
+    far = training.train("photos", "a.npz", settings, progress=progress, client=client)
     here = training.train(tmp_path / "photos", tmp_path / "b.npz", settings)
     assert_same(far.basis, here.basis)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     assert ("components", 54, 54) in stages
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "b.npz", "photos"]
-
-
-def test_relative_names_reach_workers_whole(client, tmp_path, images, monkeypatch):
-    (tmp_path / "photos").mkdir()
-    for i, image in enumerate(images[:20]):
-        save_image(tmp_path / "photos" / f"{i:03d}.png", image)
-    monkeypatch.chdir(tmp_path)
-    assert Eigenbasis.from_images("photos", SIZE, 4, client=client).count == 20

@@ -74,16 +74,6 @@ def test_a_failure_that_may_pass_is_tried_again(photos, tmp_path):
     assert len(rows) == 12 and not list(output.glob(".*"))
 
 
-def test_images_without_work_reach_no_worker(photos, tmp_path):
-    (photos / "05.png").write_text("no image")
-    eg.fit_many([photos / "01.png", photos / "07.png"], tmp_path / "fits", **QUICK)
-    executor = Here()
-    rows = eg.fit_many(photos, tmp_path / "fits", client=executor, **QUICK)
-    assert [row.status for row in rows].count("skipped") == 2
-    assert rows[5].status == "failed" and "05.png" in rows[5].error
-    assert not any("01" in names for names in executor.names)
-
-
 @pytest.mark.parametrize(
     ("side", "iterations", "longest"), [(4, 0, 6), (64, 10000, 4), (128, 10000, 1)]
 )

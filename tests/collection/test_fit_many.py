@@ -94,17 +94,6 @@ def test_bad_images_among_good_ones(photos, output):
     assert files_in(output) == ["a.npz", "d.npz", "manifest.jsonl"]
 
 
-def test_files_that_exist_are_skipped(photos, output):
-    eg.fit_many([photos / "b.png"], output, **QUICK)
-    before = (output / "b.npz").read_bytes()
-    rows = eg.fit_many(photos, output, gaussians=10, iterations=0)
-    assert statuses(rows) == {"a": "done", "b": "skipped", "c": "done", "d": "done"}
-    assert (output / "b.npz").read_bytes() == before
-    rows = eg.fit_many(photos, output, overwrite=True, gaussians=10, iterations=0)
-    assert set(statuses(rows).values()) == {"done"}
-    assert len(eg.Gaussians.load(output / "b.npz")) == 10
-
-
 def test_a_file_of_another_kind_is_never_replaced(photos, output):
     output.mkdir()
     (output / "b.npz").write_bytes(b"something else")
@@ -149,14 +138,6 @@ def test_ctrl_c_leaves_what_is_done(photos, output, stop):
     rows = eg.fit_many(photos, output, **QUICK)
     assert [row.status for row in rows[:2]] == ["skipped", "skipped"]
     assert files_in(output) == ["a.npz", "b.npz", "c.npz", "d.npz", "manifest.jsonl"]
-
-
-def test_a_result_that_cannot_be_written(photos, output, tmp_path):
-    output.mkdir()
-    (output / "b.npz").symlink_to(tmp_path / "gone" / "b.npz")
-    rows = eg.fit_many(photos, output, **QUICK)
-    assert statuses(rows) == {"a": "done", "b": "failed", "c": "done", "d": "done"}
-    assert rows[1].error == f"{output / 'b.npz'}: No such file or directory"
 
 
 def test_mistakes_are_found_before_the_work(photos, output, tmp_path):

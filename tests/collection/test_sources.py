@@ -1,14 +1,12 @@
 """Images by folder, glob and URL."""
 
-import zipfile
-
 import numpy as np
 import pytest
 
 import eigengs_dr as eg
 from _helpers.clusters import QUICK
 from eigengs_dr.collection.sources import list_sources
-from eigengs_dr.image.remote import is_url, list_urls
+from eigengs_dr.image.remote import list_urls
 
 
 @pytest.fixture
@@ -59,18 +57,3 @@ def test_images_behind_urls_are_fitted(bucket, photos, tmp_path):
     )
     assert rows[1].error.startswith("memory://bucket/none.png: cannot be read (")
     assert rows[2].error.startswith("memory://bucket/notes.txt: not an image")
-
-
-def test_images_inside_of_an_archive(photos, tmp_path):
-    pytest.importorskip("fsspec")
-    with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
-        archive.write(photos / "00.png", "in/00.png")
-        archive.write(photos / "01.png", "in/01.png")
-    urls = list_urls(f"zip://in/*.png::{tmp_path}/all.zip")
-    assert [source.name for source in list_sources(urls)] == ["00", "01"]
-    np.testing.assert_array_equal(eg.load_image(urls[1]), eg.load_image(photos / "01.png"))
-
-
-def test_what_is_a_url(tmp_path):
-    assert is_url("s3://bucket/a.png") and is_url("zip://a.png::b.zip")
-    assert not is_url("a.png") and not is_url(tmp_path) and not is_url(np.zeros(3))

@@ -14,14 +14,6 @@ from _helpers.files import BYTES, png, property_of
 from eigengs_dr.image.io import SAMPLES, ImageError, check_image, load_image, sample
 
 
-def test_8_bit_values_are_exact(tmp_path):
-    Image.fromarray(BYTES).save(tmp_path / "a.png")
-    image = load_image(tmp_path / "a.png")
-    assert image.dtype == np.float32 and image.flags.c_contiguous
-    np.testing.assert_array_equal(image, BYTES / np.float32(255))
-    np.testing.assert_array_equal(load_image(str(tmp_path / "a.png")), image)
-
-
 @pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "CMYK", "YCbCr", "I;16", "F"])
 def test_every_mode_of_an_opaque_file(tmp_path, mode):
     grey = np.array([[0, 255, 0], [255, 255, 0]], np.uint8)

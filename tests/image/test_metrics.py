@@ -7,6 +7,8 @@ import pytest
 from scipy.signal import correlate2d
 from skimage import color, metrics
 
+from eigengs_dr.fitting.placement.adaptive import place_adaptive
+from eigengs_dr.image import strips
 from eigengs_dr.image.color import to_coded, to_pu21
 from eigengs_dr.image.metrics import ms_ssim, psnr, ssim
 
@@ -200,3 +202,20 @@ def test_psnr_in_pu21():
     found = psnr(to_coded(light), to_coded(brighter), space="pu21")
     expected = -20 * np.log10(to_pu21(brighter) - to_pu21(light))[0, 0, 0]
     assert found == pytest.approx(expected)
+
+
+def test_results_do_not_depend_on_strips_or_threads(monkeypatch):
+    image = np.random.default_rng(1).random((70, 90, 3)).astype(np.float32)
+    expected = place_adaptive(image, 500)
+    figure = psnr(image, image[::-1], "ycbcr")
+    monkeypatch.setattr(strips, "STRIP_PIXELS", 900)
+    found = []
+    for cores in (1, 3):
+        monkeypatch.setattr(strips, "available_cores", lambda cores=cores: cores)
+        found.append(place_adaptive(image, 500))
+        assert psnr(image, image[::-1], "ycbcr") == pytest.approx(figure, abs=1e-9)
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_array_equal(found[0][1], found[1][1])
+    # Only the order of sums changes with the strips.
+    np.testing.assert_allclose(found[0][0], expected[0], atol=1e-3)
+    np.testing.assert_allclose(found[0][1], expected[1], rtol=1e-3, atol=1e-6)

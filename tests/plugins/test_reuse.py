@@ -52,19 +52,16 @@ class TestMapsOfAFile:
     """Their lookups are one; pictures and derivatives are those of a file for each map."""
 
     @pytest.mark.parametrize("prefilter", [0.0, 0.05])
-    def test_renderings(self, monkeypatch, lookups, of_files, prefilter):
-        """With fewer lookups than of a file for each map, and these fewer than without reuse."""
+    def test_renderings(self, lookups, of_files, prefilter):
+        """With half the lookups."""
         pictures, counts = [], [0]
-        for shared, traced in ((True, True), (False, True), (False, False)):
-            if not traced:
-                monkeypatch.setattr(reuse, "_is_traced", lambda: False)
+        for shared in (True, False):
             scene = small_scene(of_files(shared, prefilter)["bsdf"])
             pictures.append(np.array(mi.render(scene, spp=8)))
             counts.append(len(lookups))
-        one, each, all_of_them = np.diff(counts)
-        assert 2 * one == each and each < all_of_them
-        for found in pictures[:2]:
-            np.testing.assert_allclose(found, pictures[2], atol=1e-6)
+        one, each = np.diff(counts)
+        assert 2 * one == each
+        np.testing.assert_allclose(*pictures, atol=1e-6)
 
     @pytest.mark.parametrize("prefilter", [0.0, 0.05])
     def test_frozen_renderings(self, of_files, prefilter):

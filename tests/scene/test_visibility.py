@@ -26,18 +26,22 @@ from eigengs_dr.scene.visibility import visibility  # noqa: E402
 pytestmark = pytest.mark.mitsuba
 
 
+def seen_by(*cameras, **others):
+    """What cameras resolve of the poster."""
+    return visibility(scene_of(*cameras, **others), NAME, TEXELS, TEXELS)
+
+
 class TestFootprint:
     @pytest.mark.parametrize("distance", [0.5, 2.0, 8.0, 60.0])
     def test_from_the_front_is_a_part_of_a_pixel(self, distance):
-        found = visibility(scene_of(camera([0, 0, distance])), NAME, TEXELS, TEXELS)
+        found = seen_by(camera([0, 0, distance]))
         np.testing.assert_allclose(
             found.footprint[found.seen], PIXEL * pixel_at(distance), rtol=3e-3
         )
 
     def test_the_sharpest_camera_decides(self):
         near, far = camera([0, 0, 1.0]), camera([0, 0, 8.0])
-        both = visibility(scene_of(far, near), NAME, TEXELS, TEXELS)
-        one = visibility(scene_of(near), NAME, TEXELS, TEXELS)
+        both, one = seen_by(far, near), seen_by(near)
         assert not one.seen.all() and both.seen.all()
         np.testing.assert_array_equal(both.footprint[one.seen], one.footprint[one.seen])
         expected = PIXEL * pixel_at(8.0)
@@ -74,22 +78,14 @@ class TestFootprint:
 
 class TestSeen:
     def test_what_stands_in_front_hides(self):
-        found = visibility(
-            scene_of(camera([0, 0, 4.0]), board=board(0.0, 1.5)), NAME, TEXELS, TEXELS
-        )
+        found = seen_by(camera([0, 0, 4.0]), board=board(0.0, 1.5))
         assert found.seen[:, :15].all()
         assert not found.seen[:, 18:].any()
 
     def test_a_crop_is_all_of_a_film(self):
-        crop = {"crop_width": SIDE // 2, "crop_height": SIDE}
-        left = visibility(
-            scene_of(camera([0, 0, 4.0], crop_offset_x=0, crop_offset_y=0, **crop)), NAME, 32, 32
-        )
-        right = visibility(
-            scene_of(camera([0, 0, 4.0], crop_offset_x=SIDE // 2, crop_offset_y=0, **crop)),
-            NAME,
-            32,
-            32,
+        crop = {"crop_width": SIDE // 2, "crop_height": SIDE, "crop_offset_y": 0}
+        left, right = (
+            seen_by(camera([0, 0, 4.0], crop_offset_x=x, **crop)) for x in (0, SIDE // 2)
         )
         assert (left.seen[:, :14] != right.seen[:, :14]).all()
         assert (left.seen[:, 18:] != right.seen[:, 18:]).all()
@@ -97,7 +93,7 @@ class TestSeen:
         np.testing.assert_allclose(seen, PIXEL * pixel_at(4.0), rtol=3e-3)
 
     def test_shares_of_pixels_add_up(self):
-        found = visibility(scene_of(camera([0, 0, 4.0]), camera([0, 0, 1.0])), NAME, TEXELS, TEXELS)
+        found = seen_by(camera([0, 0, 4.0]), camera([0, 0, 1.0]))
         for rows in found.pixel_to_texel:
             np.testing.assert_allclose(np.asarray(rows.sum(axis=1)), 1, rtol=1e-5)
         assert found.pixels.sum() == pytest.approx(1, rel=1e-5)
@@ -121,10 +117,9 @@ class TestLookups:
         properties = {"to_uv": mi.ScalarTransform4f().scale([3, 2, 1]), "wrap_mode": "mirror"}
         cameras = camera([0, 0, 4.0])
         texture = texture_of(random_scene().on("llvm", space="linear"), **properties)
-        found = visibility(scene_of(cameras, texture=texture), NAME, TEXELS, TEXELS)
-        same = visibility(
-            scene_of(cameras, texture=bitmap(**properties)), NAME, TEXELS, TEXELS, "mirror"
-        )
+        found = seen_by(cameras, texture=texture)
+        scene = scene_of(cameras, texture=bitmap(**properties))
+        same = visibility(scene, NAME, TEXELS, TEXELS, "mirror")
         np.testing.assert_array_equal(found.footprint, same.footprint)
         assert abs(found.pixel_to_texel[0] - same.pixel_to_texel[0]).max() < 1e-6
 
@@ -133,10 +128,9 @@ class TestLookups:
         film = camera(places[0], 2 * SIDE)["film"] | {"height": SIDE}
         batch = {"type": "batch", "film": film}
         batch |= {f"camera{n}": camera(p) for n, p in enumerate(places)}
-        found = visibility(scene_of(batch), NAME, TEXELS, TEXELS)
-        single = visibility(scene_of(*map(camera, places)), NAME, TEXELS, TEXELS)
+        found, single = seen_by(batch), seen_by(*map(camera, places))
         # Around what the near one hits, texels take after a hit of any camera that is nearer.
-        near = visibility(scene_of(camera(places[1])), NAME, TEXELS, TEXELS).seen
+        near = seen_by(camera(places[1])).seen
         sure = ~near | binary_erosion(near, iterations=2)
         np.testing.assert_allclose(found.footprint[sure], single.footprint[sure], rtol=1e-4)
         assert len(found.pixel_to_texel[0].indptr) - 1 == sum(
@@ -144,21 +138,16 @@ class TestLookups:
         )
 
 
-class TestMistakes:
-    @pytest.mark.parametrize(
-        ("arguments", "words"),
-        [
-            ((NAME + "x", 8, 8), ["not in the scene", NAME]),
-            ((NAME, 8, 8, "border"), ["wrap_mode 'border'", "repeat"]),
-        ],
-    )
-    def test_cost_a_line(self, arguments, words):
-        with pytest.raises(ValueError) as error:
-            visibility(scene_of(camera([0, 0, 4.0])), *arguments)
-        assert "\n" not in str(error.value)
-        assert all(word in str(error.value) for word in words)
-
-    def test_of_cameras_that_see_nothing(self):
-        scene = scene_of(camera([0, 0, 4.0]), board=board(-2.0, 2.0))
-        with pytest.raises(ValueError, match=r"^no pixel of the scene's 1 cameras sees"):
-            visibility(scene, NAME, 8, 8)
+@pytest.mark.parametrize(
+    ("arguments", "others", "words"),
+    [
+        ((NAME + "x", 8, 8), {}, f"is not in the scene.*{NAME}"),
+        ((NAME, 8, 8, "border"), {}, "wrap_mode 'border'.*repeat"),
+        ((NAME, 8, 8), {"board": (-2.0, 2.0)}, r"^no pixel of the scene's 1 cameras sees"),
+    ],
+)
+def test_mistakes_cost_a_line(arguments, others, words):
+    others = {name: board(*sides) for name, sides in others.items()}
+    with pytest.raises(ValueError, match=words) as error:
+        visibility(scene_of(camera([0, 0, 4.0]), **others), *arguments)
+    assert "\n" not in str(error.value)
