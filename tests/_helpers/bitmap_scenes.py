@@ -95,13 +95,7 @@ def sky(folder):
 
 def room(mi, folder):
     """A dictionary: a mesh in a file, a bump map, and a bitmap inside a checkerboard."""
-    mesh = mi.Mesh("quad", 4, 2, has_vertex_texcoords=True)
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = [-1, -1, 0, 1, -1, 0, 1, 1, 0, -1, 1, 0]
-    parameters["vertex_texcoords"] = [0, 0, 1, 0, 1, 1, 0, 1]
-    parameters["faces"] = [0, 1, 2, 0, 2, 3]
-    parameters.update()
-    mesh.write_ply(str(folder / "quad.ply"))
+    mi.load_dict({"type": "cube"}).write_ply(str(folder / "cube.ply"))
     photo = {"type": "bitmap", "filename": str(folder / "photo.png")}
     rough = {"type": "bitmap", "filename": str(folder / "rough.png"), "raw": True}
     return {
@@ -109,9 +103,9 @@ def room(mi, folder):
         "integrator": {"type": "direct"},
         "sensor": camera([0, 0, 4]),
         "lamp": {"type": "constant"},
-        "quad": {
+        "cube": {
             "type": "ply",
-            "filename": str(folder / "quad.ply"),
+            "filename": str(folder / "cube.ply"),
             "bsdf": {
                 "type": "bumpmap",
                 "arbitrary": rough,

@@ -46,11 +46,6 @@ def process_of(task, shared):
     return os.getpid()
 
 
-def slow_process_of(task, shared):
-    time.sleep(0.3)  # a lost result stays lost as long
-    return os.getpid()
-
-
 def fail(task, shared):
     raise ValueError(f"task {task}")
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 import eigengs_dr as eg
+from _helpers.sets import check_equal
 from eigengs_dr.backend.executor import Done
 
 FEW = {"gaussians": 700, "iterations": 10, "block": 64, "backend": "llvm"}
@@ -50,10 +51,5 @@ class Sliced:
         raise AssertionError("the whole array was read")
 
 
-def arrays_of(result):
-    return result.gaussians.to_arrays()
-
-
 def assert_same_bits(one, other):
-    for name, values in arrays_of(one).items():
-        np.testing.assert_array_equal(values, arrays_of(other)[name], err_msg=name)
+    check_equal(one.gaussians, other.gaussians.to_arrays())

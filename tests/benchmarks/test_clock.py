@@ -1,55 +1,21 @@
 """Descents under observation, programs in turns, sets of images and their models."""
 
-import time
 from functools import partial
 
 import numpy as np
 import pytest
 
 from _helpers.benchmarks import data, one_image, task_in  # noqa: F401  data is a fixture
-from _helpers.families import family, small_model
+from _helpers.families import family
 from eigengs_bench import clock, images
 from eigengs_bench.names import PRESETS as NAMES
 from eigengs_bench.names import SETS, ImageSet
-from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.options import PRESETS, FitOptions
-from eigengs_dr.fitting.start import initialize
+from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.image.io import ImageError, save_image
 
 
-@pytest.mark.parametrize("preset", NAMES)
-def test_pictures_and_figures_are_those_of_fit(backend, preset):
-    image, model = one_image(3), small_model(backend) if preset == "eigengs" else None
-    options = {"gaussians": 100, "preset": preset, "start": model, "backend": backend}
-    moments = list(clock.descent(image, 20, {0, 10, 20}, **options))
-    trace = fit(image, iterations=20, **options).trace
-    assert [m.iteration for m in moments] == [row["iteration"] for row in trace] == [0, 10, 20]
-    for moment, row in zip(moments, trace, strict=True):
-        scored = clock.score(moment, image)
-        for key in ("psnr_rgb", "psnr_ycbcr"):  # the device sums in another order
-            assert scored[key] == pytest.approx(row[key], abs=1e-3)
+def test_presets_have_the_names_of_the_package():
     assert tuple(PRESETS) == NAMES
-
-
-def test_the_clock_starts_before_the_start_and_stops_for_the_observer(backend):
-    pause, began = 0.05, time.perf_counter()
-
-    def start():
-        time.sleep(pause)
-        return initialize(one_image(), FitOptions(gaussians=30, init="grid", backend=backend))
-
-    seconds = []
-    for moment in clock.follow(start, PRESETS["default"].schedule, 2, {0, 1, 2}):
-        seconds.append(moment.seconds)
-        time.sleep(pause)
-    assert pause < seconds[0] < seconds[1] < seconds[2]
-    assert seconds[2] < time.perf_counter() - began - 3 * pause
-
-
-def test_rows_have_at_most_100_decibels():
-    image = one_image()
-    assert clock.decibels(image, image, "rgb") == 100
-    assert np.isnan(clock.decibels(image * np.nan, image, "ycbcr"))
 
 
 def test_programs_take_turns():

@@ -60,10 +60,11 @@ def test_tables(data, tmp_path, backend):  # noqa: F811
     for title in ("Methods, 12 steps", "Bases of other images", "Colour space"):
         assert title in text
     # The same figures as those of a fit.
-    [found] = [row for row in rows if row["job"].get("preset") == "default"]
     image = pictures.images_of(task_in(tmp_path, data=data, images=1), "cats256")[0][1]
-    expected = fit(image, 60, 12, backend=backend)
-    assert found["moments"][-1]["psnr_rgb"] == pytest.approx(expected.trace[-1]["psnr_rgb"])
+    for preset in ("default", "gaussianimage"):
+        [found] = [row for row in rows if row["job"].get("preset") == preset]
+        expected = fit(image, 60, 12, preset=preset, backend=backend)
+        assert found["moments"][-1]["psnr_rgb"] == pytest.approx(expected.trace[-1]["psnr_rgb"])
 
 
 def test_means_of_tables_count_failures():

@@ -4,7 +4,6 @@ import subprocess
 import sys
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from _helpers.benchmarks import RUN, row, task_in
@@ -108,16 +107,6 @@ def test_memory_is_that_of_a_process_alone():
     assert 0.02 < rows.alone("it", rows.peak_gib)() < rows.peak_gib() + 1
     with pytest.raises(ValueError, match="it: its process was ended"):
         rows.alone("it", sys.modules["os"]._exit, 9)()
-
-
-def test_cells():
-    assert fr.number(None) == fr.number(float("nan")) == "-"
-    assert fr.number(12345.678, 2) == "12,345.68" and fr.number(float("inf")) == "inf"
-    assert fr.mean(pd.Series([1.0, 3.0, None]), 2) == "2.00 (1 failed)"
-    assert fr.extent(pd.Series([12.0, 37.0, 55.0]), 0) == "12 to 55"
-    assert fr.as_text(fr.table("It", ("name",), [])) == "It: none"
-    assert fr.smallest({100: 30.0, 400: 34.0}, 32.0) == pytest.approx(200)
-    assert np.isnan(fr.smallest({100: 30.0, 400: 34.0}, 35.0))
 
 
 def test_the_report_has_what_rows_answer(tmp_path):

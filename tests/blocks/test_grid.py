@@ -1,10 +1,14 @@
-"""Blocks, and the Gaussians dealt to them."""
+"""Blocks, the Gaussians dealt to them, and the rounds of a fit by blocks."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eigengs_dr.blocks.grid import deal, divide
+from eigengs_dr.blocks.block import rounds
+from eigengs_dr.blocks.grid import BlockSets, deal, divide
+from eigengs_dr.fitting.options import PRESETS
+from eigengs_dr.fitting.schedule import lr_factor, relocations
 
 
 @given(st.integers(1, 300), st.integers(1, 300), st.integers(20, 120), st.integers(0, 40))
@@ -46,3 +50,51 @@ def test_gaussians_follow_the_picture():
     assert dealt.tolist() == [100, 200, 500]
     # A full block leaves the rest to the others.
     assert deal(np.array([1.0, 8.0, 1.0]), np.array([100, 100, 100]), 200).tolist() == [50, 100, 50]
+
+
+SCHEDULE = PRESETS["default"].schedule
+
+
+@pytest.mark.parametrize("iterations", [0, 1, 2, 10, 100, 179, 180, 980, 5000])
+def test_rounds_take_every_step_once(iterations):
+    parts = rounds(SCHEDULE, iterations)
+    assert [step for part in parts for step in part] == list(range(iterations))
+    assert len(parts) == 1 or all(parts)
+    starts = {part.start for part in parts}
+    assert set(relocations(SCHEDULE, iterations)) <= starts  # a round may end with none
+
+
+def test_rates_rise_from_the_start_of_a_part():
+    factors = [lr_factor(SCHEDULE, step, 100, start=40) for step in range(100)]
+    whole = [lr_factor(SCHEDULE, step, 100) for step in range(100)]
+    assert factors[:40] == [0] * 40
+    rise = [a / b for a, b in zip(factors[40:50], whole[40:50], strict=True)]
+    np.testing.assert_allclose(rise, [0.2, 0.4, 0.6, 0.8, 1, 1, 1, 1, 1, 1])
+
+
+def test_a_window_sees_every_gaussian_once():
+    """Those whose means lie in it, or others that touch it, wherever their block is."""
+    blocks = divide(96, 96, 32, 8)
+    rng = np.random.default_rng(3)
+    sets = BlockSets(blocks, np.full(9, 20), ("mean", "factor", "color"), cutoff=3.0)
+    for block in blocks:
+        size = rng.choice([0.5, 12], 20)
+        corner = np.array([block.columns.start, block.rows.start])
+        own = {
+            "mean": corner + rng.uniform(-6, 38, (20, 2)),
+            "factor": np.stack([1 / size, 0 * size, 1 / size], axis=1),
+            "color": np.full((20, 3), block.number),
+        }
+        sets.put(block, own | {"mean": own["mean"] - block.corner})
+    mean, reach = sets.arrays["mean"], 3 / sets.arrays["factor"][:, :1]
+    for block in blocks:
+        inside, own = sets.in_window(block)
+        outside = sets.around(block)
+        seen = np.concatenate([inside["mean"], outside["mean"]]) + block.corner
+        low, high = block.corner, block.corner + block.window_size
+        touching = ((mean + reach >= low) & (mean - reach <= high)).all(axis=1)
+        distance = np.abs(seen[:, None] - mean[None]).max(axis=2)
+        assert ((distance < 1e-3).sum(axis=1) == 1).all()
+        assert len(set(distance.argmin(axis=1).tolist())) == len(seen)
+        assert set(distance.argmin(axis=1)) >= set(np.flatnonzero(touching))
+        assert (inside["color"][own] == block.number).all() and own.stop - own.start == 20

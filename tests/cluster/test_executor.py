@@ -1,8 +1,6 @@
 """Tasks on two real processes: order, errors, what is drawn when, and workers that end."""
 
 import os
-import signal
-import time
 from types import SimpleNamespace
 
 import dask
@@ -45,25 +43,6 @@ def test_few_tasks_are_drawn_ahead(executor):
 def test_errors_are_raised(executor):
     with pytest.raises(ValueError, match="task 0"):
         list(executor.map(clusters.fail, range(1)))
-
-
-def test_a_result_that_ends_with_its_worker_is_made_again(executor, client, monkeypatch):
-    """The worker ends after the task, before the client has read what the task returned."""
-    wait, ended = module.ClusterExecutor._ended, []
-
-    def end_worker_first(self, futures):
-        found = list(wait(self, futures))
-        if not ended:
-            holder = client.who_has(found[:1])[found[0].key][0]
-            ended.append(client.run(os.getpid, workers=[holder])[holder])
-            os.kill(ended[0], signal.SIGKILL)
-            while found[0].status == "finished":
-                time.sleep(0.001)
-        return found
-
-    monkeypatch.setattr(module.ClusterExecutor, "_ended", end_worker_first)
-    found = done(executor, clusters.slow_process_of, range(4))
-    assert len(found) == 4 and ended[0] not in [entry.value for entry in found]
 
 
 def test_a_worker_that_starts_slowly_comes_back(tmp_path):

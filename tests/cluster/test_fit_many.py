@@ -24,6 +24,7 @@ from _helpers.clusters import (
 )
 from _helpers.families import small_model
 from _helpers.process import run_python
+from _helpers.sets import check_equal
 from eigengs_dr.cluster.executor import connect, local_cluster
 from eigengs_dr.collection.manifest import NAME, read_manifest
 
@@ -71,8 +72,7 @@ def test_a_basis_and_results_travel(client):
     options = {"start": model, "iterations": 2, "backend": "llvm"}
     here = eg.fit_many(images, **options)
     for row, other in zip(eg.fit_many(images, client=client, **options), here, strict=True):
-        for name, values in other.result.gaussians.to_arrays().items():
-            np.testing.assert_array_equal(row.result.gaussians.to_arrays()[name], values)
+        check_equal(row.result.gaussians, other.result.gaussians.to_arrays())
 
 
 def test_a_worker_that_is_killed(client, photos, output, expected):
@@ -180,21 +180,17 @@ def test_encoded_images_are_those_of_this_process(client, photos, output):
     rows = model.encode_many(photos, client=client)
     model.encode_many(photos, output, client=client)
     for row, other in zip(rows, here, strict=True):
-        found, expected = row.result.to_arrays(), other.result.to_arrays()
-        stored = eg.Gaussians.load(output / f"{row.name}.npz").to_arrays()
-        for name, values in expected.items():
-            np.testing.assert_array_equal(found[name], values)
-            np.testing.assert_array_equal(stored[name], values)
+        check_equal(row.result, other.result.to_arrays())
+        check_equal(eg.Gaussians.load(output / f"{row.name}.npz"), other.result.to_arrays())
 
 
 def test_blocks_have_the_bits_of_one_process(client, tmp_path):
     picture = (255 * eg.sample("coffee")[:96, :160]).round().astype(np.uint8)
     tifffile.imwrite(tmp_path / "x.tif", picture, tile=(16, 16))
     options = {"iterations": 20, "block": 64, "backend": "llvm"}
-    alone = eg.fit_large(tmp_path / "x.tif", **options).gaussians.to_arrays()
+    alone = eg.fit_large(tmp_path / "x.tif", **options)
     shared = eg.fit_large(tmp_path / "x.tif", tmp_path / "x.npz", client=client, **options)
-    for name, value in shared.gaussians.to_arrays().items():
-        np.testing.assert_array_equal(value, alone[name])
+    check_equal(shared.gaussians, alone.gaussians.to_arrays())
     assert not (tmp_path / "x.npz.checkpoint").exists()
 
 

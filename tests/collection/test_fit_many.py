@@ -9,9 +9,9 @@ import pytest
 from PIL import Image
 
 import eigengs_dr as eg
+from _helpers.clusters import QUICK
 from _helpers.command import smooth_pixels
-
-QUICK = {"gaussians": 20, "iterations": 2}
+from _helpers.sets import check_equal
 
 
 @pytest.fixture
@@ -33,19 +33,13 @@ def files_in(folder):
     return sorted(path.name for path in Path(folder).iterdir())
 
 
-def same(first, second):
-    """Whether two sets are equal bit for bit."""
-    a, b = first.to_arrays(), second.to_arrays()
-    return all(np.array_equal(a[key], b[key]) for key in a)
-
-
 def test_results_are_those_of_single_fits(photos, output):
     rows = eg.fit_many(photos, output, **QUICK)
     assert [row.name for row in rows] == ["a", "b", "c", "d"]
     for row in rows:
         image = eg.load_image(row.input)
         alone = eg.fit(image, **QUICK)
-        assert same(eg.Gaussians.load(row.output), alone.gaussians)
+        check_equal(eg.Gaussians.load(row.output), alone.gaussians.to_arrays())
         assert (row.width, row.height, row.gaussians) == (image.shape[1], 24, 20)
         assert row.psnr_rgb == alone.psnr_rgb
         assert row.psnr_ycbcr > row.psnr_rgb > 10 and row.seconds > 0
@@ -59,7 +53,7 @@ def test_arrays_stay_in_memory_without_an_output():
     rows = eg.fit_many(images, **QUICK)
     assert [row.name for row in rows] == ["000000", "000001"]
     for row, image in zip(rows, images, strict=True):
-        assert same(row.result.gaussians, eg.fit(image, **QUICK).gaussians)
+        check_equal(row.result.gaussians, eg.fit(image, **QUICK).gaussians.to_arrays())
         assert row.input is None and row.output is None
 
 
@@ -78,7 +72,7 @@ def test_an_iterator_may_reuse_its_array():
 def test_levels_of_detail(photos, output):
     [row, *_] = eg.fit_many(photos, output, levels=2, **QUICK)
     alone = eg.fit(eg.load_image(row.input), levels=2, **QUICK)
-    assert same(eg.Gaussians.load(row.output), alone.gaussians)
+    check_equal(eg.Gaussians.load(row.output), alone.gaussians.to_arrays())
 
 
 def test_bad_images_among_good_ones(photos, output):

@@ -78,12 +78,6 @@ def test_every_source_gives_the_same_blocks(tmp_path):
         np.testing.assert_array_equal(np.concatenate(blocks), expected, name)
 
 
-def test_grey_images_are_replicated():
-    grey = pictures(3)[..., 0]
-    (block,) = read(grey)
-    np.testing.assert_array_equal(block, planes(np.repeat(grey[..., None], 3, axis=3)))
-
-
 def test_a_source_may_overwrite_its_arrays():
     images = pictures(9)
 

@@ -91,15 +91,6 @@ class TestValues:
         found = picture([texture(g).eval(texel_centres())[0]])[..., 0]
         np.testing.assert_allclose(found, light, atol=1e-5)
 
-    @pytest.mark.parametrize("seed", range(3))
-    def test_a_saved_set_is_the_same_texture(self, tmp_path, seed):
-        g = gaussians("ycbcr", seed=seed)
-        g.save(tmp_path / "x.npz")
-        loaded = mi.load_dict({"type": "gaussian_texture", "filename": str(tmp_path / "x.npz")})
-        np.testing.assert_array_equal(
-            picture(loaded.eval(texel_centres())), picture(texture(g).eval(texel_centres()))
-        )
-
 
 class TestWhere:
     @pytest.mark.parametrize(

@@ -92,23 +92,29 @@ def upstream(shape=(SIDE, SIDE, 3)):
     return np.random.default_rng(1).normal(size=shape).astype(np.float32)
 
 
+STEPS = {"mean": 2e-2, "factor": 1e-3, "coefficients": 1e-2}
+
+
+def check_gradients(scene, names):
+    """Compare with finite differences to 1 %, at equal seeds."""
+    weight = mi.TensorXf(upstream())
+    found = gradients(scene, weight)
+    assert list(found) == names
+    for name, gradient in found.items():
+        direction = direction_like(gradient)
+        expected = difference(scene, name, STEPS.get(name, 2e-3), direction, weight)
+        assert abs(expected) > 1e-2
+        assert (gradient * direction).sum() == pytest.approx(expected, rel=0.01), name
+
+
 class TestIntegrators:
     @pytest.mark.parametrize(
         ("integrator", "prefilter"), [("direct", 0.0), ("path", 0.0), ("prb", 0.0), ("prb", 0.05)]
     )
     def test_gradients_are_finite_differences(self, integrator, prefilter):
-        """To 1 %, at equal seeds; a cutoff of 6 leaves no edge for finite differences to cross."""
-        g = gaussians("ycbcr")
-        scene = small_scene(wall(g, cutoff=6.0, prefilter=prefilter), integrator, SIDE, SPP)
-        weight = mi.TensorXf(upstream())
-        found = gradients(scene, weight)
-        assert list(found) == PARAMETERS
-        for name, gradient in found.items():
-            direction = direction_like(gradient)
-            step = {"mean": 2e-2, "factor": 1e-3}.get(name, 2e-3)
-            expected = difference(scene, name, step, direction, weight)
-            assert abs(expected) > 1e-2
-            assert (gradient * direction).sum() == pytest.approx(expected, rel=0.01), name
+        """A cutoff of 6 leaves no edge for finite differences to cross."""
+        bsdf = wall(gaussians("ycbcr"), cutoff=6.0, prefilter=prefilter)
+        check_gradients(small_scene(bsdf, integrator, SIDE, SPP), PARAMETERS)
 
     def along_parameters(self, integrator, names, prefilter=0.0):
         """A picture whose parameters depend on one variable, and this variable."""
@@ -224,13 +230,7 @@ class TestModel:
     @pytest.mark.parametrize("integrator", ["direct", "prb"])
     def test_gradients_are_finite_differences(self, saved, integrator):
         bsdf = {"type": "diffuse", "reflectance": {"type": "gaussian_texture", "model": saved[0]}}
-        scene = small_scene(bsdf, integrator, SIDE, SPP)
-        weight = mi.TensorXf(upstream())
-        (gradient,) = gradients(scene, weight).values()
-        direction = direction_like(gradient)
-        expected = difference(scene, "coefficients", 1e-2, direction, weight)
-        assert abs(expected) > 1e-2
-        assert (gradient * direction).sum() == pytest.approx(expected, rel=0.01)
+        check_gradients(small_scene(bsdf, integrator, SIDE, SPP), ["coefficients"])
 
     def test_coefficients_of_another_shape(self, saved):
         with pytest.raises(RuntimeError, match=r"coefficients has shape \(2, 2\), expected \(3, "):

@@ -61,10 +61,6 @@ class TestMistakes:
         with pytest.raises(RuntimeError, match=r"x\.npz"):
             mi.load_dict({"type": "gaussian_texture", "filename": str(tmp_path / "x.npz")})
 
-    def test_normals_from_one_channel(self):
-        with pytest.raises(ValueError, match="a lookup of three channels"):
-            texture(gaussians("data", channels=1)).eval_3(at(0.5, 0.5))
-
     @in_variants(SPECTRAL)
     @pytest.mark.parametrize("raw", [True, False])
     def test_a_spectrum_from_data(self, variant, raw):

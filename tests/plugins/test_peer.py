@@ -59,16 +59,9 @@ def test_sampled_wavelengths_have_their_density(variant):
 
 def test_what_it_says_of_itself(tmp_path):
     gaussians("rgb").save(tmp_path / "bark.npz")
-    turn = mi.ScalarTransform4f().scale([2, 3, 1])
-    tex = mi.load_dict(
-        {
-            "type": "gaussian_texture",
-            "filename": str(tmp_path / "bark.npz"),
-            "wrap_mode": "mirror",
-            "raw": True,
-            "to_uv": turn,
-        }
-    )
+    bark = {"type": "gaussian_texture", "filename": str(tmp_path / "bark.npz"), "raw": True}
+    turned = {"wrap_mode": "mirror", "to_uv": mi.ScalarTransform4f().scale([2, 3, 1])}
+    tex = mi.load_dict(bark | turned)
     shown = str(tex)
     for part in (
         'name = "bark.npz"',

@@ -1,4 +1,4 @@
-"""The texture in every slot of scenes, and as a light."""
+"""The texture in every slot of scenes, as a light, and as the sky."""
 
 import drjit as dr
 import numpy as np
@@ -8,9 +8,11 @@ from _helpers.sets import SIZE
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 import eigengs_dr as eg  # noqa: E402
-from _helpers.texture import gaussians, small_scene  # noqa: E402
+from _helpers.errors import refused  # noqa: E402
+from _helpers.texture import backend, gaussians, small_scene  # noqa: E402
 from _helpers.variants import BOTH_RGB, in_all, in_variants  # noqa: E402
-from eigengs_dr.plugins import texture_of  # noqa: E402
+from eigengs_dr.image.color import to_coded, to_log  # noqa: E402
+from eigengs_dr.plugins import bake_environment, texture_of  # noqa: E402
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -90,9 +92,11 @@ class TestSlots:
         ]
         np.testing.assert_allclose(*(m.mean(axis=(0, 1)) for m in means), rtol=0.05)
 
-    def test_a_lamp_lights_as_a_bitmap_of_the_same_picture_does(self):
-        g = gaussians("linear", quiet=False)
-        data = mi.TensorXf(np.clip(eg.render(g, SIZE[0] * 8).numpy(), 0, 1))
+    @pytest.mark.parametrize(("space", "most"), [("linear", 1), ("radiance", None), ("log", None)])
+    def test_a_lamp_lights_as_a_bitmap_of_the_same_picture_does(self, space, most):
+        """Also above 1."""
+        g = gaussians(space, quiet=False)
+        data = mi.TensorXf(np.clip(eg.render(g, SIZE[0] * 8).numpy(), 0, most))
         means = []
         for radiance in (
             texture_of(g),
@@ -101,3 +105,32 @@ class TestSlots:
             scene = small_scene(None, emitter={"type": "area", "radiance": radiance})
             means.append(np.array(mi.render(scene, spp=256, seed=1)).mean(axis=(0, 1)))
         np.testing.assert_allclose(means[0], means[1], rtol=0.02)
+
+
+BRIGHT = np.array([7.0, 5.0, 3.0])
+
+
+def even(space, value, size=(32, 16)):
+    """A set that is the same everywhere."""
+    return eg.Gaussians.from_arrays(
+        [[4, 4]], [[0.5, 0, 0.5]], [[0, 0, 0]], value, size=size, space=space, backend=backend()
+    )
+
+
+@pytest.mark.parametrize(
+    ("space", "value"),
+    [("radiance", BRIGHT), ("log", to_log(BRIGHT)), ("rgb", to_coded(BRIGHT / 10))],
+)
+def test_sky_of_a_set(space, value):
+    light = BRIGHT / 10 if space == "rgb" else BRIGHT
+    mi.load_dict({"type": "scene"})  # without OptiX this test ends here, before the bitmap
+    emitter = bake_environment(even(space, value), width=16, scale=2.0)
+    scene = mi.load_dict({"type": "scene", "sky": emitter, "integrator": {"type": "path"}})
+    ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(0.3, 0.4, 0.5))
+    seen = scene.environment().eval(scene.ray_intersect(ray))
+    np.testing.assert_allclose(np.array(seen).ravel(), 2 * light, rtol=1e-3)
+
+
+def test_data_is_no_sky():
+    with refused(ValueError, "bake_environment: the set has 3 channels"):
+        bake_environment(even("data", BRIGHT))

@@ -93,7 +93,7 @@ def test_a_dictionary_with_a_mesh(folder, tmp_path):
     assert any("slopes" in reason for _, reason in found.left)
     scene = mi.load_file(str(found.scene))
     assert np.isfinite(np.array(mi.render(scene, spp=1))).all()
-    assert "quad.ply" in found.scene.read_text()
+    assert "cube.ply" in found.scene.read_text()
 
 
 def test_nothing_is_rendered_on_request(folder, tmp_path):
@@ -124,7 +124,7 @@ def test_mistakes(folder, tmp_path):
 def test_objects_in_memory_are_refused(folder, tmp_path):
     pixels = mi.Bitmap(np.full((4, 4, 3), 0.5, np.float32))
     scene = room(mi, folder)
-    scene["quad"]["bsdf"]["bsdf"]["reflectance"]["color0"] = {"type": "bitmap", "bitmap": pixels}
+    scene["cube"]["bsdf"]["bsdf"]["reflectance"]["color0"] = {"type": "bitmap", "bitmap": pixels}
     with pytest.raises(ValueError, match=r"cannot be written as XML .*; give images and meshes by"):
         eg.convert_scene(scene, tmp_path / "new", spp=0, **QUICK)
     assert not list(tmp_path.iterdir())

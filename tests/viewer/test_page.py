@@ -72,23 +72,6 @@ def test_everything_is_in_reach_on_a_phone(show):
         assert tab.page.locator(name).is_visible()
 
 
-def test_shows_20_000_gaussians_of_a_photo(show):
-    """With ``-rP``, pytest prints the figures of the manual."""
-    photo = eg.sample("coffee")
-    gaussians = eg.fit(photo, 20_000, iterations=0).gaussians
-    page = eg.view(gaussians, photo)
-    size = len(page.html.encode())
-    assert size < 1_500_000
-    tab = show(page, "large")
-    seconds = tab.run("viewer.ready") / 1000
-    tab.page.click("#actual-size")
-    difference = differ(tab.image(), codes(gaussians))
-    assert difference < 0.05
-    alone = len(eg.view(gaussians).html.encode())
-    print(f"{alone:,} bytes, {size:,} with the photo; first picture after {seconds:.2f} s")
-    print(f"mean difference to the renderer {difference:.4f} of 255")
-
-
 def test_16_bit_sums_are_close(actual):
     """Where WebGL does not add 32-bit floats, as on some phones."""
     gaussians = make_set()
