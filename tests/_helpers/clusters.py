@@ -143,7 +143,7 @@ class Here:
 
         for task in reversed(list(tasks)):
             self.tasks.append(task)
-            if self.lost & set(self.names[-1]):
+            if self.lost and self.lost & set(self.names[-1]):
                 yield Done(task, None, "its worker ended 2 times")
             else:
                 yield Done(task, function(task, shared))

@@ -4,7 +4,6 @@ import numpy as np
 
 import eigengs_dr as eg
 from _helpers.sets import check_equal
-from eigengs_dr.backend.executor import Done
 
 FEW = {"gaussians": 700, "iterations": 10, "block": 64, "backend": "llvm"}
 """Settings of a fit of 128x128 pixels in four blocks."""
@@ -23,16 +22,6 @@ def mosaic(side=256):
         for row in range(tiles)
     ]
     return np.rint(255 * np.concatenate(rows)[:side, :side]).astype(np.uint8)
-
-
-class Backwards:
-    """An executor that works on the last task first."""
-
-    workers = 1
-
-    def map(self, function, tasks, shared=None):
-        for task in reversed(list(tasks)):
-            yield Done(task, function(task, shared))
 
 
 class Sliced:

@@ -30,7 +30,6 @@ FLAGS = [
 
 DEVICES = {
     "desktop": {"viewport": {"width": 700, "height": 420}, "color_scheme": "light"},
-    "large": {"viewport": {"width": 1280, "height": 800}},
     "phone": {
         "viewport": {"width": 360, "height": 640},
         "device_scale_factor": 2,

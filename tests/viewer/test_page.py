@@ -1,10 +1,10 @@
-"""The page in a browser: it draws as the renderer does."""
+"""The page in a browser: it draws as the renderer does, and answers mouse, touch and keyboard."""
 
 import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.families import family, small_model
+from _helpers.families import SIDE, family, small_model
 from _helpers.shown import COUNT, SIZE, codes, differ, make_set
 from eigengs_dr.viewer.view import Page
 
@@ -98,3 +98,179 @@ def test_draws_again_after_the_context_is_lost(actual):
     })""")
     tab.run("0")
     assert differ(tab.image(), codes(gaussians)) < 0.05
+
+
+# --- Mouse, touch and keyboard ---
+
+
+@pytest.mark.parametrize("scale", [7.3, 1e8])
+def test_zoom_has_no_end(show, scale):
+    """Pixels are compared with those of the same set, moved and scaled."""
+    gaussians, middle = make_set(), np.array([33.3, 41.7])
+    tab = show(eg.view(gaussians))
+    tab.run(f"viewer.camera.place(...{middle.tolist()}, {scale}); viewer.redraw()")
+    found = tab.pixels()
+    size = found.shape[1::-1]
+    arrays = {name: values.astype(float) for name, values in gaussians.to_arrays().items()}
+    arrays["mean"] = (arrays["mean"] - middle) * scale + 0.5 * np.array(size)
+    arrays["factor"] /= scale
+    moved = eg.Gaussians.from_arrays(**arrays, size=size, space="rgb", dtype=np.float64)
+    assert differ(found, codes(moved)) < 0.5
+
+
+def test_mouse_and_keyboard_move_the_picture(show):
+    tab = show(eg.view(make_set()))
+    canvas, page = tab.page.locator("#view"), tab.page
+    assert tab.run("viewer.camera.x") == SIZE[0] / 2
+
+    at = tab.run("viewer.camera.toImage(150, 200)")
+    page.mouse.move(150, 200)
+    page.mouse.wheel(0, -240)
+    tab.wait("viewer.camera.scale > 1.5 * viewer.camera.fitScale")  # the wheel answers later
+    np.testing.assert_allclose(tab.run("viewer.camera.toImage(150, 200)"), at)  # stays under it
+
+    page.mouse.down()
+    page.mouse.move(190, 170, steps=3)
+    page.mouse.up()
+    np.testing.assert_allclose(tab.run("viewer.camera.toImage(190, 170)"), at)
+
+    canvas.press("0")
+    assert tab.run("viewer.camera.fitted")
+    canvas.press("+")
+    canvas.press("ArrowRight")
+    canvas.press("ArrowDown")
+    x, y, zoom = tab.run("((c) => [c.x, c.y, c.scale / c.fitScale])(viewer.camera)")
+    assert x > SIZE[0] / 2 and y > SIZE[1] / 2 and zoom == pytest.approx(1.25)
+    canvas.press("1")
+    assert tab.run("byId('zoom').textContent") == "100 %"
+
+
+def test_two_fingers_zoom(show):
+    tab = show(eg.view(make_set()), "phone")
+    touch = tab.page.context.new_cdp_session(tab.page)
+
+    def send(kind, *points):
+        points = [{"x": x, "y": y} for x, y in points]
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    before = tab.run("viewer.camera.scale")
+    at = tab.run("viewer.camera.toImage(2 * 180, 2 * 150)")
+    send("touchStart", (150, 150), (210, 150))
+    for step in range(1, 7):
+        send("touchMove", (150 - 10 * step, 150), (210 + 10 * step, 150))
+    send("touchEnd")
+    assert tab.run("viewer.camera.scale") == pytest.approx(3 * before, rel=0.01)
+    np.testing.assert_allclose(tab.run("viewer.camera.toImage(2 * 180, 2 * 150)"), at, atol=0.1)
+
+    tab.page.touchscreen.tap(180, 150)
+    tab.page.locator("#chosen").wait_for()
+
+
+def test_the_photo_is_right_of_the_divider(actual):
+    gaussians = make_set()
+    photo = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    photo[:, ::2] = (200, 100, 50)
+    tab = actual(eg.view(gaussians, photo))
+    tab.page.check("#compare")
+    left = tab.run("viewer.camera.frame[0]")
+    split = int(tab.run("viewer.camera.width") / 2 - left)
+    assert 0 < split < SIZE[0]
+    found = tab.image()
+    assert differ(found[:, :split], codes(gaussians)[:, :split]) < 0.05
+    np.testing.assert_array_equal(found[:, split:], photo[:, split:])
+
+    tab.page.focus("#divider")
+    tab.page.keyboard.press("ArrowRight")
+    assert tab.run("viewer.wipe") == pytest.approx(0.52)
+    box = tab.page.locator("#divider i").bounding_box()
+    tab.page.mouse.move(box["x"] + 1, 50)
+    tab.page.mouse.down()
+    tab.page.mouse.move(box["x"] + 1 - 50, 50)
+    tab.page.mouse.up()
+    canvas = tab.run("viewer.canvas.clientWidth")
+    assert tab.run("viewer.wipe") == pytest.approx(0.52 - 50 / canvas, abs=0.01)
+
+
+def test_points_at_a_gaussian(show):
+    mean = [[30, 30], [90, 60]]
+    factor = [[0.2, 0, 0.1], [0.25, 0, 0.25]]
+    color = [[0.5, 0.25, 0.125], [0.3, 0.3, 0.3]]
+    gaussians = eg.Gaussians.from_arrays(mean, factor, color, size=SIZE, space="rgb")
+    tab = show(eg.view(gaussians))
+    left, top, width, _ = tab.run("viewer.camera.frame")
+    corner, scale = np.array([top, left]), width / SIZE[0]
+    before = tab.pixels()
+    tab.page.mouse.move(left + 30 * scale, top + 30 * scale)
+    for name, expected in {
+        "number": "1 of 2",
+        "mean": "30.00, 30.00 px",
+        "size": "10.0 \u00d7 5.00 px",
+        "angle": "90°",
+        "color": "0.500, 0.250, 0.125",
+        "reach": "1 Gaussians",
+    }.items():
+        assert tab.page.text_content(f"#chosen-{name}") == expected
+    changed = np.argwhere(np.abs(tab.pixels() - before).max(axis=2) > 30)
+    box = (np.array([changed.min(axis=0), changed.max(axis=0)]) - corner) / scale
+    np.testing.assert_allclose(box, [[20, 25], [40, 35]], atol=1)
+
+    tab.page.mouse.move(5, 5)
+    tab.page.locator("#chosen").wait_for(state="hidden")
+    np.testing.assert_array_equal(tab.pixels(), before)
+
+
+def test_outlines(show):
+    tab = show(eg.view(make_set()))
+    before = tab.pixels()
+    tab.page.check("#outlines")
+    assert 0.05 < (np.abs(tab.pixels() - before).max(axis=2) > 30).mean() < 0.7
+    tab.page.uncheck("#outlines")
+    np.testing.assert_array_equal(tab.pixels(), before)
+
+
+def scored(model, scores):
+    """The Gaussians of a model for scores: coefficients in standard deviations."""
+    pairs = zip(scores, model.eigenvalues, strict=True)
+    return model.reconstruct([np.array(s) * np.sqrt(v[: len(s)]) for s, v in pairs])
+
+
+def test_sliders_move_a_model(actual):
+    model = small_model("llvm")
+    tab = actual(eg.view(model))
+    assert differ(tab.image(), codes(model.gaussians)) < 0.05
+    assert tab.page.locator("#components fieldset").count() == 3
+    tab.page.locator("#components fieldset:nth-child(1) input").nth(1).fill("2")
+    tab.page.locator("#components fieldset:nth-child(3) input").nth(0).fill("-1.5")
+    scores = tab.run("model.scores")
+    assert scores[0][1] == 2 and scores[2][0] == -1.5
+    assert np.count_nonzero(np.concatenate(scores)) == 2
+    assert differ(tab.image(), codes(scored(model, scores))) < 0.1
+
+    tab.page.click("#random-image")
+    scores = tab.run("model.scores")
+    assert 0.4 < np.std(np.concatenate(scores)) < 1.8
+    assert differ(tab.image(), codes(scored(model, scores))) < 0.1
+    tab.page.click("#mean-image")
+    assert differ(tab.image(), codes(model.gaussians)) < 0.05
+
+
+def test_a_photo_moves_along_the_components(actual):
+    model, photo = small_model("llvm"), family(count=3, seed=5)[2]
+    photo = np.ascontiguousarray(np.repeat(photo, 2, axis=1))  # another aspect ratio
+    tab = actual(eg.view(model, photo))
+    assert differ(tab.image(), codes(model.encode(photo))) < 0.05
+    scores = tab.run("model.scores")
+    pairs = zip(model.project(photo), model.eigenvalues, strict=True)
+    expected = [coefficients / np.sqrt(values) for coefficients, values in pairs]
+    for a, b in zip(scores, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5)
+
+    slider = tab.page.locator("#components fieldset:nth-child(1) input").first
+    slider.fill(str(round(scores[0][0] + 1)))
+    moved = zip(tab.run("model.scores"), expected, strict=True)
+    change = scored(model, [np.array(new) - old for new, old in moved])
+    before, after = (codes(g.scaled(2 * SIDE, SIDE)) for g in (model.gaussians, change))
+    assert np.abs(after - before).mean() > 1
+    assert differ(tab.image(), codes(model.encode(photo)) + after - before) < 1.0
+    tab.page.click("#photo-image")
+    assert differ(tab.image(), codes(model.encode(photo))) < 0.05

@@ -1,10 +1,11 @@
-"""Fits of a folder, and of blocks, on two processes: the bits of one, and what survives."""
+"""On two processes: tasks, fits of a folder and of blocks, a basis; and what survives."""
 
 import os
 import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import dask
 import numpy as np
@@ -14,6 +15,7 @@ from distributed import Client
 from PIL import Image
 
 import eigengs_dr as eg
+from _helpers import clusters
 from _helpers.clusters import (
     QUICK,
     DieInWrite,
@@ -23,10 +25,18 @@ from _helpers.clusters import (
     slow_writes,
 )
 from _helpers.families import small_model
+from _helpers.low_rank import SIZE, assert_same, family
 from _helpers.process import run_python
 from _helpers.sets import check_equal
-from eigengs_dr.cluster.executor import connect, local_cluster
+from eigengs_dr.backend.executor import ClusterError, Done, executor_for
+from eigengs_dr.cluster import executor as module
+from eigengs_dr.cluster.executor import WorkerSetup, connect, local_cluster, versions
 from eigengs_dr.collection.manifest import NAME, read_manifest
+from eigengs_dr.eigenbasis import training
+from eigengs_dr.eigenbasis.options import TrainOptions
+from eigengs_dr.eigenbasis.pca import stream
+from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
+from eigengs_dr.image.io import save_image
 
 
 @pytest.fixture
@@ -203,3 +213,118 @@ def test_importing_the_package_imports_no_dask():
     )
     result = run_python(code)
     assert result.stdout.strip() == "[]", result.stderr
+
+
+# --- The eigenbasis ---
+
+
+@pytest.fixture
+def images(monkeypatch):
+    """Images for four shards; workers take the sizes from the tasks."""
+    monkeypatch.setattr(stream, "SHARD", 16)
+    return family(60)
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_a_basis_has_the_bits_of_one_process(client, images, tmp_path, stored):
+    checkpoint = tmp_path if stored else None
+    found = Eigenbasis.from_images(images, SIZE, 8, client=client, checkpoint=checkpoint)
+    assert_same(found, Eigenbasis.from_images(images, SIZE, 8))
+
+
+def test_iterators_are_refused(client, images):
+    with pytest.raises(ValueError, match="a cluster needs a list"):
+        Eigenbasis.from_images(iter(images), SIZE, 8, client=client)
+
+
+def test_training(client, tmp_path, images, monkeypatch):
+    """Names are relative to the folder of the client, where no worker runs."""
+    (tmp_path / "photos").mkdir()
+    for i, image in enumerate(images):
+        save_image(tmp_path / "photos" / f"{i:03d}.png", image)
+    settings = TrainOptions(size=SIZE, components=6, gaussians=40)
+    stages = []
+
+    def progress(stage, done, total):
+        stages.append((stage, done, total))
+
+    monkeypatch.chdir(tmp_path)
+    far = training.train("photos", "a.npz", settings, progress=progress, client=client)
+    here = training.train(tmp_path / "photos", tmp_path / "b.npz", settings)
+    assert_same(far.basis, here.basis)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert ("components", 54, 54) in stages
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "b.npz", "photos"]
+
+
+# --- Tasks: order, errors, what is drawn when, and workers that end ---
+
+
+@pytest.fixture
+def executor(client):
+    return executor_for(client)
+
+
+def done(executor, *arguments):
+    return sorted(executor.map(*arguments), key=lambda entry: entry.task)
+
+
+def test_tasks_run_in_other_processes(executor):
+    found = {entry.value for entry in executor.map(clusters.process_of, range(12))}
+    assert os.getpid() not in found and len(found) == executor.workers == 2
+
+
+def test_few_tasks_are_drawn_ahead(executor):
+    drawn, most = [], []
+
+    def tasks():
+        for task in range(20):
+            drawn.append(task)
+            yield task
+
+    for ended, _ in enumerate(executor.map(clusters.add, tasks(), 0)):
+        most.append(len(drawn) - ended)
+    assert max(most) <= module.AHEAD * 2
+
+
+def test_errors_are_raised(executor):
+    with pytest.raises(ValueError, match="task 0"):
+        list(executor.map(clusters.fail, range(1)))
+
+
+def test_a_worker_that_starts_slowly_comes_back(tmp_path):
+    """Dask must not give it up while its nanny restarts it."""
+    with (
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "100ms"}),
+        local_cluster(1) as cluster,
+        Client(cluster) as client,
+    ):
+        found = done(executor_for(client), clusters.die_once, range(3), str(tmp_path))
+    assert found == [Done(k, k) for k in range(3)]
+
+
+def test_a_task_that_ends_all_workers_is_given_up(executor):
+    found = done(executor, clusters.die_always, range(6), 2)
+    assert [entry.task for entry in found if entry.lost] == [2]
+    assert "its worker ended 2 times" in found[2].lost
+    assert [entry.value for entry in found] == [0, 1, None, 3, 4, 5]
+
+
+def test_other_versions_are_refused():
+    setup = WorkerSetup(local=True, wanted=versions() | {"eigengs_dr": "9.9"})
+    with pytest.raises(ClusterError, match=r"tcp://node:1 has eigengs_dr .*, but .* has 9\.9"):
+        setup.setup(SimpleNamespace(address="tcp://node:1"))
+
+
+def test_workers_without_the_package_are_refused(client, monkeypatch):
+    def missing(plugin):
+        raise ModuleNotFoundError("No module named 'eigengs_dr'", name="eigengs_dr")
+
+    monkeypatch.setattr(client, "register_plugin", missing)
+    with pytest.raises(ClusterError, match="the workers have no eigengs_dr; install eigengs-dr"):
+        executor_for(client)
+
+
+def test_workers_are_set_up(executor, client):
+    for found in client.run(clusters.state).values():
+        assert found == {"threads": 1, "blas": {1}, "interrupt": True, "start": "spawn"}
