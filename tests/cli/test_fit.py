@@ -108,6 +108,13 @@ def test_mistakes(photo, existing, case, monkeypatch):
     assert photo.read_bytes() == pixels
 
 
+@pytest.mark.parametrize("content", [None, b"", b"this is text, not a picture\n"])
+def test_files_that_are_no_images(tmp_path, existing, content):
+    if content is not None:
+        (tmp_path / "x.png").write_bytes(content)
+    assert_refused(run("fit", tmp_path / "x.png", "-o", existing, "--overwrite"), "x.png")
+
+
 def test_cuda_without_gpu(photo, existing):
     try:
         select("cuda")

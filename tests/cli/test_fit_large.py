@@ -4,10 +4,12 @@ import json
 
 import pytest
 import tifffile
+from PIL import Image
 
 from _helpers.command import assert_refused, run, succeeded
 from _helpers.files import png
 from _helpers.mosaics import mosaic
+from eigengs_dr.blocks.windows import ORIENTATION, image_size
 from eigengs_dr.fitting import memory
 
 FEW = ["--gaussians", 700, "--iterations", 5]
@@ -45,15 +47,10 @@ def test_blocks_are_chosen_where_memory_says_so(photo, tmp_path, monkeypatch):
 # --- Memory, before the image is read ---
 
 
-def header(path, width, height, grey=False):
-    """Write a PNG file of any size without pixels."""
-    path.write_bytes(png(width, height, 8, 0 if grey else 2, []))
-    return path
-
-
 def test_large_fit_says_its_memory(tmp_path):
     """Before it finds that no pixels follow the header."""
-    photo, output = header(tmp_path / "large.png", 8000, 8000), tmp_path / "x.npz"
+    photo, output = tmp_path / "large.png", tmp_path / "x.npz"
+    photo.write_bytes(png(8000, 8000, 8, 2, []))
     command = ["fit", photo, "-o", output, "--preview", tmp_path / "p.png"]  # blocks have none
     line = "eigengs-dr: 5,000 Gaussians on 8000x8000 pixels take about 4."
     assert run(*command).stderr.startswith(line)
@@ -73,10 +70,20 @@ def test_large_fit_says_its_memory(tmp_path):
 def test_a_fit_that_does_not_fit_is_refused(tmp_path, monkeypatch, grey, options, expected):
     """Grey becomes RGB, and a search starts with one Gaussian for 64 pixels."""
     monkeypatch.setattr(memory, "usable_memory", lambda: 1)
-    path = header(tmp_path / "large.png", 8000, 4000, grey)
+    path = tmp_path / "large.png"
+    path.write_bytes(png(8000, 4000, 8, 0 if grey else 2, []))
     outputs = ["-o", tmp_path / "x.npz", "--preview", tmp_path / "p.png"]
     channels, count = expected
     needed = memory.estimate_memory(8000, 4000, channels, int(count.replace(",", "")))
     words = f"{count} Gaussians on 8000x4000 pixels take about {needed / 1e9:.1f} GB"
     result = run("fit", path, *outputs, *options)
     assert_refused(result, path, words, "this process may use 0.0 GB", "scale the image down")
+
+
+def test_sizes_of_headers(tmp_path):
+    exif = Image.Exif()
+    exif[ORIENTATION] = 6
+    Image.new("RGB", (40, 30)).save(tmp_path / "photo.jpg", exif=exif)
+    assert image_size(tmp_path / "photo.jpg") == (40, 30, 3)
+    (tmp_path / "text.png").write_text("no image")
+    assert image_size(tmp_path / "text.png") is None

@@ -73,13 +73,6 @@ def test_a_bad_image_does_not_end_a_folder(photos, trained, tmp_path):
     assert "01.png" in images[1]["error"]
 
 
-def test_a_target_out_of_reach(photos, tmp_path):
-    limits = ["--target-psnr", 90, "--max-gaussians", 20, "--iterations", 3]
-    result = run("fit", photos, "-o", tmp_path / "fits", *limits)
-    assert result.exit_code == 1
-    assert result.stderr.count("are out of reach") == 3
-
-
 MISTAKES = {
     "a file": (["photos", "-o", "photos/00.png"], "need a folder"),
     "an .npz": (["photos", "-o", "out.npz"], "need a folder"),

@@ -10,9 +10,12 @@ import pytest
 import eigengs_dr as eg
 from _helpers.sets import check_equal
 from _helpers.waves import picture
-from eigengs_dr.collection.fit_batch import fit_batch, fits_in_batches
+from eigengs_dr.collection.fit_batch import MAX_CUTOFF, fit_batch, fits_in_batches
 from eigengs_dr.fitting.options import FitOptions
+from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
+from eigengs_dr.raster.evaluate import is_steep
+from eigengs_dr.raster.parameters import kernel_radius, kernel_shape
 
 
 def pictures(count, height=30, width=33):
@@ -63,6 +66,18 @@ def test_default_fits_have_the_bits_of_single_ones():
     assert_same_bits(together[0].result, alone)
     for row, other in zip(together, two, strict=False):
         assert_same_bits(row.result, other.result)
+
+
+def test_no_gaussian_of_a_batch_is_steep():
+    """A steep one would change the arithmetic of the images beside its own."""
+    corners = np.array([[a, b, c] for a in (0, 9) for b in (-9, 0, 9) for c in (0, 9)], np.float32)
+    count = len(corners)
+    narrowest = eg.Gaussians.from_arrays(
+        np.full((count, 2), 4), corners + 1e-9, np.zeros((count, 3)), size=(8, 8), backend="llvm"
+    ).bounded()
+    for cutoff, expected in ((CUTOFF, False), (MAX_CUTOFF, False), (4.0, True)):
+        steep = is_steep(kernel_shape(narrowest), kernel_radius(cutoff))
+        assert steep.numpy().any() == expected
 
 
 def test_many_gaussians_an_image():

@@ -4,13 +4,14 @@ import math
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from scipy.signal import correlate2d
 from skimage import color, metrics
 
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
 from eigengs_dr.image import strips
 from eigengs_dr.image.color import to_coded, to_pu21
-from eigengs_dr.image.metrics import ms_ssim, psnr, ssim
+from eigengs_dr.image.metrics import blur, gaussian_taps, ms_ssim, psnr, ssim
 
 SIZES = [(1, 1), (1, 9), (2, 3), (10, 11), (12, 40), (23, 22), (45, 50)]
 
@@ -202,6 +203,16 @@ def test_psnr_in_pu21():
     found = psnr(to_coded(light), to_coded(brighter), space="pu21")
     expected = -20 * np.log10(to_pu21(brighter) - to_pu21(light))[0, 0, 0]
     assert found == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("height", [2, 9, 40])
+def test_blur_in_strips_is_that_of_scipy(height):
+    """Also with a border wider than the image."""
+    image = np.random.default_rng(0).random((height, 30)).astype(np.float32)
+    parts = [slice(y, min(y + 4, height)) for y in range(0, height, 4)]
+    bordered = (strips.with_border(lambda rows: image[rows], part, height, 7) for part in parts)
+    found = np.concatenate([blur(part, gaussian_taps(1.7)) for part in bordered])
+    np.testing.assert_allclose(found, gaussian_filter(image, 1.7, mode="reflect"), atol=1e-6)
 
 
 def test_results_do_not_depend_on_strips_or_threads(monkeypatch):

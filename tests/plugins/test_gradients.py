@@ -234,13 +234,8 @@ class TestModel:
 
     def test_coefficients_of_another_shape(self, saved):
         with pytest.raises(RuntimeError, match=r"coefficients has shape \(2, 2\), expected \(3, "):
-            mi.load_dict(
-                {
-                    "type": "gaussian_texture",
-                    "model": saved[0],
-                    "coefficients": mi.TensorXf(np.zeros((2, 2), np.float32)),
-                }
-            )
+            given = {"coefficients": mi.TensorXf(np.zeros((2, 2), np.float32))}
+            mi.load_dict({"type": "gaussian_texture", "model": saved[0], **given})
 
     @pytest.mark.parametrize("value", [np.nan, np.inf])
     def test_coefficients_that_are_not_finite(self, saved, value):
