@@ -59,16 +59,6 @@ def test_refuses_what_would_be_misread(convert):
             convert(np.zeros(shape))
 
 
-@pytest.mark.parametrize("dtype", PRECISION)
-def test_decode_equals_the_image_conversion(dtype):
-    image = np.random.default_rng(1).random((4, 6, 3)).astype(dtype)
-    channels = decode("ycbcr", [image[..., i] for i in range(3)])
-    assert all(channel.dtype == dtype for channel in channels)
-    np.testing.assert_allclose(
-        np.stack(channels, axis=-1), ycbcr_to_rgb(image), atol=5 * PRECISION[dtype]
-    )
-
-
 # --- sRGB and linear light ---------------------------------------------------------------------
 
 
