@@ -8,7 +8,15 @@ import pytest
 mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
 
 import eigengs_dr as eg  # noqa: E402
-from _helpers.bitmap_scenes import room, save_images, sky, wall  # noqa: E402
+from _helpers.bitmap_scenes import (  # noqa: E402
+    cornell,
+    indoors,
+    preview,
+    room,
+    save_images,
+    sky,
+    wall,
+)
 from eigengs_dr.image.io import load_image  # noqa: E402
 
 pytestmark = pytest.mark.mitsuba
@@ -119,6 +127,22 @@ def test_mistakes(folder, tmp_path):
         with pytest.raises(error, match=words):
             eg.convert_scene(scene, target, **settings)
         assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("scene", "converted", "words"),
+    [
+        (cornell, 1, []),
+        (preview, 3, ["environment map"]),
+        (indoors, 2, ["two values", "environment map", "slopes"]),
+    ],
+)
+def test_scenes_like_those_of_others(folder, tmp_path, scene, converted, words):
+    found = eg.convert_scene(scene(mi, folder), tmp_path / "new", target_psnr=30, iterations=20)
+    assert len(found.textures) == converted and min(found.psnr) >= 30
+    assert len(found.left) == len(words)
+    for word, (_, reason) in zip(words, sorted(found.left, key=lambda x: x[1]), strict=True):
+        assert word in reason
 
 
 def plain(mi, folder, texture, **others):
