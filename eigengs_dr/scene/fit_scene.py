@@ -160,8 +160,9 @@ def fit_for_scene(
     values, kind = values / np.float32(peak), "data" if space == "data" else "linear"
     found = visibility(scene, texture, width, height, wrap_mode)
     values = _resized(values, float(found.footprint.min() / PIXEL))
-    fine_height, fine_width = values.shape[:2]
-    fine = visibility(scene, texture, fine_width, fine_height, wrap_mode)
+    fine, (fine_height, fine_width) = found, values.shape[:2]
+    if (fine_height, fine_width) != (height, width):
+        fine = visibility(scene, texture, fine_width, fine_height, wrap_mode)
     values, fine, corner = _crop_to_seen(values, fine)
     goal = [seen_by(values, rows, kind, peak) for rows in fine.pixel_to_texel]
 
