@@ -314,8 +314,8 @@ def test_inverse(monkeypatch, tmp_path):
     for name, value in (small | {"LATTICES": (4, 8), "PHOTOS": {"ball": "coffee"}}).items():
         monkeypatch.setattr(inverse, name, value)
     rows, text = answered(tmp_path / "out", "inverse", "--backend", "llvm")
-    assert [found["job"]["method"] for found in rows] == list(inverse.METHODS)
+    assert [found["job"]["method"] for found in rows] == [m.__name__ for m in inverse.METHODS]
     for found in rows:
         assert len(found["psnr_rgb"]) == 2 and 0 < found["seconds"][0] < found["seconds"][1]
         assert found["psnr_rgb"][1] > found["psnr_rgb"][0] > 5
-    assert "ball, 2 cameras" in text and "the time of the fastest 8 steps" in text
+    assert "ball, 2 cameras" in text and "after 8 steps" in text
