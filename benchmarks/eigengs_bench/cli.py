@@ -249,6 +249,18 @@ def texture() -> None:
     """Time a material ball with textures of Gaussians against one with a bitmap, in Mitsuba."""
 
 
+@question("inverse")
+def inverse() -> None:
+    """Recover textures from photos by texels, a pyramid of them, Gaussians and coefficients.
+
+    \b
+    poster  a flat picture, with 3 and with 16 cameras around it
+    ball    the colour of a glossy coat, seen from all sides
+
+    All takes about ten minutes.
+    """
+
+
 @main.command()
 @click.argument("folder", type=options.folder, metavar="FOLDER")
 @options.output("For README.md and its charts.", "REPORT")

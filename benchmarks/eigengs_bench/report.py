@@ -34,6 +34,7 @@ QUESTIONS = {
     "scaling": "What size costs",
     "kernels": "How fast the renderer is",
     "texture": "How fast a texture is in Mitsuba",
+    "inverse": "What recovers a texture from photos",
 }
 
 

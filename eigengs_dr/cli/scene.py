@@ -189,9 +189,9 @@ def convert(
 
     FOLDER gets scene.xml, a set for each image, and for each camera the renderings before and
     after, and 8 times their difference. If a rendering misses the PSNR, the command says so and
-    exits with code 1. Environment maps, alpha masks, bump maps, images of two values, values above
-    1 and images that no camera sees stay as they are; the command says why. Other files stay where
-    they are, and the new scene names them relative to FOLDER.
+    exits with code 1. Environment maps, bump maps, images of two values such as masks, data beyond
+    0 and 1, and images that no camera sees stay as they are; the command says why. Other files stay
+    where they are, and the new scene names them relative to FOLDER.
 
     \b
     Examples:

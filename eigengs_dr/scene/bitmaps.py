@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,8 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..image.io import check_image, read_file
-from ..image.pixels import ImageError
+from ..image.color import to_coded
 from ..plugins import register_plugins  # first: its error says what to install
 from ..plugins.versions import Properties, texture_kind
 
@@ -21,9 +19,6 @@ import mitsuba as mi
 
 TWO_VALUES = 0.95
 """Share of pixels that are black or white from which on an image counts as a mask."""
-
-MASKS = {("mask", "opacity")}
-"""Slots that cut out parts of a surface: type of the parent and name of the property."""
 
 KEPT = ("to_uv", "wrap_mode")
 """Properties of a bitmap that a ``gaussian_texture`` has too."""
@@ -41,7 +36,7 @@ class Use(NamedTuple):
     slot : str
         Property of that node.
     file : str
-        Absolute path of the image; empty if it is in memory.
+        Absolute path of the image; for pixels in memory, a name of their own.
     raw : bool
         Whether the values are data.
     wrap : str
@@ -100,6 +95,8 @@ def parse(scene: Any, parameters: Mapping[str, str] | None = None) -> Parsed:
             path = folder / node.props[key]
             if path.exists():
                 node.props[key] = str(path)
+        if "data" in node.props and is_bitmap(node):  # an instance takes the tensor away
+            node.props["data"] = mi.TensorXf(np.array(node.props["data"], np.float32))
     return Parsed(config, state, folder)
 
 
@@ -128,7 +125,7 @@ def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
         props = node.props
         if props.plugin_name() == "envmap":
             left.append((_label(props, None, ""), "an environment map takes no texture"))
-        if node.type != texture_kind() or props.plugin_name() != "bitmap":
+        if not is_bitmap(node):
             continue
         # A texture with an id is a child of the scene too, where it has no use.
         above = [(p, s) for p, s in parents.get(index, []) if nodes[p].type != mi.ObjectType.Scene]
@@ -137,10 +134,15 @@ def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
         if reason := _reason(props, [(nodes[p].props.plugin_name(), s) for p, s in above]):
             left.append((name, reason))
             continue
-        file = os.path.realpath(props["filename"])
+        file = os.path.realpath(props["filename"]) if "filename" in props else f"{slot}-{index}"
         raw, wrap = bool(props.get("raw", False)), str(props.get("wrap_mode", "repeat"))
         uses.append(Use(index, parent, slot, file, raw, wrap, name))
     return uses, left
+
+
+def is_bitmap(node: Any) -> bool:
+    """Return whether a node of a parsed scene is a bitmap texture."""
+    return node.type == texture_kind() and node.props.plugin_name() == "bitmap"
 
 
 def _label(props: Properties, parent: Properties | None, slot: str) -> str:
@@ -155,12 +157,6 @@ def _reason(props: Properties, slots: list[tuple[str, str]]) -> str:
     """Say why a bitmap stays a bitmap by its properties, or nothing."""
     if not slots:
         return "nothing uses it"
-    if "filename" not in props:
-        return "its pixels are in memory; give a file"
-    if not Path(str(props["filename"])).is_file():
-        return "its file is missing"
-    if any(slot in MASKS for slot in slots):
-        return "an alpha mask: Gaussians would soften its edges"
     if any(plugin == "bumpmap" for plugin, _ in slots):
         return "heights of a bump map: cameras see their slopes, and a PSNR of heights says little"
     if str(props.get("filter_type", "bilinear")) != "bilinear":
@@ -168,22 +164,40 @@ def _reason(props: Properties, slots: list[tuple[str, str]]) -> str:
     return ""
 
 
-def read_pixels(use: Use) -> NDArray[np.float32] | str:
-    """Return the pixels of a bitmap, or say why it stays a bitmap."""
-    try:
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always")
-            found = read_file(use.file, keep_grey=use.raw)
-    except ImageError as error:
-        return str(error).removeprefix(f"{use.file}: ")
-    if any("transparent" in str(warning.message) for warning in said):
-        return "its pixels are transparent"
-    image = found.pixels
-    if image.max() > 1.001 or image.min() < -0.001:
-        return f"values from {image.min():g} to {image.max():g}, beyond 0 and 1"
-    if not use.raw:
-        image = check_image(found, copy=False)
-    extreme = float(((image <= 0.02) | (image >= 0.98)).all(axis=2).mean())
-    if extreme >= TWO_VALUES and np.ptp(image) > 0.5:
-        return "a mask of two values: Gaussians would soften its edges"
-    return image
+def read_pixels(props: Properties) -> NDArray[np.float32]:
+    """Return the pixels of a bitmap or an environment map as Mitsuba reads them.
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W, 3) or (H, W, 1)
+        Linear light, or values as they are if the bitmap is raw; without alpha.
+    """
+    if "data" in props:
+        return np.array(props["data"], np.float32)
+    kinds = mi.Bitmap.PixelFormat
+    bitmap = mi.Bitmap(props["filename"] if "filename" in props else props["bitmap"])
+    if props.get("raw", False):
+        bitmap.set_srgb_gamma(False)
+    grey = bitmap.pixel_format() in (kinds.Y, kinds.YA)
+    converted = bitmap.convert(kinds.Y if grey else kinds.RGB, mi.Struct.Type.Float32, False)
+    return np.array(converted).reshape(bitmap.height(), bitmap.width(), -1)
+
+
+def space_of(pixels: NDArray[np.float32], data: bool) -> str:
+    """Return the space of the Gaussians for pixels.
+
+    Raises
+    ------
+    ValueError
+        If the pixels must stay a bitmap, with the reason.
+    """
+    low, high = pixels.min(), pixels.max()
+    if low < -0.001 or (data and high > 1.001):
+        raise ValueError(f"values from {low:g} to {high:g}, beyond 0 and 1")
+    if high > 1.001:
+        return "radiance"
+    shown = pixels if data else to_coded(pixels)
+    extreme = float(((shown <= 0.02) | (shown >= 0.98)).all(axis=2).mean())
+    if extreme >= TWO_VALUES and np.ptp(shown) > 0.5:
+        raise ValueError("a mask of two values: Gaussians would soften its edges")
+    return "data" if data else "linear"

@@ -20,7 +20,7 @@ from ..image.color import to_coded
 from ..image.io import save_image
 from ..image.metrics import psnr
 from ..storage.atomic import refuse_url
-from .bitmaps import KEPT, Parsed, Use, file_keys, parse, read_pixels, uses_of
+from .bitmaps import KEPT, Parsed, Use, file_keys, is_bitmap, parse, read_pixels, space_of, uses_of
 from .fit_scene import SceneFit, fit_for_scene
 
 SCENE = "scene.xml"
@@ -92,13 +92,13 @@ def convert_scene(
     """Replace every bitmap of a scene by as many Gaussians as its cameras resolve.
 
     Uses of one image share a set. The function leaves alone what Gaussians would spoil or cannot
-    replace: environment maps, alpha masks, bump maps, images of two values, values above 1, images
-    that no camera sees, and those that would take more Gaussians than texels.
+    replace: environment maps, bump maps, images of two values such as masks, data beyond 0 and 1,
+    images that no camera sees, and those that would take more Gaussians than texels.
 
     Parameters
     ----------
     scene : path-like or dict
-        XML file, or dictionary as for `mitsuba.load_dict`, with images in files.
+        XML file, or dictionary as for `mitsuba.load_dict`, with meshes in files.
     output : path-like
         Folder to write; it must not exist, or be empty. It is written as a whole, or not at all.
     target_psnr : float, optional
@@ -159,7 +159,8 @@ def convert_scene(
         for number, group in enumerate(groups.values()):
             progress("textures", number, len(groups))
             file = _file_name(group[0], {texture.file for texture in textures})
-            found = _convert(before, parsed, group, target_psnr, iterations)
+            pixels = read_pixels(again.state.nodes[group[0].node].props)
+            found = _convert(before, parsed, group, pixels, target_psnr, iterations)
             if isinstance(found, str):
                 left += [(use.name, found) for use in group]
                 continue
@@ -167,7 +168,7 @@ def convert_scene(
             made |= {use.node: file for use in group}
             textures.append(_describe(group, file, found))
         progress("textures", len(groups), len(groups))
-        _rewrite(again, made, target)
+        _rewrite(again, made, work, target)
         (work / SCENE).write_text(_to_xml(again), encoding="utf-8")
         seen = list[float]()
         if spp != 0:
@@ -207,21 +208,28 @@ def _workplace(target: Path) -> Path:
 
 
 def _convert(
-    scene: Any, parsed: Parsed, group: list[Use], psnr: float, iterations: int
+    scene: Any,
+    parsed: Parsed,
+    group: list[Use],
+    pixels: NDArray[np.float32],
+    psnr: float,
+    iterations: int,
 ) -> SceneFit | str:
     """Fit the image of some uses, or return why it must stay."""
-    nodes, pixels = parsed.state.nodes, read_pixels(group[0])
-    if isinstance(pixels, str):
-        return pixels
+    nodes, use = parsed.state.nodes, group[0]
+    # Raw colours are colours all the same; pixels in memory are raw as a rule.
+    is_data = pixels.shape[2] == 1 or nodes[use.parent].props.plugin_name() == "normalmap"
     try:
+        space = space_of(pixels, use.raw and is_data)
         found = fit_for_scene(
             scene,
             [nodes[use.parent].props[use.slot] for use in group],
             pixels,
             psnr,
-            "data" if group[0].raw else "linear",
+            space,
             iterations=iterations,
             wrap_mode=[use.wrap for use in group],
+            encoding="linear",
         )
     except ValueError as error:
         return str(error)
@@ -254,10 +262,11 @@ def _file_name(use: Use, taken: set[str]) -> str:
 # --- The scene -----------------------------------------------------------------------------------
 
 
-def _rewrite(parsed: Parsed, made: dict[int, str], target: Path) -> None:
+def _rewrite(parsed: Parsed, made: dict[int, str], work: Path, target: Path) -> None:
     """Put the sets in the place of the bitmaps, and name other files relative to the folder.
 
-    `made` holds the new file for the index of each node that was a bitmap.
+    `made` holds the new file for the index of each node that was a bitmap. Bitmaps that stay and
+    are in memory become files too.
     """
     for index, node in enumerate(parsed.state.nodes):
         props = node.props
@@ -268,6 +277,11 @@ def _rewrite(parsed: Parsed, made: dict[int, str], target: Path) -> None:
             props.set_plugin_name("gaussian_texture")
             props["filename"] = made[index]
             continue
+        if (is_bitmap(node) or props.plugin_name() == "envmap") and "filename" not in props:
+            file = f"bitmap-{index}.exr"
+            mi.Bitmap(read_pixels(props)).write(str(work / file))
+            del props["data" if "data" in props else "bitmap"]
+            props["filename"] = file
         for key in file_keys(props):
             path = Path(props[key])
             if path.is_absolute() and path.exists():
@@ -280,7 +294,7 @@ def _to_xml(parsed: Parsed) -> str:
     except RuntimeError as error:
         reason = str(error).partition("] ")[2] or str(error)
         raise ValueError(
-            f"the scene cannot be written as XML ({reason}); give images and meshes by files"
+            f"the scene cannot be written as XML ({reason}); give meshes by files"
         ) from None
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from math import log
 from typing import Any, NamedTuple
 
 import mitsuba as mi
@@ -22,7 +23,9 @@ from ..fitting.density_control import DensityControl
 from ..fitting.descent import FitProblem, run
 from ..fitting.options import PRESETS
 from ..fitting.placement.adaptive import place_adaptive
+from ..fitting.search import DB_PER_DOUBLING
 from ..fitting.solvers.conjugate_gradient import solve
+from ..fitting.target import in_unit
 from ..gaussian.covariance import max_deviation
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
@@ -35,14 +38,17 @@ from ..raster.render import render
 from .target import MARGIN, error_weights, seen_by, smoothest_target
 from .visibility import Visibility, visibility
 
-COLORS = ("linear", "data")
-"""Names of the spaces of textures: linear light, or data."""
+COLORS = ("linear", "radiance", "data")
+"""Names of the spaces of textures: linear light to 1, or of any range, or data."""
 
 PIXELS = 4
 """Pixels per Gaussian at the start of the search."""
 
 CLOSE = 1.1
 """Ratio of a sufficient and an insufficient number of Gaussians at which the search ends."""
+
+LAST = 8
+"""Number of attempts from which on the search bisects: decibels say little if they have a step."""
 
 ENOUGH = 2.0
 """Smallest number of texels per pixel without an enlargement. With fewer texels the image is
@@ -107,8 +113,9 @@ def fit_for_scene(
         Smallest PSNR of any camera in dB, above 0 and below 60. It compares means of the clamped
         texture over pixels, in even light and without noise: as 8-bit sRGB for colours, unchanged
         for data.
-    space : {"linear", "data"}, optional
-        "linear" if the image is a colour, which is decoded to light; or "data".
+    space : {"linear", "radiance", "data"}, optional
+        "linear" if the image is a colour, which is decoded to light; "radiance" if it is light that
+        may exceed 1, which is compared as it is and divided by its maximum; or "data".
     max_gaussians : int, optional
         Largest number of Gaussians; by default the number of seen texels.
     iterations : int, optional
@@ -146,26 +153,29 @@ def fit_for_scene(
             "least 0 and at least 1"
         )
     checked = check_data(image) if space == "data" else check_image(image, encoding=encoding)
-    pixels = checked.clip(0, 1)
+    pixels = checked.clip(0, None if space == "radiance" else 1)
     height, width = pixels.shape[:2]
-    values = to_linear(pixels) if space == "linear" else pixels
+    values = pixels if space == "data" else to_linear(pixels)
+    peak = max(1.0, float(values.max())) if space == "radiance" else 1.0
+    values, kind = values / np.float32(peak), "data" if space == "data" else "linear"
     found = visibility(scene, texture, width, height, wrap_mode)
     values = _resized(values, float(found.footprint.min() / PIXEL))
-    fine_height, fine_width = values.shape[:2]
-    fine = visibility(scene, texture, fine_width, fine_height, wrap_mode)
+    fine, (fine_height, fine_width) = found, values.shape[:2]
+    if (fine_height, fine_width) != (height, width):
+        fine = visibility(scene, texture, fine_width, fine_height, wrap_mode)
     values, fine, corner = _crop_to_seen(values, fine)
-    goal = [seen_by(values, rows, space) for rows in fine.pixel_to_texel]
+    goal = [seen_by(values, rows, kind, peak) for rows in fine.pixel_to_texel]
 
     def seen(candidate: Image) -> tuple[float, ...]:
-        compared = "rgb" if space == "linear" else "data"
-        pictures = (seen_by(candidate, rows, space) for rows in fine.pixel_to_texel)
+        compared = "data" if kind == "data" else "rgb"
+        pictures = (seen_by(candidate, rows, kind, peak) for rows in fine.pixel_to_texel)
         return tuple(psnr_of(a, b, compared) for a, b in zip(pictures, goal, strict=True))
 
     target = smoothest_target(values, fine, lambda t: min(seen(t)) >= target_psnr + MARGIN)
-    weight = error_weights(fine, target, space)
+    weight = error_weights(fine, target, kind)
 
     def attempt(count: int) -> tuple[Gaussians, tuple[float, ...]]:
-        gaussians = _fit(target, weight, fine.seen, count, iterations, space)
+        gaussians = _fit(target, weight, fine.seen, count, iterations, kind)
         return gaussians, seen(render(gaussians).numpy())
 
     max_gaussians = min(max_gaussians or int(found.seen.sum()), fine.seen.size)
@@ -173,8 +183,8 @@ def fit_for_scene(
     start = max(1, int(looks.sum()) // PIXELS)
     gaussians, reached, tried = _search_count(attempt, target_psnr, start, max_gaussians)
     mean = gaussians.mean + type(gaussians.mean)(*corner)  # of the crop
-    placed = replace(gaussians, mean=mean, width=fine_width, height=fine_height)
-    return SceneFit(placed.scaled(width, height), reached, found, tried)
+    placed = replace(gaussians, mean=mean, width=fine_width, height=fine_height, space=space)
+    return SceneFit(in_unit(placed.scaled(width, height), peak), reached, found, tried)
 
 
 def _resized(values: Image, texels: float) -> Image:
@@ -244,7 +254,11 @@ def _search_count(
     start: int,
     most: int,
 ) -> tuple[Gaussians, tuple[float, ...], list[tuple[int, float]]]:
-    """Search for the smallest sufficient number: double or halve it, then bisect.
+    """Search for the smallest sufficient number.
+
+    Until two numbers enclose it, the first step trusts `DB_PER_DOUBLING`, and others double or
+    halve. Then the decibels of both are interpolated over the logarithm of the number, a few times,
+    and at last their ratio is bisected.
 
     Raises
     ------
@@ -252,11 +266,12 @@ def _search_count(
         If the number `most` does not suffice.
     """
     tried: list[tuple[int, float]] = []
-    low, high, best = 0, most, None
+    low, high, best, missing = 0, most, None, dict[int, float]()
     count = min(start, most)
-    while best is None or (high > CLOSE * low and high - low > 1):
+    while best is None or (high > CLOSE * low + 1 and high - low > 1):
         gaussians, reached = attempt(count)
         lowest = min(reached)
+        missing[count] = bound - lowest
         tried.append((len(gaussians), lowest))
         if lowest >= bound:
             high, best = count, (gaussians, reached)
@@ -267,8 +282,13 @@ def _search_count(
             )
         else:
             low = count
-        if best is None:
-            count = min(2 * count, most)
+        if best is None or not low:
+            octaves = missing[count] / DB_PER_DOUBLING if len(tried) == 1 else 0
+            factor = 2 ** min(max(abs(octaves), 1), 3)
+            count = min(round(factor * count), most) if best is None else round(count / factor)
         else:
-            count = round((low * high) ** 0.5) if low else high // 2
+            share = missing[low] / (missing[low] - missing[high]) if len(tried) < LAST else 0.5
+            share = min(max(share, log(CLOSE, high / low)), 1 - log(CLOSE, high / low))
+            count = round(low * (high / low) ** share)
+        count = max(count, low + 1) if best is None else min(max(count, low + 1), high - 1)
     return *best, tried

@@ -132,24 +132,28 @@ EVEN = 2.0
 """Standard deviation in texels of the blur of the weights, because rays hit texels unevenly."""
 
 
-def seen_by(texels: Image, rows: csr_array, space: str) -> NDArray[np.floating]:
+def seen_by(texels: Image, rows: csr_array, space: str, peak: float = 1.0) -> NDArray[np.floating]:
     """Return what the pixels of a camera see of a texture.
 
     Parameters
     ----------
     texels : ndarray of float32, shape (H, W, C)
-        Linear light or data; clamped to [0, 1].
+        Linear light or data, divided by `peak`; clamped to [0, 1].
     rows : scipy.sparse array, shape (n, H * W)
         One of `Visibility.pixel_to_texel`.
     space : {"linear", "data"}
         Whether means of light are coded as sRGB.
+    peak : float, optional
+        If it is above 1, light counts as it is and divided by the peak: it lights what cameras see.
 
     Returns
     -------
-    ndarray, shape (n, 1, C)
+    ndarray, shape (n, 1 or 2, C)
     """
-    looks = rows @ texels.clip(0, 1).reshape(-1, texels.shape[2])
-    return (to_coded(looks) if space == "linear" else looks)[:, None]
+    looks = (rows @ texels.clip(0, 1).reshape(-1, texels.shape[2]))[:, None]
+    if peak > 1:
+        looks = np.concatenate([looks, peak * looks], axis=1)
+    return to_coded(looks) if space == "linear" else looks
 
 
 def smoothest_target(values: Image, found: Visibility, is_close: Callable[[Image], bool]) -> Image:

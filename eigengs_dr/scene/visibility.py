@@ -3,13 +3,14 @@
 Rays go through every pixel of every camera to their first hit. Where they hit the texture, the ray
 differentials give the parallelogram ``J`` that the pixel covers there, in texels, and with it the
 footprint ``PIXEL^2 J J^T`` of the prefilter (`eigengs_dr.plugins.cone`). The smallest footprint of
-a texel counts. Rays do not follow mirrors or glass, and the lens is a pinhole.
+a texel counts. Rays go on through holes of masks, but do not follow mirrors or glass, and the lens
+is a pinhole. A lamp is seen by what it lights too, coarsely.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -37,6 +38,12 @@ MAX_RAYS = 1 << 22
 
 BATCH = 1 << 20
 """Number of rays that are traced at once."""
+
+MAX_LAYERS = 16
+"""Largest number of surfaces along a ray, all but the last with holes."""
+
+LAMP_BLOCKS = 16
+"""Number of blocks along a side of a lamp. Their means count like what a pixel sees."""
 
 Floats = NDArray[np.floating]
 
@@ -84,15 +91,18 @@ def _trace(view: View, pixels: NDArray[np.uint32], side: int) -> Hits:
     step = max(1, BATCH // side**2)
     parts = []
     for first in range(0, len(pixels), step):
-        hit, *values = _trace_batch(view, pixels[first : first + step], side)
-        chosen = np.flatnonzero(hit.numpy())
-        parts.append([array.numpy()[chosen] for array in values])
+        for hit, *values in _trace_batch(view, pixels[first : first + step], side):
+            chosen = np.flatnonzero(hit.numpy())
+            parts.append([array.numpy()[chosen] for array in values])
     pixel, x, y, short, long = (np.concatenate(c) for c in zip(*parts, strict=True))
     return Hits(pixel, x, y, short, long, side)
 
 
-def _trace_batch(view: View, pixels: NDArray[np.uint32], side: int) -> tuple:
-    """Trace ``side * side`` rays through each pixel: return hit or not, and arrays of `Hits`."""
+def _trace_batch(view: View, pixels: NDArray[np.uint32], side: int) -> Iterator[tuple]:
+    """Trace ``side * side`` rays through each pixel: yield hit or not, and arrays of `Hits`.
+
+    Rays that meet a hole of a mask go on behind it, for the next layer.
+    """
     columns, rows = view.sensor.film().crop_size()
     ray = dr.arange(mi.UInt32, len(pixels) * side * side)
     across = dr.opaque(mi.UInt32, side)  # one program for every number of rays
@@ -104,15 +114,27 @@ def _trace_batch(view: View, pixels: NDArray[np.uint32], side: int) -> tuple:
     with dr.suspend_grad():
         ray, _ = view.sensor.sample_ray_differential(0.0, 0.5, film, mi.Point2f(0.5))
         ray.has_differentials = True  # a batch of sensors computes them but leaves this False
-        si = view.scene.ray_intersect(ray, mi.RayFlags.All, True)
-        si.compute_uv_partials(ray)
-        hit = mi.Bool(False)
-        for shape in view.shapes:
-            hit |= si.shape == mi.ShapePtr(shape)
-        x, y, short, long = _on_texture(si, view)
-        hit &= si.is_valid() & dr.isfinite(long) & (long > 0)
-        dr.eval(hit, x, y, short, long)
-    return hit, pixel, x, y, short, long
+        has_holes = any(
+            mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Null) for s in view.scene.shapes()
+        )
+        onward, active = ray, mi.Bool(True)
+        for _ in range(MAX_LAYERS if has_holes else 1):
+            si = view.scene.ray_intersect(onward, mi.RayFlags.All, True, active)
+            si.compute_uv_partials(ray)
+            hit = mi.Bool(False)
+            for shape in view.shapes:
+                hit |= si.shape == mi.ShapePtr(shape)
+            x, y, short, long = _on_texture(si, view)
+            hit &= si.is_valid() & dr.isfinite(long) & (long > 0)
+            dr.eval(hit, x, y, short, long)
+            yield hit, pixel, x, y, short, long
+            if has_holes:
+                active &= si.is_valid()
+                passed = mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, active))
+                active &= dr.any(passed > 0)
+                if not dr.any(active):
+                    return
+                onward = si.spawn_ray(ray.d)
 
 
 def _on_texture(si: Interaction, view: View) -> tuple[Float, Float, Float, Float]:
@@ -145,7 +167,8 @@ class Visibility(NamedTuple):
         unseen texels. The shorter axis counts, so that no detail visible along one axis is lost.
     pixel_to_texel : list of scipy.sparse.csr_array of float32, shape (pixels, H * W)
         One matrix for each camera that sees the texture, and for each use of it, with one row for
-        each pixel that sees it: the shares of the texels in the pixel, with the sum 1.
+        each pixel that sees it: the shares of the texels in the pixel, with the sum 1. Before them,
+        for a lamp, one with a row for each of its blocks.
         ``pixel_to_texel[k] @ texels`` is the view of camera k in even light.
     """
 
@@ -201,13 +224,16 @@ def visibility(
     for mode in wraps:
         if mode not in WRAPS:
             raise ValueError(f"wrap_mode {mode!r} is unknown; use one of {', '.join(WRAPS)}")
-    uses = []
+    uses, is_lamp = [], False
     for name, mode in zip(textures, wraps, strict=True):
         node, shapes = _find(scene, name)
         scaled = mi.ScalarTransform3f().scale([width, height]) @ to_uv(mi.traverse(node))
         uses.append((shapes, mi.Transform3f(scaled), getattr(node, "wrap", mode)))
-    footprint = np.full(height * width, np.inf, np.float32)
-    lookups = []
+        emitters = (shape.emitter() for shape in shapes)
+        is_lamp |= any(e is not None and node in mi.traverse(e).hierarchy for e in emitters)
+    lookups = [_blocks(width, height)] if is_lamp else []
+    coarsest = PIXEL * max(width, height) / LAMP_BLOCKS if is_lamp else np.inf
+    footprint = np.full(height * width, coarsest, np.float32)
     for sensor, (shapes, to_texels, wrap) in product(scene.sensors(), uses):
         hits = trace_samples(View(scene, sensor, shapes, to_texels, wrap, (width, height)))
         if hits is None:
@@ -286,3 +312,13 @@ def _rows(hits: Hits, width: int, height: int) -> csr_array:
             shape = (len(pixels), height * width)
             result = result + coo_array((share, (row, texel)), shape=shape).tocsr()
     return result
+
+
+def _blocks(width: int, height: int) -> csr_array:
+    """Return the shares of texels in `LAMP_BLOCKS` x `LAMP_BLOCKS` blocks, as rows of pixels."""
+    across, down = min(LAMP_BLOCKS, width), min(LAMP_BLOCKS, height)
+    column, row = np.arange(width) * across // width, np.arange(height) * down // height
+    block = (row[:, None] * across + column).ravel()
+    share = (1 / np.bincount(block)[block]).astype(np.float32)
+    shape = (across * down, height * width)
+    return coo_array((share, (block, np.arange(height * width))), shape=shape).tocsr()

@@ -296,3 +296,19 @@ def test_texture(monkeypatch):
     held = next(t for t in texture.summarize([found]).tables if t.name == "memory")
     assert len(held.frame) == 1
     assert found["ratio_20"] > 0 and found["ratio_step"] > 0 and found["maps_3_ms"] > 0
+
+
+@pytest.mark.mitsuba
+def test_inverse(monkeypatch, tmp_path):
+    pytest.importorskip("mitsuba")
+    from eigengs_bench import inverse
+
+    small = {"SIDE": 16, "TEXELS": 64, "MANY": 4, "STEPS": 8, "EVERY": 4, "CAMERAS": (2,)}
+    for name, value in (small | {"LATTICES": (4, 8), "PHOTOS": {"ball": "coffee"}}).items():
+        monkeypatch.setattr(inverse, name, value)
+    rows, text = answered(tmp_path / "out", "inverse", "--backend", "llvm")
+    assert [found["job"]["method"] for found in rows] == [m.__name__ for m in inverse.METHODS]
+    for found in rows:
+        assert len(found["psnr_rgb"]) == 2 and 0 < found["seconds"][0] < found["seconds"][1]
+        assert found["psnr_rgb"][1] > found["psnr_rgb"][0] > 5
+    assert "ball, 2 cameras" in text and "after 8 steps" in text

@@ -8,7 +8,15 @@ import pytest
 mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
 
 import eigengs_dr as eg  # noqa: E402
-from _helpers.bitmap_scenes import room, save_images, sky, wall  # noqa: E402
+from _helpers.bitmap_scenes import (  # noqa: E402
+    cornell,
+    indoors,
+    preview,
+    room,
+    save_images,
+    sky,
+    wall,
+)
 from eigengs_dr.image.io import load_image  # noqa: E402
 
 pytestmark = pytest.mark.mitsuba
@@ -54,7 +62,7 @@ def test_what_stays_and_why(folder, tmp_path):
     found = eg.convert_scene(sky(folder), tmp_path / "new", **QUICK)
     reasons = dict(found.left)
     assert "environment map" in reasons["photo.png (environment)"]
-    assert "alpha mask" in reasons["leaf.png (mask.opacity)"]
+    assert "two values" in reasons["leaf.png (mask.opacity)"]
     assert "two values" in reasons["leaf.png (blendbsdf.weight)"]
     assert "no pixel" in reasons["hidden.png (diffuse.reflectance)"]
     [photo] = found.textures
@@ -121,10 +129,92 @@ def test_mistakes(folder, tmp_path):
         assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_objects_in_memory_are_refused(folder, tmp_path):
-    pixels = mi.Bitmap(np.full((4, 4, 3), 0.5, np.float32))
+@pytest.mark.parametrize(
+    ("scene", "converted", "words"),
+    [
+        (cornell, 1, []),
+        (preview, 3, ["environment map"]),
+        (indoors, 2, ["two values", "environment map", "slopes"]),
+    ],
+)
+def test_scenes_like_those_of_others(folder, tmp_path, scene, converted, words):
+    found = eg.convert_scene(scene(mi, folder), tmp_path / "new", target_psnr=30, iterations=20)
+    assert len(found.textures) == converted and min(found.psnr) >= 30
+    assert len(found.left) == len(words)
+    for word, (_, reason) in zip(words, sorted(found.left, key=lambda x: x[1]), strict=True):
+        assert word in reason
+
+
+def plain(mi, folder, texture, **others):
+    """The dictionary of a wall under even light that has a texture."""
+    material = {"type": "diffuse", "reflectance": texture}
+    wall = {"type": "rectangle", "bsdf": material}
+    return {**room(mi, folder), "integrator": {"type": "path"}, "quad": wall, **others}
+
+
+@pytest.mark.parametrize("kind", ["tensor", "bitmap"])
+def test_pixels_in_memory(folder, tmp_path, kind):
+    """They become sets; those that stay become files; and the scene of the caller still works."""
+    light = np.array(mi.Bitmap(eg.sample("coffee")[:192:6, :192:6]), np.float32)
+    given = {"data": mi.TensorXf(light)} if kind == "tensor" else {"bitmap": mi.Bitmap(light)}
+    photo = {"type": "bitmap", "raw": True, "wrap_mode": "clamp", **given}
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.full((4, 8, 3), 0.8, np.float32))}
+    scene = plain(mi, folder, photo, lamp=sky)
+    found = eg.convert_scene(scene, tmp_path / "new", target_psnr=30, iterations=20)
+    [texture] = found.textures
+    assert texture.names == ("a bitmap in memory (bsdf.reflectance)",)
+    assert eg.Gaussians.load(tmp_path / "new" / texture.file).space == "linear"
+    assert [name for name, _ in found.left] == ["a bitmap in memory (environment)"]
+    assert min(found.psnr) > 29
+    moved = (tmp_path / "new").rename(tmp_path / "moved")
+    for again in (mi.load_file(str(moved / "scene.xml")), mi.load_dict(scene)):
+        assert np.array(mi.render(again, spp=4)).mean() > 0.1
+
+
+def test_a_lamp_above_1_also_lights_by_what_is_hidden(folder, tmp_path):
+    light = 6 * eg.sample("coffee")[:384:4, :384:4] ** 2
+    mi.Bitmap(light).write(str(folder / "lamp.exr"))
+    picture = {"type": "bitmap", "filename": str(folder / "lamp.exr"), "wrap_mode": "clamp"}
+    at = mi.ScalarTransform4f()
+    lamp = {"type": "rectangle", "emitter": {"type": "area", "radiance": picture}}
+    board = {"type": "rectangle", "to_world": at.translate([1, 0, 0.5])}
+    scene = plain(mi, folder, {"type": "rgb", "value": 0.5}, lamp=lamp, quad=board)
+    found = eg.convert_scene(scene, tmp_path / "new", target_psnr=32, iterations=20, spp=256)
+    [texture] = found.textures
+    assert found.left == [] and min(found.psnr) > 30
+    saved = eg.Gaussians.load(tmp_path / "new" / texture.file)
+    assert saved.space == "radiance"
+    hidden = np.s_[:, 60:]  # behind the board
+    power = eg.render(saved).numpy()[hidden].mean() / light[hidden].mean()
+    assert power == pytest.approx(1, abs=0.03)
+
+
+def test_a_soft_mask_and_what_shows_through_it(folder, tmp_path):
+    y, x = np.mgrid[:64, :64] / 64
+    eg.save_image(folder / "veil.png", np.clip(1.1 - 2 * np.hypot(x - 0.5, y - 0.5), 0, 1))
+    veil = {"type": "bitmap", "filename": str(folder / "veil.png"), "raw": True}
+    photo = {"type": "bitmap", "filename": str(folder / "photo.png"), "wrap_mode": "clamp"}
+    grey = {"type": "twosided", "bsdf": {"type": "diffuse"}}
+    curtain = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 0, 1]).scale(2),
+        "bsdf": {"type": "mask", "opacity": veil, "bsdf": grey},
+    }
+    scene = plain(mi, folder, photo, curtain=curtain)
+    found = eg.convert_scene(scene, tmp_path / "new", target_psnr=32, iterations=20)
+    assert found.left == []
+    assert {t.file for t in found.textures} == {"photo.npz", "veil.npz"}
+    assert min(found.psnr) > 31
+
+
+def test_meshes_in_memory_are_refused(folder, tmp_path):
     scene = room(mi, folder)
-    scene["cube"]["bsdf"]["bsdf"]["reflectance"]["color0"] = {"type": "bitmap", "bitmap": pixels}
-    with pytest.raises(ValueError, match=r"cannot be written as XML .*; give images and meshes by"):
+    scene["quad"] = mi.load_dict({"type": "ply", "filename": str(folder / "quad.ply")})
+    veil = {"type": "bitmap", "data": mi.TensorXf(np.full((2, 2, 1), 0.5, np.float32))}
+    scene["wall"] = {
+        "type": "rectangle",
+        "bsdf": {"type": "mask", "opacity": veil, "bsdf": {"type": "diffuse"}},
+    }
+    with pytest.raises(ValueError, match=r"cannot be written as XML .*; give meshes by files"):
         eg.convert_scene(scene, tmp_path / "new", spp=0, **QUICK)
     assert not list(tmp_path.iterdir())
