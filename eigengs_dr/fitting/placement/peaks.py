@@ -12,7 +12,8 @@ images takes one launch of each kernel, and each image has peaks of its own.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -157,11 +158,11 @@ def residual_peaks(
         return peaks._replace(mean=peaks.mean * times, size=peaks.size * times)
     runs = _runs(types, grid)
     pixels = grid.tiles * grid.pixels
-    best = tuple(dr.zeros(types.Float, pixels * n) for n in (1, 1, channels))
+    best = tuple(dr.zeros(types.Float, pixels) for _ in range(2))
     dr.make_opaque(best)
     for deviation in (share * spacing for share in CANDIDATE_SIZES):
         best = _better(missed, grid, channels, deviation, squares, best)
-    gain, size, color = best
+    gain, size = best
     top = _local_maxima(gain, runs)
     place = dr.compress(top > 0)
     if dr.width(place):
@@ -172,13 +173,9 @@ def residual_peaks(
         none = types.Float()
         return Peaks(types.Float2(none, none), none, [none] * channels, place, place)
     column, row, _ = runs.of(place)
-    peaks = Peaks(
-        types.Float2(types.Float(column) + 0.5, types.Float(row) + 0.5),
-        dr.gather(types.Float, size, place),
-        [dr.gather(types.Float, color, place * channels + c) for c in range(channels)],
-        image,
-        rank,
-    )
+    mean = types.Float2(types.Float(column) + 0.5, types.Float(row) + 0.5)
+    size = dr.gather(types.Float, size, place)
+    peaks = Peaks(mean, size, _colors(missed, place, size, runs, channels), image, rank)
     dr.eval(peaks)
     return peaks
 
@@ -246,7 +243,7 @@ def _better(
     squares: Float,
     best: tuple[Float, ...],
 ) -> tuple[Float, ...]:
-    """Return gain, size and colour of the better of the best so far and a size, for each pixel."""
+    """Return gain and size of the better of the best so far and a size, for each pixel."""
     types, length = types_of(missed), grid.pixels * channels
     radius = max(1, math.ceil(TRUNCATION * deviation))
     offsets = np.arange(-radius, radius + 1)
@@ -264,18 +261,14 @@ def _better(
         factors = gather_run(types, squares, tile, length, True)
     terms = [dr.square(p) * f * inverse for p, f in zip(both, factors, strict=True)]
     inside = gather_run(types, pixels_inside(types, grid), tile, grid.pixels, True)
-    gains, sizes, colors = (
-        gather_run(types, v, tile, dr.width(v) // grid.tiles, True) for v in best
-    )
+    gains, sizes = (gather_run(types, v, tile, grid.pixels, True) for v in best)
     for n in range(grid.pixels):
         gain = sum(terms[n * channels : (n + 1) * channels])
         better = (inside[n] > 0) & (gain > gains[n])
         gains[n] = dr.select(better, gain, gains[n])
         sizes[n] = dr.select(better, size, sizes[n])
-        for k in range(n * channels, (n + 1) * channels):
-            colors[k] = dr.select(better, both[k] * inverse, colors[k])
     found = tuple(dr.empty(types.Float, dr.width(v)) for v in best)
-    for array, values in zip(found, (gains, sizes, colors), strict=True):
+    for array, values in zip(found, (gains, sizes), strict=True):
         dr.scatter(array, types.FloatX(values), tile)
     dr.eval(found)
     return found
@@ -357,29 +350,67 @@ def _local_maxima(gain: Float, runs: _Runs) -> Float:
 def _apart(place: UInt, top: Float, size: Float, runs: _Runs, reach: int) -> UInt:
     """Return the maxima that no better maximum within its own radius suppresses."""
     types = types_of(top)
-    column, row, start = runs.of(place)
     own = dr.gather(types.Float, top, place)
-    limit = dr.opaque(types.Int, reach)
-    first, last = (column - limit) // RUN, (column + limit) // RUN
-    x, y = types.Float(column), types.Float(row)
 
-    def look(i: UInt, j: UInt, is_best: Bool) -> tuple:
-        at, inside = runs.at(i, j, start)
-        inside &= j <= row + limit
+    def look(at: UInt, inside: Bool, x: list, y: UInt, is_best: Bool) -> Bool:
         gains, sizes = (gather_run(types, v, at, RUN, inside) for v in (top, size))
         for k in range(RUN):
-            away = dr.maximum(dr.abs(types.Float(i * RUN + k) - x), dr.abs(types.Float(j) - y))
+            away = types.Float(dr.maximum(dr.abs(x[k]), dr.abs(y)))
             near = away <= dr.ceil(SUPPRESSION_RADIUS * sizes[k])
             before = (gains[k] > own) | ((gains[k] == own) & (at * RUN + k < place))
             is_best &= ~(inside & near & before)
-        ends = i >= last
-        return dr.select(ends, first, i + 1), dr.select(ends, j + 1, j), is_best
+        return is_best
 
-    is_best = dr.while_loop(
-        (types.Int(first), row - limit, types.Bool(True)),
-        lambda i, j, is_best: is_best & (j <= row + limit),
-        look,
-        label="keep peaks apart",
+    limit = dr.opaque(types.Int, reach)
+    is_best = _for_each_run(place, limit, runs, look, types.Bool(True), "keep peaks apart")
+    return dr.gather(types.UInt, place, dr.compress(is_best))
+
+
+def _colors(missed: Float, place: UInt, size: Float, runs: _Runs, channels: int) -> list:
+    """Return the best colours ``<w, r> / <w, w>`` of round Gaussians at some pixels."""
+    types = types_of(missed)
+    reach = dr.maximum(types.Int(dr.ceil(TRUNCATION * size)), 1)
+    slope = -0.5 / math.log(2) * dr.square(dr.rcp(size))
+
+    def add(at: UInt, inside: Bool, x: list, y: UInt, sums: list) -> list:
+        values = gather_run(types, missed, at, RUN * channels, inside)
+        *along, own = sums
+        for k in range(RUN):
+            weight = dr.exp2(slope * types.Float(dr.square(x[k]) + dr.square(y)))
+            weight = dr.select(dr.abs(x[k]) <= reach, weight, 0)
+            own = dr.fma(weight, weight, own)
+            along = [dr.fma(weight, values[k * channels + c], s) for c, s in enumerate(along)]
+        return [*along, own]
+
+    zeros = [types.Float(0)] * (channels + 1)
+    *along, own = _for_each_run(place, reach, runs, add, zeros, "find colours")
+    return [s / own for s in along]
+
+
+def _for_each_run(
+    place: UInt, reach: UInt, runs: _Runs, visit: Callable[..., Any], state: Any, label: str
+) -> Any:
+    """Call `visit` for the runs within a radius of pixels, row by row; return the last state.
+
+    It is ``visit(at, inside, x, y, state) -> state`` with the index of the run, whether there is
+    one, and the distances of its pixels by columns, a list, and by rows.
+    """
+    Int = type(reach)
+    column, row, start = runs.of(place)
+    # A quotient of Dr.Jit rounds towards 0, and the window may begin left of the image.
+    first, last = (column + (RUN - 1) * reach) // RUN - reach, (column + reach) // RUN
+
+    def body(i: UInt, j: UInt, state: Any) -> tuple:
+        at, inside = runs.at(i, j, start)
+        x = [i * RUN + (k - column) for k in range(RUN)]
+        state = visit(at, inside & (j <= row + reach), x, j - row, state)
+        ends = i >= last
+        return dr.select(ends, first, i + 1), dr.select(ends, j + 1, j), state
+
+    return dr.while_loop(
+        (Int(first), Int(row - reach), state),
+        lambda i, j, state: j <= row + reach,
+        body,
+        label=label,
         max_iterations=-1,
     )[-1]
-    return dr.gather(types.UInt, place, dr.compress(is_best))
