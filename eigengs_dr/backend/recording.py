@@ -7,6 +7,7 @@ or lets the replay fail ("determining size of variable"). One lock of this modul
 
 from __future__ import annotations
 
+import atexit
 import gc
 import threading
 from collections import deque
@@ -122,6 +123,29 @@ def freeze_program(function: Program) -> Iterator[Program]:
     """
     # Lists grow and shrink in a descent. Each other size is recorded, in 3 ms: no fault.
     program = dr.freeze(function, warn_after=MANY_RECORDINGS)
+    try:
+        yield _guarded(program, function)
+    finally:
+        _retire(program.clear)
+
+
+KEPT_RECORDINGS = 8
+"""Recordings that a program of `record` keeps: those of the layouts that were used last."""
+
+
+def record(function: Program) -> Program:
+    """Freeze a function of a module, for all its calls in the process; see `freeze_program`.
+
+    Other fits of a layout replay what the first one recorded. All that a call needs must be in its
+    arguments: a replay notices nothing else.
+    """
+    program = dr.freeze(function, limit=KEPT_RECORDINGS, warn_after=MANY_RECORDINGS)
+    atexit.register(program.clear)
+    return _guarded(program, function)
+
+
+def _guarded(program: Program, function: Program) -> Program:
+    """Return a frozen function whose calls are `exclusive`, with the collector off."""
 
     @wraps(function)
     def call(*arguments: Any, **settings: Any) -> Any:
@@ -133,10 +157,7 @@ def freeze_program(function: Program) -> Iterator[Program]:
             finally:
                 _calls -= 1
 
-    try:
-        yield call
-    finally:
-        _retire(program.clear)
+    return call
 
 
 @contextmanager
