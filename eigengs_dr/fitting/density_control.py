@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import Bool, Float, UInt, make_divisor, types_of
+from ..backend.recording import record
 from ..gaussian.gaussians import Gaussians, concatenate, take
 from ..raster.binning.lists import TileLists
 from ..raster.kernels import channel_moments
@@ -158,7 +159,8 @@ def removal_cost(
         return scene.removal_cost(error, scene.diagonal()).numpy()
 
 
-class _Comparison(NamedTuple):
+@dataclass(frozen=True)
+class _Comparison:
     """A set and its image on the device, with one build of tile lists.
 
     Attributes
@@ -308,42 +310,15 @@ def relocate(
         grid, total = scene.lists.grid, len(gaussians)
         count = total // grid.images
         own = range(count) if part is None else range(count)[part.own]
-        leaving = max(int(how.share * len(own)), how.dropped)
-        inside = types.Float(1)
+        leaving, inside = max(int(how.share * len(own)), how.dropped), None
         if part is not None:
             core = np.zeros((grid.height, grid.width, gaussians.channels), np.float32)
             core[part.core] = 1
             inside = to_tiles(types, core, grid)
-
-        # Who leaves
-        error, _ = scene.error_of(scene.colors)
-        diagonal = scene.diagonal()
-        cost = scene.removal_cost(error, diagonal)
-        if part is not None:
-            cost = dr.select(_among(dr.arange(types.UInt, total), own), cost, dr.inf)
-        moved = _least(cost, leaving, grid.images)
-        keep = dr.full(types.Float, 1, total)
-        if leaving:
-            dr.scatter(keep, types.Float(0), moved)
-
-        # What is missing without them
-        _, squares = channel_moments(error * inside, len(scene.colors[0]), grid)
-        strength = sum(squares) * dr.opaque(types.Float, 1 / max(1, len(own)))
-        colors = [c * keep for c in scene.colors[0]], scene.colors[1]
-        dr.eval(colors, keep, strength)
-        error, _ = scene.error_of(colors)
-        dr.eval(error)
-        if image.weight is None:
-            inverse = [i * keep for i in invert(diagonal[0])] * len(colors[0])
-            free = inverse, invert(diagonal[1]) * len(colors[1])
-            free = free if part is None else held_background(free)
-            dr.eval(free)
-            for _ in range(ROUND_STEPS):
-                colors = take_step(scene.shape, colors, error, free, scene.lists, scene.cutoff)
-                dr.eval(colors)
+        moved, colors, error, strength = _remove(scene, inside, own, leaving, total)
 
         # What takes their places
-        peaks = scene.peaks(error * inside, leaving - how.dropped)
+        peaks = scene.peaks(error, leaving - how.dropped)
         mean, factor = (
             type(rows)([row + dr.zeros(types.Float, total) for row in rows])
             for rows in (gaussians.mean, gaussians.factor)
@@ -367,6 +342,65 @@ def relocate(
         return _without(found, moved, how.dropped, grid.images).bounded()
 
 
+@record
+def _remove(
+    scene: _Comparison, inside: Float | None, own: range, leaving: int, total: int
+) -> tuple[UInt, Unknowns, Float, Float]:
+    """Let Gaussians leave, and solve for the colours of the others.
+
+    Parameters
+    ----------
+    scene : _Comparison
+    inside : Float, or None
+        Factor of the errors that count, where not all do. The background then stays.
+    own : range
+        The Gaussians of each image that may leave.
+    leaving, total : int
+        Number of Gaussians that leave each image, and of all Gaussians of all images.
+
+    Returns
+    -------
+    moved : UInt32, or None
+        Those that leave, from `_least`, if there are some.
+    colors : Unknowns
+        The new colours; 0 for those.
+    error : Float
+        The new rendering minus the image, times `inside`.
+    strength : Float, shape (images,)
+        Squared error of the old rendering divided by the number of own Gaussians.
+    """
+    types, grid, channels = types_of(scene.target), scene.lists.grid, len(scene.colors[0])
+
+    # Who leaves
+    error, _ = scene.error_of(scene.colors)
+    diagonal = scene.diagonal()
+    cost = scene.removal_cost(error, diagonal)
+    if inside is not None:
+        cost = dr.select(_among(dr.arange(types.UInt, total), own), cost, dr.inf)
+        error *= inside
+    keep, moved = dr.full(types.Float, 1, total), None
+    if leaving:
+        moved = _least(cost, leaving, grid.images)
+        dr.scatter(keep, types.Float(0), moved)
+    _, squares = channel_moments(error, channels, grid)
+    strength = sum(squares) * dr.opaque(types.Float, 1 / max(1, len(own)))
+
+    # What is missing without them
+    colors = [c * keep for c in scene.colors[0]], scene.colors[1]
+    dr.eval(colors, keep, strength)
+    error, _ = scene.error_of(colors)
+    dr.eval(error)
+    if scene.squares is None:
+        inverse = [i * keep for i in invert(diagonal[0])] * channels
+        free = inverse, invert(diagonal[1]) * channels
+        free = free if inside is None else held_background(free)
+        dr.eval(free)
+        for _ in range(ROUND_STEPS):
+            colors = take_step(scene.shape, colors, error, free, scene.lists, scene.cutoff)
+            dr.eval(colors)
+    return moved, colors, error if inside is None else error * inside, strength
+
+
 def _among(number: UInt, own: range) -> Bool:
     """Return which numbers are in a range."""
     UInt = type(number)
@@ -376,8 +410,6 @@ def _among(number: UInt, own: range) -> Bool:
 def _least(cost: Float, number: int, images: int) -> UInt:
     """Return the `number` Gaussians of least cost of each image, image after image."""
     types, total = types_of(cost), dr.width(cost)
-    if not number:  # of less than ten Gaussians
-        return types.UInt()
     order = dr.argsort(cost)
     if images > 1:  # a stable sort by image keeps the order by cost
         image, _ = make_divisor(types, total // images).divmod(order)
