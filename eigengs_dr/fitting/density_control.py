@@ -525,8 +525,8 @@ def perturb(
     factor : Array3f, shape (N, 3)
     """
     types, total = types_of(mean), dr.width(mean)
-    images = dr.width(error)
-    image, lane = make_divisor(types, total // images).divmod(dr.arange(types.UInt, total))
+    count = total // dr.width(error)
+    image, lane = make_divisor(types, count).divmod(dr.arange(types.UInt, total))
     error = dr.gather(types.Float, error, image)
     a, b, c = factor
     amplitude = sum(dr.square(row) for row in color) / (a * c)
@@ -536,9 +536,8 @@ def perturb(
     size = dr.select(size < MAX_NOISE, size, types.Float(MAX_NOISE))
     moves = _among(lane, own)
     size = dr.select(moves, size, 0)
-    generator = dr.rng(how.seed)
-    normal = [generator.normal(types.Float, total // images) for _ in range(5)]
-    x, y, u, v, w = (dr.gather(types.Float, z, lane) * size for z in normal)
+    normal, first = dr.rng(how.seed).normal(types.Float, 5 * count), dr.opaque(types.UInt, count)
+    x, y, u, v, w = (dr.gather(types.Float, normal, lane + k * first) * size for k in range(5))
     y /= c
     u, v, w = (SHAPE_SHARE * z for z in (u, v, w))
     wider = dr.exp(u)
