@@ -11,8 +11,9 @@ import atexit
 import gc
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import is_dataclass
 from functools import wraps
 from typing import Any
 
@@ -129,19 +130,45 @@ def freeze_program(function: Program) -> Iterator[Program]:
         _retire(program.clear)
 
 
-KEPT_RECORDINGS = 8
-"""Recordings that a program of `record` keeps: those of the layouts that were used last."""
+KEPT_RECORDINGS, LARGEST = 8, 1 << 22
+"""Recordings that a program of `record` keeps: those that were used last. And the size of the
+largest array of a call that is recorded. A replay frees its temporary arrays at its end, which
+takes memory, and where arrays are larger tracing hardly counts."""
 
 
 def record(function: Program) -> Program:
     """Freeze a function of a module, for all its calls in the process; see `freeze_program`.
 
-    Other fits of a layout replay what the first one recorded. All that a call needs must be in its
-    arguments: a replay notices nothing else.
+    Other fits with arrays of the same sizes replay what the first one recorded. All that a call
+    needs must be in its arguments, and these must be positional: a replay notices nothing else.
     """
-    program = dr.freeze(function, limit=KEPT_RECORDINGS, warn_after=MANY_RECORDINGS)
+    program = dr.freeze(
+        lambda sizes, *arguments: function(*arguments),
+        limit=KEPT_RECORDINGS,
+        warn_after=MANY_RECORDINGS,
+    )
     atexit.register(program.clear)
-    return _guarded(program, function)
+    replay = _guarded(program, function)
+
+    @wraps(function)
+    def call(*arguments: Any) -> Any:
+        sizes = list(_sizes_of(arguments))  # they may be numbers in a program
+        if max(sizes) > LARGEST:
+            return function(*arguments)
+        return replay(sizes, *arguments)
+
+    return call
+
+
+def _sizes_of(arguments: Iterable[Any]) -> Iterator[int]:
+    """Yield the sizes of all arrays in some arguments."""
+    for value in arguments:
+        if dr.is_array_v(value):
+            yield dr.width(value)
+        elif isinstance(value, (list, tuple)):
+            yield from _sizes_of(value)
+        elif is_dataclass(value):
+            yield from _sizes_of(vars(value).values())
 
 
 def _guarded(program: Program, function: Program) -> Program:

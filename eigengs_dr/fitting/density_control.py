@@ -315,7 +315,7 @@ def relocate(
             core = np.zeros((grid.height, grid.width, gaussians.channels), np.float32)
             core[part.core] = 1
             inside = to_tiles(types, core, grid)
-        moved, colors, error, strength = _remove(scene, inside, own, leaving, total)
+        moved, colors, error, strength = _remove(scene, inside, own, leaving)
 
         # What takes their places
         peaks = scene.peaks(error, leaving - how.dropped)
@@ -344,7 +344,7 @@ def relocate(
 
 @record
 def _remove(
-    scene: _Comparison, inside: Float | None, own: range, leaving: int, total: int
+    scene: _Comparison, inside: Float | None, own: range, leaving: int
 ) -> tuple[UInt, Unknowns, Float, Float]:
     """Let Gaussians leave, and solve for the colours of the others.
 
@@ -355,8 +355,8 @@ def _remove(
         Factor of the errors that count, where not all do. The background then stays.
     own : range
         The Gaussians of each image that may leave.
-    leaving, total : int
-        Number of Gaussians that leave each image, and of all Gaussians of all images.
+    leaving : int
+        Number of Gaussians that leave each image.
 
     Returns
     -------
@@ -375,6 +375,7 @@ def _remove(
     error, _ = scene.error_of(scene.colors)
     diagonal = scene.diagonal()
     cost = scene.removal_cost(error, diagonal)
+    total = dr.width(cost)
     if inside is not None:
         cost = dr.select(_among(dr.arange(types.UInt, total), own), cost, dr.inf)
         error *= inside
