@@ -141,6 +141,7 @@ def record(function: Program) -> Program:
 
     Other fits with arrays of the same sizes replay what the first one recorded. All that a call
     needs must be in its arguments, and these must be positional: a replay notices nothing else.
+    The function may not sort: on cuda, Dr.Jit 1.5 ends the process when it records `drjit.argsort`.
     """
     program = dr.freeze(
         lambda sizes, *arguments: function(*arguments),

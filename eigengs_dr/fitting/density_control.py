@@ -315,7 +315,13 @@ def relocate(
             core = np.zeros((grid.height, grid.width, gaussians.channels), np.float32)
             core[part.core] = 1
             inside = to_tiles(types, core, grid)
-        moved, colors, error, strength = _remove(scene, inside, own, leaving)
+        cost, diagonal, strength = _weigh(scene, inside, own)
+        keep, moved = dr.full(types.Float, 1, total), None
+        if leaving:
+            moved = _least(cost, leaving, grid.images)
+            dr.scatter(keep, types.Float(0), moved)
+        dr.eval(keep)
+        colors, error = _without_some(scene, keep, diagonal, inside)
 
         # What takes their places
         peaks = scene.peaks(error, leaving - how.dropped)
@@ -343,52 +349,61 @@ def relocate(
 
 
 @record
-def _remove(
-    scene: _Comparison, inside: Float | None, own: range, leaving: int
-) -> tuple[UInt, Unknowns, Float, Float]:
-    """Let Gaussians leave, and solve for the colours of the others.
+def _weigh(scene: _Comparison, inside: Float | None, own: range) -> tuple[Float, Unknowns, Float]:
+    """Return the removal costs, infinite for others than the own Gaussians.
 
     Parameters
     ----------
     scene : _Comparison
     inside : Float, or None
-        Factor of the errors that count, where not all do. The background then stays.
+        Factor of the errors that count, where not all do.
     own : range
         The Gaussians of each image that may leave.
-    leaving : int
-        Number of Gaussians that leave each image.
 
     Returns
     -------
-    moved : UInt32, or None
-        Those that leave, from `_least`, if there are some.
-    colors : Unknowns
-        The new colours; 0 for those.
-    error : Float
-        The new rendering minus the image, times `inside`.
+    cost : Float, shape (N,)
+    diagonal : Unknowns
+        From `_Comparison.diagonal`.
     strength : Float, shape (images,)
-        Squared error of the old rendering divided by the number of own Gaussians.
+        Squared error of the image divided by the number of own Gaussians.
     """
-    types, grid, channels = types_of(scene.target), scene.lists.grid, len(scene.colors[0])
-
-    # Who leaves
+    types, channels = types_of(scene.target), len(scene.colors[0])
     error, _ = scene.error_of(scene.colors)
     diagonal = scene.diagonal()
     cost = scene.removal_cost(error, diagonal)
-    total = dr.width(cost)
     if inside is not None:
-        cost = dr.select(_among(dr.arange(types.UInt, total), own), cost, dr.inf)
+        cost = dr.select(_among(dr.arange(types.UInt, dr.width(cost)), own), cost, dr.inf)
         error *= inside
-    keep, moved = dr.full(types.Float, 1, total), None
-    if leaving:
-        moved = _least(cost, leaving, grid.images)
-        dr.scatter(keep, types.Float(0), moved)
-    _, squares = channel_moments(error, channels, grid)
-    strength = sum(squares) * dr.opaque(types.Float, 1 / max(1, len(own)))
+    _, squares = channel_moments(error, channels, scene.lists.grid)
+    return cost, diagonal, sum(squares) * dr.opaque(types.Float, 1 / max(1, len(own)))
 
-    # What is missing without them
+
+@record
+def _without_some(
+    scene: _Comparison, keep: Float, diagonal: Unknowns, inside: Float | None
+) -> tuple[Unknowns, Float]:
+    """Set the colours of some Gaussians to 0, and solve for those of the others.
+
+    Parameters
+    ----------
+    scene : _Comparison
+    keep : Float, shape (N,)
+        0 for the Gaussians without a colour, and 1 for the others.
+    diagonal : Unknowns
+        From `_Comparison.diagonal`.
+    inside : Float, or None
+        Factor of the errors that count, where not all do. The background then stays.
+
+    Returns
+    -------
+    colors : Unknowns
+    error : Float
+        The rendering minus the image, times `inside`.
+    """
+    channels = len(scene.colors[0])
     colors = [c * keep for c in scene.colors[0]], scene.colors[1]
-    dr.eval(colors, keep, strength)
+    dr.eval(colors)
     error, _ = scene.error_of(colors)
     dr.eval(error)
     if scene.squares is None:
@@ -399,7 +414,7 @@ def _remove(
         for _ in range(ROUND_STEPS):
             colors = take_step(scene.shape, colors, error, free, scene.lists, scene.cutoff)
             dr.eval(colors)
-    return moved, colors, error if inside is None else error * inside, strength
+    return colors, error if inside is None else error * inside
 
 
 def _among(number: UInt, own: range) -> Bool:
