@@ -17,6 +17,7 @@ from eigengs_bench.report import Section, number, table
 from eigengs_bench.rows import Row, Task
 from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.descent import TiledImage
 from eigengs_dr.fitting.descent import run as descend_to_end
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.refine import refine
@@ -28,7 +29,13 @@ from eigengs_dr.raster.binning.lists import TileLists, build_lists
 from eigengs_dr.raster.binning.tiles import Grid
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, KernelParameters, kernel_radius
 from eigengs_dr.raster.reference import render_plain
-from eigengs_dr.raster.render import bin_gaussians, decode_parameters, rasterize, to_tensor
+from eigengs_dr.raster.render import (
+    batch_to_tiles,
+    bin_gaussians,
+    decode_parameters,
+    rasterize,
+    to_tensor,
+)
 
 # The scene: Gaussians of equal size, spread evenly at random over a square picture.
 SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
@@ -213,8 +220,12 @@ def fit_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
     def steps() -> eg.Gaussians:
         return descend_to_end(problem._replace(control=None), schedule, FIT_STEPS)
 
+    def relocated() -> eg.Gaussians:
+        return control.relocate(moved, move, image)
+
     moved = steps()
-    timed = {"fit": whole, "steps": steps, "round": lambda: control.relocate(moved, move)}
+    image = TiledImage(batch_to_tiles(types, problem.target), lists=bin_gaussians(moved))
+    timed = {"fit": whole, "steps": steps, "round": relocated}
     ms = interleaved(timed, 1, FIT_ROUNDS, progress)
     return {
         "fit_over_steps": ms["fit"] / ms["steps"],

@@ -7,11 +7,13 @@ or lets the replay fail ("determining size of variable"). One lock of this modul
 
 from __future__ import annotations
 
+import atexit
 import gc
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import is_dataclass
 from functools import wraps
 from typing import Any
 
@@ -122,6 +124,56 @@ def freeze_program(function: Program) -> Iterator[Program]:
     """
     # Lists grow and shrink in a descent. Each other size is recorded, in 3 ms: no fault.
     program = dr.freeze(function, warn_after=MANY_RECORDINGS)
+    try:
+        yield _guarded(program, function)
+    finally:
+        _retire(program.clear)
+
+
+KEPT_RECORDINGS, LARGEST = 8, 1 << 22
+"""Recordings that a program of `record` keeps: those that were used last. And the size of the
+largest array of a call that is recorded. A replay frees its temporary arrays at its end, which
+takes memory, and where arrays are larger tracing hardly counts."""
+
+
+def record(function: Program) -> Program:
+    """Freeze a function of a module, for all its calls in the process; see `freeze_program`.
+
+    Other fits with arrays of the same sizes replay what the first one recorded. All that a call
+    needs must be in its arguments, and these must be positional: a replay notices nothing else.
+    The function may not sort: on cuda, Dr.Jit 1.5 ends the process when it records `drjit.argsort`.
+    """
+    program = dr.freeze(
+        lambda sizes, *arguments: function(*arguments),
+        limit=KEPT_RECORDINGS,
+        warn_after=MANY_RECORDINGS,
+    )
+    atexit.register(program.clear)
+    replay = _guarded(program, function)
+
+    @wraps(function)
+    def call(*arguments: Any) -> Any:
+        sizes = list(_sizes_of(arguments))  # they may be numbers in a program
+        if max(sizes) > LARGEST:
+            return function(*arguments)
+        return replay(sizes, *arguments)
+
+    return call
+
+
+def _sizes_of(arguments: Iterable[Any]) -> Iterator[int]:
+    """Yield the sizes of all arrays in some arguments."""
+    for value in arguments:
+        if dr.is_array_v(value):
+            yield dr.width(value)
+        elif isinstance(value, (list, tuple)):
+            yield from _sizes_of(value)
+        elif is_dataclass(value):
+            yield from _sizes_of(vars(value).values())
+
+
+def _guarded(program: Program, function: Program) -> Program:
+    """Return a frozen function whose calls are `exclusive`, with the collector off."""
 
     @wraps(function)
     def call(*arguments: Any, **settings: Any) -> Any:
@@ -133,10 +185,7 @@ def freeze_program(function: Program) -> Iterator[Program]:
             finally:
                 _calls -= 1
 
-    try:
-        yield call
-    finally:
-        _retire(program.clear)
+    return call
 
 
 @contextmanager

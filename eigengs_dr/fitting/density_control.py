@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import Bool, Float, UInt, make_divisor, types_of
+from ..backend.recording import record
 from ..gaussian.gaussians import Gaussians, concatenate, take
 from ..raster.binning.lists import TileLists
 from ..raster.kernels import channel_moments
 from ..raster.parameters import detached_shape
 from ..raster.render import batch_to_tiles, bin_gaussians, pixels_inside, to_tiles
+from .descent import TiledImage
 from .placement.adaptive import redistribute
 from .placement.peaks import Peaks, residual_peaks
 from .schedule import Relocation
@@ -80,9 +82,9 @@ class DensityControl:
             gaussians, count, self.shown, self.target, self.weight, self.solve_steps
         )
 
-    def relocate(self, gaussians: Gaussians, how: Relocation) -> Gaussians:
+    def relocate(self, gaussians: Gaussians, how: Relocation, image: TiledImage) -> Gaussians:
         """Move Gaussians; see the function `relocate`."""
-        return relocate(gaussians, how, self.target, self.weight)
+        return relocate(gaussians, how, image)
 
 
 @dataclass(frozen=True)
@@ -97,9 +99,9 @@ class PartControl(DensityControl):
 
     part: Part | None = None
 
-    def relocate(self, gaussians: Gaussians, how: Relocation) -> Gaussians:
+    def relocate(self, gaussians: Gaussians, how: Relocation, image: TiledImage) -> Gaussians:
         """Move Gaussians of the part; see the function `relocate`."""
-        return relocate(gaussians, how, self.target, self.weight, self.part)
+        return relocate(gaussians, how, image, self.part)
 
 
 @dataclass(frozen=True)
@@ -114,9 +116,9 @@ class LevelControl(DensityControl):
 
     counts: tuple[int, ...] = ()
 
-    def relocate(self, gaussians: Gaussians, how: Relocation) -> Gaussians:
+    def relocate(self, gaussians: Gaussians, how: Relocation, image: TiledImage) -> Gaussians:
         """Move the Gaussians of each level; see `relocate_levels`."""
-        return relocate_levels(gaussians, how, self.counts, self.target, self.weight)
+        return relocate_levels(gaussians, how, self.counts, image)
 
 
 ROUND_STEPS = 2
@@ -152,12 +154,13 @@ def removal_cost(
         Negative if the set would be better without the Gaussian.
     """
     with dr.suspend_grad():
-        scene = _compare(gaussians, target, weight)
+        scene = _compare(gaussians, _upload(gaussians, target, weight))
         error, _ = scene.error_of(scene.colors)
         return scene.removal_cost(error, scene.diagonal()).numpy()
 
 
-class _Comparison(NamedTuple):
+@dataclass(frozen=True)
+class _Comparison:
     """A set and its image on the device, with one build of tile lists.
 
     Attributes
@@ -207,20 +210,22 @@ class _Comparison(NamedTuple):
         return residual_peaks(-error, grid, len(self.colors[0]), count, spacing, self.squares)
 
 
-def _compare(
-    gaussians: Gaussians, target: NDArray[np.float32], weight: Array | None
-) -> _Comparison:
-    """Upload an image or a batch, and list the Gaussians of the tiles."""
-    images = len(target) if target.ndim == 4 else 1
-    types, lists = types_of(gaussians.mean), bin_gaussians(gaussians, images=images)
+def _upload(gaussians: Gaussians, target: NDArray[np.float32], weight: Array | None) -> TiledImage:
+    """Copy an image and its weights to the device."""
+    types = types_of(gaussians.mean)
+    return TiledImage(*(v if v is None else batch_to_tiles(types, v) for v in (target, weight)))
+
+
+def _compare(gaussians: Gaussians, image: TiledImage) -> _Comparison:
+    """Compare a set with an image; list the Gaussians of the tiles if nobody has."""
+    types, target, lists = types_of(gaussians.mean), image.values, image.lists
+    if lists is None:
+        lists = bin_gaussians(gaussians, images=dr.width(gaussians.background[0]))
     shape, zeros = detached_shape(gaussians), dr.zeros(types.Float, len(gaussians))
     colors = [c + zeros for c in gaussians.color], list(gaussians.background)
-    squares = None
-    if weight is not None:
-        squares = dr.square(batch_to_tiles(types, np.asarray(weight, np.float32)))
-    image = batch_to_tiles(types, target)
+    squares = None if image.weight is None else dr.square(image.weight)
     dr.eval(shape, colors, squares)
-    return _Comparison(shape, colors, lists, gaussians.cutoff, image, squares)
+    return _Comparison(shape, colors, lists, gaussians.cutoff, target, squares)
 
 
 def prune(
@@ -257,7 +262,8 @@ def densify(
     if count <= len(gaussians):
         return gaussians
     with dr.suspend_grad():
-        scene, types = _compare(gaussians, target, weight), types_of(gaussians.mean)
+        types = types_of(gaussians.mean)
+        scene = _compare(gaussians, _upload(gaussians, target, weight))
         error, _ = scene.error_of(scene.colors)
         peaks = scene.peaks(error, count - len(gaussians))
         if not dr.width(peaks.size):
@@ -275,24 +281,21 @@ def densify(
 def relocate(
     gaussians: Gaussians,
     how: Relocation,
-    target: NDArray[np.float32],
-    weight: Array | None = None,
+    image: TiledImage,
     part: Part | None = None,
 ) -> Gaussians:
     """Move the Gaussians of least use to where they reduce the error most, and perturb all.
 
     The Gaussians of least `removal_cost` leave: they get the colour 0, and steps of the colour
     solve adapt the others. Round Gaussians at the peaks of the error that is left then take their
-    places in the order, except the places of those that are dropped. All of it runs on the device;
-    one build of tile lists serves it.
+    places in the order, except the places of those that are dropped. All of it runs on the device.
 
     Parameters
     ----------
     gaussians : Gaussians
+        Of a batch, the Gaussians of all images, image after image; each image is for itself.
     how : Relocation
-    target, weight
-        See `removal_cost`. For a batch (M, H, W, C): the set holds the Gaussians of all images,
-        image after image, and each image is for itself.
+    image : TiledImage
     part : Part, optional
         The Gaussians of one image that may move, and where. The background then stays.
 
@@ -303,46 +306,25 @@ def relocate(
         places, Gaussians of least use stay, with the colour 0.
     """
     with dr.suspend_grad():
-        scene, types = _compare(gaussians, target, weight), types_of(gaussians.mean)
+        scene, types = _compare(gaussians, image), types_of(gaussians.mean)
         grid, total = scene.lists.grid, len(gaussians)
         count = total // grid.images
         own = range(count) if part is None else range(count)[part.own]
-        leaving = max(int(how.share * len(own)), how.dropped)
-        inside = types.Float(1)
+        leaving, inside = max(int(how.share * len(own)), how.dropped), None
         if part is not None:
-            core = np.zeros_like(target)
+            core = np.zeros((grid.height, grid.width, gaussians.channels), np.float32)
             core[part.core] = 1
             inside = to_tiles(types, core, grid)
-
-        # Who leaves
-        error, _ = scene.error_of(scene.colors)
-        diagonal = scene.diagonal()
-        cost = scene.removal_cost(error, diagonal)
-        if part is not None:
-            cost = dr.select(_among(dr.arange(types.UInt, total), own), cost, dr.inf)
-        moved = _least(cost, leaving, grid.images)
-        keep = dr.full(types.Float, 1, total)
+        cost, diagonal, strength = _weigh(scene, inside, own)
+        keep, moved = dr.full(types.Float, 1, total), None
         if leaving:
+            moved = _least(cost, leaving, grid.images)
             dr.scatter(keep, types.Float(0), moved)
-
-        # What is missing without them
-        _, squares = channel_moments(error * inside, len(scene.colors[0]), grid)
-        strength = sum(squares) * dr.opaque(types.Float, 1 / max(1, len(own)))
-        colors = [c * keep for c in scene.colors[0]], scene.colors[1]
-        dr.eval(colors, keep, strength)
-        error, _ = scene.error_of(colors)
-        dr.eval(error)
-        if weight is None:
-            inverse = [i * keep for i in invert(diagonal[0])] * len(colors[0])
-            free = inverse, invert(diagonal[1]) * len(colors[1])
-            free = free if part is None else held_background(free)
-            dr.eval(free)
-            for _ in range(ROUND_STEPS):
-                colors = take_step(scene.shape, colors, error, free, scene.lists, scene.cutoff)
-                dr.eval(colors)
+        dr.eval(keep)
+        colors, error = _without_some(scene, keep, diagonal, inside)
 
         # What takes their places
-        peaks = scene.peaks(error * inside, leaving - how.dropped)
+        peaks = scene.peaks(error, leaving - how.dropped)
         mean, factor = (
             type(rows)([row + dr.zeros(types.Float, total) for row in rows])
             for rows in (gaussians.mean, gaussians.factor)
@@ -366,6 +348,75 @@ def relocate(
         return _without(found, moved, how.dropped, grid.images).bounded()
 
 
+@record
+def _weigh(scene: _Comparison, inside: Float | None, own: range) -> tuple[Float, Unknowns, Float]:
+    """Return the removal costs, infinite for others than the own Gaussians.
+
+    Parameters
+    ----------
+    scene : _Comparison
+    inside : Float, or None
+        Factor of the errors that count, where not all do.
+    own : range
+        The Gaussians of each image that may leave.
+
+    Returns
+    -------
+    cost : Float, shape (N,)
+    diagonal : Unknowns
+        From `_Comparison.diagonal`.
+    strength : Float, shape (images,)
+        Squared error of the image divided by the number of own Gaussians.
+    """
+    types, channels = types_of(scene.target), len(scene.colors[0])
+    error, _ = scene.error_of(scene.colors)
+    diagonal = scene.diagonal()
+    cost = scene.removal_cost(error, diagonal)
+    if inside is not None:
+        cost = dr.select(_among(dr.arange(types.UInt, dr.width(cost)), own), cost, dr.inf)
+        error *= inside
+    _, squares = channel_moments(error, channels, scene.lists.grid)
+    return cost, diagonal, sum(squares) * dr.opaque(types.Float, 1 / max(1, len(own)))
+
+
+@record
+def _without_some(
+    scene: _Comparison, keep: Float, diagonal: Unknowns, inside: Float | None
+) -> tuple[Unknowns, Float]:
+    """Set the colours of some Gaussians to 0, and solve for those of the others.
+
+    Parameters
+    ----------
+    scene : _Comparison
+    keep : Float, shape (N,)
+        0 for the Gaussians without a colour, and 1 for the others.
+    diagonal : Unknowns
+        From `_Comparison.diagonal`.
+    inside : Float, or None
+        Factor of the errors that count, where not all do. The background then stays.
+
+    Returns
+    -------
+    colors : Unknowns
+    error : Float
+        The rendering minus the image, times `inside`.
+    """
+    channels = len(scene.colors[0])
+    colors = [c * keep for c in scene.colors[0]], scene.colors[1]
+    dr.eval(colors)
+    error, _ = scene.error_of(colors)
+    dr.eval(error)
+    if scene.squares is None:
+        inverse = [i * keep for i in invert(diagonal[0])] * channels
+        free = inverse, invert(diagonal[1]) * channels
+        free = free if inside is None else held_background(free)
+        dr.eval(free)
+        for _ in range(ROUND_STEPS):
+            colors = take_step(scene.shape, colors, error, free, scene.lists, scene.cutoff)
+            dr.eval(colors)
+    return colors, error if inside is None else error * inside
+
+
 def _among(number: UInt, own: range) -> Bool:
     """Return which numbers are in a range."""
     UInt = type(number)
@@ -375,8 +426,6 @@ def _among(number: UInt, own: range) -> Bool:
 def _least(cost: Float, number: int, images: int) -> UInt:
     """Return the `number` Gaussians of least cost of each image, image after image."""
     types, total = types_of(cost), dr.width(cost)
-    if not number:  # of less than ten Gaussians
-        return types.UInt()
     order = dr.argsort(cost)
     if images > 1:  # a stable sort by image keeps the order by cost
         image, _ = make_divisor(types, total // images).divmod(order)
@@ -403,8 +452,7 @@ def relocate_levels(
     gaussians: Gaussians,
     how: Relocation,
     counts: Sequence[int],
-    target: NDArray[np.float32],
-    weight: Array | None = None,
+    image: TiledImage,
 ) -> Gaussians:
     """Move the Gaussians of least use in each level to where the image up to it has most error.
 
@@ -415,8 +463,8 @@ def relocate_levels(
 
     Parameters
     ----------
-    gaussians, target, weight
-        See `relocate`.
+    gaussians, image
+        See `relocate`; the lists are made anew.
     how : Relocation
         Its share is that of the Gaussians of a level.
     counts : sequence of int
@@ -429,11 +477,12 @@ def relocate_levels(
     """
     how = how._replace(noise=0.0)
     # Without a weight, `relocate` would solve for the colours of earlier levels too.
-    weight = np.ones_like(target) if weight is None else weight
+    values, weight, _ = image
+    weight = dr.opaque(type(values), 1, dr.width(values)) if weight is None else weight
     everywhere = slice(None), slice(None)
     for before, count in pairwise([0, *counts]):
         part = Part(slice(before, count), everywhere)
-        parts = [relocate(gaussians[:count], how, target, weight, part)]
+        parts = [relocate(gaussians[:count], how, TiledImage(values, weight), part)]
         if count < len(gaussians):  # the background is one for all levels
             later = gaussians[count:]
             parts.append(replace(later, background=0 * later.background))
@@ -492,8 +541,8 @@ def perturb(
     factor : Array3f, shape (N, 3)
     """
     types, total = types_of(mean), dr.width(mean)
-    images = dr.width(error)
-    image, lane = make_divisor(types, total // images).divmod(dr.arange(types.UInt, total))
+    count = total // dr.width(error)
+    image, lane = make_divisor(types, count).divmod(dr.arange(types.UInt, total))
     error = dr.gather(types.Float, error, image)
     a, b, c = factor
     amplitude = sum(dr.square(row) for row in color) / (a * c)
@@ -503,9 +552,8 @@ def perturb(
     size = dr.select(size < MAX_NOISE, size, types.Float(MAX_NOISE))
     moves = _among(lane, own)
     size = dr.select(moves, size, 0)
-    generator = dr.rng(how.seed)
-    normal = [generator.normal(types.Float, total // images) for _ in range(5)]
-    x, y, u, v, w = (dr.gather(types.Float, z, lane) * size for z in normal)
+    normal, first = dr.rng(how.seed).normal(types.Float, 5 * count), dr.opaque(types.UInt, count)
+    x, y, u, v, w = (dr.gather(types.Float, normal, lane + k * first) * size for k in range(5))
     y /= c
     u, v, w = (SHAPE_SHARE * z for z in (u, v, w))
     wider = dr.exp(u)

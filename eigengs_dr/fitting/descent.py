@@ -38,6 +38,24 @@ MSE_EPSILON = 1e-10
 """Mean squared error added before the logarithm, which would diverge at an error of 0."""
 
 
+class TiledImage(NamedTuple):
+    """The image of a descent on the device, or a batch of images.
+
+    Attributes
+    ----------
+    values : Float
+        In the space of the set, in the tile layout of `eigengs_dr.raster.kernels`.
+    weight : Float, or None
+        Factor of the errors before squaring, in tile layout.
+    lists : TileLists, or None
+        Lists that are valid for the current set; None if there are none yet.
+    """
+
+    values: Float
+    weight: Float = None
+    lists: TileLists | None = None
+
+
 class Control(Protocol):
     """The density control of a descent: Gaussians that are placed anew, move and leave.
 
@@ -51,7 +69,7 @@ class Control(Protocol):
     def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
         """Return a new set of `count` Gaussians, denser where the old set left more error."""
 
-    def relocate(self, gaussians: Gaussians, how: Relocation) -> Gaussians:
+    def relocate(self, gaussians: Gaussians, how: Relocation, image: TiledImage) -> Gaussians:
         """Return as many Gaussians, less those that `how` drops.
 
         Some have moved to where the old set left most error, and all are perturbed.
@@ -194,10 +212,13 @@ def _run_phase(
     start = 0 if part.start in moves_at else part.start
     factors = [lr_factor(schedule, step, iterations, start) for step in range(iterations)]
     rates, stop = rate_table(types, schedule, factors), part.start
+    lists: list[TileLists] = []
     with freeze_program(step_program(schedule, fixed, levels)) as take_step:
         for step in part:
             if step in moves_at and problem.control:
-                fixed = problem.control.relocate(dr.detach(state.gaussians), moves_at[step])
+                image = TiledImage(target, weight, lists[-1] if lists else None)
+                current = dr.detach(state.gaussians)
+                fixed = problem.control.relocate(current, moves_at[step], image)
                 state, stop = start_descent(fixed, schedule, images), step
             if step == stop:
                 end = min((s for s in moves_at if s > step), default=part.stop)

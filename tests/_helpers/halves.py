@@ -2,10 +2,14 @@
 
 import numpy as np
 
+from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.fitting import density_control
+from eigengs_dr.fitting.descent import TiledImage
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.placement.adaptive import residual
 from eigengs_dr.fitting.start import initialize
 from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.raster.render import batch_to_tiles
 
 SIDE = 32
 
@@ -28,3 +32,10 @@ def fitted(count=60):
 def squared_error(gaussians, target, weight=1.0):
     """Sum of the squares of what a rendering misses."""
     return float(np.square(weight * residual(gaussians, target).astype(np.float64)).sum())
+
+
+def relocate(gaussians, how, target, weight=None, **part):
+    """A round of relocation for an image (H, W, C)."""
+    types = types_of(gaussians.mean)
+    tiles = (None if v is None else batch_to_tiles(types, v) for v in (target, weight))
+    return density_control.relocate(gaussians, how, TiledImage(*tiles), **part)

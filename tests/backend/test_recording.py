@@ -1,11 +1,14 @@
 """Frozen programs, and what the garbage collector must not do while they are recorded."""
 
 import gc
+from dataclasses import dataclass
+from typing import Any
 
+import drjit as dr
 import pytest
 
 from _helpers.process import run_python
-from eigengs_dr.backend.recording import freeze_program
+from eigengs_dr.backend.recording import LARGEST, freeze_program, record
 from eigengs_dr.backend.selection import select
 
 LITTER = """
@@ -55,3 +58,39 @@ def test_the_collector_is_left_as_it_was(backend):
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+@dataclass(frozen=True)
+class Pair:
+    x: Any
+    factor: int
+
+
+def test_a_program_of_a_module_notices_other_sizes(backend):
+    """Also of arrays in lists and dataclasses, whose sizes are numbers in the program."""
+    Float, traced = select(backend).Float, []
+
+    @record
+    def grown(x, rows):
+        traced.append(dr.width(x))
+        return [x * (dr.width(row.x) * row.factor) for row in rows]
+
+    for size, other in ((4, 3), (5, 3), (4, 6), (4, 3), (4, 6)):
+        x, row = dr.arange(Float, size), Pair(dr.arange(Float, other), 2)
+        dr.eval(x, row)
+        (found,) = grown(x, [row])
+        assert dr.all(found == 2 * other * x)
+    assert traced == [4, 5, 4]
+
+
+def test_large_arrays_are_traced(backend):
+    Float, traced = select(backend).Float, []
+
+    @record
+    def increased(x):
+        traced.append(dr.width(x))
+        return x + 1
+
+    for size in (3, LARGEST + 1, LARGEST + 1):
+        assert dr.all(increased(dr.full(Float, 1, size)) == 2)
+    assert traced == [3, LARGEST + 1, LARGEST + 1]

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.halves import SIDE, fitted, picture, squared_error
-from eigengs_dr.fitting.density_control import Part, relocate, relocate_levels, removal_cost
-from eigengs_dr.fitting.descent import descend
+from _helpers.halves import SIDE, fitted, picture, relocate, squared_error
+from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.fitting.density_control import Part, relocate_levels, removal_cost
+from eigengs_dr.fitting.descent import TiledImage, descend
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.schedule import Relocation, relocations
 from eigengs_dr.fitting.start import initialize
+from eigengs_dr.raster.render import batch_to_tiles
 
 SCHEDULE = PRESETS["default"].schedule
 
@@ -57,7 +59,8 @@ def test_levels_relocate_inside_themselves(counts):
     """A quarter of each level, at most, before the same background; colours are not solved for."""
     start, target = fitted()
     before = start.gaussians.to_arrays()
-    found = relocate_levels(start.gaussians, Relocation(0.25), counts, target).to_arrays()
+    tiles = TiledImage(batch_to_tiles(types_of(start.gaussians.mean), target))
+    found = relocate_levels(start.gaussians, Relocation(0.25), counts, tiles).to_arrays()
     moved = (found["mean"] != before["mean"]).any(axis=1)
     for low, high in pairwise([0, *counts]):
         assert 0 < moved[low:high].sum() <= (high - low) // 4
@@ -125,9 +128,9 @@ def test_a_descent_relocates_and_goes_on():
     start = initialize(picture(), FitOptions(gaussians=60, init="adaptive"))
     calls = []
 
-    def move(gaussians, how):
+    def move(gaussians, how, image):
         calls.append(how.share)
-        return start.control.relocate(gaussians, how)
+        return start.control.relocate(gaussians, how, image)
 
     problem = start._replace(control=SimpleNamespace(redistributes=False, relocate=move))
     schedule = replace(SCHEDULE, relocate_every=15, noise=0.0)

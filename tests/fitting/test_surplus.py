@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.halves import SIDE, fitted, picture, squared_error
-from eigengs_dr.fitting.density_control import relocate, removal_cost
+from _helpers.halves import SIDE, fitted, picture, relocate, squared_error
+from eigengs_dr.fitting.density_control import removal_cost
 from eigengs_dr.fitting.descent import descend
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.refine import refine

@@ -12,15 +12,17 @@ images takes one launch of each kernel, and each image has peaks of its own.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
 
 from ...backend.arrays import ArrayTypes, Bool, Float, UInt, make_divisor, types_of
+from ...backend.recording import record
 from ...raster.binning.tiles import TILE, Grid, GridArrays
 from ...raster.parameters import gather_run
-from ...raster.render import pixels_inside
 
 CANDIDATE_SIZES = (0.2, 0.4, 0.8)
 """Candidate sizes of an added Gaussian, as multiples of the mean spacing. Five from 0.2 to 1.6 take
@@ -62,7 +64,8 @@ class Peaks(NamedTuple):
     rank: UInt
 
 
-class _Runs(NamedTuple):
+@dataclass(frozen=True)
+class _Runs:
     """The runs of an image, one for each lane.
 
     Attributes
@@ -156,13 +159,8 @@ def residual_peaks(
             return peaks
         return peaks._replace(mean=peaks.mean * times, size=peaks.size * times)
     runs = _runs(types, grid)
-    pixels = grid.tiles * grid.pixels
-    best = tuple(dr.zeros(types.Float, pixels * n) for n in (1, 1, channels))
-    dr.make_opaque(best)
-    for deviation in (share * spacing for share in CANDIDATE_SIZES):
-        best = _better(missed, grid, channels, deviation, squares, best)
-    gain, size, color = best
-    top = _local_maxima(gain, runs)
+    weights = [_weights_of(types, share * spacing) for share in CANDIDATE_SIZES]
+    gain, size, top = _gain_map(missed, squares, weights, runs, grid, channels)
     place = dr.compress(top > 0)
     if dr.width(place):
         reach = math.ceil(SUPPRESSION_RADIUS * CANDIDATE_SIZES[-1] * spacing)
@@ -172,13 +170,9 @@ def residual_peaks(
         none = types.Float()
         return Peaks(types.Float2(none, none), none, [none] * channels, place, place)
     column, row, _ = runs.of(place)
-    peaks = Peaks(
-        types.Float2(types.Float(column) + 0.5, types.Float(row) + 0.5),
-        dr.gather(types.Float, size, place),
-        [dr.gather(types.Float, color, place * channels + c) for c in range(channels)],
-        image,
-        rank,
-    )
+    mean = types.Float2(types.Float(column) + 0.5, types.Float(row) + 0.5)
+    size = dr.gather(types.Float, size, place)
+    peaks = Peaks(mean, size, _colors(missed, place, size, runs, channels), image, rank)
     dr.eval(peaks)
     return peaks
 
@@ -238,50 +232,93 @@ def _shrunk(values: Float, grid: Grid, small: Grid, channels: int, times: int) -
     return result
 
 
-def _better(
+@dataclass(frozen=True)
+class _Weights:
+    """The weights ``2^(slope k^2)`` along an axis of a Gaussian of one size, each of shape (1,).
+
+    Attributes
+    ----------
+    size : Float
+        Standard deviation in pixels.
+    slope : Float
+    reach : Int32
+        Largest offset k.
+    inverse : Float
+        One over the sum of the squares of all weights of the Gaussian.
+    """
+
+    size: Float
+    slope: Float
+    reach: UInt
+    inverse: Float
+
+
+def _weights_of(types: ArrayTypes, deviation: float) -> _Weights:
+    """Return the weights of a size, in arrays, so that one program serves all sizes."""
+    reach = max(1, math.ceil(TRUNCATION * deviation))
+    offsets = np.arange(-reach, reach + 1)
+    own = float(np.exp(-np.square(offsets / deviation)).sum()) ** 2
+    values = deviation, -0.5 / (math.log(2) * deviation**2), 1 / own
+    size, slope, inverse = (dr.opaque(types.Float, v) for v in values)
+    return _Weights(size, slope, dr.opaque(types.Int, reach), inverse)
+
+
+@record
+def _gain_map(
     missed: Float,
+    squares: Float,
+    weights: list[_Weights],
+    runs: _Runs,
     grid: Grid,
     channels: int,
-    deviation: float,
+) -> tuple[Float, Float, Float]:
+    """Return for each pixel the largest gain, its size, and the gain again if it is a maximum."""
+    types = types_of(missed)
+    best = tuple(dr.zeros(types.Float, grid.tiles * grid.pixels) for _ in range(2))
+    dr.make_opaque(best)
+    for size in weights:
+        best = _better(missed, squares, size, best, runs.sizes, grid, channels)
+    return *best, _local_maxima(best[0], runs)
+
+
+def _better(
+    missed: Float,
     squares: Float,
+    weights: _Weights,
     best: tuple[Float, ...],
+    sizes: GridArrays,
+    grid: Grid,
+    channels: int,
 ) -> tuple[Float, ...]:
-    """Return gain, size and colour of the better of the best so far and a size, for each pixel."""
+    """Return gain and size of the better of the best so far and a size, for each pixel."""
     types, length = types_of(missed), grid.pixels * channels
-    radius = max(1, math.ceil(TRUNCATION * deviation))
-    offsets = np.arange(-radius, radius + 1)
-    own = float(np.exp(-np.square(offsets / deviation)).sum()) ** 2
-    # In arrays, so that one program serves all sizes.
-    slope = dr.opaque(types.Float, -0.5 / (math.log(2) * deviation**2))
-    size, inverse = dr.opaque(types.Float, deviation), dr.opaque(types.Float, 1 / own)
-    reach, tile = dr.opaque(types.Int, radius), dr.arange(types.UInt, grid.tiles)
+    slope, reach = weights.slope, weights.reach
+    tile = dr.arange(types.UInt, grid.tiles)
     down = dr.empty(types.Float, dr.width(missed))
-    dr.scatter(down, types.FloatX(_blur(missed, grid, channels, slope, reach, 1)), tile)
+    dr.scatter(down, types.FloatX(_blur(missed, sizes, channels, slope, reach, 1)), tile)
     dr.eval(down)
-    both = _blur(down, grid, channels, slope, reach, 0)
+    both = _blur(down, sizes, channels, slope, reach, 0)
     factors = [1.0] * length
     if squares is not None:
         factors = gather_run(types, squares, tile, length, True)
-    terms = [dr.square(p) * f * inverse for p, f in zip(both, factors, strict=True)]
-    inside = gather_run(types, pixels_inside(types, grid), tile, grid.pixels, True)
-    gains, sizes, colors = (
-        gather_run(types, v, tile, dr.width(v) // grid.tiles, True) for v in best
-    )
+    terms = [dr.square(p) * f * weights.inverse for p, f in zip(both, factors, strict=True)]
+    x, y = (types.Float(v) for v in sizes.first_pixel(tile))
+    gains, found = (gather_run(types, v, tile, grid.pixels, True) for v in best)
     for n in range(grid.pixels):
         gain = sum(terms[n * channels : (n + 1) * channels])
-        better = (inside[n] > 0) & (gain > gains[n])
+        better = (gain > gains[n]) & (x + n % RUN < sizes.width) & (y + n // RUN < sizes.height)
         gains[n] = dr.select(better, gain, gains[n])
-        sizes[n] = dr.select(better, size, sizes[n])
-        for k in range(n * channels, (n + 1) * channels):
-            colors[k] = dr.select(better, both[k] * inverse, colors[k])
-    found = tuple(dr.empty(types.Float, dr.width(v)) for v in best)
-    for array, values in zip(found, (gains, sizes, colors), strict=True):
+        found[n] = dr.select(better, weights.size, found[n])
+    result = tuple(dr.empty(types.Float, dr.width(v)) for v in best)
+    for array, values in zip(result, (gains, found), strict=True):
         dr.scatter(array, types.FloatX(values), tile)
-    dr.eval(found)
-    return found
+    dr.eval(result)
+    return result
 
 
-def _blur(image: Float, grid: Grid, channels: int, slope: Float, radius: UInt, axis: int) -> list:
+def _blur(
+    image: Float, sizes: GridArrays, channels: int, slope: Float, radius: UInt, axis: int
+) -> list:
     """Sum the values along an axis of each pixel times ``2^(slope k^2)``; a lane owns a tile.
 
     Cost for each tile within the radius: a gather of the tile, 7 exponentials, and 4 products for
@@ -297,13 +334,12 @@ def _blur(image: Float, grid: Grid, channels: int, slope: Float, radius: UInt, a
     list of Float, shape (tiles,)
         One for each value of a tile.
     """
-    types, side, length = types_of(image), TILE[axis], grid.pixels * channels
-    sizes = grid.in_arrays(types)
-    own = types.Int(dr.arange(types.UInt, grid.tiles))
+    types, side, length = types_of(image), TILE[axis], RUN * ROWS * channels
+    own = types.Int(dr.arange(types.UInt, dr.width(image) // length))
     here = types.Int(sizes.first_pixel(types.UInt(own))[axis]) // side
     step, count = ((1, sizes.nx), (sizes.nx, sizes.ny))[axis]
     tiles = (radius + side - 1) // side
-    pixel_of = [(n % TILE[0], n // TILE[0]) for n in range(grid.pixels)]
+    pixel_of = [(n % RUN, n // RUN) for n in range(RUN * ROWS)]
 
     def add(tile: UInt, sums: list) -> tuple:
         inside = (here + tile >= 0) & (here + tile < count) & (tile <= tiles)
@@ -357,29 +393,67 @@ def _local_maxima(gain: Float, runs: _Runs) -> Float:
 def _apart(place: UInt, top: Float, size: Float, runs: _Runs, reach: int) -> UInt:
     """Return the maxima that no better maximum within its own radius suppresses."""
     types = types_of(top)
-    column, row, start = runs.of(place)
     own = dr.gather(types.Float, top, place)
-    limit = dr.opaque(types.Int, reach)
-    first, last = (column - limit) // RUN, (column + limit) // RUN
-    x, y = types.Float(column), types.Float(row)
 
-    def look(i: UInt, j: UInt, is_best: Bool) -> tuple:
-        at, inside = runs.at(i, j, start)
-        inside &= j <= row + limit
+    def look(at: UInt, inside: Bool, x: list, y: UInt, is_best: Bool) -> Bool:
         gains, sizes = (gather_run(types, v, at, RUN, inside) for v in (top, size))
         for k in range(RUN):
-            away = dr.maximum(dr.abs(types.Float(i * RUN + k) - x), dr.abs(types.Float(j) - y))
+            away = types.Float(dr.maximum(dr.abs(x[k]), dr.abs(y)))
             near = away <= dr.ceil(SUPPRESSION_RADIUS * sizes[k])
             before = (gains[k] > own) | ((gains[k] == own) & (at * RUN + k < place))
             is_best &= ~(inside & near & before)
-        ends = i >= last
-        return dr.select(ends, first, i + 1), dr.select(ends, j + 1, j), is_best
+        return is_best
 
-    is_best = dr.while_loop(
-        (types.Int(first), row - limit, types.Bool(True)),
-        lambda i, j, is_best: is_best & (j <= row + limit),
-        look,
-        label="keep peaks apart",
+    limit = dr.opaque(types.Int, reach)
+    is_best = _for_each_run(place, limit, runs, look, types.Bool(True), "keep peaks apart")
+    return dr.gather(types.UInt, place, dr.compress(is_best))
+
+
+def _colors(missed: Float, place: UInt, size: Float, runs: _Runs, channels: int) -> list:
+    """Return the best colours ``<w, r> / <w, w>`` of round Gaussians at some pixels."""
+    types = types_of(missed)
+    reach = dr.maximum(types.Int(dr.ceil(TRUNCATION * size)), 1)
+    slope = -0.5 / math.log(2) * dr.square(dr.rcp(size))
+
+    def add(at: UInt, inside: Bool, x: list, y: UInt, sums: list) -> list:
+        values = gather_run(types, missed, at, RUN * channels, inside)
+        *along, own = sums
+        for k in range(RUN):
+            weight = dr.exp2(slope * types.Float(dr.square(x[k]) + dr.square(y)))
+            weight = dr.select(dr.abs(x[k]) <= reach, weight, 0)
+            own = dr.fma(weight, weight, own)
+            along = [dr.fma(weight, values[k * channels + c], s) for c, s in enumerate(along)]
+        return [*along, own]
+
+    zeros = [types.Float(0)] * (channels + 1)
+    *along, own = _for_each_run(place, reach, runs, add, zeros, "find colours")
+    return [s / own for s in along]
+
+
+def _for_each_run(
+    place: UInt, reach: UInt, runs: _Runs, visit: Callable[..., Any], state: Any, label: str
+) -> Any:
+    """Call `visit` for the runs within a radius of pixels, row by row; return the last state.
+
+    It is ``visit(at, inside, x, y, state) -> state`` with the index of the run, whether there is
+    one, and the distances of its pixels by columns, a list, and by rows.
+    """
+    Int = type(reach)
+    column, row, start = runs.of(place)
+    # A quotient of Dr.Jit rounds towards 0, and the window may begin left of the image.
+    first, last = (column + (RUN - 1) * reach) // RUN - reach, (column + reach) // RUN
+
+    def body(i: UInt, j: UInt, state: Any) -> tuple:
+        at, inside = runs.at(i, j, start)
+        x = [i * RUN + (k - column) for k in range(RUN)]
+        state = visit(at, inside & (j <= row + reach), x, j - row, state)
+        ends = i >= last
+        return dr.select(ends, first, i + 1), dr.select(ends, j + 1, j), state
+
+    return dr.while_loop(
+        (Int(first), Int(row - reach), state),
+        lambda i, j, state: j <= row + reach,
+        body,
+        label=label,
         max_iterations=-1,
     )[-1]
-    return dr.gather(types.UInt, place, dr.compress(is_best))

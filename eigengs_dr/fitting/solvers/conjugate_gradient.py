@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.arrays import Float, UInt, rcp, release_memory, types_of, upload
-from ...backend.recording import freeze_program
+from ...backend.recording import record
 from ...gaussian.file import MAX_CUTOFF
 from ...gaussian.gaussians import Gaussians
 from ...raster.adjoint import adjoint
@@ -185,25 +185,20 @@ def reduce_error(
     squares : list of list of Float, shape (images,)
         For each step, and each channel, the sum of the squares of the error after it.
     """
-    types, channels, grid = types_of(error), len(x[0]), lists.grid
-    r = negate(apply_transposed(shape, error, channels, lists, cutoff))
-    p = multiply(r, inverse)
-    rz = dots(r, p, grid)
+    types = types_of(error)
+    p, rz = _begin(shape, error, inverse, lists, cutoff)
     enough = [RELATIVE_TOLERANCE[types.bits] * a for a in rz]
-    number = dr.width(shape[0]) / grid.images
+    number = dr.width(shape[0]) / lists.grid.images
     noise = dr.opaque(types.Float, number * ROUNDING[types.bits] ** 2)
-    dr.eval(p, rz, enough)
-    del r
+    dr.eval(enough)
     dr.flush_malloc_cache()  # what the lists and the start took would stay reserved
     found = []
-    # For this solve only: a program does not notice another number of Gaussians.
-    with freeze_program(_advance) as advance, freeze_program(_turn) as turn:
-        for _ in range(steps):
-            x, q, alpha = advance(shape, x, p, rz, lists, cutoff)
-            _add_in_place(error, q, alpha, lists)
-            del q  # before the next one
-            p, rz, squares = turn(shape, error, p, rz, enough, noise, inverse, lists, cutoff)
-            found.append(squares)
+    for _ in range(steps):
+        x, q, alpha = _advance(shape, x, p, rz, lists, cutoff)
+        _add_in_place(error, q, alpha, lists)
+        del q  # before the next one
+        p, rz, squares = _turn(shape, error, p, rz, enough, noise, inverse, lists, cutoff)
+        found.append(squares)
     return x, found
 
 
@@ -214,16 +209,23 @@ def take_step(
 
     Cost: an adjoint with respect to colours and a rendering.
     """
-    channels, grid = len(x[0]), lists.grid
-    r = negate(apply_transposed(shape, error, channels, lists, cutoff))
-    p = multiply(r, inverse)
-    rz = dots(r, p, grid)
-    dr.eval(p, rz)
+    p, rz = _begin(shape, error, inverse, lists, cutoff)
     x, q, alpha = _advance(shape, x, p, rz, lists, cutoff)
     _add_in_place(error, q, alpha, lists)
     return x
 
 
+@record
+def _begin(
+    shape: list, error: Float, inverse: Unknowns, lists: TileLists, cutoff: float
+) -> tuple[Unknowns, list]:
+    """Return the first direction p, and its rz."""
+    r = negate(apply_transposed(shape, error, len(inverse[0]), lists, cutoff))
+    p = multiply(r, inverse)
+    return p, dots(r, p, lists.grid)
+
+
+@record
 def _advance(
     shape: list, x: Unknowns, p: Unknowns, rz: list, lists: TileLists, cutoff: float
 ) -> tuple[Unknowns, Float, list]:
@@ -236,6 +238,7 @@ def _advance(
     return add_multiple(x, alpha, p, lists.image), q, alpha
 
 
+@record
 def _turn(
     shape: list,
     error: Float,
