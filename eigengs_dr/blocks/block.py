@@ -17,6 +17,7 @@ that it is the density of the whole image.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -143,8 +144,7 @@ def survey(task: PlaceTask, settings: Settings) -> Surveyed:
     if options.space == "normal":
         read_data(pixels, options.space)  # no other range makes normals
     target = make_target(pixels, options.space)
-    canvas, image = _canvas(target.shown, options)
-    _, density = density_from_hessian(canvas, image, settings.spacing)
+    canvas, _, density = _density(target, settings)
     core = task.block.core
     return Surveyed(
         _mass(canvas, density, task.block),
@@ -153,11 +153,12 @@ def survey(task: PlaceTask, settings: Settings) -> Surveyed:
     )
 
 
-def _canvas(image: NDArray[np.float32], options: FitOptions) -> tuple[Canvas, Float]:
-    """Return an image (H, W, C) in tile layout."""
-    types = types_in(select(options.backend))
-    grid = Grid(image.shape[1], image.shape[0])
-    return Canvas.of(types, grid), to_tiles(types, image, grid)
+def _density(target: FitTarget, settings: Settings) -> tuple[Canvas, Float, Float]:
+    """Return the canvas of a window, and squared Hessian and density on it."""
+    types = types_in(select(settings.options.backend))
+    canvas = Canvas.of(types, Grid(target.shown.shape[1], target.shown.shape[0]))
+    read = partial(to_tiles, types, target.shown, canvas.grid)
+    return canvas, *density_from_hessian(canvas, read, settings.spacing)
 
 
 def _mass(canvas: Canvas, density: Float, block: Block) -> float:
@@ -176,8 +177,7 @@ def place(task: PlaceTask, settings: Settings) -> Arrays:
         The mean (n, 2) in pixels of the window, inside of the core, and the factor (n, 3).
     """
     options, count, spacing = settings.options, task.gaussians, settings.spacing
-    canvas, image = _canvas(make_target(task.window.read(), options.space).shown, options)
-    energy, density = density_from_hessian(canvas, image, spacing)
+    canvas, energy, density = _density(make_target(task.window.read(), options.space), settings)
     types, grid = canvas.types, canvas.grid
     if task.old is not None:
         mean, factor, ratio = (task.old[name] for name in ("mean", "factor", "ratio"))
@@ -217,8 +217,7 @@ def find_density(task: FitTask, settings: Settings, step_done: StepDone | None =
     target = make_target(task.window.read(), settings.options.space)
     problem = _start(task, target, settings)
     found = _descend(problem, task, settings, step_done)
-    canvas, image = _canvas(target.shown, settings.options)
-    _, density = density_from_hessian(canvas, image, settings.spacing)
+    canvas, _, density = _density(target, settings)
     owners = Owners.of(found)
     error = squared_error(found, problem.target, problem.weight, owners.lists)
     ratio = density_ratio(owners, error, density)
