@@ -18,7 +18,7 @@ FITS = {
     "detail": ("face", COUNT, 35.40, 41.64),
     "rgb": ("face", {**COUNT, "space": "rgb"}, 35.40, 41.51),
     "linear": ("face", {**COUNT, "space": "linear"}, 34.65, 40.80),
-    "start": ("face", {**COUNT, "iterations": 0}, 29.39, 35.61),
+    "start": ("face", {**COUNT, "iterations": 0}, 29.05, 35.26),
     "grid": ("face", {**COUNT, "iterations": 0, "init": "grid"}, 25.87, 32.08),
     "gaussianimage": ("face", {**COUNT, "iterations": 300, "preset": "gaussianimage"}, 9.39, 14.56),
     "basis": ("astronaut", {**NATURAL, "iterations": 0}, 32.74, 38.85),

@@ -110,10 +110,7 @@ def measure_descent(case: Case, steps: int, backend: str | None) -> Row:
 
 def _place(target: Image, count: int, backend: str) -> tuple[eg.Gaussians, float]:
     started = time.perf_counter()
-    mean, factor = place_adaptive(target, count, np.random.default_rng(0))
-    color, size = np.zeros((count, 3)), (target.shape[1], target.shape[0])
-    placed = eg.Gaussians.from_arrays(mean, factor, color, size=size, backend=backend).bounded()
-    dr.eval(placed)
+    placed = place_adaptive(target, count, "ycbcr", backend)
     dr.sync_thread()
     return placed, time.perf_counter() - started
 

@@ -17,6 +17,7 @@ that it is the density of the whole image.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -24,26 +25,23 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.arrays import Float, types_in
 from ..backend.recording import exclusive
+from ..backend.selection import select
 from ..fitting.density_control import Part, PartControl
 from ..fitting.descent import FitProblem, run
 from ..fitting.options import FitOptions
-from ..fitting.placement.adaptive import (
-    density_from_hessian,
-    lloyd_step,
-    normalize_density,
-    residual,
-    shapes_from_hessian,
-    squared_error,
-    stratify_along_hilbert,
-)
-from ..fitting.placement.density import density_ratio, nearest_center, scale_by_owner
+from ..fitting.placement.adaptive import density_from_hessian, place_by_density
+from ..fitting.placement.density import Owners, density_ratio, squared_error
+from ..fitting.placement.filters import Canvas
 from ..fitting.schedule import Schedule, relocations
 from ..fitting.solvers.conjugate_gradient import solve
 from ..fitting.target import BRIGHT, WHITE, FitTarget, make_target, read_data, unit_of
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
 from ..image.pixels import ImageError
+from ..raster.binning.tiles import Grid
+from ..raster.render import to_tensor, to_tiles
 from .draw import draw
 from .grid import Block
 from .windows import Window
@@ -93,8 +91,8 @@ class PlaceTask(NamedTuple):
     gaussians : int
         From 1 to the pixels of the core.
     old : dict of str to ndarray, or None
-        What a fit has shown about the density: the mean (N, 2) of the Gaussians in the window, in
-        its pixels, and the ratio (N, 1), see
+        What a fit has shown about the density: mean (N, 2) and factor (N, 3) of the Gaussians in
+        the window, in its pixels, and the ratio (N, 1), see
         `eigengs_dr.fitting.placement.density.density_ratio`. By default the density follows the
         second derivatives alone.
     """
@@ -135,6 +133,7 @@ class FitTask(NamedTuple):
     part: range
 
 
+@exclusive()
 def survey(task: PlaceTask, settings: Settings) -> Surveyed:
     """Measure how many Gaussians a block needs, relative to others, before any fit."""
     options = settings.options
@@ -145,15 +144,30 @@ def survey(task: PlaceTask, settings: Settings) -> Surveyed:
     if options.space == "normal":
         read_data(pixels, options.space)  # no other range makes normals
     target = make_target(pixels, options.space)
-    density = density_from_hessian(target.shown, settings.spacing)
+    canvas, _, density = _density(target, settings)
     core = task.block.core
     return Surveyed(
-        float(density[core].sum(dtype=np.float64)),
+        _mass(canvas, density, task.block),
         target.values[core].sum(axis=(0, 1), dtype=np.float64),
         unit_of(pixels, options.space),
     )
 
 
+def _density(target: FitTarget, settings: Settings) -> tuple[Canvas, Float, Float]:
+    """Return the canvas of a window, and squared Hessian and density on it."""
+    types = types_in(select(settings.options.backend))
+    canvas = Canvas.of(types, Grid(target.shown.shape[1], target.shown.shape[0]))
+    read = partial(to_tiles, types, target.shown, canvas.grid)
+    return canvas, *density_from_hessian(canvas, read, settings.spacing)
+
+
+def _mass(canvas: Canvas, density: Float, block: Block) -> float:
+    """Return the integral of a density (pixels,) over the core of a block."""
+    pixels = to_tensor(density, canvas.grid, 1).numpy()[..., 0]
+    return float(pixels[block.core].sum(dtype=np.float64))
+
+
+@exclusive()
 def place(task: PlaceTask, settings: Settings) -> Arrays:
     """Place and shape the Gaussians of a block.
 
@@ -162,17 +176,28 @@ def place(task: PlaceTask, settings: Settings) -> Arrays:
     dict of str to ndarray
         The mean (n, 2) in pixels of the window, inside of the core, and the factor (n, 3).
     """
-    image = make_target(task.window.read(), settings.options.space).shown
-    density = density_from_hessian(image, settings.spacing)
+    options, count, spacing = settings.options, task.gaussians, settings.spacing
+    canvas, energy, density = _density(make_target(task.window.read(), options.space), settings)
+    types, grid = canvas.types, canvas.grid
     if task.old is not None:
-        owner = nearest_center(task.old["mean"], density.shape)
-        scale_by_owner(density, owner, task.old["ratio"][:, 0])
-    rows, columns = task.block.core
-    inside = normalize_density(density[rows, columns].copy(), task.gaussians)
-    density[rows, columns] = inside
-    mean = lloyd_step(stratify_along_hilbert(inside, task.gaussians), inside)
-    mean += np.array([columns.start, rows.start])
-    return {"mean": mean, "factor": shapes_from_hessian(mean, density, image, settings.spacing)}
+        mean, factor, ratio = (task.old[name] for name in ("mean", "factor", "ratio"))
+        size = grid.width, grid.height
+        old = Gaussians.from_arrays(
+            mean,
+            factor,
+            ratio,
+            size=size,
+            space="data",
+            backend=types.backend,
+            cutoff=options.cutoff,
+        )
+        density *= Owners.of(old).average(old.color[0])
+    column, row, _, _ = canvas.pixels()
+    for place, part in zip((row, column), task.block.core, strict=True):
+        first, last = (dr.opaque(types.Int, edge) for edge in (part.start, part.stop))
+        density = dr.select((place >= first) & (place < last), density, 0)
+    mean, factor = place_by_density(canvas, density, energy, count, spacing)
+    return {"mean": mean.numpy().T, "factor": factor.numpy().T}
 
 
 StepDone = Callable[[int], None]
@@ -186,21 +211,22 @@ def find_density(task: FitTask, settings: Settings, step_done: StepDone | None =
     Returns
     -------
     dict of str to ndarray
-        The mean (n, 2) of the own Gaussians in pixels of the window, their ratio (n, 1), see
-        `PlaceTask`, and the mass (1,) of the density in the core.
+        Mean (n, 2) and factor (n, 3) of the own Gaussians in pixels of the window, their ratio
+        (n, 1), see `PlaceTask`, and the mass (1,) of the density in the core.
     """
     target = make_target(task.window.read(), settings.options.space)
     problem = _start(task, target, settings)
     found = _descend(problem, task, settings, step_done)
-    mean = found.to_arrays()["mean"]
-    density = density_from_hessian(target.shown, settings.spacing)
-    owner = nearest_center(mean, density.shape)
-    ratio = density_ratio(mean, owner, _squared_error(found, problem), density)
-    scale_by_owner(density, owner, ratio)
+    canvas, _, density = _density(target, settings)
+    owners = Owners.of(found)
+    error = squared_error(found, problem.target, problem.weight, owners.lists)
+    ratio = density_ratio(owners, error, density)
+    arrays = found.to_arrays()
     return {
-        "mean": mean[task.own],
-        "ratio": ratio[task.own, None].astype(np.float32),
-        "mass": np.array([density[task.block.core].sum(dtype=np.float64)]),
+        "mean": arrays["mean"][task.own],
+        "factor": arrays["factor"][task.own],
+        "ratio": ratio.numpy()[task.own, None],
+        "mass": np.array([_mass(canvas, density * owners.average(ratio), task.block)]),
     }
 
 
@@ -220,7 +246,10 @@ def fit_block(task: FitTask, settings: Settings, step_done: StepDone | None = No
     found = _descend(problem._replace(control=control), task, settings, step_done)
     if task.part.stop == task.iterations:
         # The last steps may make a set worse that is nearly perfect; earlier ones, any set.
-        before, after = (_squared_error(g, problem).sum() for g in (problem.gaussians, found))
+        before, after = (
+            float(dr.sum(squared_error(g, problem.target, problem.weight))[0])
+            for g in (problem.gaussians, found)
+        )
         found = found if after < before else problem.gaussians
     arrays = found.to_arrays()
     return {name: arrays[name][task.own] for name in ("mean", "factor", "color")}
@@ -263,10 +292,6 @@ def _descend(
 
     schedule = settings.options.method.schedule
     return run(problem, schedule, task.iterations, after, part=task.part)
-
-
-def _squared_error(found: Gaussians, problem: FitProblem) -> NDArray[np.float32]:
-    return squared_error(residual(found, problem.target), problem.weight)
 
 
 SHORT_ROUNDS, LAST_ROUNDS = 3, 5

@@ -122,7 +122,7 @@ class Run:
 
     def _find_density(self, placed: BlockSets, steps: int) -> tuple[NDArray[np.float64], BlockSets]:
         """Fit all blocks for some steps; return masses, means and ratios of the wanted density."""
-        old = BlockSets(self.blocks, placed.counts, ("mean", "ratio"))
+        old = BlockSets(self.blocks, placed.counts, ("mean", "factor", "ratio"))
         mass = np.empty(len(self.blocks))
         task = partial(self._fit_task, sets=placed, steps=steps, part=range(steps))
         self._begin("density", len(self.blocks) * steps)

@@ -8,24 +8,20 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import types_of, upload
 from ..backend.feedback import defer_interrupts
 from ..backend.recording import exclusive
-from ..fitting.density_control import DensityControl
-from ..fitting.descent import FitProblem, run
+from ..fitting.descent import run
 from ..fitting.fit import Fit, finish
 from ..fitting.measure import Row, Shown, psnrs
-from ..fitting.options import FitOptions
-from ..fitting.placement.adaptive import place_by_error
+from ..fitting.options import INITS, FitOptions
 from ..fitting.refine import Refinement, trace_steps
-from ..fitting.solvers.conjugate_gradient import solve
-from ..fitting.start import PLACEMENTS, control_for, place
+from ..fitting.start import start_from_placement
 from ..fitting.target import FitTarget, make_target
 from ..gaussian.gaussians import Gaussians, like
 from ..image.metrics import MAX_PSNR
@@ -45,7 +41,7 @@ One steep Gaussian changes the arithmetic of all, so those of another image may 
 def fits_in_batches(options: FitOptions, pixels: NDArray[np.float32]) -> bool:
     """Return whether `fit_batch` fits images like `pixels` (H, W, C) bit for bit as alone."""
     return (
-        options.placement in PLACEMENTS
+        options.placement in INITS
         and options.method.solves
         and options.target_psnr is None
         and options.levels is None
@@ -80,11 +76,9 @@ def fit_batch(images: NDArray[np.float32], options: FitOptions) -> list[Fit]:
     """
     started = time.perf_counter()
     options.check_image(images[0])
-    targets = [make_target(pixels, options.space) for pixels in images]
-    control = _control(targets, options)
-    placed = _stack([place(target, options) for target in targets])
-    start = solve(placed, control.target, options.solve_steps).gaussians
-    problem = FitProblem(start, control.target, control.weight, control)
+    target = _stack([make_target(pixels, options.space) for pixels in images])
+    problem = start_from_placement(target, options)
+    start = problem.gaussians
     seconds_init = (time.perf_counter() - started) / len(images)
     found = [Refinement(start, [], 0, "iterations", {}) for _ in images]
     marks = trace_steps(options.iterations)
@@ -125,46 +119,15 @@ def _judge(found: Refinement, batch: Gaussians, row: Row) -> Refinement:
     return found._replace(iterations=row["iteration"], stopped=stopped)
 
 
-@dataclass(frozen=True)
-class _BatchControl(DensityControl):
-    """The density control of all images.
-
-    Attributes
-    ----------
-    each : tuple of DensityControl
-        That of each image.
-    """
-
-    each: tuple[DensityControl, ...] = ()
-
-    def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
-        """Place all sets anew."""
-        share = count // len(self.each)
-        placed = [
-            place_by_error(one, share, c.shown, c.target, c.weight)
-            for c, one in zip(self.each, _split(gaussians), strict=True)
-        ]
-        return solve(_stack(placed), self.target, self.solve_steps).gaussians
-
-
-def _control(targets: list[FitTarget], options: FitOptions) -> _BatchControl:
-    """Return the density control of a batch."""
-    each = tuple(control_for(target, options) for target in targets)
+def _stack(targets: list[FitTarget]) -> FitTarget:
+    """Return the targets of all images as one, of arrays (M, H, W, C)."""
     values = np.stack([target.values for target in targets])
+    shown = values
+    if targets[0].shown is not targets[0].values:
+        shown = np.stack([target.shown for target in targets])
     weights = [target.weight for target in targets if target.weight is not None]
-    weight = np.stack(weights) if weights else None
-    anew = each[0].redistributes
-    return _BatchControl(values, weight, values, options.solve_steps, anew, each=each)
-
-
-def _stack(sets: list[Gaussians]) -> Gaussians:
-    """Return the Gaussians of all images as one set; its background has a value for each."""
-    arrays = [each.to_arrays() for each in sets]
-    mean, factor, color = (np.concatenate([a[name] for a in arrays]) for name in _OWN)
-    types = types_of(sets[0].mean)
-    rows = np.stack([a["background"] for a in arrays], axis=1)
-    background = types.FloatX([upload(types.Float, row) for row in rows])
-    return replace(like(sets[0], mean, factor, color), background=background)
+    pixels = np.stack([target.pixels for target in targets])
+    return FitTarget(pixels, values, shown, np.stack(weights) if weights else None)
 
 
 def _split(batch: Gaussians) -> list[Gaussians]:

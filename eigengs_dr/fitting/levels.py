@@ -15,11 +15,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..backend.arrays import types_of
 from ..gaussian.gaussians import Gaussians, concatenate
 from .density_control import LevelControl, removal_cost
 from .descent import FitProblem, run
 from .options import FitOptions, level_counts
-from .placement.adaptive import place_like, residual
+from .placement.adaptive import place_adaptive, residual
 from .refine import FitProgress, Refinement, Score, refine
 from .schedule import Schedule
 from .solvers.conjugate_gradient import solve
@@ -95,7 +96,8 @@ def _place_levels(
         problem = start._replace(gaussians=gaussians)
         gaussians = run(problem, schedule, steps, lambda *_: interrupted(), levels=below)
         left = residual(gaussians, start.target)
-        added = place_like(gaussians, left, count - len(gaussians))
+        kind = gaussians.space, types_of(gaussians.mean).backend, gaussians.cutoff
+        added = place_adaptive(left, count - len(gaussians), *kind)
         added = solve(added, left).gaussians
         # The background is one for all levels: a new one would change the earlier levels.
         gaussians = concatenate([gaussians, replace(added, background=0 * added.background)])

@@ -7,37 +7,29 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from ..image.strips import MAX_THREADS, STRIP_PIXELS, available_cores
 from .schedule import MAX_SURPLUS, MAX_SURPLUS_DENSITY
 
-BASE_BYTES = 130e6
+BASE_BYTES = 165e6
 """Memory of Python, libLLVM and the compiled programs. This and the constants below follow the
-largest resident memory of processes that fit a mosaic of photos with the backend llvm on 2 cores,
-10 steps:
+largest resident memory of processes that fit a mosaic of photos with the backend llvm, 10 steps:
 
 | image | channels | Gaussians | measured | estimated |
 |---|---|---|---|---|
-| 512x512 | 3 | 20,000 | 0.20 GB | 0.21 GB |
-| 1,024x1,024 | 3 | 80,000 | 0.38 GB | 0.44 GB |
-| 2,048x2,048 | 3 | 20,000 | 0.64 GB | 0.63 GB |
-| 2,048x2,048 | 3 | 320,000 | 0.88 GB | 0.84 GB |
-| 2,048x2,048 | 1 | 320,000 | 0.63 GB | 0.65 GB |
-| 4,000x3,000 | 3 | 5,000 | 1.17 GB | 1.17 GB |
-| 4,096x4,096 | 3 | 1,280,000 | 2.37 GB | 2.43 GB |
+| 512x512 | 3 | 20,000 | 0.19 GB | 0.20 GB |
+| 1,024x1,024 | 3 | 80,000 | 0.32 GB | 0.32 GB |
+| 2,048x2,048 | 3 | 20,000 | 0.65 GB | 0.63 GB |
+| 2,048x2,048 | 3 | 320,000 | 0.83 GB | 0.80 GB |
+| 2,048x2,048 | 1 | 320,000 | 0.60 GB | 0.57 GB |
+| 4,000x3,000 | 3 | 5,000 | 1.42 GB | 1.43 GB |
+| 4,096x4,096 | 3 | 1,280,000 | 2.62 GB | 2.69 GB |"""
 
-Rows of equal size give `BYTES_PER_GAUSSIAN` and `BYTES_PER_VALUE`, the two largest sizes
-`BYTES_PER_PIXEL`, and the others `BYTES_PER_STRIP_PIXEL`."""
-
-BYTES_PER_STRIP_PIXEL = 170.0
-"""Memory of the temporary arrays of a placement, for each pixel of the strips under way."""
-
-BYTES_PER_PIXEL = 5.0
+BYTES_PER_PIXEL = 24.0
 """Memory of the density and of the lists of tiles, for each pixel."""
 
-BYTES_PER_VALUE = 22.0
-"""Memory of the images, for each pixel and channel: between 5 and 6 images in single precision."""
+BYTES_PER_VALUE = 27.0
+"""Memory of the images, for each pixel and channel: nearly 7 images in single precision."""
 
-BYTES_PER_GAUSSIAN = 730.0
+BYTES_PER_GAUSSIAN = 600.0
 """Memory of the parameters, of the colour solve and of the lists, for each Gaussian. A fit of
 130,000 Gaussians on 2,048x2,048 pixels takes 65 MB more with as many in addition than without."""
 
@@ -59,11 +51,9 @@ def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> i
         tiles and take more. It counts the largest surplus, which short fits do not have.
     """
     pixels = width * height
-    in_strips = min(pixels, STRIP_PIXELS * min(MAX_THREADS, available_cores()))
     with_surplus = min((1 + MAX_SURPLUS) * gaussians, MAX_SURPLUS_DENSITY * pixels)
     return round(
         BASE_BYTES
-        + in_strips * BYTES_PER_STRIP_PIXEL
         + pixels * (BYTES_PER_PIXEL + channels * BYTES_PER_VALUE)
         + max(gaussians, with_surplus) * BYTES_PER_GAUSSIAN
     )

@@ -1,7 +1,8 @@
 """The start of a fit: Gaussians with colours, placed by the image, of another set, or of a model.
 
-``PLACEMENTS`` names the placements. Two of them see only the size of the image: a hexagonal grid of
-round Gaussians, and random Gaussians.
+``PLACEMENTS`` names the placements that see only the size of the image: a hexagonal grid of round
+Gaussians, and random Gaussians. The placement by the image itself is that of
+`eigengs_dr.fitting.placement.adaptive`.
 """
 
 from __future__ import annotations
@@ -89,7 +90,6 @@ Placement = Callable[
 an image (H, W, C)."""
 
 PLACEMENTS: dict[str, Placement] = {
-    "adaptive": place_adaptive,
     "grid": place_grid,
     "random": place_random,
 }
@@ -218,18 +218,24 @@ def start_from_placement(target: FitTarget, options: FitOptions) -> FitProblem:
 
 
 def place(target: FitTarget, options: FitOptions) -> Gaussians:
-    """Place Gaussians by the image alone, with the colour 0, or by chance if none is solved for."""
-    count = options.count_for(target.values)
-    height, width, channels = target.values.shape
+    """Place Gaussians by the image alone, with the colour 0, or by chance if none is solved for.
+
+    A batch gets the sets of all images, image after image.
+    """
+    values = target.values if target.values.ndim == 4 else target.values[None]
+    images, height, width, channels = values.shape
+    count = options.count_for(values[0])
+    if options.placement == "adaptive":
+        return place_adaptive(
+            target.shown, count, options.space, options.backend, float(options.cutoff)
+        )
     generator = np.random.default_rng(options.seed)
-    mean, factor = PLACEMENTS[str(options.placement)](target.shown, count, generator)
+    mean, factor = PLACEMENTS[str(options.placement)](values[0], count, generator)
     color: NDArray[np.floating] = np.zeros((count, channels), np.float32)
     if not options.method.solves:
         color = generator.uniform(0, 1, color.shape)
     return Gaussians.from_arrays(
-        mean,
-        factor,
-        color,
+        *(np.tile(rows, (images, 1)) for rows in (mean, factor, color)),
         size=(width, height),
         space=options.space,
         backend=options.backend,

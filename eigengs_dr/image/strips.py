@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,37 +104,3 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):  # not on macOS
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def with_border(
-    read: Callable[[slice], NDArray[np.floating]],
-    rows: slice,
-    height: int,
-    border: int,
-    mode: Literal["symmetric", "constant"] = "symmetric",
-) -> NDArray[np.floating]:
-    """Return rows of an image with the pixels around them, beyond the image too.
-
-    Parameters
-    ----------
-    read : callable
-        ``read(rows)`` returns rows of the image: shape (..., R, W).
-    rows : slice
-        Rows from `strips`.
-    height : int
-        Number of rows of the image.
-    border : int
-        Pixels to add on each of the four sides.
-    mode : {"symmetric", "constant"}
-        How the image continues beyond its edges: mirrored, or with zeros.
-
-    Returns
-    -------
-    ndarray, shape (..., R + 2 border, W + 2 border)
-        The same values for any division into strips.
-    """
-    first, last = max(0, rows.start - border), min(height, rows.stop + border)
-    inside = read(slice(first, last))
-    above, below = border - (rows.start - first), border - (last - rows.stop)
-    pad = [(0, 0)] * (inside.ndim - 2) + [(above, below), (border, border)]
-    return np.pad(inside, pad, mode)

@@ -218,34 +218,24 @@ def _fit(
     space: str,
 ) -> Gaussians:
     """Place `count` Gaussians, drop those that reach no seen texel, and fit the rest."""
-    height, width, channels = target.shape
     picture = to_coded(target) if space == "linear" else target
-    mean, factor = place_adaptive(picture, count, np.random.default_rng(0))
-    kept = _reaches_seen(mean, factor, seen)
-    start = Gaussians.from_arrays(
-        mean[kept],
-        factor[kept],
-        np.zeros((int(kept.sum()), channels)),
-        size=(width, height),
-        space=space,
-        backend="cuda" if "cuda" in mi.variant() else "llvm",
-    ).bounded()
-    start = solve(start, target).gaussians
+    start = place_adaptive(picture, count, space, "cuda" if "cuda" in mi.variant() else "llvm")
+    start = solve(_seen_only(start, seen), target).gaussians
     schedule = PRESETS["default"].schedule
     control = DensityControl(target, weight, picture)
     found = run(FitProblem(start, target, weight, control), schedule, iterations)
-    arrays = found.to_arrays()
-    return found[np.flatnonzero(_reaches_seen(arrays["mean"], arrays["factor"], seen))]
+    return _seen_only(found, seen)
 
 
-def _reaches_seen(
-    mean: NDArray[np.floating], factor: NDArray[np.floating], seen: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """Return which Gaussians may reach a seen texel, by their longer axes; at least one."""
+def _seen_only(gaussians: Gaussians, seen: NDArray[np.bool_]) -> Gaussians:
+    """Keep the Gaussians that may reach a seen texel, by their longer axes; at least one."""
+    arrays = gaussians.to_arrays()
+    mean, factor = arrays["mean"], arrays["factor"]
     column = mean[:, 0].astype(int).clip(0, seen.shape[1] - 1)
     row = mean[:, 1].astype(int).clip(0, seen.shape[0] - 1)
     away = distance_transform_edt(~seen)[row, column]
-    return away <= np.maximum(CUTOFF * max_deviation(*factor.T), away.min())
+    reaches = away <= np.maximum(CUTOFF * max_deviation(*factor.T), away.min())
+    return gaussians[np.flatnonzero(reaches)]
 
 
 def _search_count(

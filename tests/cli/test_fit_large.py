@@ -52,7 +52,7 @@ def test_large_fit_says_its_memory(tmp_path):
     photo, output = tmp_path / "large.png", tmp_path / "x.npz"
     photo.write_bytes(png(8000, 8000, 8, 2, []))
     command = ["fit", photo, "-o", output, "--preview", tmp_path / "p.png"]  # blocks have none
-    line = "eigengs-dr: 5,000 Gaussians on 8000x8000 pixels take about 4."
+    line = "eigengs-dr: 5,000 Gaussians on 8000x8000 pixels take about 6."
     assert run(*command).stderr.startswith(line)
     assert not run(*command, "--quiet").stderr.startswith(line)
 

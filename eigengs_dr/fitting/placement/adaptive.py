@@ -1,8 +1,9 @@
 """Adaptive placement: more and smaller Gaussians where the image has large second derivatives.
 
 Gaussians approximate an image well where it is nearly linear; the error comes from the second
-derivatives. So the density of Gaussians follows the squared Hessian (`hessian_energy`). The means
-are the centroids of pieces of equal mass of a Hilbert curve, after one Lloyd step. Each Gaussian is
+derivatives. So the density of Gaussians follows the squared Hessian
+(`eigengs_dr.fitting.placement.filters`). The means are the centroids of pieces of equal mass of a
+Hilbert curve, after one Lloyd step (`eigengs_dr.fitting.placement.pieces`). Each Gaussian is
 stretched along the direction of the smallest second derivative. The constants were chosen on
 training images of faces and of ImageNet classes by the error after 10 steps of the colour solve.
 
@@ -15,13 +16,17 @@ So the density and the error of one fit give the best density:
     rho' ~ k^(1 / (q + 1)) = rho s^(1 / (q + 1)).
 
 Only a fit can tell parts that are hard to fit from parts that just have large second derivatives.
-The errors of several neighbouring Gaussians are averaged; between these Gaussians, the density
-follows the second derivatives. The constants were chosen on training images of ImageNet classes
-and of cats, by the error after 1,000 steps.
+Neighbouring Gaussians share their errors, see `eigengs_dr.fitting.placement.density.Owners`; in
+what a Gaussian owns, the density follows the second derivatives. The constants were chosen on
+training images of ImageNet classes and of cats, by the error after 1,000 steps.
+
+Images are in tile layout, and all of it runs on the device. A batch of images takes one launch of
+each kernel; no sum of one depends on another.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -29,18 +34,29 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gaussian.covariance import factor_from_covariance
-from ...gaussian.gaussians import Gaussians, like
-from ...image.hilbert import Square, hilbert_squares
-from ...image.metrics import blur, gaussian_taps
-from ...image.resize import resample
-from ...image.strips import map_threads, strips, with_border
-from ...raster.render import render
-from ..solvers.conjugate_gradient import solve
-from .density import center_pixels, nearest_center, sum_by_center, target_density
+from ...backend.arrays import Float, types_in, types_of
+from ...backend.selection import select
+from ...gaussian.file import CUTOFF
+from ...gaussian.gaussians import Gaussians, Rows
+from ...raster.binning.tiles import Grid
+from ...raster.kernels import sum_by_image
+from ...raster.parameters import gather_run
+from ...raster.render import batch_to_tiles, render
+from ..solvers.conjugate_gradient import solve, spread
+from .density import Owners, squared_error, target_density
+from .filters import PIXELS, Canvas, blur, squared_hessian
+from .peaks import shrunk
+from .pieces import lloyd_step, pixel_of, stratify_along_hilbert
 
 Array = NDArray[np.floating]
-Density = Callable[[Array], Array]
+
+Density = Callable[[Canvas, Float, int], Float]
+"""``density(canvas, default, times)`` returns the Gaussians per pixel, up to a factor, for the
+density by `density_from_hessian` of an image, which was shrunk by `times`; all in tile layout."""
+
+Read = Callable[[], Float]
+"""``read()`` returns an image in tile layout. It lives no longer than its blur needs it: images
+take most of the memory."""
 
 IMAGE_BLUR = 0.18
 """Standard deviation of the blur of the image, in spacings: it removes details that no Gaussian can
@@ -72,230 +88,158 @@ the constants above were chosen near this spacing, and filters of large images t
 def place_adaptive(
     image: Array,
     count: int,
-    generator: np.random.Generator | None = None,
+    space: str,
+    backend: str | None = None,
+    cutoff: float = CUTOFF,
     density: Density | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Place and shape Gaussians by the second derivatives of an image.
+) -> Gaussians:
+    """Place and shape Gaussians by the second derivatives of an image, with the colour 0.
 
-    Beside the image, the function holds about 15 bytes per pixel.
+    All of it runs on the device, without a copy to the host.
 
     Parameters
     ----------
-    image : ndarray, shape (H, W, C)
-        Image in the space of the squared error.
+    image : ndarray, shape (H, W, C) or (M, H, W, C)
+        In the space of the squared error. A batch gets the sets of all images, image after image.
     count : int
-        Number of Gaussians, from 1 to H W.
-    generator : numpy.random.Generator, optional
-        Not used: the result is a function of the image.
+        Number of Gaussians of an image, from 1 to H W.
+    space, backend, cutoff
+        Those of the set, see `eigengs_dr.Gaussians`.
     density : callable, optional
-        ``density(default)`` returns the Gaussians per pixel, up to a factor, for the density (H, W)
-        by `density_from_hessian` of the image or of a smaller one, which it may overwrite.
+        See `Density`.
 
     Returns
     -------
-    mean : ndarray, shape (count, 2)
-        In pixels; pixel centres lie at +0.5.
-    factor : ndarray, shape (count, 3)
-        a, b, c in 1 / pixels; see `eigengs_dr.Gaussians`.
+    Gaussians
+        Neighbours in memory are close in space.
     """
-    height, width = image.shape[:2]
-    spacing = float(np.sqrt(height * width / count))
-    if spacing >= 2 * WORKING_SPACING:
-        times = int(spacing / WORKING_SPACING)
-        size = -(-width // times), -(-height // times)
-        small = resample(image.astype(np.float32, copy=False), *size)
-        mean, factor = place_adaptive(small, count, density=density)
-        x, y = width / small.shape[1], height / small.shape[0]
-        return mean * (x, y), factor / (x, y, y)
-    per_pixel = density_from_hessian(image, spacing)
-    per_pixel = normalize_density(density(per_pixel) if density else per_pixel, count)
-    mean = lloyd_step(stratify_along_hilbert(per_pixel, count), per_pixel)
-    return mean, shapes_from_hessian(mean, per_pixel, image, spacing)
+    types, (height, width, channels) = types_in(select(backend)), image.shape[-3:]
+    images = len(image) if image.ndim == 4 else 1
+    canvas = Canvas.of(types, Grid(width, height, images=images))
+    mean, factor = _place(canvas, lambda: batch_to_tiles(types, image), count, density)
+    color = [dr.zeros(types.Float, images * count) for _ in range(channels)]
+    background = [dr.zeros(types.Float, images) for _ in range(channels)]
+    dr.make_opaque(color, background)
+    rows = types.FloatX(color), types.FloatX(background)
+    placed = Gaussians(mean, factor, *rows, width, height, space, float(cutoff)).bounded()
+    dr.eval(placed)
+    dr.flush_malloc_cache()  # nothing later asks for blocks of these sizes
+    return placed
 
 
-def hessian_energy(image: Array, spacing: float, rows: slice | None = None) -> NDArray[np.float32]:
-    """Return the squared Hessian ``sum_c H_c H_c`` of a blurred image plus isotropic noise.
+def _place(
+    canvas: Canvas, read: Read, count: int, density: Density | None, times: int = 1
+) -> tuple[Rows, Rows]:
+    """Return the means and the factors of `place_adaptive`, of an image that was shrunk before."""
+    types, grid = canvas.types, canvas.grid
+    spacing = math.sqrt(grid.width * grid.height / count)
+    smaller = int(spacing / WORKING_SPACING)
+    if smaller > 1:
+        small = Grid(-(-grid.width // smaller), -(-grid.height // smaller), images=grid.images)
+        image = read()
+        image = shrunk(image, grid, small, canvas.channels(image), smaller)
+        less = Canvas.of(types, small)
+        mean, factor = _place(less, lambda: image, count, density, smaller * times)
+        scale, inverse = (dr.opaque(types.Float, v) for v in (smaller, 1 / smaller))
+        return mean * scale, factor * inverse
+    energy, per_pixel = density_from_hessian(canvas, read, spacing)
+    if density:
+        per_pixel = density(canvas, per_pixel, times)
+    return place_by_density(canvas, per_pixel, energy, count, spacing)
+
+
+def place_by_density(
+    canvas: Canvas, density: Float, energy: Float, count: int, spacing: float
+) -> tuple[Rows, Rows]:
+    """Return means, an Array2f, and factors, an Array3f, of Gaussians by a density.
 
     Parameters
     ----------
-    image : ndarray, shape (H, W, C)
+    canvas : Canvas
+    density : Float, shape (pixels,)
+        Up to a factor; 0 where no Gaussian may lie.
+    energy : Float, shape (pixels * 3,)
+        The squared Hessian, from `density_from_hessian`.
+    count : int
+        Number of Gaussians of an image.
     spacing : float
-        Distance between Gaussians in pixels.
-    rows : slice, optional
-        Rows of the image to compute; by default all.
+        Mean distance of Gaussians in pixels.
+    """
+    density = normalize_density(canvas, density, count)
+    mean = stratify_along_hilbert(canvas, density, count)
+    mean = lloyd_step(canvas, mean, density, spacing)
+    dr.flush_malloc_cache()  # the blur of the energy takes the most
+    factor = shapes_from_hessian(canvas, mean, density, energy, spacing)
+    return canvas.types.Float2(mean), factor
+
+
+def density_from_hessian(canvas: Canvas, read: Read, spacing: float) -> tuple[Float, Float]:
+    """Return the squared Hessian of an image, and the density for it, up to a factor.
+
+    Parameters
+    ----------
+    canvas : Canvas
+    read : callable
+        See `Read`.
+    spacing : float
+        Mean distance of Gaussians in pixels.
 
     Returns
     -------
-    ndarray of float32, shape (3, R, W)
-        The entries xx, yy and xy.
+    energy : Float, shape (pixels * 3,)
+        See `eigengs_dr.fitting.placement.filters.squared_hessian`.
+    density : Float, shape (pixels,)
+        0 outside the image.
     """
-    height, width, channels = image.shape
-    rows = slice(0, height) if rows is None else rows
-    taps = gaussian_taps(IMAGE_BLUR * spacing)
     noise = (NOISE_SLOPE / spacing**2) ** 2 / 2
-    energy = np.empty((3, rows.stop - rows.start, width), np.float32)
-    energy[:2], energy[2] = noise, 0
-    for channel in range(channels):
-
-        def plane(part: slice, channel: int = channel) -> NDArray[np.float32]:
-            return image[part, :, channel].astype(np.float32, order="C")
-
-        xx, yy, xy = _hessian(blur(with_border(plane, rows, height, len(taps)), taps))
-        across = xy * xy
-        energy[0] += xx * xx + across
-        energy[1] += yy * yy + across
-        xy *= xx + yy
-        energy[2] += xy
-    return energy
+    energy, trace = squared_hessian(canvas, blur(canvas, read(), IMAGE_BLUR * spacing), noise)
+    trace = blur(canvas, trace, DENSITY_BLUR * spacing)
+    inside = canvas.pixels()[-1]
+    density = dr.select(inside, dr.exp2(DENSITY_EXPONENT * dr.log2(trace)), 0)
+    dr.eval(density)
+    return energy, density
 
 
-def _hessian(plane: Array) -> tuple[Array, Array, Array]:
-    """Return the second differences xx, yy and xy of a plane without its outermost pixels."""
-    middle = plane[1:-1, 1:-1]
-    # Differences of neighbours first: those of close floats are exact.
-    xx = (plane[1:-1, 2:] - middle) - (middle - plane[1:-1, :-2])
-    yy = (plane[2:, 1:-1] - middle) - (middle - plane[:-2, 1:-1])
-    slope = 0.5 * (plane[:, 2:] - plane[:, :-2])
-    return xx, yy, 0.5 * (slope[2:] - slope[:-2])
+def normalize_density(canvas: Canvas, density: Float, count: int) -> Float:
+    """Scale a density to a sum of about `count` an image, with at most one Gaussian per pixel."""
+    types, grid = canvas.types, canvas.grid
+    wanted = dr.opaque(types.Float, count)
+    values = types.FloatX(gather_run(types, density, canvas.tile, PIXELS, True))
+    image = canvas.sizes.image_of(canvas.tile)
 
+    def scaled(factor: Float) -> Float:
+        return dr.minimum(values * spread(factor, image), 1)
 
-def density_from_hessian(image: Array, spacing: float) -> NDArray[np.float32]:
-    """Return the density (H, W) by the squared Hessian of an image (H, W, C), up to a factor."""
-    height, width = image.shape[:2]
-    taps = gaussian_taps(DENSITY_BLUR * spacing)
-    density = np.empty((height, width), np.float32)
-
-    def trace(rows: slice) -> Array:
-        bend = hessian_energy(image, spacing, rows)
-        return np.asarray(bend[0] + bend[1])
-
-    def fill(rows: slice) -> None:
-        mean = blur(with_border(trace, rows, height, len(taps) - 1), taps)
-        np.power(mean, np.float32(DENSITY_EXPONENT), out=density[rows])
-
-    map_threads(fill, strips(height, width))
-    return density
-
-
-def normalize_density(density: Array, count: int) -> NDArray[np.float32]:
-    """Scale a density to a sum of about `count` Gaussians, with at most one per pixel.
-
-    An array of float32 is scaled in place, and returned.
-    """
-    per_pixel = density.astype(np.float32, copy=False)
-    parts = strips(*per_pixel.shape)
-    factor = count / sum(map_threads(lambda rows: per_pixel[rows].sum(dtype=np.float64), parts))
-
-    def scaled(rows: slice) -> Array:
-        return np.minimum(per_pixel[rows] * np.float32(factor), np.float32(1))
-
+    factor = wanted / sum_by_image(dr.sum(values, axis=0), grid)
     for _ in range(4):  # each round moves the excess of full pixels to the others
-        factor *= count / sum(map_threads(lambda rows: scaled(rows).sum(dtype=np.float64), parts))
-
-    def scale(rows: slice) -> None:
-        per_pixel[rows] = scaled(rows)
-
-    map_threads(scale, parts)
-    return per_pixel
-
-
-def stratify_along_hilbert(density: Array, count: int) -> NDArray[np.float64]:
-    """Cut a Hilbert curve through the pixels into pieces of equal mass, and return their centroids.
-
-    Returns
-    -------
-    ndarray of float64, shape (count, 2)
-        Centroids in pixels, in the order of the curve: neighbours in memory are close in space.
-    """
-    squares = hilbert_squares(*density.shape)
-    mass = map_threads(
-        lambda square: density[square.rows, square.columns].sum(dtype=np.float64), squares
-    )
-    begin = np.concatenate([[0.0], np.cumsum(mass)])
-    cuts = np.linspace(0, begin[-1], count + 1)
-    first = np.searchsorted(cuts, begin)
-    first[-1] = count + 1
-    moments = np.empty((count + 1, 2))
-
-    def integrate(number: int) -> Array:
-        """Fill in the moments of the curve from the start of a square to the cuts in it."""
-        own = slice(first[number], first[number + 1])
-        moments[own], total = _moments(density, squares[number], cuts[own] - begin[number])
-        return total
-
-    totals = np.array(map_threads(integrate, range(len(squares))))
-    before = np.cumsum(totals, axis=0) - totals
-    for number in range(len(squares)):
-        moments[first[number] : first[number + 1]] += before[number]
-    return np.diff(moments, axis=0) * (count / begin[-1])
-
-
-def _moments(density: Array, square: Square, cuts: Array) -> tuple[Array, Array]:
-    """Return the moments (n, 2) of a square up to some masses along the curve, and its total."""
-    row, column = square.order()
-    mass = density[square.rows, square.columns][row, column].astype(np.float64)
-    mass_before = np.concatenate([[0.0], np.cumsum(mass)])
-    # The curve visits pixels, so the moment is linear in the mass between the ends of a pixel.
-    found, totals = np.empty((len(cuts), 2)), np.empty(2)
-    for axis, position in enumerate((column + square.columns.start, row + square.rows.start)):
-        moment = np.concatenate([[0.0], np.cumsum(mass * (position + 0.5))])
-        found[:, axis] = np.interp(cuts, mass_before, moment)
-        totals[axis] = moment[-1]
-    return found, totals
-
-
-def lloyd_step(mean: Array, density: Array) -> NDArray[np.float64]:
-    """Take one Lloyd step: move each centre to the centroid of the pixels nearest to it."""
-    height, width = density.shape
-    owner = nearest_center(mean, density.shape)
-    x, y = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
-    mass, *moments = sum_by_center(owner, len(mean), [(density,), (density, x), (density, y)])
-    result = np.array(mean, np.float64)
-    moves = mass > 0
-    for axis in (0, 1):
-        result[moves, axis] = moments[axis][moves] / mass[moves]
+        factor *= wanted / sum_by_image(dr.sum(scaled(factor), axis=0), grid)
+    result = dr.empty(types.Float, dr.width(density))
+    dr.scatter(result, scaled(factor), canvas.tile)
+    dr.eval(result)
     return result
 
 
 def shapes_from_hessian(
-    mean: Array, density: Array, image: Array, spacing: float
-) -> NDArray[np.float64]:
-    """Return factors (N, 3): size by the density, ratio and angle of the axes by the Hessian."""
-    height, width = density.shape
-    column, row = center_pixels(mean, density.shape)
-    taps = gaussian_taps(DIRECTION_BLUR * spacing)
-    order = np.argsort(row, kind="stable")
-    rows_in_order = row[order]
-    factor = np.empty((len(mean), 3))
-
-    def energy(rows: slice) -> Array:
-        return hessian_energy(image, spacing, rows)
-
-    def fill(rows: slice) -> None:
-        first, last = np.searchsorted(rows_in_order, [rows.start, rows.stop])
-        own = order[first:last]
-        bend = blur(with_border(energy, rows, height, len(taps) - 1), taps)
-        bend = bend[:, row[own] - rows.start, column[own]].astype(np.float64)
-        factor[own] = _factors(bend, density[row[own], column[own]].astype(np.float64))
-
-    map_threads(fill, strips(height, width))
-    return factor
-
-
-def _factors(bend: Array, density: Array) -> NDArray[np.float64]:
-    """Return factors (N, 3) for squared Hessians (3, N) and densities (N,)."""
-    xx, yy, xy = bend
-    split = np.hypot(xx - yy, 2 * xy)
+    canvas: Canvas, mean: tuple[Float, Float], density: Float, energy: Float, spacing: float
+) -> Rows:
+    """Return factors: size by the density, ratio and angle of the axes by the squared Hessian."""
+    types = canvas.types
+    energy = blur(canvas, energy, DIRECTION_BLUR * spacing)
+    place, _, _ = pixel_of(canvas, mean)
+    xx, yy, xy = (dr.gather(types.Float, energy, place * 3 + k) for k in range(3))
+    # The eigenvalues of the energy differ by `split`; the larger one belongs to the direction with
+    # the cosine and the sine of twice its angle.
+    split = dr.sqrt(dr.square(xx - yy) + dr.square(2 * xy))
+    cos, sin = (dr.select(split > 0, v / split, 0) for v in (xx - yy, 2 * xy))
     ratio = 1 + (MAX_STRETCH - 1) * split / (xx + yy)
-    variance = RELATIVE_SIZE**2 / density
+    variance = RELATIVE_SIZE**2 / dr.gather(types.Float, density, place)
     along, across = variance * ratio, variance / ratio
-    angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # the direction of the largest second derivative
-    cos, sin = np.cos(angle), np.sin(angle)
-    return factor_from_covariance(
-        across * cos**2 + along * sin**2,
-        (across - along) * cos * sin,
-        across * sin**2 + along * cos**2,
-    )
+    middle, half = 0.5 * (along + across), 0.5 * (along - across)
+    sigma_yy, sigma_xy = middle + half * cos, -half * sin
+    a = dr.sqrt(sigma_yy) / variance
+    factor = types.Float3(a, -sigma_xy / sigma_yy * a, 1 / dr.sqrt(sigma_yy))
+    dr.eval(factor)
+    return factor
 
 
 def redistribute(
@@ -311,14 +255,14 @@ def redistribute(
     Parameters
     ----------
     gaussians : Gaussians
-        The old set, after some steps of a fit.
+        The old set, after some steps of a fit. For a batch, the sets of all images.
     count : int
-        Number of Gaussians of the new set, from 1 to H W.
-    image : ndarray, shape (H, W, C)
+        Number of Gaussians of the new set, or of the sets of all images together.
+    image : ndarray, shape (H, W, C) or (M, H, W, C)
         The image that shapes the Gaussians, see `eigengs_dr.fitting.placement.adaptive`.
-    target : ndarray of float32, shape (H, W, C)
+    target : ndarray of float32, same shape
         The image in the space of the set.
-    weight : ndarray, shape (H, W, C), optional
+    weight : ndarray, same shape, optional
         Factor of the errors before squaring.
     solve_steps : int, optional
         Steps of the colour solve, see `eigengs_dr.fitting.solvers.conjugate_gradient`.
@@ -328,68 +272,32 @@ def redistribute(
     Gaussians
         The new set. It keeps no Gaussian of the old set.
     """
-    placed = place_by_error(gaussians, count, image, target, weight)
+    images = len(target) if target.ndim == 4 else 1
+    with dr.suspend_grad():
+        owners = Owners.of(gaussians, images)
+        error = squared_error(gaussians, target, weight, owners.lists)
+
+        def density(canvas: Canvas, default: Float, times: int) -> Float:
+            if times == 1:
+                return target_density(owners, error, default)
+            grid = canvas.grid
+            scale, inverse = (dr.opaque(canvas.types.Float, v) for v in (times, 1 / times))
+            small = replace(
+                gaussians,
+                mean=gaussians.mean * inverse,
+                factor=gaussians.factor * scale,
+                width=grid.width,
+                height=grid.height,
+            )
+            less = shrunk(error, owners.lists.grid, grid, 1, times)
+            return target_density(Owners.of(small, images), less, default)
+
+        kind = gaussians.space, types_of(gaussians.mean).backend, gaussians.cutoff
+        placed = place_adaptive(image, count // images, *kind, density)
     return solve(placed, target, solve_steps).gaussians
-
-
-def place_by_error(
-    gaussians: Gaussians,
-    count: int,
-    image: Array,
-    target: NDArray[np.float32],
-    weight: Array | None = None,
-) -> Gaussians:
-    """Place the set of `redistribute`, with the colour 0."""
-    error = squared_error(residual(gaussians, target), weight)
-    density = density_for_error(gaussians.to_arrays()["mean"], error)
-    return place_like(gaussians, image, count, density)
-
-
-def density_for_error(mean: Array, error: NDArray[np.float32]) -> Density:
-    """Return the density of a new set for the means (N, 2) and the error (H, W) of the old set."""
-
-    def density(default: Array) -> Array:
-        height, width = default.shape
-        if (height, width) == error.shape:
-            return target_density(mean, error, default)
-        # The placement shrinks the image.
-        there = mean * np.array([width / error.shape[1], height / error.shape[0]])
-        here = np.maximum(resample(error[..., None], width, height)[..., 0], 0)
-        return target_density(there, here, default)
-
-    return density
-
-
-def place_like(
-    gaussians: Gaussians, image: Array, count: int, density: Density | None = None
-) -> Gaussians:
-    """Place Gaussians by an image in the space and size of another set, with the colour 0.
-
-    For the parameters see `redistribute` and `place_adaptive`.
-    """
-    mean, factor = place_adaptive(image, count, density=density)
-    placed = like(gaussians, mean, factor, np.zeros((count, gaussians.channels), np.float32))
-    return placed.bounded()
 
 
 def residual(gaussians: Gaussians, target: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the target minus the rendering of a set, both in its space: shape (H, W, C)."""
     shown = render(replace(dr.detach(gaussians), space="data"))
     return np.asarray(target - shown.numpy(), np.float32)
-
-
-def squared_error(missed: Array, weight: Array | None = None) -> NDArray[np.float32]:
-    """Return the sum of the squares of the channels of a residual (H, W, C): shape (H, W).
-
-    The weight, of the same shape, is a factor of the errors before squaring.
-    """
-    error = np.zeros(missed.shape[:2], np.float32)
-
-    def add_up(rows: slice) -> None:
-        for channel in range(missed.shape[2]):
-            part = missed[rows, :, channel]
-            part = part if weight is None else part * weight[rows, :, channel]
-            error[rows] += np.square(part)
-
-    map_threads(add_up, strips(*missed.shape[:2]))
-    return error

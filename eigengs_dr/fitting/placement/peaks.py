@@ -151,7 +151,7 @@ def residual_peaks(
         side = -(-grid.width // times), -(-grid.height // times)
         small = Grid(*side, images=grid.images)
         missed, squares = (
-            None if v is None else _shrunk(v, grid, small, channels, times)
+            None if v is None else shrunk(v, grid, small, channels, times)
             for v in (missed, squares)
         )
         peaks = residual_peaks(missed, small, channels, count, spacing / times, squares)
@@ -199,7 +199,7 @@ def _ranked(place: UInt, gain: Float, grid: Grid, count: int) -> tuple[UInt, UIn
     return place, image, rank
 
 
-def _shrunk(values: Float, grid: Grid, small: Grid, channels: int, times: int) -> Float:
+def shrunk(values: Float, grid: Grid, small: Grid, channels: int, times: int) -> Float:
     """Return the means over squares of pixels of images in tile layout; evaluated."""
     types, side = types_of(values), dr.opaque(types_of(values).Int, times)
     runs, large = _runs(types, small), _runs(types, grid)

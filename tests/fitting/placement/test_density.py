@@ -3,38 +3,94 @@
 import numpy as np
 import pytest
 
+import eigengs_dr as eg
+from _helpers.plain_placement import to_canvas, to_pixels
+from _helpers.sets import SIZE, random_scene
 from eigengs_dr.fitting.placement.density import (
     ERROR_EXPONENT,
+    Owners,
+    squared_error,
     target_density,
 )
 
 
-def squares(side):
-    """Centres of squares of 5 x 5 pixels."""
-    y, x = np.mgrid[2.5:side:5, 2.5:side:5]
-    return np.stack([x.ravel(), y.ravel()], axis=1)
+def rounds(side, backend, spacing=5):
+    """Round Gaussians in the centres of squares."""
+    y, x = (v.ravel() for v in np.mgrid[spacing / 2 : side : spacing, spacing / 2 : side : spacing])
+    sharpness = np.full(len(x), 1 / (0.7 * spacing))
+    return eg.Gaussians.from_arrays(
+        np.stack([x, y], 1),
+        np.stack([sharpness, 0 * x, sharpness], 1),
+        np.zeros((len(x), 1)),
+        size=(side, side),
+        space="data",
+        backend=backend,
+    )
 
 
-def test_equal_shares_of_error_leave_the_density_as_it_was():
-    """Splats on a grid, each with the same error: nothing is gained by moving any."""
-    density = target_density(squares(30), np.ones((30, 30)), np.ones((30, 30)))
-    np.testing.assert_allclose(density, density.mean(dtype=float), rtol=1e-6)
+def density_for(gaussians, error, bending, backend):
+    canvas, error = to_canvas(error, backend)
+    return to_pixels(
+        canvas, target_density(Owners.of(gaussians), error, to_canvas(bending, backend)[1])
+    )
+
+
+def test_parts_are_those_of_the_weights(backend):
+    """A sum over pixels and an average over Gaussians, by all weights in double precision."""
+    scene = random_scene(channels=1)
+    owners = Owners.of(scene.on(backend))
+    weights = np.exp(-0.5 * np.square(scene.distances()))
+    weights[scene.distances() > 3] = 0
+    total = weights.sum(axis=0)
+    parts = weights / np.where(total > 1e-6, total, np.inf)
+    rng = np.random.default_rng(0)
+    maps, values = rng.uniform(0, 1, (2, *SIZE[::-1])), rng.uniform(1, 2, len(weights))
+    tiles = [to_canvas(m, backend)[1] for m in maps]
+    for found, expected in zip(owners.collect(*tiles), maps, strict=True):
+        np.testing.assert_allclose(
+            found.numpy(), (parts * expected).sum((1, 2)), rtol=0.1, atol=0.1
+        )
+    inner = scene.off_edge(3.0) & (total > 0.1)
+    found = to_pixels(owners.canvas, owners.average(owners.canvas.types.Float(values)))
+    expected = np.einsum("n,nhw->hw", values, parts)
+    np.testing.assert_allclose(found[inner], expected[inner], rtol=1e-4)
+    assert (found > 0.99).all()  # also where there is no Gaussian
+
+
+def test_error_is_that_of_the_rendering(backend):
+    scene = random_scene()
+    gaussians = scene.on(backend)
+    target = np.random.default_rng(0).uniform(0, 1, (SIZE[1], SIZE[0], 3)).astype(np.float32)
+    weight = np.random.default_rng(1).uniform(0, 2, target.shape).astype(np.float32)
+    shown = eg.render(gaussians).numpy()
+    canvas, _ = to_canvas(target, backend)
+    for factor in (None, weight):
+        expected = np.square((target - shown) * (1 if factor is None else factor)).sum(axis=2)
+        found = to_pixels(canvas, squared_error(gaussians, target, factor))
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_equal_shares_of_error_leave_the_density_as_it_was(backend):
+    """Gaussians on a grid, each with the same error: nothing is gained by moving any."""
+    density = density_for(rounds(80, backend), np.ones((80, 80)), np.ones((80, 80)), backend)
+    inner = density[25:-25, 25:-25]
+    np.testing.assert_allclose(inner, inner.mean(), rtol=1e-3)
 
 
 @pytest.mark.parametrize("times", [0.1, 10.0, 100.0])
-def test_density_follows_the_error_by_its_power(times):
-    """Far from the border of two halves, densities differ by ``times^(1 / (FALL + 1))``."""
-    error = np.ones((60, 60))
-    error[:, 30:] = times
-    density = target_density(squares(60), error, np.ones((60, 60)))
-    ratio = density[:, 50:].mean() / density[:, :10].mean()
-    np.testing.assert_allclose(ratio, times ** (1 / (ERROR_EXPONENT + 1)), rtol=1e-6)
+def test_density_follows_the_error_by_its_power(backend, times):
+    """Far from the border of two halves, densities differ by ``times^(1 / (q + 1))``."""
+    error = np.ones((80, 80))
+    error[:, 40:] = times
+    density = density_for(rounds(80, backend), error, np.ones((80, 80)), backend)
+    ratio = density[20:60, 60].mean() / density[20:60, 20].mean()
+    np.testing.assert_allclose(ratio, times ** (1 / (ERROR_EXPONENT + 1)), rtol=1e-3)
 
 
 def test_that_power_leaves_the_least_error():
     """Of all powers of the error, it is the one whose density misses least: a numerical check."""
     share, tried = np.array([1.0, 30.0]), np.array([0.5, 0.5])
-    factor = share * tried**ERROR_EXPONENT * tried  # e = factor rho^-FALL on two equal areas
+    factor = share * tried**ERROR_EXPONENT * tried  # e = factor rho^-q on two equal areas
 
     def error(power):
         density = tried * share**power
@@ -45,14 +101,17 @@ def test_that_power_leaves_the_least_error():
     assert best == pytest.approx(1 / (ERROR_EXPONENT + 1), abs=1e-3)
 
 
-def test_among_neighbours_density_follows_the_bending():
-    mean = np.array([[8.0, 16.0], [24.0, 16.0]])
+def test_in_a_part_density_follows_the_bending(backend):
+    """One Gaussian owns all pixels."""
     bending = np.ones((32, 32))
     bending[:, 4:8] = 5
-    density = target_density(mean, np.ones((32, 32)), bending)
-    np.testing.assert_allclose(density / density[0, 0], bending, rtol=1e-6)
+    one = eg.Gaussians.from_arrays(
+        [[16, 16]], [[0.05, 0, 0.05]], [[0]], size=(32, 32), space="data", backend=backend
+    )
+    density = density_for(one, np.ones((32, 32)), bending, backend)
+    np.testing.assert_allclose(density / density[0, 0], bending, rtol=1e-3)
 
 
-def test_nothing_missed_and_nothing_bent_is_still_a_density():
-    density = target_density(np.array([[5.0, 5.0]]), np.zeros((8, 8)), np.full((8, 8), 1e-30))
+def test_nothing_missed_and_nothing_bent_is_still_a_density(backend):
+    density = density_for(rounds(8, backend), np.zeros((8, 8)), np.full((8, 8), 1e-30), backend)
     assert np.isfinite(density).all() and (density > 0).all()

@@ -9,7 +9,14 @@ from _helpers.sets import few
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
 from eigengs_dr.fitting.start import place_grid, place_random
 
-INITS = [place_random, place_grid, place_adaptive]
+
+def adaptive(image, count, generator):
+    """Means and factors of the adaptive placement."""
+    arrays = place_adaptive(image, count, "data", "llvm").to_arrays()
+    return arrays["mean"], arrays["factor"]
+
+
+INITS = [place_random, place_grid, adaptive]
 
 
 @pytest.mark.parametrize("place", INITS)
@@ -22,7 +29,7 @@ def test_any_image_and_any_count(place, drawn):
 
 
 @pytest.mark.parametrize("place", INITS)
-@pytest.mark.parametrize("shape", [(1, 1), (1, 17), (17, 1), (2, 2), (64, 3)])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 17), (17, 1), (2, 2), (64, 3), (1, 512)])
 @pytest.mark.parametrize("part", [0, 0.5, 1])
 def test_narrow_images(place, shape, part):
     image = generator().uniform(0, 1, (*shape, 3)).astype(np.float32)

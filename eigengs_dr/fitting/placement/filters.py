@@ -1,0 +1,284 @@
+"""Filters of images in tile layout, in kernels that own pixels.
+
+A batch of images takes one launch of each kernel, and no pixel sees another image.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import drjit as dr
+
+from ...backend.arrays import ArrayTypes, Bool, Float, UInt
+from ...raster.binning.tiles import TILE, Grid, GridArrays
+
+SIDE = TILE[0]
+"""Width and height of a tile in pixels."""
+
+PIXELS = SIDE * SIDE
+
+TRUNCATION = 2.5
+"""Radius of the weights of a blur, in standard deviations."""
+
+
+class Canvas(NamedTuple):
+    """Images in tile layout.
+
+    Attributes
+    ----------
+    types : ArrayTypes
+    grid : Grid
+    sizes : GridArrays
+        Those of `grid`: each costs some microseconds, and many kernels need them.
+    """
+
+    types: ArrayTypes
+    grid: Grid
+    sizes: GridArrays
+
+    @classmethod
+    def of(cls, types: ArrayTypes, grid: Grid) -> Canvas:
+        """Return the images of a grid."""
+        return cls(types, grid, grid.in_arrays(types))
+
+    @property
+    def tile(self) -> UInt:
+        """Lanes that own a tile each."""
+        return dr.arange(self.types.UInt, self.grid.tiles)
+
+    def sides(self) -> tuple[UInt, UInt]:
+        """Return width and height of an image as Int32."""
+        return self.types.Int(self.sizes.width), self.types.Int(self.sizes.height)
+
+    def corner(self, tile: UInt) -> tuple[UInt, UInt]:
+        """Return column and row of the first pixel of a tile as Int32."""
+        column, row = self.sizes.first_pixel(tile)
+        return self.types.Int(column), self.types.Int(row)
+
+    def channels(self, image: Float) -> int:
+        """Return the number of values of a pixel."""
+        return dr.width(image) // (self.grid.tiles * PIXELS)
+
+    def first_tile(self, image: UInt) -> UInt:
+        """Return the first tile of an image, which is None if there is only one."""
+        if image is None or self.sizes.image is None:
+            return self.types.UInt(0)
+        return image * self.sizes.image.divisor
+
+    def place(self, first: UInt, x: UInt, y: UInt) -> UInt:
+        """Return the index in tile layout of a pixel of the image with the tile `first`."""
+        tile = self.types.UInt((y >> 2) * self.sizes.nx + (x >> 2)) + first
+        return tile * PIXELS + self.types.UInt((y & 3) * SIDE + (x & 3))
+
+    def pixels(self) -> tuple[UInt, UInt, UInt, Bool]:
+        """Return column, row, first tile of the image, and whether it is inside, of all pixels.
+
+        A lane owns a pixel.
+        """
+        index = dr.arange(self.types.UInt, self.grid.tiles * PIXELS)
+        tile = index >> 4
+        column, row = self.corner(tile)
+        column += self.types.Int(index & 3)
+        row += self.types.Int((index >> 2) & 3)
+        width, height = self.sides()
+        inside = (column < width) & (row < height)
+        return column, row, self.first_tile(self.sizes.image_of(tile)), inside
+
+
+def scan(
+    canvas: Canvas,
+    source: Float,
+    axis: int,
+    tiles: UInt,
+    visit: Callable[..., Any],
+    state: Any,
+    label: str,
+) -> Any:
+    """Visit the tiles around each tile along an axis; return the last state. A lane owns a tile.
+
+    Images alternate between the layout of tiles by rows and by columns: with the first axis the
+    tiles of `source` must be stored by columns, with the second by rows. The pixels of a line
+    across the axis are then neighbours in memory.
+
+    Parameters
+    ----------
+    source : Float or Int, shape (pixels * channels,)
+    axis : int
+        0 for tiles of a row, 1 for those of a column.
+    tiles : Int32, shape (1,)
+        Largest distance of a tile.
+    visit : callable
+        ``visit(lines, distance, first, state) -> state`` with the 4 lines of pixels of a tile, each
+        an array of 4 pixels after another; the distance of the tile in pixels; the coordinate of
+        its first line; and whether there is such a tile.
+    """
+    types, side = canvas.types, canvas.sides()[axis]
+    own = types.Int(canvas.tile)
+    here = canvas.corner(canvas.tile)[axis]
+    step = (1, canvas.sizes.nx)[axis]
+    length = SIDE * canvas.channels(source)
+    kind = dr.int32_array_t(types.FloatX) if dr.is_integral_v(source) else types.FloatX
+
+    def look(distance: UInt, state: Any) -> tuple:
+        first = here + distance * SIDE
+        inside = (first >= 0) & (first < side)
+        start = (own + distance * step) * SIDE
+        lines = [
+            dr.gather(kind, source, types.UInt(start + k), inside, shape=(length, dr.width(own)))
+            for k in range(SIDE)
+        ]
+        return distance + 1, visit(lines, distance * SIDE, first, inside, state)
+
+    return dr.while_loop(
+        (types.Int(-tiles), state),
+        lambda distance, state: distance <= tiles,
+        look,
+        label=label,
+        max_iterations=-1,
+    )[1]
+
+
+def turned(canvas: Canvas, lines: list) -> Float:
+    """Store lines from `scan`, tiles by columns if they were by rows, and vice versa; evaluated."""
+    channels = len(lines[0]) // SIDE
+    values = [
+        line[n * channels + c] for n in range(SIDE) for line in lines for c in range(channels)
+    ]
+    result = dr.empty(type(values[0]), canvas.grid.tiles * len(values))
+    dr.scatter(result, type(lines[0])(values), canvas.tile)
+    dr.eval(result)
+    return result
+
+
+def blur(canvas: Canvas, image: Float, deviation: float) -> Float:
+    """Return the means of the pixels around each pixel, by Gaussian weights; evaluated.
+
+    Only pixels of the image count: near its edges, means are over those inside the window. Cost for
+    each axis, and each tile within the radius: a gather of the tile, 7 exponentials, and 4 products
+    for each value.
+
+    Parameters
+    ----------
+    image : Float, shape (pixels * channels,)
+        In tile layout, 0 outside the image.
+    deviation : float
+        Standard deviation in pixels.
+
+    Returns
+    -------
+    Float, shape (pixels * channels,)
+        Outside the image, any finite values.
+    """
+    types = canvas.types
+    # In arrays, so that one program serves all deviations.
+    slope = dr.opaque(types.Float, -0.5 / (math.log(2) * deviation**2))
+    radius = dr.opaque(types.Int, max(1, math.ceil(TRUNCATION * deviation)))
+    tiles = (radius + SIDE - 1) // SIDE
+    length = SIDE * canvas.channels(image)
+    for axis in (1, 0):
+        end = canvas.sides()[axis]
+
+        def add(
+            lines: list, distance: UInt, first: UInt, inside: Bool, state: tuple, end: UInt = end
+        ) -> tuple:
+            sums, totals = list(state[0]), list(state[1])
+            weight = []
+            for offset in range(1 - SIDE, SIDE):
+                k = distance + offset
+                near = dr.exp2(slope * dr.square(types.Float(k)))
+                weight.append(dr.select(dr.abs(k) <= radius, near, 0))
+            for k in range(SIDE):
+                counts = inside & (first + k < end)
+                for own in range(SIDE):
+                    w = weight[k - own + SIDE - 1]
+                    sums[own] = dr.fma(w, lines[k], sums[own])
+                    totals[own] = totals[own] + dr.select(counts, w, 0)
+            return sums, totals
+
+        zeros = [dr.zeros(types.FloatX, (length, 1)) for _ in range(SIDE)]
+        start = zeros, [types.Float(0) for _ in range(SIDE)]
+        sums, totals = scan(canvas, image, axis, tiles, add, start, "blur")
+        image = turned(
+            canvas,
+            [s * dr.select(t > 0, dr.rcp(t), 0) for s, t in zip(sums, totals, strict=True)],
+        )
+    return image
+
+
+def squared_hessian(canvas: Canvas, image: Float, noise: float) -> tuple[Float, Float]:
+    """Return ``sum_c H_c H_c`` of images plus isotropic noise; evaluated.
+
+    Second derivatives are differences of neighbours; an image continues with the pixels of its
+    edges. A lane owns the 4 pixels of a row of a tile.
+
+    Parameters
+    ----------
+    image : Float, shape (pixels * channels,)
+        In tile layout.
+    noise : float
+        Added to xx and to yy.
+
+    Returns
+    -------
+    energy : Float, shape (pixels * 3,)
+        The entries xx, yy and xy in tile layout, 0 outside the image.
+    trace : Float, shape (pixels,)
+        ``xx + yy``.
+    """
+    types, sizes, channels = canvas.types, canvas.sizes, canvas.channels(image)
+    length = SIDE * channels
+    lane = dr.arange(types.UInt, canvas.grid.tiles * SIDE)
+    width, height = canvas.sides()
+    column, row = canvas.corner(lane >> 2)
+    inner = types.Int(lane & 3)
+    row += inner
+
+    def load(step: int) -> list:
+        """Return the values of 6 pixels: those of the row above, of the own or of that below."""
+        source = types.Int(lane) + step
+        if step:
+            leaves = inner == (0 if step < 0 else SIDE - 1)
+            source += dr.select(leaves, (sizes.nx - 1) * (SIDE * step), 0)
+        there = (row + step >= 0) & (row + step < height)
+        values: list = []
+        for side in (-SIDE, 0, SIDE):
+            inside = there & (column + side >= 0) & (column + side < width)
+            index = types.UInt(source + side)
+            shape = (length, dr.width(lane))
+            values += list(dr.gather(types.FloatX, image, index, inside, shape=shape))
+        values = values[length - channels : 2 * length + channels]
+        for k in range(2 * channels, len(values)):
+            inside = column + (k // channels - 1) < width
+            values[k] = dr.select(inside, values[k], values[k - channels])
+        for k in range(channels):
+            values[k] = dr.select(column > 0, values[k], values[k + channels])
+        return values
+
+    FloatX = types.FloatX
+    own = load(0)
+    above = list(dr.select(row > 0, FloatX(load(-1)), FloatX(own)))
+    below = list(dr.select(row + 1 < height, FloatX(load(1)), FloatX(own)))
+    (up_left, up, up_right), (left, middle, right), (down_left, down, down_right) = (
+        [FloatX(v[k * channels : k * channels + length]) for k in range(3)]
+        for v in (above, own, below)
+    )
+    # Differences of neighbours first: those of close floats are exact.
+    xx, yy = (right - middle) - (middle - left), (down - middle) - (middle - up)
+    xy = 0.25 * ((down_right - down_left) - (up_right - up_left))
+    square = dr.square(xy)
+    products = dr.square(xx) + square, dr.square(yy) + square, xy * (xx + yy)
+    base = dr.opaque(types.Float, noise)
+    energy, trace = [], []
+    for k in range(SIDE):
+        inside = (column + k < width) & (row < height)
+        sums = [sum(list(p)[k * channels : (k + 1) * channels]) for p in products]
+        own_energy = [sums[0] + base, sums[1] + base, sums[2]]
+        energy += [dr.select(inside, e, 0) for e in own_energy]
+        trace.append(dr.select(inside, own_energy[0] + own_energy[1], 0))
+    found = [dr.empty(types.Float, dr.width(lane) * len(v)) for v in (energy, trace)]
+    for array, values in zip(found, (energy, trace), strict=True):
+        dr.scatter(array, FloatX(values), lane)
+    dr.eval(found)
+    return found[0], found[1]
