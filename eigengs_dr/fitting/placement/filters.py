@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -20,7 +21,7 @@ SIDE = TILE[0]
 PIXELS = SIDE * SIDE
 
 TRUNCATION = 2.5
-"""Radius of the weights of a blur, in standard deviations."""
+"""Radius of the weights along an axis, in standard deviations; with 3, peaks gain 0.00 dB."""
 
 
 class Canvas(NamedTuple):
@@ -152,29 +153,61 @@ def turned(canvas: Canvas, lines: list) -> Float:
     return result
 
 
+@dataclass(frozen=True)
+class Weights:
+    """The weights ``2^(slope k^2)`` of a Gaussian along an axis, k up to a radius in pixels.
+
+    Both are arrays, so that one program serves all deviations.
+
+    Attributes
+    ----------
+    slope : Float, shape (1,)
+    radius : Int32, shape (1,)
+    """
+
+    slope: Float
+    radius: UInt
+
+    @classmethod
+    def of(cls, types: ArrayTypes, deviation: float) -> Weights:
+        """Return the weights of a Gaussian with a standard deviation in pixels."""
+        slope, radius = -0.5 / (math.log(2) * deviation**2), radius_of(deviation)
+        return cls(dr.opaque(types.Float, slope), dr.opaque(types.Int, radius))
+
+
+def radius_of(deviation: float) -> int:
+    """Return the radius of the weights of a Gaussian with a standard deviation, in pixels."""
+    return max(1, math.ceil(TRUNCATION * deviation))
+
+
 def blur(canvas: Canvas, image: Float, deviation: float) -> Float:
     """Return the means of the pixels around each pixel, by Gaussian weights; evaluated.
 
-    Only pixels of the image count: near its edges, means are over those inside the window. Cost for
-    each axis, and each tile within the radius: a gather of the tile, 7 exponentials, and 4 products
-    for each value.
+    Only pixels of the image count: near its edges, means are over those inside the window. `image`
+    is as for `weighted_sums`, the deviation in pixels; outside the image are any finite values.
+    """
+    return weighted_sums(canvas, image, Weights.of(canvas.types, deviation), means=True)
+
+
+def weighted_sums(canvas: Canvas, image: Float, weights: Weights, means: bool = False) -> Float:
+    """Sum the pixels around each pixel by Gaussian weights; evaluated.
+
+    Cost for each axis, and each tile within the radius: a gather of the tile, 7 exponentials, and 4
+    products for each value.
 
     Parameters
     ----------
     image : Float, shape (pixels * channels,)
         In tile layout, 0 outside the image.
-    deviation : float
-        Standard deviation in pixels.
+    weights : Weights
+    means : bool, optional
+        Whether to divide by the sums of the weights inside the image.
 
     Returns
     -------
     Float, shape (pixels * channels,)
-        Outside the image, any finite values.
     """
-    types = canvas.types
-    # In arrays, so that one program serves all deviations.
-    slope = dr.opaque(types.Float, -0.5 / (math.log(2) * deviation**2))
-    radius = dr.opaque(types.Int, max(1, math.ceil(TRUNCATION * deviation)))
+    types, radius = canvas.types, weights.radius
     tiles = (radius + SIDE - 1) // SIDE
     length = SIDE * canvas.channels(image)
     for axis in (1, 0):
@@ -187,23 +220,24 @@ def blur(canvas: Canvas, image: Float, deviation: float) -> Float:
             weight = []
             for offset in range(1 - SIDE, SIDE):
                 k = distance + offset
-                near = dr.exp2(slope * dr.square(types.Float(k)))
+                near = dr.exp2(weights.slope * dr.square(types.Float(k)))
                 weight.append(dr.select(dr.abs(k) <= radius, near, 0))
             for k in range(SIDE):
                 counts = inside & (first + k < end)
                 for own in range(SIDE):
                     w = weight[k - own + SIDE - 1]
                     sums[own] = dr.fma(w, lines[k], sums[own])
-                    totals[own] = totals[own] + dr.select(counts, w, 0)
+                    if means:
+                        totals[own] = totals[own] + dr.select(counts, w, 0)
             return sums, totals
 
         zeros = [dr.zeros(types.FloatX, (length, 1)) for _ in range(SIDE)]
-        start = zeros, [types.Float(0) for _ in range(SIDE)]
+        start = zeros, [types.Float(0) for _ in range(SIDE * means)]
         sums, totals = scan(canvas, image, axis, tiles, add, start, "blur")
-        image = turned(
-            canvas,
-            [s * dr.select(t > 0, dr.rcp(t), 0) for s, t in zip(sums, totals, strict=True)],
-        )
+        if means:
+            inverse = (dr.select(t > 0, dr.rcp(t), 0) for t in totals)
+            sums = [s * i for s, i in zip(sums, inverse, strict=True)]
+        image = turned(canvas, sums)
     return image
 
 

@@ -23,14 +23,12 @@ from ...backend.arrays import ArrayTypes, Bool, Float, UInt, make_divisor, types
 from ...backend.recording import record
 from ...raster.binning.tiles import TILE, Grid, GridArrays
 from ...raster.parameters import gather_run
+from .filters import TRUNCATION, Canvas, Weights, radius_of, weighted_sums
 
 CANDIDATE_SIZES = (0.2, 0.4, 0.8)
 """Candidate sizes of an added Gaussian, as multiples of the mean spacing. Five from 0.2 to 1.6 take
 two and a half times as long, and gain -0.03 to 0.03 dB (16 crops of 128x128 and 9 training photos
 of 256x256 pixels, 200 to 1,000 steps)."""
-
-TRUNCATION = 2.5
-"""Radius of the weights along an axis, in standard deviations; 3 gains 0.00 dB there."""
 
 SUPPRESSION_RADIUS = 1.5
 """Distance from an added Gaussian to a worse one, in standard deviations of the added one."""
@@ -159,8 +157,8 @@ def residual_peaks(
             return peaks
         return peaks._replace(mean=peaks.mean * times, size=peaks.size * times)
     runs = _runs(types, grid)
-    weights = [_weights_of(types, share * spacing) for share in CANDIDATE_SIZES]
-    gain, size, top = _gain_map(missed, squares, weights, runs, grid, channels)
+    candidates = [_candidate(types, share * spacing) for share in CANDIDATE_SIZES]
+    gain, size, top = _gain_map(missed, squares, candidates, runs, grid, channels)
     place = dr.compress(top > 0)
     if dr.width(place):
         reach = math.ceil(SUPPRESSION_RADIUS * CANDIDATE_SIZES[-1] * spacing)
@@ -233,41 +231,36 @@ def shrunk(values: Float, grid: Grid, small: Grid, channels: int, times: int) ->
 
 
 @dataclass(frozen=True)
-class _Weights:
-    """The weights ``2^(slope k^2)`` along an axis of a Gaussian of one size, each of shape (1,).
+class _Candidate:
+    """An added Gaussian of one size; arrays of shape (1,).
 
     Attributes
     ----------
+    weights : Weights
     size : Float
         Standard deviation in pixels.
-    slope : Float
-    reach : Int32
-        Largest offset k.
     inverse : Float
-        One over the sum of the squares of all weights of the Gaussian.
+        One over the sum of the squares of all its weights.
     """
 
+    weights: Weights
     size: Float
-    slope: Float
-    reach: UInt
     inverse: Float
 
 
-def _weights_of(types: ArrayTypes, deviation: float) -> _Weights:
-    """Return the weights of a size, in arrays, so that one program serves all sizes."""
-    reach = max(1, math.ceil(TRUNCATION * deviation))
+def _candidate(types: ArrayTypes, deviation: float) -> _Candidate:
+    reach = radius_of(deviation)
     offsets = np.arange(-reach, reach + 1)
     own = float(np.exp(-np.square(offsets / deviation)).sum()) ** 2
-    values = deviation, -0.5 / (math.log(2) * deviation**2), 1 / own
-    size, slope, inverse = (dr.opaque(types.Float, v) for v in values)
-    return _Weights(size, slope, dr.opaque(types.Int, reach), inverse)
+    size, inverse = (dr.opaque(types.Float, v) for v in (deviation, 1 / own))
+    return _Candidate(Weights.of(types, deviation), size, inverse)
 
 
 @record
 def _gain_map(
     missed: Float,
     squares: Float,
-    weights: list[_Weights],
+    candidates: list[_Candidate],
     runs: _Runs,
     grid: Grid,
     channels: int,
@@ -276,15 +269,15 @@ def _gain_map(
     types = types_of(missed)
     best = tuple(dr.zeros(types.Float, grid.tiles * grid.pixels) for _ in range(2))
     dr.make_opaque(best)
-    for size in weights:
-        best = _better(missed, squares, size, best, runs.sizes, grid, channels)
+    for candidate in candidates:
+        best = _better(missed, squares, candidate, best, runs.sizes, grid, channels)
     return *best, _local_maxima(best[0], runs)
 
 
 def _better(
     missed: Float,
     squares: Float,
-    weights: _Weights,
+    candidate: _Candidate,
     best: tuple[Float, ...],
     sizes: GridArrays,
     grid: Grid,
@@ -292,80 +285,25 @@ def _better(
 ) -> tuple[Float, ...]:
     """Return gain and size of the better of the best so far and a size, for each pixel."""
     types, length = types_of(missed), grid.pixels * channels
-    slope, reach = weights.slope, weights.reach
     tile = dr.arange(types.UInt, grid.tiles)
-    down = dr.empty(types.Float, dr.width(missed))
-    dr.scatter(down, types.FloatX(_blur(missed, sizes, channels, slope, reach, 1)), tile)
-    dr.eval(down)
-    both = _blur(down, sizes, channels, slope, reach, 0)
+    sums = weighted_sums(Canvas(types, grid, sizes), missed, candidate.weights)
+    sums = gather_run(types, sums, tile, length, True)
     factors = [1.0] * length
     if squares is not None:
         factors = gather_run(types, squares, tile, length, True)
-    terms = [dr.square(p) * f * weights.inverse for p, f in zip(both, factors, strict=True)]
+    terms = [dr.square(p) * f * candidate.inverse for p, f in zip(sums, factors, strict=True)]
     x, y = (types.Float(v) for v in sizes.first_pixel(tile))
     gains, found = (gather_run(types, v, tile, grid.pixels, True) for v in best)
     for n in range(grid.pixels):
         gain = sum(terms[n * channels : (n + 1) * channels])
         better = (gain > gains[n]) & (x + n % RUN < sizes.width) & (y + n // RUN < sizes.height)
         gains[n] = dr.select(better, gain, gains[n])
-        found[n] = dr.select(better, weights.size, found[n])
+        found[n] = dr.select(better, candidate.size, found[n])
     result = tuple(dr.empty(types.Float, dr.width(v)) for v in best)
     for array, values in zip(result, (gains, found), strict=True):
         dr.scatter(array, types.FloatX(values), tile)
     dr.eval(result)
     return result
-
-
-def _blur(
-    image: Float, sizes: GridArrays, channels: int, slope: Float, radius: UInt, axis: int
-) -> list:
-    """Sum the values along an axis of each pixel times ``2^(slope k^2)``; a lane owns a tile.
-
-    Cost for each tile within the radius: a gather of the tile, 7 exponentials, and 4 products for
-    each value.
-
-    Parameters
-    ----------
-    axis : int
-        0 for the pixels of a row, 1 for those of a column.
-
-    Returns
-    -------
-    list of Float, shape (tiles,)
-        One for each value of a tile.
-    """
-    types, side, length = types_of(image), TILE[axis], RUN * ROWS * channels
-    own = types.Int(dr.arange(types.UInt, dr.width(image) // length))
-    here = types.Int(sizes.first_pixel(types.UInt(own))[axis]) // side
-    step, count = ((1, sizes.nx), (sizes.nx, sizes.ny))[axis]
-    tiles = (radius + side - 1) // side
-    pixel_of = [(n % RUN, n // RUN) for n in range(RUN * ROWS)]
-
-    def add(tile: UInt, sums: list) -> tuple:
-        inside = (here + tile >= 0) & (here + tile < count) & (tile <= tiles)
-        values = gather_run(types, image, types.UInt(own + tile * step), length, inside)
-        weight = {}
-        for offset in range(1 - side, side):
-            k = tile * side + offset
-            near = dr.abs(k) <= radius
-            weight[offset] = dr.select(near, dr.exp2(slope * dr.square(types.Float(k))), 0)
-        sums = list(sums)
-        for n, at in enumerate(pixel_of):
-            for m, other in enumerate(pixel_of):
-                if at[1 - axis] == other[1 - axis]:
-                    for c in range(channels):
-                        place, w = n * channels + c, weight[other[axis] - at[axis]]
-                        sums[place] = dr.fma(w, values[m * channels + c], sums[place])
-        return tile + 1, sums
-
-    sums: list = dr.while_loop(
-        (types.Int(-tiles), [types.Float(0) for _ in range(length)]),
-        lambda tile, sums: tile <= tiles,
-        add,
-        label="blur",
-        max_iterations=-1,
-    )[-1]
-    return sums
 
 
 def _local_maxima(gain: Float, runs: _Runs) -> Float:

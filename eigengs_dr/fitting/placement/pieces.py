@@ -219,6 +219,10 @@ pixels farther away do not count."""
 FRACTION = 30
 """Bits behind the point of a mass."""
 
+LOCAL = dr.ReduceMode.Local
+"""Copies of an array for each thread, which is how Dr.Jit adds to small ones, make a program of its
+size."""
+
 
 def lloyd_step(
     canvas: Canvas, mean: tuple[Float, Float], density: Float, spacing: float
@@ -251,7 +255,7 @@ def lloyd_step(
     place, column, row = pixel_of(canvas, mean)
     last = dr.zeros(UInt, dr.width(density))
     dr.make_opaque(last)
-    dr.scatter_reduce(dr.ReduceOp.Max, last, dr.arange(UInt, count) + 1, place)
+    dr.scatter_reduce(dr.ReduceOp.Max, last, dr.arange(UInt, count) + 1, place, mode=LOCAL)
     keys = dr.select(last > 0, Int(0), NONE)
     dr.eval(keys)
     tiles = dr.opaque(Int, min(math.ceil(REACH * spacing / SIDE), HALF // SIDE - 1))
@@ -268,7 +272,7 @@ def lloyd_step(
     mass = UInt64(density * dr.opaque(types.Float, 2.0**FRACTION))
     terms = mass, mass * UInt64(HALF - away[0]), mass * UInt64(HALF - away[1])
     for array, term in zip(sums, terms, strict=True):
-        dr.scatter_reduce(dr.ReduceOp.Add, array, term, owner, found)
+        dr.scatter_reduce(dr.ReduceOp.Add, array, term, owner, found, mode=LOCAL)
     dr.eval(sums)
     x, y = (
         dr.select(

@@ -11,10 +11,10 @@ from scipy.ndimage import correlate1d, maximum_filter
 from _helpers.sets import few
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.placement.filters import TRUNCATION
 from eigengs_dr.fitting.placement.peaks import (
     CANDIDATE_SIZES,
     SUPPRESSION_RADIUS,
-    TRUNCATION,
     residual_peaks,
 )
 from eigengs_dr.raster.binning.tiles import Grid
