@@ -95,8 +95,9 @@ def guest() -> Iterator[None]:
             _guests.here -= 1
 
 
-MANY_RECORDINGS = 1000
-"""Recordings of one program after which Dr.Jit warns; by default after 10."""
+MANY_RECORDINGS = 1 << 30
+"""Recordings of one program after which Dr.Jit warns; by default after 10. Lists grow and shrink in
+a descent, and images have many sizes: each other size is recorded, in 3 ms, which is no fault."""
 
 
 @contextmanager
@@ -122,7 +123,6 @@ def freeze_program(function: Program) -> Iterator[Program]:
         The frozen function, with the arguments and the result of `function`. Its calls are
         `exclusive`.
     """
-    # Lists grow and shrink in a descent. Each other size is recorded, in 3 ms: no fault.
     program = dr.freeze(function, warn_after=MANY_RECORDINGS)
     try:
         yield _guarded(program, function)

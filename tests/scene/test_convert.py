@@ -149,7 +149,7 @@ def plain(mi, folder, texture, **others):
     """The dictionary of a wall under even light that has a texture."""
     material = {"type": "diffuse", "reflectance": texture}
     wall = {"type": "rectangle", "bsdf": material}
-    return {**room(mi, folder), "integrator": {"type": "path"}, "quad": wall, **others}
+    return {**room(mi, folder), "integrator": {"type": "path"}, "cube": wall, **others}
 
 
 @pytest.mark.parametrize("kind", ["tensor", "bitmap"])
@@ -178,7 +178,7 @@ def test_a_lamp_above_1_also_lights_by_what_is_hidden(folder, tmp_path):
     at = mi.ScalarTransform4f()
     lamp = {"type": "rectangle", "emitter": {"type": "area", "radiance": picture}}
     board = {"type": "rectangle", "to_world": at.translate([1, 0, 0.5])}
-    scene = plain(mi, folder, {"type": "rgb", "value": 0.5}, lamp=lamp, quad=board)
+    scene = plain(mi, folder, {"type": "rgb", "value": 0.5}, lamp=lamp, cube=board)
     found = eg.convert_scene(scene, tmp_path / "new", target_psnr=32, iterations=20, spp=256)
     [texture] = found.textures
     assert found.left == [] and min(found.psnr) > 30
@@ -209,7 +209,7 @@ def test_a_soft_mask_and_what_shows_through_it(folder, tmp_path):
 
 def test_meshes_in_memory_are_refused(folder, tmp_path):
     scene = room(mi, folder)
-    scene["quad"] = mi.load_dict({"type": "ply", "filename": str(folder / "quad.ply")})
+    scene["cube"] = mi.load_dict({"type": "ply", "filename": str(folder / "cube.ply")})
     veil = {"type": "bitmap", "data": mi.TensorXf(np.full((2, 2, 1), 0.5, np.float32))}
     scene["wall"] = {
         "type": "rectangle",
