@@ -22,16 +22,16 @@ CHARTS = Path(__file__).parent / "images" / "measured"
 def substitutions() -> dict[str, Any]:
     """Return the tables of all questions in Markdown, and the figures of the last row of each."""
     CHARTS.mkdir(exist_ok=True)
-    found: dict[str, Any] = {"tables": {"once": _tables_measured_once()}}
+    tables, figures = {"once": _tables_measured_once()}, dict[str, Any]()
     for bench in QUESTIONS:
         if rows := read(ROWS, bench):
             section = import_module(f"eigengs_bench.{bench}").summarize(rows)
             known = [one for one in section.tables if not one.frame.empty]
-            found["tables"][bench] = {one.name: _with_source(one, rows) for one in known}
+            tables[bench] = {one.name: _with_source(one, rows) for one in known}
             for name, figure in section.charts.items():
                 save_figure(CHARTS / f"{name}.svg", figure)
-            found[bench] = {k: v for k, v in rows[-1].items() if isinstance(v, (int, float, str))}
-    return found
+            figures[bench] = {k: v for k, v in rows[-1].items() if isinstance(v, (int, float, str))}
+    return figures | {"tables": tables}
 
 
 def _tables_measured_once() -> dict[str, str]:

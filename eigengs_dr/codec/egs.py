@@ -25,11 +25,10 @@ from numpy.typing import NDArray
 from ..gaussian.channels import TextureMap, channel_weights, check_maps
 from ..gaussian.file import CUTOFF, SetData
 from ..image.color import MAX_CHANNELS, SPACES
-from ..image.hilbert import MAX_LEVELS, hilbert_encode
 from ..storage.atomic import atomic_write
 from ..storage.npz import MAX_ENTRIES, BadValue
 from . import weights
-from .cells import EVENNESS, code_cells
+from .cells import EVENNESS, MAX_LEVELS, code_cells, hilbert_encode
 from .gaussian_model import GaussianCoder
 from .quantization import Steps, Symbols, dequantize
 from .range_coder import Decoder, Encoder

@@ -31,7 +31,7 @@ IntArray = NDArray[np.int64]
 
 MAX_SYMBOL = 1 << 23
 """Bound of the integers; finer steps are not worth storing. Two cells differ by less than twice the
-bound, which fits `eigengs_dr.image.hilbert.MAX_LEVELS`."""
+bound, which fits `eigengs_dr.codec.cells.MAX_LEVELS`."""
 
 SCALE_STEP, STRETCH_STEP, TURN_STEP, MEAN_STEP = 1.2, 1.0, 1.0, 1.4142135623730951
 """Steps of s, l, the angle and the mean, times Q."""

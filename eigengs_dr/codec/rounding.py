@@ -24,8 +24,8 @@ from ..fitting.descent import FitProblem, run
 from ..fitting.options import PRESETS
 from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.gaussians import Gaussians, like
-from ..image.hilbert import hilbert_encode
 from ..raster.render import render
+from .cells import hilbert_encode
 from .egs import EgsContent
 from .quantization import DEAD_ZONE, Steps, Symbols, dequantize, quantize
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from eigengs_dr.image.hilbert import MAX_LEVELS, hilbert_encode
+from eigengs_dr.codec.cells import MAX_LEVELS, hilbert_encode
 
 
 @pytest.mark.parametrize("levels", [0, 1, 2, 5])
