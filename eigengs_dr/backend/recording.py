@@ -182,6 +182,10 @@ def _guarded(program: Program, function: Program) -> Program:
             _calls += 1
             try:
                 return program(*arguments, **settings)
+            except RuntimeError as error:
+                if isinstance(error.__cause__, KeyboardInterrupt):  # Dr.Jit wraps what it meets
+                    raise KeyboardInterrupt from error
+                raise
             finally:
                 _calls -= 1
 

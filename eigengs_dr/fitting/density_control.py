@@ -181,7 +181,7 @@ class _Comparison:
     lists: TileLists
     cutoff: float
     target: Float
-    squares: Float
+    squares: Float | None
 
     def error_of(self, colors: Unknowns) -> tuple[Float, list]:
         """Return the rendering with some colours minus the image, and its squares by lanes."""

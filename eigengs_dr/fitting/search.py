@@ -87,6 +87,10 @@ POLISH_GAIN, GAIN_DECAY = 0.1, 0.5
 """Expected gain of the first polish, in dB, and of the next polish, as a fraction of the gain of
 the last; training images gained 0.2 dB."""
 
+FAR = 1.5
+"""Gaussians of the best set over those of a polish that misses the goal, from which on the polish
+adds as if there were no such set: a try may meet the goal with twice the number."""
+
 ENOUGH = 0.02
 """Decibels above the goal that do not justify another polish."""
 
@@ -314,7 +318,7 @@ def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
             if wanted == count or -missing < ENOUGH:
                 return
             changed = prune(trial.gaussians, target, wanted, weight)
-        elif found.missing <= 0:
+        elif found.missing <= 0 and len(found.gaussians) <= FAR * count:
             # The best number lies between this one and that of the best set; or a polish suffices.
             wanted = max(
                 count, _count_for_gain(run, count, missing, (count + len(found.gaussians)) // 2)

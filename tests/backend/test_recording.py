@@ -94,3 +94,12 @@ def test_large_arrays_are_traced(backend):
     for size in (3, LARGEST + 1, LARGEST + 1):
         assert dr.all(increased(dr.full(Float, 1, size)) == 2)
     assert traced == [3, LARGEST + 1, LARGEST + 1]
+
+
+def test_an_interrupt_in_a_recorded_program_stays_one(backend):
+    @record
+    def program(value):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        program(select(backend).Float(1))

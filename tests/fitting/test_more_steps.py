@@ -7,7 +7,7 @@ import pytest
 import eigengs_dr as eg
 
 SLACK = 0.1
-"""Decibels by which a longer fit may be worse: the noise of its rounds decides more than its steps."""
+"""Decibels by which a longer fit may be worse: the noise of rounds decides more than steps do."""
 
 CORNERS = {
     "coffee": (100, 200),

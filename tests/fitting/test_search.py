@@ -203,6 +203,22 @@ def test_a_search_goes_on_where_the_fit_just_meets_the_goal():
     assert len(result.gaussians) < fitted[0]
 
 
+def test_a_search_grows_on_below_a_try_that_met_the_goal_with_many():
+    """Where the fit just misses the goal, and more Gaussians gain less than the tries measured."""
+    fitted, seen = [], [0]
+
+    def measure(gaussians, steps):
+        placed, seen[0] = len(steps) == seen[0], len(steps)
+        if steps and steps[-1] == 1000:
+            fitted.append(len(gaussians))
+        if fitted:
+            return np.log2(len(gaussians) / (1.06 * fitted[0]))
+        return 4 * np.log2(len(gaussians) / 20) - 6 * placed
+
+    result, _ = searched_at_rest(measure)
+    assert fitted[0] < len(result.gaussians) <= 1.2 * fitted[0]
+
+
 def test_a_search_ends_where_no_place_is_left_to_grow():
     """After four tries of 4 steps and a fit of 40 steps, where nothing is missed."""
     black = np.zeros((SIDE, SIDE, 3), np.float32)

@@ -155,7 +155,10 @@ def residual_peaks(
         peaks = residual_peaks(missed, small, channels, count, spacing / times, squares)
         if not dr.width(peaks.size):
             return peaks
-        return peaks._replace(mean=peaks.mean * times, size=peaks.size * times)
+        # The last pixels of the small image may lie over the edge.
+        last = types.Float2(*(dr.opaque(types.Float, v - 0.5) for v in (grid.width, grid.height)))
+        mean = dr.minimum(peaks.mean * times, last)
+        return peaks._replace(mean=mean, size=peaks.size * times)
     runs = _runs(types, grid)
     candidates = [_candidate(types, share * spacing) for share in CANDIDATE_SIZES]
     gain, size, top = _gain_map(missed, squares, candidates, runs, grid, channels)
@@ -232,7 +235,7 @@ def shrunk(values: Float, grid: Grid, small: Grid, channels: int, times: int) ->
 
 @dataclass(frozen=True)
 class _Candidate:
-    """An added Gaussian of one size; arrays of shape (1,).
+    """An added Gaussian of one size; all arrays have the shape (1,).
 
     Attributes
     ----------
