@@ -130,10 +130,12 @@ def freeze_program(function: Program) -> Iterator[Program]:
         _retire(program.clear)
 
 
-KEPT_RECORDINGS, LARGEST = 8, 1 << 22
-"""Recordings that a program of `record` keeps: those that were used last. And the size of the
-largest array of a call that is recorded. A replay frees its temporary arrays at its end, which
-takes memory, and where arrays are larger tracing hardly counts."""
+KEPT_RECORDINGS = 8
+"""Recordings that a program of `record` keeps: those that were used last."""
+
+LARGEST_RECORDED = 1 << 22
+"""Size of the largest array of a call that is recorded. A replay frees its temporary arrays at its
+end, which takes memory, and where arrays are larger tracing hardly counts."""
 
 
 def record(function: Program) -> Program:
@@ -154,7 +156,7 @@ def record(function: Program) -> Program:
     @wraps(function)
     def call(*arguments: Any) -> Any:
         sizes = list(_sizes_of(arguments))  # they may be numbers in a program
-        if max(sizes) > LARGEST:
+        if max(sizes) > LARGEST_RECORDED:
             return function(*arguments)
         return replay(sizes, *arguments)
 

@@ -8,7 +8,7 @@ import drjit as dr
 import pytest
 
 from _helpers.process import run_python
-from eigengs_dr.backend.recording import LARGEST, freeze_program, record
+from eigengs_dr.backend.recording import LARGEST_RECORDED, freeze_program, record
 from eigengs_dr.backend.selection import select
 
 LITTER = """
@@ -91,9 +91,9 @@ def test_large_arrays_are_traced(backend):
         traced.append(dr.width(x))
         return x + 1
 
-    for size in (3, LARGEST + 1, LARGEST + 1):
+    for size in (3, LARGEST_RECORDED + 1, LARGEST_RECORDED + 1):
         assert dr.all(increased(dr.full(Float, 1, size)) == 2)
-    assert traced == [3, LARGEST + 1, LARGEST + 1]
+    assert traced == [3, LARGEST_RECORDED + 1, LARGEST_RECORDED + 1]
 
 
 def test_an_interrupt_in_a_recorded_program_stays_one(backend):

@@ -31,12 +31,12 @@ def psnr_in(mask, picture, pixels):
     return -10 * np.log10(error[mask].mean())
 
 
-@pytest.mark.parametrize("iterations", [40, pytest.param(300, marks=pytest.mark.slow)])
-def test_no_seam_is_left(iterations):
-    """Near borders and elsewhere, the error is that of a fit of the whole.
+KNOWN = pytest.mark.xfail(reason="0.3 dB worse than the whole, away from borders", strict=True)
 
-    After 300 steps, blocks are 0.03 dB better near borders, and 0.3 dB worse elsewhere.
-    """
+
+@pytest.mark.parametrize("iterations", [40, pytest.param(300, marks=[pytest.mark.slow, KNOWN])])
+def test_no_seam_is_left(iterations):
+    """Near borders and elsewhere, the error is that of a fit of the whole."""
     pixels = mosaic(256)
     settings = {"gaussians": 3000, "iterations": iterations, "backend": "llvm"}
     blocks = eg.fit_large(pixels, block=96, **settings)
@@ -44,7 +44,7 @@ def test_no_seam_is_left(iterations):
     whole = eg.fit(pixels, **settings)
     shown = eg.picture_of(blocks.gaussians)
     for mask in (near_borders(256, 96, 16), ~near_borders(256, 96, 16)):
-        assert psnr_in(mask, shown, pixels) > psnr_in(mask, whole.image, pixels) - 0.4
+        assert psnr_in(mask, shown, pixels) > psnr_in(mask, whole.image, pixels) - 0.2
     assert blocks.psnr_rgb == pytest.approx(eg.psnr(shown, pixels / 255.0), abs=1e-3)
     assert blocks.psnr_ycbcr == pytest.approx(
         eg.psnr(shown, pixels / 255.0, space="ycbcr"), abs=1e-3

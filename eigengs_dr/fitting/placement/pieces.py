@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import reduce
 
 import drjit as dr
 
@@ -294,20 +295,12 @@ def _nearest_along(canvas: Canvas, keys: UInt, tiles: UInt, axis: int) -> UInt:
             for k in (distance + offset for offset in range(1 - SIDE, SIDE))
         ]
         return [
-            dr.minimum(nearest, _least([lines[k] + cost[k - own + SIDE - 1] for k in range(SIDE)]))
+            reduce(dr.minimum, (lines[k] + cost[k - own + SIDE - 1] for k in range(SIDE)), nearest)
             for own, nearest in enumerate(state)
         ]
 
     start = [dr.full(IntX, NONE, (SIDE, 1)) for _ in range(SIDE)]
     return turned(canvas, scan(canvas, keys, axis, tiles, look, start, "nearest centre"))
-
-
-def _least(values: list) -> Float:
-    """Return the smallest of several."""
-    least = values[0]
-    for value in values[1:]:
-        least = dr.minimum(least, value)
-    return least
 
 
 def pixel_of(canvas: Canvas, mean: tuple[Float, Float]) -> tuple[UInt, UInt, UInt]:
