@@ -26,9 +26,7 @@ class Case(NamedTuple):
     """One thing that may go wrong.
 
     ``image()`` makes the image. `place`, a `Placement`, returns means and factors to start from;
-    None for the start of the preset. `rates` multiplies the rates of the preset. A case `alone`
-    runs in a process of its own, for its memory. With `shorter`, the run is compared with a
-    run that was asked for as many steps.
+    None for the start of the preset. `rates` multiplies the rates of the preset.
     """
 
     name: str
@@ -37,8 +35,6 @@ class Case(NamedTuple):
     iterations: int = ITERATIONS
     place: Callable[..., Shapes] | None = None
     rates: float = 1.0
-    alone: bool = False
-    shorter: int = 0
 
 
 def photo(width: int = SIDE, height: int = SIDE) -> Image:
@@ -151,13 +147,10 @@ _ALL = (
     Case("saturated", _saturated),  # the eight corners of the RGB cube
     Case("noise", _noise),
     Case("1x512", partial(photo, 512, 1), 128),
-    Case("large", partial(photo, 4096, 4096), 20000, 20, alone=True),
     Case("foreign", _foreign),
     *(Case(place.__name__, photo, place=place) for place in (needles, subpixel, heap, outside)),
     Case("fast", photo, rates=10.0),
     Case("long", photo, iterations=10_000),
-    # Few Gaussians gain little early, while rates are high.
-    Case("steps", photo, 800, 5000, shorter=1000),
 )
 
 CASES = {case.name: case for case in _ALL}
@@ -168,9 +161,4 @@ def chosen_cases(names: Sequence[str], iterations: int) -> list[Case]:
     if unknown := [name for name in names if name not in CASES]:
         raise ValueError(f"case {unknown[0]!r} is unknown; use one of {', '.join(CASES)}")
     chosen = [CASES[name] for name in dict.fromkeys(names or CASES)]
-    return [
-        case._replace(
-            iterations=min(case.iterations, iterations), shorter=min(case.shorter, iterations)
-        )
-        for case in chosen
-    ]
+    return [case._replace(iterations=min(case.iterations, iterations)) for case in chosen]

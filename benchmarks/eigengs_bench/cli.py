@@ -19,7 +19,7 @@ from eigengs_bench.names import (
     SOLVE_STEPS,
     TABLES,
 )
-from eigengs_bench.rows import FILE, Task, code_state
+from eigengs_bench.rows import FILE, Row, Task, code_state
 from eigengs_bench.rows import record as record_rows
 from eigengs_dr.backend.selection import select
 from eigengs_dr.cli import options
@@ -81,7 +81,7 @@ def question(bench: str, usual: tuple[str, ...] = ()) -> Any:
             with bar(run.quiet) as show:
                 task = Task(folder, about, backend=run.backend, progress=show, **shared)
                 rows = module.run(task, **settings)
-            _save(module.summarize(rows), folder, run)
+            _show(module.summarize(rows), rows, folder, run)
             if record:
                 record_rows(MANUAL, rows)
 
@@ -90,13 +90,14 @@ def question(bench: str, usual: tuple[str, ...] = ()) -> Any:
     return decorate
 
 
-def _save(section: Any, output: Path, run: options.Run) -> None:
-    """Write the charts of a section as SVG into a folder; print its tables."""
-    from eigengs_bench.report import as_text, save_figure
+def _show(section: Any, rows: list[Row], output: Path, run: options.Run) -> None:
+    """Write the charts of a section as SVG into a folder; print its tables, and their sources."""
+    from eigengs_bench.report import as_text, save_figure, sources_of
 
     for name, figure in section.charts.items():
         save_figure(output / f"{name}.svg", figure)
     run.tell("\n\n".join(map(as_text, section.tables)))
+    run.tell("\n" + "\n".join(sources_of(rows)))
     run.tell("".join(f"\nchart: {output / name}.svg" for name in section.charts))
 
 
@@ -184,11 +185,10 @@ def rate() -> None:
 @number("--images", "Of each set.", 20, 1)
 @number("--iterations", "Steps of every fit.", 1000, 1)
 def number_of_gaussians() -> None:
-    """Measure how many Gaussians a PSNR takes: of fits of fixed numbers, and by the search.
+    """Measure how many Gaussians the search of fit --target-psnr finds, and what it costs.
 
-    On every image: fits of fixed numbers, Gaussians placed once, until two enclose each target; the
-    search of fit --target-psnr, and a default fit of the number it found. An image of 256x256
-    pixels takes a minute or two.
+    Beside it: a default fit of the number that was found. An image of 256x256 pixels takes half a
+    minute.
     """
 
 
@@ -199,7 +199,7 @@ def number_of_gaussians() -> None:
 def stability() -> None:
     """Try every preset on hard cases: odd images, odd starts, rates too high.
 
-    All cases take about ten minutes; the case "large" takes gigabytes.
+    All cases take about ten minutes.
     """
 
 

@@ -108,7 +108,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
         )
         for line in both.itertuples()
     ]
-    table = fr.table(CAPTION, COLUMNS, lines, fits.code, "quality")
+    table = fr.table(CAPTION, COLUMNS, lines, "quality")
     return fr.Section([table], {"kodak-gaussians": _over_gaussians(photos, known)})
 
 

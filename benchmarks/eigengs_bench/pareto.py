@@ -108,7 +108,6 @@ VARIANTS: dict[str, Any] = {
     "YCbCr": ("psnr_ycbcr", fr.mean),
     "RGB": ("psnr_rgb", fr.mean),
     "on front": ("front", "first"),
-    "as many": ("front_same", "first"),
 }
 # What a knob is, its colour and marker.
 KNOBS = {
@@ -133,21 +132,15 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
 def points_of(fits: pd.DataFrame) -> pd.DataFrame:
     """Gather the images of a set: medians of seconds and means of PSNRs, NaN where a fit failed.
 
-    "front" and "front_same" are 1 on the front of all points, and on the front of points with as
-    many Gaussians as the default fit.
+    "front" is true where no point is as fast and better.
     """
     groups = fits.groupby(["knob", "value", "iteration", "gaussians"], sort=False)
     points = groups[["psnr_ycbcr"]].agg(lambda values: values.mean(skipna=False))
     points.insert(0, "seconds", groups.seconds.median())
     points = points.assign(images=groups.size()).reset_index()
-    same = points.gaussians.isin(points.gaussians[points.value == "default"])
-    for column, some in (("front", points), ("front_same", points[same])):
-        best = front(list(zip(some.seconds, some.psnr_ycbcr, strict=True)))
-        on = [
-            p.Index in some.index and (p.seconds, p.psnr_ycbcr) in best for p in points.itertuples()
-        ]
-        points[column] = pd.Series(on).astype(int)
-    return points
+    pairs = list(zip(points.seconds, points.psnr_ycbcr, strict=True))
+    best = front(pairs)
+    return points.assign(front=[pair in best for pair in pairs])
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -169,14 +162,13 @@ def _variants(name: str, fits: pd.DataFrame, points: pd.DataFrame) -> fr.Table:
     start, ends = fits[fits.iteration == 0], fits[fits.iteration == steps]
     lines = ends.merge(start[[*FIT, "seconds", "psnr_ycbcr"]], on=FIT, suffixes=("", "_start"))
     lines["fit"] = lines.knob + " " + lines.value.map(text_of)
-    for key in ("front", "front_same"):
-        on = points[points[key] == 1].groupby(["knob", "value"], sort=False).iteration
-        at = on.agg(lambda values: ", ".join(f"{step:,}" for step in values)).rename(key)
-        lines = lines.join(at, on=["knob", "value"]).fillna({key: fr.MISSING})
+    on = points[points.front].groupby(["knob", "value"], sort=False).iteration
+    at = on.agg(lambda values: ", ".join(f"{step:,}" for step in values)).rename("front")
+    lines = lines.join(at, on=["knob", "value"]).fillna({"front": fr.MISSING})
     caption = (
         f"{name}, {fr.counted(fits.image)}: seconds and PSNR at the start and after {steps:,} "
-        "steps; after how many steps a fit is on the front of all fits, and on the front of fits "
-        "with as many Gaussians; other settings are the default ones"
+        "steps; after how many steps a fit is on the front, where none is as fast and better; "
+        "other settings are the default ones"
     )
     return fr.grouped(caption, lines, ["fit"], VARIANTS)._replace(name=name)
 
@@ -187,7 +179,7 @@ def text_of(value: str | float) -> str:
 
 
 def _chart(points: pd.DataFrame, name: str) -> Figure:
-    """Draw all fits of a set (see `points_of`) and their fronts."""
+    """Draw all fits of a set (see `points_of`) and their front."""
     title = f"Speed against accuracy: {name}, images: {points.images.max()}; up and left is better"
     figure = fr.new_figure(10, 6, title)
     axis = figure.subplots()
@@ -197,9 +189,7 @@ def _chart(points: pd.DataFrame, name: str) -> Figure:
     for preset, color in fr.COLORS.items():
         line = points[points.value == preset].sort_values("iteration")
         _plot(axis, line, preset, color=color, marker="o")
-    same, edge = (points[points[k] == 1].sort_values("seconds") for k in ("front_same", "front"))
-    label = f"front of fits with {same.gaussians.max():,} Gaussians"
-    _plot(axis, same, label, color=fr.INK, lw=1.2, ls="--")
+    edge = points[points.front].sort_values("seconds")
     _plot(axis, edge, "front: none is better", color=fr.INK, lw=8, alpha=0.18)
     fr.label_axes(axis, "seconds, start included", "PSNR in YCbCr / dB")
     return figure

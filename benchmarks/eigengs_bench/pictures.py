@@ -17,8 +17,8 @@ from eigengs_bench.cases import CASES
 from eigengs_bench.clock import Image, Moment, descent
 from eigengs_bench.images import images_of, is_present, model_for
 from eigengs_bench.names import CATS, NATURAL, PICTURES
-from eigengs_bench.rows import Job, Row, Task, code_name
-from eigengs_bench.stability import moments, tiling
+from eigengs_bench.rows import Job, Row, Task
+from eigengs_bench.stability import moments
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.io import sample
@@ -63,8 +63,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
         charts["curves"] = _curves_chart(curves)
     if histograms := [row for row in rows if "radii" in row]:
         charts["radii"] = _radii_chart(histograms)
-    codes = [code_name(row["run"]) for row in rows]
-    return fr.Section([fr.table("Pictures", ("file", "caption"), lines, codes)], charts)
+    return fr.Section([fr.table("Pictures", ("file", "caption"), lines)], charts)
 
 
 def preset_descent(
@@ -192,27 +191,23 @@ def _drawn(
 def _iterations(task: Task) -> list[Row]:
     """Show the first iterations of every preset: the paper's figures of convergence."""
     marks = [n for n in (0, 10, 100) if n < task.iterations] + [task.iterations]
+    file, words, photo = f"iterations-{PHOTO}.jpg", 'a photo and the basis "natural"', sample(PHOTO)
+    model = EigenGS.load("natural", task.backend)
+    if is_present(task, CATS):
+        file, words = "cats-iterations.png", "a cat and a basis of other cats"
+        [(_, photo)] = images_of(task, CATS, 1)
+        model = model_for(task, CATS, CATS, COMPONENTS)
+    image = to_size(photo, model)
 
-    def make(image: Image, model: EigenGS) -> list[tuple[str, Sequence[Cell]]]:
+    def make() -> list[tuple[str, Sequence[Cell]]]:
         rows: list[tuple[str, Sequence[Cell]]] = []
         for preset, heading in METHODS.items():
             cells = [_cell_of(m, image) for m in preset_descent(task, image, model, preset, marks)]
             rows.append((heading, [*cells, ("photo", image)]))
         return rows
 
-    shipped = EigenGS.load("natural", task.backend)
-    subjects = [
-        (f"iterations-{PHOTO}.jpg", 'a photo and the basis "natural"', sample(PHOTO), shipped)
-    ]
-    if is_present(task, CATS):
-        [(_, cat)] = images_of(task, CATS, 1)
-        model = model_for(task, CATS, CATS, COMPONENTS)
-        subjects.append(("cats-iterations.png", "a cat and a basis of other cats", cat, model))
-    found = []
-    for file, words, image, model in subjects:
-        caption = f"Iterations of every preset: {words}, {_size(model)}; PSNR in YCbCr"
-        found += _drawn(task, file, caption, partial(make, to_size(image, model), model))
-    return found
+    caption = f"Iterations of every preset: {words}, {_size(model)}; PSNR in YCbCr"
+    return _drawn(task, file, caption, make)
 
 
 def _colors(task: Task) -> list[Row]:
@@ -249,12 +244,11 @@ def _tiles(task: Task) -> list[Row]:
         shown, errors = [], []
         for preset in METHODS:
             picture = moments(case, image, preset, task.backend)[-1].picture
-            shown.append((f"{preset}: {tiling(picture, image):.2f}", picture[middle]))
+            shown.append((f"{preset}: {psnr(picture, image, 'ycbcr'):.1f} dB", picture[middle]))
             errors.append(("", (0.5 + STRETCHED * (picture - image))[middle]))
         return [("", shown), (f"their errors times {STRETCHED}", errors)]
 
-    steps = f"{task.iterations:,} steps"
-    caption = f"The middle of a slow gradient after {steps}, and its tiling in 8-bit levels"
+    caption = f"The middle of a slow gradient after {task.iterations:,} steps; PSNR in YCbCr"
     return _drawn(task, "tiles.png", caption, make)
 
 

@@ -158,7 +158,7 @@ def _table(name: str, points: pd.DataFrame) -> fr.Table:
     lines = [
         (
             codec,
-            *(_compared(sizes, codec) for sizes in found),
+            *(fr.mean(sizes[codec], 2) for sizes in found),
             _saved(points, codec),
             fr.median(part.seconds),
             fr.median(part.decode_seconds, 3),
@@ -169,20 +169,10 @@ def _table(name: str, points: pd.DataFrame) -> fr.Table:
     lines.append(("images that all reach", *reached, *[fr.MISSING] * 3))
     caption = (
         f"{name}, {fr.counted(points.image)}: bits a pixel for a PSNR in 8-bit RGB, interpolated; "
-        "in brackets the bits of a codec over ours, and on how many images ours are fewer "
-        "(images that were JPEG files once suit JPEG). BD-rate: bits of ours at equal PSNR against "
-        "the codec's, mean over the images"
+        "BD-rate: bits of ours at equal PSNR against the codec's, mean over the images"
     )
     columns = ("codec", *(f"{level:g} dB" for level in LEVELS), "BD-rate", "s", "s to decode")
-    return fr.table(caption, columns, lines, points.code, name)
-
-
-def _compared(sizes: pd.DataFrame, codec: str) -> str:
-    if sizes.empty:
-        return fr.MISSING
-    mean, ours = sizes[codec].mean(), sizes[OURS]
-    ratio = f" ({mean / ours.mean():.2f}, {(ours < sizes[codec]).sum()})"
-    return fr.number(mean, 2) + ratio * (codec != OURS)
+    return fr.table(caption, columns, lines, name)
 
 
 def bd_rate(ours: pd.DataFrame, other: pd.DataFrame) -> float:
@@ -248,7 +238,7 @@ def _published(points: pd.DataFrame) -> fr.Table:
         "published mean curves; above 0 ours takes more bits"
     )
     columns = ("method", "BD-rate of ours", "source")
-    return fr.table(caption, columns, lines, points.code, "published")
+    return fr.table(caption, columns, lines, "published")
 
 
 def _chart(points: pd.DataFrame, name: str) -> Figure:

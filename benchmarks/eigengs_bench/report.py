@@ -97,26 +97,22 @@ def sources_of(rows: Sequence[Row]) -> list[str]:
 def frame_of(rows: Iterable[Row], key: str = "") -> pd.DataFrame:
     """Lay rows out: a line a row, or a line an entry of the list `key` of the rows that have it.
 
-    Columns are the fields of the jobs, the figures, and "code", the name of the code. Figures of
-    fits that have failed, null in the file, are NaN.
+    Columns are the fields of the jobs, and the figures. Figures of fits that have failed, null in
+    the file, are NaN.
     """
     lines = []
     for row in rows:
         figures = {k: v for k, v in row.items() if k not in ("bench", "job", "run", key)}
-        shared = {**row["job"], **figures, "code": code_name(row["run"])}
+        shared = {**row["job"], **figures}
         lines += [{**shared, **entry} for entry in (row.get(key, []) if key else [{}])]
     return pd.DataFrame([{k: math.nan if v is None else v for k, v in ln.items()} for ln in lines])
 
 
 def table(
-    caption: str,
-    columns: Iterable[str],
-    lines: Iterable[Sequence[Any]],
-    codes: Iterable[str] = (),
-    name: str = "",
+    caption: str, columns: Iterable[str], lines: Iterable[Sequence[Any]], name: str = ""
 ) -> Table:
-    """Make a table of lines of texts; `codes` names the code of all rows behind it."""
-    return Table(caption + remark(codes), pd.DataFrame(list(lines), columns=list(columns)), name)
+    """Make a table of lines of texts."""
+    return Table(caption, pd.DataFrame(list(lines), columns=list(columns)), name)
 
 
 def grouped(caption: str, frame: pd.DataFrame, by: list[str], columns: Mapping[str, Any]) -> Table:
@@ -124,16 +120,7 @@ def grouped(caption: str, frame: pd.DataFrame, by: list[str], columns: Mapping[s
     if frame.empty:
         return Table(caption, frame)
     cells = frame.groupby(by, sort=False).agg(**columns).reset_index()
-    return Table(caption + remark(frame.code), cells)
-
-
-def remark(codes: Iterable[str]) -> str:
-    """Say that rows are of several commits, or of a tree that was not clean; else ""."""
-    known = list(dict.fromkeys(codes))
-    if len(known) > 1 or any("uncommitted" in code for code in known):
-        kind = "different code" if len(known) > 1 else "code that is in no commit"
-        return f" [rows of {kind}: {'; '.join(known)}]"
-    return ""
+    return Table(caption, cells)
 
 
 def as_text(table: Table, style: str = "simple") -> str:

@@ -217,23 +217,11 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
             x = "pixels" if name == "pixels" else "gaussians"
             line = "equal density of Gaussians" if name == "pixels" else part["size"]
             part = part.assign(line=line)
-            caption += _exponents(part, x)
             charts[f"scaling-{name}"] = _chart(part, x)
         columns = {title: (column, fr.median) for title, column in shown.items()}
         found = fr.grouped(caption, part, ["size", "Gaussians"], columns)
         tables.append(found._replace(name=str(name)))
     return fr.Section(tables, charts)
-
-
-def slope(x: Sequence[float], y: Sequence[float]) -> float:
-    """Fit the exponent p of ``y ~ x^p`` by least squares of logarithms; NaN for one point."""
-    return float(np.polyfit(np.log(x), np.log(y), 1)[0]) if len(x) > 1 else float("nan")
-
-
-def _exponents(part: pd.DataFrame, x: str) -> str:
-    lines = part.groupby("line", sort=False)
-    found = [f"{name} {slope(some[x], some.mean_ms):.2f}" for name, some in lines]
-    return f"; exponents of a step: {', '.join(found)}"
 
 
 def _chart(part: pd.DataFrame, x: str) -> Figure:

@@ -1,6 +1,5 @@
-"""Hard cases times presets: which stay finite, and end no worse than they or shorter runs were."""
+"""Hard cases times presets: which stay finite, and end no worse than they were."""
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -8,25 +7,21 @@ from itertools import product
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, maximum_filter
 
 import eigengs_dr as eg
 from eigengs_bench import report as fr
 from eigengs_bench.cases import Case, chosen_cases
 from eigengs_bench.clock import Image, Moment, decibels, follow
-from eigengs_bench.rows import Job, Row, Task, alone, code_name, peak_gib
+from eigengs_bench.rows import Job, Row, Task
 from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.refine import trace_steps
 from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.fitting.start import initialize, mean_picture
-from eigengs_dr.gaussian.covariance import max_deviation
-from eigengs_dr.image.color import RGB_TO_YCBCR, rgb_to_ycbcr
+from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.metrics import MAX_PSNR
 
 BASIS = "natural"  # where presets that need a basis start
-TOLERANCE = 0.01  # decibels that an end may lie below its start
 
 
 def run(task: Task, cases: Sequence[str], presets: Sequence[str]) -> list[Row]:
@@ -36,9 +31,8 @@ def run(task: Task, cases: Sequence[str], presets: Sequence[str]) -> list[Row]:
 
 def _jobs(task: Task, cases: Iterable[Case], presets: Sequence[str]) -> Iterator[Job]:
     for case, name in product(cases, presets):
-        work = partial(measure_cell, case, name, task.backend)
         job = {"case": case.name, "preset": name, "iterations": case.iterations}
-        yield job, alone(f"case {case.name!r}", work) if case.alone else work
+        yield job, partial(measure_cell, case, name, task.backend)
 
 
 def measure_cell(case: Case, preset: str, backend: str | None) -> Row:
@@ -46,9 +40,7 @@ def measure_cell(case: Case, preset: str, backend: str | None) -> Row:
 
     "needs", alone, says what a preset lacks. Else "finite" is true if all parameters and pixels are
     finite at all marks of `trace_steps`; start and end are PSNRs of the first and of the last
-    moment, drop is the loss from the best moment to the last;
-    "condition" is the highest of a covariance, "peak_gib" the memory of a case in its own process,
-    "shorter_ycbcr" the PSNR at the end of a run of the shorter number of steps of the case.
+    moment.
     """
     image = case.image()
     most = image.shape[0] * image.shape[1]
@@ -56,12 +48,16 @@ def measure_cell(case: Case, preset: str, backend: str | None) -> Row:
     if encodes and len(eg.EigenGS.load(BASIS, backend).gaussians) > most:
         return {"needs": f"a basis with at most {most} Gaussians"}
     followed = moments(case, image, preset, backend)
-    memory = {"peak_gib": peak_gib()} if case.alone else {}  # before the judgement takes its own
-    row = {**_score(followed, image), **memory}
-    if case.shorter:
-        shorter = moments(case._replace(iterations=case.shorter), image, preset, backend)
-        row["shorter_ycbcr"] = decibels(shorter[-1].picture, image, "ycbcr")
-    return row
+    finite = [np.isfinite(moment.picture).all() for moment in followed]
+    for moment in followed:
+        finite += [np.isfinite(values).all() for values in moment.gaussians.to_arrays().values()]
+    return {
+        "finite": all(finite),
+        "gaussians": len(followed[0].gaussians),
+        "seconds": followed[-1].seconds,
+        "start_ycbcr": decibels(followed[0].picture, image, "ycbcr"),
+        "end_ycbcr": decibels(followed[-1].picture, image, "ycbcr"),
+    }
 
 
 def moments(case: Case, image: Image, preset: str, backend: str | None = None) -> list[Moment]:
@@ -93,104 +89,18 @@ def _start(case: Case, image: Image, solves: bool, backend: str | None) -> FitPr
     return FitProblem(solve(start, target).gaussians if solves else start, target)
 
 
-def _score(followed: list[Moment], image: Image) -> Row:
-    first, last = followed[0], followed[-1]
-    arrays = [moment.gaussians.to_arrays() for moment in followed]
-    finite = [np.isfinite(moment.picture).all() for moment in followed]
-    finite += [np.isfinite(values).all() for kept in arrays for values in kept.values()]
-    row: Row = {
-        "finite": all(finite),
-        "condition": max(_condition(*kept["factor"].T) for kept in arrays),
-        "tiling": tiling(last.picture, image),
-        "gaussians": len(first.gaussians),
-        "seconds": last.seconds,
-    }
-    for space in ("ycbcr", "rgb"):
-        # Above EXACT there is rounding only: no drop. NaN stays.
-        seen = [decibels(m.picture, image, space) for m in followed]
-        row[f"start_{space}"], row[f"end_{space}"] = float(seen[0]), float(seen[-1])
-        row[f"drop_{space}"] = float(np.max(seen) - seen[-1])
-    return row
-
-
-def _condition(a: Image, b: Image, c: Image) -> float:
-    """Return the largest condition number of covariances with the factors a, b, c."""
-    # The determinant of a covariance, the product of its eigenvalues, is 1 / (a c)^2.
-    deviation = max_deviation(*(entries.astype(np.float64) for entries in (a, b, c)))
-    return float(np.square(np.square(deviation) * a * c).max())
-
-
-# ---------------------------------------------------------------------------------------------
-#  Penny-round tiles: Gaussians that show where an image is smooth
-# ---------------------------------------------------------------------------------------------
-
-# Weights of R, G and B in the luma of ITU-R BT.601, where 1 is white.
-LUMA = RGB_TO_YCBCR[0] / RGB_TO_YCBCR[0].sum()
-# Standard deviation in pixels of the blur that takes tiles away: it leaves 0.2 % of a wave of 7
-# pixels, the distance of 5,000 Gaussians on 512x512, and 93 % of one of 64.
-BLUR = 4.0
-# Where an image differs by more from its own blur, in 8-bit levels, it has content that hides
-# tiles, and errors beside edges are none. Rounding to 8 bits stays below.
-DETAIL = 2.0
-
-
-def tiling(picture: Image, image: Image) -> float:
-    """Measure fine errors in the smooth regions of an image, in 8-bit levels.
-
-    With ``r`` the luma of ``picture - image``, G a Gaussian blur of `BLUR` pixels and S the pixels
-    around which nothing differs by `DETAIL` from its blur, it is ``255 sqrt(mean over S of
-    (r - G r)^2)``: linear in the error, blind to slow errors such as a wrong shade, 0 for equal
-    pictures, NaN where nothing is smooth.
-
-    Examples
-    --------
-    >>> image = np.full((32, 32, 3), 0.5)
-    >>> round(tiling(image + 0.01 * (np.indices((32, 32)).sum(0) % 2)[..., None], image), 1)
-    1.3
-    """
-    reach = 2 * round(2 * BLUR) + 1  # the blur carries errors of content as far
-    smooth = maximum_filter(255 * np.abs(_fine(image @ LUMA)), reach, mode="nearest") <= DETAIL
-    if not smooth.any():
-        return float("nan")
-    return 255 * float(np.sqrt(np.mean(np.square(_fine((picture - image) @ LUMA)[smooth]))))
-
-
-def _fine(plane: NDArray[np.floating]) -> NDArray[np.float64]:
-    plane = plane.astype(np.float64)
-    return plane - gaussian_filter(plane, BLUR)
-
-
 # ---------------------------------------------------------------------------------------------
 #  Tables: cases down, presets across, one table a figure
 # ---------------------------------------------------------------------------------------------
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
-    """Lay the matrix out, and list what is wrong with default; see `defects`."""
+    """Lay out two matrices of cases and presets: PSNRs, and seconds."""
     steps = " or ".join(f"{n:,}" for n in sorted({row["job"]["iterations"] for row in rows}))
-    matrix = [
-        _matrix(f"{caption}; {steps} steps", cell, rows, name)
-        for name, (caption, cell) in FIGURES.items()
-    ]
-    found, codes = [(line,) for line in defects(rows)], [code_name(row["run"]) for row in rows]
-    caption = "Cells of default that are not finite, or end below their start or a shorter run"
-    return fr.Section([*matrix, fr.table(caption, ("cell",), found, codes)])
-
-
-def defects(rows: Iterable[Row]) -> list[str]:
-    """Name the cells of default that are not finite, or end too low: one line each.
-
-    Too low is below their start, or below the end of a run that was asked for fewer steps.
-    """
-    found = []
-    for row in (row for row in rows if row["job"]["preset"] == "default" and "needs" not in row):
-        if not row["finite"]:
-            found.append(f"{row['job']['case']}: not finite")
-        elif (lost := row["start_ycbcr"] - row["end_ycbcr"]) > TOLERANCE:
-            found.append(f"{row['job']['case']}: ends {lost:.2f} dB below its start")
-        elif (lost := row.get("shorter_ycbcr", -math.inf) - row["end_ycbcr"]) > TOLERANCE:
-            found.append(f"{row['job']['case']}: ends {lost:.2f} dB below a run of fewer steps")
-    return found
+    ends = f"PSNR in dB, YCbCr, at the end, from the start; {steps} steps"
+    return fr.Section(
+        [_matrix(ends, _ends, rows, "ends"), _matrix("Seconds", _cost, rows, "costs")]
+    )
 
 
 def _matrix(caption: str, cell: Callable[[Row], str], rows: Sequence[Row], name: str) -> fr.Table:
@@ -199,8 +109,7 @@ def _matrix(caption: str, cell: Callable[[Row], str], rows: Sequence[Row], name:
     cells = cells.drop_duplicates(["case", "preset"], keep="last")
     matrix = cells.pivot(index="case", columns="preset", values="cell").fillna(fr.MISSING)
     matrix = matrix.loc[cells.case.unique(), cells.preset.unique()].reset_index()
-    codes = [code_name(row["run"]) for row in rows]
-    return fr.table(caption, matrix, matrix.to_numpy(), codes, name)
+    return fr.Table(caption, matrix, name)
 
 
 def _ends(row: Row) -> str:
@@ -214,24 +123,5 @@ def _decibels(value: float | None) -> str:
     return "exact" if value == MAX_PSNR else fr.number(value)
 
 
-def _ratio(row: Row) -> str:
-    value = row.get("condition")
-    return fr.number(value, 0) if value is None or value < 1e5 else f"{value:.1e}"
-
-
 def _cost(row: Row) -> str:
-    memory = row.get("peak_gib")
-    return fr.number(row.get("seconds"), 1) + (f" ({memory:.1f} GiB)" if memory else "")
-
-
-# Names and captions of the tables, and what writes a cell of each.
-FIGURES: dict[str, tuple[str, Callable[[Row], str]]] = {
-    "ends": ("PSNR in dB, YCbCr, at the end, from the start", _ends),
-    "drops": (
-        "dB from the best moment to the last, YCbCr",
-        lambda row: fr.number(row.get("drop_ycbcr"), 2),
-    ),
-    "conditions": ("Highest condition number of a covariance", _ratio),
-    "tiling": ("Tiling, 8-bit levels", lambda row: fr.number(row.get("tiling"), 2)),
-    "costs": ("Seconds, and the peak of memory", _cost),
-}
+    return fr.number(row.get("seconds"), 1)

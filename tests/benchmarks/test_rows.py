@@ -78,16 +78,19 @@ def test_a_damaged_line_is_named(tmp_path, line):
         rows.read(tmp_path / rows.FILE)
 
 
-def test_a_table_says_when_its_rows_are_of_different_code():
-    said = {
-        "": [RUN, RUN],
-        " [rows of different code: commit aaaaaaaaa; commit bbbbbbbbb]": [RUN, OTHER, RUN],
-        " [rows of code that is in no commit: commit aaaaaaaaa with uncommitted changes]": [DIRTY],
-    }
-    for text, runs in said.items():
-        codes = fr.frame_of([row({}, run) for run in runs]).code
-        assert fr.table("It", ("a",), [("1",)], codes).caption == "It" + text
-    assert rows.code_name({**RUN, "commit": None}) == "version 0.1.0, commit unknown"
+def test_sources_name_every_command_and_its_code():
+    runs = [RUN, OTHER, DIRTY, {**RUN, "commit": None}]
+    lines = fr.sources_of([row({}, run) for run in runs])
+    codes = [
+        "commit aaaaaaaaa",
+        "commit bbbbbbbbb",
+        "commit aaaaaaaaa with uncommitted changes",
+        "version 0.1.0, commit unknown",
+    ]
+    assert lines == [
+        *(f"`eigengs-dr bench tables`, 2026-01-01, {code}" for code in codes),
+        "a CPU, 2 threads, backend llvm; eigengs_dr 0.1.0",
+    ]
 
 
 def git(folder, *arguments):
