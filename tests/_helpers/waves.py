@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from _helpers.sets import random_scene
+from eigengs_dr.fitting.descent import FitProblem, descend
 from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.metrics import psnr
@@ -42,6 +43,15 @@ def start(backend, count=SPLATS, seed=0):
 def default(**changed):
     """The schedule of the default preset, changed."""
     return replace(PRESETS["default"].schedule, **changed)
+
+
+def half_read(backend, count=2):
+    """A descent of which some sets were read; they hold arrays that share NumPy's memory."""
+    gaussians, target = start(backend)
+    sets = descend(FitProblem(gaussians, target), default(redistribute_after=0), 5)
+    for _ in range(count):
+        next(sets)
+    return sets
 
 
 def check_sound(result, image):

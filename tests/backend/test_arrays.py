@@ -1,17 +1,22 @@
-"""Types of arrays."""
+"""Arrays of a backend: their types, uploads, and arithmetic that is as good as NumPy's."""
 
 import drjit as dr
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
-from eigengs_dr.backend.arrays import types_of, upload
+from _helpers.sets import few
+from eigengs_dr.backend.arrays import (
+    TANH_SMALL,
+    make_divisor,
+    rcp,
+    rsqrt,
+    tanh,
+    types_of,
+    upload,
+)
 from eigengs_dr.backend.selection import select
-
-
-def test_types_of(types):
-    for array in (types.Float(1), types.Float3(1), types.FloatX([[1, 2]]), types.Tensor([1.0])):
-        assert types_of(array) == types
-    assert dr.type_v(types.Float) == getattr(dr.VarType, f"Float{types.bits}")
 
 
 def test_types_of_refuses_what_has_no_backend_or_no_derivatives(backend):
@@ -30,3 +35,69 @@ def test_upload_copies(types, count, offset):
     values += 1
     for found in (single, integers):
         np.testing.assert_array_equal(found.numpy(), values - 1)
+
+
+TOLERANCE = {32: 1e-6, 64: 1e-14}
+"""Relative error by precision: Dr.Jit's own functions miss it on cuda in one of the two."""
+
+POSITIVE = np.geomspace(1e-6, 1e6, 2001)
+SIGNED = np.concatenate([-POSITIVE, POSITIVE])
+TO_TANH = np.concatenate([np.geomspace(1e-20, 30, 2001), TANH_SMALL + np.linspace(-0.1, 0.1, 999)])
+
+
+def value_and_slope(types, function, x):
+    """A function at points, rounded to the precision, and its derivative there."""
+    variable = types.Float(x)
+    dr.enable_grad(variable)
+    value = function(variable)
+    dr.backward(dr.sum(value))
+    return value.numpy(), variable.grad.numpy(), variable.numpy().astype(np.float64)
+
+
+@pytest.mark.parametrize(
+    ("function", "points", "value", "slope"),
+    [
+        (rcp, SIGNED, lambda x: 1 / x, lambda x: -(x**-2.0)),
+        (rsqrt, POSITIVE, lambda x: x**-0.5, lambda x: -0.5 * x**-1.5),
+        (tanh, TO_TANH, np.tanh, lambda x: np.cosh(x) ** -2.0),
+        (tanh, -TO_TANH, np.tanh, lambda x: np.cosh(x) ** -2.0),
+    ],
+)
+def test_values_and_derivatives_are_those_of_numpy(types, function, points, value, slope):
+    tolerance = TOLERANCE[types.bits]
+    found, derivative, x = value_and_slope(types, function, points)
+    np.testing.assert_allclose(found, value(x), rtol=tolerance)
+    # exp(-60) of the largest v is good to 60 roundings of its argument.
+    np.testing.assert_allclose(
+        derivative, slope(x), rtol=60 * tolerance if function is tanh else tolerance
+    )
+
+
+def test_tanh_ends_at_one_and_keeps_nan(types):
+    points = np.array([np.inf, -np.inf, 1e30, -1e30, np.nan])
+    value, slope, _ = value_and_slope(types, tanh, points)
+    np.testing.assert_array_equal(value, [1, -1, 1, -1, np.nan])
+    np.testing.assert_array_equal(slope[:-1], 0)
+
+
+def test_arrays_of_several(types):
+    pair = types.Float2([1, 2], [4, 5])
+    for function in (rcp, rsqrt, tanh):
+        found = function(pair)
+        assert type(found) is type(pair)
+        assert dr.all(found.y == function(pair.y))
+
+
+@few
+@example(divisor=1, values=[])
+@example(divisor=64, values=[])
+@example(divisor=2**30 + 1, values=[])
+@example(divisor=2**31 - 1, values=[])
+@given(divisor=st.integers(1, 2**31 - 1), values=st.lists(st.integers(0, 2**31 - 1), max_size=20))
+def test_division_by_an_integer_is_exact(types, divisor, values):
+    """Also next to multiples, and up to the largest values."""
+    near = [k * divisor + d for k in (1, 2, 2**31 // divisor) for d in (-1, 0, 1)]
+    n = np.array([v for v in [0, 2**31 - 1, *near, *values] if 0 <= v < 2**31], np.uint32)
+    quotient, remainder = make_divisor(types, divisor).divmod(types.UInt(n))
+    np.testing.assert_array_equal(quotient.numpy(), n // divisor)
+    np.testing.assert_array_equal(remainder.numpy(), n % divisor)
