@@ -54,12 +54,6 @@ def test_is_a_parameter(before, prefilter):
         np.testing.assert_allclose(np.array(found), np.array(expected), atol=2e-5)
 
 
-def test_has_no_gradient():
-    flags = {key: entry[3] for key, entry in mi.traverse(texture(gaussians())).properties.items()}
-    assert flags["to_uv"] & mi.ParamFlags.NonDifferentiable
-    assert not flags["mean"] & mi.ParamFlags.NonDifferentiable
-
-
 class TestMistakes:
     @pytest.mark.parametrize(
         ("value", "message"),
