@@ -6,13 +6,11 @@ import drjit as dr
 import numpy as np
 import pytest
 
+import eigengs_dr as eg
 from _helpers.sets import COUNT, SIZE
-
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-import eigengs_dr as eg  # noqa: E402
-from _helpers.texture import at, gaussians, in_front, picture, texel_centres, texture  # noqa: E402
-from _helpers.variants import in_all, in_variants, on_both  # noqa: E402
-from eigengs_dr.image.color import to_linear  # noqa: E402
+from _helpers.texture import at, gaussians, in_front, mi, picture, texel_centres, texture
+from _helpers.variants import in_all, in_variants, on_both
+from eigengs_dr.image.color import to_linear
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 

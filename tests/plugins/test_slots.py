@@ -4,15 +4,13 @@ import drjit as dr
 import numpy as np
 import pytest
 
+import eigengs_dr as eg
+from _helpers.errors import refused
 from _helpers.sets import SIZE
-
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-import eigengs_dr as eg  # noqa: E402
-from _helpers.errors import refused  # noqa: E402
-from _helpers.texture import backend, gaussians, small_scene  # noqa: E402
-from _helpers.variants import BOTH_RGB, in_all, in_variants  # noqa: E402
-from eigengs_dr.image.color import to_coded, to_log  # noqa: E402
-from eigengs_dr.plugins import bake_environment, texture_of  # noqa: E402
+from _helpers.texture import backend, gaussians, mi, small_scene
+from _helpers.variants import BOTH_RGB, in_all, in_variants
+from eigengs_dr.image.color import to_coded, to_log
+from eigengs_dr.plugins import bake_environment, texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 

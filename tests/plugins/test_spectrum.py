@@ -1,14 +1,12 @@
 """Upsampling of colours to spectra: bounds, round trip through Mitsuba's curves, derivatives."""
 
+import drjit as dr
 import numpy as np
 import pytest
 
-mi = pytest.importorskip("mitsuba")
-import drjit as dr  # noqa: E402
-
-from _helpers.texture import at, gaussians, texture  # noqa: E402
-from _helpers.variants import on_both  # noqa: E402
-from eigengs_dr.plugins import color as spectrum  # noqa: E402
+from _helpers.texture import at, gaussians, mi, texture
+from _helpers.variants import on_both
+from eigengs_dr.plugins import color as spectrum
 
 pytestmark = [
     pytest.mark.mitsuba,

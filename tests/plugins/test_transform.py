@@ -4,8 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-from _helpers.texture import at, gaussians, in_front, texture  # noqa: E402
+from _helpers.texture import at, gaussians, in_front, mi, texture
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 

@@ -5,17 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
-
-import eigengs_dr as eg  # noqa: E402
-from _helpers.bitmap_scenes import (  # noqa: E402
-    cornell,
-    room,
-    save_images,
-    sky,
-    wall,
-)
-from eigengs_dr.image.io import load_image  # noqa: E402
+import eigengs_dr as eg
+from _helpers.bitmap_scenes import cornell, room, save_images, sky, wall
+from _helpers.poster import mi
+from eigengs_dr.image.io import load_image
 
 pytestmark = pytest.mark.mitsuba
 
