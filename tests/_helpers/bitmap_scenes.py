@@ -72,7 +72,6 @@ def save_images(folder):
     side = 32
     y, x = np.mgrid[:side, :side] / side
     eg.save_image(folder / "photo.png", eg.sample("coffee")[:192:6, :192:6])
-    eg.save_image(folder / "poster.png", eg.sample("coffee")[:384:4, :384:4])
     eg.save_image(folder / "rough.png", 0.3 + 0.4 * np.sin(5 * x) ** 2)
     eg.save_image(folder / "leaf.png", (np.hypot(x - 0.5, y - 0.5) < 0.4).astype(float))
     eg.save_image(folder / "hidden.png", np.stack([x, y, x], axis=2))
@@ -123,83 +122,11 @@ def room(mi, folder):
     }
 
 
-def _camera(mi, place, target):
-    to_world = mi.ScalarTransform4f().look_at(place, target, [0, 0, 1])
-    film = {"type": "hdrfilm", "width": 48, "height": 36, "rfilter": {"type": "box"}}
-    sampler = {"type": "independent", "sample_count": 64}
-    lens = {"type": "perspective", "fov": 45, "to_world": to_world}
-    return {**lens, "film": film, "sampler": sampler}
-
-
-def _bitmap(folder, name, **properties):
-    file = str(folder / f"{name}.png")
-    return {"type": "bitmap", "filename": file, "wrap_mode": "clamp", **properties}
-
-
 def cornell(mi, folder):
     """Mitsuba's own Cornell box with a photo on the wall."""
+    photo = {"type": "bitmap", "filename": str(folder / "photo.png"), "wrap_mode": "clamp"}
     scene = mi.cornell_box()
-    scene["back"]["bsdf"] = {"type": "diffuse", "reflectance": _bitmap(folder, "photo")}
+    scene["back"]["bsdf"] = {"type": "diffuse", "reflectance": photo}
     scene["sensor"] = {**scene["sensor"], "sampler": {"type": "independent", "sample_count": 64}}
     scene["sensor"]["film"].update(width=48, height=48, rfilter={"type": "box"})
     return scene
-
-
-def preview(mi, folder):
-    """A ball of a material with three maps, on a checkerboard under a sky."""
-    at = mi.ScalarTransform4f()
-    data = {"raw": True, "to_uv": at.scale([2, 1, 1]), "wrap_mode": "repeat"}
-    coat = {
-        "type": "principled",
-        "base_color": _bitmap(folder, "photo"),
-        "roughness": _bitmap(folder, "rough", **data),
-    }
-    coat = {"type": "normalmap", "normalmap": _bitmap(folder, "normals", **data), "bsdf": coat}
-    board = {"type": "checkerboard", "to_uv": at.scale([4, 4, 1])}
-    return {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 4},
-        "camera": _camera(mi, [0, -5, 2], [0, 0, 1]),
-        "sky": {"type": "envmap", "filename": str(folder / "photo.png")},
-        "floor": {
-            "type": "rectangle",
-            "to_world": at.scale(3),
-            "bsdf": {"type": "diffuse", "reflectance": board},
-        },
-        "ball": {"type": "sphere", "center": [0, 0, 1], "bsdf": coat},
-    }
-
-
-def indoors(mi, folder):
-    """A room: a sky, a floor, a wall with relief, a leaf that is cut out, and a screen."""
-    at = mi.ScalarTransform4f()
-    upright = at.rotate([1, 0, 0], 90).scale([1, -1, 1])
-    paint = {"type": "diffuse", "reflectance": _bitmap(folder, "poster")}
-    relief = {"type": "bumpmap", "heights": _bitmap(folder, "rough", raw=True), "bsdf": paint}
-    leaf = {"type": "mask", "opacity": _bitmap(folder, "leaf", raw=True)}
-    light = 4 * np.array(mi.Bitmap(str(folder / "photo.png")), np.float32) / 255
-    screen = {"type": "bitmap", "bitmap": mi.Bitmap(light), "wrap_mode": "clamp"}
-    glossy = {"type": "roughplastic", "diffuse_reflectance": _bitmap(folder, "poster")}
-    return {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 4},
-        "camera": _camera(mi, [0, -5, 1.6], [0, 0, 1.2]),
-        "other": _camera(mi, [2, -4, 2], [0, 0, 1]),
-        "sky": {"type": "envmap", "filename": str(folder / "photo.png")},
-        "floor": {"type": "rectangle", "to_world": at.scale(3), "bsdf": glossy},
-        "wall": {
-            "type": "rectangle",
-            "to_world": at.translate([0, 2, 1.6]) @ upright.scale(2),
-            "bsdf": {"type": "twosided", "bsdf": relief},
-        },
-        "plant": {
-            "type": "rectangle",
-            "to_world": at.translate([-1, 0, 1]) @ upright.scale(0.8),
-            "bsdf": {**leaf, "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}},
-        },
-        "screen": {
-            "type": "rectangle",
-            "to_world": at.translate([1, 1.9, 1.6]) @ upright.scale(0.6),
-            "emitter": {"type": "area", "radiance": screen},
-        },
-    }

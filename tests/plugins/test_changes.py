@@ -4,12 +4,10 @@ import drjit as dr
 import numpy as np
 import pytest
 
+import eigengs_dr as eg
 from _helpers.sets import SIZE
-
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-import eigengs_dr as eg  # noqa: E402
-from _helpers.texture import backend, gaussians, small_scene, texel_centres, texture  # noqa: E402
-from eigengs_dr.plugins import texture_of  # noqa: E402
+from _helpers.texture import backend, gaussians, mi, small_scene, texel_centres, texture
+from eigengs_dr.plugins import texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 

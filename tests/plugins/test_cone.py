@@ -6,12 +6,11 @@ import drjit as dr
 import numpy as np
 import pytest
 
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-from _helpers.poster import camera  # noqa: E402
-from _helpers.texture import at, gaussians, in_front, texture  # noqa: E402
-from eigengs_dr.plugins import pixel_angle, texture_of  # noqa: E402
-from eigengs_dr.plugins.cone import PIXEL, metric  # noqa: E402
-from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, bound_covariance  # noqa: E402
+from _helpers.poster import camera
+from _helpers.texture import at, gaussians, in_front, mi, texture
+from eigengs_dr.plugins import pixel_angle, texture_of
+from eigengs_dr.plugins.cone import PIXEL, metric
+from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, bound_covariance
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 

@@ -5,9 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-from _helpers.texture import at, gaussians, in_front, texture  # noqa: E402
-from eigengs_dr.plugins import properties  # noqa: E402
+from _helpers.texture import at, gaussians, in_front, mi, texture
+from eigengs_dr.plugins import properties
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 

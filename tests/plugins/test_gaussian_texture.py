@@ -6,13 +6,11 @@ import drjit as dr
 import numpy as np
 import pytest
 
+import eigengs_dr as eg
 from _helpers.sets import COUNT, SIZE
-
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-import eigengs_dr as eg  # noqa: E402
-from _helpers.texture import at, gaussians, in_front, picture, texel_centres, texture  # noqa: E402
-from _helpers.variants import in_all, in_variants, on_both  # noqa: E402
-from eigengs_dr.image.color import to_linear  # noqa: E402
+from _helpers.texture import at, gaussians, in_front, mi, picture, texel_centres, texture
+from _helpers.variants import in_all, in_variants, on_both
+from eigengs_dr.image.color import to_linear
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -29,15 +27,12 @@ def test_first_so_many_of_a_file(tmp_path):
 
 class TestValues:
     @pytest.mark.parametrize("space", ["ycbcr", "rgb", "linear", "data"])
-    def test_raw_is_what_render_gives(self, space):
+    def test_are_what_render_gives_clamped_and_decoded_unless_raw(self, space):
         g = gaussians(space, quiet=False)
-        found = picture(texture(g, raw=True).eval_3(texel_centres()))
-        np.testing.assert_allclose(found, eg.render(g).numpy(), atol=1e-5)
-
-    @pytest.mark.parametrize("space", ["ycbcr", "rgb", "linear", "data"])
-    def test_colours_are_clamped_and_decoded(self, space):
-        g = gaussians(space, quiet=False)
-        shown = np.clip(eg.render(g).numpy(), 0, 1)
+        rendered = eg.render(g).numpy()
+        raw = picture(texture(g, raw=True).eval_3(texel_centres()))
+        np.testing.assert_allclose(raw, rendered, atol=1e-5)
+        shown = np.clip(rendered, 0, 1)
         expected = to_linear(shown) if space in ("ycbcr", "rgb") else shown
         found = picture(texture(g).eval(texel_centres()))
         np.testing.assert_allclose(found, expected, atol=1e-5)
@@ -93,32 +88,21 @@ class TestValues:
 
 
 class TestWhere:
-    @pytest.mark.parametrize(
-        ("wrap", "inside"),
-        [
-            ("repeat", [0.8, 0.25]),
-            ("mirror", [0.2, 0.75]),
-            ("clamp", [0.5 / SIZE[0], 1 - 0.5 / SIZE[1]]),
-        ],
-    )
-    def test_outside_of_the_image(self, wrap, inside):
-        tex = texture(gaussians(), wrap_mode=wrap)
-        found = np.array(tex.eval(at(mi.Float(-0.2), mi.Float(1.25))))
-        expected = np.array(tex.eval(at(mi.Float(inside[0]), mi.Float(inside[1]))))
-        np.testing.assert_allclose(found, expected, atol=1e-5)
-
-    def test_a_clamped_texture_repeats_the_centres_of_pixels_as_a_bitmap(self):
-        """Further out than the centres of the outermost pixels, Gaussians fall off."""
+    @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
+    @pytest.mark.parametrize("prefilter", [0.0, 1e-6])
+    def test_outside_of_the_image_it_is_as_a_bitmap(self, wrap, prefilter):
+        """Clamped, also further out than the centres of pixels, where Gaussians fall off."""
         g = gaussians("data")
+        properties = {"raw": True, "wrap_mode": wrap}
         data = mi.TensorXf(eg.render(g).numpy())
-        bitmap = {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"}
-        u, v = np.meshgrid([-0.3, 0.1 / SIZE[0], 1.7], (np.arange(SIZE[1]) + 0.5) / SIZE[1])
-        si = at(*(mi.Float(np.float32(k.ravel())) for k in (u, v)))
+        bitmap = {"type": "bitmap", "data": data, "filter_type": "nearest", **properties}
+        u, v = (np.arange(-side, 3 * side) + 0.5 for side in SIZE)
+        u = np.append(u, [-0.3, 0.1] if wrap == "clamp" else [])
+        u, v = np.meshgrid(u / SIZE[0], v / SIZE[1])
+        si = in_front(at(*(mi.Float(np.float32(k.ravel())) for k in (u, v))))
         expected = np.array(mi.load_dict(bitmap).eval(si))
-        for prefilter in (0.0, 1e-6):
-            tex = texture(g, wrap_mode="clamp", prefilter=prefilter)
-            found = np.array(tex.eval(in_front(si)))
-            np.testing.assert_allclose(found, expected, atol=1e-3)
+        found = np.array(texture(g, wrap_mode=wrap, prefilter=prefilter).eval(si))
+        np.testing.assert_allclose(found, expected, atol=1e-3)
 
     @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
     @pytest.mark.parametrize("prefilter", [0.0, 0.001])

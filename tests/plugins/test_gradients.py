@@ -4,24 +4,23 @@ import drjit as dr
 import numpy as np
 import pytest
 
+import eigengs_dr as eg
 from _helpers.families import small_model
 from _helpers.process import run_python
 from _helpers.sets import SIZE, random_scene
-
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-import eigengs_dr as eg  # noqa: E402
-from _helpers.texture import (  # noqa: E402
+from _helpers.texture import (
     at,
     backend,
     gaussians,
     in_front,
+    mi,
     picture,
     small_scene,
     texel_centres,
     texture,
 )
-from eigengs_dr.gaussian.gaussians import MIN_DEVIATION  # noqa: E402
-from eigengs_dr.plugins import keep_in_bounds, texture_of  # noqa: E402
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
+from eigengs_dr.plugins import keep_in_bounds, texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 

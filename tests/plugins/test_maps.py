@@ -8,23 +8,22 @@ import drjit as dr
 import numpy as np
 import pytest
 
+import eigengs_dr as eg
 from _helpers.materials import MAPS, material
 from _helpers.sets import SIZE
-
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-import eigengs_dr as eg  # noqa: E402
-from _helpers.texture import (  # noqa: E402
+from _helpers.texture import (
     at,
     backend,
     gaussians,
+    mi,
     picture,
     small_scene,
     texel_centres,
     texture,
 )
-from eigengs_dr.plugins import gaussian_texture, texture_of  # noqa: E402
-from eigengs_dr.plugins import lookup as reuse  # noqa: E402
-from eigengs_dr.plugins import parameters as files  # noqa: E402
+from eigengs_dr.plugins import gaussian_texture, texture_of
+from eigengs_dr.plugins import lookup as reuse
+from eigengs_dr.plugins import parameters as files
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 

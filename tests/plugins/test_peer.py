@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from _helpers.sets import COUNT, SIZE
-
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-from _helpers.texture import at, gaussians, small_scene, texture  # noqa: E402
-from _helpers.variants import in_all, in_variants, on_both  # noqa: E402
-from eigengs_dr.plugins import texture_of  # noqa: E402
+from _helpers.texture import at, gaussians, mi, small_scene, texture
+from _helpers.variants import in_all, in_variants, on_both
+from eigengs_dr.plugins import texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 

@@ -9,10 +9,8 @@ import pytest
 
 from _helpers.families import small_model
 from _helpers.materials import material
-
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-from _helpers.texture import backend, gaussians, texel_centres  # noqa: E402
-from eigengs_dr.plugins import texture_of  # noqa: E402
+from _helpers.texture import backend, gaussians, mi, texel_centres
+from eigengs_dr.plugins import texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 

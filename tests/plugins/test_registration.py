@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
+import eigengs_dr as eg
 from _helpers.process import run_python
-
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-import eigengs_dr as eg  # noqa: E402
-from _helpers.texture import gaussians, texture  # noqa: E402
+from _helpers.texture import gaussians, mi, texture
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 

@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 
+import eigengs_dr as eg
 from _helpers.sets import SIZE
-
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-import eigengs_dr as eg  # noqa: E402
-from _helpers.texture import at, backend, gaussians, texel_centres, texture  # noqa: E402
-from _helpers.variants import in_variants, on_both  # noqa: E402
-from eigengs_dr.gaussian.gaussians import Gaussians  # noqa: E402
-from eigengs_dr.image.color import to_linear  # noqa: E402
+from _helpers.texture import at, backend, gaussians, mi, texel_centres, texture
+from _helpers.variants import in_variants, on_both
+from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.image.color import to_linear
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 

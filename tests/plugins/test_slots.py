@@ -4,15 +4,13 @@ import drjit as dr
 import numpy as np
 import pytest
 
+import eigengs_dr as eg
+from _helpers.errors import refused
 from _helpers.sets import SIZE
-
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-import eigengs_dr as eg  # noqa: E402
-from _helpers.errors import refused  # noqa: E402
-from _helpers.texture import backend, gaussians, small_scene  # noqa: E402
-from _helpers.variants import BOTH_RGB, in_all, in_variants  # noqa: E402
-from eigengs_dr.image.color import to_coded, to_log  # noqa: E402
-from eigengs_dr.plugins import bake_environment, texture_of  # noqa: E402
+from _helpers.texture import backend, gaussians, mi, small_scene
+from _helpers.variants import BOTH_RGB, in_all, in_variants
+from eigengs_dr.image.color import to_coded, to_log
+from eigengs_dr.plugins import bake_environment, texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -20,33 +18,19 @@ others = [
     pytest.param(name, marks=pytest.mark.slow) for name in ("llvm_ad_mono", "llvm_ad_spectral")
 ]
 
-SLOTS = ["diffuse", "principled", "roughconductor", "roughdielectric", "plastic", "roughplastic"]
-SLOTS += ["blend", "mask", "normalmap", "bumpmap", "light"]
+SLOTS = ["principled", "roughplastic", "mask", "normalmap", "bumpmap", "light"]
+"""Places of a colour, a number, an average, a cut-out, a vector, slopes and a sampled light."""
 
 
 def slots(g):
-    """BSDFs with a texture in every kind of place that Mitsuba has for one, by name."""
+    """BSDFs with a texture in each kind of place that asks for something else, by name."""
     colour, number = texture_of(g), texture_of(gaussians("data", channels=1))
-    diffuse = {"type": "diffuse"}
+    normal, diffuse = texture_of(gaussians("data")), {"type": "diffuse"}
     return {
-        "diffuse": {"type": "diffuse", "reflectance": colour},
         "principled": {"type": "principled", "base_color": colour, "roughness": number},
-        "roughconductor": {"type": "roughconductor", "alpha": number},
-        "roughdielectric": {"type": "roughdielectric", "alpha": number},
-        "plastic": {"type": "plastic", "diffuse_reflectance": colour},
         "roughplastic": {"type": "roughplastic", "diffuse_reflectance": colour},
-        "blend": {
-            "type": "blendbsdf",
-            "weight": number,
-            "a": diffuse,
-            "b": {"type": "diffuse", "reflectance": 0.1},
-        },
         "mask": {"type": "mask", "opacity": number, "inner": diffuse},
-        "normalmap": {
-            "type": "normalmap",
-            "normalmap": texture_of(gaussians("data")),
-            "inner": diffuse,
-        },
+        "normalmap": {"type": "normalmap", "normalmap": normal, "inner": diffuse},
         "bumpmap": {"type": "bumpmap", "bump": number, "scale": 3.0, "inner": diffuse},
     }
 

@@ -1,17 +1,12 @@
 """Upsampling of colours to spectra: bounds, round trip through Mitsuba's curves, derivatives."""
 
-import subprocess
-import sys
-
+import drjit as dr
 import numpy as np
 import pytest
 
-mi = pytest.importorskip("mitsuba")
-import drjit as dr  # noqa: E402
-
-from _helpers.texture import at, gaussians, texture  # noqa: E402
-from _helpers.variants import on_both  # noqa: E402
-from eigengs_dr.plugins import color as spectrum  # noqa: E402
+from _helpers.texture import at, gaussians, mi, texture
+from _helpers.variants import on_both
+from eigengs_dr.plugins import color as spectrum
 
 pytestmark = [
     pytest.mark.mitsuba,
@@ -82,11 +77,6 @@ def test_greys_are_exact():
     assert np.all(spectra == grey[:, None])
 
 
-def test_samples_are_those_of_the_basis():
-    wavelengths, spectra = spectrum.basis()
-    np.testing.assert_allclose(evaluate(np.eye(3), wavelengths), spectra, rtol=0, atol=1e-6)
-
-
 def test_wavelengths_that_are_none():
     odd = np.array([np.nan, 0, -1, 359.9, 830.1, 1e9, np.inf, -np.inf])
     assert np.all(evaluate(np.full((3, 1), 0.5), odd) == 0)
@@ -117,8 +107,3 @@ def test_derivatives_in_both_modes_are_the_basis():
     value.grad = mi.Spectrum(*weight)
     dr.backward_to(rgb)
     np.testing.assert_allclose(np.array(rgb.grad)[:, 0], basis @ weight, rtol=0, atol=1e-5)
-
-
-def test_import_needs_no_variant():
-    code = "import eigengs_dr.plugins.color as s; s.basis()"
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -4,8 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-from _helpers.texture import at, gaussians, in_front, texture  # noqa: E402
+from _helpers.texture import at, gaussians, in_front, mi, texture
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -52,12 +51,6 @@ def test_is_a_parameter(before, prefilter):
         (changed.pdf_position(si.uv), turned.pdf_position(si.uv)),
     ):
         np.testing.assert_allclose(np.array(found), np.array(expected), atol=2e-5)
-
-
-def test_has_no_gradient():
-    flags = {key: entry[3] for key, entry in mi.traverse(texture(gaussians())).properties.items()}
-    assert flags["to_uv"] & mi.ParamFlags.NonDifferentiable
-    assert not flags["mean"] & mi.ParamFlags.NonDifferentiable
 
 
 class TestMistakes:

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from _helpers.process import run_python
-
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-from _helpers.texture import gaussians, small_scene  # noqa: E402
-from eigengs_dr.plugins import gaussian_texture, texture_of, versions  # noqa: E402
+from _helpers.texture import gaussians, mi, small_scene
+from eigengs_dr.plugins import gaussian_texture, texture_of, versions
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 

@@ -5,19 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
-
-import eigengs_dr as eg  # noqa: E402
-from _helpers.bitmap_scenes import (  # noqa: E402
-    cornell,
-    indoors,
-    preview,
-    room,
-    save_images,
-    sky,
-    wall,
-)
-from eigengs_dr.image.io import load_image  # noqa: E402
+import eigengs_dr as eg
+from _helpers.bitmap_scenes import cornell, room, save_images, sky, wall
+from _helpers.poster import mi
+from eigengs_dr.image.io import load_image
 
 pytestmark = pytest.mark.mitsuba
 
@@ -72,17 +63,6 @@ def test_what_stays_and_why(folder, tmp_path):
     assert str(folder) not in found.scene.read_text()  # other files are named relative to it
 
 
-def test_a_bump_map_stays(folder, tmp_path):
-    """Cameras see its slopes: Gaussians of 40 dB in heights left 26 dB between the renderings."""
-    scene = wall(folder)
-    text = scene.read_text().replace("normalmap", "bumpmap")
-    bumpy = scene.with_name("bumpy.xml")
-    bumpy.write_text(text)
-    found = eg.convert_scene(bumpy, tmp_path / "new", **QUICK)
-    assert "slopes" in dict(found.left)["normals.png (bumpmap.bumpmap)"]
-    assert {t.file for t in found.textures} == {"photo.npz", "rough.npz"}
-
-
 def test_renderings_that_miss_the_goal_are_named(folder, tmp_path):
     """The goal is that of textures in even light; a strong lamp amplifies errors in the dark."""
     eg.save_image(folder / "night.png", 0.15 * eg.sample("coffee")[:192:6, :192:6])
@@ -95,7 +75,8 @@ def test_renderings_that_miss_the_goal_are_named(folder, tmp_path):
     assert min(found.psnr) < 30
 
 
-def test_a_dictionary_with_a_mesh(folder, tmp_path):
+def test_a_dictionary_with_a_mesh_and_a_bump_map_that_stays(folder, tmp_path):
+    """Cameras see its slopes: Gaussians of 40 dB in heights left 26 dB between the renderings."""
     found = eg.convert_scene(room(mi, folder), tmp_path / "new", spp=2, **QUICK)
     assert {t.file for t in found.textures} == {"photo.npz"}
     assert any("slopes" in reason for _, reason in found.left)
@@ -129,20 +110,10 @@ def test_mistakes(folder, tmp_path):
         assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize(
-    ("scene", "converted", "words"),
-    [
-        (cornell, 1, []),
-        (preview, 3, ["environment map"]),
-        (indoors, 2, ["two values", "environment map", "slopes"]),
-    ],
-)
-def test_scenes_like_those_of_others(folder, tmp_path, scene, converted, words):
-    found = eg.convert_scene(scene(mi, folder), tmp_path / "new", target_psnr=30, iterations=20)
-    assert len(found.textures) == converted and min(found.psnr) >= 30
-    assert len(found.left) == len(words)
-    for word, (_, reason) in zip(words, sorted(found.left, key=lambda x: x[1]), strict=True):
-        assert word in reason
+def test_the_cornell_box(folder, tmp_path):
+    found = eg.convert_scene(cornell(mi, folder), tmp_path / "new", **QUICK)
+    assert len(found.textures) == 1 and min(found.psnr) >= 30
+    assert found.left == []
 
 
 def plain(mi, folder, texture, **others):

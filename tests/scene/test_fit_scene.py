@@ -7,8 +7,6 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter, laplace
 from scipy.sparse import csr_array
 
-pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
-
 import eigengs_dr as eg
 from _helpers.poster import NAME, albedo, bitmap, blocks, board, camera, photo, scene_of
 from _helpers.sets import few

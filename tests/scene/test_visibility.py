@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
-from _helpers.sets import random_scene
-
-mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
-from _helpers.poster import (  # noqa: E402
+from _helpers.poster import (
     NAME,
     SIDE,
     TEXELS,
@@ -15,13 +12,15 @@ from _helpers.poster import (  # noqa: E402
     bitmap,
     board,
     camera,
+    mi,
     picture,
     pixel_at,
     scene_of,
 )
-from eigengs_dr.plugins import texture_of  # noqa: E402
-from eigengs_dr.plugins.cone import PIXEL  # noqa: E402
-from eigengs_dr.scene.visibility import visibility  # noqa: E402
+from _helpers.sets import random_scene
+from eigengs_dr.plugins import texture_of
+from eigengs_dr.plugins.cone import PIXEL
+from eigengs_dr.scene.visibility import visibility
 
 pytestmark = pytest.mark.mitsuba
 

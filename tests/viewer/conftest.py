@@ -105,10 +105,6 @@ class Tab:
         x, y, w, h = map(int, (left, top, width, height))
         return self.pixels()[y : y + h, x : x + w]
 
-    def screenshot(self):
-        """What the screen shows, shape (H, W, 3)."""
-        return np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB"), float)
-
 
 @pytest.fixture(scope="package")
 def window():

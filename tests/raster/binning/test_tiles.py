@@ -1,16 +1,13 @@
 """Lists of splats: complete and tight, against a test of every splat with every tile."""
 
-import drjit as dr
 import numpy as np
 import pytest
 from hypothesis import given
 
 from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, random_scene, scenes
 from _helpers.tile_lists import GRID, RADIUS, upload
-from eigengs_dr.backend.arrays import types_in
-from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.binning.lists import build_lists
-from eigengs_dr.raster.binning.tiles import TILE, Grid, for_each_tile
+from eigengs_dr.raster.binning.tiles import TILE, Grid
 
 EDGE = 1e-3
 """Relative distance to the cutoff within which rounding may decide."""
@@ -135,35 +132,6 @@ def test_grids(backend, size, tile):
     assert grid.pixels == tile[0] * tile[1]
     scene = random_scene(2)
     check_lists(backend, scene.mean * np.array(size) / SIZE, scene.factor, grid)
-
-
-@few
-@given(scene=scenes())
-def test_padded_lists_last_while_splats_move(backend, scene):
-    padded = membership(lists_of(backend, scene.mean, scene.factor, pad=1.5))
-    for angle in range(4):
-        moved = scene.mean + 1.45 * np.array([np.cos(angle), np.sin(angle)])
-        touched = touched_by_pixels(distances(moved, scene.factor, SIZE), GRID)
-        assert not (touched & ~padded).any()
-
-
-def test_the_walk_visits_the_lists(backend):
-    """The adjoint walks instead of reading lists: both must see the same tiles."""
-    scene = random_scene(6)
-    shape = upload(backend, scene.mean, scene.factor)
-    types = types_in(select(backend))
-    visits = dr.zeros(types.UInt, COUNT * GRID.tiles)
-    owner = dr.arange(types.UInt, COUNT)
-
-    def visit(tile, column, row, active, state):
-        dr.scatter_add(visits, types.UInt(1), owner * GRID.tiles + types.UInt(tile), active)
-        return state + dr.select(active, types.UInt(column + row * GRID.nx) - types.UInt(tile), 0)
-
-    wrong = for_each_tile(shape, RADIUS, GRID, visit, dr.zeros(types.UInt, COUNT), label="test")
-    dr.eval(wrong, visits)
-    assert not wrong.numpy().any()
-    expected = membership(lists_of(backend, scene.mean, scene.factor)).reshape(-1)
-    np.testing.assert_array_equal(visits.numpy(), expected)
 
 
 @pytest.mark.slow
