@@ -315,21 +315,9 @@ def test_a_failed_write_leaves_everything_as_it_was(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_unwritable_targets(tmp_path):
-    (tmp_path / "folder.png").mkdir()
-    (tmp_path / "file").write_bytes(b"")
-    for target in ("folder.png", "nowhere/a.png", "file/a.png"):
-        with pytest.raises(ImageError, match=r"cannot be written|is a folder") as error:
-            save_image(tmp_path / target, BYTES)
-        assert one_line(error).count("choose another path") == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
-
-
 def test_bad_pixels_touch_no_file(tmp_path):
     for image, words in (
         (np.full((2, 2), np.nan), "not finite"),
-        (np.zeros((2, 2, 5)), "shape"),
-        (np.zeros((0, 0, 3)), "no pixels"),
         (np.linspace(0, 255, 12).reshape(2, 2, 3), "divide by 255"),
     ):
         with pytest.raises(ImageError, match=words):
