@@ -12,17 +12,6 @@ from eigengs_dr.eigenbasis.options import TrainOptions
 from eigengs_dr.eigenbasis.training import train
 from eigengs_dr.image.io import ImageError
 
-FIGURES = {
-    "seconds",
-    "pca_seconds",
-    "shape_seconds",
-    "weight_seconds",
-    "components",
-    "gaussians",
-}
-
-MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
-
 
 def test_end_to_end(folder, output):
     stages = []
@@ -30,7 +19,6 @@ def test_end_to_end(folder, output):
         folder, output, settings(), progress=lambda stage, *counts: stages.append((stage, *counts))
     )
     figures = trained.figures
-    assert {*FIGURES, *MEASURED} <= set(figures)
     assert (figures["images"], figures["components"], figures["gaussians"]) == (22, [6] * 3, 60)
     # Components that are as smooth as these are rendered well by 60 splats.
     assert figures["psnr_init"] == pytest.approx(figures["psnr_pca"], abs=0.5)
@@ -98,13 +86,6 @@ def test_nothing_but_unreadable_images(folder, output):
     with pytest.raises(ImageError, match="none of 22 images"):
         train(folder, output, settings())
     assert list(output.parent.iterdir()) == [folder]
-
-
-def test_too_few_images_to_hold_one_out(tmp_path, output):
-    folder = random_fields(tmp_path / "few", 9)
-    figures = train(folder, output, settings()).figures
-    assert figures["images"] == 9
-    assert not {*MEASURED} & set(figures)
 
 
 def test_images_of_other_sizes(folder, output):

@@ -14,10 +14,9 @@ def test_concatenation(backend):
     """Splats one after the other, backgrounds added."""
     parts = [random_scene(seed, count) for seed, count in ((0, COUNT), (1, 3), (2, 1))]
     sets = [p.on(backend) for p in parts]
-    sets[1].factor = select(backend).Array3f(
-        *parts[1].factor[0].tolist()
-    )  # values that all splats share
-    parts[1].factor[:] = parts[1].factor[0]
+    shared = [0.5, 0.25, 0.75]  # by all splats of a set
+    sets[1].factor = select(backend).Array3f(shared)
+    parts[1].factor[:] = shared
     joined = concatenate(sets)
     expected = {name: np.concatenate([getattr(p, name) for p in parts]) for name in NAMES[:3]}
     background = 3 * parts[0].background.astype(np.float32)
