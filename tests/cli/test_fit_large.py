@@ -58,7 +58,6 @@ def test_large_fit_says_its_memory(tmp_path):
 @pytest.mark.parametrize(
     ("grey", "options", "expected"),
     [
-        (False, [], (3, "5,000")),
         (False, ["--gaussians", 70], (3, "70")),
         (False, ["--target-psnr", 30], (3, "500,000")),
         (True, [], (3, "5,000")),

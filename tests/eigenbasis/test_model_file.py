@@ -11,7 +11,7 @@ from _helpers.sets import check_equal
 from eigengs_dr.eigenbasis import model_file as modelfile
 from eigengs_dr.storage import npz as archive
 
-NUMBERS = [key for key, field in modelfile.LAYOUT.items() if field.kind != "U"]
+FLOATS = [key for key, field in modelfile.LAYOUT.items() if field.kind[0] == "f"]
 
 
 @pytest.fixture(scope="module")
@@ -103,22 +103,20 @@ def test_files_of_version_1_are_read(model, members, path):
 # --- What is refused ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("key", NUMBERS)
-def test_arrays_of_another_type_or_dimension(members, path, key):
-    for array in (members[key].astype(np.int32), members[key][None]):
-        write(path, {**members, key: array})
-        check_refused(path, f"key '{key}' is ")
-    for value in (np.nan, np.inf):
-        if members[key].dtype.kind == "f":
-            array = members[key].copy()
-            array.flat[-1] = value
-            write(path, {**members, key: array})
-            check_refused(path, f"{key} holds values that are not finite")
+@pytest.mark.parametrize("key", FLOATS)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_not_finite(members, path, key, value):
+    array = members[key].copy()
+    array.flat[-1] = value
+    write(path, {**members, key: array})
+    check_refused(path, f"{key} holds values that are not finite")
 
 
 @pytest.mark.parametrize(
     ("key", "change", "words"),
     [
+        ("weights1", lambda a: a[None], "key 'weights1' is "),
+        ("weights1", lambda a: a.astype(int), "key 'weights1' is "),
         ("weights1", lambda a: a[:, :-1], "weights1 has shape"),
         ("weights1", lambda a: a[:, :0], "weights1 has shape"),
         ("scale2", lambda a: a[:-1], "scale2 has shape"),
