@@ -205,9 +205,7 @@ def test_check_image_keeps_rows_columns_and_channels():
         (np.zeros((0, 4, 3)), "no pixels"),
         (np.zeros((4, 0)), "no pixels"),
         (np.zeros((4, 4), np.int64), "pixels are int64"),
-        (np.zeros((4, 4), complex), "pixels are complex128"),
         (np.full((4, 4), None), "pixels are object"),
-        (np.full((4, 4), "a"), "pixels are <U1"),
         ([[1, 2], [3]], "not an array"),
         (
             np.full((2, 2), 255.0),
