@@ -1,7 +1,8 @@
-"""Pages of the manual: their Python runs in order, and what they claim of derivatives holds."""
+"""README and manual: their Python runs, their commands have the options they name, claims hold."""
 
 import re
 import runpy
+import shlex
 import warnings
 from pathlib import Path
 
@@ -10,26 +11,32 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.families import small_model
+from eigengs_dr.cli.main import main
+from eigengs_dr.fitting.options import PRESETS, Preset
+from eigengs_dr.fitting.schedule import Schedule
 
-FOLDER = Path(__file__).parent.parent / "docs"
-BLOCK = re.compile(r"^```python\n(.*?)^```", re.M | re.S)
+ROOT = Path(__file__).parent.parent
+FOLDER = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(FOLDER.glob("*.md")), *sorted(FOLDER.glob("*/*.md"))]
+BLOCK = re.compile(r"^ *```python\n(.*?)^ *```", re.M | re.S)
 
 
-def run_page(name, gaussians=None):
-    """Run the blocks of a page as one program, perhaps with fewer Gaussians; its variables."""
-    text = (FOLDER / name).read_text()
-    if gaussians:
-        text = re.sub(r"gaussians=\d+", f"gaussians={gaussians}", text)
-    space = {"__name__": "page"}
+def run_blocks(page, space, shrink=str):
+    """Run the blocks of a page as one program, perhaps made smaller; returns its variables."""
+    text = page.read_text()
     for found in BLOCK.finditer(text):
         line = text.count("\n", 0, found.start(1))
-        exec(compile("\n" * line + found[1], str(FOLDER / name), "exec"), space)
+        exec(compile("\n" * line + shrink(found[1]), str(page), "exec"), space)
     return space
+
+
+# --- Pages that are programs ---
 
 
 @pytest.fixture(scope="module")
 def own_loop():
-    return run_page("how-to/own-loop.md")
+    return run_blocks(FOLDER / "how-to/own-loop.md", {"__name__": "page"})
 
 
 def numbers(tensor):
@@ -94,14 +101,135 @@ def test_getting_started_runs_without_a_warning(tmp_path, monkeypatch):
     eg.save_image("photo.jpg", eg.sample("coffee")[100:164, 200:264])
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
-        run_page("getting-started.md", gaussians="300")
+        run_blocks(
+            FOLDER / "getting-started.md",
+            {"__name__": "page"},
+            lambda code: re.sub(r"gaussians=\d+", "gaussians=300", code),
+        )
     assert eg.load_image("large.png").shape == (2048, 2048, 3)
+
+
+# --- Other pages, on tiny images ---
+
+
+TEXTURE = re.compile(r'<texture name="\w+" (type="gaussian_texture">.*?</texture>)', re.S)
+COMMAND = re.compile(r"^ *((?:.*&& )?eigengs-dr [^\n#]*)", re.M)
+NUMBER = re.compile(r"\b\d[\d_]{3,}\b")
+
+ROOM = """<scene version="3.0.0">
+  <integrator type="direct"/>
+  <emitter type="constant"/>
+  <sensor type="perspective">
+    <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm">
+      <integer name="width" value="24"/><integer name="height" value="24"/></film>
+    <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
+  </sensor>
+  <shape type="rectangle" id="poster"><bsdf type="diffuse">
+    <texture name="reflectance" type="bitmap"><string name="filename" value="photo.jpg"/></texture>
+  </bsdf></shape>
+</scene>"""
+
+RUN_AS_A_WHOLE = ("how-to/own-loop.md", "getting-started.md")  # above
+
+
+def is_mitsuba(page):
+    return "mi." in page.read_text() or bool(TEXTURE.search(page.read_text()))
+
+
+def cases():
+    for page in PAGES:
+        name = str(page.relative_to(FOLDER if "docs" in page.parts else ROOT))
+        if BLOCK.search(page.read_text()) and name not in RUN_AS_A_WHOLE:
+            marks = [pytest.mark.mitsuba] if is_mitsuba(page) else []
+            yield pytest.param(page, id=name, marks=marks)
+
+
+def fit_one(file):
+    return file
+
+
+@pytest.fixture
+def space(tmp_path, monkeypatch):
+    """A folder with the files that pages name, and the variables that they use."""
+    monkeypatch.chdir(tmp_path)
+    image = eg.sample("coffee")[100:124, 200:224]
+    images = [np.roll(image, 5 * k, axis=1) for k in range(5)]
+    for folder in ("photos", "states"):
+        (tmp_path / folder).mkdir()
+    for k, other in enumerate(images):
+        eg.save_image(f"photos/{k}.png", other)
+    for name in ("photo.jpg", "wood.jpg", "huge.tif"):
+        eg.save_image(name, np.tile(image, (3, 3, 1)) if name == "huge.tif" else image)
+    eg.save_image("roughness.png", image[..., :1])
+    eg.save_image("sky.exr", 20 * image, encoding="linear")
+    result = eg.fit(image, 50, iterations=2)
+    light = eg.fit(image, 50, iterations=2, space="linear").gaussians
+    for name in ("wood", "lamp", "sky", "photo"):
+        light.save(f"{name}.npz")
+    model = small_model("llvm")
+    model.save("cats.npz")
+    (tmp_path / "room.xml").write_text(ROOM)
+    n = np.full((24, 24, 3), (0.5, 0.5, 1.0))
+    space = {
+        "__name__": "__main__",
+        "eg": eg,
+        "np": np,
+        "image": image,
+        "images": images,
+        "array": np.tile(image, (3, 3, 1)),
+    }
+    space |= {"a": image, "r": image[..., :1], "n": n, "model": model, "result": result}
+    space |= {"gaussians": result.gaussians, "files": ["a", "b"], "fit_one": fit_one}
+    return space | {"PRESETS": dict(PRESETS), "Preset": Preset, "Schedule": Schedule}
+
+
+def small(code):
+    """Shrink numbers of Gaussians, pixels and workers to what a tiny image takes, without a GPU."""
+    code = code.replace("n_workers=4", "n_workers=1").replace(".Pool(4)", ".Pool(1)")
+    code = code.replace('"cuda"', '"llvm"')
+    return NUMBER.sub(lambda found: str(min(200, int(found[0].replace("_", "")) // 50)), code)
+
+
+@pytest.mark.parametrize("page", list(cases()))
+def test_python_of_a_page_runs(page, space):
+    if is_mitsuba(page):
+        mi = pytest.importorskip("mitsuba")
+        mi.set_variant("llvm_ad_rgb")
+        eg.register_plugins()
+        from eigengs_dr.plugins import texture_of
+
+        space |= {"mi": mi, "texture_of": texture_of}
+    run_blocks(page, space, small)
+    for texture in TEXTURE.findall(page.read_text()):
+        mi.load_string(f'<texture version="3.0.0" {texture}')
+
+
+TEXTS = {str(page.relative_to(ROOT)): page.read_text() for page in PAGES}
+TEXTS |= {f"{name} --help": command.help or "" for name, command in main.commands.items()}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_commands_of_a_page_exist(name):
+    for found in COMMAND.finditer(TEXTS[name]):
+        _, verb, *words = shlex.split(found[1].split("&& ")[-1].rstrip(" \\&"))
+        command = main.get_command(None, verb) if not verb.startswith("-") else main
+        if verb == "bench" and words and not words[0].startswith("-"):
+            command = command.get_command(None, words[0])
+        assert command, found[1]
+        known = {option for parameter in command.params for option in parameter.opts} | {"--help"}
+        for word in words:
+            if re.match(r"--?[a-zA-Z]", word):
+                assert word in known, found[1]
+
+
+# --- Claims ---
 
 
 def test_getting_started_lists_all_extras():
     text = (FOLDER / "getting-started.md").read_text()
     said = set(re.findall(r"^\| `(\w+)` \|", text, re.M))
-    extras = (FOLDER.parent / "pyproject.toml").read_text()
+    extras = (ROOT / "pyproject.toml").read_text()
     extras = extras.split("[project.optional-dependencies]")[1].split("\n[")[0]
     assert set(re.findall(r"^(\w+) = \[", extras, re.M)) == said
 
@@ -143,5 +271,5 @@ def test_figures_of_the_readme_are_of_rows():
     from eigengs_bench import kodak, rows
 
     [table] = kodak.summarize(rows.read(FOLDER / "rows.jsonl", "kodak")).tables
-    figures = re.findall(r"(\d+\.\d+) dB \|", (FOLDER.parent / "README.md").read_text())
+    figures = re.findall(r"(\d+\.\d+) dB \|", (ROOT / "README.md").read_text())
     assert figures and set(figures) <= set(table.frame["PSNR, float"])

@@ -21,13 +21,6 @@ print(importlib.util.find_spec("plugins"))
 """
 
 
-def find_plugins(folder, *paths):
-    """Where the plugins are found from another folder, and whether they are top-level too."""
-    command = [sys.executable, "-c", FIND, *map(str, paths)]
-    process = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
-    return process.stdout.splitlines()
-
-
 def test_in_the_root_of_a_checkout(tmp_path):
     """Its package comes before an installed one; -S leaves editable installs out."""
     libraries = os.pathsep.join(path for path in sys.path if path.endswith("site-packages"))
@@ -67,4 +60,6 @@ def test_wheel(tmp_path):
     assert page and page <= set(names)
     installed = tmp_path / "installed"
     where = str(installed / "eigengs_dr/plugins/__init__.py")
-    assert find_plugins(tmp_path, installed) == [where, "None"]
+    command = [sys.executable, "-c", FIND, str(installed)]
+    found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert found.stdout.splitlines() == [where, "None"]

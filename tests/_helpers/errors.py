@@ -14,6 +14,18 @@ def one_line(error):
 
 
 @contextmanager
+def file_refused(path, words=""):
+    """Expect an error whose message is one line that starts with the name of a file."""
+    with pytest.raises(ValueError) as error:
+        yield
+    message = str(error.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    assert words in message
+    assert len(message) < len(str(path)) + 300
+
+
+@contextmanager
 def refused(kind, match):
     """Expect an error whose message is one line with a remedy."""
     with pytest.raises(kind, match=match) as error:

@@ -1,18 +1,11 @@
-"""Two pixels, files that Pillow does not write, what it says of a file, and the arrays of one."""
+"""Two pixels, files that Pillow does not write, and the arrays of a file."""
 
 import struct
 import zlib
 
 import numpy as np
-from PIL import Image
 
 BYTES = np.array([[[0, 51, 102], [255, 204, 153]]], np.uint8)
-
-
-def property_of(path, name):
-    """Open a file with Pillow itself and ask it for its mode or format."""
-    with Image.open(path) as file:
-        return getattr(file, name)
 
 
 def members_of(path):

@@ -38,12 +38,6 @@ def assert_same(a, b):
             np.testing.assert_array_equal(x, y, name)
 
 
-def assert_equal(first, second):
-    """Two states of a PCA are equal to the last bit."""
-    for key, array in first.arrays().items():
-        np.testing.assert_array_equal(second.arrays()[key], array, key)
-
-
 @cache
 def basis_of(space):
     """Components of `family`: 12 of the first channel, 5 of the others."""

@@ -1,12 +1,11 @@
 """Files that commands read and write."""
 
-import numpy as np
 import pytest
 from PIL import Image
 
 from _helpers.command import SMALL, run, smooth_pixels, succeeded
 from _helpers.photos import random_fields
-from eigengs_dr.gaussian.file import SetData, write
+from _helpers.sets import random_scene
 
 
 @pytest.fixture
@@ -41,9 +40,7 @@ def trained(tmp_path_factory):
 def existing(tmp_path):
     """An output file of an earlier run, which a refused run has to leave as it is."""
     path = tmp_path / "existing.npz"
-    shapes = np.zeros((1, 2), np.float32), np.float32([[1, 0, 1]]), np.zeros((1, 3), np.float32)
-    data = dict(zip(("mean", "factor", "color"), shapes, strict=True))
-    write(path, SetData(data | {"background": np.zeros(3, np.float32)}, (8, 8), "ycbcr"))
+    random_scene(count=1).on("llvm").save(path)
     before, earlier = sorted(tmp_path.iterdir()), path.read_bytes()
     yield path
     assert path.read_bytes() == earlier

@@ -66,11 +66,8 @@ def test_a_note_is_one_line(tmp_path):
 
 MISTAKES = {
     "few": (["--gaussians", 0], ["gaussians"]),
-    "text": (["--gaussians", "many"], ["gaussians"]),
     "many": (["--gaussians", 1025], ["photo.png: gaussians is 1025"]),
-    "steps": (["--iterations", -1], ["iterations"]),
     "init": (["--init", "nowhere"], ["init"]),
-    "seed": (["--seed", -1], ["seed"]),
     "both": (["--target-psnr", 30, "--gaussians", 9], ["exclude each other"]),
     "space alone": (["--target-space", "ycbcr"], ["belong to target_psnr"]),
     "most alone": (["--max-gaussians", 50], ["belong to target_psnr"]),
@@ -81,11 +78,9 @@ MISTAKES = {
     "signs": (["--levels", "16;40"], ["16;40: expected a number, or several"]),
     "cluster": (["--cluster", "local"], ["--cluster takes several images"]),
     "blocks, target": (["--blocks", 64, "--target-psnr", 30], ["--blocks needs", "--target-psnr"]),
-    "blocks, levels": (["--blocks", 64, "--levels", 2], ["--blocks needs", "--levels"]),
     "blocks, preview": (["--blocks", 64, "--preview", "x.png"], ["--blocks needs", "--preview"]),
     "blocks, init": (["--blocks", 64, "--init", "random"], ["--blocks needs"]),
     "small blocks": (["--blocks", 5], ["at least 32"]),
-    "no blocks": (["--blocks", -1], ["at least 32"]),
     "basis": (["--basis", "nowhere"], ["'nowhere'", "natural"]),
     "basis, folder": (["--basis", "."], ["neither a file"]),
     "no folder": (["-o", "gone/x.npz"], ["gone"]),
@@ -108,10 +103,8 @@ def test_mistakes(photo, existing, case, monkeypatch):
     assert photo.read_bytes() == pixels
 
 
-@pytest.mark.parametrize("content", [None, b"", b"this is text, not a picture\n"])
-def test_files_that_are_no_images(tmp_path, existing, content):
-    if content is not None:
-        (tmp_path / "x.png").write_bytes(content)
+def test_a_file_that_is_no_image(tmp_path, existing):
+    (tmp_path / "x.png").write_text("this is text, not a picture")
     assert_refused(run("fit", tmp_path / "x.png", "-o", existing, "--overwrite"), "x.png")
 
 
@@ -248,7 +241,7 @@ def test_the_papers_form_lacks_the_mean_image(trained, photo, tmp_path):
 
 
 def test_levels(photo, tmp_path):
-    fitted, small, page, report = (tmp_path / f"a.{end}" for end in ("npz", "egs", "html", "json"))
+    fitted, small, report = (tmp_path / f"a.{end}" for end in ("npz", "egs", "json"))
     base = ["fit", photo, "-o", fitted, "--overwrite", "--quiet", "--iterations", 5]
     succeeded(run(*base, "--gaussians", 64, "--levels", 2))
     succeeded(run("pack", fitted, "-o", small, "--levels", 2))
@@ -264,7 +257,4 @@ def test_levels(photo, tmp_path):
     assert json.loads(report.read_text())["levels"] == [16, 40, 64]
     succeeded(run("pack", fitted, "-o", small, "--levels", "16,40,64"))
     assert json.loads(run("info", small, "--json").stdout)["sections"] == [16, 24, 24]
-    succeeded(run("view", fitted, "-o", page, "--levels", "16,40,64"))
-    assert '"levels": [16, 40, 64]' in page.read_text()
     assert_refused(run("pack", fitted, "-o", small, "--levels", "16,40"), "levels 16, 40")
-    assert_refused(run("view", fitted, "-o", page, "--levels", "40,16,64"), "levels 40, 16, 64")

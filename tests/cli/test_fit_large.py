@@ -4,12 +4,10 @@ import json
 
 import pytest
 import tifffile
-from PIL import Image
 
 from _helpers.command import assert_refused, run, succeeded
 from _helpers.files import png
 from _helpers.mosaics import mosaic
-from eigengs_dr.blocks.windows import ORIENTATION, image_size
 from eigengs_dr.fitting import memory
 
 FEW = ["--gaussians", 700, "--iterations", 5]
@@ -60,7 +58,6 @@ def test_large_fit_says_its_memory(tmp_path):
 @pytest.mark.parametrize(
     ("grey", "options", "expected"),
     [
-        (False, [], (3, "5,000")),
         (False, ["--gaussians", 70], (3, "70")),
         (False, ["--target-psnr", 30], (3, "500,000")),
         (True, [], (3, "5,000")),
@@ -78,12 +75,3 @@ def test_a_fit_that_does_not_fit_is_refused(tmp_path, monkeypatch, grey, options
     words = f"{count} Gaussians on 8000x4000 pixels take about {needed / 1e9:.1f} GB"
     result = run("fit", path, *outputs, *options)
     assert_refused(result, path, words, "this process may use 0.0 GB", "scale the image down")
-
-
-def test_sizes_of_headers(tmp_path):
-    exif = Image.Exif()
-    exif[ORIENTATION] = 6
-    Image.new("RGB", (40, 30)).save(tmp_path / "photo.jpg", exif=exif)
-    assert image_size(tmp_path / "photo.jpg") == (40, 30, 3)
-    (tmp_path / "text.png").write_text("no image")
-    assert image_size(tmp_path / "text.png") is None

@@ -45,6 +45,8 @@ def test_shows_levels_and_a_photo(photo):
     assert said("view", photo, "--image", "photo.png", "--levels", 3, "--quiet") == ""
     assert levels_of(page_of(photo)) == "4, 16, 64"
     assert "data:image/png;base64," in page_of(photo)
+    said("view", photo, "--levels", "16,40,64")
+    assert levels_of(page_of(photo)) == "16, 40, 64"
     said("pack", photo, "-o", "photo.egs", "--levels", 2)
     said("view", "photo.egs")
     assert levels_of(page_of(photo)) == "16, 64"
@@ -92,6 +94,7 @@ def test_refuses_bad_input(photo, tmp_path):
         ([photo, "-o", "a.png"], ["a.png", "must end in .html"]),
         ([photo, "-o", "folder/a.html"], ["folder"]),
         ([photo, "--levels", 9], ["photo.npz", "levels is 9"]),
+        ([photo, "--levels", "40,16,64"], ["levels 40, 16, 64"]),
         ([photo, "--image", "square.png"], ["photo.npz", "32x32 pixels"]),
         ([photo, "--image", "text.png"], ["text.png"]),
     ):

@@ -1,11 +1,18 @@
-"""Cells of a plane, coded without their order."""
+"""Cells of a plane, coded without their order, and the Hilbert curve through them."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from eigengs_dr.codec.cells import EVENNESS, code_cells, morton_encode
+from eigengs_dr.codec.cells import (
+    EVENNESS,
+    MAX_LEVELS,
+    code_cells,
+    hilbert_encode,
+    morton_encode,
+)
 from eigengs_dr.codec.range_coder import Decoder, Encoder
 
 
@@ -31,3 +38,20 @@ def test_cells_come_back(cells, evenness, levels):
 
 def test_many_gaussians_in_one_cell():
     coded(np.full((1 << 21, 2), 3), 3, 1)
+
+
+@pytest.mark.parametrize("levels", [0, 1, 2, 5])
+def test_the_curve_visits_every_point_by_single_steps(levels):
+    side = 1 << levels
+    points = np.indices((side, side)).reshape(2, -1).T
+    places = hilbert_encode(points, levels)
+    assert sorted(places) == list(range(side * side))
+    path = points[np.argsort(places)]
+    assert (np.abs(np.diff(path, axis=0)).sum(axis=1) == 1).all()
+
+
+@given(hnp.arrays(np.int64, (7, 2), elements=st.integers(0, (1 << MAX_LEVELS) - 1)))
+def test_places_on_the_largest_curve_are_one_for_each_point(points):
+    places = hilbert_encode(points, MAX_LEVELS)
+    assert (places >> 2 * MAX_LEVELS == 0).all()
+    assert len(np.unique(places)) == len(np.unique(points, axis=0))

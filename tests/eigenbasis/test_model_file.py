@@ -5,12 +5,13 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.command import said
+from _helpers.errors import file_refused
 from _helpers.families import family, fidelity, rendered, small_basis, small_model, splits
 from _helpers.sets import check_equal
 from eigengs_dr.eigenbasis import model_file as modelfile
 from eigengs_dr.storage import npz as archive
 
-NUMBERS = [key for key, field in modelfile.LAYOUT.items() if field.kind != "U"]
+FLOATS = [key for key, field in modelfile.LAYOUT.items() if field.kind[0] == "f"]
 
 
 @pytest.fixture(scope="module")
@@ -28,13 +29,9 @@ def path(tmp_path):
     return tmp_path / "model.npz"
 
 
-def refusal(path):
-    """The one line that a file is refused with."""
-    with pytest.raises(ValueError) as caught:
+def check_refused(path, words=""):
+    with file_refused(path, words):
         eg.EigenGS.load(path)
-    assert "\n" not in str(caught.value)
-    assert str(caught.value).startswith(f"{path}: ")
-    return str(caught.value)
 
 
 def write(path, members, version=modelfile.VERSION, name=modelfile.FORMAT):
@@ -100,28 +97,26 @@ def test_files_of_version_1_are_read(model, members, path):
     loaded.save(path)
     assert eg.EigenGS.load(path).truncation_curve() is None
     write(path, old, version=2)
-    assert "key 'variance' is missing" in refusal(path)
+    check_refused(path, "key 'variance' is missing")
 
 
 # --- What is refused ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("key", NUMBERS)
-def test_arrays_of_another_type_or_dimension(members, path, key):
-    for array in (members[key].astype(np.int32), members[key][None]):
-        write(path, {**members, key: array})
-        assert f"key '{key}' is " in refusal(path)
-    for value in (np.nan, np.inf):
-        if members[key].dtype.kind == "f":
-            array = members[key].copy()
-            array.flat[-1] = value
-            write(path, {**members, key: array})
-            assert f"{key} holds values that are not finite" in refusal(path)
+@pytest.mark.parametrize("key", FLOATS)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_not_finite(members, path, key, value):
+    array = members[key].copy()
+    array.flat[-1] = value
+    write(path, {**members, key: array})
+    check_refused(path, f"{key} holds values that are not finite")
 
 
 @pytest.mark.parametrize(
     ("key", "change", "words"),
     [
+        ("weights1", lambda a: a[None], "key 'weights1' is "),
+        ("weights1", lambda a: a.astype(int), "key 'weights1' is "),
         ("weights1", lambda a: a[:, :-1], "weights1 has shape"),
         ("weights1", lambda a: a[:, :0], "weights1 has shape"),
         ("scale2", lambda a: a[:-1], "scale2 has shape"),
@@ -148,7 +143,7 @@ def test_arrays_of_another_type_or_dimension(members, path, key):
 )
 def test_arrays_that_do_not_fit(members, path, key, change, words):
     write(path, {**members, key: change(members[key])})
-    assert words in refusal(path)
+    check_refused(path, words)
 
 
 def test_truncated_and_other_files(model, members, path):
@@ -156,10 +151,10 @@ def test_truncated_and_other_files(model, members, path):
     content = path.read_bytes()
     for share in (0, 1e-3, 0.3, 0.7, 0.99):
         path.write_bytes(content[: int(share * len(content))])
-        refusal(path)
+        check_refused(path)
     write(path, members, version=modelfile.VERSION + 1)
-    assert "upgrade" in refusal(path)
+    check_refused(path, "upgrade")
     model.gaussians.save(path)
-    assert "format is 'eigengs_dr.gaussians'" in refusal(path)
+    check_refused(path, "format is 'eigengs_dr.gaussians'")
     np.savez(path, a=np.zeros(3))
-    assert "key 'format' is missing" in refusal(path)
+    check_refused(path, "key 'format' is missing")

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from _helpers.photos import random_fields
 from _helpers.trainings import checkpoint_of, settings
 from eigengs_dr.eigenbasis import training
 from eigengs_dr.eigenbasis.pca import stream
@@ -126,22 +125,21 @@ def test_ctrl_c(folder, output, in_pieces, stage, call, kept):
 
 
 @pytest.mark.parametrize(
-    ("changed", "words"), [({"seed": 1}, "seed 0 instead of 1"), ({"iterations": 25}, "iterations")]
+    ("other", "changed", "words"),
+    [
+        ("photos", {"seed": 1}, "seed 0 instead of 1"),
+        ("photos", {"iterations": 25}, "iterations"),
+        (".", {}, "folder"),
+    ],
 )
-def test_other_settings_than_the_checkpoint(folder, output, in_pieces, changed, words):
+def test_other_settings_than_the_checkpoint(folder, output, in_pieces, other, changed, words):
     kill(folder, output, "weights", iterations=3)
+    (folder.parent / "000.png").write_bytes((folder / "000.png").read_bytes())
     with pytest.raises(ValueError, match=words) as caught:
-        train(folder, output, settings(**{"iterations": 3, **changed}))
+        train(folder.parent / other, output, settings(**{"iterations": 3, **changed}))
     assert str(checkpoint_of(output)) in str(caught.value)
     assert "delete" in str(caught.value)
     assert train(folder, output, settings(iterations=3)).figures["resumed"]
-
-
-def test_another_folder_than_the_checkpoint(folder, output, tmp_path):
-    kill(folder, output, "weights")
-    other = random_fields(tmp_path / "other", 12)
-    with pytest.raises(ValueError, match="folder"):
-        train(other, output, settings())
 
 
 def test_a_folder_that_grew_meanwhile(folder, output, tmp_path, in_pieces):

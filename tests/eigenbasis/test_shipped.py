@@ -3,10 +3,9 @@
 import pickle
 
 import numpy as np
-import pytest
 
 import eigengs_dr as eg
-from _helpers.families import SPLATS, small_model
+from _helpers.families import small_model
 from _helpers.sets import check_equal
 from eigengs_dr.eigenbasis.eigengs import SHIPPED, EigenGS
 from train_natural import DEMO, crops
@@ -31,14 +30,6 @@ def test_crops_that_the_shipped_basis_is_trained_on():
 
 def test_shipped_basis_is_small():
     assert SHIPPED["natural"].stat().st_size <= 4_000_000
-
-
-def test_bases_by_name_and_file(backend, tmp_path):
-    model = small_model(backend)
-    model.save(tmp_path / "small.npz")
-    assert len(EigenGS.load(tmp_path / "small.npz", backend).gaussians) == SPLATS
-    with pytest.raises(ValueError, match="model 'nature' is neither a file nor one of: natural"):
-        EigenGS.load("nature")
 
 
 def test_a_model_travels_as_arrays(backend):

@@ -12,17 +12,6 @@ from eigengs_dr.eigenbasis.options import TrainOptions
 from eigengs_dr.eigenbasis.training import train
 from eigengs_dr.image.io import ImageError
 
-FIGURES = {
-    "seconds",
-    "pca_seconds",
-    "shape_seconds",
-    "weight_seconds",
-    "components",
-    "gaussians",
-}
-
-MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
-
 
 def test_end_to_end(folder, output):
     stages = []
@@ -30,7 +19,6 @@ def test_end_to_end(folder, output):
         folder, output, settings(), progress=lambda stage, *counts: stages.append((stage, *counts))
     )
     figures = trained.figures
-    assert {*FIGURES, *MEASURED} <= set(figures)
     assert (figures["images"], figures["components"], figures["gaussians"]) == (22, [6] * 3, 60)
     # Components that are as smooth as these are rendered well by 60 splats.
     assert figures["psnr_init"] == pytest.approx(figures["psnr_pca"], abs=0.5)
@@ -100,13 +88,6 @@ def test_nothing_but_unreadable_images(folder, output):
     assert list(output.parent.iterdir()) == [folder]
 
 
-def test_too_few_images_to_hold_one_out(tmp_path, output):
-    folder = random_fields(tmp_path / "few", 9)
-    figures = train(folder, output, settings()).figures
-    assert figures["images"] == 9
-    assert not {*MEASURED} & set(figures)
-
-
 def test_images_of_other_sizes(folder, output):
     with pytest.warns(UserWarning, match="resized to 20x12"):
         figures = train(folder, output, settings(size=(20, 12))).figures
@@ -122,7 +103,6 @@ def test_fewer_splats_than_components(folder, output, count):
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"gaussians": 1025}, "gaussians is 1025; a basis of 32x32 takes 1 to 1024"),
         ({"gaussians": 0}, "gaussians is 0"),
         ({"gaussians": 2.5}, "gaussians is 2.5"),
         ({"iterations": -1}, "iterations is -1"),
@@ -131,10 +111,7 @@ def test_fewer_splats_than_components(folder, output, count):
         ({"preset": "eigengs", "iterations": 0}, "iterations is 0"),
         ({"frequency_aware": "maybe"}, "is 'maybe'; use 'auto', True or False"),
         ({"space": "lab"}, "space 'lab' is unknown; use one of ycbcr, rgb"),
-        ({"size": (0, 1)}, "size is 0x1"),
         ({"components": -1}, "components is -1"),
-        ({"components": (3, 4)}, "expected a number, or three"),
-        ({"energy": 1.5}, "energy is 1.5"),
         ({"target_psnr": 20, "energy": 0.9}, "give one of them"),
         ({"target_psnr": np.nan}, "target_psnr is nan"),
     ],

@@ -1,15 +1,13 @@
 """Parts of a set."""
 
 import numpy as np
-import pytest
 
-import eigengs_dr as eg
 from _helpers.footprints import matrices
 from eigengs_dr.blocks.draw import draw
 from eigengs_dr.gaussian.file import CUTOFF, SetData, crop
 
 
-def random_set(count=200, size=(96, 64), space="ycbcr"):
+def random_set(count=200, size=(96, 64)):
     """Gaussians of many sizes and angles."""
     rng = np.random.default_rng(3)
     mean = rng.uniform(0, size, (count, 2))
@@ -17,33 +15,7 @@ def random_set(count=200, size=(96, 64), space="ycbcr"):
     factor = np.stack([a, rng.normal(0, 0.3, count), c], axis=1)
     color = rng.normal(0, 0.3, (count, 3))
     arrays = {"mean": mean, "factor": factor, "color": color, "background": [0.4, 0.5, 0.5]}
-    return SetData({k: np.asarray(v, np.float32) for k, v in arrays.items()}, size, space)
-
-
-def whole(data):
-    return eg.picture_of(
-        eg.Gaussians.from_arrays(**data.arrays, size=data.size, space=data.space, backend="llvm")
-    )
-
-
-@pytest.mark.parametrize(
-    "region", [(0, 0, 96, 64), (13, 7, 30, 21), (90, 60, 6, 4), (0, 63, 96, 1)]
-)
-def test_part_draws_what_the_whole_shows(region):
-    data, (left, top, width, height) = random_set(), region
-    part = crop(data, (left, top), (width, height))
-    assert part.size == (width, height)
-    shown = whole(data)[top : top + height, left : left + width]
-    np.testing.assert_allclose(draw(part, "llvm"), shown, atol=2e-5)
-
-
-def test_scaled_part():
-    data = random_set()
-    part = crop(data, (10, 20), (60, 40), (2.0, 2.0))
-    large = whole(
-        data._replace(arrays=crop(data, (0, 0), (192, 128), (2.0, 2.0)).arrays, size=(192, 128))
-    )
-    np.testing.assert_allclose(draw(part, "llvm"), large[40:80, 20:80], atol=2e-5)
+    return SetData({k: np.asarray(v, np.float32) for k, v in arrays.items()}, size, "data")
 
 
 def test_only_gaussians_that_touch_are_kept():
@@ -63,4 +35,5 @@ def test_part_without_gaussians_is_background():
     data.arrays["factor"][:] = [2, 0, 2]
     part = crop(data, (50, 30), (4, 3))
     assert len(part.arrays["mean"]) == 0
-    np.testing.assert_allclose(draw(part, "llvm"), whole(data)[30:33, 50:54], atol=1e-6)
+    found = draw(part, "llvm")
+    np.testing.assert_array_equal(found, np.broadcast_to(np.float32([0.4, 0.5, 0.5]), (3, 4, 3)))

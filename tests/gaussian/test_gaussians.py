@@ -1,14 +1,17 @@
-"""Sets of splats: arrays in and out, selection, sizes."""
+"""Sets of splats: arrays in and out, selection, sizes, bounds, and several as one."""
 
 from dataclasses import replace
 
 import drjit as dr
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
-from _helpers.sets import COUNT, NAMES, SIZE, arrays_of, check_equal, random_scene
+from _helpers.sets import COUNT, NAMES, SIZE, arrays_of, check_equal, few, random_scene
 from eigengs_dr.backend.selection import select
-from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.gaussian.gaussians import MIN_DEVIATION, Gaussians, concatenate
 from eigengs_dr.raster.render import render
 
 
@@ -58,7 +61,6 @@ def test_arrays_of_values_that_all_splats_share(backend):
 
 BAD = [
     ("mean", np.zeros((0, 2)), r"mean has shape \(0, 2\)"),
-    ("mean", np.zeros((COUNT, 3)), "mean has shape"),
     ("factor", np.ones((COUNT - 1, 3)), "factor has shape"),
     ("color", np.ones(COUNT), "color has shape"),
     ("background", np.ones(2), "background has shape"),
@@ -69,8 +71,6 @@ BAD = [
     ("factor", np.zeros((COUNT, 3)), "a or c <= 0"),
     ("factor", np.tile([1, 0, -1], (COUNT, 1)), "a or c <= 0"),
     ("factor", np.full((COUNT, 3), 1e-60), "a or c <= 0"),  # 0 in float32
-    ("size", (0, 5), "size is"),
-    ("size", (5,), "size is"),
     ("size", (5, 1 << 17), "size is"),
     ("space", "hsv", "space is 'hsv'"),
     ("space", "a\nb", "space is"),
@@ -189,3 +189,98 @@ def test_sets_in_double_precision(backend, tmp_path):
 def test_other_precisions_are_refused(dtype):
     with pytest.raises(ValueError, match=r"give numpy\.float32 or numpy\.float64"):
         Gaussians.from_arrays([[4, 5]], [[1, 0, 1]], [[1]], size=(8, 8), dtype=dtype)
+
+
+# --- Several sets as one --------------------------------------------------------------------------
+
+
+def test_concatenation(backend):
+    """Splats one after the other, backgrounds added."""
+    parts = [random_scene(seed, count) for seed, count in ((0, COUNT), (1, 3), (2, 1))]
+    sets = [p.on(backend) for p in parts]
+    shared = [0.5, 0.25, 0.75]  # by all splats of a set
+    sets[1].factor = select(backend).Array3f(shared)
+    parts[1].factor[:] = shared
+    joined = concatenate(sets)
+    expected = {name: np.concatenate([getattr(p, name) for p in parts]) for name in NAMES[:3]}
+    background = 3 * parts[0].background.astype(np.float32)
+    assert len(joined) == COUNT + 4
+    found = joined.to_arrays()
+    np.testing.assert_allclose(found.pop("background"), background, rtol=1e-6)
+    for name, value in found.items():
+        np.testing.assert_array_equal(value, np.float32(expected[name]))
+    assert concatenate(sets[:1]) is sets[0]
+
+
+def test_concatenation_of_nothing():
+    with pytest.raises(ValueError, match="no sets"):
+        concatenate([])
+
+
+def test_concatenation_of_what_differs(backend):
+    first = random_scene().on(backend)
+    others = [
+        random_scene(size=(9, 9)).on(backend),
+        random_scene(channels=1).on(backend),
+        replace(first, space="rgb"),
+        random_scene().on(backend, 64),
+    ]
+    for other in others:
+        with pytest.raises(ValueError, match="sets differ") as error:
+            concatenate([first, other])
+        assert "\n" not in str(error.value)
+
+
+# --- Bounds ---------------------------------------------------------------------------------------
+
+
+LOW, HIGH = 1 / (2 * max(SIZE)), 1 / MIN_DEVIATION
+"""Bounds of the diagonal of a factor."""
+
+any_floats = st.floats(width=32, allow_nan=True, allow_infinity=True)
+
+
+def unbounded(backend, values):
+    """A set with any numbers: values has shape (COUNT, 8)."""
+    scene = random_scene()._replace(mean=values[:, :2], factor=values[:, 2:5], color=values[:, 5:])
+    return scene.on(backend)
+
+
+def check_bounds(arrays):
+    mean, factor = arrays["mean"], arrays["factor"].astype(np.float64)
+    assert ((mean >= 0) & (mean <= SIZE)).all()
+    a, b, c = factor.T
+    for diagonal in (a, c):
+        assert ((diagonal >= LOW * (1 - 1e-6)) & (diagonal <= HIGH)).all()
+    assert (np.abs(b) <= HIGH).all()
+    assert np.isfinite(arrays["color"]).all()
+    inverse = np.array([[a * a, a * b], [a * b, b * b + c * c]]).transpose(2, 0, 1)
+    assert (np.linalg.det(inverse) > 0).all()
+
+
+@few
+@given(values=hnp.arrays(np.float32, (COUNT, 8), elements=any_floats))
+def test_bounds_hold_after_any_step(backend, values):
+    bounded = unbounded(backend, values).bounded()
+    check_bounds(bounded.to_arrays())
+    check_equal(bounded.bounded(), bounded.to_arrays())
+
+
+def test_bounds_leave_alone_what_is_inside(backend):
+    scene = random_scene()
+    scene = scene._replace(mean=np.clip(scene.mean, 0, SIZE))
+    check_equal(scene.on(backend).bounded(), arrays_of(scene))
+
+
+def test_what_replaces_numbers_that_are_not_finite(backend):
+    """A mean by the middle, a factor by its bound, a colour by 0."""
+    for value in (np.nan, np.inf, -np.inf):
+        found = unbounded(backend, np.full((COUNT, 8), value)).bounded().to_arrays()
+        np.testing.assert_array_equal(found["mean"][0], [SIZE[0] / 2, SIZE[1] / 2])
+        np.testing.assert_array_equal(found["factor"][0], [HIGH, 0, HIGH])
+        assert not found["color"].any()
+    scene = random_scene(size=(1, 1))._replace(background=np.array([np.nan, 0, np.inf]))
+    smallest = scene.on(backend).bounded().to_arrays()
+    assert np.isfinite(smallest["background"]).all()
+    assert ((smallest["mean"] >= 0) & (smallest["mean"] <= 1)).all()
+    assert smallest["factor"][:, [0, 2]].min() >= 0.5

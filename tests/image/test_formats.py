@@ -173,17 +173,9 @@ def test_truncated_files(tmp_path, suffix, share):
 
 def test_a_tiff_that_claims_too_many_pixels_is_refused_before_it_is_decoded(tmp_path):
     save_image(tmp_path / "a.tif", LIGHT / 5000, bits=16)
-    content = bytearray((tmp_path / "a.tif").read_bytes())
-    with tifffile.TiffFile(tmp_path / "a.tif") as file:
-        tags = [file.pages[0].tags[name] for name in ("ImageWidth", "ImageLength")]
-        order = file.byteorder
-        for tag in tags:
-            size = 4 if tag.dtype == 4 else 2
-            start = tag.valueoffset
-            content[start : start + size] = (60_000).to_bytes(
-                size, "little" if order == "<" else "big"
-            )
-    (tmp_path / "a.tif").write_bytes(content)
+    with tifffile.TiffFile(tmp_path / "a.tif", mode="r+b") as file:
+        for name in ("ImageWidth", "ImageLength"):
+            file.pages[0].tags[name].overwrite(60_000)
     with pytest.raises(ImageError, match="more than 536,870,912 pixels"):
         load_image(tmp_path / "a.tif")
 
@@ -211,8 +203,6 @@ def test_encoding_of_a_file_can_be_said(tmp_path):
     codes = np.full((2, 3, 3), 0.5)
     save_image(tmp_path / "a.exr", codes)
     save_image(tmp_path / "a.png", codes)
-    assert read_file(tmp_path / "a.exr").encoding == "linear"
-    assert read_file(tmp_path / "a.png").encoding == "srgb"
     np.testing.assert_array_equal(check_image(tmp_path / "a.exr", encoding="srgb"), 0.5)
     light = check_image(tmp_path / "a.png", encoding="linear")
     np.testing.assert_allclose(light, to_coded(load_image(tmp_path / "a.png")), rtol=1e-6)

@@ -12,7 +12,7 @@ from PIL import Image
 
 import eigengs_dr as eg
 from _helpers.errors import one_line, refused
-from _helpers.files import BYTES, png, property_of
+from _helpers.files import BYTES, png
 from eigengs_dr.image.formats import PICTURE_SUFFIXES
 from eigengs_dr.image.io import (
     SAMPLES,
@@ -34,7 +34,7 @@ def test_every_mode_of_an_opaque_file(tmp_path, mode):
     }.get(mode, lambda: Image.fromarray(grey).convert(mode))()
     path = tmp_path / "a.tif"
     image.save(path)
-    assert property_of(path, "mode") == mode
+    assert Image.open(path).mode == mode
     result = load_image(path)
     assert result.shape == (2, 3, 3)
     expected = np.repeat(grey[..., None], 3, axis=2) / 255
@@ -205,9 +205,7 @@ def test_check_image_keeps_rows_columns_and_channels():
         (np.zeros((0, 4, 3)), "no pixels"),
         (np.zeros((4, 0)), "no pixels"),
         (np.zeros((4, 4), np.int64), "pixels are int64"),
-        (np.zeros((4, 4), complex), "pixels are complex128"),
         (np.full((4, 4), None), "pixels are object"),
-        (np.full((4, 4), "a"), "pixels are <U1"),
         ([[1, 2], [3]], "not an array"),
         (
             np.full((2, 2), 255.0),
@@ -260,6 +258,8 @@ def test_lossless_round_trip(tmp_path_factory, suffix, image):
     path = tmp_path_factory.mktemp("round") / f"a{suffix}"
     save_image(path, image)
     np.testing.assert_array_equal(load_image(path), check_image(image))
+    kept = load_image(path, keep_grey=True)
+    np.testing.assert_array_equal(kept, check_image(image, keep_grey=True))
     save_image(path, load_image(path))
     np.testing.assert_array_equal(load_image(path), check_image(image))
 
@@ -271,17 +271,7 @@ def test_every_suffix_is_written_in_its_format(tmp_path, suffix):
     save_image(path, image)
     np.testing.assert_allclose(load_image(path), image, atol=0.02)
     kind = {".jpg": "JPEG", ".tif": "TIFF"}.get(suffix, suffix[1:].upper())
-    assert property_of(path, "format") == kind
-
-
-@pytest.mark.parametrize(("channels", "mode"), [(1, "L"), (3, "RGB")])
-def test_grey_stays_grey(tmp_path, channels, mode):
-    image = np.random.default_rng(0).integers(0, 256, (5, 4, channels), np.uint8)
-    save_image(tmp_path / "a.png", image)
-    assert property_of(tmp_path / "a.png", "mode") == mode
-    kept = load_image(tmp_path / "a.png", keep_grey=True)
-    np.testing.assert_array_equal(kept, check_image(image, keep_grey=True))
-    assert kept.shape == image.shape and kept.flags.c_contiguous
+    assert Image.open(path).format == kind
 
 
 def test_saving_clamps_and_rounds(tmp_path):
@@ -315,21 +305,9 @@ def test_a_failed_write_leaves_everything_as_it_was(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_unwritable_targets(tmp_path):
-    (tmp_path / "folder.png").mkdir()
-    (tmp_path / "file").write_bytes(b"")
-    for target in ("folder.png", "nowhere/a.png", "file/a.png"):
-        with pytest.raises(ImageError, match=r"cannot be written|is a folder") as error:
-            save_image(tmp_path / target, BYTES)
-        assert one_line(error).count("choose another path") == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
-
-
 def test_bad_pixels_touch_no_file(tmp_path):
     for image, words in (
         (np.full((2, 2), np.nan), "not finite"),
-        (np.zeros((2, 2, 5)), "shape"),
-        (np.zeros((0, 0, 3)), "no pixels"),
         (np.linspace(0, 255, 12).reshape(2, 2, 3), "divide by 255"),
     ):
         with pytest.raises(ImageError, match=words):

@@ -46,7 +46,6 @@ def test_a_write_that_fails_leaves_the_old_file(path):
         ("some.format", 2, {}, "version is 3, this package reads up to 2; upgrade"),
         ("some.format", 3, {"z": Field("f4", 1)}, "key 'z' is missing"),
         ("some.format", 3, {"a": Field("f8", 3)}, "key 'a' is 3-dimensional float32, expected 3-d"),
-        ("some.format", 3, {"a": Field("f4", 2)}, "expected 2-dimensional float32"),
         ("some.format", 3, {"b": Field("U", 0)}, "expected 0-dimensional text"),
         ("some.format", 3, {"a": Field("f4", 3, 23)}, r"key 'a' claims shape \(2, 3, 4\), more"),
     ],
@@ -66,11 +65,4 @@ def test_shapes_need_no_arrays(path):
     content[place : place + 8] = bytes(8)
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"x: .*(not a readable|cut off)"):
-        npz.read(path, "some.format", 3, LAYOUT)
-
-
-@pytest.mark.parametrize("damage", [lambda data: b"", lambda data: data[:-9], lambda data: b"text"])
-def test_what_is_no_archive_is_refused(path, damage):
-    path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(ValueError, match=r"x: not a readable some.format file \(.*\); it may be"):
         npz.read(path, "some.format", 3, LAYOUT)

@@ -68,18 +68,16 @@ def test_bands_start_apart(backend):
     assert not np.array_equal(first, second)
 
 
-@splits
-def test_split_keeps_sides_apart(backend, split):
-    model = small_model(backend, split)
+def test_split_keeps_sides_apart(backend):
+    model = small_model(backend, split=True)
     low, first = model.low, model.low_components
-    assert (low, first) == ((10, 6) if split else (0, 0))
+    assert (low, first) == (10, 6)
     for weights in model.weights:
-        assert not weights[:first, low:-1].any() or not split
+        assert not weights[:first, low:-1].any()
         assert not weights[first:, :low].any()
         assert np.abs(weights).max(axis=1).min() > 0
     areas = 1 / np.prod(model.gaussians.to_arrays()["factor"][:, [0, 2]], axis=1)
-    if split:
-        assert areas[:low].min() > 5 * areas[low:].max()
+    assert areas[:low].min() > 5 * areas[low:].max()
 
 
 def test_a_tenth_of_the_splats_is_low(backend):

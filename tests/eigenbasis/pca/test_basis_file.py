@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from _helpers.errors import file_refused
 from _helpers.files import members_of
 from _helpers.low_rank import HEIGHT, WIDTH, assert_same, basis_of
 from eigengs_dr.eigenbasis.pca import basis_file as basisfile
@@ -30,54 +31,42 @@ def test_files_of_version_1_are_read(tmp_path):
     assert_same(Eigenbasis.load(tmp_path / "a.npz"), basis_of("rgb"))
 
 
-def change(key, value):
-    return lambda arrays: arrays.__setitem__(key, value)
-
-
 @pytest.mark.parametrize(
-    ("edit", "complaint"),
+    ("changed", "complaint"),
     [
-        (lambda a: a.pop("mean"), "key 'mean' is missing"),
-        (change("mean", np.zeros((2, HEIGHT, WIDTH), "f4")), r"mean has shape \(2, 11, 14\)"),
-        (change("mean", np.zeros((3, 4, 4), "f4")), "key 'components0' claims shape"),
-        (change("mean", np.zeros((3, HEIGHT, WIDTH))), "key 'mean' is 3-dimensional float64"),
-        (change("mean", np.full((3, HEIGHT, WIDTH), np.nan, "f4")), "mean holds values that are"),
-        (change("variance", np.ones(2)), r"variance has shape \(2,\)"),
-        (change("variance", np.zeros(3)), "eigenvalues0 add up to more than variance 0"),
-        (change("eigenvalues2", np.arange(5.0)), "eigenvalues2 must descend"),
-        (change("eigenvalues2", -np.arange(5.0)), "eigenvalues2 must descend and not be negative"),
+        ({"mean": None}, "key 'mean' is missing"),
+        ({"mean": np.zeros((2, HEIGHT, WIDTH), "f4")}, "mean has shape (2, 11, 14)"),
+        ({"mean": np.zeros((3, 4, 4), "f4")}, "key 'components0' claims shape"),
+        ({"mean": np.zeros((3, HEIGHT, WIDTH))}, "key 'mean' is 3-dimensional float64"),
+        ({"mean": np.full((3, HEIGHT, WIDTH), np.nan, "f4")}, "mean holds values that are"),
+        ({"variance": np.ones(2)}, "variance has shape (2,)"),
+        ({"variance": np.zeros(3)}, "eigenvalues0 add up to more than variance 0"),
+        ({"eigenvalues2": np.arange(5.0)}, "eigenvalues2 must descend"),
+        ({"eigenvalues2": -np.arange(5.0)}, "eigenvalues2 must descend and not be negative"),
         (
-            change("eigenvalues2", np.zeros(1 << 20)),
+            {"eigenvalues2": np.zeros(1 << 20)},
             "eigenvalues2 has 1048576 values, more than pixels",
         ),
-        (change("eigenvalues2", np.zeros(0)), "key 'components2' claims shape"),
-        (change("components0", np.zeros((12, 14, 11), "f4")), "components0 has shape"),
+        ({"eigenvalues2": np.zeros(0)}, "key 'components2' claims shape"),
+        ({"components0": np.zeros((12, 14, 11), "f4")}, "components0 has shape"),
         (
-            change("components0", np.full((12, HEIGHT, WIDTH), np.inf, "f4")),
+            {"components0": np.full((12, HEIGHT, WIDTH), np.inf, "f4")},
             "components0 holds values that are not finite",
         ),
-        (change("count", np.array(0)), "count is 0, expected at least 1"),
-        (change("space", np.array("linear")), "space is 'linear', expected one of ycbcr, rgb"),
+        ({"count": np.array(0)}, "count is 0, expected at least 1"),
+        ({"space": np.array("linear")}, "space is 'linear', expected one of ycbcr, rgb"),
     ],
 )
-def test_files_that_do_not_fit_together(tmp_path, edit, complaint):
+def test_files_that_do_not_fit_together(tmp_path, changed, complaint):
     path = tmp_path / "a.npz"
     basis_of("rgb").save(path)
-    arrays = members_of(path)
-    edit(arrays)
+    arrays = {k: v for k, v in (members_of(path) | changed).items() if v is not None}
     archive.write(path, basisfile.FORMAT, basisfile.VERSION, arrays)
-    with pytest.raises(ValueError, match=complaint) as error:
+    with file_refused(path, complaint):
         Eigenbasis.load(path)
-    assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
 
 
-def test_files_that_are_something_else(tmp_path):
-    path = tmp_path / "a.npz"
-    path.write_bytes(b"something")
-    with pytest.raises(ValueError, match=r"not a readable .* file"):
-        Eigenbasis.load(path)
-    archive.write(path, "eigengs_dr.gaussians", 1, {})
-    with pytest.raises(ValueError, match="format is"):
-        Eigenbasis.load(path)
-    with pytest.raises(FileNotFoundError):
-        Eigenbasis.load(tmp_path / "nowhere.npz")
+def test_files_of_another_format(tmp_path):
+    archive.write(tmp_path / "a.npz", "eigengs_dr.gaussians", 1, {})
+    with file_refused(tmp_path / "a.npz", "format is"):
+        Eigenbasis.load(tmp_path / "a.npz")

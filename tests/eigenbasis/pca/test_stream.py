@@ -1,4 +1,4 @@
-"""PCA in shards: what merges lose, resuming, any order."""
+"""PCA in shards: resuming, any order."""
 
 from contextlib import suppress
 from itertools import count
@@ -6,7 +6,7 @@ from itertools import count
 import numpy as np
 import pytest
 
-from _helpers.low_rank import SIZE, assert_equal, family, planes
+from _helpers.low_rank import SIZE, family
 from eigengs_dr.backend.executor import Done
 from eigengs_dr.eigenbasis.pca import incremental, stream
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
@@ -34,19 +34,7 @@ def find(images, components=20, **options):
 
 
 def assert_same_states(first, second):
-    for pair in zip(first, second, strict=True):
-        assert_equal(*pair)
-
-
-def test_merges_only_lose():
-    """Of noise, whose variances hardly fall: the worst case. The sum of all variances stays."""
-    images = family(130, noise=0.05)
-    for c, state in enumerate(find(images, 16)):
-        channel = planes(images)[:, c].astype(np.float64)
-        exact = np.linalg.svd(channel - channel.mean(axis=0), compute_uv=False)[:20] ** 2
-        assert (state.scatter <= exact + 1e-5 * exact[0]).all()
-        assert state.scatter.sum() > 0.9 * exact.sum()
-        np.testing.assert_allclose(state.squares, channel.var(axis=0).sum() * 130, rtol=1e-4)
+    np.testing.assert_equal([s.arrays() for s in second], [s.arrays() for s in first])
 
 
 @pytest.mark.parametrize("number", [20, 21, 40, 59, 61, 101, 139])
