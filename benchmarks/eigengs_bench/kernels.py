@@ -1,6 +1,5 @@
 """How fast the renderer is: against plain Dr.Jit, and against the machine."""
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -9,11 +8,10 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
 import eigengs_dr as eg
 from eigengs_bench.clock import interleaved
-from eigengs_bench.report import Section, number, table
+from eigengs_bench.report import Section, table
 from eigengs_bench.rows import Row, Task
 from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
@@ -29,13 +27,7 @@ from eigengs_dr.raster.binning.lists import TileLists, build_lists
 from eigengs_dr.raster.binning.tiles import Grid
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, KernelParameters, kernel_radius
 from eigengs_dr.raster.reference import render_plain
-from eigengs_dr.raster.render import (
-    batch_to_tiles,
-    bin_gaussians,
-    decode_parameters,
-    rasterize,
-    to_tensor,
-)
+from eigengs_dr.raster.render import batch_to_tiles, bin_gaussians, decode_parameters, rasterize
 
 # The scene: Gaussians of equal size, spread evenly at random over a square picture.
 SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
@@ -44,8 +36,6 @@ PLAIN_TILE = (8, 8)
 WARM_UP, ROUNDS = 3, 15  # rounds that compile and settle, and rounds that are measured
 FIT_STEPS, FIT_ROUNDS = 500, 5  # steps of the refinement behind `fit_over_steps`, and how often
 PEAK_LANES, PEAK_LOOPS, PEAK_UNROLL = 1 << 16, 100, 8  # size of the program that measures the peak
-CUTOFFS = (2.5, 3.0, 3.5, 4.0, 5.0)  # whose time and error are measured
-WIDEST = 8.0  # cutoff that stands for none in double precision (1.3e-14 of an amplitude is left)
 
 
 def run(task: Task) -> list[Row]:
@@ -56,36 +46,23 @@ def run(task: Task) -> list[Row]:
     memory; the fractions are evaluations inside the cutoff ellipses over that peak.
     `fit_over_steps` is the time of a refinement over that of its steps alone, without relocation,
     second placement and trace, and `round_in_steps` that of a round of relocation over that of such
-    a step. "cutoffs" has time and error of the picture by cutoff.
+    a step.
     """
     job: Row = {"side": SIDE, "gaussians": COUNT, "at": time.time()}  # each call measures anew
-    return task.measure("kernels", [(job, partial(_measure, task))])
+    return task.measure("kernels", [(job, partial(measure, task))])
 
 
 def summarize(rows: Sequence[Row]) -> Section:
-    """Lay out the figures of the last row, and what a cutoff costs and leaves out."""
-    row = rows[-1]
-    names = [name for name, value in row.items() if isinstance(value, float)]
-    figures = table("Kernels", ("figure", "value"), [(n, f"{row[n]:.4g}") for n in names])
-    lines = [
-        (
-            f"{c['cutoff']:g}",
-            *(number(c[k], 2) for k in ("forward_ms", "step_ms")),
-            *(f"{c[k]:.1e}" for k in ("largest_error", "rms_error")),
-        )
-        for c in row["cutoffs"]
-    ]
-    columns = ("cutoff", "forward, ms", "and reverse, ms", "largest error", "RMS error")
-    caption = "Time of a picture, and what its cutoff leaves out (1 is white)"
-    return Section([figures, table(caption, columns, lines, name="cutoffs")])
+    """Lay out the figures of the last row."""
+    lines = [(name, f"{value:.4g}") for name, value in rows[-1].items() if isinstance(value, float)]
+    return Section([table("Kernels", ("figure", "value"), lines)])
 
 
-def _measure(task: Task) -> Row:
+def measure(task: Task) -> Row:
+    """Measure the figures of `run`."""
     types = types_in(select(task.backend))
-    scene = random_scene(types)
-    figures = kernel_figures(types, scene, partial(task.progress, "kernels"))
-    figures |= fit_figures(types, partial(task.progress, "fit"))
-    return figures | {"cutoffs": cutoff_figures(scene)}
+    figures = kernel_figures(types, random_scene(types), partial(task.progress, "kernels"))
+    return figures | fit_figures(types, partial(task.progress, "fit"))
 
 
 def random_scene(types: ArrayTypes) -> eg.Gaussians:
@@ -105,8 +82,8 @@ def kernel_figures(
     types: ArrayTypes, scene: eg.Gaussians, progress: Callable[..., None] = lambda *_: None
 ) -> Row:
     """Time both renderers, the lists and the peak on a scene."""
-    plain_forward, plain_step, _ = programs(scene, CUTOFF, plain=True)
-    fast_forward, fast_step, _ = programs(scene, CUTOFF, plain=False)
+    plain_forward, plain_step = programs(scene, plain=True)
+    fast_forward, fast_step = programs(scene, plain=False)
     seeds = dr.linspace(types.Float, 0, 1, PEAK_LANES)
     dr.eval(seeds)
     timed: dict[str, Callable[[], Any]] = {
@@ -132,10 +109,8 @@ def kernel_figures(
     }
 
 
-def programs(
-    scene: eg.Gaussians, cutoff: float, plain: bool
-) -> tuple[Any, Any, Callable[[], NDArray[Any]]]:
-    """Make frozen programs that draw a scene, forward and with reverse, and what shows it.
+def programs(scene: eg.Gaussians, plain: bool) -> tuple[Any, Any]:
+    """Make frozen programs that draw a scene, forward and with reverse.
 
     ``program.func.clear()`` frees a program. `plain` is `render_plain` instead of `rasterize`.
     """
@@ -144,33 +119,27 @@ def programs(
     draw: Callable[..., Any]
     if plain:
         grid, draw = Grid(scene.width, scene.height, PLAIN_TILE), render_plain
-        lists = build_lists(parameters.shape, kernel_radius(cutoff), grid)
+        lists = build_lists(parameters.shape, kernel_radius(CUTOFF), grid)
         values = [*scene.mean, *scene.factor, *parameters.color]
     else:
-        draw, lists = _rasterize, bin_gaussians(replace(scene, cutoff=cutoff))
+        draw, lists = _rasterize, bin_gaussians(replace(scene, cutoff=CUTOFF))
         values = [*parameters.shape, *parameters.color]
     dr.eval(values)
-    shape = (scene.height, scene.width, scene.channels)
-    delta = upload(type(values[0]), np.random.default_rng(1).normal(size=math.prod(shape)))
+    size = scene.height * scene.width * scene.channels
+    delta = upload(type(values[0]), np.random.default_rng(1).normal(size=size))
 
     @dr.freeze
     def forward(values: list, background: list, lists: TileLists) -> Any:
-        return draw(values, background, lists, cutoff)
+        return draw(values, background, lists, CUTOFF)
 
     @dr.freeze
     def step(values: list, background: list, lists: TileLists, delta: Any) -> list:
         dr.enable_grad(values)
-        dr.backward(dr.dot(draw(values, background, lists, cutoff), delta))
+        dr.backward(dr.dot(draw(values, background, lists, CUTOFF), delta))
         return dr.grad(values)
 
-    def shown() -> NDArray[Any]:
-        image = draw(values, background, lists, cutoff)
-        if plain:
-            return image.numpy().reshape(shape)
-        return to_tensor(image, lists.grid, shape[2]).numpy()
-
     frozen = partial(step, values, background, lists, delta)
-    return partial(forward, values, background, lists), frozen, shown
+    return partial(forward, values, background, lists), frozen
 
 
 def _rasterize(values: list, background: list, lists: TileLists, cutoff: float) -> Any:
@@ -231,25 +200,3 @@ def fit_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
         "fit_over_steps": ms["fit"] / ms["steps"],
         "round_in_steps": ms["round"] / (ms["steps"] / FIT_STEPS),
     }
-
-
-def cutoff_figures(scene: eg.Gaussians) -> list[Row]:
-    """Time pictures by cutoff; errors are of all pixels, against float64 at `WIDEST`."""
-    module = select(types_of(scene.mean).backend)
-    colors = {key: module.ArrayXf64(getattr(scene, key)) for key in ("color", "background")}
-    shapes = {"mean": module.Array2f64(scene.mean), "factor": module.Array3f64(scene.factor)}
-    exact = eg.render(replace(scene, **shapes, **colors), cutoff=WIDEST).numpy()
-    rows, timed = list[Row](), dict[str, Any]()
-    for cutoff in CUTOFFS:
-        forward, step, shown = programs(scene, cutoff, plain=False)
-        timed |= {f"forward {cutoff}": forward, f"step {cutoff}": step}
-        error = shown() - exact
-        largest, rms = np.abs(error).max(), np.sqrt(np.mean(error**2))
-        rows.append({"cutoff": cutoff, "largest_error": largest, "rms_error": rms})
-    ms = interleaved(timed, WARM_UP, ROUNDS)
-    for program in timed.values():
-        program.func.clear()
-    return [
-        row | {f"{what}_ms": ms[f"{what} {row['cutoff']}"] for what in ("forward", "step")}
-        for row in rows
-    ]

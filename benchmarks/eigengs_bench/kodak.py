@@ -23,7 +23,6 @@ from eigengs_bench.rows import Job, Row, Task
 
 SET = "kodak"
 
-PUBLISHED = "published_kodak.csv"
 KIND = ["iterations", "solve_steps"]
 FIT = [*KIND, "gaussians"]
 COLUMNS = (
@@ -114,7 +113,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
 
 def published() -> pd.DataFrame:
     """Read the published figures: a line a method and a number of Gaussians, with its source."""
-    return pd.read_csv(str(files("eigengs_bench") / PUBLISHED))
+    return pd.read_csv(str(files("eigengs_bench") / "published_kodak.csv"))
 
 
 def _name(depth: int) -> str:

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 import eigengs_dr as eg
 from eigengs_bench import report as fr
 from eigengs_bench.clock import Image, descent, score, warm_up
-from eigengs_bench.images import images_of, is_trained, model_for
+from eigengs_bench.images import images_of
 from eigengs_bench.names import SETS
 from eigengs_bench.rows import Job, Row, Task
 from eigengs_dr.fitting.options import PRESETS
@@ -26,8 +26,6 @@ from eigengs_dr.gaussian.file import CUTOFF
 HORIZONS = (0, 10, 100, 300, 1000)
 # Steps after which the one run is looked at where rates stay: it stands for all shorter ones.
 MARKS = (0, 10, 20, 50, 100, 200, 500, 1000)
-# Components a channel of the models that all fits start from, and of others.
-DEFAULT_COMPONENTS, COMPONENTS = 300, (50, 100, 500)
 
 
 class Variant(NamedTuple):
@@ -52,15 +50,8 @@ def run(task: Task, names: Sequence[str]) -> list[Row]:
 
 
 def variants(task: Task, name: str) -> list[Variant]:
-    """List the fits that are compared on a set, the default one first.
-
-    Their models are trained where they are missing; sets without images to train on use the basis
-    that ships, in one size.
-    """
-    count, models = SETS[name].gaussians, dict[int, eg.EigenGS]()
-    if is_trained(task, name):
-        models = {k: model_for(task, name, name, k) for k in (DEFAULT_COMPONENTS, *COMPONENTS)}
-    basis = models.pop(DEFAULT_COMPONENTS, None) or eg.EigenGS.load("natural", task.backend)
+    """List the fits that are compared on a set, the default one first."""
+    count, basis = SETS[name].gaussians, eg.EigenGS.load("natural", task.backend)
     return [
         Variant("preset", "default", count),
         Variant("preset", "gaussianimage", count, "gaussianimage"),
@@ -71,7 +62,6 @@ def variants(task: Task, name: str) -> list[Variant]:
         *(Variant("solve steps", k, count, solve_steps=k) for k in (0, 2, 5, 30)),
         *(Variant("cutoff", k, count, cutoff=k) for k in (2.5, 3.5, 4.0, 5.0)),
         *(Variant("gaussians", round(k * count), round(k * count)) for k in (0.25, 0.5, 2, 4)),
-        *(Variant("components", k, None, "eigengs", start=model) for k, model in models.items()),
     ]
 
 
@@ -115,7 +105,6 @@ KNOBS = {
     "solve steps": ("Steps of the colour solve", "#c27c0e", "^"),
     "cutoff": ("Cutoff in standard deviations", "#7a5c43", "D"),
     "gaussians": ("Number of Gaussians", "#1f9e89", "v"),
-    "components": ("Components a channel of eigengs", "#5a8f3c", "P"),
 }
 
 

@@ -213,10 +213,8 @@ def _iterations(task: Task) -> list[Row]:
 def _colors(task: Task) -> list[Row]:
     """Compare fits in YCbCr and in RGB: the paper's figures of colour spaces."""
     model = EigenGS.load("natural", task.backend)
-    image, marks = (
-        to_size(sample(PHOTO), model),
-        sorted({min(10, task.iterations), task.iterations}),
-    )
+    image = to_size(sample(PHOTO), model)
+    marks = sorted({min(10, task.iterations), task.iterations})
 
     def make() -> list[tuple[str, Sequence[Cell]]]:
         rows: list[tuple[str, Sequence[Cell]]] = []

@@ -98,9 +98,8 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
     """Lay out two matrices of cases and presets: PSNRs, and seconds."""
     steps = " or ".join(f"{n:,}" for n in sorted({row["job"]["iterations"] for row in rows}))
     ends = f"PSNR in dB, YCbCr, at the end, from the start; {steps} steps"
-    return fr.Section(
-        [_matrix(ends, _ends, rows, "ends"), _matrix("Seconds", _cost, rows, "costs")]
-    )
+    tables = _matrix(ends, _ends, rows, "ends"), _matrix("Seconds", _cost, rows, "costs")
+    return fr.Section(tables)
 
 
 def _matrix(caption: str, cell: Callable[[Row], str], rows: Sequence[Row], name: str) -> fr.Table:

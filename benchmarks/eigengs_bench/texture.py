@@ -53,7 +53,6 @@ def summarize(rows: Sequence[Row]) -> Section:
     changes = [
         (what, *(f"{row[f'{name}_{n}_ms']:.1f} ms" for n in CHANGED))
         for what, name in LOOKUPS.items()
-        if f"{name}_{CHANGED[0]}_ms" in row
     ]
     over = f"Time of a picture over that with a bitmap of {TEXELS:,} x {TEXELS:,} texels"
     after = "Time to take over a change of all shapes, or of all colours"
@@ -84,7 +83,7 @@ def _memory(row: Row) -> Table:
     columns = ["Gaussians", "arrays of the file", "points", "prefilter", "BC7", "ASTC 6x6"]
     columns += ["bitmap, mip maps", "points, s", "prefilter, s"]
     lines = []
-    for n in HELD if f"bytes_{HELD[0]}" in row else ():
+    for n in HELD:
         held = [row[f"bytes_{n}"] / row[f"held_{n}"], row[f"bytes_{n}"], row[f"bytes_filtered_{n}"]]
         rivals = [PIXELS * n * bits / 8 for bits in (8, 128 / 36, 4 / 3 * 32 * 3)]
         seconds = [f"{row[f'first_{name}{n}_ms'] / 1e3:.2f}" for name in ("", "filtered_")]
