@@ -59,14 +59,6 @@ def die_once(task, shared):
     return task
 
 
-def die_always(task, shared):
-    """End the process at every try of one task."""
-    if task == shared:
-        os.kill(os.getpid(), signal.SIGKILL)
-    time.sleep(0.05)
-    return task
-
-
 def state():
     """What a worker was set up with."""
     import multiprocessing

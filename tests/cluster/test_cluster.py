@@ -303,13 +303,6 @@ def test_a_worker_that_starts_slowly_comes_back(tmp_path):
     assert found == [Done(k, k) for k in range(3)]
 
 
-def test_a_task_that_ends_all_workers_is_given_up(executor):
-    found = done(executor, clusters.die_always, range(6), 2)
-    assert [entry.task for entry in found if entry.lost] == [2]
-    assert "its worker ended 2 times" in found[2].lost
-    assert [entry.value for entry in found] == [0, 1, None, 3, 4, 5]
-
-
 def test_other_versions_are_refused():
     setup = WorkerSetup(local=True, wanted=versions() | {"eigengs_dr": "9.9"})
     with pytest.raises(ClusterError, match=r"tcp://node:1 has eigengs_dr .*, but .* has 9\.9"):

@@ -60,12 +60,6 @@ def test_grown_adds_where_the_error_is():
     assert squared_error(result, target) < 0.2 * squared_error(empty, target)
 
 
-def test_grown_to_fewer_or_as_many_is_the_set():
-    start, target = fitted()
-    for count in (10, 60):
-        assert densify(start.gaussians, target, count) is start.gaussians
-
-
 def test_grown_of_a_perfect_set_is_the_set():
     start, _ = fitted(20)
     plain = replace(start.gaussians, space="data")

@@ -32,19 +32,6 @@ def reached(gaussians, image):
 
 
 @pytest.mark.parametrize(
-    ("count", "levels", "expected"),
-    [
-        (5000, 4, [78, 312, 1250, 5000]),
-        (7, 1, [7]),
-        (4, 2, [1, 4]),
-        (9000, (5000, np.int64(7000), 9000), [5000, 7000, 9000]),
-    ],
-)
-def test_counts(count, levels, expected):
-    assert level_counts(count, levels) == expected
-
-
-@pytest.mark.parametrize(
     ("count", "levels", "message"),
     [
         (9, [5, 5, 9], "levels 5, 5, 9: numbers of Gaussians must rise"),
@@ -95,10 +82,6 @@ def test_the_picture_is_that_of_the_whole_set(image, result):
     np.testing.assert_array_equal(result.image, picture_of(result.gaussians))
     best = max(row["psnr_ycbcr"] for row in result.trace)
     assert reached(result.gaussians, image) == pytest.approx(best, abs=1e-3)
-
-
-def test_one_level_is_a_set_like_any(image):
-    assert len(fit(image, 10, levels=1, iterations=2).gaussians) == 10
 
 
 @pytest.mark.parametrize("color", ["linear", "rgb", "data"])

@@ -77,14 +77,6 @@ def test_data_of_any_range():
     np.testing.assert_allclose(levels.image[..., 0], heights, atol=60)
 
 
-def test_normals_from_minus_1_to_1():
-    y, x = np.mgrid[:40, :48].astype(np.float32)
-    slopes = np.stack([np.sin(x / 9), np.cos(y / 7), np.ones_like(x)], 2)
-    normals = slopes / np.linalg.norm(slopes, axis=2, keepdims=True)
-    result = eg.fit(normals, space="data", **SMALL)
-    assert np.abs(eg.render(result.gaussians).numpy() - normals).mean() < 0.01
-
-
 def test_many_images_of_light(tmp_path, light):
     for name in ("a.pfm", "b.pfm"):
         eg.save_image(tmp_path / name, light)

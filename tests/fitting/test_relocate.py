@@ -2,16 +2,15 @@
 
 from dataclasses import replace
 from itertools import pairwise
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.halves import SIDE, fitted, picture, relocate, squared_error
+from _helpers.halves import SIDE, fitted, relocate, squared_error
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.fitting.density_control import Part, relocate_levels, removal_cost
-from eigengs_dr.fitting.descent import TiledImage, descend
+from eigengs_dr.fitting.descent import TiledImage
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.schedule import Relocation, relocations
 from eigengs_dr.fitting.start import initialize
@@ -122,22 +121,6 @@ def test_noise_falls_and_seeds_differ():
     rounds = list(relocations(replace(SCHEDULE, relocate_every=65, noise=3.0), 1000).values())
     np.testing.assert_allclose([move.noise for move in rounds], 3 * np.linspace(1, 0.1, 10))
     assert len({move.seed for move in rounds}) == 10
-
-
-def test_a_descent_relocates_and_goes_on():
-    start = initialize(picture(), FitOptions(gaussians=60, init="adaptive"))
-    calls = []
-
-    def move(gaussians, how, image):
-        calls.append(how.share)
-        return start.control.relocate(gaussians, how, image)
-
-    problem = start._replace(control=SimpleNamespace(redistributes=False, relocate=move))
-    schedule = replace(SCHEDULE, relocate_every=15, noise=0.0)
-    sets = list(descend(problem, schedule, 75))
-    assert (len(sets), calls) == (76, [SCHEDULE.relocate_share] * 3)
-    error = [squared_error(s, start.target) for s in (sets[0], sets[-1])]
-    assert error[1] < 0.7 * error[0]
 
 
 @pytest.mark.parametrize("count", [1, 9])

@@ -6,7 +6,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.sets import SIZE
-from _helpers.texture import backend, gaussians, mi, small_scene, texel_centres, texture
+from _helpers.texture import backend, gaussians, mi, texel_centres, texture
 from eigengs_dr.plugins import texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
@@ -109,21 +109,3 @@ def test_derivatives_are_those_of_a_new_texture(names, mode, prefilter):
     ):
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
         assert np.abs(found).max() > 1e-4
-
-
-@pytest.mark.parametrize("prefilter", PREFILTERS)
-def test_frozen_renderings_follow(prefilter):
-    frozen = dr.freeze(lambda scene, seed: mi.render(scene, spp=4, seed=seed))
-    wall = {"type": "diffuse", "reflectance": texture_of(gaussians("linear"), prefilter=prefilter)}
-    scene = small_scene(wall)
-    key = "wall.bsdf.reflectance"
-    parameters = mi.traverse(scene)
-    for step, names in enumerate(((), *CHANGES, ("color",), ("color",))):
-        random = np.random.default_rng(step)
-        for name in names:
-            value = np.array(parameters[f"{key}.{name}"])
-            value *= 1 + 0.1 * random.uniform(-1, 1, value.shape)
-            parameters[f"{key}.{name}"] = mi.TensorXf(np.float32(value))
-        parameters.update()
-        found = np.array(frozen(scene, mi.UInt32(step)))
-        np.testing.assert_allclose(found, np.array(mi.render(scene, spp=4, seed=step)), atol=1e-6)

@@ -87,20 +87,6 @@ def test_density_follows_the_error_by_its_power(backend, times):
     np.testing.assert_allclose(ratio, times ** (1 / (ERROR_EXPONENT + 1)), rtol=1e-3)
 
 
-def test_that_power_leaves_the_least_error():
-    """Of all powers of the error, it is the one whose density misses least: a numerical check."""
-    share, tried = np.array([1.0, 30.0]), np.array([0.5, 0.5])
-    factor = share * tried**ERROR_EXPONENT * tried  # e = factor rho^-q on two equal areas
-
-    def error(power):
-        density = tried * share**power
-        return (factor * (density / density.sum()) ** -ERROR_EXPONENT).sum()
-
-    powers = np.linspace(0, 1, 2001)
-    best = powers[np.argmin([error(p) for p in powers])]
-    assert best == pytest.approx(1 / (ERROR_EXPONENT + 1), abs=1e-3)
-
-
 def test_in_a_part_density_follows_the_bending(backend):
     """One Gaussian owns all pixels."""
     bending = np.ones((32, 32))

@@ -49,24 +49,11 @@ def test_pieces_are_those_of_numpy(backend, height, width, part):
     np.testing.assert_allclose(found, plain_pieces(density.astype(np.float32), count), atol=1e-3)
 
 
-def test_pieces_of_a_batch_are_those_of_its_images(backend):
-    batch = np.random.default_rng(0).uniform(0.1, 1, (3, 13, 18, 1))
-    for image, own in zip(batch, np.split(pieces(batch, 40, backend), 3), strict=True):
-        np.testing.assert_allclose(own, pieces(image, 40, backend), atol=1e-5)
-
-
 def test_pieces_of_an_even_density_are_squares(backend):
     """64 centres on 32 x 32 pixels: pieces of the curve are blocks of 4 x 4."""
     mean = pieces(np.full((32, 32), 64 / 1024), 64, backend)
     expected = {(4 * i + 2.0, 4 * j + 2.0) for i in range(8) for j in range(8)}
     assert {tuple(m) for m in np.round(mean, 5).tolist()} == expected
-
-
-def test_one_piece_is_the_centroid(backend):
-    density = np.random.default_rng(3).uniform(0.1, 1, (9, 14))
-    y, x = np.indices(density.shape) + 0.5
-    expected = [(density * v).sum() / density.sum() for v in (x, y)]
-    np.testing.assert_allclose(pieces(density, 1, backend)[0], expected, rtol=1e-6)
 
 
 def test_places_without_mass_get_no_piece(backend):
