@@ -1,7 +1,5 @@
 """What a splat is worth, and which ones are removed or added."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,7 +8,6 @@ import eigengs_dr as eg
 from _helpers.halves import SIDE, fitted, squared_error
 from _helpers.sets import few, scenes
 from eigengs_dr.fitting.density_control import densify, prune, removal_cost
-from eigengs_dr.raster.render import render
 
 
 @few
@@ -58,12 +55,6 @@ def test_grown_adds_where_the_error_is():
     assert len(result) == 61
     np.testing.assert_allclose(result.to_arrays()["mean"][60], [20.5, 9.5])
     assert squared_error(result, target) < 0.2 * squared_error(empty, target)
-
-
-def test_grown_of_a_perfect_set_is_the_set():
-    start, _ = fitted(20)
-    plain = replace(start.gaussians, space="data")
-    assert len(densify(plain, render(plain).numpy(), 30)) == 20
 
 
 def test_a_weight_leaves_colours_as_they_are():

@@ -126,8 +126,3 @@ def test_levels_keep_the_background(image):
     np.testing.assert_allclose(
         found.to_arrays()["background"], alone.to_arrays()["background"], atol=1e-6
     )
-
-
-def test_as_many_as_fit_takes_by_default(image):
-    small = image[:4, :4]
-    assert len(fit(small, levels=2, iterations=0).gaussians) == 16

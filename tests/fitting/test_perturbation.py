@@ -68,12 +68,6 @@ def test_a_perfect_image_keeps_its_gaussians():
         np.testing.assert_allclose(after[name], before[name], rtol=1e-12)
 
 
-def test_seeds():
-    sets = [perturbed(scene(1.0), 0.01, 1.0, seed)["mean"] for seed in (1, 1, 2)]
-    assert (sets[0] == sets[1]).all()
-    assert (sets[0] != sets[2]).any()
-
-
 def test_the_error_added_to_an_image():
     """One Gaussian far from others adds ``strength^2`` times the error, in the mean."""
     arrays = {

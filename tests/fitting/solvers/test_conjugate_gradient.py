@@ -14,12 +14,9 @@ from eigengs_dr.fitting.solvers.conjugate_gradient import solve
 from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.raster.render import render
 
-ROOMY = 12
-"""Splats that overlap little: few steps converge."""
 
-
-def roomy(count=ROOMY, channels=3):
-    """Splats on a lattice, 5 pixels apart, with standard deviations around 2."""
+def roomy(count=12, channels=3):
+    """Splats on a lattice, 5 pixels apart, with deviations around 2: few steps converge."""
     rng = np.random.default_rng(count)
     place = np.stack([np.arange(count) % 4, np.arange(count) // 4], axis=1)
     mean = place * 5.0 + 3 + rng.uniform(-0.5, 0.5, (count, 2))
@@ -244,11 +241,6 @@ def test_wrong_shape(backend, shape):
     ) as error:
         solve(random_scene().on(backend), np.zeros(shape))
     assert "\n" not in str(error.value)
-
-
-def test_negative_steps_are_refused(backend):
-    with pytest.raises(ValueError, match="steps"):
-        solve(random_scene().on(backend), noise(), steps=-1)
 
 
 @pytest.mark.parametrize("cutoff", [0.0, 13.0])
