@@ -1,5 +1,7 @@
 """What a splat is worth, and which ones are removed or added."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -8,6 +10,7 @@ import eigengs_dr as eg
 from _helpers.halves import SIDE, fitted, squared_error
 from _helpers.sets import few, scenes
 from eigengs_dr.fitting.density_control import densify, prune, removal_cost
+from eigengs_dr.raster.render import render
 
 
 @few
@@ -64,3 +67,9 @@ def test_a_weight_leaves_colours_as_they_are():
     value = removal_cost(gaussians, target, weight)
     best = np.sort(np.argsort(-value, kind="stable")[:30])
     np.testing.assert_array_equal(kept.to_arrays()["color"], gaussians[best].to_arrays()["color"])
+
+
+def test_grown_of_a_perfect_set_is_the_set():
+    start, _ = fitted(20)
+    plain = replace(start.gaussians, space="data")
+    assert len(densify(plain, render(plain).numpy(), 30)) == 20

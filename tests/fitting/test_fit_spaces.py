@@ -174,3 +174,11 @@ def test_light_above_1_is_fitted_without_a_bound_by_default(light, space):
     assert eg.fit(light, space=space, encoding="linear", **SMALL).gaussians.space == "log"
     with pytest.raises(ImageError, match="light above 1; give the space 'log'"):
         eg.fit_large(light, gaussians=200, iterations=2, block=32, space=space, encoding="linear")
+
+
+def test_normals_from_minus_1_to_1():
+    y, x = np.mgrid[:40, :48].astype(np.float32)
+    slopes = np.stack([np.sin(x / 9), np.cos(y / 7), np.ones_like(x)], 2)
+    normals = slopes / np.linalg.norm(slopes, axis=2, keepdims=True)
+    result = eg.fit(normals, space="data", **SMALL)
+    assert np.abs(eg.render(result.gaussians).numpy() - normals).mean() < 0.01

@@ -121,3 +121,9 @@ def test_noise_falls_and_seeds_differ():
     rounds = list(relocations(replace(SCHEDULE, relocate_every=65, noise=3.0), 1000).values())
     np.testing.assert_allclose([move.noise for move in rounds], 3 * np.linspace(1, 0.1, 10))
     assert len({move.seed for move in rounds}) == 10
+
+
+@pytest.mark.parametrize("count", [1, 9])
+def test_sets_too_small_for_a_share_keep_their_gaussians(count):
+    result = eg.fit(eg.sample("coffee")[:32, :32], count)
+    assert len(result.gaussians) == count

@@ -21,6 +21,7 @@ from _helpers.texture import (
     texel_centres,
     texture,
 )
+from eigengs_dr.backend.recording import collector_off
 from eigengs_dr.plugins import gaussian_texture, texture_of
 from eigengs_dr.plugins import lookup as reuse
 from eigengs_dr.plugins import parameters as files
@@ -152,7 +153,7 @@ class TestMapsOfAFile:
 
     @pytest.mark.parametrize("prefilter", [0.0, 0.05])
     def test_frozen_renderings(self, of_files, prefilter):
-        frozen = dr.freeze(lambda scene, seed: mi.render(scene, spp=4, seed=seed))
+        frozen = dr.freeze(collector_off()(lambda scene, seed: mi.render(scene, spp=4, seed=seed)))
         scenes = [small_scene(of_files(shared, prefilter)) for shared in (True, False)]
         parameters = [mi.traverse(scene) for scene in scenes]
         for step in range(4):

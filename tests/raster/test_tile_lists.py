@@ -18,6 +18,7 @@ def on(backend, count=30, dtype=np.float32):
     return eg.Gaussians.from_arrays(**arrays, size=SIZE, space="rgb", backend=backend, dtype=dtype)
 
 
+@recording.collector_off()  # it may not free scenes of other tests while Dr.Jit records
 def step(gaussians, lists, size):
     """The picture, and the gradient of its mean square."""
     gaussians = dr.detach(gaussians)

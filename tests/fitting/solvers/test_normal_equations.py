@@ -44,17 +44,6 @@ def test_splats_outside_have_empty_rows(backend):
     np.testing.assert_allclose(solved[:5], 0, atol=1e-6)
 
 
-@few
-@given(scene=scenes())
-def test_correlate(backend, scene):
-    matrix = dense_matrix(scene, 3.0)
-    found = NormalEquations(scene.on(backend)).correlate(images(7))
-    expected = matrix.T @ images(7).reshape(7, -1).T
-    edges = ~scene.off_edge(3.0).ravel()  # where rounding decides
-    slack = 0.012 * edges.sum() + 2e-4
-    np.testing.assert_allclose(found, expected, atol=slack)
-
-
 def test_correlate_pixels(backend):
     """The planes of an image may share its memory; the sums do not change from call to call."""
     equations = NormalEquations(random_scene(1).on(backend))
