@@ -61,9 +61,9 @@ def test_default_fits_have_the_bits_of_single_ones():
     photo = eg.sample("coffee")
     crops = [photo[y : y + 48, x : x + 48] for y, x in ((40, 60), (110, 190), (200, 300))]
     together, two = (eg.fit_many(part, gaussians=300) for part in (crops, crops[:2]))
-    alone = eg.fit(crops[0], gaussians=300)
+    alone = eg.fit(crops[1], gaussians=300)
     assert np.abs(alone.gaussians.to_arrays()["factor"]).max() > 0.99 / MIN_DEVIATION
-    assert_same_bits(together[0].result, alone)
+    assert_same_bits(together[1].result, alone)
     for row, other in zip(together, two, strict=False):
         assert_same_bits(row.result, other.result)
 
