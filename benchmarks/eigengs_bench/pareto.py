@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 import eigengs_dr as eg
 from eigengs_bench import report as fr
 from eigengs_bench.clock import Image, descent, score, warm_up
-from eigengs_bench.images import images_of
+from eigengs_bench.images import images_of, is_trained, model_for
 from eigengs_bench.names import SETS
 from eigengs_bench.rows import Job, Row, Task
 from eigengs_dr.fitting.options import PRESETS
@@ -50,8 +50,12 @@ def run(task: Task, names: Sequence[str]) -> list[Row]:
 
 
 def variants(task: Task, name: str) -> list[Variant]:
-    """List the fits that are compared on a set, the default one first."""
-    count, basis = SETS[name].gaussians, eg.EigenGS.load("natural", task.backend)
+    """List the fits that are compared on a set, the default one first.
+
+    The basis is that of the set, which is trained if it is missing, or else the one that ships.
+    """
+    count, own = SETS[name].gaussians, is_trained(task, name)
+    basis = model_for(task, name, name, 300) if own else eg.EigenGS.load("natural", task.backend)
     return [
         Variant("preset", "default", count),
         Variant("preset", "gaussianimage", count, "gaussianimage"),

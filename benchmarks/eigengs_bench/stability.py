@@ -98,8 +98,8 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
     """Lay out two matrices of cases and presets: PSNRs, and seconds."""
     steps = " or ".join(f"{n:,}" for n in sorted({row["job"]["iterations"] for row in rows}))
     ends = f"PSNR in dB, YCbCr, at the end, from the start; {steps} steps"
-    tables = _matrix(ends, _ends, rows, "ends"), _matrix("Seconds", _cost, rows, "costs")
-    return fr.Section(tables)
+    costs = _matrix("Seconds", lambda row: fr.number(row.get("seconds")), rows, "costs")
+    return fr.Section([_matrix(ends, _ends, rows, "ends"), costs])
 
 
 def _matrix(caption: str, cell: Callable[[Row], str], rows: Sequence[Row], name: str) -> fr.Table:
@@ -120,7 +120,3 @@ def _ends(row: Row) -> str:
 
 def _decibels(value: float | None) -> str:
     return "exact" if value == MAX_PSNR else fr.number(value)
-
-
-def _cost(row: Row) -> str:
-    return fr.number(row.get("seconds"), 1)
