@@ -198,7 +198,7 @@ def number_of_gaussians() -> None:
 def stability() -> None:
     """Try every preset on hard cases: odd images, odd starts, rates too high.
 
-    All cases take about ten minutes.
+    All cases take two minutes.
     """
 
 
