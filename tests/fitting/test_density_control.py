@@ -70,6 +70,5 @@ def test_a_weight_leaves_colours_as_they_are():
 
 
 def test_grown_of_a_perfect_set_is_the_set():
-    start, _ = fitted(20)
-    plain = replace(start.gaussians, space="data")
+    plain = replace(fitted(20)[0].gaussians, space="data")
     assert len(densify(plain, render(plain).numpy(), 30)) == 20

@@ -257,6 +257,8 @@ byte_images = hnp.arrays(
 def test_lossless_round_trip(tmp_path_factory, suffix, image):
     path = tmp_path_factory.mktemp("round") / f"a{suffix}"
     save_image(path, image)
+    with Image.open(path) as file:
+        assert file.mode == ("L" if image.shape[2] == 1 else "RGB")
     np.testing.assert_array_equal(load_image(path), check_image(image))
     kept = load_image(path, keep_grey=True)
     np.testing.assert_array_equal(kept, check_image(image, keep_grey=True))

@@ -4,8 +4,11 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from _helpers.sets import upload
+from _helpers.footprints import matrices
+from _helpers.sets import covariances, few, random_scene, upload
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.evaluate import exp2_neg, is_steep, weights, widen
 from eigengs_dr.raster.parameters import EXP2_SCALE, kernel_radius
@@ -17,9 +20,10 @@ def test_exp2_neg(types):
     halves, small = np.arange(0, 120.25, 0.25), 2.0 ** -np.arange(99)
     q = np.concatenate([halves, small, rng.uniform(0, 120, 200_000)])
     q = q.astype(np.float32).astype(np.float64)
-    error = np.abs(exp2_neg(types.Float(q)).numpy().astype(np.float64) / np.exp2(-q) - 1)
-    single = 2.5e-7 if types.backend == "llvm" else 5e-7
-    assert error.max() < (single if types.bits == 32 else 1e-15)
+    found = exp2_neg(types.Float(q)).numpy().astype(np.float64)
+    single, above = (2.5e-7, 0) if types.backend == "llvm" else (5e-7, 5e-7)
+    assert np.abs(found / np.exp2(-q) - 1).max() < (single if types.bits == 32 else 1e-15)
+    assert found.max() <= 1 + above
 
 
 @pytest.mark.parametrize("rows", [1, 2, 4])
@@ -66,3 +70,17 @@ def test_widened_needles_keep_their_digits(backend, spread):
         found[bits] = [np.array(v) for v in (a1, b1, c1, amplitude)]
     for single, double in zip(found[""], found["64"], strict=True):
         np.testing.assert_allclose(single, double, rtol=1e-3, atol=1e-6)
+
+
+@few
+@given(seed=st.integers(0, 1000))
+def test_covariances_add_and_the_integral_stays(backend, seed):
+    rng, scene = np.random.default_rng(seed), random_scene(seed)
+    spread = covariances(rng.uniform(0, 30, (1, 2)), rng.uniform(0, np.pi, 1))[0]
+    Float = select(backend).Float64
+    shape = [Float(v) for v in (*scene.mean.T, *scene.factor.T)]
+    (*_, a, b, c), amplitude = widen(shape, [Float(v) for v in spread.ravel()[[0, 1, 3]]])
+    before, after = matrices(*scene.factor.T), matrices(*map(np.array, (a, b, c)))
+    np.testing.assert_allclose(after, before + spread, rtol=1e-9, atol=1e-9)
+    integrals = (np.sqrt(np.linalg.det(m)) for m in (before, after))
+    np.testing.assert_allclose(next(integrals), np.array(amplitude) * next(integrals))

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from sklearn.decomposition import PCA
 
 from _helpers.errors import one_line
-from _helpers.low_rank import HEIGHT, SIZE, WIDTH, basis_of, family, planes
+from _helpers.low_rank import HEIGHT, PIXELS, SIZE, WIDTH, basis_of, family, planes
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
+from eigengs_dr.eigenbasis.pca.incremental import empty_state, merge
 from eigengs_dr.image.io import ImageError
 from eigengs_dr.image.resize import resample
 
@@ -200,3 +201,16 @@ def test_coefficients_of_another_basis_are_refused():
         with pytest.raises(ValueError, match="coefficients have shapes") as error:
             basis_of("rgb").reconstruct(weights)
         one_line(error)
+
+
+def test_rows_stay_orthonormal_when_variances_differ_much():
+    """What rounding mixes into small components is as large as they are."""
+    rng = np.random.default_rng(0)
+    spread = np.logspace(-1, -4.5, 30)
+    directions = np.linalg.qr(rng.normal(size=(PIXELS, 30)))[0].T * np.sqrt(PIXELS)
+    images = 0.5 + (rng.normal(size=(200, 30)) * spread) @ directions
+    state = empty_state(SIZE)
+    for block in np.split(images.astype(np.float32), 8):
+        state = merge(state, block, 40)
+        overlap = state.rows.astype(np.float64) @ state.rows.T.astype(np.float64)
+        assert np.abs(overlap - np.eye(len(state.rows))).max() < 1e-5

@@ -1,10 +1,13 @@
-"""Sums seen through a footprint, against brute force: a fine picture, its copies, a weighed sum."""
+"""Sums seen through a footprint, against brute force; its bounds, and the error function."""
 
 from dataclasses import replace
 
 import drjit as dr
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.special import erf
 
 from _helpers.footprints import (
     CUTOFF,
@@ -15,9 +18,10 @@ from _helpers.footprints import (
     some_points,
     stacked,
 )
-from _helpers.sets import SIZE, random_scene
-from eigengs_dr.backend.arrays import types_of
-from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, arrange
+from _helpers.sets import SIZE, covariances, few, random_scene
+from eigengs_dr.backend.arrays import types_in, types_of
+from eigengs_dr.backend.selection import select
+from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, arrange, bound_covariance, quick_erf
 from eigengs_dr.raster.lookup.points import Packed
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
@@ -138,3 +142,44 @@ def test_lists_in_order_give_the_same(backend, variance):
     copies = replace(packed, arranged=arrange(sizes.listed[0][1].splat, p.shape, p.color))
     found, expected = (sum_prefiltered(sizes, q, *rest) for q in (copies, packed))
     np.testing.assert_allclose(np.array(found), np.array(expected), atol=2e-5)
+
+
+class TestBoundedCovariance:
+    def bounded(self, backend, metrics):
+        Float = types_in(select(backend)).Float
+        rows = [Float(np.asarray(m, np.float32)) for m in np.array(metrics).T.copy()]
+        covariance, blind = bound_covariance(rows)
+        return np.stack([np.array(c) for c in covariance], 1), np.array(blind)
+
+    @few
+    @given(
+        long=st.floats(0.001, 100),
+        short=st.floats(0.001, 100),
+        angle=st.floats(0, 3),
+    )
+    def test_inverts_and_shortens(self, backend, long, short, angle):
+        axes = covariances(np.array([[1.0, 0.0]]), np.array([angle]))[0]
+        other = np.eye(2) - axes
+        metric = axes / long**2 + other / short**2
+        expected = axes * min(long, MAX_FOOTPRINT) ** 2 + other * min(short, MAX_FOOTPRINT) ** 2
+        found, blind = self.bounded(backend, [[metric[0, 0], metric[0, 1], metric[1, 1]]])
+        if min(long, short) > MAX_FOOTPRINT * 1.001:
+            assert blind[0]
+        elif min(long, short) < MAX_FOOTPRINT / 1.001:
+            assert not blind[0]
+            keys = ((0, 0), (0, 1), (1, 1))
+            np.testing.assert_allclose(found[0], [expected[k] for k in keys], atol=2e-3)
+
+    def test_what_is_not_finite_is_blind(self, backend):
+        found, blind = self.bounded(
+            backend, [[np.nan, 0, 1], [np.inf, 0, np.inf], [0, 0, 0], [1, np.nan, 1]]
+        )
+        assert blind.all()
+        assert np.isfinite(found).all()
+
+
+def test_quick_erf_is_close(backend):
+    x = np.linspace(-6, 6, 2001, dtype=np.float32)
+    found = np.array(quick_erf(types_in(select(backend)).Float(x)))
+    np.testing.assert_allclose(found, erf(x), atol=0.0055)
+    assert np.abs(found).max() <= 1 + 1e-6
