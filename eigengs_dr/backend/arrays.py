@@ -86,12 +86,24 @@ def _types(module: str, bits: int) -> ArrayTypes:
     return ArrayTypes._make([*found, module.split(".")[1], bits])
 
 
-def release_memory() -> None:
+LARGE = 1 << 22
+"""Most values of an image whose memory is kept for the next one: new pages take time. The start of
+a fit of 512x512 pixels took 1.6 times as long without."""
+
+
+def release_memory(values: int) -> None:
     """Give memory that is free back to the system: that of Dr.Jit, and that of the C library.
 
     Both keep what was freed for later. After a step of a fit that takes much memory, nothing later
     asks for blocks of these sizes.
+
+    Parameters
+    ----------
+    values : int
+        Size of the image of this step: its memory is given back from `LARGE` on.
     """
+    if values < LARGE:
+        return
     dr.flush_malloc_cache()
     if sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc; others have none

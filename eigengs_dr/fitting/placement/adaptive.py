@@ -34,7 +34,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.arrays import Float, types_in, types_of
+from ...backend.arrays import Float, release_memory, types_in, types_of
 from ...backend.selection import select
 from ...gaussian.file import CUTOFF
 from ...gaussian.gaussians import Gaussians, Rows
@@ -123,7 +123,7 @@ def place_adaptive(
     rows = types.FloatX(color), types.FloatX(background)
     placed = Gaussians(mean, factor, *rows, width, height, space, float(cutoff)).bounded()
     dr.eval(placed)
-    dr.flush_malloc_cache()  # nothing later asks for blocks of these sizes
+    release_memory(image.size)  # nothing later asks for blocks of these sizes
     return placed
 
 
@@ -168,7 +168,7 @@ def place_by_density(
     density = normalize_density(canvas, density, count)
     mean = stratify_along_hilbert(canvas, density, count)
     mean = lloyd_step(canvas, mean, density, spacing)
-    dr.flush_malloc_cache()  # the blur of the energy takes the most
+    release_memory(dr.width(energy))  # the blur of the energy takes the most
     factor = shapes_from_hessian(canvas, mean, density, energy, spacing)
     return canvas.types.Float2(mean), factor
 

@@ -84,6 +84,18 @@ def curve_of(canvas: Canvas) -> tuple[UInt, UInt]:
     return types.UInt(rank) + canvas.first_tile(sizes.image_of(tile)), types.UInt(state)
 
 
+def order_along_hilbert(canvas: Canvas, mean: tuple[Float, Float]) -> UInt:
+    """Return the order of means along a Hilbert curve through the tiles, image after image.
+
+    Parameters
+    ----------
+    mean : pair of Float, shape (N,)
+        In pixels, image after image.
+    """
+    rank, (place, _, _) = curve_of(canvas)[0], pixel_of(canvas, mean)
+    return dr.argsort(dr.gather(canvas.types.UInt, rank, place // PIXELS))
+
+
 def stratify_along_hilbert(canvas: Canvas, density: Float, count: int) -> tuple[Float, Float]:
     """Cut a Hilbert curve through the pixels into pieces of equal mass; return their centroids.
 

@@ -108,7 +108,7 @@ def solve(
         start, hold = (color, free), background is not None
         lists = bin_gaussians(gaussians, images=len(images))
         solution = _solve(gaussians, lists, image, start, steps, hold)
-    release_memory()  # the lists too
+    release_memory(image.size)  # the lists too
     return solution
 
 
@@ -191,7 +191,7 @@ def reduce_error(
     number = dr.width(shape[0]) / lists.grid.images
     noise = dr.opaque(types.Float, number * ROUNDING[types.bits] ** 2)
     dr.eval(enough)
-    dr.flush_malloc_cache()  # what the lists and the start took would stay reserved
+    release_memory(dr.width(error))  # what the lists and the start took would stay reserved
     found = []
     for _ in range(steps):
         x, q, alpha = _advance(shape, x, p, rz, lists, cutoff)
