@@ -14,9 +14,9 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import Float, types_of
-from ..backend.recording import exclusive
-from ..gaussian.gaussians import Gaussians
+from ..backend.arrays import ArrayTypes, Float, types_of
+from ..backend.recording import exclusive, record
+from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import (
     RGB_TO_YCBCR,
     decode,
@@ -28,7 +28,7 @@ from ..image.color import (
     unit_codes,
 )
 from ..image.metrics import float_space, psnr_from_mse
-from ..raster.binning.tiles import Grid
+from ..raster.binning.lists import TileLists
 from ..raster.kernels import forward, sum_by_image
 from ..raster.parameters import (
     detached_shape,
@@ -98,45 +98,61 @@ def psnrs(gaussians: Gaussians, parts: Sequence[Shown]) -> NDArray[np.float64]:
     """
     first = parts[0].image
     images = len(first) if first.ndim == 4 else 1
+    types = types_of(gaussians.mean)
     with dr.suspend_grad():
         lists = bin_gaussians(gaussians, adjoint=False, images=images)
-        packed = pack_parameters([*detached_shape(gaussians), *gaussians.color])
-        background, radius = list(gaussians.background), kernel_radius(gaussians.cutoff)
-        rendered = forward(packed, background, lists, radius)
-        dr.eval(rendered)
-        sums = [s for part in parts for s in _squared_errors(rendered, part, gaussians, lists.grid)]
+        shape, color = detached_shape(gaussians), whole(gaussians.color, gaussians)
+        uploads = [_upload(types, part) for part in parts]
+        background = list(gaussians.background)
+        sums = _squared_errors(shape, color, background, lists, gaussians.cutoff, uploads)
         dr.eval(sums)
     sizes = [part.image.size // images for part in parts for _ in range(2)]
     mse = np.array([s.numpy() / size for s, size in zip(sums, sizes, strict=True)])
     return np.vectorize(psnr_from_mse)(mse).reshape(len(parts), 2, images)
 
 
-def _squared_errors(rendered: Float, part: Shown, gaussians: Gaussians, grid: Grid) -> list:
-    """Return the squared errors of a part in both spaces, Float64 of shape (images,).
+def _upload(types: ArrayTypes, part: Shown) -> tuple:
+    """Return the space, the first channel, the weight, the image and the base of a part."""
+    image, base = (None if v is None else batch_to_tiles(types, v) for v in (part.image, part.base))
+    return part.space, part.channels.start or 0, dr.opaque(types.Float, part.weight), image, base
 
-    A lane owns the pixels of a row of a tile.
+
+@record
+def _squared_errors(
+    shape: list, color: list, background: list, lists: TileLists, cutoff: float, parts: list
+) -> list:
+    """Return the squared errors of parts in both spaces each, Float64 of shape (images,).
+
+    A lane owns the pixels of a row of a tile. The parts are from `_upload`.
     """
-    types, (length, _) = types_of(rendered), grid.tile
+    types, grid = types_of(shape[0]), lists.grid
+    rendered = forward(
+        pack_parameters([*shape, *color]), background, lists, kernel_radius(cutoff)
+    )
+    dr.eval(rendered)
+    length = grid.tile[0]
     run = dr.arange(types.UInt, grid.tiles * grid.pixels // length)
 
-    def read(image: Float, channels: int) -> list:
+    def read(image: Float) -> list:
+        channels = dr.width(image) // (grid.tiles * grid.pixels)
         values = gather_run(types, image, run, length * channels, True)
         return [values[k * channels : (k + 1) * channels] for k in range(length)]
 
-    image = read(batch_to_tiles(types, part.image), part.image.shape[-1])
-    base = None if part.base is None else read(batch_to_tiles(types, part.base), 3)
-    inside = read(pixels_inside(types, grid), 1)
-    weight = dr.opaque(types.Float, part.weight)
-    spaces, totals = (float_space(part.space), "rgb"), [types.Float(0), types.Float(0)]
-    for k, sums in enumerate(read(rendered, gaussians.channels)):
-        shown = show(part.space, [s / weight for s in sums[part.channels]])
-        if base is not None:
-            shown = [s + b for s, b in zip(shown, base[k], strict=True)]
-        for n, space in enumerate(spaces):
-            error = squared_difference(shown, image[k], space)
-            totals[n] += dr.select(inside[k][0] > 0, error, 0)
-    Double = dr.float64_array_t(types.Float)
-    return [sum_by_image(Double(total), grid) for total in totals]
+    pixels, inside = read(rendered), read(pixels_inside(types, grid))
+    found = []
+    for space, first, weight, image, base in parts:
+        totals = [types.Float(0), types.Float(0)]
+        for k, own in enumerate(read(image)):
+            sums = pixels[k][first : first + len(own)]
+            shown = show(space, [s / weight for s in sums])
+            if base is not None:
+                shown = [s + b for s, b in zip(shown, read(base)[k], strict=True)]
+            for n, kind in enumerate((float_space(space), "rgb")):
+                error = squared_difference(shown, own, kind)
+                totals[n] += dr.select(inside[k][0] > 0, error, 0)
+        Double = dr.float64_array_t(types.Float)
+        found += [sum_by_image(Double(total), grid) for total in totals]
+    return found
 
 
 def show(space: str, sums: list) -> list:
