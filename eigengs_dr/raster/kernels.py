@@ -240,18 +240,23 @@ def sum_by_image(values: Float, grid: Grid) -> Any:
 
 def channel_sums(image: Float, channels: int, grid: Grid) -> list:
     """Sum each channel of images in tile layout; return a list of Float, shape (images,)."""
-    sums = sum_channels(_pixels(image, channels, grid), channels)
-    dr.eval(sums)  # one kernel for all channels
-    return [sum_by_image(s, grid) for s in sums]
+    return _totals(sum_channels(_pixels(image, channels, grid), channels), grid)
 
 
 def channel_moments(image: Float, channels: int, grid: Grid) -> tuple[list, list]:
     """Sum the values and the squares of each channel, as `channel_sums`, in one pass."""
     values = _pixels(image, channels, grid)
-    sums = sum_channels(values, channels)
     squares = sum_channels([dr.square(v) for v in values], channels)
-    dr.eval(sums, squares)
-    return [sum_by_image(s, grid) for s in sums], [sum_by_image(s, grid) for s in squares]
+    found = _totals([*sum_channels(values, channels), *squares], grid)
+    return found[:channels], found[channels:]
+
+
+def _totals(values: list, grid: Grid) -> list:
+    """Add values of tiles in double precision: sums over large images keep their digits."""
+    Float, Double = type(values[0]), dr.float64_array_t(type(values[0]))
+    values = [Double(v) for v in values]
+    dr.eval(values)  # one kernel for all
+    return [Float(sum_by_image(v, grid)) for v in values]
 
 
 def _pixels(image: Float, channels: int, grid: Grid) -> list:

@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.arrays import Float, release_memory, types_in, types_of
+from ...backend.recording import record
 from ...backend.selection import select
 from ...gaussian.file import CUTOFF
 from ...gaussian.gaussians import Gaussians, Rows
@@ -148,6 +149,7 @@ def _place(
     return place_by_density(canvas, per_pixel, energy, count, spacing)
 
 
+@record
 def place_by_density(
     canvas: Canvas, density: Float, energy: Float, count: int, spacing: float
 ) -> tuple[Rows, Rows]:

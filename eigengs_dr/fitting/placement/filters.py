@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import drjit as dr
 
@@ -24,7 +24,8 @@ TRUNCATION = 2.5
 """Radius of the weights along an axis, in standard deviations; with 3, peaks gain 0.00 dB."""
 
 
-class Canvas(NamedTuple):
+@dataclass(frozen=True)
+class Canvas:
     """Images in tile layout.
 
     Attributes

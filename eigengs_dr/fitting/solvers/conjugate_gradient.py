@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...backend.arrays import Float, UInt, rcp, release_memory, types_of, upload
 from ...backend.recording import record
 from ...gaussian.file import MAX_CUTOFF
-from ...gaussian.gaussians import Gaussians
+from ...gaussian.gaussians import Gaussians, whole
 from ...raster.adjoint import adjoint
 from ...raster.binning.lists import TileLists
 from ...raster.binning.tiles import Grid
@@ -100,57 +100,57 @@ def solve(
     if steps < 0:
         raise ValueError(f"solve: steps is {steps}; it must be at least 0")
     with dr.suspend_grad():
-        types = types_of(gaussians.mean)
-        images = image if image.ndim == 4 else image[None]
-        color, free = _start(gaussians, images, warm_start)
-        if background is not None:
-            free = [upload(types.Float, row) for row in np.asarray(background)[:, None]]
-        start, hold = (color, free), background is not None
-        lists = bin_gaussians(gaussians, images=len(images))
-        solution = _solve(gaussians, lists, image, start, steps, hold)
-    release_memory(image.size)  # the lists too
-    return solution
+        cutoff = gaussians.cutoff
+        lists = bin_gaussians(gaussians, images=len(image) if image.ndim == 4 else 1)
+        shape = detached_shape(gaussians)
+        x, error, first, inverse = _start(gaussians, shape, image, lists, warm_start, background)
+        x, squares = reduce_error(shape, x, error, inverse, lists, cutoff, steps)
+        residuals = [dr.sum(sum(square)) for square in [first, *squares]]
+        FloatX = types_of(gaussians.mean).FloatX
+        solved = replace(gaussians, color=FloatX(x[0]), background=FloatX(x[1]))
+        dr.eval(solved, residuals)
+        total = dr.concat(residuals).numpy()  # one copy to the host
+        del lists
+    release_memory(image.size)
+    return Solution(solved, np.sqrt(total / image.size).tolist())
 
 
-def _start(gaussians: Gaussians, images: NDArray[np.floating], warm: bool) -> Unknowns:
-    """Return the first unknowns: those of the set, or zero and the mean of each image."""
-    types, n = types_of(gaussians.mean), len(gaussians)
-    if warm:
-        color = [types.Float(c) + dr.zeros(types.Float, n) for c in gaussians.color]
-        return color, [types.Float(b) for b in gaussians.background]
-    means = images.mean(axis=(1, 2), dtype=np.float64).T
-    color = [dr.zeros(types.Float, n) for _ in means]
-    dr.make_opaque(color)
-    return color, [upload(types.Float, row) for row in means]
-
-
-def _solve(
+def _start(
     gaussians: Gaussians,
-    lists: TileLists,
+    shape: list,
     image: NDArray[np.floating],
-    x: Unknowns,
-    steps: int,
-    hold_background: bool = False,
-) -> Solution:
-    """Solve for an image, or for a batch of images, from the unknowns x."""
-    types, cutoff, grid = types_of(gaussians.mean), gaussians.cutoff, lists.grid
-    shape = detached_shape(gaussians)
-    dr.eval(shape, x)
+    lists: TileLists,
+    warm: bool,
+    background: NDArray[np.floating] | None,
+) -> tuple[Unknowns, Float, list, Unknowns]:
+    """Return the first unknowns, and what `_first_error` says of them.
+
+    They are those of the set, or zero and the mean of each image.
+    """
+    types, grid = types_of(gaussians.mean), lists.grid
     target = batch_to_tiles(types, np.asarray(image, np.float32))
+    if warm:
+        color, free = whole(gaussians.color, gaussians), list(gaussians.background)
+    else:
+        color = [dr.zeros(types.Float, len(gaussians)) for _ in range(gaussians.channels)]
+        sums = channel_sums(target, gaussians.channels, grid)
+        free = [s * dr.opaque(types.Float, 1 / (grid.width * grid.height)) for s in sums]
+    if background is not None:
+        free = [upload(types.Float, row) for row in np.asarray(background)[:, None]]
+    x = color, free
+    dr.make_opaque(shape, x)
+    error, first, inverse = _first_error(shape, x, target, lists, gaussians.cutoff)
+    dr.eval(error, first, inverse)
+    return x, error, first, inverse if background is None else held_background(inverse)
+
+
+@record
+def _first_error(
+    shape: list, x: Unknowns, target: Float, lists: TileLists, cutoff: float
+) -> tuple[Float, list, Unknowns]:
+    """Return ``A x - D``, the sums of its squares, and the preconditioner."""
     error, lanes = apply(shape, x, lists, cutoff, target)
-    first = sum_lanes(lanes, lists)
-    dr.eval(error, first)
-    del target
-    inverse = inverse_diagonal(shape, gaussians.channels, lists, cutoff)
-    if hold_background:
-        inverse = held_background(inverse)
-    x, squares = reduce_error(shape, x, error, inverse, lists, cutoff, steps)
-    residuals = [dr.sum(sum(square)) for square in [first, *squares]]
-    solved = replace(gaussians, color=types.FloatX(x[0]), background=types.FloatX(x[1]))
-    dr.eval(solved, residuals)
-    number = grid.width * grid.height * grid.images * gaussians.channels
-    total = dr.concat(residuals).numpy()  # one copy to the host
-    return Solution(solved, np.sqrt(total / number).tolist())
+    return error, sum_lanes(lanes, lists), inverse_diagonal(shape, len(x[0]), lists, cutoff)
 
 
 def reduce_error(
