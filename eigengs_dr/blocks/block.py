@@ -17,7 +17,6 @@ that it is the density of the whole image.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -157,8 +156,8 @@ def _density(target: FitTarget, settings: Settings) -> tuple[Canvas, Float, Floa
     """Return the canvas of a window, and squared Hessian and density on it."""
     types = types_in(select(settings.options.backend))
     canvas = Canvas.of(types, Grid(target.shown.shape[1], target.shown.shape[0]))
-    read = partial(to_tiles, types, target.shown, canvas.grid)
-    return canvas, *density_from_hessian(canvas, read, settings.spacing)
+    image = to_tiles(types, target.shown, canvas.grid)
+    return canvas, *density_from_hessian(canvas, image, settings.spacing)
 
 
 def _mass(canvas: Canvas, density: Float, block: Block) -> float:

@@ -55,10 +55,6 @@ Density = Callable[[Canvas, Float, int], Float]
 """``density(canvas, default, times)`` returns the Gaussians per pixel, up to a factor, for the
 density by `density_from_hessian` of an image, which was shrunk by `times`; all in tile layout."""
 
-Read = Callable[[], Float]
-"""``read()`` returns an image in tile layout. It lives no longer than its blur needs it: images
-take most of the memory."""
-
 IMAGE_BLUR = 0.18
 """Standard deviation of the blur of the image, in spacings: it removes details that no Gaussian can
 follow."""
@@ -117,7 +113,7 @@ def place_adaptive(
     types, (height, width, channels) = types_in(select(backend)), image.shape[-3:]
     images = len(image) if image.ndim == 4 else 1
     canvas = Canvas.of(types, Grid(width, height, images=images))
-    mean, factor = _place(canvas, lambda: batch_to_tiles(types, image), count, density)
+    mean, factor = _place(canvas, batch_to_tiles(types, image), count, density)
     color = [dr.zeros(types.Float, images * count) for _ in range(channels)]
     background = [dr.zeros(types.Float, images) for _ in range(channels)]
     dr.make_opaque(color, background)
@@ -129,7 +125,7 @@ def place_adaptive(
 
 
 def _place(
-    canvas: Canvas, read: Read, count: int, density: Density | None, times: int = 1
+    canvas: Canvas, image: Float, count: int, density: Density | None, times: int = 1
 ) -> tuple[Rows, Rows]:
     """Return the means and the factors of `place_adaptive`, of an image that was shrunk before."""
     types, grid = canvas.types, canvas.grid
@@ -137,13 +133,13 @@ def _place(
     smaller = int(spacing / WORKING_SPACING)
     if smaller > 1:
         small = Grid(-(-grid.width // smaller), -(-grid.height // smaller), images=grid.images)
-        image = read()
         image = shrunk(image, grid, small, canvas.channels(image), smaller)
         less = Canvas.of(types, small)
-        mean, factor = _place(less, lambda: image, count, density, smaller * times)
+        mean, factor = _place(less, image, count, density, smaller * times)
         scale, inverse = (dr.opaque(types.Float, v) for v in (smaller, 1 / smaller))
         return mean * scale, factor * inverse
-    energy, per_pixel = density_from_hessian(canvas, read, spacing)
+    energy, per_pixel = density_from_hessian(canvas, image, spacing)
+    del image  # images take most of the memory
     if density:
         per_pixel = density(canvas, per_pixel, times)
     return place_by_density(canvas, per_pixel, energy, count, spacing)
@@ -175,14 +171,15 @@ def place_by_density(
     return canvas.types.Float2(mean), factor
 
 
-def density_from_hessian(canvas: Canvas, read: Read, spacing: float) -> tuple[Float, Float]:
+@record
+def density_from_hessian(canvas: Canvas, image: Float, spacing: float) -> tuple[Float, Float]:
     """Return the squared Hessian of an image, and the density for it, up to a factor.
 
     Parameters
     ----------
     canvas : Canvas
-    read : callable
-        See `Read`.
+    image : Float, shape (pixels * channels,)
+        In tile layout.
     spacing : float
         Mean distance of Gaussians in pixels.
 
@@ -194,7 +191,7 @@ def density_from_hessian(canvas: Canvas, read: Read, spacing: float) -> tuple[Fl
         0 outside the image.
     """
     noise = (NOISE_SLOPE / spacing**2) ** 2 / 2
-    energy, trace = squared_hessian(canvas, blur(canvas, read(), IMAGE_BLUR * spacing), noise)
+    energy, trace = squared_hessian(canvas, blur(canvas, image, IMAGE_BLUR * spacing), noise)
     trace = blur(canvas, trace, DENSITY_BLUR * spacing)
     inside = canvas.pixels()[-1]
     density = dr.select(inside, dr.exp2(DENSITY_EXPONENT * dr.log2(trace)), 0)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.arrays import Float, rcp, types_of
+from ...backend.recording import record
 from ...gaussian.gaussians import Gaussians, whole
 from ...raster.binning.lists import TileLists
 from ...raster.kernels import forward, sum_by_image
@@ -31,7 +32,8 @@ NO_WEIGHT = 1e-6
 """Sum of weights that counts as none: pixels that no Gaussian reaches take the average."""
 
 
-class Owners(NamedTuple):
+@dataclass(frozen=True)
+class Owners:
     """The parts of pixels that Gaussians own: ``w_n(x) / sum_m w_m(x)`` of the pixel x.
 
     They overlap, so that what a Gaussian owns is an average over its neighbours too.
@@ -159,6 +161,7 @@ def density_ratio(owners: Owners, error: Float, bending: Float) -> Float:
     return ratio
 
 
+@record
 def target_density(owners: Owners, error: Float, bending: Float) -> Float:
     """Return the density at which all Gaussians would have the same error, up to a factor.
 

@@ -44,7 +44,7 @@ def density_of(image, count, backend="llvm"):
     """Gaussians per pixel (H, W)."""
     canvas, values = to_canvas(image, backend)
     spacing = float(np.sqrt(image.shape[0] * image.shape[1] / count))
-    _, density = density_from_hessian(canvas, lambda: values, spacing)
+    _, density = density_from_hessian(canvas, values, spacing)
     return to_pixels(canvas, normalize_density(canvas, density, count))
 
 
@@ -78,7 +78,7 @@ def test_density_and_shapes_are_those_of_numpy(backend, shape):
     trace = plain_blur(energy[..., :2].sum(axis=2), DENSITY_BLUR * spacing)
     expected = trace**DENSITY_EXPONENT
     canvas, values = to_canvas(image, backend)
-    found_energy, found = density_from_hessian(canvas, lambda: values, spacing)
+    found_energy, found = density_from_hessian(canvas, values, spacing)
     np.testing.assert_allclose(to_pixels(canvas, found), expected, rtol=1e-3)
     column, row = (generator(5).integers(0, side, 30) for side in shape[::-1])
     mean = [canvas.types.Float((v + 0.5).astype(np.float32)) for v in (column, row)]
