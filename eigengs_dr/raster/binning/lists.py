@@ -400,6 +400,11 @@ PACKET = 16
 def order_lanes(length: NDArray[np.int64], window: NDArray[np.int64]) -> NDArray[np.uint32]:
     """Return an order of lanes with like lengths in a packet, and packets dealt out evenly.
 
+    Dr.Jit cuts a launch on llvm into blocks of neighbouring lanes, two for each core. Pieces leave
+    a tenth to a third of their lanes empty, all at the end: the last block would have no work. In
+    simulation, the longest thread had 1.27 times the mean work on 2 cores, 1.46 times on 16 and
+    1.51 times on 64; dealt out 1.01, 1.10 and 1.15 times (512x512, 20,000 Gaussians).
+
     Parameters
     ----------
     length : ndarray of int64, shape (lanes,)
@@ -410,28 +415,17 @@ def order_lanes(length: NDArray[np.int64], window: NDArray[np.int64]) -> NDArray
     Returns
     -------
     ndarray of uint32, shape (lanes,)
-        By window, then by descending length; lanes without work are spread among the others.
+        By window, then by descending length; packets without work are spread among the others.
     """
     order = _descending(length, window)
-    return order[_deal(length[order])]
-
-
-def _deal(length: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return an order of lanes that spreads empty packets evenly among the others.
-
-    Dr.Jit cuts a launch on llvm into blocks of neighbouring lanes, two for each core. Pieces leave
-    a tenth to a third of their lanes empty, all at the end: the last block would have no work. In
-    simulation, the longest thread had 1.27 times the mean work on 2 cores, 1.46 times on 16 and
-    1.51 times on 64; dealt out 1.01, 1.10 and 1.15 times (512x512, 20,000 Gaussians).
-    """
-    count = len(length) // PACKET * PACKET
-    full = length[:count].reshape(-1, PACKET).max(axis=1, initial=0) > 0
-    place = np.empty(len(full))
+    dealt = len(order) // PACKET * PACKET
+    packets = order[:dealt].reshape(-1, PACKET)
+    full = (length[packets[:, 0]] > 0) | (length[packets[:, -1]] > 0)
+    place = np.empty(len(packets), np.uint16)  # NumPy sorts 16 bits fastest
     for kind in (full, ~full):
-        place[kind] = (np.arange(kind.sum()) + 0.5) / max(1, kind.sum())
-    packets = np.argsort(place, kind="stable")
-    lanes = (packets[:, None] * PACKET + np.arange(PACKET)).ravel()
-    return np.concatenate([lanes, np.arange(count, len(length))])
+        place[kind] = np.linspace(0, 65535, kind.sum())
+    packets = packets[np.argsort(place, kind="stable")]
+    return np.concatenate([packets.ravel(), order[dealt:]])
 
 
 def _descending(length: NDArray[np.int64], window: NDArray[np.int64]) -> NDArray[np.uint32]:
