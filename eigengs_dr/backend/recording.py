@@ -180,7 +180,7 @@ def _guarded(program: Program, function: Program) -> Program:
     @wraps(function)
     def call(*arguments: Any, **settings: Any) -> Any:
         global _calls
-        with _LOCK, collector_off():
+        with exclusive(), collector_off():
             _calls += 1
             try:
                 return program(*arguments, **settings)

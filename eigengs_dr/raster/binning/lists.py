@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from ...backend.arrays import ArrayTypes, Bool, Float, UInt, make_divisor, types_of, upload
+from ...backend.recording import record
 from ..evaluate import is_steep
 from .tiles import TILE, Grid, GridArrays, for_each_row, for_each_tile, granularity_of
 
@@ -147,10 +148,9 @@ def build_lists(
     # Numbers in arrays: as literals, they would compile the programs again and again.
     sizes, wide = grid.in_arrays(types), dr.opaque(types.Float, radius * growth)
     pad = dr.opaque(types.Float, pad) if isinstance(pad, float) else pad
-    touched = _count_tiles(types, shape, wide, sizes, pad)
-    share, UInt64 = granularity_of(types), dr.uint64_array_t(types.UInt)
-    dr.schedule(touched)  # in the kernel of the sum
-    entries, steep = _read_totals(types, touched, is_steep(shape, radius) & (touched > 0))
+    share = granularity_of(types)
+    touched, totals = _count_tiles(shape, radius, wide, sizes, pad)
+    entries, steep = int(totals[0]) % (1 << 40), int(totals[0]) >= 1 << 40
     steep = steep or not share.products or grid.tile[0] != TILE[0]
     if entries >= MAX_LIST_ENTRIES:
         raise ValueError(
@@ -158,22 +158,13 @@ def build_lists(
             f"{MAX_LIST_ENTRIES}: use fewer or smaller Gaussians, or a smaller image"
         )
     visits = share.visits_for(entries // grid.images, grid.tiles // grid.images)
-    number = (touched + (visits - 1)) // visits
-    # One prefix sum for the tiles and the pieces: each sum fits into 32 bits.
-    both = dr.fma(UInt64(number), 1 << 32, UInt64(touched))
-    dr.schedule(number)
-    before = dr.prefix_sum(both)
-    start, first = types.UInt(before), types.UInt(before >> 32)
-    last = start + touched
-    dr.schedule(first, last)
     image = _images(types, dr.width(touched), grid)
-    tile = _emit_tiles(types, shape, wide, sizes, pad, image, (start, last), _padded(entries))
-    pieces = None
-    if adjoint:
-        # At most one piece of a Gaussian is not full, which bounds their number without reading it.
-        capacity = _padded(dr.width(number) + entries // visits)
-        pieces = _cut(types, tile, (start, last), (first, number), capacity)
-    dr.eval(tile)
+    # At most one piece of a Gaussian is not full, which bounds their number without reading it.
+    most = _padded(dr.width(touched) + entries // visits) if adjoint else 0
+    tile, last, cut = _list_tiles(
+        shape, wide, sizes, pad, image, touched, visits, (_padded(entries), most)
+    )
+    pieces = _in_order(types, tile, *cut) if adjoint else None
     transpose = transpose_by_counting if types.backend == "llvm" else transpose_by_sorting
     splat, starts = transpose(types, grid.tiles, tile, last, entries, dr.width(tile))
     order, begin, end = _lanes(types, grid, starts, ordered and share.ordered)
@@ -201,21 +192,51 @@ def _padded(count: int) -> int:
     return (count // step + 1) * step
 
 
-def _count_tiles(types: ArrayTypes, shape: list, radius: Any, grid: GridArrays, pad: Float) -> Any:
-    """Return the number of tiles that each Gaussian touches, UInt32 of shape (N,)."""
+@record
+def _count_tiles(
+    shape: list, radius: float, wide: Float, grid: GridArrays, pad: Float
+) -> tuple[UInt, Any]:
+    """Return the number of tiles that each Gaussian touches, and totals for one copy to the host.
+
+    The total holds the number of all entries, and 2^40 for each Gaussian that is steep.
+    """
+    types = types_of(shape[0])
+    UInt64 = dr.uint64_array_t(types.UInt)
 
     def add(row: UInt, first: UInt, last: UInt, total: UInt) -> Any:
         return total + types.UInt(dr.maximum(last - first, 0))
 
-    return for_each_row(shape, radius, grid, add, types.UInt(0), pad=pad, label="count tiles")
+    touched = for_each_row(shape, wide, grid, add, types.UInt(0), pad=pad, label="count tiles")
+    dr.schedule(touched)  # in the kernel of the sum
+    steep = is_steep(shape, radius) & (touched > 0)
+    return touched, dr.sum(dr.fma(UInt64(dr.select(steep, 1, 0)), 1 << 40, UInt64(touched)))
 
 
-def _read_totals(types: ArrayTypes, touched: Bool, steep: Any) -> tuple[int, bool]:
-    """Read the number of all entries, and whether a Gaussian is steep, in one copy."""
+@record
+def _list_tiles(
+    shape: list,
+    radius: Float,
+    grid: GridArrays,
+    pad: Float,
+    image: UInt,
+    touched: UInt,
+    visits: int,
+    capacity: tuple[int, int],
+) -> tuple[UInt, UInt, tuple | None]:
+    """Return the tiles of all Gaussians, their ends, and the pieces from `_cut`."""
+    types = types_of(shape[0])
     UInt64 = dr.uint64_array_t(types.UInt)
-    # The sum of both needs one reduction: the flags count in the bits above all entries.
-    total = int(dr.sum(dr.fma(UInt64(dr.select(steep, 1, 0)), 1 << 40, UInt64(touched)))[0])
-    return total % (1 << 40), total >= 1 << 40
+    number = (touched + (visits - 1)) // visits
+    # One prefix sum for the tiles and the pieces: each sum fits into 32 bits.
+    both = dr.fma(UInt64(number), 1 << 32, UInt64(touched))
+    dr.schedule(number)
+    before = dr.prefix_sum(both)
+    start, first = types.UInt(before), types.UInt(before >> 32)
+    last = start + touched
+    dr.schedule(first, last)
+    tile = _emit_tiles(types, shape, radius, grid, pad, image, (start, last), capacity[0])
+    cut = _cut(types, (start, last), (first, number), capacity[1]) if capacity[1] else None
+    return tile, last, cut
 
 
 def _emit_tiles(
@@ -257,19 +278,22 @@ def _lanes(types: ArrayTypes, grid: Grid, starts: UInt, ordered: bool) -> tuple[
     return tile, dr.gather(types.UInt, starts, tile), dr.gather(types.UInt, starts, tile + 1)
 
 
-def _cut(types: ArrayTypes, tile: UInt, tiles: tuple, slots: tuple, capacity: int) -> Pieces:
+def _cut(types: ArrayTypes, tiles: tuple, slots: tuple, capacity: int) -> tuple:
     """Cut the tiles of every Gaussian into pieces of like length, at most the granularity.
 
     Parameters
     ----------
-    tile : UInt32
-        Tiles, Gaussian after Gaussian.
     tiles : tuple of UInt32, shape (N,)
         Start and end of the tiles of each Gaussian.
     slots : tuple of UInt32, shape (N,)
         First piece and number of pieces of each Gaussian.
     capacity : int
         Number of pieces, with padding.
+
+    Returns
+    -------
+    splat, begin, end, first, number
+        See `Pieces`.
     """
     (start, last), (first, number) = tiles, slots
     count, stop = dr.width(number), first + number
@@ -288,6 +312,14 @@ def _cut(types: ArrayTypes, tile: UInt, tiles: tuple, slots: tuple, capacity: in
 
     done = dr.while_loop((first, start), lambda i, at: i < stop, write, label="cut pieces")
     dr.eval(done, splat, begin, end)
+    return splat, begin, end, first, number
+
+
+def _in_order(
+    types: ArrayTypes, tile: UInt, splat: UInt, begin: UInt, end: UInt, first: UInt, number: UInt
+) -> Pieces:
+    """Return pieces in the order of lanes."""
+    capacity = dr.width(splat)
     slot = dr.arange(types.UInt, capacity)
     if granularity_of(types).ordered:
         lengths = (end - begin).numpy().astype(np.int64)
