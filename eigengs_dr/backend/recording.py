@@ -155,23 +155,28 @@ def record(function: Program) -> Program:
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
-        sizes = list(_sizes_of(arguments))  # they may be numbers in a program
+        arrays = list(_arrays_in(arguments))
+        sizes = [dr.width(array) for array in arrays]  # they may be numbers in a program
         if max(sizes) > LARGEST_RECORDED:
             return function(*arguments)
-        return replay(sizes, *arguments)
+        found = replay(sizes, *arguments)
+        # A recording begins a new scope, a replay does not. Programs of later operations have
+        # their instructions in the order of scopes: they would be others after a replay.
+        dr.detail.new_scope(dr.backend_v(arrays[0]))
+        return found
 
     return call
 
 
-def _sizes_of(arguments: Iterable[Any]) -> Iterator[int]:
-    """Yield the sizes of all arrays in some arguments."""
+def _arrays_in(arguments: Iterable[Any]) -> Iterator[Any]:
+    """Yield all arrays in some arguments."""
     for value in arguments:
         if dr.is_array_v(value):
-            yield dr.width(value)
+            yield value
         elif isinstance(value, (list, tuple)):
-            yield from _sizes_of(value)
+            yield from _arrays_in(value)
         elif is_dataclass(value):
-            yield from _sizes_of(vars(value).values())
+            yield from _arrays_in(vars(value).values())
 
 
 def _guarded(program: Program, function: Program) -> Program:

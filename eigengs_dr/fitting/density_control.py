@@ -29,12 +29,11 @@ from .schedule import Relocation
 from .solvers.conjugate_gradient import (
     Unknowns,
     apply,
-    apply_squared,
-    correlate,
     held_background,
     invert,
     solve,
     take_step,
+    weigh,
 )
 
 Array = NDArray[np.floating]
@@ -147,7 +146,7 @@ def removal_cost(
     """Return how much the squared error grows if one Gaussian is removed, for each Gaussian.
 
     With the error e of the set, ``|e - c_n w_n|^2 - |e|^2 = c_n^2 <w_n, w_n> - 2 c_n <w_n, e>``,
-    summed over channels. Cost: a rendering and two adjoints with respect to colours.
+    summed over channels. Cost: a rendering and an adjoint with respect to colours.
 
     Parameters
     ----------
@@ -165,7 +164,7 @@ def removal_cost(
     with dr.suspend_grad():
         scene = _compare(gaussians, _upload(gaussians, target, weight))
         error, _ = scene.error_of(scene.colors)
-        return scene.removal_cost(error, scene.diagonal()).numpy()
+        return scene.weigh(error)[0].numpy()
 
 
 @dataclass(frozen=True)
@@ -196,20 +195,20 @@ class _Comparison:
         """Return the rendering with some colours minus the image, and its squares by lanes."""
         return apply(self.shape, colors, self.lists, self.cutoff, self.target)
 
-    def diagonal(self) -> Unknowns:
-        """Return ``<w_n, w_n>`` of each channel, or of all channels where there is no weight."""
-        channels, factors = len(self.colors[0]), self.squares
-        if factors is None:
-            channels, factors = 1, pixels_inside(types_of(self.target), self.lists.grid)
-        return apply_squared(self.shape, factors, channels, self.lists, self.cutoff)
+    def weigh(self, error: Float) -> tuple[Float, Unknowns]:
+        """Return the removal costs of a set with a known error, see `removal_cost`.
 
-    def removal_cost(self, error: Float, diagonal: Unknowns) -> Float:
-        """Return the removal costs of a set with a known error; see `removal_cost`."""
-        color, channels = self.colors[0], len(self.colors[0])
+        Return ``<w_n, w_n>`` too, of each channel, or of all channels where there is no weight.
+        """
+        color, channels, factors = self.colors[0], len(self.colors[0]), self.squares
+        if factors is None:
+            factors = pixels_inside(types_of(self.target), self.lists.grid)
         weighted = error if self.squares is None else error * self.squares
-        along = correlate(self.shape, weighted, channels, self.lists, self.cutoff)
+        dr.eval(factors, weighted)
+        along, diagonal = weigh(self.shape, weighted, channels, self.lists, self.cutoff, factors)
         own = diagonal[0] * (channels // len(diagonal[0]))
-        return sum(c * (c * o - 2 * a) for c, o, a in zip(color, own, along, strict=True))
+        cost = sum(c * (c * o - 2 * a) for c, o, a in zip(color, own, along, strict=True))
+        return cost, diagonal
 
     def peaks(self, error: Float, count: int) -> Peaks:
         """Return where at most `count` added Gaussians would reduce an error of an image most."""
@@ -373,14 +372,13 @@ def _weigh(scene: _Comparison, inside: Float | None, own: range) -> tuple[Float,
     -------
     cost : Float, shape (N,)
     diagonal : Unknowns
-        From `_Comparison.diagonal`.
+        From `_Comparison.weigh`.
     strength : Float, shape (images,)
         Squared error of the image divided by the number of own Gaussians.
     """
     types, channels = types_of(scene.target), len(scene.colors[0])
     error, _ = scene.error_of(scene.colors)
-    diagonal = scene.diagonal()
-    cost = scene.removal_cost(error, diagonal)
+    cost, diagonal = scene.weigh(error)
     if inside is not None:
         cost = dr.select(_among(dr.arange(types.UInt, dr.width(cost)), own), cost, dr.inf)
         error *= inside
@@ -400,7 +398,7 @@ def _without_some(
     keep : Float, shape (N,)
         0 for the Gaussians without a colour, and 1 for the others.
     diagonal : Unknowns
-        From `_Comparison.diagonal`.
+        From `_Comparison.weigh`.
     inside : Float, or None
         Factor of the errors that count, where not all do. The background then stays.
 

@@ -126,9 +126,7 @@ def _squared_errors(
     A lane owns the pixels of a row of a tile. The parts are from `_upload`.
     """
     types, grid = types_of(shape[0]), lists.grid
-    rendered = forward(
-        pack_parameters([*shape, *color]), background, lists, kernel_radius(cutoff)
-    )
+    rendered = forward(pack_parameters([*shape, *color]), background, lists, kernel_radius(cutoff))
     dr.eval(rendered)
     length = grid.tile[0]
     run = dr.arange(types.UInt, grid.tiles * grid.pixels // length)

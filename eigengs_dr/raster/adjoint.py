@@ -20,6 +20,7 @@ def adjoint(
     lists: TileLists,
     radius: float,
     color_only: bool = False,
+    factors: Float = None,
 ) -> list:
     """Return the gradient of ``<delta, forward(packed)>`` with respect to all parameters.
 
@@ -39,6 +40,9 @@ def adjoint(
         As for `forward`.
     color_only : bool, optional
         Omit the derivatives with respect to the shapes.
+    factors : Float, optional
+        One or more images in tile layout. With `color_only`, the products ``<f, w^2>`` of each with
+        the squared weights follow the derivatives.
 
     Returns
     -------
@@ -46,9 +50,14 @@ def adjoint(
         Derivatives with respect to mean x, mean y, a, b, c (unless `color_only`) and the channels.
     """
     assert lists.pieces is not None, "the lists were built without adjoint=True"
-    number = channels if color_only else NUM_SHAPE_PARAMS + channels
-    parts = adjoint_pieces(packed, delta, channels, lists, radius, color_only)
+    number = channels + (0 if color_only else NUM_SHAPE_PARAMS) + _images_in(factors, lists)
+    parts = adjoint_pieces(packed, delta, channels, lists, radius, color_only, factors)
     return sum_pieces(parts, lists.pieces, number)
+
+
+def _images_in(factors: Float, lists: TileLists) -> int:
+    """Return the number of images in the factors of `adjoint`."""
+    return 0 if factors is None else dr.width(factors) // (lists.grid.tiles * lists.grid.pixels)
 
 
 def adjoint_pieces(
@@ -58,6 +67,7 @@ def adjoint_pieces(
     lists: TileLists,
     radius: float,
     color_only: bool = False,
+    factors: Float = None,
 ) -> Any:
     """Return the packed sums of every piece, for `sum_pieces`; parameters as for `adjoint`.
 
@@ -79,15 +89,15 @@ def adjoint_pieces(
         )
     splat = unpack_parameters(packed, index, NUM_SHAPE_PARAMS + channels)
     shape, block = splat[:NUM_SHAPE_PARAMS], (tile_size[0], rows)
-    length = block[0] * rows * channels
+    length, images = block[0] * rows, _images_in(factors, lists)
 
     def add_tile(i: UInt, sums: list) -> tuple:
         active = i < end
         tile = gather_index(types, pieces.tile, i, active)
-        d = gather_run(types, delta, tile * shares + part, length, active)
+        d = gather_run(types, delta, tile * shares + part, length * channels, active)
         column, row = sizes.first_pixel(tile)
         x, y = types.Float(column) + 0.5, types.Float(row + part * rows) + 0.5
-        color = sums[-channels:]
+        color = sums[-channels - images :][:channels]
 
         def cotangent(k: int, w: Float) -> Any:
             g = type(w)(0)
@@ -97,13 +107,18 @@ def adjoint_pieces(
             return g
 
         if color_only:
+            own, f = sums[channels:], []
+            if images:
+                f = gather_run(types, factors, tile * shares + part, length * images, active)
             for k, w in enumerate(weights(shape, x, y, block, radius, lists.steep)):
                 cotangent(k, w)
-            return i + 1, color
+                square = dr.square(w)
+                own = [dr.fma(square, f[k * images + n], s) for n, s in enumerate(own)]
+            return i + 1, color + own
         gradient = weights_vjp(shape, x, y, block, radius, cotangent, lists.steep)
         return i + 1, [s + g for s, g in zip(sums, gradient, strict=False)] + color
 
-    number = channels if color_only else NUM_SHAPE_PARAMS + channels
+    number = channels + (images if color_only else NUM_SHAPE_PARAMS)
     sums = dr.while_loop(
         (types.UInt(begin), [types.Float(0) for _ in range(number)]),
         lambda i, sums: i < end,

@@ -8,7 +8,6 @@ stored.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,14 +17,12 @@ from numpy.typing import NDArray
 
 from ...backend.arrays import Float, UInt, rcp, release_memory, types_of, upload
 from ...backend.recording import record
-from ...gaussian.file import MAX_CUTOFF
 from ...gaussian.gaussians import Gaussians, whole
 from ...raster.adjoint import adjoint
 from ...raster.binning.lists import TileLists
 from ...raster.binning.tiles import Grid
 from ...raster.kernels import channel_moments, channel_sums, residual, sum_by_image, sum_lanes
 from ...raster.parameters import (
-    NUM_SHAPE_PARAMS,
     detached_shape,
     gather_run,
     kernel_radius,
@@ -103,8 +100,10 @@ def solve(
         cutoff = gaussians.cutoff
         lists = bin_gaussians(gaussians, images=len(image) if image.ndim == 4 else 1)
         shape = detached_shape(gaussians)
-        x, error, first, inverse = _start(gaussians, shape, image, lists, warm_start, background)
-        x, squares = reduce_error(shape, x, error, inverse, lists, cutoff, steps)
+        x, error, first, inverse, along = _start(
+            gaussians, shape, image, lists, warm_start, background
+        )
+        x, squares = reduce_error(shape, x, error, inverse, along, lists, cutoff, steps)
         residuals = [dr.sum(sum(square)) for square in [first, *squares]]
         FloatX = types_of(gaussians.mean).FloatX
         solved = replace(gaussians, color=FloatX(x[0]), background=FloatX(x[1]))
@@ -122,7 +121,7 @@ def _start(
     lists: TileLists,
     warm: bool,
     background: NDArray[np.floating] | None,
-) -> tuple[Unknowns, Float, list, Unknowns]:
+) -> tuple[Unknowns, Float, list, Unknowns, tuple]:
     """Return the first unknowns, and what `_first_error` says of them.
 
     They are those of the set, or zero and the mean of each image.
@@ -139,18 +138,28 @@ def _start(
         free = [upload(types.Float, row) for row in np.asarray(background)[:, None]]
     x = color, free
     dr.make_opaque(shape, x)
-    error, first, inverse = _first_error(shape, x, target, lists, gaussians.cutoff)
-    dr.eval(error, first, inverse)
-    return x, error, first, inverse if background is None else held_background(inverse)
+    held = background is not None
+    return x, *_first_error(shape, x, target, held, lists, gaussians.cutoff)
 
 
 @record
 def _first_error(
-    shape: list, x: Unknowns, target: Float, lists: TileLists, cutoff: float
-) -> tuple[Float, list, Unknowns]:
-    """Return ``A x - D``, the sums of its squares, and the preconditioner."""
+    shape: list, x: Unknowns, target: Float, held: bool, lists: TileLists, cutoff: float
+) -> tuple[Float, list, Unknowns, tuple]:
+    """Return ``A x - D``, the sums of its squares, the preconditioner, and the first direction.
+
+    A held background keeps its value.
+    """
+    channels, grid = len(x[0]), lists.grid
     error, lanes = apply(shape, x, lists, cutoff, target)
-    return error, sum_lanes(lanes, lists), inverse_diagonal(shape, len(x[0]), lists, cutoff)
+    dr.eval(error)
+    inside = pixels_inside(types_of(error), grid)
+    color, diagonal = weigh(shape, error, channels, lists, cutoff, inside)
+    # All channels have the same diagonal.
+    inverse = invert(diagonal[0]) * channels, invert(diagonal[1]) * channels
+    inverse = held_background(inverse) if held else inverse
+    along = _direction((color, channel_sums(error, channels, grid)), inverse, grid)
+    return error, sum_lanes(lanes, lists), inverse, along
 
 
 def reduce_error(
@@ -158,6 +167,7 @@ def reduce_error(
     x: Unknowns,
     error: Float,
     inverse: Unknowns,
+    along: tuple[Unknowns, list],
     lists: TileLists,
     cutoff: float,
     steps: int,
@@ -174,7 +184,9 @@ def reduce_error(
     error : Float
         ``A x - D`` in tile layout, evaluated. It becomes that of the result, in place.
     inverse : Unknowns
-        The preconditioner, from `inverse_diagonal`. Unknowns where it is 0 keep their values.
+        The preconditioner: one over the diagonal. Unknowns where it is 0 keep their values.
+    along : tuple
+        The first direction p, and its rz; see `_direction`.
     lists : TileLists
     cutoff : float
     steps : int
@@ -186,7 +198,7 @@ def reduce_error(
         For each step, and each channel, the sum of the squares of the error after it.
     """
     types = types_of(error)
-    p, rz = _begin(shape, error, inverse, lists, cutoff)
+    p, rz = along
     enough = [RELATIVE_TOLERANCE[types.bits] * a for a in rz]
     number = dr.width(shape[0]) / lists.grid.images
     noise = dr.opaque(types.Float, number * ROUNDING[types.bits] ** 2)
@@ -220,9 +232,16 @@ def _begin(
     shape: list, error: Float, inverse: Unknowns, lists: TileLists, cutoff: float
 ) -> tuple[Unknowns, list]:
     """Return the first direction p, and its rz."""
-    r = negate(apply_transposed(shape, error, len(inverse[0]), lists, cutoff))
+    return _direction(
+        apply_transposed(shape, error, len(inverse[0]), lists, cutoff), inverse, lists.grid
+    )
+
+
+def _direction(gradient: Unknowns, inverse: Unknowns, grid: Grid) -> tuple[Unknowns, list]:
+    """Return the direction ``p = z`` of steepest descent, and ``rz = r^T z``."""
+    r = negate(gradient)
     p = multiply(r, inverse)
-    return p, dots(r, p, lists.grid)
+    return p, dots(r, p, grid)
 
 
 @record
@@ -305,17 +324,33 @@ def apply_transposed(
     return color, channel_sums(delta, channels, lists.grid)
 
 
-def correlate(shape: list, delta: Float, channels: int, lists: TileLists, cutoff: float) -> list:
-    """Return for each channel the correlations of an image with every Gaussian."""
+def correlate(
+    shape: list,
+    delta: Float,
+    channels: int,
+    lists: TileLists,
+    cutoff: float,
+    factors: Float = None,
+) -> list:
+    """Return for each channel the correlations of an image with every Gaussian.
+
+    After them come the products of the squared weights with one or more images of factors.
+    """
     packed = pack_parameters([*shape, *[type(delta)(0)] * channels])
-    return adjoint(packed, delta, channels, lists, kernel_radius(cutoff), color_only=True)
+    return adjoint(packed, delta, channels, lists, kernel_radius(cutoff), True, factors)
 
 
-def inverse_diagonal(shape: list, channels: int, lists: TileLists, cutoff: float) -> Unknowns:
-    """Return one over the diagonal of ``A^T A``: all channels have the same."""
-    inside = pixels_inside(types_of(shape[0]), lists.grid)
-    color, background = apply_squared(shape, inside, 1, lists, cutoff)
-    return invert(color) * channels, invert(background) * channels
+def weigh(
+    shape: list, delta: Float, channels: int, lists: TileLists, cutoff: float, factors: Float
+) -> tuple[list, Unknowns]:
+    """Return the correlations of an image d with every Gaussian, and the diagonal of ``A^T F A``.
+
+    F holds factors of the squares of errors, one for all channels or one for each. Cost: one pass
+    over the lists.
+    """
+    found = correlate(shape, delta, channels, lists, cutoff, factors)
+    diagonal = found[channels:]
+    return found[:channels], (diagonal, channel_sums(factors, len(diagonal), lists.grid))
 
 
 def invert(diagonal: list) -> list:
@@ -327,16 +362,6 @@ def held_background(inverse: Unknowns) -> Unknowns:
     """Return a preconditioner with which the background keeps its value."""
     Float = type(inverse[1][0])
     return inverse[0], [dr.opaque(Float, 0)] * len(inverse[1])
-
-
-def apply_squared(
-    shape: list, delta: Float, channels: int, lists: TileLists, cutoff: float
-) -> Unknowns:
-    """Apply `apply_transposed` with ``w^2``, the weight of a Gaussian narrower by sqrt 2."""
-    root = math.sqrt(2)
-    narrow = [*shape[:2], *[f * root for f in shape[2:NUM_SHAPE_PARAMS]]]
-    reach = min(cutoff * root, MAX_CUTOFF)  # beyond, the squares are 0 in any precision
-    return apply_transposed(narrow, delta, channels, replace(lists, steep=True), reach)
 
 
 Unknowns = tuple[list, list]
