@@ -88,7 +88,8 @@ def _types(module: str, bits: int) -> ArrayTypes:
 
 LARGE = 1 << 22
 """Most values of an image whose memory is kept for the next one: new pages take time. The start of
-a fit of 512x512 pixels took 1.6 times as long without."""
+a fit of 512x512 pixels took 1.6 times as long without. Recorded programs must not give memory back:
+at least `eigengs_dr.backend.recording.LARGEST_RECORDED`."""
 
 
 def release_memory(values: int) -> None:
@@ -100,9 +101,9 @@ def release_memory(values: int) -> None:
     Parameters
     ----------
     values : int
-        Size of the image of this step: its memory is given back from `LARGE` on.
+        Size of the image of this step: above `LARGE`, its memory is given back.
     """
-    if values < LARGE:
+    if values <= LARGE:
         return
     dr.flush_malloc_cache()
     if sys.platform == "linux":

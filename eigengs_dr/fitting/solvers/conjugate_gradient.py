@@ -152,14 +152,15 @@ def _first_error(
     """
     channels, grid = len(x[0]), lists.grid
     error, lanes = apply(shape, x, lists, cutoff, target)
-    dr.eval(error)
+    first = sum_lanes(lanes, lists)
+    dr.eval(error, first)  # together: later, the sums would render again
     inside = pixels_inside(types_of(error), grid)
     color, diagonal = weigh(shape, error, channels, lists, cutoff, inside)
     # All channels have the same diagonal.
     inverse = invert(diagonal[0]) * channels, invert(diagonal[1]) * channels
     inverse = held_background(inverse) if held else inverse
     along = _direction((color, channel_sums(error, channels, grid)), inverse, grid)
-    return error, sum_lanes(lanes, lists), inverse, along
+    return error, first, inverse, along
 
 
 def reduce_error(
