@@ -63,10 +63,10 @@ def test_levels_are_materials_too():
 
 
 def test_packing(tmp_path):
-    result = eg.fit(images(), 12, iterations=40)
+    result = eg.fit(images(), 12, iterations=100)
     before = figures(result)
     packed = eg.pack(result, tmp_path / "m.egs", images(), max_psnr_drop=0.5)
-    assert packed.psnr_drop <= 0.5
+    assert 0 < packed.psnr_drop <= 0.5
     assert packed.bytes == (tmp_path / "m.egs").stat().st_size < 12 * 12 * 4
     loaded = eg.Gaussians.load(tmp_path / "m.egs")
     assert [m[:3] for m in loaded.maps] == [m[:3] for m in result.gaussians.maps]

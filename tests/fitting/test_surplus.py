@@ -55,9 +55,8 @@ def test_noise_is_that_of_a_set_that_keeps_all():
 
 @pytest.mark.parametrize("surplus", [0, 1, 13, 14, 500])
 def test_rounds_drop_all_of_it_evenly(surplus):
-    dropped = [
-        move.dropped for move in relocations(PRESETS["default"].schedule, 980, surplus).values()
-    ]
+    rounds = relocations(PRESETS["default"].schedule, 980, surplus)
+    dropped = [move.dropped for move in rounds.values()]
     assert len(dropped) == 14 and sum(dropped) == surplus
     assert max(dropped) - min(dropped) <= 1
 
