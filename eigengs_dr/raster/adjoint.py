@@ -50,7 +50,7 @@ def adjoint(
         Derivatives with respect to mean x, mean y, a, b, c (unless `color_only`) and the channels.
     """
     assert lists.pieces is not None, "the lists were built without adjoint=True"
-    number = channels + (0 if color_only else NUM_SHAPE_PARAMS) + _images_in(factors, lists)
+    number = channels + (_images_in(factors, lists) if color_only else NUM_SHAPE_PARAMS)
     parts = adjoint_pieces(packed, delta, channels, lists, radius, color_only, factors)
     return sum_pieces(parts, lists.pieces, number)
 
