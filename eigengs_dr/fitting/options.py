@@ -329,9 +329,11 @@ PRESETS = {
         schedule=Schedule(
             optimizer="adam",
             settings={"beta_1": 0.9, "beta_2": 0.9, "epsilon": 1e-12},
-            rates={"mean": 0.28, "factor": 0.22, "color": 0.0115},
+            rates={"mean": 0.4, "factor": 0.22, "color": 0.0115},
+            decay=0.045,
+            drift=1.4,
             relocate_every=45,
-            rate_exponent=0.5,
+            rate_exponent=0.8,
         ),
     ),
     "gaussianimage": Preset(init="random", solves=False, schedule=_ONE_RATE),

@@ -45,8 +45,7 @@ from ...raster.parameters import gather_run
 from ...raster.render import batch_to_tiles, render
 from ..solvers.conjugate_gradient import solve, spread
 from .density import Owners, squared_error, target_density
-from .filters import PIXELS, Canvas, blur, squared_hessian
-from .peaks import shrunk
+from .filters import PIXELS, Canvas, blur, shrunk, squared_hessian
 from .pieces import lloyd_step, pixel_of, stratify_along_hilbert
 
 Array = NDArray[np.floating]
@@ -133,8 +132,8 @@ def _place(
     smaller = int(spacing / WORKING_SPACING)
     if smaller > 1:
         small = Grid(-(-grid.width // smaller), -(-grid.height // smaller), images=grid.images)
-        image = shrunk(image, grid, small, canvas.channels(image), smaller)
         less = Canvas.of(types, small)
+        image = shrunk(canvas, image, less, smaller)
         mean, factor = _place(less, image, count, density, smaller * times)
         scale, inverse = (dr.opaque(types.Float, v) for v in (smaller, 1 / smaller))
         return mean * scale, factor * inverse
@@ -288,7 +287,7 @@ def redistribute(
                 width=grid.width,
                 height=grid.height,
             )
-            less = shrunk(error, owners.lists.grid, grid, 1, times)
+            less = shrunk(owners.canvas, error, canvas, times)
             return target_density(Owners.of(small, images), less, default)
 
         kind = gaussians.space, types_of(gaussians.mean).backend, gaussians.cutoff

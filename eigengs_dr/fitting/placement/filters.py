@@ -14,6 +14,7 @@ import drjit as dr
 
 from ...backend.arrays import ArrayTypes, Bool, Float, UInt
 from ...raster.binning.tiles import TILE, Grid, GridArrays
+from ...raster.parameters import gather_run
 
 SIDE = TILE[0]
 """Width and height of a tile in pixels."""
@@ -74,12 +75,13 @@ class Canvas:
         tile = self.types.UInt((y >> 2) * self.sizes.nx + (x >> 2)) + first
         return tile * PIXELS + self.types.UInt((y & 3) * SIDE + (x & 3))
 
-    def pixels(self) -> tuple[UInt, UInt, UInt, Bool]:
-        """Return column, row, first tile of the image, and whether it is inside, of all pixels.
+    def pixels(self, index: UInt = None) -> tuple[UInt, UInt, UInt, Bool]:
+        """Return column, row, first tile of the image, and whether it is inside, of pixels.
 
-        A lane owns a pixel.
+        They are those of an index in tile layout, by default all: a lane owns a pixel.
         """
-        index = dr.arange(self.types.UInt, self.grid.tiles * PIXELS)
+        if index is None:
+            index = dr.arange(self.types.UInt, self.grid.tiles * PIXELS)
         tile = index >> 4
         column, row = self.corner(tile)
         column += self.types.Int(index & 3)
@@ -87,6 +89,64 @@ class Canvas:
         width, height = self.sides()
         inside = (column < width) & (row < height)
         return column, row, self.first_tile(self.sizes.image_of(tile)), inside
+
+    def store(self, values: list) -> Float:
+        """Write the values of all tiles, a list by pixels and channels; return the image."""
+        result = dr.empty(type(values[0]), self.grid.tiles * len(values))
+        rows = dr.replace_type_t(self.types.FloatX, dr.type_v(result))
+        dr.scatter(result, rows(values), self.tile)
+        return result
+
+
+def neighbourhood(canvas: Canvas, image: Float, margin: int) -> list:
+    """Return the pixels of each tile and those around it, up to a margin of 4 pixels or less.
+
+    They are rows of values by columns and channels, 0 where the image has no tile.
+    """
+    types, channels, tile = canvas.types, canvas.channels(image), canvas.types.Int(canvas.tile)
+    (x, y), (width, height) = canvas.corner(canvas.tile), canvas.sides()
+    rows = []
+    for k in range(-margin, SIDE + margin):
+        above, inner = divmod(k, SIDE)
+        there = (y + above * SIDE >= 0) & (y + above * SIDE < height)
+        row: list = []
+        for beside in (-1, 0, 1):
+            inside = there & (x + beside * SIDE >= 0) & (x + beside * SIDE < width)
+            run = types.UInt((tile + above * canvas.sizes.nx + beside) * SIDE + inner)
+            row += gather_run(types, image, run, SIDE * channels, inside)
+        rows.append(row[(SIDE - margin) * channels : (2 * SIDE + margin) * channels])
+    return rows
+
+
+def shrunk(canvas: Canvas, image: Float, small: Canvas, times: int) -> Float:
+    """Return the means over squares of `times` x `times` pixels as images of `small`; evaluated."""
+    types, channels = canvas.types, canvas.channels(image)
+    x, y, first, _ = small.pixels()
+    if small.sizes.image is not None:
+        first = canvas.first_tile(small.sizes.image_of(first))
+    side, (width, height) = dr.opaque(types.Int, times), canvas.sides()
+
+    def add(i: UInt, j: UInt, number: Float, sums: list) -> tuple:
+        column, row = x * side + i, y * side + j
+        inside = (column < width) & (row < height)
+        values = gather_run(types, image, canvas.place(first, column, row), channels, inside)
+        sums = [s + v for s, v in zip(sums, values, strict=True)]
+        number = number + dr.select(inside, types.Float(1), 0)
+        ends = i + 1 == side
+        return dr.select(ends, 0, i + 1), dr.select(ends, j + 1, j), number, sums
+
+    number, sums = dr.while_loop(
+        (types.Int(0), types.Int(0), types.Float(0), [types.Float(0)] * channels),
+        lambda i, j, number, sums: j < side,
+        add,
+        label="shrink",
+        max_iterations=-1,
+    )[2:]
+    means = [s / dr.maximum(number, 1) for s in sums]
+    result = dr.empty(types.Float, dr.width(x) * channels)
+    dr.scatter(result, types.FloatX(means), dr.arange(types.UInt, dr.width(x)))
+    dr.eval(result)
+    return result
 
 
 def scan(
@@ -148,8 +208,7 @@ def turned(canvas: Canvas, lines: list) -> Float:
     values = [
         line[n * channels + c] for n in range(SIDE) for line in lines for c in range(channels)
     ]
-    result = dr.empty(type(values[0]), canvas.grid.tiles * len(values))
-    dr.scatter(result, type(lines[0])(values), canvas.tile)
+    result = canvas.store(values)
     dr.eval(result)
     return result
 
