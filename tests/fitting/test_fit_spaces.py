@@ -147,7 +147,7 @@ def test_many_images_of_light(tmp_path, light):
 @pytest.mark.parametrize("color", ["radiance", "log"])
 def test_by_blocks(light, color):
     result = eg.fit_large(
-        light, gaussians=200, iterations=30, block=32, space=color, encoding="linear"
+        light, gaussians=200, iterations=60, block=32, space=color, encoding="linear"
     )
     assert result.psnr_ycbcr > 18
     assert eg.render(result.gaussians).numpy().max() > 100
