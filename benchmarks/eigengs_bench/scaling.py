@@ -94,7 +94,8 @@ def measure_descent(case: Case, steps: int, backend: str | None) -> Row:
     placed, place_seconds = _place(target, case.gaussians, types.backend)
     solve(placed, target, 1)  # compiles
     started = time.perf_counter()
-    start = solve(placed, target).gaussians
+    start = solve(placed, target)
+    dr.sync_thread()
     solve_seconds = time.perf_counter() - started
     del placed
     step_ms, mean_ms = time_steps(FitProblem(start, target), steps)

@@ -86,7 +86,7 @@ def _start(case: Case, image: Image, solves: bool, backend: str | None) -> FitPr
     size, shape = (image.shape[1], image.shape[0]), (case.gaussians, 3)
     colors = np.zeros(shape) if solves else generator.uniform(0, 1, shape)
     start = eg.Gaussians.from_arrays(mean, factor, colors, size=size, backend=backend).bounded()
-    return FitProblem(solve(start, target).gaussians if solves else start, target)
+    return FitProblem(solve(start, target) if solves else start, target)
 
 
 # ---------------------------------------------------------------------------------------------

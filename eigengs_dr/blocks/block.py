@@ -276,7 +276,7 @@ def _start(task: FitTask, target: FitTarget, settings: Settings) -> FitProblem:
         cutoff=options.cutoff,
     ).bounded()
     if not solved:
-        placed = solve(placed, values, options.solve_steps, background=background).gaussians
+        placed = solve(placed, values, options.solve_steps, background=background)
     return FitProblem(placed, values, target.weight)
 
 

@@ -276,7 +276,7 @@ def quantize_with_feedback(gaussians: Gaussians, target: Array, steps: Steps) ->
         if not len(free):
             break
         rest = rest - planes_of(like(gaussians, **dequantize(done[-1], steps)))
-        current = solve(current[np.flatnonzero(~now)], rest, 2, warm_start=True).gaussians
+        current = solve(current[np.flatnonzero(~now)], rest, 2, warm_start=True)
         if inside:  # descent would move means outside the image into it
             current = run(FitProblem(current, rest), slow, STEPS)
     symbols = Symbols(*map(np.concatenate, zip(*done, strict=True)))

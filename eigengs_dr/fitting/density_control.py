@@ -248,7 +248,7 @@ def prune(
     kept = np.sort(np.argsort(-value, kind="stable")[:count])
     if weight is not None:
         return gaussians[kept]
-    return solve(gaussians[kept], target, PRUNE_STEPS, warm_start=True).gaussians
+    return solve(gaussians[kept], target, PRUNE_STEPS, warm_start=True)
 
 
 def densify(

@@ -98,7 +98,7 @@ def _place_levels(
         left = residual(gaussians, start.target)
         kind = gaussians.space, types_of(gaussians.mean).backend, gaussians.cutoff
         added = place_adaptive(left, count - len(gaussians), *kind)
-        added = solve(added, left).gaussians
+        added = solve(added, left)
         # The background is one for all levels: a new one would change the earlier levels.
         gaussians = concatenate([gaussians, replace(added, background=0 * added.background)])
     return gaussians

@@ -142,7 +142,7 @@ def start_from_set(target: FitTarget, options: FitOptions) -> FitProblem:
         exact = (native.width, native.height, native.cutoff) == (width, height, options.cutoff)
     start = replace(start.bounded(), cutoff=float(options.cutoff))
     if method.solves and not exact:
-        start = solve(start, target.values, options.solve_steps, warm_start=True).gaussians
+        start = solve(start, target.values, options.solve_steps, warm_start=True)
     if method.mean != "dense":
         return FitProblem(start, target.values, target.weight, control_for(target, options))
     assert not isinstance(source, Gaussians)
@@ -213,7 +213,7 @@ def start_from_placement(target: FitTarget, options: FitOptions) -> FitProblem:
     """Place Gaussians by the image alone, and find their colours."""
     start = place(target, options)
     if options.method.solves:
-        start = solve(start, target.values, options.solve_steps).gaussians
+        start = solve(start, target.values, options.solve_steps)
     return FitProblem(start, target.values, target.weight, control_for(target, options))
 
 

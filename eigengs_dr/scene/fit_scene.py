@@ -220,7 +220,7 @@ def _fit(
     """Place `count` Gaussians, drop those that reach no seen texel, and fit the rest."""
     picture = to_coded(target) if space == "linear" else target
     start = place_adaptive(picture, count, space, "cuda" if "cuda" in mi.variant() else "llvm")
-    start = solve(_seen_only(start, seen), target).gaussians
+    start = solve(_seen_only(start, seen), target)
     schedule = PRESETS["default"].schedule
     control = DensityControl(target, weight, picture)
     found = run(FitProblem(start, target, weight, control), schedule, iterations)

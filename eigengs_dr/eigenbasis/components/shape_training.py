@@ -98,7 +98,7 @@ def _round(
     rates = rate_table(types, SCHEDULE, factors)
     with freeze_program(step_program(SCHEDULE, gaussians)) as take_step:
         for index, image in enumerate(samples(band, seed, first, last)):
-            solved = solve(state.gaussians, image, SOLVE_STEPS).gaussians
+            solved = solve(state.gaussians, image, SOLVE_STEPS)
             fixed = replace(gaussians, color=solved.color, background=solved.background)
             state = take_step(
                 replace(state, packed=pack(solved)),

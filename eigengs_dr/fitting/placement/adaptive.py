@@ -292,7 +292,7 @@ def redistribute(
 
         kind = gaussians.space, types_of(gaussians.mean).backend, gaussians.cutoff
         placed = place_adaptive(image, count // images, *kind, density)
-    return solve(placed, target, solve_steps).gaussians
+    return solve(placed, target, solve_steps)
 
 
 def residual(gaussians: Gaussians, target: NDArray[np.float32]) -> NDArray[np.float32]:

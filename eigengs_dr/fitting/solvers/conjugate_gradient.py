@@ -9,7 +9,6 @@ stored.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -21,7 +20,7 @@ from ...gaussian.gaussians import Gaussians, whole
 from ...raster.adjoint import adjoint
 from ...raster.binning.lists import TileLists
 from ...raster.binning.tiles import Grid
-from ...raster.kernels import channel_moments, channel_sums, residual, sum_by_image, sum_lanes
+from ...raster.kernels import channel_sums, residual, sum_by_image, sum_lanes
 from ...raster.parameters import (
     detached_shape,
     gather_run,
@@ -35,24 +34,16 @@ RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}
 smaller. A smaller ``r^T z`` is only rounding."""
 
 ROUNDING = {32: 2e-7, 64: 4e-16}
-"""Relative error of a correlation with a Gaussian, by the bits of a float. A channel with the error
-e stops too if ``r^T z`` is below ``N ROUNDING^2 |e|^2``, which rounding alone reaches."""
+"""Relative error of a correlation with a Gaussian, by the bits of a float. A channel that started
+with the error e stops too if ``r^T z`` is below ``N ROUNDING^2 |e|^2``, which is only rounding."""
 
 
-class Solution(NamedTuple):
-    """Result of `solve`.
+Unknowns = tuple[list, list]
+"""Colours of all Gaussians and backgrounds of all images: a Float for each channel in both."""
 
-    Attributes
-    ----------
-    gaussians : Gaussians
-        The set with the new colours and background.
-    residuals : list of float
-        Root mean square of ``D - A c`` over pixels and channels, before the first step and after
-        every step. It never grows, except by rounding.
-    """
-
-    gaussians: Gaussians
-    residuals: list[float]
+State = tuple[Unknowns, Unknowns, Unknowns, list]
+"""The unknowns x, the direction p, ``r = A^T (D - A x)``, and ``r^T z`` with ``z`` = r times the
+preconditioner."""
 
 
 def solve(
@@ -61,7 +52,7 @@ def solve(
     steps: int = 10,
     warm_start: bool = False,
     background: NDArray[np.floating] | None = None,
-) -> Solution:
+) -> Gaussians:
     """Find the colours and the background that fit an image best on fixed shapes.
 
     The method is conjugate gradients on the normal equations, for each channel separately, with
@@ -83,8 +74,9 @@ def solve(
 
     Returns
     -------
-    Solution
-        The background of a batch has a value for each image; its residuals are over all images.
+    Gaussians
+        The set with the new colours and background; that of a batch has a value for each image. A
+        step never adds to the error ``|A c - D|^2``, except by rounding.
 
     Raises
     ------
@@ -100,18 +92,16 @@ def solve(
         cutoff = gaussians.cutoff
         lists = bin_gaussians(gaussians, images=len(image) if image.ndim == 4 else 1)
         shape = detached_shape(gaussians)
-        x, error, first, inverse, along = _start(
-            gaussians, shape, image, lists, warm_start, background
-        )
-        x, squares = reduce_error(shape, x, error, inverse, along, lists, cutoff, steps)
-        residuals = [dr.sum(sum(square)) for square in [first, *squares]]
-        FloatX = types_of(gaussians.mean).FloatX
-        solved = replace(gaussians, color=FloatX(x[0]), background=FloatX(x[1]))
-        dr.eval(solved, residuals)
-        total = dr.concat(residuals).numpy()  # one copy to the host
+        inverse, enough, state = _start(gaussians, shape, image, lists, warm_start, background)
+        release_memory(image.size)  # what the lists and the start took would stay reserved
+        for _ in range(steps):
+            state = _step(shape, state, enough, inverse, lists, cutoff)
+        (color, free), FloatX = state[0], types_of(gaussians.mean).FloatX
+        solved = replace(gaussians, color=FloatX(color), background=FloatX(free))
+        dr.eval(solved)
         del lists
     release_memory(image.size)
-    return Solution(solved, np.sqrt(total / image.size).tolist())
+    return solved
 
 
 def _start(
@@ -121,10 +111,10 @@ def _start(
     lists: TileLists,
     warm: bool,
     background: NDArray[np.floating] | None,
-) -> tuple[Unknowns, Float, list, Unknowns, tuple]:
-    """Return the first unknowns, and what `_first_error` says of them.
+) -> tuple[Unknowns, list, State]:
+    """Return the preconditioner, where to stop, and the first state: see `_begin`.
 
-    They are those of the set, or zero and the mean of each image.
+    The first unknowns are those of the set, or zero and the mean of each image.
     """
     types, grid = types_of(gaussians.mean), lists.grid
     target = batch_to_tiles(types, np.asarray(image, np.float32))
@@ -138,44 +128,69 @@ def _start(
         free = [upload(types.Float, row) for row in np.asarray(background)[:, None]]
     x = color, free
     dr.make_opaque(shape, x)
-    held = background is not None
-    return x, *_first_error(shape, x, target, held, lists, gaussians.cutoff)
+    return _begin(shape, x, target, background is not None, lists, gaussians.cutoff)
 
 
 @record
-def _first_error(
+def _begin(
     shape: list, x: Unknowns, target: Float, held: bool, lists: TileLists, cutoff: float
-) -> tuple[Float, list, Unknowns, tuple]:
-    """Return ``A x - D``, the sums of its squares, the preconditioner, and the first direction.
+) -> tuple[Unknowns, list, State]:
+    """Return the preconditioner, the ``r^T z`` at which channels stop, and the first state.
 
     A held background keeps its value.
     """
-    channels, grid = len(x[0]), lists.grid
+    channels, grid, types = len(x[0]), lists.grid, types_of(target)
     error, lanes = apply(shape, x, lists, cutoff, target)
-    first = sum_lanes(lanes, lists)
-    dr.eval(error, first)  # together: later, the sums would render again
-    inside = pixels_inside(types_of(error), grid)
-    color, diagonal = weigh(shape, error, channels, lists, cutoff, inside)
+    squares = sum_lanes(lanes, lists)
+    dr.eval(error, squares)  # together: later, the sums would render again
+    color, diagonal = weigh(shape, error, channels, lists, cutoff, pixels_inside(types, grid))
     # All channels have the same diagonal.
     inverse = invert(diagonal[0]) * channels, invert(diagonal[1]) * channels
     inverse = held_background(inverse) if held else inverse
-    along = _direction((color, channel_sums(error, channels, grid)), inverse, grid)
-    return error, first, inverse, along
+    r = negate((color, channel_sums(error, channels, grid)))
+    p = multiply(r, inverse)
+    rz = dots(r, p, grid)
+    number = dr.opaque(types.Float, dr.width(shape[0]) / grid.images * ROUNDING[types.bits] ** 2)
+    enough = [
+        dr.maximum(RELATIVE_TOLERANCE[types.bits] * a, number * e)
+        for a, e in zip(rz, squares, strict=True)
+    ]
+    return inverse, enough, (x, p, r, rz)
 
 
-def reduce_error(
-    shape: list,
-    x: Unknowns,
-    error: Float,
-    inverse: Unknowns,
-    along: tuple[Unknowns, list],
-    lists: TileLists,
-    cutoff: float,
-    steps: int,
-) -> tuple[Unknowns, list]:
-    """Take steps of conjugate gradients from the unknowns x.
+@record
+def _step(
+    shape: list, state: State, enough: list, inverse: Unknowns, lists: TileLists, cutoff: float
+) -> State:
+    """Take a step of conjugate gradients.
 
-    Beside the lists, memory holds two images in a step: the error ``A x - D`` and ``A p``.
+    r follows ``r - alpha A^T q``, so that no image but q is needed.
+    """
+    x, p, r, rz = state
+    Float, grid, channels = type(shape[0]), lists.grid, len(rz)
+    x, q, alpha = _advance(shape, x, p, rz, lists, cutoff)
+    change = apply_transposed(shape, q, channels, lists, cutoff)
+    r = add_multiple(r, [-a for a in alpha], change, lists.image)
+    z = multiply(r, inverse)
+    new_rz = dots(r, z, grid)
+    goes_on = [a > least for a, least in zip(new_rz, enough, strict=True)]
+    beta = [
+        dr.select(go & (a > 0), b / a, Float(0))
+        for go, a, b in zip(goes_on, rz, new_rz, strict=True)
+    ]
+    factor = [dr.select(go, Float(1), 0) for go in goes_on]
+    dr.eval(beta, factor)
+    nothing = ([0.0] * channels,) * 2
+    p = add_multiple(add_multiple(nothing, factor, z, lists.image), beta, p, lists.image)
+    return x, p, r, new_rz
+
+
+def take_step(
+    shape: list, x: Unknowns, error: Float, inverse: Unknowns, lists: TileLists, cutoff: float
+) -> Unknowns:
+    """Take one step of steepest descent from the unknowns x.
+
+    Cost: an adjoint with respect to colours and a rendering.
 
     Parameters
     ----------
@@ -186,66 +201,17 @@ def reduce_error(
         ``A x - D`` in tile layout, evaluated. It becomes that of the result, in place.
     inverse : Unknowns
         The preconditioner: one over the diagonal. Unknowns where it is 0 keep their values.
-    along : tuple
-        The first direction p, and its rz; see `_direction`.
     lists : TileLists
     cutoff : float
-    steps : int
-
-    Returns
-    -------
-    x : Unknowns
-    squares : list of list of Float, shape (images,)
-        For each step, and each channel, the sum of the squares of the error after it.
     """
-    types = types_of(error)
-    p, rz = along
-    enough = [RELATIVE_TOLERANCE[types.bits] * a for a in rz]
-    number = dr.width(shape[0]) / lists.grid.images
-    noise = dr.opaque(types.Float, number * ROUNDING[types.bits] ** 2)
-    dr.eval(enough)
-    release_memory(dr.width(error))  # what the lists and the start took would stay reserved
-    found = []
-    for _ in range(steps):
-        x, q, alpha = _advance(shape, x, p, rz, lists, cutoff)
-        _add_in_place(error, q, alpha, lists)
-        del q  # before the next one
-        p, rz, squares = _turn(shape, error, p, rz, enough, noise, inverse, lists, cutoff)
-        found.append(squares)
-    return x, found
-
-
-def take_step(
-    shape: list, x: Unknowns, error: Float, inverse: Unknowns, lists: TileLists, cutoff: float
-) -> Unknowns:
-    """Take one step from the unknowns x, which is a step of steepest descent; see `reduce_error`.
-
-    Cost: an adjoint with respect to colours and a rendering.
-    """
-    p, rz = _begin(shape, error, inverse, lists, cutoff)
+    r = negate(apply_transposed(shape, error, len(inverse[0]), lists, cutoff))
+    p = multiply(r, inverse)
+    rz = dots(r, p, lists.grid)
     x, q, alpha = _advance(shape, x, p, rz, lists, cutoff)
     _add_in_place(error, q, alpha, lists)
     return x
 
 
-@record
-def _begin(
-    shape: list, error: Float, inverse: Unknowns, lists: TileLists, cutoff: float
-) -> tuple[Unknowns, list]:
-    """Return the first direction p, and its rz."""
-    return _direction(
-        apply_transposed(shape, error, len(inverse[0]), lists, cutoff), inverse, lists.grid
-    )
-
-
-def _direction(gradient: Unknowns, inverse: Unknowns, grid: Grid) -> tuple[Unknowns, list]:
-    """Return the direction ``p = z`` of steepest descent, and ``rz = r^T z``."""
-    r = negate(gradient)
-    p = multiply(r, inverse)
-    return p, dots(r, p, grid)
-
-
-@record
 def _advance(
     shape: list, x: Unknowns, p: Unknowns, rz: list, lists: TileLists, cutoff: float
 ) -> tuple[Unknowns, Float, list]:
@@ -256,40 +222,6 @@ def _advance(
     alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, curvature, strict=True)]
     dr.eval(alpha)
     return add_multiple(x, alpha, p, lists.image), q, alpha
-
-
-@record
-def _turn(
-    shape: list,
-    error: Float,
-    p: Unknowns,
-    rz: list,
-    enough: list,
-    noise: Float,
-    inverse: Unknowns,
-    lists: TileLists,
-    cutoff: float,
-) -> tuple[Unknowns, list, list]:
-    """Return the next direction p, its rz, and the sums of the squares of the error."""
-    Float, grid, channels = type(error), lists.grid, len(rz)
-    color = correlate(shape, error, channels, lists, cutoff)
-    sums, squares = channel_moments(error, channels, grid)
-    r = negate((color, sums))
-    z = multiply(r, inverse)
-    new_rz = dots(r, z, grid)
-    goes_on = [
-        a > dr.maximum(least, noise * e)
-        for a, least, e in zip(new_rz, enough, squares, strict=True)
-    ]
-    beta = [
-        dr.select(go & (a > 0), b / a, Float(0))
-        for go, a, b in zip(goes_on, rz, new_rz, strict=True)
-    ]
-    factor = [dr.select(go, Float(1), 0) for go in goes_on]
-    dr.eval(beta, factor)
-    nothing = ([0.0] * channels,) * 2
-    p = add_multiple(add_multiple(nothing, factor, z, lists.image), beta, p, lists.image)
-    return p, new_rz, squares
 
 
 def _add_in_place(image: Float, step: Float, factors: list, lists: TileLists) -> None:
@@ -363,10 +295,6 @@ def held_background(inverse: Unknowns) -> Unknowns:
     """Return a preconditioner with which the background keeps its value."""
     Float = type(inverse[1][0])
     return inverse[0], [dr.opaque(Float, 0)] * len(inverse[1])
-
-
-Unknowns = tuple[list, list]
-"""Colours of all Gaussians and backgrounds of all images: a Float for each channel in both."""
 
 
 def negate(x: Unknowns) -> Unknowns:
