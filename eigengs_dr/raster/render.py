@@ -330,11 +330,12 @@ class _Rasterize(dr.CustomOp):
 def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
     """Upload an image (height, width, channels) in tile layout; pixels outside it are 0.
 
-    A lane gathers one value; the distances in memory of rows, columns and channels are those of
-    pixels, or of planes that `numpy.moveaxis` shows as pixels.
+    The images (M, height, width, channels) of a batch follow each other. A lane gathers one value;
+    the distances in memory of rows, columns and channels are those of pixels, or of planes that
+    `numpy.moveaxis` shows as pixels.
     """
-    height, width, channels = image.shape
-    planes = np.moveaxis(image, 2, 0)
+    height, width, channels = image.shape[-3:]
+    planes = np.moveaxis(image, -1, -3)
     if planes.flags.c_contiguous:
         source, strides = planes, (width, 1, height * width)
     else:
@@ -342,13 +343,16 @@ def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
     # Sizes are in arrays, so that one program serves all images with as many channels.
     limits = (dr.opaque(types.UInt, side) for side in (width, height))
     steps = (dr.opaque(types.UInt, stride) for stride in strides)
-    tile_width, tile_height = grid.tile
-    index = dr.arange(types.UInt, grid.nx * grid.ny * grid.pixels * channels)
+    sizes, (tile_width, tile_height) = grid.in_arrays(types), grid.tile
+    index = dr.arange(types.UInt, grid.tiles * grid.pixels * channels)
     pixel, channel = index // channels, index % channels
-    column, row = grid.in_arrays(types).first_pixel(pixel // grid.pixels)
+    tile = pixel // grid.pixels
+    column, row = sizes.first_pixel(tile)
     column += pixel % tile_width
     row += pixel // tile_width % tile_height
     place = sum(n * step for n, step in zip((row, column, channel), steps, strict=True))
+    if grid.images > 1:
+        place += sizes.image_of(tile) * dr.opaque(types.UInt, height * width * channels)
     inside = [n < limit for n, limit in zip((column, row), limits, strict=True)]
     flat = types.Float(source.reshape(-1))
     result = dr.gather(types.Float, flat, place, inside[0] & inside[1])
@@ -372,16 +376,8 @@ def batch_to_tiles(types: ArrayTypes, images: NDArray[Any]) -> Any:
 
     An image (height, width, channels) is a batch of one.
     """
-    if images.ndim == 3:
-        return to_tiles(types, images, Grid(images.shape[1], images.shape[0]))
-    grid = Grid(images.shape[2], images.shape[1])
-    length = grid.tiles * grid.pixels * images.shape[3]
-    result, index = dr.empty(types.Float, len(images) * length), dr.arange(types.UInt, length)
-    for k, image in enumerate(images):  # by a program that serves all positions and sizes
-        place = dr.opaque(types.UInt, k * length) + index
-        dr.scatter(result, to_tiles(types, image, grid), place)
-        dr.eval(result)
-    return result
+    number, (height, width) = len(images) if images.ndim == 4 else 1, images.shape[-3:-1]
+    return to_tiles(types, images, Grid(width, height, images=number))
 
 
 def to_tensor(image: Float, grid: Grid, channels: int) -> Any:
