@@ -155,7 +155,7 @@ def adan_by_hand(x, gradient, rate, steps, betas, epsilon=1e-8):
     [
         (Adam(0.9, 0.9, 1e-12), adam_by_hand, (0.9, 0.9)),
         (Adam(0.9, 0.99, 1e-12), adam_by_hand, (0.9, 0.99)),
-        (Adam(0.0, 0.5, 1e-12), adam_by_hand, (0.0, 0.5)),
+        (Adam(0.5, 0.9, 1e-12), adam_by_hand, (0.5, 0.9)),
         (Adan(), adan_by_hand, (0.98, 0.92, 0.99)),
         (Adan((0.9, 0.5, 0.95)), adan_by_hand, (0.9, 0.5, 0.95)),
     ],

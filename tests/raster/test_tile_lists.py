@@ -31,7 +31,11 @@ def step(gaussians, lists, size):
 @pytest.mark.parametrize("size", [(), (50, 37)])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_frozen_rendering_and_its_gradient(backend, size, dtype):
-    """The bits of plain ones, in the recording, in replays, and with other values."""
+    """The bits of plain ones, in the recording, in replays, and with other values.
+
+    On cuda, sums of atomic operations have no order.
+    """
+    bound = {"rtol": 0, "atol": 0 if backend == "llvm" else 1e-6}
     g = on(backend, dtype=dtype)
     frozen = dr.freeze(lambda g, lists: step(g, lists, size))
     for shift in (0, 0, 0.25, 0.5):
@@ -40,7 +44,7 @@ def test_a_frozen_rendering_and_its_gradient(backend, size, dtype):
         np.testing.assert_array_equal(found[0].numpy(), wanted[0].numpy())
         for name in NAMES:
             pair = [getattr(gradient, name).numpy() for gradient in (found[1], wanted[1])]
-            np.testing.assert_array_equal(*pair)
+            np.testing.assert_allclose(*pair, **bound)
 
 
 def test_without_lists_a_recording_says_what_to_do(backend):
