@@ -78,22 +78,28 @@ def _shortest_list(
     return begin, end
 
 
-def where_any(active: Bool, compute: Callable[[], list], packed: Packed) -> list:
-    """Return sums that few points need, and skip the work for packets of lanes without one.
+def where_any(
+    active: Bool, compute: Callable[[], list], packed: Packed, others: list | None = None
+) -> list:
+    """Return values that few points need, and skip the work for packets of lanes without one.
 
     Parameters
     ----------
     active : Bool
-        The points that need the sums; the others get 0.
+        The points that need the values.
     compute : callable
-        Returns one sum for each channel.
+        Returns the values, by default one for each channel.
     packed : Packed
         Parameters. With gradients nothing is skipped: Dr.Jit cannot carry them out of the branch.
+    others : list of Float, optional
+        The values of other points, by default 0.
     """
     if dr.grad_enabled(packed.values):
         return compute()
-    zeros = tuple(types_of(packed.values).Float(0) for _ in range(packed.channels))
-    return list(dr.if_stmt((), active, lambda: tuple(compute()), lambda: zeros, mode="symbolic"))
+    rest = others or [types_of(packed.values).Float(0)] * packed.channels
+    return list(
+        dr.if_stmt((), active, lambda: tuple(compute()), lambda: tuple(rest), mode="symbolic")
+    )
 
 
 def _local(sizes: SizeClasses, i: UInt, j: UInt, x: Float, y: Float) -> tuple:
@@ -124,6 +130,7 @@ def _sum_copies(
     types, cutoff = types_of(packed.values), packed.cutoff
     scaled = kernel_covariance(footprint)
     (left, right), (top, bottom) = bounds
+    crosses = (left < right) | (top < bottom)
     bottom = dr.select(active, bottom, top - 1)
     classes = dr.width(sizes.table) // 8
 
@@ -164,6 +171,20 @@ def _sum_copies(
         )
         return begin, end, row, stop
 
+    def advance(n: UInt, end: UInt, row: UInt, stop: UInt, place: tuple) -> tuple:
+        """Go to the next row of cells; few Gaussians are the last ones of a row.
+
+        After the last row comes the next size class, then the next copy, then the next row of
+        copies.
+        """
+        row = row + 1
+        fresh = row > stop
+        k, i, j = place
+        k = dr.select(fresh, k + 1, k)
+        k, i = dr.select(k >= classes, 0, k), dr.select(k >= classes, i + 1, i)
+        i, j = dr.select(i > right, left, i), dr.select(i > right, j + 1, j)
+        return *next_run(fresh, row, stop, (k, i, j), types.Bool(True)), (k, i, j)
+
     def add(
         n: UInt, end: UInt, row: UInt, stop: UInt, place: tuple, point: tuple, sums: list
     ) -> tuple:
@@ -174,20 +195,18 @@ def _sum_copies(
         seen = [scaled[0], scaled[1] * sign, scaled[2]]
         shape, amplitude = widen(shape, seen)
         (w,) = weights(shape, px, py, (1, 1), packed.radius)
-        part = inside_share(shape, seen, px, py, sizes.width, sizes.height)
+        (part,) = where_any(
+            crosses,
+            lambda: [inside_share(shape, seen, px, py, sizes.width, sizes.height)],
+            packed,
+            [types.Float(1)],
+        )
         w = dr.select(here, w * amplitude * part, 0)
         sums = [dr.fma(w, c, s) for c, s in zip(color, sums, strict=True)]
         n = n + 1
-        ran = n >= end
-        row = dr.select(ran, row + 1, row)
-        fresh = ran & (row > stop)
-        # The next size class; after the last one the next copy, then the next row of copies.
-        k = dr.select(fresh, k + 1, k)
-        k, i = dr.select(k >= classes, 0, k), dr.select(k >= classes, i + 1, i)
-        i, j = dr.select(i > right, left, i), dr.select(i > right, j + 1, j)
-        begin, new_end, row, stop = next_run(fresh, row, stop, (k, i, j), ran)
-        n, end = dr.select(ran, begin, n), dr.select(ran, new_end, end)
-        return n, end, row, stop, (k, i, j), point, sums
+        state = n, end, row, stop, place
+        state = dr.if_stmt(state, n >= end, advance, lambda *same: same, mode="symbolic")
+        return *state, point, sums
 
     zero = dr.zeros(types.Int, dr.width(x))
     start = next_run(types.Bool(True), zero, zero, (zero, left, top), active)
