@@ -188,7 +188,7 @@ def _sum_copies(
     def add(
         n: UInt, end: UInt, row: UInt, stop: UInt, place: tuple, point: tuple, sums: list
     ) -> tuple:
-        (k, i, j), (x, y) = place, point
+        (_, i, j), (x, y) = place, point
         here = (n < end) & (j <= bottom)
         shape, color = packed.gather(gather_index(types, sizes.splat, n, here), here)
         px, py, sign = _local(sizes, i, j, x, y)
