@@ -16,7 +16,7 @@ SPACES = [("ycbcr", 3), ("rgb", 1), ("rgb", 4), ("linear", 3), ("data", 2)]
 def small_fit():
     """A fit of 100 splats, and its image."""
     image = family(1, side=32, seed=7)[0]
-    return eg.fit(image, 100, iterations=60, backend="llvm").gaussians, image
+    return eg.fit(image, 100, iterations=150, backend="llvm").gaussians, image
 
 
 def peak(work):
