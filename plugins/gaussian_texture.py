@@ -7,6 +7,7 @@ derivatives inside a virtual call. So the class below only passes arrays to the 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -284,6 +285,33 @@ def gaussian_texture() -> type:
             )
 
     return GaussianTexture
+
+
+def resident_bytes(texture: Texture) -> int:
+    """Return the bytes of the arrays that a ``gaussian_texture`` holds in memory.
+
+    They are its parameters, lists of Gaussians, copies in the order of the lists and, with a
+    prefilter, the pyramid. Textures of one file share all of them.
+    """
+    arrays: dict[int, int] = {}
+    seen: set[int] = set()
+
+    def visit(tree: Any) -> None:
+        if tree is None or isinstance(tree, type | str) or id(tree) in seen:
+            return
+        seen.add(id(tree))
+        if dr.is_tensor_v(tree):
+            tree = tree.array
+        if dr.is_jit_v(tree) and dr.depth_v(tree) == 1:
+            arrays[tree.index] = dr.width(tree) * dr.itemsize_v(tree)
+            return
+        inner = vars(tree) if hasattr(tree, "__dict__") else tree
+        inner = inner.values() if isinstance(inner, dict) else inner
+        for one in inner if isinstance(inner, Iterable) else ():
+            visit(one)
+
+    visit(vars(texture))
+    return sum(arrays.values())
 
 
 def _name(texture: Texture) -> str:

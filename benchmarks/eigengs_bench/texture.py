@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -221,6 +221,8 @@ def hold(mi: Any, angle: float, progress: Callable[..., None] = lambda *_: None)
 
 def _first_lookup(mi: Any, path: Path, angle: float) -> tuple[int, float]:
     """Load a texture and look it up once; return the bytes of its arrays, and the seconds."""
+    from eigengs_dr.plugins.gaussian_texture import resident_bytes
+
     started = time.perf_counter()
     file = {"type": "gaussian_texture", "filename": str(path), "prefilter": angle}
     texture, si = mi.load_dict(file), dr.zeros(mi.SurfaceInteraction3f)
@@ -228,23 +230,4 @@ def _first_lookup(mi: Any, path: Path, angle: float) -> tuple[int, float]:
     dr.eval(texture.eval_1(si))
     dr.sync_thread()
     seconds = time.perf_counter() - started
-    arrays: dict[int, int] = {}
-    _collect(vars(texture), arrays, set())
-    return sum(arrays.values()), seconds
-
-
-def _collect(tree: Any, arrays: dict[int, int], seen: set[int]) -> None:
-    """Add the bytes of the arrays of a tree of objects to `arrays`, by their index."""
-    if tree is None or isinstance(tree, type) or id(tree) in seen:
-        return
-    seen.add(id(tree))
-    if dr.is_tensor_v(tree):
-        tree = tree.array
-    if dr.is_jit_v(tree) and dr.depth_v(tree) == 1:
-        arrays[tree.index] = dr.width(tree) * dr.itemsize_v(tree)
-        return
-    inner = vars(tree) if hasattr(tree, "__dict__") else tree
-    inner = inner.values() if isinstance(inner, dict) else inner
-    if isinstance(inner, Iterable) and not isinstance(inner, str):
-        for one in inner:
-            _collect(one, arrays, seen)
+    return resident_bytes(texture), seconds

@@ -51,7 +51,7 @@ class Program(click.Group):
         except OSError as error:
             complete = error.filename is not None and error.strerror is not None
             say(f"error: {error.filename}: {error.strerror}" if complete else f"error: {error}")
-        except (ValueError, BackendError, ClusterError) as error:
+        except (ValueError, ImportError, BackendError, ClusterError) as error:
             say(f"error: {error}")
         except RuntimeError as error:
             # Click raises one for Ctrl-C, and Dr.Jit while it traces a program.

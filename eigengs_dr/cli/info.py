@@ -19,6 +19,7 @@ from ..storage.atomic import reader_of
 from . import options
 from .console import table
 from .outputs import check_outputs, name_pictures
+from .scene import load_mitsuba
 
 Facts = dict[str, Any]
 
@@ -27,7 +28,8 @@ Facts = dict[str, Any]
 @click.argument("file", type=click.Path(path_type=Path), metavar="NAME|FILE")
 @options.as_json
 @options.value("--preview", "FILE", options.path, "Picture of the contents.")
-def info(file: Path, as_json: bool, preview: Path | None) -> None:
+@click.option("--texture", is_flag=True, help="Also load it in Mitsuba, for its bytes in memory.")
+def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None:
     """Show the contents of a fitted image, a material or a model.
 
     NAME is a basis of the package, such as natural. For a fitted image, bpp is the size of the
@@ -41,6 +43,9 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
     share of the variance, and the PSNR of PCA with them, for the training images and for the
     images held out.
 
+    With --texture, texture_bytes is what a gaussian_texture of the file holds in memory for lookups
+    at points, and prefilter_bytes what it holds with a prefilter.
+
     The preview shows the rendered image, or the mean image, some components and the outlines of
     the Gaussians of a model.
 
@@ -49,6 +54,7 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
       eigengs-dr info photo.npz
       eigengs-dr info photo.egs --json
       eigengs-dr info natural
+      eigengs-dr info photo.npz --texture
       eigengs-dr info model.npz --preview components.png
     """
     [picture] = name_pictures([file], preview)
@@ -73,6 +79,8 @@ def info(file: Path, as_json: bool, preview: Path | None) -> None:
         facts |= _describe_fit(file)
     if kind != "model":
         facts["bpp"] = round(8 * facts["bytes"] / (facts["width"] * facts["height"]), 4)
+    if texture:
+        facts |= _load_textures("model" if kind == "model" else "filename", **facts)
     if not packed:
         facts["ledger"] = npz.sizes_of(file)
     if picture:
@@ -142,6 +150,18 @@ def _truncation(model: eg.EigenGS) -> list[Facts]:
             row["psnr_held_out"] = round(float(model.held_out[n]), 3)
         rows.append(row)
     return rows
+
+
+def _load_textures(key: str, file: str, maps: Any = (), **_: Any) -> Facts:
+    """Return the bytes that textures of a file hold, without and with a prefilter."""
+    mi = load_mitsuba(None, quiet=True)
+    from ..plugins.gaussian_texture import resident_bytes
+
+    source = {"type": "gaussian_texture", key: file}
+    if maps:
+        source["map"] = maps[0]["name"]
+    angles = {"texture_bytes": 0.0, "prefilter_bytes": 1e-3}
+    return {k: resident_bytes(mi.load_dict({**source, "prefilter": a})) for k, a in angles.items()}
 
 
 def _text(truncation: Any = (), maps: Any = (), ledger: Any = (), **facts: Any) -> str:

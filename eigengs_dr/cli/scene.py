@@ -43,10 +43,7 @@ def definition(text: str) -> tuple[str, str]:
 
 
 variant_option = options.value(
-    "--variant",
-    "NAME",
-    str,
-    "Mitsuba variant.  [default: cuda_ad_rgb with a GPU, else llvm_ad_rgb]",
+    "--variant", "NAME", str, "Of Mitsuba.  [default: cuda_ad_rgb with a GPU, else llvm_ad_rgb]"
 )
 many: Any = {"multiple": True, "callback": lambda context, option, given: dict(given)}
 definitions_option = click.option(
@@ -92,9 +89,7 @@ def scene(
         with explained(path), bar(run.quiet) as show:
             found = mi.load_file(str(path), **definitions)
             if not isinstance(found, mi.Scene):
-                raise ValueError(
-                    "the file holds no scene; its root must be <scene version='3.0.0'>"
-                )
+                raise ValueError("it holds no scene; its root must be <scene version='3.0.0'>")
             if not found.sensors():
                 raise ValueError("the scene has no sensor; add one")
             pixels, samples = render_in_passes(found, 0, spp, partial(show, str(path)))
@@ -110,18 +105,17 @@ def load_mitsuba(variant: str | None, quiet: bool) -> ModuleType:
     """Import Mitsuba, set a variant and register the plugins."""
     backend = variant.partition("_")[0] if variant else None
     module = select(backend if backend in ("llvm", "cuda") else None)
-    try:
-        import mitsuba as mi
-    except ImportError as error:
-        advice = "install it: pip install 'mitsuba>=3.9,<4'"
-        raise ValueError(f"scenes need Mitsuba ({error}); {advice}") from error
-    from ..plugins import register_plugins
+    from ..plugins import register_plugins  # first: its error says what to install
+
+    # isort: split
+    import mitsuba as mi
 
     if variant is None:
         variant = "cuda_ad_rgb" if "cuda" in module.__name__ else "llvm_ad_rgb"
     if variant not in mi.variants():
-        known = ", ".join(mi.variants())
-        raise click.UsageError(f"--variant {variant}: unknown; use one of {known}")
+        raise click.UsageError(
+            f"--variant {variant}: unknown; use one of {', '.join(mi.variants())}"
+        )
     mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error if quiet else mi.LogLevel.Warn)
     register_plugins()

@@ -39,6 +39,16 @@ def test_info_of_a_fit(set_file):
     assert "gaussians   40" in text and "photo.png" in text and "bpp" in text
 
 
+def test_info_of_textures(set_file, trained, tmp_path):
+    """At least the arrays of the file; with a prefilter more."""
+    pytest.importorskip("mitsuba", reason="textures need mitsuba")
+    for file in (set_file[1], trained[0] / "m.npz"):
+        assert "texture_bytes" not in facts_of(file)
+        facts = facts_of(file, "--texture")
+        assert facts["texture_bytes"] > 32 * facts["gaussians"]
+        assert facts["prefilter_bytes"] > facts["texture_bytes"] + 4 * 3 * 32**2
+
+
 def test_a_set_that_was_edited_claims_no_figures(set_file, tmp_path):
     eg.Gaussians.load(set_file[1])[:20].save(tmp_path / "b.npz")
     facts = facts_of(tmp_path / "b.npz")

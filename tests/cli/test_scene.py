@@ -1,6 +1,7 @@
 """The commands `scene` and `convert`."""
 
 import json
+import subprocess
 import sys
 
 import numpy as np
@@ -136,10 +137,14 @@ def test_mistaken_options(options, words, scene, tmp_path):
     assert_refused(run("scene", scene(), "-o", tmp_path / "x.png", *options), *words)
 
 
-def test_without_mitsuba(scene, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "mitsuba", None)
-    result = run("scene", scene(), "-o", tmp_path / "x.png")
-    assert_refused(result, "pip install 'mitsuba>=3.9,<4'")
+def test_without_mitsuba(scene, tmp_path):
+    program = (
+        "import sys; sys.modules['mitsuba'] = None; from eigengs_dr.cli.main import main; main()"
+    )
+    command = [sys.executable, "-c", program, "scene", scene(), "-o", tmp_path / "x.png"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 2 and len(result.stderr.splitlines()) == 1
+    assert "pip install 'mitsuba>=3.9,<4'" in result.stderr
 
 
 def test_convert(tmp_path):

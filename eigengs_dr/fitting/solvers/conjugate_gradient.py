@@ -155,6 +155,7 @@ def _begin(
         dr.maximum(RELATIVE_TOLERANCE[types.bits] * a, number * e)
         for a, e in zip(rz, squares, strict=True)
     ]
+    dr.eval(inverse, enough, x, p, r, rz)  # else they would hold the images
     return inverse, enough, (x, p, r, rz)
 
 
@@ -182,6 +183,7 @@ def _step(
     dr.eval(beta, factor)
     nothing = ([0.0] * channels,) * 2
     p = add_multiple(add_multiple(nothing, factor, z, lists.image), beta, p, lists.image)
+    dr.eval(x, p, r, new_rz)  # else they would hold the image q
     return x, p, r, new_rz
 
 
