@@ -157,9 +157,8 @@ def _load_textures(key: str, file: str, maps: Any = (), **_: Any) -> Facts:
     mi = load_mitsuba(None, quiet=True)
     from ..plugins.gaussian_texture import resident_bytes
 
-    source = {"type": "gaussian_texture", key: file}
-    if maps:
-        source["map"] = maps[0]["name"]
+    one = {"map": maps[0]["name"]} if maps else {}
+    source = {"type": "gaussian_texture", key: file, **one}
     angles = {"texture_bytes": 0.0, "prefilter_bytes": 1e-3}
     return {k: resident_bytes(mi.load_dict({**source, "prefilter": a})) for k, a in angles.items()}
 

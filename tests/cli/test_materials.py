@@ -61,8 +61,8 @@ def test_info(fitted, tmp_path):
     spaces = {"albedo": "linear", "roughness": "data", "normal": "normal"}
     assert {m["name"]: m["space"] for m in facts["maps"]} == spaces
     assert eg.load_image(tmp_path / "p.png").shape[0] == 24
-    text = said("info", fitted)
-    assert "roughness" in text and "weight" in text
+    text = said("info", fitted, "--texture")
+    assert "roughness" in text and "weight" in text and "prefilter_bytes" in text
 
 
 def test_pack(fitted, folder, tmp_path):
