@@ -157,8 +157,7 @@ def _load_textures(key: str, file: str, maps: Any = (), **_: Any) -> Facts:
     mi = load_mitsuba(None, quiet=True)
     from ..plugins.gaussian_texture import resident_bytes
 
-    one = {"map": maps[0]["name"]} if maps else {}
-    source = {"type": "gaussian_texture", key: file, **one}
+    source = {"type": "gaussian_texture", key: file} | ({"map": maps[0]["name"]} if maps else {})
     angles = {"texture_bytes": 0.0, "prefilter_bytes": 1e-3}
     return {k: resident_bytes(mi.load_dict({**source, "prefilter": a})) for k, a in angles.items()}
 
