@@ -290,8 +290,15 @@ def gaussian_texture() -> type:
 def resident_bytes(texture: Texture) -> int:
     """Return the bytes of the arrays that a ``gaussian_texture`` holds in memory.
 
-    They are its parameters, lists of Gaussians, copies in the order of the lists and, with a
-    prefilter, the pyramid. Textures of one file share all of them.
+    Parameters
+    ----------
+    texture : mitsuba.Texture
+
+    Returns
+    -------
+    int
+        Bytes of its parameters, lists of Gaussians, copies in the order of the lists and, with a
+        prefilter, the pyramid. Textures of one file share them, and each counts them.
     """
     arrays: dict[int, int] = {}
     seen: set[int] = set()

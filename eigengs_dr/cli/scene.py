@@ -113,9 +113,8 @@ def load_mitsuba(variant: str | None, quiet: bool) -> ModuleType:
     if variant is None:
         variant = "cuda_ad_rgb" if "cuda" in module.__name__ else "llvm_ad_rgb"
     if variant not in mi.variants():
-        raise click.UsageError(
-            f"--variant {variant}: unknown; use one of {', '.join(mi.variants())}"
-        )
+        known = ", ".join(mi.variants())
+        raise click.UsageError(f"--variant {variant}: unknown; use one of {known}")
     mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error if quiet else mi.LogLevel.Warn)
     register_plugins()

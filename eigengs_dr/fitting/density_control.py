@@ -209,7 +209,7 @@ class _Comparison:
 
     def peaks(self, error: Float, count: int) -> Peaks:
         """Return where at most `count` added Gaussians would reduce an error of an image most."""
-        canvas = Canvas.of(types_of(error), self.lists.grid)
+        canvas = Canvas(types_of(error), self.lists.grid, self.lists.sizes)
         return residual_peaks(canvas, -error, count, self.squares)
 
 

@@ -155,7 +155,7 @@ def adan_by_hand(x, gradient, rate, steps, betas, epsilon=1e-8):
     [
         (Adam(0.9, 0.9, 1e-12), adam_by_hand, (0.9, 0.9)),
         (Adam(0.9, 0.99, 1e-12), adam_by_hand, (0.9, 0.99)),
-        (Adam(0.5, 0.9, 1e-12), adam_by_hand, (0.5, 0.9)),
+        (Adam(0.0, 0.5, 1e-12), adam_by_hand, (0.0, 0.5)),
         (Adan(), adan_by_hand, (0.98, 0.92, 0.99)),
         (Adan((0.9, 0.5, 0.95)), adan_by_hand, (0.9, 0.5, 0.95)),
     ],
@@ -164,8 +164,9 @@ def adan_by_hand(x, gradient, rate, steps, betas, epsilon=1e-8):
 def test_steps_are_those_of_the_paper(types, optimizer, by_hand, betas):
     """Of a variable whose gradient is always 0 too: it rests."""
     start = np.array([1.0, -2, 0.5, 0])
-    path = minimize(optimizer, types.Float(start), lambda x: x * x * x + 3 * dr.sin(x), 0.1, 30)
-    expected = by_hand(start, lambda x: x**3 + 3 * np.sin(x), 0.1, 30, betas)
+    steps = 30 if betas[0] else 20  # without momentum it then oscillates, and rounding grows
+    path = minimize(optimizer, types.Float(start), lambda x: x * x * x + 3 * dr.sin(x), 0.1, steps)
+    expected = by_hand(start, lambda x: x**3 + 3 * np.sin(x), 0.1, steps, betas)
     rtol = 1e-4 if types.bits == 32 else 1e-10
     np.testing.assert_allclose(path, expected, rtol=0, atol=rtol * np.ptp(expected))
 

@@ -99,9 +99,19 @@ class Canvas:
 
 
 def neighbourhood(canvas: Canvas, image: Float, margin: int) -> list:
-    """Return the pixels of each tile and those around it, up to a margin of 4 pixels or less.
+    """Return the pixels of each tile and those around it; a lane owns a tile.
 
-    They are rows of values by columns and channels, 0 where the image has no tile.
+    Parameters
+    ----------
+    image : Float, shape (pixels * channels,)
+        In tile layout.
+    margin : int
+        Pixels around the tile, at most 4.
+
+    Returns
+    -------
+    list of list of Float
+        Rows of values by columns and channels, 0 where the image has no tile.
     """
     types, channels, tile = canvas.types, canvas.channels(image), canvas.types.Int(canvas.tile)
     (x, y), (width, height) = canvas.corner(canvas.tile), canvas.sides()

@@ -17,6 +17,7 @@ import drjit as dr
 
 from ...backend.arrays import Float, UInt, make_divisor
 from ...backend.recording import record
+from ...raster.parameters import gather_run
 from .filters import PIXELS, SIDE, Canvas, neighbourhood, radius_of
 
 SIZE = 0.6
@@ -84,8 +85,7 @@ def residual_peaks(canvas: Canvas, missed: Float, count: int, squares: Float = N
         return Peaks(types.Float2(none, none), [none] * channels, place, place)
     x, y, *_ = canvas.pixels(place)
     mean = types.Float2(types.Float(x) + 0.5, types.Float(y) + 0.5)
-    best = dr.gather(types.FloatX, colors, place, shape=(channels, dr.width(place)))
-    peaks = Peaks(mean, list(best), image, rank)
+    peaks = Peaks(mean, gather_run(types, colors, place, channels, True), image, rank)
     dr.eval(peaks)
     return peaks
 
@@ -100,8 +100,7 @@ def _maxima(canvas: Canvas, missed: Float, squares: Float) -> tuple[Float, Float
     colors = _best_colors(neighbourhood(canvas, missed, RADIUS), channels)
     terms = [dr.square(c) for c in colors]
     if squares is not None:
-        shape = PIXELS * channels, canvas.grid.tiles
-        factors = dr.gather(canvas.types.FloatX, squares, canvas.tile, shape=shape)
+        factors = gather_run(canvas.types, squares, canvas.tile, PIXELS * channels, True)
         terms = [t * f for t, f in zip(terms, factors, strict=True)]
     x, y = canvas.corner(canvas.tile)
     width, height = canvas.sides()

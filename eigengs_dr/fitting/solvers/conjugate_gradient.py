@@ -150,9 +150,9 @@ def _begin(
     r = negate((color, channel_sums(error, channels, grid)))
     p = multiply(r, inverse)
     rz = dots(r, p, grid)
-    number = dr.opaque(types.Float, dr.width(shape[0]) / grid.images * ROUNDING[types.bits] ** 2)
+    noise = dr.opaque(types.Float, dr.width(shape[0]) / grid.images * ROUNDING[types.bits] ** 2)
     enough = [
-        dr.maximum(RELATIVE_TOLERANCE[types.bits] * a, number * e)
+        dr.maximum(RELATIVE_TOLERANCE[types.bits] * a, noise * e)
         for a, e in zip(rz, squares, strict=True)
     ]
     dr.eval(inverse, enough, x, p, r, rz)  # else they would hold the images
