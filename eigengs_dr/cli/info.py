@@ -124,7 +124,8 @@ def _describe_packed(file: Path) -> Facts:
 
 def _describe_model(model: eg.EigenGS) -> Facts:
     g = model.gaussians
-    facts = _describe_set(SetHead(len(g), g.channels, (g.width, g.height), g.space, g.cutoff, g.maps))
+    size = g.width, g.height
+    facts = _describe_set(SetHead(len(g), g.channels, size, g.space, g.cutoff, g.maps))
     facts |= {"components": list(model.components), "frequency_aware": model.low > 0}
     if model.low:
         facts |= {"low_gaussians": model.low, "high_gaussians": len(g) - model.low}
@@ -157,10 +158,9 @@ def _load_textures(key: str, file: str, maps: Any = (), **_: Any) -> Facts:
     from ..plugins.gaussian_texture import resident_bytes
 
     source = {"type": "gaussian_texture", key: file} | ({"map": maps[0]["name"]} if maps else {})
-    angles = ("texture_bytes", 0.0), ("prefilter_bytes", 1e-3)
     with explained(Path(file)):  # one at a time: textures of a file share what they hold
-        found = {k: resident_bytes(mi.load_dict({**source, "prefilter": a})) for k, a in angles}
-    return found
+        found = [resident_bytes(mi.load_dict({**source, "prefilter": a})) for a in (0.0, 1e-3)]
+    return dict(zip(("texture_bytes", "prefilter_bytes"), found, strict=True))
 
 
 def _text(truncation: Any = (), maps: Any = (), ledger: Any = (), **facts: Any) -> str:
