@@ -64,7 +64,7 @@ def candidates() -> list[Library]:
             real = os.path.realpath(path)
             # A small file with this name is a linker script.
             if os.path.isfile(real) and os.path.getsize(real) > 1_000_000:
-                found.setdefault(real, Library(path, _version_in(path) or _version_in(real)))
+                found.setdefault(real, _library(path))
     return sorted(
         found.values(), key=lambda one: (one.version not in TESTED_VERSIONS, -(one.version or 0))
     )
@@ -107,6 +107,11 @@ def _patterns() -> list[str]:
     return [os.path.join(folder, name) for folder in folders for name in names]
 
 
+def _library(path: str) -> Library:
+    """Take the version from the name of a file, or from the name of what it links to."""
+    return Library(path, _version_in(path) or _version_in(os.path.realpath(path)))
+
+
 def _version_in(path: str) -> int | None:
     """Read the major version from ``libLLVM.so.19.1``, ``libLLVM-15.so`` or ``llvm@18/lib/...``."""
     name = re.search(r"libLLVM(?:-|\.so\.|\.)(\d+)", os.path.basename(path))
@@ -115,16 +120,24 @@ def _version_in(path: str) -> int | None:
     return int(found.group(1)) if found else None
 
 
+def too_old() -> str | None:
+    """Say in part of a line that the library at `PATH_VARIABLE` has a name of an old version.
+
+    To load a library only to refuse it may crash the process, and takes minutes on a cold disk.
+    """
+    asked = _library(os.environ.get(PATH_VARIABLE, ""))
+    if asked.usable:
+        return None
+    return f"{asked.path} (from {PATH_VARIABLE}) is LLVM {asked.version}, which Dr.Jit cannot use"
+
+
 def load_failure() -> str:
     """Say in part of a line which libLLVM Dr.Jit refused, or that none was found."""
     asked = os.environ.get(PATH_VARIABLE)
     if not asked:
         names = ", ".join(library.path for library in candidates())
         return f"no libLLVM is new enough for Dr.Jit ({names})" if names else "no libLLVM was found"
-    if not os.path.exists(asked):
-        return f"{asked} (from {PATH_VARIABLE}) does not exist"
-    version = _version_in(asked) or _version_in(os.path.realpath(asked))
-    fault = f"is LLVM {version}, which Dr.Jit refuses" if version else "is no libLLVM"
+    fault = "is no libLLVM" if os.path.exists(asked) else "does not exist"
     return f"{asked} (from {PATH_VARIABLE}) {fault}"
 
 

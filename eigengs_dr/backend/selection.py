@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import Any
 
 from .feedback import warn
-from .libllvm import MIN_VERSION, advice, load_failure, loaded_path
+from .libllvm import MIN_VERSION, advice, load_failure, loaded_path, too_old
 
 UNTESTED_ON_GPU = "tested with a simulated driver only, not yet on a GPU"
 """State of the cuda backend, until the whole suite has passed on a GPU."""
@@ -64,8 +64,8 @@ def select(backend: str | None = None) -> ModuleType:
         return dr.cuda.ad
     if backend == "cuda":
         raise BackendError("no CUDA GPU or driver was found; use backend 'llvm'")
-    if not dr.has_backend(dr.JitBackend.LLVM):
-        raise BackendError(f"{load_failure()}; {advice()}")
+    if (fault := too_old()) or not dr.has_backend(dr.JitBackend.LLVM):
+        raise BackendError(f"{fault or load_failure()}; {advice()}")
     version = dr.detail.llvm_version()[0]
     if version < MIN_VERSION:
         raise BackendError(f"{loaded_path()} is LLVM {version}, which crashes Dr.Jit; {advice()}")
