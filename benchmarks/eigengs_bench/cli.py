@@ -256,7 +256,7 @@ def inverse() -> None:
     poster  a flat picture, with 3 and with 16 cameras around it
     ball    the colour of a glossy coat, seen from all sides
 
-    All takes about ten minutes.
+    All takes about five minutes.
     """
 
 

@@ -62,7 +62,7 @@ def exclusive() -> Iterator[None]:
     ...     dr.enable_grad(start.color)
     ...     dr.backward(dr.sum(eg.render(start).array))
     """
-    if getattr(_guests, "here", 0):
+    if _is_guest():
         yield
         return
     with _LOCK:
@@ -76,23 +76,26 @@ def exclusive() -> Iterator[None]:
 _guests = threading.local()
 """``here`` counts the blocks of `guest` around this thread, which works for one that waits."""
 
-_ONE_GUEST = threading.RLock()
-"""The guest that holds it may use Dr.Jit."""
-
 
 @contextmanager
 def guest() -> Iterator[None]:
-    """Use Dr.Jit for a thread that waits for this one: `exclusive` takes no lock in the block.
+    """Use Dr.Jit for a thread that waits for this one: nothing in the block waits for a lock.
 
-    Mitsuba makes the objects of a scene in threads of its own, for which the caller waits. If the
-    caller holds the lock, they would wait for it for ever. Guests take turns.
+    Mitsuba makes the objects of a scene in the threads of Dr.Jit's pool, for which the caller
+    waits. If the caller holds the lock, they would wait for it for ever. Guests do not even wait
+    for each other: a thread that waits for a kernel does other work of the pool meanwhile, such as
+    the object of a bitmap, and OpenEXR waits for threads of the same pool. So guests trace, which
+    threads may do at once, and replay nothing, see `record`.
     """
-    with _ONE_GUEST:
-        _guests.here = getattr(_guests, "here", 0) + 1
-        try:
-            yield
-        finally:
-            _guests.here -= 1
+    _guests.here = getattr(_guests, "here", 0) + 1
+    try:
+        yield
+    finally:
+        _guests.here -= 1
+
+
+def _is_guest() -> bool:
+    return getattr(_guests, "here", 0) > 0
 
 
 MANY_RECORDINGS = 1 << 30
@@ -157,7 +160,7 @@ def record(function: Program) -> Program:
     def call(*arguments: Any) -> Any:
         arrays = list(_arrays_in(arguments))
         sizes = [dr.width(array) for array in arrays]  # they may be numbers in a program
-        if max(sizes) > LARGEST_RECORDED:
+        if max(sizes) > LARGEST_RECORDED or _is_guest():
             return function(*arguments)
         found = replay(sizes, *arguments)
         # A recording begins a new scope, a replay does not. Programs of later operations have

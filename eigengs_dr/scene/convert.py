@@ -93,7 +93,7 @@ def convert_scene(
 
     Uses of one image share a set. The function leaves alone what Gaussians would spoil or cannot
     replace: environment maps, bump maps, images of two values such as masks, data beyond 0 and 1,
-    images that no camera sees, and those that would take more Gaussians than texels.
+    images of no shape or that no camera sees, and those that would take more Gaussians than texels.
 
     Parameters
     ----------
@@ -154,8 +154,12 @@ def convert_scene(
         made = dict[int, str]()
         textures = list[ConvertedTexture]()
         groups: dict[tuple[str, bool], list[Use]] = {}
+        on_shapes = [mi.traverse(shape).hierarchy for shape in before.shapes()]
         for use in uses:
-            groups.setdefault((use.file, use.raw), []).append(use)
+            if any(_texture(parsed, use) in found for found in on_shapes):
+                groups.setdefault((use.file, use.raw), []).append(use)
+            else:
+                left.append((use.name, "no shape has it: nothing says where the cameras see it"))
         for number, group in enumerate(groups.values()):
             progress("textures", number, len(groups))
             file = _file_name(group[0], {texture.file for texture in textures})
@@ -223,7 +227,7 @@ def _convert(
         space = space_of(pixels, use.raw and is_data)
         found = fit_for_scene(
             scene,
-            [nodes[use.parent].props[use.slot] for use in group],
+            [_texture(parsed, use) for use in group],
             pixels,
             psnr,
             space,
@@ -236,6 +240,11 @@ def _convert(
     if _memory(found.gaussians) >= pixels.size:
         return f"{len(found.gaussians):,} Gaussians take more memory than its texels"
     return found
+
+
+def _texture(parsed: Parsed, use: Use) -> Any:
+    """Return the texture of a scene that was made from what was parsed."""
+    return parsed.state.nodes[use.parent].props[use.slot]
 
 
 def _memory(gaussians: Gaussians) -> int:

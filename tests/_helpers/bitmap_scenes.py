@@ -64,6 +64,9 @@ SKY = """<scene version="3.0.0">
       <texture name="reflectance" type="bitmap"><string name="filename" value="hidden.png"/>
         </texture></bsdf>
   </shape>
+  <emitter type="projector">
+    <texture name="irradiance" type="bitmap"><string name="filename" value="photo.png"/></texture>
+  </emitter>
 </scene>"""
 
 
@@ -88,7 +91,7 @@ def wall(folder):
 
 
 def sky(folder):
-    """An environment map, a cut-out leaf, a lamp, and an image that no camera sees."""
+    """An environment map, a cut-out leaf, a lamp, a projector, and an image that nobody sees."""
     (folder / "sky.xml").write_text(SKY.format(cameras=CAMERA.format(origin="0,0,4")))
     return folder / "sky.xml"
 

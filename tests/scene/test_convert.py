@@ -53,12 +53,13 @@ def test_what_stays_and_why(folder, tmp_path):
     found = eg.convert_scene(sky(folder), tmp_path / "new", **QUICK)
     reasons = dict(found.left)
     assert "environment map" in reasons["photo.png (environment)"]
+    assert "no shape" in reasons["photo.png (projector.irradiance)"]
     assert "two values" in reasons["leaf.png (mask.opacity)"]
     assert "two values" in reasons["leaf.png (blendbsdf.weight)"]
     assert "no pixel" in reasons["hidden.png (diffuse.reflectance)"]
     [photo] = found.textures
     assert photo.names == ("photo.png (diffuse.reflectance)", "photo.png (area.radiance)")
-    assert bitmaps_in(found.scene) == 3
+    assert bitmaps_in(found.scene) == 4
     assert min(found.psnr) > 25
     assert str(folder) not in found.scene.read_text()  # other files are named relative to it
 
