@@ -159,7 +159,12 @@ def convert_scene(
             if any(_texture(parsed, use) in found for found in on_shapes):
                 groups.setdefault((use.file, use.raw), []).append(use)
             else:
-                left.append((use.name, "no shape has it: nothing says where the cameras see it"))
+                left.append(
+                    (
+                        use.name,
+                        "no shape outside of groups has it, so that no camera sees it directly",
+                    )
+                )
         for number, group in enumerate(groups.values()):
             progress("textures", number, len(groups))
             file = _file_name(group[0], {texture.file for texture in textures})

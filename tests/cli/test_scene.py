@@ -154,7 +154,7 @@ def test_convert(tmp_path):
     for words in ("32x32", "(the same set)", "memory: ", "left alone: leaf.png", "camera 1: "):
         assert words in told
     report = json.loads((tmp_path / "r").read_text())
-    assert report["bytes"] < report["bytes_before"] and len(report["left"]) == 4
+    assert report["bytes"] < report["bytes_before"] and len(report["left"]) == 5
     assert (tmp_path / "new" / "scene.xml").exists()
     assert_refused(run("convert", scene, "-o", tmp_path / "new"), "exists and is not empty")
 
