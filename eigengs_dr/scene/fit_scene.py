@@ -58,7 +58,9 @@ takes a quarter of the time. 1,024 x 1,024 texels at 6 texels a pixel and more: 
 1,515 Gaussians for 40 dB, and 46.81 instead of 46.87 dB between the renderings."""
 
 DETAIL = 64
-"""Smallest number of seen texels a Gaussian of the images of a fit."""
+"""Fewest seen texels a Gaussian in a fit. A target with four times as many is halved, again and
+again: on a ball of 1,536 x 1,536 texels, the fits of 200 and 1,200 Gaussians took 16 s instead of
+44 s, and 2 % more Gaussians were needed."""
 
 FINER = 3
 """Factor of the enlargement; odd, so that the centres of texels stay samples."""

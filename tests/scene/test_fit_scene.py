@@ -110,6 +110,13 @@ def fitted(*cameras, image=None, space="linear", **others):
 
 
 class TestFit:
+    def test_few_gaussians_are_fitted_to_a_smaller_image(self):
+        large = gaussian_filter(np.kron(photo(), np.ones((4, 4, 1)))[:189, :187], (8, 8, 0))
+        target, seen = large.astype(np.float32), np.ones(large.shape[:2], bool)
+        found = scenefit._fit(target, np.ones_like(target), seen, 40, STEPS, "data")
+        assert (found.width, found.height) == (187, 189)
+        assert eg.psnr(eg.render(found).numpy(), target) > 31.5
+
     @pytest.mark.parametrize("distance", [1.0, 2.7])
     def test_a_renderer_sees_what_was_asked_for(self, distance):
         # The poster fills the picture, or nearly: what is around it is the same for both.
