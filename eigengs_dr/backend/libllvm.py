@@ -115,7 +115,7 @@ def _library(path: str) -> Library:
 def _version_in(path: str) -> int | None:
     """Read the major version from ``libLLVM.so.19.1``, ``libLLVM-15.so`` or ``llvm@18/lib/...``."""
     name = re.search(r"libLLVM(?:-|\.so\.|\.)(\d+)", os.path.basename(path))
-    folder = re.search(r"llvm(?:[@-]?|/)(\d+)[^/\\]*[/\\]lib", path, re.IGNORECASE)
+    folder = re.search(r"llvm(?:[@-]?|/)(\d+)(?:\.[\d.]*)?[/\\]lib", path, re.IGNORECASE)
     found = name or folder
     return int(found.group(1)) if found else None
 

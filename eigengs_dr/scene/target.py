@@ -136,7 +136,7 @@ def _blur_by(deviation: NDArray[np.floating]) -> Callable[[Image], Image]:
     halved, interpolated = 0.0, 0.0  # variances of a base, and of the way back from it
     for number in range(last + 1):
         variance = low**2 * 2**number
-        if variance / 2 >= (COARSE * texel) ** 2:
+        if number and variance / 2 >= (COARSE * texel) ** 2:  # of the blur before
             halved = variance / 2 - interpolated + texel**2 / 4
             texel, level = 2 * texel, _mean_of_blocks(level)
             interpolated += 3 / 16 * texel**2

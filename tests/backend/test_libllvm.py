@@ -107,6 +107,7 @@ def test_choice_of_the_user_stays(folder, monkeypatch):
         ("/opt/homebrew/Cellar/llvm/21.1.2/lib/libLLVM.dylib", 21),
         (r"C:\Program Files\LLVM\bin\LLVM-C.dll", None),
         ("/opt/conda/lib/libLLVM.so", None),
+        ("/home/me/llvm-9f2ab/lib/libLLVM.so", None),
     ],
 )
 def test_version_in_names_of_folders(path, version):

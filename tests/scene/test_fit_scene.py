@@ -62,7 +62,9 @@ class TestTarget:
             part = slice(16, 48), columns  # borders are continued more coarsely
             expected = gaussian_filter(image, (sigma, sigma, 0), mode="nearest")
             np.testing.assert_allclose(found[part], expected[part], atol=0.01)
-        np.testing.assert_allclose(_blur_by(deviation)(np.ones_like(image)), 1, atol=1e-5)
+        for other in (deviation, np.full((9, 6), 5.0), np.ones((1, 1))):
+            flat = np.ones((*other.shape, 1), np.float32)
+            np.testing.assert_allclose(_blur_by(other)(flat), 1, atol=1e-5)
 
     def test_cameras_take_it_for_the_image(self):
         image = photo()
@@ -110,7 +112,7 @@ def fitted(*cameras, image=None, space="linear", **others):
 
 
 class TestFit:
-    def test_few_gaussians_are_fitted_to_a_smaller_image(self):
+    def test_few_gaussians_for_a_large_smooth_target(self):
         large = gaussian_filter(np.kron(photo(), np.ones((4, 4, 1)))[:189, :187], (8, 8, 0))
         target, seen = large.astype(np.float32), np.ones(large.shape[:2], bool)
         found = scenefit._fit(target, np.ones_like(target), seen, 40, STEPS, "data")
