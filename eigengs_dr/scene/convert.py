@@ -27,6 +27,9 @@ SCENE = "scene.xml"
 """Name of the new scene in its folder."""
 
 
+NO_SHAPE = "no shape outside of groups has it, so that no camera sees it directly"
+
+
 class ConvertedTexture(NamedTuple):
     """A bitmap that became Gaussians.
 
@@ -159,12 +162,7 @@ def convert_scene(
             if any(_texture(parsed, use) in found for found in on_shapes):
                 groups.setdefault((use.file, use.raw), []).append(use)
             else:
-                left.append(
-                    (
-                        use.name,
-                        "no shape outside of groups has it, so that no camera sees it directly",
-                    )
-                )
+                left.append((use.name, NO_SHAPE))
         for number, group in enumerate(groups.values()):
             progress("textures", number, len(groups))
             file = _file_name(group[0], {texture.file for texture in textures})

@@ -19,7 +19,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, zoom
 from scipy.sparse import csr_array
 
 from ..fitting.target import dark_weight
@@ -77,18 +77,9 @@ def _mean_of_blocks(image: Image) -> Image:
 
 
 def _doubled(image: Image, height: int, width: int) -> Image:
-    """Interpolate an image of values for 2 x 2 texels at these texels.
-
-    A texel lies a quarter of a block off the centre of its block. SciPy's ``zoom`` takes 3 times as
-    long.
-    """
-    for axis, side in enumerate((height, width)):
-        blocks = np.moveaxis(image, axis, 0)
-        padded = np.concatenate([blocks[:1], blocks, blocks[-1:]])
-        pairs = [0.75 * blocks + 0.25 * other for other in (padded[:-2], padded[2:])]
-        texels = np.stack(pairs, axis=1).reshape(-1, *blocks.shape[1:])
-        image = np.asarray(np.moveaxis(texels[:side], 0, axis), np.float32)
-    return image
+    """Interpolate an image of values for 2 x 2 texels at these texels."""
+    larger = zoom(image, (2, 2, 1), order=1, mode="nearest", grid_mode=True)
+    return np.asarray(larger[:height, :width], np.float32)
 
 
 def back_project(whole: Image, found: Visibility, share: float) -> Image:
