@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from contextlib import suppress
-from pathlib import Path
-
+from ..storage.memory import usable_memory
 from .schedule import MAX_SURPLUS, MAX_SURPLUS_DENSITY
 
 BASE_BYTES = 165e6
@@ -57,47 +53,6 @@ def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> i
         + pixels * (BYTES_PER_PIXEL + channels * BYTES_PER_VALUE)
         + max(gaussians, with_surplus) * BYTES_PER_GAUSSIAN
     )
-
-
-def usable_memory(root: Path = Path("/")) -> int | None:
-    """Return the bytes of memory that this process may use, or None if the system does not say.
-
-    They are those of the machine, or fewer in a container, or in a job of a batch system: Linux
-    limits the memory of a control group and of the groups that it lies in, by version 1 or 2.
-
-    Parameters
-    ----------
-    root : Path, optional
-        The root of the file system with ``proc`` and ``sys``.
-    """
-    try:
-        installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, OSError, ValueError):  # Windows has no `sysconf`
-        return None
-    return min([installed, *_group_limits(root)])
-
-
-def _group_limits(root: Path) -> Iterator[int]:
-    """Yield the limits of the control groups of this process that are visible from here."""
-    try:
-        lines = (root / "proc/self/cgroup").read_text().splitlines()
-    except OSError:
-        return
-    for line in lines:
-        _, controllers, path = line.split(":", 2)
-        if not controllers:
-            mount, name = root / "sys/fs/cgroup", "memory.max"
-        elif "memory" in controllers.split(","):
-            mount, name = root / "sys/fs/cgroup/memory", "memory.limit_in_bytes"
-        else:
-            continue
-        group = mount / path.lstrip("/")
-        # A container may see its own group alone, at the mount, and not the path to it.
-        for folder in [group, *group.parents]:
-            with suppress(OSError, ValueError):  # no such file, or "max"
-                yield int((folder / name).read_text())
-            if folder == mount:
-                break
 
 
 def check_memory(width: int, height: int, channels: int, gaussians: int) -> str:
