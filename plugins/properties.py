@@ -73,7 +73,7 @@ def source_of(props: Properties) -> Source:
     return source
 
 
-def _from_arrays(props: Properties, backend: str) -> Gaussians:
+def _from_arrays(props: Properties, backend: str | None) -> Gaussians:
     """Read a set from the properties of `texture_of`."""
     missing = [key for key in (*FIELDS, "width", "height", "space") if key not in props]
     if missing:
