@@ -168,6 +168,30 @@ def test_fits_in_four_threads_have_the_bits_of_fits_one_by_one(backend):
         assert list(pool.map(fit_one, range(40), timeout=4 * WAIT)) == alone
 
 
+EAGER_THREADS = """
+import sys, threading
+import eigengs_dr as eg
+from _helpers.waves import picture
+
+def fits():
+    for _ in range(6):
+        eg.fit(picture(), 40, iterations=3, progress=False)
+
+sys.setswitchinterval(1e-6)
+threads = [threading.Thread(target=fits, daemon=True) for _ in range(2)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+print("whole")
+"""
+
+
+def test_threads_that_drop_results_do_not_hang():
+    """Python changes threads as often as it may, as it does once a minute on a loaded machine."""
+    assert run_python(EAGER_THREADS, PYTHONPATH=python_path()).stdout == "whole\n"
+
+
 def test_gradients_beside_fits_have_the_bits_of_gradients_alone(backend):
     def gradient(_):
         with eg.exclusive():
