@@ -1,4 +1,4 @@
-"""Threads that fit, render, load scenes and drop results, mixed, for a minute or for SOAK_SECONDS."""
+"""Threads that fit, render, load scenes and drop results, for a minute or SOAK_SECONDS."""
 
 import os
 
