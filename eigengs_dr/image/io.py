@@ -10,16 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.feedback import warn
 from ..storage.atomic import atomic_write, refuse_url
 from .color import to_coded, to_linear
 from .formats import (
     ADVICE,
     BITS,
     SUFFIXES,
-    decode_file,
     has_openimageio,
     write_file,
 )
+from .header import over_background, transparency_note
+from .pictures import is_picture, picture_pixels
 from .pixels import (
     MAX_PIXEL,
     EncodedImage,
@@ -30,7 +32,8 @@ from .pixels import (
     reason_of,
     to_floats,
 )
-from .remote import is_url, local_copy
+from .reading import decode, read_header
+from .remote import is_copied, local_copy
 from .strips import Pixels, by_strips
 
 
@@ -82,17 +85,19 @@ def read_file(
     `encoding` overrules the file: by default files of floats hold light, others sRGB.
     """
     check_encoding(encoding)
-    if is_url(path):
-        url = str(path)
-        with local_copy(url) as file:
+    if is_copied(path):
+        with local_copy(str(path)) as file:
             try:
                 return read_file(file, keep_grey, encoding)
             except ImageError as error:
-                raise ImageError(str(error).replace(str(file), url)) from None
+                raise ImageError(str(error).replace(str(file), str(path))) from None
     path = Path(path)
-    found = decode_file(path, keep_grey)
-    said = encoding or found.encoding
-    return EncodedImage(to_floats(found.pixels, str(path), keep_grey, encoding=said), said)
+    header = read_header(path)
+    header.check_memory(path)
+    decoded = decode(path, header, keep_grey)
+    said = encoding or decoded.encoding
+    pixels = to_floats(decoded.pixels, str(path), keep_grey, copy=False, encoding=said)
+    return EncodedImage(pixels, said)
 
 
 def read_image(image: Any, keep_grey: bool = False, encoding: str | None = None) -> EncodedImage:
@@ -105,7 +110,22 @@ def read_image(image: Any, keep_grey: bool = False, encoding: str | None = None)
         return read_file(image, keep_grey, encoding)  # type: ignore[arg-type]
     if isinstance(image, EncodedImage):
         return image._replace(encoding=encoding or image.encoding)
-    return EncodedImage(image, encoding_of(image, encoding) or "srgb")
+    return EncodedImage(pixels_of(image), encoding_of(image, encoding) or "srgb")
+
+
+def pixels_of(image: Any) -> Any:
+    """Return what a `PIL.Image.Image` shows, grey or RGB over white; anything else as it is."""
+    if not is_picture(image):
+        return image
+    try:
+        pixels = picture_pixels(image)
+    except ImageError as error:
+        raise ImageError(f"image: {error}") from None
+    alpha = "straight" if pixels.shape[2] in (2, 4) else "none"
+    pixels, transparent = over_background(pixels, alpha)
+    if transparent:
+        warn(f"image: {transparency_note(alpha)}")
+    return pixels
 
 
 def read_floats(
@@ -209,6 +229,7 @@ def save_image(
     refuse_url(path)
     path = Path(path)
     bits = bits_of(path, bits)
+    image = pixels_of(image)
     said = encoding_of(image, encoding)
     if bits == 8 and said != "linear" and getattr(image, "dtype", None) == np.uint8:
         array = np.asarray(image)
@@ -354,4 +375,6 @@ def sample(name: str) -> NDArray[np.float32]:
         raise ImageError(f"sample {name!r} is unknown; use one of {', '.join(SAMPLES)}")
     # find_spec finds the folder without the slow import of scikit-image.
     [folder] = find_spec("skimage").submodule_search_locations  # type: ignore[union-attr, misc]
-    return load_image(Path(folder) / "data" / SAMPLES[name])
+    path = Path(folder) / "data" / SAMPLES[name]
+    header = read_header(path)._replace(notes=())  # the profile of one is another
+    return to_floats(decode(path, header, keep_grey=False).pixels, name)

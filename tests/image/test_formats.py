@@ -176,7 +176,7 @@ def test_a_tiff_that_claims_too_many_pixels_is_refused_before_it_is_decoded(tmp_
     with tifffile.TiffFile(tmp_path / "a.tif", mode="r+b") as file:
         for name in ("ImageWidth", "ImageLength"):
             file.pages[0].tags[name].overwrite(60_000)
-    with pytest.raises(ImageError, match="more than 536,870,912 pixels"):
+    with pytest.raises(ImageError, match="takes 43,200 MB in memory"):
         load_image(tmp_path / "a.tif")
 
 
