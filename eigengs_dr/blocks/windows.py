@@ -118,9 +118,9 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
     Parameters
     ----------
     source : path-like or array
-        A file: TIFF of grey or RGB by strips or tiles, and ``.npy``, are read by windows. Pillow
-        decodes other files (PNG, JPEG, TIFF of other kinds) whole, into 4 bytes a pixel; files of
-        floats or 16 bits take 12.
+        A file: TIFF by strips or tiles and ``.npy`` are read by windows. Other files (PNG, JPEG,
+        TIFF of rare kinds) are decoded whole: colours of 8 bits take 10 bytes a pixel meanwhile,
+        and 3 for good.
         Or an array (H, W, 3), (H, W, 1) or (H, W) of a type that `eigengs_dr.load_image` knows, of
         which ``source[top:bottom, left:right]`` is a part: NumPy's, also memory-mapped, zarr's,
         Dask's.

@@ -40,16 +40,18 @@ from .strips import Pixels, by_strips
 def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]:
     """Read an image file as RGB.
 
-    The function replicates grey, converts palette, CMYK and YCbCr, and applies the orientation of
-    the EXIF header. It ignores colour profiles. Values of 8 and 16 bits are divided by 255 and
-    65535. Values of floats stay as they are. EXR, Radiance HDR, and PNG of 16-bit colour need
-    OpenImageIO, from the extra ``hdr``; without it, the last has 8 bits and a warning.
+    The function replicates grey, converts palette, CMYK and YCbCr, and applies the orientation. It
+    ignores colour profiles, with a warning if one is not sRGB. Integers are divided by their
+    largest value, so that 1 is white. Floats stay as they are. EXR, Radiance HDR, and PNG of 16-bit
+    colour need OpenImageIO, from the extra ``hdr``; without it, the last has 8 bits and a warning.
+    The manual has a table of all kinds of files.
 
     Parameters
     ----------
     path : str or Path
-        PNG, JPEG and other files that Pillow reads; TIFF; EXR; Radiance HDR; PFM. Or the URL of
-        such a file, which needs fsspec, from the extra ``cluster``.
+        PNG, JPEG and other files that Pillow reads; TIFF; EXR; Radiance HDR; PGM, PPM and PFM. Or a
+        pipe, or the URL of such a file, which needs fsspec, from the extra ``cluster``; both are
+        read up to 1 GB.
     keep_grey : bool, optional
         Return one channel if the file is opaque grey.
 
@@ -64,13 +66,15 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
     -----
     UserWarning
         If the image has transparent pixels, which are shown over white, or over black in an EXR
-        file. If the file holds several frames, of which the first is used.
+        file. If the file holds several images, of which the first is used; channels that are no
+        colours; colours that are not sRGB; or more bits than are read.
 
     Raises
     ------
     ImageError
-        If the file is missing, empty, damaged, too large or not an image; a pixel is not finite; or
-        an EXR file holds one channel without `keep_grey`, or several layers.
+        If the file is missing, empty, damaged, not an image, or of a kind that has no meaning here;
+        its pixels would take much more memory than the file is likely to need; a pixel is not
+        finite; or an EXR file holds one channel without `keep_grey`, or several layers.
     OSError
         If a URL cannot be read.
     """
@@ -146,7 +150,7 @@ def check_image(
 
     Parameters
     ----------
-    image : array_like, shape (H, W), (H, W, 1) or (H, W, 3); or path-like or URL
+    image : array_like, shape (H, W), (H, W, 1) or (H, W, 3); or path-like or URL; or PIL image
         Grey or RGB: uint8 or uint16 (scaled to [0, 1]), bool, or floats with 1 as white. sRGB may
         overshoot [0, 1] by 0.5, as in resampled images; it is not clamped. Light may have any
         finite value. A file and a ``mitsuba.Bitmap`` say themselves what they hold.

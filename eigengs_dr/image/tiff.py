@@ -104,6 +104,7 @@ def tiff_header(path: Path) -> Header:
 def read_tiff(path: Path) -> Pixels:
     """Return the first image of a file: grey or RGB as stored, and alpha if there is one."""
     import tifffile
+    from PIL import UnidentifiedImageError
 
     with tifffile.TiffFile(path) as file:
         page, number, _ = _first_page(file)
@@ -124,14 +125,14 @@ def read_tiff(path: Path) -> Pixels:
             return _read_openimageio(path, number, layout)
     integers = not layout.floats and not layout.associated
     if integers and (layout.bits <= 8 or (layout.bits == 16 and layout.color == "grey")):
-        with open_picture(path) as image:
+        with suppress(UnidentifiedImageError), open_picture(path) as image:
             image.seek(number)
             return picture_pixels(image)
     if "imagecodecs" in reason or "compression" in reason:
         name = getattr(page.compression, "name", page.compression)
         raise ImageError(
-            f"compression {name} with {layout.bits} bits cannot be decoded here; type: "
-            "pip install imagecodecs OpenImageIO, or export it without compression"
+            f"compression {name} with {layout.bits} bits needs another package; type: "
+            "pip install imagecodecs OpenImageIO, or export it with 8 or 16 bits, uncompressed"
         )
     raise ImageError(f"damaged or unsupported ({reason}); export it again")
 

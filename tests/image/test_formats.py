@@ -189,6 +189,22 @@ def test_without_openimageio(tmp_path, monkeypatch):
     save_image(tmp_path / "a.pfm", LIGHT)  # needs no package
 
 
+@pytest.mark.parametrize("compression", ["lzw", "packbits"])
+def test_tiff_without_openimageio(tmp_path, monkeypatch, compression):
+    pixels = {8: (LIGHT / 20).astype(np.uint8), 16: LIGHT.astype(np.uint16)}
+    for bits, values in pixels.items():
+        image = oiio.ImageBuf(np.ascontiguousarray(values))
+        image.specmod().attribute("compression", compression)
+        assert image.write(str(tmp_path / f"{bits}.tif"), f"uint{bits}")
+    monkeypatch.setitem(sys.modules, "OpenImageIO", None)
+    np.testing.assert_allclose(load_image(tmp_path / "8.tif"), pixels[8] / 255, atol=1e-6)
+    if compression == "lzw":
+        with refused(ImageError, "LZW with 16 bits needs another package; type: pip install"):
+            load_image(tmp_path / "16.tif")
+    else:  # tifffile knows it
+        np.testing.assert_allclose(load_image(tmp_path / "16.tif"), pixels[16] / 65535, atol=1e-6)
+
+
 @pytest.mark.parametrize(("name", "bits"), [("a.jpg", 16), ("a.hdr", 16), ("a.png", 32)])
 def test_bits_that_a_format_has_not(tmp_path, name, bits):
     with refused(ImageError, f"bits is {bits}; a"):
