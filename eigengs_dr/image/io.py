@@ -89,18 +89,22 @@ def read_file(
     `encoding` overrules the file: by default files of floats hold light, others sRGB.
     """
     check_encoding(encoding)
-    if is_copied(path):
-        with local_copy(str(path)) as file:
-            try:
-                return read_file(file, keep_grey, encoding)
-            except ImageError as error:
-                raise ImageError(str(error).replace(str(file), str(path))) from None
-    path = Path(path)
+    if not is_copied(path):
+        return _read_local(Path(path), str(path), keep_grey, encoding)
+    with local_copy(str(path)) as file:
+        try:
+            return _read_local(file, str(path), keep_grey, encoding)
+        except ImageError as error:
+            raise ImageError(str(error).replace(str(file), str(path))) from None
+
+
+def _read_local(path: Path, name: str, keep_grey: bool, encoding: str | None) -> EncodedImage:
+    """Read a file that warnings call `name`."""
     header = read_header(path)
     header.check_memory(path)
-    decoded = decode(path, header, keep_grey)
+    decoded = decode(path, header, keep_grey, name)
     said = encoding or decoded.encoding
-    pixels = to_floats(decoded.pixels, str(path), keep_grey, copy=False, encoding=said)
+    pixels = to_floats(decoded.pixels, name, keep_grey, copy=False, encoding=said)
     return EncodedImage(pixels, said)
 
 

@@ -91,10 +91,10 @@ def read_header(path: Path) -> Header:
         return reader.header(path)
 
 
-def decode(path: Path, header: Header, keep_grey: bool) -> EncodedImage:
+def decode(path: Path, header: Header, keep_grey: bool, name: str = "") -> EncodedImage:
     """Return the pixels of a file, grey or RGB in its own type, and what they are.
 
-    For warnings and errors see `load_image`.
+    Warnings call the file `name`, by default its path. For warnings and errors see `load_image`.
     """
     with image_errors(path):
         reader = reader_of(path)
@@ -107,8 +107,8 @@ def decode(path: Path, header: Header, keep_grey: bool) -> EncodedImage:
             reader = PICTURE
         pixels = reader.pixels(path)
     for note in header.notes:
-        warn(f"{path}: {note}")
+        warn(f"{name or path}: {note}")
     pixels, transparent = over_background(oriented(pixels, header.orientation), header.alpha)
     if transparent:
-        warn(f"{path}: {transparency_note(header.alpha)}")
+        warn(f"{name or path}: {transparency_note(header.alpha)}")
     return EncodedImage(pixels, header.encoding)
