@@ -15,10 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..image.formats import TIFF_SUFFIXES, kind_of, open_header, open_picture, picture_pixels
-from ..image.io import ImageError, check_data, check_image, read_file
+from ..backend.feedback import warn
+from ..image.header import transparency_note
+from ..image.io import ImageError, check_data, check_image, pixels_of, read_file
 from ..image.pixels import encoding_of
-from ..image.remote import is_url
+from ..image.reading import TIFF, decode, read_header, reader_of
+from ..image.remote import is_copied
+from ..image.tiff import has_windows, read_window
 
 MAX_SIDE = 1 << 16
 """Longest side of a set of Gaussians, in pixels."""
@@ -115,9 +118,9 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
     Parameters
     ----------
     source : path-like or array
-        A file: TIFF of grey or RGB by strips or tiles, and ``.npy``, are read by windows. Pillow
-        decodes other files (PNG, JPEG, TIFF of other kinds) whole, into 4 bytes a pixel; files of
-        floats or 16 bits take 12.
+        A file: TIFF by strips or tiles and ``.npy`` are read by windows. Other files (PNG, JPEG,
+        TIFF of rare kinds) are decoded whole: colours of 8 bits take 10 bytes a pixel meanwhile,
+        and 3 for good.
         Or an array (H, W, 3), (H, W, 1) or (H, W) of a type that `eigengs_dr.load_image` knows, of
         which ``source[top:bottom, left:right]`` is a part: NumPy's, also memory-mapped, zarr's,
         Dask's.
@@ -135,8 +138,9 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
     ImageError
         If there is no such file, it is no image, or the shape or the size is wrong.
     """
-    if is_url(source):
-        source, encoding = read_file(source, keep_grey, encoding)
+    source = pixels_of(source)
+    if isinstance(source, (str, os.PathLike)) and is_copied(source):
+        source, encoding = read_file(str(source), keep_grey, encoding)
     if isinstance(source, (str, os.PathLike)):
         name, identity = str(source), _identity(Path(source))
         shape, pixels, said = _open_file(Path(source), keep_grey)
@@ -150,8 +154,7 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
         raise ImageError(f"image: is a {kind}; pass a file or an array of shape (H, W, 3)")
     if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] not in (1, 3)):
         raise ImageError(f"{name}: shape {shape}, expected (H, W) or (H, W, 3)")
-    if not all(1 <= side <= MAX_SIDE for side in shape[:2]):
-        raise ImageError(f"{name}: {shape[1]}x{shape[0]} pixels; sides go from 1 to {MAX_SIDE:,}")
+    _check_sides(name, shape)
     channels = 1 if keep_grey and shape[2:] in ((), (1,)) else 3
     return Source(shape[1], shape[0], channels, name, identity, pixels, keep_grey, encoding)
 
@@ -180,14 +183,26 @@ def _open_file(path: Path, keep_grey: bool) -> tuple[tuple[int, ...], str | Pixe
         except (ValueError, EOFError, OSError) as error:
             raise ImageError(f"{path}: not a readable .npy file ({error})") from None
         return shape, absolute, "srgb"
-    if path.suffix.lower() in TIFF_SUFFIXES and (found := window_shape(absolute)):
-        return found[0], absolute, "linear" if found[1].kind == "f" else "srgb"
-    if kind_of(path) is not None:
-        pixels, encoding = read_file(path, keep_grey)
-    else:  # 8 bits stay 8 bits
-        with open_picture(path, MAX_SIDE) as picture:
-            pixels, encoding = picture_pixels(picture)[0], "srgb"
-    return pixels.shape, pixels, encoding
+    header = read_header(path)
+    shape = header.height, header.width, header.channels
+    _check_sides(str(path), shape)
+    if reader_of(path) is TIFF and has_windows(path):
+        notes = (
+            header.notes
+            if header.alpha == "none"
+            else (*header.notes, transparency_note(header.alpha))
+        )
+        for note in notes:
+            warn(f"{path}: {note}")
+        return shape, absolute, header.encoding
+    header.check_memory(path, as_floats=False)
+    pixels, encoding = decode(path, header, keep_grey)  # 8 bits stay 8 bits
+    return shape, pixels, encoding
+
+
+def _check_sides(name: str, shape: tuple[int, ...]) -> None:
+    if not all(1 <= side <= MAX_SIDE for side in shape[:2]):
+        raise ImageError(f"{name}: {shape[1]}x{shape[0]} pixels; sides go from 1 to {MAX_SIDE:,}")
 
 
 def _read_part(path: str, rows: slice, columns: slice) -> Pixels:
@@ -197,130 +212,22 @@ def _read_part(path: str, rows: slice, columns: slice) -> Pixels:
     return read_window(path, rows, columns)
 
 
-MAX_SEGMENT = 1 << 26
-"""Values of the largest strip or tile that is decoded for a window. A file of one compressed strip
-is better decoded once."""
-
 TILE_SIDE = 256
 """Side of the tiles of files that `write_tiles` writes, in pixels."""
-
-
-def window_shape(path: str) -> tuple[tuple[int, int, int], np.dtype[Any]] | None:
-    """Return height, width, channels and the type of a TIFF file that `read_window` reads, or None.
-
-    Such a file holds grey or RGB as 8 or 16 bits or floats. Its strips or tiles are plain, or have
-    a compression that tifffile knows here: others need the package imagecodecs.
-    """
-    import tifffile
-
-    try:
-        with tifffile.TiffFile(path) as file:
-            page = file.pages[0]
-            channels = page.samplesperpixel
-            plain = page.planarconfig == 1 and page.photometric in (1, 2) and page.imagedepth == 1
-            turned = "Orientation" in page.tags and page.tags["Orientation"].value != 1
-            known = page.dtype is not None and page.dtype.str[1:] in ("u1", "u2", "f4", "f2", "f8")
-            if not plain or turned or not known or channels not in (1, 3):
-                return None
-            if not page.is_memmappable:
-                if np.prod(page.chunks, dtype=np.int64) > MAX_SEGMENT:
-                    return None
-                _decode(file, page, 0)
-            return (page.imagelength, page.imagewidth, channels), page.dtype
-    except Exception:  # tifffile raises many types; Pillow reads what it does not, or says why not
-        return None
-
-
-def read_window(path: str, rows: slice, columns: slice) -> Pixels:
-    """Read a part of a TIFF file for which `window_shape` returns a shape.
-
-    Parameters
-    ----------
-    path : str
-    rows, columns : slice
-        Inside the image.
-
-    Returns
-    -------
-    ndarray, shape (R, C, channels) or (R, C)
-
-    Raises
-    ------
-    ImageError
-        If the file is missing or damaged.
-    """
-    import tifffile
-
-    try:
-        with tifffile.TiffFile(path) as file:
-            page = file.pages[0]
-            if not page.is_memmappable:
-                return _from_segments(file, page, rows, columns)
-        whole = tifffile.memmap(path, page=0, mode="r")
-        return np.array(whole[rows, columns], whole.dtype.newbyteorder("="))
-    except Exception as error:  # tifffile raises many types
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ImageError(f"{path}: damaged or unreadable ({reason}); export it again") from error
-
-
-def _from_segments(file: Any, page: Any, rows: slice, columns: slice) -> Pixels:
-    """Decode the strips or tiles that a window touches. One without data is black."""
-    height, width = page.chunks[:2]
-    across = -(-page.imagewidth // width)
-    shape = (rows.stop - rows.start, columns.stop - columns.start, page.samplesperpixel)
-    result = np.zeros(shape, page.dtype)
-    for row in range(rows.start // height, -(-rows.stop // height)):
-        for column in range(columns.start // width, -(-columns.stop // width)):
-            segment = _decode(file, page, row * across + column)
-            if segment is not None:
-                here, there = _shared(rows, row * height, segment.shape[0])
-                left, right = _shared(columns, column * width, segment.shape[1])
-                result[here, left] = segment[there, right]
-    return result
-
-
-def _shared(part: slice, start: int, length: int) -> tuple[slice, slice]:
-    """Return what a part shares with a segment, counted from the start of each."""
-    first, last = max(part.start, start), min(part.stop, start + length)
-    return slice(first - part.start, last - part.start), slice(first - start, last - start)
-
-
-def _decode(file: Any, page: Any, number: int) -> Pixels | None:
-    """Return a strip or a tile (R, C, channels)."""
-    file.filehandle.seek(page.dataoffsets[number])
-    data = file.filehandle.read(page.databytecounts[number])
-    segment, _, _ = page.decode(data, number)
-    return None if segment is None else np.asarray(segment[0])
-
-
-GREY = ("1", "L", "I", "I;16", "I;16B", "I;16L", "F")
-"""Modes of Pillow for opaque images of one channel."""
-
-TURNED = range(5, 9)
-"""EXIF orientations that swap width and height."""
-
-ORIENTATION = 0x0112
-"""EXIF tag of the orientation."""
 
 
 def image_size(path: Path | str) -> tuple[int, int, int] | None:
     """Return height, width and channels, 1 or 3, from the header of an image file.
 
-    None for a URL, which is read once, and for a file that is no image.
+    None for a URL or a pipe, which is read once, and for a file that is no image.
     """
-    if isinstance(path, str):
+    if is_copied(path):
         return None
-    if path.suffix.lower() in TIFF_SUFFIXES and (found := window_shape(str(path))):
-        return found[0]
     try:
-        with open_header(path) as file:
-            width, height = file.size
-            # Pillow decodes a PNG file to find its EXIF data; they seldom turn it.
-            turned = file.format != "PNG" and file.getexif().get(ORIENTATION) in TURNED
-            channels = 1 if file.mode in GREY else 3
-    except Exception:  # Pillow's decoders raise many types
+        header = read_header(Path(path))
+    except ImageError:
         return None
-    return (width, height, channels) if turned else (height, width, channels)
+    return header.height, header.width, header.channels
 
 
 def write_tiles(

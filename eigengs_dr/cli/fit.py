@@ -174,7 +174,8 @@ def _expand(source: Path | str) -> Sequence[Path | str]:
     """Replace a folder, a pattern or a URL by the images that it stands for."""
     from ..image.folder import list_images
 
-    return [source] if isinstance(source, Path) and source.is_file() else list_images(source)
+    single = isinstance(source, Path) and source.exists() and not source.is_dir()
+    return [source] if single else list_images(source)
 
 
 # ---------------------------------------------------------------------------------------------

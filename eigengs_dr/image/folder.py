@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from ..backend.feedback import warn
 from .color import BASIS_SPACES, check_size, to_planes
-from .io import SUFFIXES, check_image, load_image
+from .formats import LEFT_SUFFIXES, READ_SUFFIXES
+from .io import check_image, load_image
 from .pixels import ImageError
 from .remote import is_url, list_urls
 from .resize import center_crop
@@ -31,7 +32,7 @@ MAX_WAITING, MAX_WAITING_BYTES = 512, 1 << 25
 then tells. One image may wait whatever its size."""
 
 MAX_NAMED = 3
-"""Largest number of skipped files that a warning names."""
+"""Largest number of files that a warning names."""
 
 Source = str | os.PathLike[str] | NDArray[Any] | Iterable[str | os.PathLike[str] | NDArray[Any]]
 """A folder or its URL, an array of images, or any iterable of files, of URLs and of such arrays."""
@@ -67,7 +68,12 @@ def image_files(folder: str | Path) -> list[Path]:
     Returns
     -------
     list of Path
-        Files with a suffix of `SUFFIXES` in upper or lower case, sorted by name.
+        Files with a suffix of `READ_SUFFIXES` in upper or lower case, sorted by name.
+
+    Warns
+    -----
+    UserWarning
+        If files with a suffix of `LEFT_SUFFIXES` are left out.
 
     Raises
     ------
@@ -81,15 +87,20 @@ def image_files(folder: str | Path) -> list[Path]:
         raise ImageError(f"{folder}: is a file; name the folder that holds it") from None
     except OSError as error:
         raise ImageError(f"{folder}: not a readable folder ({error.strerror}); check it") from None
-    files = [
-        entry
-        for entry in entries
-        if entry.suffix.lower() in SUFFIXES and entry.name[0] != "." and entry.is_file()
-    ]
+    entries = [entry for entry in entries if entry.name[0] != "." and entry.is_file()]
+    files = [entry for entry in entries if entry.suffix.lower() in READ_SUFFIXES]
+    left = [entry.name for entry in entries if entry.suffix.lower() in LEFT_SUFFIXES]
+    if left:
+        warn(f"{folder}: {len(left)} files of kinds that are not read are left out: {_names(left)}")
     if not files:
-        known = " ".join(SUFFIXES)
+        known = " ".join(READ_SUFFIXES)
         raise ImageError(f"{folder}: holds no images; expected files ending in {known}")
     return files
+
+
+def _names(names: list[str]) -> str:
+    """Return the first names of a list."""
+    return ", ".join(names[:MAX_NAMED]) + (", ..." if len(names) > MAX_NAMED else "")
 
 
 def list_images(images: str | os.PathLike[str]) -> Sequence[str | Path]:
@@ -218,8 +229,7 @@ def _blocks(
     if len(problems) == done:
         raise ImageError(f"none of {done} images can be read, as {problems[0]}; check the files")
     if problems:
-        named = ", ".join(problems[:MAX_NAMED]) + (", ..." if len(problems) > MAX_NAMED else "")
-        warn(f"{len(problems)} of {done} images were skipped: {named}")
+        warn(f"{len(problems)} of {done} images were skipped: {_names(problems)}")
     if fitted:
         warn(f"{fitted} of {done} images were centre-cropped and resized to {size[0]}x{size[1]}")
 

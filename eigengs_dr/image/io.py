@@ -10,16 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.feedback import warn
 from ..storage.atomic import atomic_write, refuse_url
 from .color import to_coded, to_linear
 from .formats import (
     ADVICE,
     BITS,
     SUFFIXES,
-    decode_file,
     has_openimageio,
     write_file,
 )
+from .header import over_background, transparency_note
+from .pictures import is_picture, picture_pixels
 from .pixels import (
     MAX_PIXEL,
     EncodedImage,
@@ -30,23 +32,26 @@ from .pixels import (
     reason_of,
     to_floats,
 )
-from .remote import is_url, local_copy
+from .reading import decode, read_header
+from .remote import is_copied, local_copy
 from .strips import Pixels, by_strips
 
 
 def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]:
     """Read an image file as RGB.
 
-    The function replicates grey, converts palette, CMYK and YCbCr, and applies the orientation of
-    the EXIF header. It ignores colour profiles. Values of 8 and 16 bits are divided by 255 and
-    65535. Values of floats stay as they are. EXR, Radiance HDR, and PNG of 16-bit colour need
-    OpenImageIO, from the extra ``hdr``; without it, the last has 8 bits and a warning.
+    The function replicates grey, converts palette, CMYK and YCbCr, and applies the orientation. It
+    ignores colour profiles, with a warning if one is not sRGB. Integers are divided by their
+    largest value, so that 1 is white. Floats stay as they are. EXR, Radiance HDR, and PNG of 16-bit
+    colour need OpenImageIO, from the extra ``hdr``; without it, the last has 8 bits and a warning.
+    The manual has a table of all kinds of files.
 
     Parameters
     ----------
     path : str or Path
-        PNG, JPEG and other files that Pillow reads; TIFF; EXR; Radiance HDR; PFM. Or the URL of
-        such a file, which needs fsspec, from the extra ``cluster``.
+        PNG, JPEG and other files that Pillow reads; TIFF; EXR; Radiance HDR; PGM, PPM and PFM. Or a
+        pipe, or the URL of such a file, which needs fsspec, from the extra ``cluster``; both are
+        read up to 1 GB.
     keep_grey : bool, optional
         Return one channel if the file is opaque grey.
 
@@ -61,13 +66,15 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
     -----
     UserWarning
         If the image has transparent pixels, which are shown over white, or over black in an EXR
-        file. If the file holds several frames, of which the first is used.
+        file. If the file holds several images, of which the first is used; channels that are no
+        colours; colours that are not sRGB; or more bits than are read.
 
     Raises
     ------
     ImageError
-        If the file is missing, empty, damaged, too large or not an image; a pixel is not finite; or
-        an EXR file holds one channel without `keep_grey`, or several layers.
+        If the file is missing, empty, damaged, not an image, or of a kind that has no meaning here;
+        its pixels would take much more memory than the file is likely to need; a pixel is not
+        finite; or an EXR file holds one channel without `keep_grey`, or several layers.
     OSError
         If a URL cannot be read.
     """
@@ -82,17 +89,23 @@ def read_file(
     `encoding` overrules the file: by default files of floats hold light, others sRGB.
     """
     check_encoding(encoding)
-    if is_url(path):
-        url = str(path)
-        with local_copy(url) as file:
-            try:
-                return read_file(file, keep_grey, encoding)
-            except ImageError as error:
-                raise ImageError(str(error).replace(str(file), url)) from None
-    path = Path(path)
-    found = decode_file(path, keep_grey)
-    said = encoding or found.encoding
-    return EncodedImage(to_floats(found.pixels, str(path), keep_grey, encoding=said), said)
+    if not is_copied(path):
+        return _read_local(Path(path), str(path), keep_grey, encoding)
+    with local_copy(str(path)) as file:
+        try:
+            return _read_local(file, str(path), keep_grey, encoding)
+        except ImageError as error:
+            raise ImageError(str(error).replace(str(file), str(path))) from None
+
+
+def _read_local(path: Path, name: str, keep_grey: bool, encoding: str | None) -> EncodedImage:
+    """Read a file that warnings call `name`."""
+    header = read_header(path)
+    header.check_memory(path)
+    decoded = decode(path, header, keep_grey, name)
+    said = encoding or decoded.encoding
+    pixels = to_floats(decoded.pixels, name, keep_grey, copy=False, encoding=said)
+    return EncodedImage(pixels, said)
 
 
 def read_image(image: Any, keep_grey: bool = False, encoding: str | None = None) -> EncodedImage:
@@ -105,7 +118,22 @@ def read_image(image: Any, keep_grey: bool = False, encoding: str | None = None)
         return read_file(image, keep_grey, encoding)  # type: ignore[arg-type]
     if isinstance(image, EncodedImage):
         return image._replace(encoding=encoding or image.encoding)
-    return EncodedImage(image, encoding_of(image, encoding) or "srgb")
+    return EncodedImage(pixels_of(image), encoding_of(image, encoding) or "srgb")
+
+
+def pixels_of(image: Any) -> Any:
+    """Return what a `PIL.Image.Image` shows, grey or RGB over white; anything else as it is."""
+    if not is_picture(image):
+        return image
+    try:
+        pixels = picture_pixels(image)
+    except ImageError as error:
+        raise ImageError(f"image: {error}") from None
+    alpha = "straight" if pixels.shape[2] in (2, 4) else "none"
+    pixels, transparent = over_background(pixels, alpha)
+    if transparent:
+        warn(f"image: {transparency_note(alpha)}")
+    return pixels
 
 
 def read_floats(
@@ -126,7 +154,7 @@ def check_image(
 
     Parameters
     ----------
-    image : array_like, shape (H, W), (H, W, 1) or (H, W, 3); or path-like or URL
+    image : array_like, shape (H, W), (H, W, 1) or (H, W, 3); or path-like or URL; or PIL image
         Grey or RGB: uint8 or uint16 (scaled to [0, 1]), bool, or floats with 1 as white. sRGB may
         overshoot [0, 1] by 0.5, as in resampled images; it is not clamped. Light may have any
         finite value. A file and a ``mitsuba.Bitmap`` say themselves what they hold.
@@ -209,6 +237,7 @@ def save_image(
     refuse_url(path)
     path = Path(path)
     bits = bits_of(path, bits)
+    image = pixels_of(image)
     said = encoding_of(image, encoding)
     if bits == 8 and said != "linear" and getattr(image, "dtype", None) == np.uint8:
         array = np.asarray(image)
@@ -354,4 +383,6 @@ def sample(name: str) -> NDArray[np.float32]:
         raise ImageError(f"sample {name!r} is unknown; use one of {', '.join(SAMPLES)}")
     # find_spec finds the folder without the slow import of scikit-image.
     [folder] = find_spec("skimage").submodule_search_locations  # type: ignore[union-attr, misc]
-    return load_image(Path(folder) / "data" / SAMPLES[name])
+    path = Path(folder) / "data" / SAMPLES[name]
+    header = read_header(path)._replace(notes=())  # the profile of one is another
+    return to_floats(decode(path, header, keep_grey=False).pixels, name)

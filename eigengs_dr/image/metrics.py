@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .color import RGB_TO_YCBCR, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_linear, to_pu21
-from .io import to_8bit
+from .io import pixels_of, to_8bit
 from .pixels import peak_of
 from .strips import Pixels, map_threads, strips
 
@@ -233,7 +233,7 @@ def _scaled(image: Pixels) -> Pixels:
 
 def _pair(a: ArrayLike, b: ArrayLike) -> tuple[Pixels, Pixels]:
     """Return both images as RGB of one shape (H, W, 3) without a copy; grey is replicated."""
-    x, y = (_scaled(np.asarray(image)) for image in (a, b))
+    x, y = (_scaled(np.asarray(pixels_of(image))) for image in (a, b))
     if x.shape != y.shape:
         raise ValueError(f"images have shapes {x.shape} and {y.shape}; crop or scale one of them")
     if x.ndim != 3 or x.shape[2] not in (1, 3) or x.size == 0:

@@ -9,11 +9,13 @@ from __future__ import annotations
 import glob
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from .formats import SUFFIXES
+from ..storage.memory import SETTING, download_limit
+from .formats import READ_SUFFIXES
 from .pixels import ImageError, reason_of
 
 
@@ -63,13 +65,21 @@ def list_urls(url: str) -> list[str]:
     return sorted(system.unstrip_protocol(name) + tail for name in names)
 
 
+def is_copied(name: object) -> bool:
+    """Whether the content of a name can be read once only: that of a URL, a pipe or a socket."""
+    if is_url(name):
+        return True
+    path = Path(str(name))
+    return path.is_fifo() or path.is_socket()
+
+
 @contextmanager
-def local_copy(url: str) -> Iterator[Path]:
-    """Copy the file behind a URL to a temporary file for the time of a block.
+def local_copy(name: str) -> Iterator[Path]:
+    """Copy what is behind a URL or a pipe to a temporary file for the time of a block.
 
     Parameters
     ----------
-    url : str
+    name : str
 
     Yields
     ------
@@ -78,19 +88,33 @@ def local_copy(url: str) -> Iterator[Path]:
     Raises
     ------
     ImageError
-        If fsspec is missing.
+        If fsspec is missing, or there are more bytes than `download_limit`.
     OSError
-        If the file cannot be read, which may pass; the message names the URL.
+        If it cannot be read, which may pass; the message has the name.
     """
+    limit = download_limit()
     with TemporaryDirectory() as folder:
         file = Path(folder) / "image"
-        system = _fsspec()
         try:
-            with system.open(url, "rb") as remote:
-                file.write_bytes(remote.read())
+            source = partial(_fsspec().open, name) if is_url(name) else Path(name).open
+            with source("rb") as remote, file.open("wb") as copy:
+                while part := remote.read(min(PART, limit + 1 - copy.tell())):
+                    copy.write(part)
+                size = copy.tell()
+        except ImageError:
+            raise
         except Exception as error:  # each store raises its own types
-            raise OSError(f"{url}: cannot be read ({reason_of(error)})") from error
+            raise OSError(f"{name}: cannot be read ({reason_of(error)})") from error
+        if size > limit:
+            raise ImageError(
+                f"{name}: has more than {limit / 1e6:,.0f} MB; if you trust it, set "
+                f"{SETTING} to as many MB as it has"
+            )
         yield file
+
+
+PART = 1 << 20
+"""Bytes that are copied at once."""
 
 
 def _fsspec() -> Any:
@@ -105,4 +129,4 @@ def _fsspec() -> Any:
 
 def _is_image(name: str) -> bool:
     path = PurePosixPath(name)
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+    return path.suffix.lower() in READ_SUFFIXES and not path.name.startswith(".")

@@ -15,6 +15,10 @@ ALWAYS, TIMES_FILE = 512 << 20, 100
 takes 8 times its PNG, and up to 60 times its JPEG, as floats; a TIFF of 2 MB can claim 8 GB."""
 
 
+MAX_DOWNLOAD = 1 << 30
+"""Bytes of a file behind a URL or of a pipe; they are copied to the disk."""
+
+
 def usable_memory(root: Path = Path("/")) -> int | None:
     """Return the bytes of memory that this process may use, or None if the system does not say.
 
@@ -72,10 +76,8 @@ def check_content(path: str | os.PathLike[str], needed: int) -> None:
         If that is more than `ALWAYS` and `TIMES_FILE` times the size of the file, or more than half
         of `usable_memory`. One line names the variable that raises the limit.
     """
-    setting = os.environ.get(SETTING, "")
-    if setting.isdecimal():
-        limit = int(setting) << 20
-    else:
+    limit = _setting()
+    if limit is None:
         limit = max(ALWAYS, TIMES_FILE * os.stat(path).st_size)
         limit = min(limit, (usable_memory() or limit * 2) // 2)
     if needed > limit:
@@ -83,3 +85,14 @@ def check_content(path: str | os.PathLike[str], needed: int) -> None:
             f"{path}: takes {needed / 1e6:,.0f} MB in memory, the limit is {limit / 1e6:,.0f} MB; "
             f"if you trust the file, set {SETTING}={(needed >> 20) + 1}"
         )
+
+
+def download_limit() -> int:
+    """Return the bytes that a download or a pipe may have: as `SETTING` says, or `MAX_DOWNLOAD`."""
+    return _setting() or MAX_DOWNLOAD
+
+
+def _setting() -> int | None:
+    """Return the bytes that the environment variable says."""
+    text = os.environ.get(SETTING, "")
+    return int(text) << 20 if text.isdecimal() else None

@@ -7,9 +7,10 @@ from PIL import Image
 
 from _helpers.files import png
 from _helpers.mosaics import Sliced, mosaic
-from eigengs_dr.blocks.windows import open_source, window_shape, write_tiles
+from eigengs_dr.blocks.windows import image_size, open_source, write_tiles
 from eigengs_dr.image.color import to_coded
 from eigengs_dr.image.io import ImageError, load_image, save_image
+from eigengs_dr.image.tiff import has_windows
 
 PART = slice(37, 90), slice(50, 131)
 
@@ -41,7 +42,7 @@ def assert_same(source, pixels, part=PART):
 def test_tiff_is_read_by_windows(tmp_path, pixels, options):
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, pixels, photometric="rgb", **options)
-    assert window_shape(str(path)) == ((150, 150, 3), np.uint8)
+    assert has_windows(path) and image_size(path) == (150, 150, 3)
     assert_same(open_source(path), pixels)
 
 
@@ -91,7 +92,8 @@ def test_pictures_are_decoded_once(tmp_path, pixels, name):
 def test_transparent_picture_is_shown_over_white(tmp_path, pixels):
     alpha = np.full((150, 150, 1), 128, np.uint8)
     Image.fromarray(np.concatenate([pixels, alpha], axis=2)).save(tmp_path / "a.png")
-    found = open_source(tmp_path / "a.png").window(*PART).read()
+    with pytest.warns(UserWarning, match="over white"):
+        found = open_source(tmp_path / "a.png").window(*PART).read()
     with pytest.warns(UserWarning, match="over white"):
         np.testing.assert_array_equal(found, load_image(tmp_path / "a.png")[PART])
 
@@ -107,7 +109,7 @@ def test_a_header_that_claims_too_much_is_refused_before_anything_is_decoded(tmp
     (tmp_path / "a.png").write_bytes(png(1 << 20, 1 << 20, 8, 2, []))  # 1 TB of pixels
     with pytest.raises(ImageError, match="1048576x1048576 pixels; sides go from 1 to 65,536"):
         open_source(tmp_path / "a.png")
-    with pytest.raises(ImageError, match=r"has more than .* pixels; scale it down first"):
+    with pytest.raises(ImageError, match="MB in memory, the limit is"):
         load_image(tmp_path / "a.png")
 
 
@@ -171,4 +173,5 @@ def test_tiles_are_written(tmp_path, channels):
     write_tiles(tmp_path / "a.tif", pixels.shape, iter([pixels[:512], pixels[512:]]))
     found = np.asarray(Image.open(tmp_path / "a.tif"))
     np.testing.assert_array_equal(found.reshape(pixels.shape), pixels)
-    assert window_shape(str(tmp_path / "a.tif")) == (pixels.shape, np.uint8)
+    assert has_windows(tmp_path / "a.tif")
+    assert image_size(tmp_path / "a.tif") == pixels.shape

@@ -7,9 +7,11 @@ from functools import partial
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import eigengs_dr as eg
 from _helpers.command import assert_refused, run, succeeded
+from _helpers.errors import refused
 from _helpers.families import small_model
 
 pytest.importorskip("fsspec")
@@ -79,6 +81,22 @@ def test_a_url_of_http(served, tmp_path):
         eg.load_image(f"{served}/none.png")
     succeeded(run("fit", f"{served}/2.png", "-o", tmp_path / "a.npz", "--iterations", 5))
     assert eg.Gaussians.load(tmp_path / "a.npz").width == 32
+
+
+def test_a_url_is_read_up_to_a_limit(served, photos, monkeypatch):
+    (photos / "large.png").write_bytes((photos / "1.png").read_bytes() + bytes(2 << 20))
+    assert eg.load_image(f"{served}/large.png").shape == (32, 32, 3)
+    monkeypatch.setenv("EIGENGS_DR_MAX_FILE_MB", "1")
+    with refused(ValueError, rf"{served}/large.png: has more than 1 MB; .*EIGENGS_DR_MAX_FILE_MB"):
+        eg.load_image(f"{served}/large.png")
+    (photos / "large.png").unlink()
+
+
+def test_a_warning_names_the_url(photos):
+    Image.new("RGBA", (8, 8), (0, 0, 0, 9)).save(photos / "clear.webp")
+    with pytest.warns(UserWarning, match=f"file://{photos}/clear.webp: transparent pixels"):
+        eg.load_image(f"file://{photos}/clear.webp")
+    (photos / "clear.webp").unlink()
 
 
 def test_images_of_a_basis_and_a_model(place, photos, tmp_path):

@@ -1,0 +1,237 @@
+"""Files of floats and of more than 8 bits, but TIFF: EXR, Radiance HDR, PNG, and the netpbm family.
+
+OpenImageIO, from the extra ``hdr``, is one wheel of 8 MB that needs NumPy alone and does EXR,
+Radiance HDR and PNG of 16 bits; imageio does it by a download or by OpenCV. The netpbm files, PGM,
+PPM and PFM, are a header of four words and rows of numbers. Pillow keeps 8 bits of PPM, and
+OpenImageIO 3.2 returns PFM upside down.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .header import TURNED, Header
+from .pictures import exif_orientation, picture_header, png_chunks
+from .pixels import ImageError
+from .strips import Pixels, by_strips
+
+# ---------------------------------------------------------------------------------------------
+#  OpenImageIO
+# ---------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a file; its colours and alpha stay as they are stored."""
+    import OpenImageIO as oiio
+
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    config.attribute("oiio:RawColor", 1)
+    file = oiio.ImageInput.open(str(path), config)
+    if not file:
+        raise OSError(oiio.geterror().strip())
+    try:
+        yield file
+    finally:
+        file.close()
+
+
+def read_openimageio(path: Path, number: int = 0) -> Pixels:
+    """Return one image of a file (H, W, C) in the type of its values.
+
+    Raises
+    ------
+    OSError
+        If it cannot be decoded.
+    """
+    with _opened(path) as file:
+        if number and not file.seek_subimage(number, 0):
+            raise OSError(file.geterror().strip())
+        spec = file.spec()
+        pixels = file.read_image(number, 0, 0, spec.nchannels, spec.format)
+        if pixels is None:
+            raise OSError(file.geterror().strip())
+        return np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+
+
+def png_header(path: Path) -> Header:
+    """Return what a PNG file of 16-bit colour says."""
+    header, chunks = picture_header(path), png_chunks(path)
+    # Values of 2 bytes in rows of OpenImageIO, once more for NumPy.
+    return header._replace(
+        orientation=exif_orientation(chunks.get(b"eXIf", b"")),
+        bytes_per_pixel=4 * (header.channels + 1),
+    )
+
+
+def exr_header(path: Path) -> Header:
+    """Return what an EXR file says; refuse by name what is no picture."""
+    import OpenImageIO as oiio
+
+    with _opened(path) as file:
+        spec = file.spec()
+        names = tuple(spec.channelnames)
+        if file.seek_subimage(1, 0):
+            raise ImageError("holds several parts; save one as a file of its own")
+        if spec.deep:
+            raise ImageError("holds deep pixels; flatten it first")
+        if len(names) > 1 and names not in (("R", "G", "B"), ("R", "G", "B", "A")):
+            shown = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+            raise ImageError(
+                f"holds the channels {shown}; save the layer that is meant, as R, G and B, "
+                "to a file of its own"
+            )
+        if spec.format == oiio.UINT32:
+            raise ImageError("holds numbers of objects, no colours; convert it to floats")
+        alpha = "light" if len(names) == 4 else "none"
+        channels = 1 if len(names) == 1 else 3
+        needed = 4 * len(names) + 4 * len(names) * (_display(spec) != _data(spec))
+        notes = _exr_notes(spec)
+        return Header(
+            spec.full_width, spec.full_height, channels, needed, "linear", 1, alpha, notes
+        )
+
+
+REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+"""Chromaticities of red, green, blue and white, as in an EXR file."""
+
+
+def _exr_notes(spec: Any) -> tuple[str, ...]:
+    notes: tuple[str, ...] = ()
+    primaries = spec.getattribute("chromaticities")
+    if primaries is not None and np.abs(np.subtract(primaries, REC709)).max() > 0.01:
+        notes += ("its primaries are not those of sRGB, which is ignored",)
+    if _display(spec) != _data(spec):
+        notes += ("its display window is shown, and what it lacks is black",)
+    return notes
+
+
+def _display(spec: Any) -> tuple[int, int, int, int]:
+    return spec.full_x, spec.full_y, spec.full_width, spec.full_height
+
+
+def _data(spec: Any) -> tuple[int, int, int, int]:
+    return spec.x, spec.y, spec.width, spec.height
+
+
+def read_exr(path: Path) -> Pixels:
+    """Return the display window of an EXR file (H, W, C) as floats."""
+    with _opened(path) as file:
+        spec = file.spec()
+    pixels = read_openimageio(path)
+    if _display(spec) == _data(spec):
+        return pixels
+    shown = np.zeros((spec.full_height, spec.full_width, pixels.shape[2]), pixels.dtype)
+    left, top = spec.x - spec.full_x, spec.y - spec.full_y
+    right, bottom = left + spec.width, top + spec.height
+    here = np.s_[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
+    target = shown[here]
+    there = pixels[max(-top, 0) :, max(-left, 0) :][: target.shape[0], : target.shape[1]]
+    target[:] = there
+    return shown
+
+
+_RESOLUTION = re.compile(rb"\n([-+][XY]) +\d+ +([-+][XY]) +\d+\n")
+
+_RADIANCE = {
+    b"-Y+X": 1, b"-Y-X": 2, b"+Y-X": 3, b"+Y+X": 4, b"+X-Y": 5, b"-X-Y": 6, b"-X+Y": 7, b"+X+Y": 8,
+}  # fmt: skip
+"""EXIF orientation by the order of pixels in a Radiance file. OpenImageIO 3.2 swaps 6 and 8."""
+
+
+def hdr_header(path: Path) -> Header:
+    """Return what a Radiance file says."""
+    with path.open("rb") as file:
+        text = file.read(1 << 14)
+    if b"32-bit_rle_xyze" in text:
+        raise ImageError("holds XYZ colours; convert it to RGB")
+    with _opened(path) as opened:
+        spec = opened.spec()
+    order = _RESOLUTION.search(text)
+    orientation = _RADIANCE.get(order[1] + order[2], 1) if order else 1
+    width, height = spec.width, spec.height
+    if orientation in TURNED:
+        width, height = height, width
+    return Header(width, height, 3, 12, "linear", orientation)
+
+
+# ---------------------------------------------------------------------------------------------
+#  Portable maps
+# ---------------------------------------------------------------------------------------------
+
+_GAP = rb"(?:\s|#[^\n]*\n)+"
+_NUMBER = rb"(\d{1,9})"
+_PFM = re.compile(rb"(P[Ff])\s+(\d{1,9})\s+(\d{1,9})\s+(-?[0-9.eE+-]+)\s")
+"""Kind (PF is RGB, Pf is grey), width, height, and a scale that is negative for little endian."""
+_PNM = re.compile(rb"(P[2356])" + _GAP + _NUMBER + _GAP + _NUMBER + _GAP + _NUMBER + rb"\s")
+"""Kind (P2 and P3 are text; P3 and P6 are RGB), width, height, and the value of white."""
+
+MAX_HEADER = 1 << 16
+"""Bytes in which the header of a portable map ends; it may have comments."""
+
+
+class _Map:
+    """The header of a portable map."""
+
+    def __init__(self, path: Path) -> None:
+        with path.open("rb") as file:
+            start = file.read(MAX_HEADER)
+        header = _PFM.match(start) or _PNM.match(start)
+        if not header:
+            raise ValueError("no header of a portable map")
+        self.kind, self.start = header[1], header.end()
+        self.width, self.height = int(header[2]), int(header[3])
+        self.channels = 3 if self.kind in (b"P3", b"P6", b"PF") else 1
+        self.floats, self.text = self.kind in (b"PF", b"Pf"), self.kind in (b"P2", b"P3")
+        if self.floats:
+            self.dtype: np.dtype[Any] = np.dtype("<f4" if float(header[4]) < 0 else ">f4")
+            return
+        self.white = int(header[4])
+        if not 1 <= self.white <= 65535:
+            raise ValueError(f"its white is {self.white}, not 1 to 65,535")
+        self.dtype = np.dtype("u1" if self.white < 256 else ">u2")
+
+    @property
+    def bytes(self) -> int:
+        return self.width * self.height * self.channels * self.dtype.itemsize
+
+
+def netpbm_header(path: Path) -> Header:
+    """Return what a PGM, PPM or PFM file says."""
+    header = _Map(path)
+    encoding = "linear" if header.floats else "srgb"
+    several = not header.floats and not header.text
+    more = several and path.stat().st_size > header.start + 2 * header.bytes
+    needed = header.channels * (8 if header.text else header.dtype.itemsize)
+    notes = ("holds several images, the first is used",) if more else ()
+    return Header(header.width, header.height, header.channels, needed, encoding, notes=notes)
+
+
+def read_netpbm(path: Path) -> Pixels:
+    """Return the pixels of a PGM, PPM or PFM file; those whose white is another are floats."""
+    header = _Map(path)
+    shape = header.height, header.width, header.channels
+    with path.open("rb") as file:
+        file.seek(header.start)
+        content = file.read() if header.text or header.floats else file.read(header.bytes)
+    if header.text:
+        numbers = re.sub(rb"#[^\n]*", b"", content).split(maxsplit=int(np.prod(shape)))
+        values = np.array(numbers[: int(np.prod(shape))], np.float32)
+    elif len(content) != header.bytes:
+        raise ValueError("its size is not that of its header")
+    else:
+        values = np.frombuffer(content, header.dtype)
+    pixels = values.reshape(shape)
+    if header.floats:
+        return pixels[::-1]
+    if header.white in (255, 65535) and not header.text:
+        return pixels
+    white = np.float32(header.white)
+    return by_strips(lambda rows: np.minimum(rows / white, 1), pixels)

@@ -1,0 +1,72 @@
+"""Every kind of image file is written, read, and compared with its picture and with the manual."""
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from _helpers.image_kinds import KINDS
+from eigengs_dr.blocks.windows import open_source
+from eigengs_dr.image.io import ImageError, check_image, load_image
+
+PAGE = Path(__file__).parents[2] / "docs/reference/image-files.md"
+
+LOSSY = {"JPEG": 0.1, "YCbCr": 0.02, "AVIF": 0.1, "JPEG 2000": 0.02, "Radiance HDR": 0.01}
+"""Largest mean error of a value."""
+
+
+def verdict_of(kind, folder):
+    """Write a file of a kind and read it; say what came of it, or fail if the pixels are wrong."""
+    path = folder / f"a{kind.suffix}"
+    expected = kind.write(path)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            image = load_image(path)
+        except ImageError as error:
+            assert expected is None, error
+            return "refused: " + str(error).removeprefix(f"{path}: ")
+    assert expected is not None
+    expected = np.broadcast_to(expected, (*expected.shape[:2], 3))
+    assert image.shape == expected.shape
+    tolerance = LOSSY.get(kind.what.split(",")[0], LOSSY.get(kind.format, 0.006))
+    assert np.abs(image - expected).mean() < tolerance
+    assert tolerance > 0.01 or np.abs(image - expected).max() < 0.01
+    notes = [str(warning.message).removeprefix(f"{path}: ") for warning in caught]
+    return "; ".join(["read", *notes])
+
+
+def rows_of(page):
+    """The rows of the table of the manual: format and kind to verdict."""
+    rows = re.findall(r"^\| ([^|]+) \| ([^|]+) \| ([^|]+) \|$", page, re.M)[1:]
+    return {(name, what): verdict for name, what, verdict in rows}
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: f"{kind.format}, {kind.what}")
+def test_the_manual_says_what_becomes_of_a_file(kind, tmp_path):
+    rows = rows_of(PAGE.read_text(encoding="utf-8"))
+    assert verdict_of(kind, tmp_path) == rows.get((kind.format, kind.what))
+
+
+def test_the_manual_has_no_other_rows():
+    rows = rows_of(PAGE.read_text(encoding="utf-8"))
+    assert list(rows) == [(kind.format, kind.what) for kind in KINDS]
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    "kind", [kind for kind in KINDS if kind.format == "TIFF"], ids=lambda kind: kind.what
+)
+def test_a_window_of_a_large_file_shows_the_same(kind, tmp_path):
+    path = tmp_path / "a.tif"
+    if kind.write(path) is None:
+        with pytest.raises(ImageError):
+            open_source(path)
+        return
+    whole = check_image(path)
+    source = open_source(path)
+    assert (source.height, source.width) == whole.shape[:2]
+    found = source.window(slice(1, 5), slice(2, 6)).read()
+    np.testing.assert_allclose(found, whole[1:5, 2:6], atol=1e-6)
