@@ -267,10 +267,11 @@ def fit(
     )
     if maps:
         return fit_maps(maps, options, started, progress)
-    result = fit_image(image, options, progress)
-    if not isinstance(image, (str, os.PathLike)):
-        return result
-    return replace(result, source=os.path.basename(image))
+    source = os.path.basename(image) if isinstance(image, (str, os.PathLike)) else ""
+    try:
+        return replace(fit_image(image, options, progress), source=source)
+    except FitInterrupted as stop:
+        raise FitInterrupted(replace(stop.result, source=source)) from None
 
 
 def _maps_alone(

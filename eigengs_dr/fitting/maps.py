@@ -20,7 +20,7 @@ from ..image.metrics import target_key
 from ..image.pixels import ImageError
 from ..storage.npz import BadValue
 from .measure import Row, Shown, psnrs
-from .options import FitOptions
+from .options import FitOptions, check_goal
 from .placement.adaptive import residual
 from .start import start_from_placement
 from .target import FitTarget, make_target, read_pixels, unit_of
@@ -123,15 +123,18 @@ def _goals(
     """Return the goal of each map in dB, if there are goals; check their names."""
     if target is None:
         return [None] * len(images)
-    if not isinstance(target, Mapping):
-        return [float(target)] * len(images)
     names = [image.name for image in images]
+    if not isinstance(target, Mapping):
+        target = dict.fromkeys(names, target)
     if sorted(target) != sorted(names):
         raise ValueError(
             f"target_psnr names {', '.join(target)}; give one number, or one for each of "
             f"{', '.join(names)}"
         )
-    return [float(target[name]) for name in names]
+    goals = [float(target[name]) for name in names]
+    for goal in goals:
+        check_goal(goal)
+    return [*goals]
 
 
 def _factors(images: Sequence[MapImage], weights: Mapping[str, float]) -> list[float]:

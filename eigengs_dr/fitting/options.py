@@ -217,10 +217,15 @@ class FitOptions:
                 "target_psnr works with preset 'default' and init 'adaptive', not with "
                 f"{self.preset!r} and {self.placement or 'a start'!r}"
             )
-        if not 0 < self.target_psnr <= MAX_PSNR:
-            raise ValueError(
-                f"target_psnr is {self.target_psnr}; it must be above 0 and at most {MAX_PSNR:g}"
-            )
+        check_goal(self.target_psnr)
+
+
+def check_goal(target_psnr: float) -> None:
+    """Raise ValueError for a PSNR in dB that no fit can have as its goal."""
+    if not 0 < target_psnr <= MAX_PSNR:
+        raise ValueError(
+            f"target_psnr is {target_psnr}; it must be above 0 and at most {MAX_PSNR:g}"
+        )
 
 
 def default_count(pixels: int) -> int:

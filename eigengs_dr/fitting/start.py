@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
@@ -140,7 +141,9 @@ def start_from_set(target: FitTarget, options: FitOptions) -> FitProblem:
         start = source.encode(target.pixels, colors, method.mean)
         # At another size or cutoff the colours of a model are not exact.
         exact = (native.width, native.height, native.cutoff) == (width, height, options.cutoff)
-    start = replace(start.bounded(), cutoff=float(options.cutoff))
+    start = replace(start, cutoff=float(options.cutoff))
+    if options.iterations:  # a descent needs means inside of the image
+        start = start.bounded()
     if method.solves and not exact:
         start = solve(start, target.values, options.solve_steps, warm_start=True)
     if method.mean != "dense":
@@ -150,7 +153,7 @@ def start_from_set(target: FitTarget, options: FitOptions) -> FitProblem:
 
 
 def load_start(start: Any, backend: str | None) -> Gaussians | Model:
-    """Return the set or the model of a start.
+    """Return the set or the model of a start, without the derivatives of the caller.
 
     Raises
     ------
@@ -161,7 +164,7 @@ def load_start(start: Any, backend: str | None) -> Gaussians | Model:
     """
     if isinstance(start, (str, os.PathLike)):
         return one_image(Gaussians.load(start, backend))
-    found = start if isinstance(start, Model) else one_image(set_of(start))
+    found = start if isinstance(start, Model) else dr.detach(one_image(set_of(start)))
     current = types_of((found if isinstance(found, Gaussians) else found.gaussians).mean).backend
     if backend not in (None, current):
         raise ValueError(

@@ -23,8 +23,9 @@ from .io import check_image, load_image
 from .pixels import ImageError
 from .remote import is_url, list_urls
 from .resize import center_crop
+from .strips import available_cores
 
-THREADS = min(8, os.cpu_count() or 1)
+THREADS = min(8, available_cores())
 """Number of threads that decode files; Pillow and NumPy release the interpreter lock."""
 
 MAX_WAITING, MAX_WAITING_BYTES = 512, 1 << 25

@@ -15,7 +15,7 @@ from eigengs_dr.fitting.fit import FitInterrupted, fit
 from eigengs_dr.fitting.options import INITS, PRESETS, default_count
 from eigengs_dr.fitting.start import place_grid
 from eigengs_dr.image.color import SPACES
-from eigengs_dr.image.io import sample
+from eigengs_dr.image.io import sample, save_image
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import render
 
@@ -208,14 +208,25 @@ def test_a_cutoff_stays_with_its_set(backend):
 
 
 @pytest.mark.parametrize("when", [0, 10, 30])
-def test_interruption_keeps_the_best_so_far(backend, when):
+def test_interruption_keeps_the_best_so_far(backend, when, tmp_path):
+    save_image(tmp_path / "a.pfm", picture())
+
     def interrupt(iteration, iterations, row):
         if iteration >= when:
             raise KeyboardInterrupt
 
     with pytest.raises(FitInterrupted) as interruption:
-        fit(picture(), SPLATS, 60, progress=interrupt, backend=backend)
+        fit(
+            tmp_path / "a.pfm",
+            SPLATS,
+            60,
+            progress=interrupt,
+            backend=backend,
+            encoding="srgb",
+            space="ycbcr",
+        )
     result = interruption.value.result
+    assert result.source == "a.pfm"
     check_sound(result, picture())
     assert (result.iterations, result.stopped) == (when, "interrupted")
     rows = [row["iteration"] for row in result.trace]

@@ -121,6 +121,11 @@ SMALL = {"albedo": np.zeros((8, 8, 3)), "roughness": np.zeros((8, 8))}
         (SMALL, {"weights": {"ao": 1}}, "weights names 'ao', which is no map"),
         (SMALL, {"weights": {"albedo": 0}}, "'albedo' has 0; it must be above 0"),
         (SMALL, {"target_psnr": {"albedo": 30}}, "target_psnr names albedo; give one number"),
+        (
+            SMALL,
+            {"target_psnr": {"albedo": 30, "roughness": np.nan}},
+            "target_psnr is nan",
+        ),
         (SMALL, {"target_psnr": 30, "gaussians": 9}, "exclude each other"),
         (SMALL, {"target_psnr": 30, "levels": 2}, "levels and target_psnr exclude each other"),
         (SMALL, {"gaussians": 65}, "gaussians is 65"),

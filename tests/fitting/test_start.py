@@ -1,5 +1,6 @@
 """Where a fit starts: from a basis, or from a placement."""
 
+import drjit as dr
 import numpy as np
 import pytest
 
@@ -85,6 +86,19 @@ def test_a_fit_goes_on_from_a_set(backend, others, tmp_path):
     assert film.psnr_ycbcr > eg.fit(others[1], start=first, **kept).psnr_ycbcr + 3
     [row] = eg.fit_many([others[0]], start=first, **kept)
     np.testing.assert_allclose(row.result.image, first.image, atol=1e-4)
+
+
+def test_a_start_is_left_as_it_is(backend, others):
+    """Its derivatives, and means outside of the image as long as nothing moves."""
+    start = eg.fit(others[0], SPLATS, 0, backend=backend).gaussians
+    arrays = start.to_arrays()
+    arrays["mean"][0] = -1.5, 3
+    start = eg.Gaussians.from_arrays(**arrays, size=(start.width, start.height), backend=backend)
+    dr.enable_grad(start.mean)
+    still = eg.fit(others[0], start=start, iterations=0, solve_steps=0, backend=backend)
+    np.testing.assert_array_equal(still.image, eg.render(start).numpy())
+    eg.fit(others[0], start=start, iterations=3, backend=backend)
+    assert not dr.any(dr.grad(start.mean) != 0, axis=None)
 
 
 def test_data_above_1_start_in_their_own_unit(backend):

@@ -8,7 +8,6 @@ once, and each image costs one product and one back-substitution. For one image,
 
 from __future__ import annotations
 
-import os
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -25,6 +24,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from ...backend.arrays import types_of, upload
 from ...backend.recording import freeze_program
 from ...gaussian.gaussians import Gaussians
+from ...image.strips import available_cores
 from ...raster.adjoint import adjoint
 from ...raster.evaluate import weights
 from ...raster.parameters import (
@@ -40,7 +40,7 @@ GROUP = 3
 """Planes that one adjoint correlates: as many as an image has channels, so that all calls share one
 program."""
 
-THREADS = min(4, os.cpu_count() or 1)
+THREADS = min(4, available_cores())
 """Threads that share a sparse product; SciPy does not hold the interpreter lock. The result does
 not depend on their number."""
 
