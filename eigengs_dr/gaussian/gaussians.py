@@ -16,7 +16,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..backend.arrays import Float, UInt, types_in, types_of, upload, upload_rows
+from ..backend.arrays import Float, UInt, types_in, settle, types_of, upload, upload_rows
 from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..backend.selection import BackendError, select
@@ -408,13 +408,15 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
         parts = zip(*(whole(getattr(g, name), g) for g in sets), strict=True)
         return type(getattr(first, name))([dr.concat(part) for part in parts])
 
-    return replace(
+    joined = replace(
         first,
         mean=join("mean"),
         factor=join("factor"),
         color=join("color"),
         background=sum((g.background for g in sets[1:]), first.background),
     )
+    dr.eval(joined)  # no scatter is left for what the caller does next, see `settle`
+    return joined
 
 
 def like(
@@ -494,7 +496,7 @@ def to_tensors(gaussians: Gaussians) -> dict[str, Rows]:
     tensors = {}
     for name in FIELDS:
         rows = getattr(gaussians, name)
-        rows = list(rows) if name == "background" else whole(rows, gaussians)
+        rows = settle(list(rows) if name == "background" else whole(rows, gaussians))
         joint = dr.ravel(types.FloatX(rows), order="F")
         tensors[name] = types.Tensor(joint, (dr.width(joint) // len(rows), len(rows)))
     tensors["background"] = tensors["background"][0]
