@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import ArrayTypes, Float, UInt, make_divisor, types_of
+from ..backend.arrays import ArrayTypes, Float, UInt, make_divisor, settle, types_of
 from ..backend.recording import exclusive
 from ..gaussian.channels import show_sums, slices
 from ..gaussian.file import MAX_CUTOFF, check_index_range
@@ -386,6 +386,7 @@ def to_tensor(image: Float, grid: Grid, channels: int) -> Any:
     rows = dr.custom(_Rows, image, grid, channels)
     if grid.overhangs:
         rows = _crop(types, rows, grid, channels)
+    settle([rows])
     return types.Tensor(rows, (grid.height, grid.width, channels))
 
 

@@ -73,6 +73,7 @@ consumers = {
     "to_tensors": lambda g: {name: t.numpy() for name, t in eg.to_tensors(g).items()},
     "from_tensors": lambda g: eg.from_tensors(eg.to_tensors(g), like=g).to_arrays(),
     "render": lambda g: eg.render(g).numpy(),
+    "ravel": lambda g: dr.ravel(type(g.color)([eg.render(g).array] * 2), order="F").numpy(),
     "tile_lists": lambda g: eg.render(g, lists=eg.tile_lists(g)).numpy(),
     "gradients": derivatives,
     "to_arrays": lambda g: g.to_arrays(),
