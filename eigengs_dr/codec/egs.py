@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian.channels import TextureMap, channel_weights, check_maps
-from ..gaussian.file import CUTOFF, SetData
+from ..gaussian.file import CUTOFF, SetData, check
 from ..image.color import MAX_CHANNELS, SPACES
 from ..storage.atomic import atomic_write
 from ..storage.memory import check_content
@@ -134,9 +134,15 @@ def write(path: str | os.PathLike[str], packed: EgsContent) -> int:
 
     Raises
     ------
+    ValueError
+        If `Gaussians.load` would refuse the set.
     OSError
         If the file cannot be written; an existing file then stays unchanged.
     """
+    try:
+        check(packed.set_data())
+    except BadValue as error:
+        raise ValueError(f"{path}: {error}") from None
     content = to_bytes(packed)
     with atomic_write(path) as temporary:
         return temporary.write_bytes(content)

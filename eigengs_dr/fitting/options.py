@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar, runtime_che
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian.file import CUTOFF, MAX_CUTOFF, check_index_range
+from ..gaussian.file import CUTOFF, MAX_CUTOFF, check_index_range, check_sides
 from ..image.color import SPACES
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import check_encoding
@@ -158,6 +158,7 @@ class FitOptions:
         pixels : ndarray of float32, shape (H, W, C)
         """
         height, width, channels = pixels.shape
+        check_sides((width, height))
         check_index_range(width, height, channels)
         for name in ("gaussians", "max_gaussians"):
             count = getattr(self, name)

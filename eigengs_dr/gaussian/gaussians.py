@@ -16,7 +16,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..backend.arrays import Float, UInt, types_in, settle, types_of, upload, upload_rows
+from ..backend.arrays import Float, UInt, settle, types_in, types_of, upload, upload_rows
 from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..backend.selection import BackendError, select

@@ -221,9 +221,9 @@ def test_a_file_of_few_bytes_for_each_gaussian_is_refused_before_it_is_decoded(p
     """Gaussians that take no bits, in a section of a byte for each of them."""
     count = 2 << 20
     path.write_bytes(header() + body(count, (b"\0" + PLAIN).ljust(count, b"\0")))
-    check_refused(path, path.read_bytes(), "takes 931 MB in memory")
+    with file_refused(path, "takes 931 MB in memory"):
+        eg.Gaussians.load(path)
     check_refused(path, header() + body(8 * count, bytes(count)), "claims 16777216 Gaussians")
-    assert peak(lambda: pytest.raises(ValueError, packed.read, path)) < 8 * count
 
 
 def test_what_decoding_takes_is_what_the_bound_says(path):
