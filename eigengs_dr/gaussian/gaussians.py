@@ -16,6 +16,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from ..backend.arguments import takes_numbers
 from ..backend.arrays import Float, UInt, settle, types_in, types_of, upload, upload_rows
 from ..backend.feedback import to_html
 from ..backend.recording import exclusive
@@ -85,6 +86,7 @@ class Gaussians:
     maps: tuple[TextureMap, ...] = ()
 
     @classmethod
+    @takes_numbers
     def from_arrays(
         cls,
         mean: ArrayLike,
@@ -230,6 +232,7 @@ class Gaussians:
         return replace(self, color=color, background=background, space=found.space, maps=())
 
     @exclusive()
+    @takes_numbers
     def scaled(self, width: int, height: int) -> Gaussians:
         """Scale the picture to another native size, in pixels; differentiable.
 
@@ -309,6 +312,7 @@ class Gaussians:
         write(path, self.data())
 
     @classmethod
+    @takes_numbers
     def load(
         cls,
         path: str | os.PathLike[str],
