@@ -66,7 +66,9 @@ def select(backend: str | None = None) -> ModuleType:
         raise BackendError("no CUDA GPU or driver was found; use backend 'llvm'")
     if (fault := too_old()) or not dr.has_backend(dr.JitBackend.LLVM):
         raise BackendError(f"{fault or load_failure()}; {advice()}")
-    version = dr.detail.llvm_version()[0]
+    from .detail import llvm_version
+
+    version = llvm_version()[0]
     if version < MIN_VERSION:
         raise BackendError(f"{loaded_path()} is LLVM {version}, which crashes Dr.Jit; {advice()}")
     return dr.llvm.ad
@@ -101,6 +103,8 @@ def describe(backend: str | None = None) -> dict[str, Any]:
     module = select(backend)
     import drjit as dr
 
+    from .detail import llvm_version
+
     llvm = dr.has_backend(dr.JitBackend.LLVM)
     return {
         "backend": "cuda" if module is dr.cuda.ad else "llvm",
@@ -112,7 +116,7 @@ def describe(backend: str | None = None) -> dict[str, Any]:
             "drjit": version_of("drjit"),
             "numpy": version_of("numpy"),
             "python": platform.python_version(),
-            "libllvm": ".".join(map(str, dr.detail.llvm_version())) if llvm else None,
+            "libllvm": ".".join(map(str, llvm_version())) if llvm else None,
             "libllvm_path": loaded_path() if llvm else None,
         },
     }

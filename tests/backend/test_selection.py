@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from _helpers.process import SELECT, run_python
-from eigengs_dr.backend import doctor, selection
+from eigengs_dr.backend import detail, doctor, selection
 from eigengs_dr.backend import libllvm as module
 from eigengs_dr.backend.libllvm import PATH_VARIABLE
 from eigengs_dr.backend.selection import BackendError, describe, select
@@ -22,8 +22,8 @@ def fake_drjit(monkeypatch, *, llvm, version, cuda=False):
         JitBackend=kinds,
         has_backend=lambda kind: {"llvm": llvm, "cuda": cuda}[kind],
         cuda=SimpleNamespace(ad=SimpleNamespace()),
-        detail=SimpleNamespace(llvm_version=lambda: version),
     )
+    monkeypatch.setattr(detail, "llvm_version", lambda: version)
     monkeypatch.setitem(sys.modules, "drjit", drjit)
     monkeypatch.delenv(PATH_VARIABLE, raising=False)
 
