@@ -280,7 +280,7 @@ def gaussian_texture() -> type:
                 f"  resolution = [{self.width}, {self.height}],\n"
                 f"  space = {self.space},\n  raw = {int(self.raw)},\n"
                 f"  wrap_mode = {self.wrap},\n  prefilter = {angle},\n"
-                f"  cutoff = {self.cutoff:g},\n  mean = {self.mean()},\n"
+                f"  cutoff = {self.cutoff:g},\n"
                 f"  transform = {transform}\n]"
             )
 

@@ -20,6 +20,7 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.arrays import Bool, Float
+from eigengs_dr.backend.detail import indices_of, scope
 from eigengs_dr.raster.binning.lists import TileLists
 from eigengs_dr.raster.lookup.footprint import arrange, bound_covariance
 from eigengs_dr.raster.lookup.points import (
@@ -203,14 +204,14 @@ def reused(
     if dr.grad_enabled(table.packed.values) or not _is_traced():
         return look_up()
     backend = dr.backend_v(mi.Float)
-    if dr.detail.scope(backend) != _lookups.scope:
+    if scope(backend) != _lookups.scope:
         _lookups.found.clear()
     # The arrays keep their indices, so that no other variable has them.
     arrays = [table.packed.values, *(getattr(si, name) for name in inputs)]
-    key = (where, *dr.detail.collect_indices(arrays))
+    key = (where, *indices_of(arrays))
     if key not in _lookups.found:
         _lookups.found[key] = look_up(), arrays
-    _lookups.scope = dr.detail.scope(backend)
+    _lookups.scope = scope(backend)
     return _lookups.found[key][0]
 
 

@@ -6,9 +6,11 @@ import inspect
 import pkgutil
 import re
 
+import drjit as dr
 import pytest
 
 import eigengs_dr
+from _helpers.families import family, small_basis, small_model
 from _helpers.process import run_python
 from eigengs_dr.backend.libllvm import candidates
 
@@ -101,3 +103,18 @@ except ImportError as error:
 """
     process = run_python(code)
     assert "pip install 'mitsuba" in process.stdout, process.stderr
+
+
+def test_to_print_computes_nothing(tmp_path):
+    """What a user sees in a shell after a call: results, and sets that are not evaluated yet."""
+    image = family(1, side=32)[0]
+    fit = eigengs_dr.fit(image, 20, iterations=1, backend="llvm")
+    lazy = fit.gaussians.scaled(40, 40)
+    packed = eigengs_dr.pack(fit, tmp_path / "x.egs", max_psnr_drop=60)
+    rows = eigengs_dr.fit_many([image], tmp_path, gaussians=20, iterations=1)
+    lists, page = eigengs_dr.tile_lists(fit), eigengs_dr.view(fit)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for thing in (fit, lazy, packed, rows, lists, page, small_basis(), small_model("llvm")):
+            dr.kernel_history_clear()
+            assert len(repr(thing)) < 400
+            assert not dr.kernel_history(), repr(thing)

@@ -160,6 +160,16 @@ def upload_rows(kind: type, rows: Iterable[Values]) -> list[Float]:
     return targets
 
 
+def settle(rows: list[Float]) -> list[Float]:
+    """Return rows after their pending scatters, if there are any.
+
+    Dr.Jit 1.5 ends the process ("dirty variable") where it scatters several such rows at once, as
+    `drjit.ravel` does. `drjit.concat` and `drjit.ravel` return such rows, and users scatter too.
+    """
+    dr.eval([row for row in rows if row.state == dr.VarState.Dirty])
+    return rows
+
+
 TANH_NUMERATOR = (-9.64399179425052238628e-1, -9.92877231001918586564e1, -1.61468768441708447952e3)
 TANH_DENOMINATOR = (
     1.0,

@@ -21,6 +21,11 @@ DELAY = 2.0
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
+def printable(text: str) -> str:
+    """Return a text from a file with "?" for what a terminal would obey or could not show."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
 def to_html(value: Any) -> str:
     """Return what a notebook shows of an object of this package: pictures and figures."""
     return HTML[0](value)

@@ -29,6 +29,8 @@ from typing import Any
 
 import drjit as dr
 
+from .detail import new_scope
+
 Program = Callable[..., Any]
 """A function of Dr.Jit arrays."""
 
@@ -179,7 +181,7 @@ def record(function: Program) -> Program:
         result = replay(sizes, arguments)
         # A recording begins a new scope, a replay does not. Programs of later operations have
         # their instructions in the order of scopes: they would be others after a replay.
-        dr.detail.new_scope(dr.backend_v(arrays[0]))
+        new_scope(dr.backend_v(arrays[0]))
         return result
 
     return call

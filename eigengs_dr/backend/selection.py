@@ -79,7 +79,9 @@ def select(backend: str | None = None) -> ModuleType:
         raise BackendError("no CUDA GPU or driver was found; use backend 'llvm'")
     if (fault := too_old()) or not _has(dr, "LLVM"):
         raise BackendError(f"{fault or load_failure()}; {advice()}")
-    version = dr.detail.llvm_version()[0]
+    from .detail import llvm_version
+
+    version = llvm_version()[0]
     if version < MIN_VERSION:
         raise BackendError(f"{loaded_path()} is LLVM {version}, which crashes Dr.Jit; {advice()}")
     return dr.llvm.ad
@@ -112,11 +114,10 @@ def _announce(backend: str, state: str) -> None:
 @cache
 def _cuda_agrees() -> bool:
     """Whether cuda may be the default: a fit agrees with llvm; warn if it does not."""
-    import drjit as dr
+    from .detail import cuda_device
 
-    device = (dr.detail.cuda_version(), dr.detail.cuda_compute_capability())
     versions = {name: version_of(name) for name in ("eigengs-dr", "drjit")}
-    right = gpu.agrees("cuda", f"{platform.node()} {device} {versions}")
+    right = gpu.agrees("cuda", f"{platform.node()} {cuda_device()} {versions}")
     if not right:
         warn(
             "backend cuda: a small fit differs from llvm, which is used instead; "
@@ -148,6 +149,8 @@ def describe(backend: str | None = None) -> dict[str, Any]:
     module = select(backend)
     import drjit as dr
 
+    from .detail import llvm_version
+
     llvm = _has(dr, "LLVM")
     return {
         "backend": name_of(module),
@@ -159,7 +162,7 @@ def describe(backend: str | None = None) -> dict[str, Any]:
             "drjit": version_of("drjit"),
             "numpy": version_of("numpy"),
             "python": platform.python_version(),
-            "libllvm": ".".join(map(str, dr.detail.llvm_version())) if llvm else None,
+            "libllvm": ".".join(map(str, llvm_version())) if llvm else None,
             "libllvm_path": loaded_path() if llvm else None,
         },
     }

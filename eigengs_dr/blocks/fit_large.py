@@ -8,8 +8,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
+from ..backend.arguments import takes_numbers
 from ..backend.executor import executor_for
 from ..backend.feedback import defer_interrupts, shows_progress
 from ..backend.selection import select
@@ -71,6 +70,7 @@ class LargeFit:
 
 @named_options
 @shows_progress
+@takes_numbers
 def fit_large(
     image: Any,
     output: str | os.PathLike[str] | None = None,
@@ -194,8 +194,8 @@ def plan(image: Source, options: FitOptions, side: int) -> tuple[list[Block], Se
     ValueError
         If the blocks are too small, or the Gaussians too few or too many.
     """
-    if not isinstance(side, (int, np.integer)) or side < MIN_SIDE:
-        raise ValueError(f"block is {side!r}; it must be at least {MIN_SIDE} pixels, and whole")
+    if side < MIN_SIDE:
+        raise ValueError(f"block is {side}; it must be at least {MIN_SIDE} pixels")
     pixels = image.width * image.height
     count = options.gaussians
     if count is None:

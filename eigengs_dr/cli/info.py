@@ -11,13 +11,14 @@ import click
 
 import eigengs_dr as eg
 
+from ..backend.feedback import printable
 from ..backend.selection import select
 from ..gaussian import file as set_file
-from ..gaussian.file import SetHead
+from ..gaussian.file import SetData
 from ..storage import npz
 from ..storage.atomic import reader_of
 from . import options
-from .console import table
+from .console import about, table
 from .outputs import check_outputs, name_pictures
 from .scene import explained, load_mitsuba
 
@@ -89,20 +90,21 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
     click.echo(json.dumps(facts, indent=2) if as_json else _text(**facts))
 
 
-def _describe_set(head: SetHead) -> Facts:
+def _describe_set(data: SetData) -> Facts:
     """Describe a set; maps have spaces of their own."""
-    facts: Facts = {"gaussians": head.gaussians, "width": head.size[0], "height": head.size[1]}
-    facts |= {"channels": head.channels, "cutoff": head.cutoff}
-    if head.maps:
-        return facts | {"maps": [m._asdict() for m in head.maps]}
-    return facts | {"space": head.space}
+    count, channels = data.arrays["color"].shape
+    facts: Facts = {"gaussians": count, "width": data.size[0], "height": data.size[1]}
+    facts |= {"channels": channels, "cutoff": data.cutoff}
+    if data.maps:
+        return facts | {"maps": [m._asdict() for m in data.maps]}
+    return facts | {"space": data.space}
 
 
 def _describe_fit(file: Path) -> Facts:
-    """Describe a file by its head alone, since a large set takes gigabytes, and its fit."""
-    head = set_file.read_head(file)
-    facts = _describe_set(head)
-    if not head.maps and (figures := set_file.read_figures(file)):
+    """Describe a set, which is read whole: what can be described can be loaded. And its fit."""
+    data = set_file.read(file)
+    facts = _describe_set(data)
+    if not data.maps and (figures := set_file.read_figures(file)):
         for name in ("psnr_ycbcr", "psnr_rgb"):  # JSON has no infinity
             value = getattr(figures, name)
             facts[name] = round(value, 2) if isfinite(value) else str(value)
@@ -115,20 +117,19 @@ def _describe_packed(file: Path) -> Facts:
     from ..codec import egs
 
     found = egs.read(file)
-    counts, channels = [len(section.cell) for section in found.sections], len(found.background)
-    own = found.size, found.space, found.cutoff, found.maps
-    facts = _describe_set(SetHead(sum(counts), channels, *own)) | {"sections": counts}
+    data = found.set_data()
+    with about(file):
+        set_file.check(data)
+    facts = _describe_set(data) | {"sections": [len(part.cell) for part in found.sections]}
     steps = {f"{name}_step": float(f"{x:.4g}") for name, x in found.steps._asdict().items()}
     return facts | steps
 
 
 def _describe_model(model: eg.EigenGS) -> Facts:
-    g = model.gaussians
-    size = g.width, g.height
-    facts = _describe_set(SetHead(len(g), g.channels, size, g.space, g.cutoff, g.maps))
+    facts = _describe_set(model.gaussians.data())
     facts |= {"components": list(model.components), "frequency_aware": model.low > 0}
     if model.low:
-        facts |= {"low_gaussians": model.low, "high_gaussians": len(g) - model.low}
+        facts |= {"low_gaussians": model.low, "high_gaussians": len(model.gaussians) - model.low}
         facts["low_components"] = model.low_components
     if truncation := _truncation(model):
         facts["truncation"] = truncation
@@ -166,12 +167,12 @@ def _load_textures(key: str, file: str, maps: Any = (), **_: Any) -> Facts:
 def _text(truncation: Any = (), maps: Any = (), ledger: Any = (), **facts: Any) -> str:
     """Format facts as lines, and maps, arrays and the truncation curve as tables below."""
     width = max(map(len, facts)) + 1
-    lines = [f"{key:{width}} {value}" for key, value in facts.items()]
+    lines = [f"{key:{width}} {printable(str(value))}" for key, value in facts.items()]
     if maps:
         rows = [(m["name"], str(m["channels"]), m["space"], f"{m['weight']:.3g}") for m in maps]
         lines += ["", *table([("map", "channels", "space", "weight"), *rows])]
     if ledger:
-        sizes = [(name[:16], f"{size:,}") for name, size in ledger.items()]
+        sizes = [(printable(name[:16]), f"{size:,}") for name, size in ledger.items()]
         lines += ["", *table([("array", "bytes"), *sizes])]
     if truncation:
         rows = [("components", "variance", "training", "held out")]

@@ -23,10 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian.channels import TextureMap, channel_weights, check_maps
-from ..gaussian.file import CUTOFF, SetData
+from ..gaussian.file import CUTOFF, SetData, check
 from ..image.color import MAX_CHANNELS, SPACES
 from ..storage.atomic import atomic_write
-from ..storage.npz import MAX_ENTRIES, BadValue
+from ..storage.memory import check_content
+from ..storage.npz import BadValue
 from . import weights
 from .cells import EVENNESS, MAX_LEVELS, code_cells, hilbert_encode
 from .gaussian_model import GaussianCoder
@@ -55,6 +56,9 @@ _MAP = struct.Struct("<BBBd")
 
 HEAD = struct.Struct("<III")
 """Number of Gaussians, number of bytes that follow, and the CRC-32 of that number and the bytes."""
+
+DECODING, DECODING_CHANNEL = 384, 20
+"""Bytes of memory that decoding takes for a Gaussian, and for each of its channels: measured."""
 
 RICH = 0x80
 """Flag of a section that stores all weights, not only the first ones."""
@@ -130,9 +134,15 @@ def write(path: str | os.PathLike[str], packed: EgsContent) -> int:
 
     Raises
     ------
+    ValueError
+        If `Gaussians.load` would refuse the set.
     OSError
         If the file cannot be written; an existing file then stays unchanged.
     """
+    try:
+        check(packed.set_data())
+    except BadValue as error:
+        raise ValueError(f"{path}: {error}") from None
     content = to_bytes(packed)
     with atomic_write(path) as temporary:
         return temporary.write_bytes(content)
@@ -221,16 +231,11 @@ def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsConten
         levels, count, corner, content = _read_header(file)
         if sections is not None and not 1 <= sections <= count:
             raise BadValue(f"the file has {count} sections, not {sections}; ask for 1 to {count}")
-        channels = len(content.background)
-        room = MAX_ENTRIES // max(3, channels)
+        channels, total = len(content.background), 0
         for number in range(1, (sections or count) + 1):
             body, splats = read_body(file, number)
-            if splats > room:
-                raise BadValue(
-                    f"section {number} claims {splats} Gaussians, but at most {room} more can be "
-                    "read"
-                )
-            room -= splats
+            total += splats
+            check_content(path, total * (DECODING + DECODING_CHANNEL * channels))
             try:
                 symbols = decode_body(body, splats, channels, levels, content.steps)
             except BadValue as error:

@@ -12,6 +12,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.arguments import takes_numbers
 from ..backend.arrays import types_of
 from ..backend.recording import exclusive
 from ..fitting.fit import Fit
@@ -66,6 +67,7 @@ class PackResult(NamedTuple):
 
 
 @exclusive()
+@takes_numbers
 def pack(
     gaussians: Gaussians | Fit,
     output: str | os.PathLike[str],

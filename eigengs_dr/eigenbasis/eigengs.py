@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.arguments import takes_numbers
 from ..backend.feedback import shows_progress, to_html
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
@@ -77,6 +78,7 @@ class EigenGS:
 
     @classmethod
     @shows_progress
+    @takes_numbers
     def fit(
         cls,
         basis: Eigenbasis | Source,
@@ -155,6 +157,7 @@ class EigenGS:
         return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean_image.size)
 
     @exclusive()
+    @takes_numbers
     def project(self, image: ArrayLike, target_psnr: float | None = None) -> tuple[Planes, ...]:
         """Find the coefficients of an image by least squares on the rendered components.
 
@@ -208,6 +211,7 @@ class EigenGS:
         return self.encoder.reconstruct(coefficients, size)
 
     @exclusive()
+    @takes_numbers
     def encode(
         self,
         image: ArrayLike,
@@ -240,6 +244,7 @@ class EigenGS:
         return self.encoder.encode(pixels, colors, mean, target_psnr)
 
     @shows_progress
+    @takes_numbers
     def encode_many(
         self,
         images: Images,
@@ -279,6 +284,7 @@ class EigenGS:
         job = Job(partial(_encode_all, model=self, options=(colors, mean, target_psnr)))
         return run_images(images, output, overwrite, job, progress, client)
 
+    @takes_numbers
     def dense_mean(self, width: int, height: int) -> Planes:
         """Return the pixels of the mean image, shape (height, width, C), in the model's space."""
         return resample(np.moveaxis(self.mean_image, 0, 2), width, height)

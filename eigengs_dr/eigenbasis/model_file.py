@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian.file import CUTOFF
+from ..gaussian.file import CUTOFF, SetData, check
 from ..gaussian.gaussians import Gaussians
 from ..storage import npz
 from ..storage.npz import Field
@@ -55,7 +55,12 @@ version 3 left out."""
 
 def write_model(path: str | os.PathLike[str], model: EigenGS) -> None:
     """Write the file of a model, all or nothing; see `eigengs_dr.EigenGS.save`."""
-    npz.write(path, FORMAT, VERSION, to_members(model))
+    members = to_members(model)
+    try:
+        check_members(members)
+    except ValueError as error:
+        raise ValueError(f"{Path(path)}: {error}") from None
+    npz.write(path, FORMAT, VERSION, members)
 
 
 def read_members(path: str | os.PathLike[str], backend: str | None) -> dict[str, Any]:
@@ -102,6 +107,31 @@ def to_members(model: EigenGS) -> dict[str, NDArray]:
 def from_members(arrays: dict[str, NDArray], backend: str | None) -> dict[str, Any]:
     """Check the arrays of a file and convert them to the arguments of `eigengs_dr.EigenGS`.
 
+    Errors as for `check_members`.
+    """
+    weights = check_members(arrays)
+    low, low_components = arrays["split"].tolist()
+    return {
+        "gaussians": Gaussians.from_data(_set_of(arrays), backend),
+        "weights": weights,
+        "eigenvalues": tuple(arrays[f"eigenvalues{c}"] for c in range(3)),
+        "mean_image": arrays["mean_image"].astype(np.float32),
+        "low": low,
+        "low_components": low_components,
+        "variance": arrays.get("variance", np.zeros(0)),
+        "held_out": arrays.get("held_out", np.zeros(0)),
+    }
+
+
+def _set_of(arrays: dict[str, NDArray]) -> SetData:
+    """Return the set in the arrays of a file."""
+    parts = {key: arrays[key] for key in ("mean", "factor", "color", "background")}
+    return SetData(parts, tuple(arrays["size"].tolist()), str(arrays["space"]))
+
+
+def check_members(arrays: dict[str, NDArray]) -> tuple[NDArray[np.float32], ...]:
+    """Check the arrays of a file, and return the weights of each channel.
+
     Raises
     ------
     ValueError
@@ -133,15 +163,7 @@ def from_members(arrays: dict[str, NDArray], backend: str | None) -> dict[str, A
     falls = np.diff(held_out) < -1e-9  # the logarithm rounds by less
     if falls.any() or (np.abs(held_out) > MAX_PSNR).any():
         raise ValueError(f"held_out must ascend, within {MAX_PSNR:g} dB")
-    gaussians = Gaussians.from_arrays(
-        arrays["mean"],
-        arrays["factor"],
-        arrays["color"],
-        arrays["background"],
-        size=size,
-        space=str(arrays["space"]),
-        backend=backend,
-    )
+    check(_set_of(arrays))
     with np.errstate(over="ignore"):  # the check below refuses infinity
         weights = tuple(
             arrays[f"weights{c}"].astype(np.float32) * arrays[f"scale{c}"][:, None]
@@ -152,13 +174,4 @@ def from_members(arrays: dict[str, NDArray], backend: str | None) -> dict[str, A
     for name, rows in values.items():
         if not np.abs(rows).max(initial=0) <= MAX_WEIGHT:
             raise ValueError(f"{name} exceeds {MAX_WEIGHT:g}, which no image needs")
-    return {
-        "gaussians": gaussians,
-        "weights": weights,
-        "eigenvalues": tuple(arrays[f"eigenvalues{c}"] for c in range(3)),
-        "mean_image": arrays["mean_image"].astype(np.float32),
-        "low": low,
-        "low_components": low_components,
-        "variance": variance,
-        "held_out": held_out,
-    }
+    return weights

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
+from ..backend.arguments import plain_numbers
 from ..image.color import BASIS_SPACES, check_size
 from .pca.basis import check_components
 from .pca.truncation import check_target
@@ -52,6 +51,8 @@ class TrainOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        for name, value in plain_numbers(vars(self), TrainOptions.__annotations__).items():
+            object.__setattr__(self, name, value)
         check_components(self.components, self.energy)
         if self.target_psnr is not None:
             check_target(self.target_psnr)
@@ -71,8 +72,8 @@ class TrainOptions:
             "iterations": self.training_steps,
         }
         for name, number in counts.items():
-            if not isinstance(number, (int, np.integer)) or number < 0:
-                raise ValueError(f"{name} is {number!r}; it must be at least 0, and whole")
+            if number < 0:
+                raise ValueError(f"{name} is {number}; it must be at least 0")
         width, height = check_size(self.size)
         if not 1 <= self.gaussians <= width * height:
             raise ValueError(

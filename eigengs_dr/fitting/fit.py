@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.arguments import takes_numbers
 from ..backend.feedback import defer_interrupts, shows_progress, to_html
 from ..backend.recording import exclusive
 from ..gaussian.channels import channel_weights
@@ -118,6 +119,7 @@ class FitInterrupted(KeyboardInterrupt):
 
 @named_options
 @shows_progress
+@takes_numbers
 def fit(
     image: ArrayLike | os.PathLike[str] | Mapping[str, ArrayLike],
     gaussians: int | None = None,

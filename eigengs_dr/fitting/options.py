@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar, runtime_che
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian.file import CUTOFF, MAX_CUTOFF, check_index_range
+from ..backend.arguments import plain_numbers, takes_numbers
+from ..gaussian.file import CUTOFF, MAX_CUTOFF, check_index_range, check_sides
 from ..image.color import SPACES
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import check_encoding
@@ -113,7 +114,11 @@ class FitOptions:
     encoding: str | None = None
 
     def __post_init__(self) -> None:
-        if self.levels is not None and not isinstance(self.levels, (int, np.integer)):
+        for name, value in plain_numbers(vars(self), FitOptions.__annotations__).items():
+            object.__setattr__(self, name, value)
+        if isinstance(self.levels, np.integer):
+            object.__setattr__(self, "levels", int(self.levels))
+        if self.levels is not None and not isinstance(self.levels, int):
             object.__setattr__(self, "gaussians", _check_counts(self.gaussians, self.levels)[-1])
         self._check_numbers()
         check_encoding(self.encoding)
@@ -158,6 +163,7 @@ class FitOptions:
         pixels : ndarray of float32, shape (H, W, C)
         """
         height, width, channels = pixels.shape
+        check_sides((width, height))
         check_index_range(width, height, channels)
         for name in ("gaussians", "max_gaussians"):
             count = getattr(self, name)
@@ -193,9 +199,9 @@ class FitOptions:
             if getattr(self, name) is not None:
                 counts[name] = getattr(self, name)
         for name, count in counts.items():
-            if not isinstance(count, (int, np.integer)) or count < 0:
+            if count < 0:
                 least = 1 if name.endswith("gaussians") else 0
-                raise ValueError(f"{name} is {count!r}; it must be at least {least}, and whole")
+                raise ValueError(f"{name} is {count!r}; it must be at least {least}")
         if not 0 < self.cutoff <= MAX_CUTOFF:
             raise ValueError(
                 f"cutoff is {self.cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}"
@@ -239,6 +245,7 @@ def max_gaussians_for(pixels: NDArray[np.float32]) -> int:
     return max(1, pixels.size // (COLOR_PARAMETERS + channels))
 
 
+@takes_numbers
 def level_counts(count: int, levels: Levels) -> list[int]:
     """Return the number of Gaussians up to each level.
 

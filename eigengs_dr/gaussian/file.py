@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.feedback import printable
 from ..image.color import MAX_CHANNELS, SPACES
 from ..image.formats import SUFFIXES
 from ..storage import npz
@@ -33,6 +34,13 @@ its amplitude: 1.1 % at 3, 0.034 % at 4, 3.7e-6 at 5."""
 MAX_CUTOFF = 12.0
 """Largest cutoff, in standard deviations. The fast exponential needs a bound, and ``exp(-72)`` is
 below single precision."""
+
+MAX_SIDE = 1 << 16
+"""Largest side of a set in pixels: a mean in single precision then has 1/128 pixel or less."""
+
+MAX_SUM = 1e18
+"""Largest sum of the absolute colours of a channel: it and its square are finite in single
+precision, and so is every rendering."""
 
 MAX_ENTRIES = 1 << 30
 """Largest number of elements of one array: 357 million Gaussians."""
@@ -132,13 +140,16 @@ def write(path: str | os.PathLike[str], data: SetData, figures: FitFigures | Non
     Raises
     ------
     ValueError
-        If the suffix is ``.egs``.
+        If the suffix is ``.egs``, or `read` would refuse the set.
     OSError
         If the file cannot be written; an existing file does not change.
     """
     check_suffix(path)
     kind = MATERIAL if data.maps else FORMAT
-    members: Arrays = {name: np.asarray(array, np.float32) for name, array in data.arrays.items()}
+    with np.errstate(over="ignore"):  # the check refuses infinity
+        members: Arrays = {name: np.asarray(a, np.float32) for name, a in data.arrays.items()}
+    with _errors_of(path):
+        check(data._replace(arrays=members))
     members["size"] = np.array(data.size, np.int64)
     members["cutoff"] = np.array(data.cutoff, np.float64)
     if data.maps:
@@ -179,13 +190,12 @@ def read_head(path: Path) -> SetHead:
     shape = npz.read_shapes(path, kind, version, {"color": LAYOUT["color"]})["color"]
     with _errors_of(path):
         size, space, cutoff, maps = _properties(npz.read(path, kind, version, small))
-        if maps:
-            check_maps(maps, shape[1])
+        _check_properties(shape[1], size, space, cutoff, maps)
     return SetHead(shape[0], shape[1], size, space, cutoff, maps)
 
 
 @contextmanager
-def _errors_of(path: Path) -> Iterator[None]:
+def _errors_of(path: str | os.PathLike[str]) -> Iterator[None]:
     """Put the name of a file before the errors of its values."""
     try:
         yield
@@ -260,8 +270,7 @@ def read_figures(path: Path) -> FitFigures | None:
     values, source = found["figures"], str(found["source"])
     if values.shape != (3,) or not (np.isfinite(values[2]) and 0 <= values[2] < 1 << 53):
         raise ValueError(f"{path}: figures are {values.tolist()}, expected two PSNR and the steps")
-    printable = "".join(c if c.isprintable() else "?" for c in source)
-    return FitFigures(float(values[0]), float(values[1]), int(values[2]), printable)
+    return FitFigures(float(values[0]), float(values[1]), int(values[2]), printable(source))
 
 
 def read(path: Path, sections: int | None = None) -> SetData:
@@ -281,8 +290,9 @@ def read(path: Path, sections: int | None = None) -> SetData:
 def check(data: SetData) -> None:
     """Raise `BadValue` if a part of a set is invalid.
 
-    Shapes must fit each other, the space and the maps. Values must be finite, a and c positive,
-    sides from 1 to 65536 pixels, and the cutoff in (0, `MAX_CUTOFF`].
+    This one function decides for files that are read and written, and for arrays. Shapes must fit
+    each other, the space and the maps. Values must be finite, a and c positive, colours within
+    `MAX_SUM`, sides from 1 to `MAX_SIDE` pixels, and the cutoff in (0, `MAX_CUTOFF`].
     """
     arrays, size, space, cutoff, maps = data
     mean, factor, color = arrays["mean"], arrays["factor"], arrays["color"]
@@ -303,8 +313,30 @@ def check(data: SetData) -> None:
             raise BadValue(f"{name} holds values that are not finite")
     if not (factor[:, [0, 2]] > 0).all():
         raise BadValue("factor has a or c <= 0; both must be positive")
-    if len(size) != 2 or not all(1 <= side <= 1 << 16 for side in size):
-        raise BadValue(f"size is {size}, expected two sides from 1 to 65536")
+    sums = np.abs(color).sum(axis=0, dtype=np.float64) + np.abs(arrays["background"])
+    if (sums > MAX_SUM).any():
+        raise BadValue(
+            f"color and background of a channel add up to {sums.max():.3g}, the limit is "
+            f"{MAX_SUM:g}; scale them"
+        )
+    _check_properties(channels, size, space, cutoff, maps)
+
+
+def check_sides(size: tuple[int, ...]) -> None:
+    """Raise `BadValue` unless a size is two sides that a set can have."""
+    if len(size) != 2 or not all(1 <= side <= MAX_SIDE for side in size):
+        raise BadValue(f"size is {size}, expected two sides from 1 to {MAX_SIDE}")
+
+
+def _check_properties(
+    channels: int,
+    size: tuple[int, ...],
+    space: str,
+    cutoff: float,
+    maps: tuple[TextureMap, ...],
+) -> None:
+    """Raise `BadValue` if what a set says beside its arrays is invalid."""
+    check_sides(size)
     if not 0 < cutoff <= MAX_CUTOFF:
         raise BadValue(f"cutoff is {cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}")
     if maps:
@@ -313,10 +345,10 @@ def check(data: SetData) -> None:
             raise BadValue(f"space is {space!r}, expected 'data' for a set with maps")
     if space not in SPACES:
         raise BadValue(f"space is {space!r}, expected one of {', '.join(SPACES)}")
-    if space != "data" and color.shape[1] not in (1, 3, 4):
-        raise BadValue(f"color has {color.shape[1]} channels; space {space!r} has 1, 3 or 4")
-    if space in ("ycbcr", "normal") and color.shape[1] != 3:
-        raise BadValue(f"color has {color.shape[1]} channels; space {space!r} has 3")
+    if space != "data" and channels not in (1, 3, 4):
+        raise BadValue(f"color has {channels} channels; space {space!r} has 1, 3 or 4")
+    if space in ("ycbcr", "normal") and channels != 3:
+        raise BadValue(f"color has {channels} channels; space {space!r} has 3")
 
 
 MAX_VALUES = (1 << 32) - 1

@@ -16,7 +16,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..backend.arrays import Float, UInt, types_in, types_of, upload, upload_rows
+from ..backend.arguments import takes_numbers
+from ..backend.arrays import Float, UInt, settle, types_in, types_of, upload, upload_rows
 from ..backend.feedback import to_html
 from ..backend.recording import exclusive
 from ..backend.selection import BackendError, select
@@ -85,6 +86,7 @@ class Gaussians:
     maps: tuple[TextureMap, ...] = ()
 
     @classmethod
+    @takes_numbers
     def from_arrays(
         cls,
         mean: ArrayLike,
@@ -230,6 +232,7 @@ class Gaussians:
         return replace(self, color=color, background=background, space=found.space, maps=())
 
     @exclusive()
+    @takes_numbers
     def scaled(self, width: int, height: int) -> Gaussians:
         """Scale the picture to another native size, in pixels; differentiable.
 
@@ -309,6 +312,7 @@ class Gaussians:
         write(path, self.data())
 
     @classmethod
+    @takes_numbers
     def load(
         cls,
         path: str | os.PathLike[str],
@@ -408,13 +412,15 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
         parts = zip(*(whole(getattr(g, name), g) for g in sets), strict=True)
         return type(getattr(first, name))([dr.concat(part) for part in parts])
 
-    return replace(
+    joined = replace(
         first,
         mean=join("mean"),
         factor=join("factor"),
         color=join("color"),
         background=sum((g.background for g in sets[1:]), first.background),
     )
+    dr.eval(joined)  # no scatter is left for what the caller does next, see `settle`
+    return joined
 
 
 def like(
@@ -494,7 +500,7 @@ def to_tensors(gaussians: Gaussians) -> dict[str, Rows]:
     tensors = {}
     for name in FIELDS:
         rows = getattr(gaussians, name)
-        rows = list(rows) if name == "background" else whole(rows, gaussians)
+        rows = settle(list(rows) if name == "background" else whole(rows, gaussians))
         joint = dr.ravel(types.FloatX(rows), order="F")
         tensors[name] = types.Tensor(joint, (dr.width(joint) // len(rows), len(rows)))
     tensors["background"] = tensors["background"][0]

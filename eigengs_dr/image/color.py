@@ -329,14 +329,15 @@ def from_log(codes: Array) -> Array:
     Returns
     -------
     array, same shape and type
-        Light, with finite derivatives for finite results.
+        Light, of at most 2^126 for finite codes.
     """
     factor = math.log1p(LOG_SLOPE)
     if isinstance(codes, np.ndarray):
-        return np.asarray(np.expm1(factor * codes) / LOG_SLOPE, codes.dtype)
+        exponent = np.minimum(factor * codes, 126 * math.log(2))
+        return np.asarray(np.expm1(exponent) / LOG_SLOPE, codes.dtype)
     import drjit as dr  # loads libLLVM
 
-    return (dr.exp2(codes * (factor / math.log(2))) - 1) * (1 / LOG_SLOPE)
+    return (dr.exp2(dr.minimum(codes * (factor / math.log(2)), 126)) - 1) * (1 / LOG_SLOPE)
 
 
 def to_pu21(light: Array) -> Array:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.arguments import takes_numbers
 from ..backend.feedback import warn
 from ..storage.atomic import atomic_write, refuse_url
 from .color import to_coded, to_linear
@@ -200,6 +201,7 @@ def check_data(image: Any, copy: bool = True) -> NDArray[np.float32]:
     return read_floats(image, keep_grey=True, copy=copy, encoding="linear").pixels
 
 
+@takes_numbers
 def save_image(
     path: str | Path, image: ArrayLike, encoding: str | None = None, bits: int | None = None
 ) -> None:

@@ -13,7 +13,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import ArrayTypes, Float, UInt, make_divisor, types_of
+from ..backend.arguments import takes_numbers
+from ..backend.arrays import ArrayTypes, Float, UInt, make_divisor, settle, types_of
 from ..backend.recording import exclusive
 from ..gaussian.channels import show_sums, slices
 from ..gaussian.file import MAX_CUTOFF, check_index_range
@@ -34,6 +35,7 @@ from .parameters import (
 
 
 @exclusive()
+@takes_numbers
 def render(
     gaussians: Gaussians | Fitted,
     width: int | None = None,
@@ -106,6 +108,7 @@ def render(
 
 
 @exclusive()
+@takes_numbers
 def tile_lists(
     gaussians: Gaussians | Fitted,
     width: int | None = None,
@@ -155,6 +158,7 @@ def tile_lists(
 
 
 @exclusive()
+@takes_numbers
 def picture_of(
     gaussians: Gaussians | Fitted,
     width: int | None = None,
@@ -386,6 +390,7 @@ def to_tensor(image: Float, grid: Grid, channels: int) -> Any:
     rows = dr.custom(_Rows, image, grid, channels)
     if grid.overhangs:
         rows = _crop(types, rows, grid, channels)
+    settle([rows])
     return types.Tensor(rows, (grid.height, grid.width, channels))
 
 

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.arguments import takes_numbers
 from ..backend.feedback import shows_progress, warn
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
@@ -83,6 +84,7 @@ class ConvertedScene(NamedTuple):
 
 @shows_progress
 @exclusive()
+@takes_numbers
 def convert_scene(
     scene: str | os.PathLike[str] | dict[str, Any],
     output: str | os.PathLike[str],

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, zoom
 from skimage.transform import resize_local_mean
 
+from ..backend.arguments import takes_numbers
 from ..backend.recording import exclusive
 from ..backend.selection import backend_of
 from ..fitting.density_control import DensityControl
@@ -91,6 +92,7 @@ class SceneFit(NamedTuple):
 
 
 @exclusive()
+@takes_numbers
 def fit_for_scene(
     scene: Any,
     texture: str | Texture | Sequence[str | Texture],

@@ -9,7 +9,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from _helpers.process import SELECT, run_python
-from eigengs_dr.backend import doctor, gpu, selection
+from eigengs_dr.backend import detail, doctor, gpu, selection
 from eigengs_dr.backend import libllvm as module
 from eigengs_dr.backend.libllvm import PATH_VARIABLE
 from eigengs_dr.backend.selection import (
@@ -30,11 +30,8 @@ def fake_drjit(monkeypatch, *, llvm=True, version=(19, 1, 7), cuda=False, metal=
     drjit.has_backend = works.__getitem__
     for name in BACKENDS:
         setattr(drjit, name, SimpleNamespace(ad=ModuleType(f"drjit.{name}.ad")))
-    drjit.detail = SimpleNamespace(
-        llvm_version=lambda: version,
-        cuda_version=lambda: (12, 8),
-        cuda_compute_capability=lambda: 90,
-    )
+    monkeypatch.setattr(detail, "llvm_version", lambda: version)
+    monkeypatch.setattr(detail, "cuda_device", lambda: ((12, 8), 90))
     monkeypatch.setitem(sys.modules, "drjit", drjit)
     monkeypatch.delenv(PATH_VARIABLE, raising=False)
     selection._announce.cache_clear()
@@ -85,7 +82,7 @@ def test_cuda_is_the_default_where_it_agrees_with_llvm(monkeypatch, tmp_path):
     select()
     assert tried == ["llvm", "cuda"]
     drjit = fake_drjit(monkeypatch, cuda=True)
-    drjit.detail.cuda_version = lambda: (13, 0)
+    monkeypatch.setattr(detail, "cuda_device", lambda: ((13, 0), 90))
     trial = gpu.Trial(0.1, [float("nan")])
     with pytest.warns(UserWarning, match="a small fit differs from llvm, which is used instead"):
         assert select() is drjit.llvm.ad

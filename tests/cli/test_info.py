@@ -73,12 +73,33 @@ def test_hostile_figures_are_refused_in_one_line(change, set_file):
     assert len(eg.Gaussians.load(file)) == 40  # the set itself is whole
 
 
-def test_heads_alone_are_read(set_file):
-    """A large set takes gigabytes: its values are neither read nor checked."""
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"mean": np.full((40, 2), np.nan, np.float32)}, "not finite"),
+        ({"size": np.array([0, 32])}, "size is (0, 32)"),
+        ({"size": np.array([], np.int64)}, "size is ()"),
+        ({"space": np.array("a\x1b[31m")}, r"space is 'a\x1b[31m'"),
+        (
+            {"color": np.full((40, 3), 3e38, np.float32)},
+            "color and background of a channel add up to 1.2e+40",
+        ),
+    ],
+)
+def test_what_cannot_be_loaded_is_not_described(change, words, set_file):
     file = set_file[1]
-    np.savez(file, **dict(np.load(file)) | {"mean": np.full((40, 2), np.nan, np.float32)})
-    assert facts_of(file)["gaussians"] == 40
-    assert_refused(run("render", file, "-o", file.with_suffix(".png")), "not finite")
+    np.savez(file, **dict(np.load(file)) | change)
+    assert_refused(run("info", file), file, words)
+    with pytest.raises(ValueError, match=r"a\.npz: "):
+        eg.Gaussians.load(file)
+
+
+def test_text_from_files_cannot_command_the_terminal(set_file, tmp_path):
+    """A name of a member of the archive, and the name of the file itself."""
+    file = tmp_path / "b\x1b[31m.npz"
+    np.savez(file, **dict(np.load(set_file[1])) | {"x\x1b[2J": np.zeros(3)})
+    text = said("info", file)
+    assert "b?[31m.npz" in text and "x?[2J" in text and "\x1b" not in text
 
 
 def test_lossless_psnr_and_strange_names_are_shown(set_file, tmp_path):

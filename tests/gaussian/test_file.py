@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+import eigengs_dr as eg
+from _helpers.errors import file_refused
 from _helpers.sets import SIZE, arrays_of, check_equal, few, random_scene
 from eigengs_dr.backend.selection import select
 from eigengs_dr.gaussian.file import check_index_range
@@ -37,7 +39,7 @@ def test_files_come_back_bit_equal(backend, tmp_path, space):
 def test_any_numbers_come_back(tmp_path_factory, values, size):
     path = tmp_path_factory.mktemp("any") / "x.bin"  # any suffix will do
     factor = np.abs(values[:, 2:5]) + np.float32(1e-30)
-    arrays = {"mean": values[:, :2], "factor": factor, "color": values[:, 5:]}
+    arrays = {"mean": values[:, :2], "factor": factor, "color": np.clip(values[:, 5:], -1e17, 1e17)}
     Gaussians.from_arrays(**arrays, size=size, space="data").save(path)
     found = Gaussians.load(path)
     check_equal(found, {**arrays, "background": np.zeros(3)})
@@ -76,3 +78,17 @@ def test_larger_sizes_are_refused_in_one_line(size):
     assert "scale it down" in message and "\n" not in message
     with pytest.raises(ValueError, match="has 4,294,967,296 values"):  # in whole tiles
         check_index_range(8189, 8192, 64, tile=(4, 4))
+
+
+def test_what_cannot_be_loaded_is_not_saved(path):
+    """One check decides for reading and for writing."""
+    with pytest.raises(ValueError, match=r"sides from 1 to 65536"):
+        eg.fit(np.zeros((1, 70_000, 3), np.float32), 10, backend="llvm")
+    good = random_scene().on("llvm")
+    wide = good.scaled(70_000, 1)
+    diverged = replace(good, mean=good.mean * np.nan)
+    bright = replace(good, color=good.color * 1e38)
+    for bad, words in ((wide, "size is"), (diverged, "not finite"), (bright, "color")):
+        with file_refused(path, words):
+            bad.save(path)
+    assert not path.exists()

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...backend.arguments import takes_numbers
 from ...backend.feedback import shows_progress, to_html, warn
 from ...image.color import check_size, to_planes, ycbcr_to_rgb
 from ...image.folder import Source
@@ -62,6 +63,7 @@ class Eigenbasis:
 
     @classmethod
     @shows_progress
+    @takes_numbers
     def from_images(
         cls,
         images: Source,

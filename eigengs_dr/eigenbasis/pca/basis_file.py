@@ -79,7 +79,7 @@ def check_arrays(arrays: Mapping[str, NDArray], shapes: Mapping[str, tuple[int, 
             raise npz.BadValue(f"{name} has shape {arrays[name].shape}, expected {shape}")
     if arrays["space"] not in BASIS_SPACES:
         known = ", ".join(BASIS_SPACES)
-        raise npz.BadValue(f"space is '{arrays['space']}', expected one of {known}")
+        raise npz.BadValue(f"space is {str(arrays['space'])!r}, expected one of {known}")
     pixels = arrays.get("mean_image", arrays["mean"])[0].size
     for c in range(3):
         values = arrays[f"eigenvalues{c}"]

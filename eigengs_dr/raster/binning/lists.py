@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from ...backend.arrays import ArrayTypes, Bool, Float, UInt, make_divisor, types_of, upload
+from ...backend.detail import sorting_index
 from ...backend.recording import record
 from ..evaluate import is_steep
 from .tiles import TILE, Grid, GridArrays, for_each_row, for_each_tile, granularity_of
@@ -65,7 +66,7 @@ class Pieces:
     capacity: tuple[int, int]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class TileLists:
     """Indices of the Gaussians that may touch each tile, in ascending order.
 
@@ -101,6 +102,10 @@ class TileLists:
     pieces: Pieces | None
     capacity: int
     steep: bool
+
+    def __repr__(self) -> str:
+        width, height = self.grid.width, self.grid.height
+        return f"TileLists({width}x{height} pixels, {self.capacity} entries)"
 
 
 def build_lists(
@@ -404,7 +409,7 @@ def _sort_stably(key: Any, value: Any, bits: int) -> tuple[Any, Any]:
     for k in range(passes):
         digit = (key >> (k * width)) & ((1 << width) - 1)
         dr.eval(digit, key, value)
-        order = dr.detail.block_mkperm(digit, dr.width(key), 1 << width)
+        order = sorting_index(digit, 1 << width)
         key, value = dr.gather(UInt, key, order), dr.gather(UInt, value, order)
     dr.eval(key, value)
     return key, value

@@ -1,0 +1,50 @@
+"""What the package needs of `drjit.detail`: if a test fails, what it names has to be mended."""
+
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+
+import eigengs_dr
+from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.detail import indices_of, llvm_version, new_scope, scope, sorting_index
+from eigengs_dr.backend.selection import select
+
+
+def test_libllvm_says_its_version():
+    """`select` refuses versions that crash; `doctor` and reports show it."""
+    if dr.has_backend(dr.JitBackend.LLVM):
+        assert llvm_version() >= (8, 0, 0)
+
+
+def test_scopes_are_numbered(backend):
+    """`record` begins one after a replay, or programs after it are compiled twice; a texture uses
+    a lookup again only within one, or it could belong to a branch that has ended."""
+    kind = dr.backend_v(select(backend).Float)
+    before = scope(kind)
+    assert scope(kind) == before
+    new_scope(kind)
+    assert scope(kind) != before
+
+
+def test_variables_have_numbers(backend):
+    """A texture knows by them that it is asked twice for the same points."""
+    types = types_in(select(backend))
+    one, other = types.Float(1, 2), types.Float2([3, 4], [5, 6])
+    numbers = indices_of([one, other])
+    assert len(set(numbers)) == 3 and numbers == indices_of([one, other])
+    assert indices_of([types.Float(1, 2)]) != indices_of([one])
+
+
+def test_digits_are_sorted_stably(backend):
+    """Lists of Gaussians on cuda are made by it; an order that changes gives other bits."""
+    digits = np.random.default_rng(0).integers(0, 16, 500)
+    index = sorting_index(types_in(select(backend)).UInt(digits.astype(np.uint32)), 16)
+    np.testing.assert_array_equal(index.numpy(), np.argsort(digits, kind="stable"))
+
+
+def test_nothing_else_uses_what_may_change():
+    root = Path(eigengs_dr.__file__).parents[1]
+    files = [*root.glob("eigengs_dr/**/*.py"), *root.glob("plugins/*.py")]
+    users = [f.name for f in files if "dr.detail" in f.read_text("utf-8").replace("mi.detail", "")]
+    assert users == ["detail.py"]

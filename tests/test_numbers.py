@@ -1,0 +1,63 @@
+"""Numbers of NumPy are numbers wherever a number is; truth values and text are none."""
+
+import inspect
+import json
+import re
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.families import family
+
+NEED_MITSUBA = ("convert_scene", "fit_for_scene", "register_plugins")
+
+
+def functions():
+    """Yield the public functions and methods, by their names."""
+    for name in eg.__all__:
+        if name in NEED_MITSUBA:
+            pytest.importorskip("mitsuba", reason="scenes need mitsuba")
+        thing = getattr(eg, name)
+        if not inspect.isclass(thing):
+            yield name, thing
+            continue
+        for method in vars(thing):
+            if not method.startswith("_") and callable(getattr(thing, method)):
+                yield f"{name}.{method}", getattr(thing, method)
+
+
+def test_what_is_no_number_is_refused_in_one_line():
+    """Everywhere in the public API where an annotation says int or float."""
+    checked = 0
+    for name, function in functions():
+        for number, parameter in inspect.signature(function).parameters.items():
+            if not re.fullmatch(r"(int|float)( \| None)?", str(parameter.annotation)):
+                continue
+            required = [
+                p.name
+                for p in inspect.signature(function).parameters.values()
+                if p.default is p.empty and p.kind is not p.VAR_KEYWORD
+            ]
+            for wrong in ("5", True, np.True_, [1], 1.5 if "int" in parameter.annotation else "x"):
+                with pytest.raises(ValueError, match=f"^{number} is .*; it must be a") as error:
+                    function(**{**dict.fromkeys(required), number: wrong})
+                assert "\n" not in str(error.value), name
+            checked += 1
+    assert checked > 30
+
+
+def test_a_fit_takes_numbers_of_numpy(tmp_path):
+    image = family(1, side=16)[0]
+    n = np.int64
+    plain = eg.fit(image, 20, iterations=3, solve_steps=2, seed=1, cutoff=2.5, levels=2)
+    numbers = {"iterations": np.int32(3), "solve_steps": n(2), "seed": np.uint8(1), "levels": n(2)}
+    result = eg.fit(image, n(20), cutoff=np.float32(2.5), **numbers)
+    for name, array in plain.gaussians.to_arrays().items():
+        np.testing.assert_array_equal(array, result.gaussians.to_arrays()[name])
+    json.dumps([result.iterations, result.gaussians.cutoff])
+    rows = eg.fit_many([image, image], tmp_path, gaussians=n(20), iterations=n(3))
+    assert [row.gaussians for row in rows] == [20, 20]
+    assert eg.render(result, width=n(9), height=n(7), cutoff=np.float32(2)).shape == (7, 9, 3)
+    with pytest.raises(ValueError, match="gaussians is 'many'; it must be a whole number"):
+        eg.fit_many([image], tmp_path, gaussians="many")
