@@ -328,7 +328,7 @@ def _name(texture: Texture) -> str:
 def _refuse(props: Properties) -> Texture:
     raise RuntimeError(
         f"gaussian_texture does not support the variant {mi.variant()}; "
-        "use mi.set_variant('llvm_ad_rgb') or another llvm or cuda variant"
+        "use mi.set_variant('llvm_ad_rgb') or another variant of llvm, cuda or metal"
     )
 
 

@@ -134,7 +134,7 @@ class SharedFile:
         What lookups of all channels read, by the properties that it depends on.
     """
 
-    def __init__(self, path: str, backend: str, first: int | None) -> None:
+    def __init__(self, path: str, backend: str | None, first: int | None) -> None:
         self.path = path
         whole = Gaussians.load(path, backend)
         if first is not None and first > len(whole):
@@ -186,7 +186,7 @@ _files: WeakValueDictionary[tuple, SharedFile] = WeakValueDictionary()
 """The files of living textures; the textures hold them."""
 
 
-def shared_file(path: str, backend: str, first: int | None) -> SharedFile:
+def shared_file(path: str, backend: str | None, first: int | None) -> SharedFile:
     """Return the content of a file; while a texture uses it, the file is not read again.
 
     A file that has changed on disk counts as another one. For errors see `Gaussians.load`.

@@ -8,6 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from eigengs_dr.backend.selection import backend_of
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.file import MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
@@ -48,7 +49,7 @@ def source_of(props: Properties) -> Source:
             "gaussian_texture: give one of filename (a saved set), model (a saved EigenGS) or "
             f"mean, factor, color, ... (see texture_of); got {' and '.join(given) or 'none'}"
         )
-    backend = "cuda" if "cuda" in mi.variant() else "llvm"
+    backend = backend_of(mi.variant())
     if given[0] == "model":
         coefficients = props.get("coefficients", None)
         if coefficients is not None:
@@ -72,7 +73,7 @@ def source_of(props: Properties) -> Source:
     return source
 
 
-def _from_arrays(props: Properties, backend: str) -> Gaussians:
+def _from_arrays(props: Properties, backend: str | None) -> Gaussians:
     """Read a set from the properties of `texture_of`."""
     missing = [key for key in (*FIELDS, "width", "height", "space") if key not in props]
     if missing:

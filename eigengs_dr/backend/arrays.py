@@ -19,6 +19,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from .selection import BACKENDS
+
 Float = Any
 """Floats of Dr.Jit, of the backend and precision of the caller: no static type can name them."""
 
@@ -45,13 +47,17 @@ class ArrayTypes(NamedTuple):
     bits: int
 
 
+MODULES = tuple(f"drjit.{backend}.ad" for backend in BACKENDS)
+"""Modules of Dr.Jit whose arrays have derivatives."""
+
+
 def types_of(array: Float) -> ArrayTypes:
     """Return the array types with the backend and the precision of a Dr.Jit array.
 
     Parameters
     ----------
     array : Dr.Jit array
-        A floating-point array of any depth from ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
+        A floating-point array of any depth from ``drjit.llvm.ad`` or that of another backend.
 
     Returns
     -------
@@ -60,20 +66,20 @@ def types_of(array: Float) -> ArrayTypes:
     Raises
     ------
     TypeError
-        If the array is not a floating-point array of ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
+        If the array is no floating-point array of such a module.
     """
     leaf = dr.leaf_t(array)
     module = leaf.__module__
-    if module not in ("drjit.llvm.ad", "drjit.cuda.ad") or not dr.is_float_v(leaf):
+    if module not in MODULES or not dr.is_float_v(leaf):
         raise TypeError(
-            "expected float arrays of drjit.llvm.ad or drjit.cuda.ad, "
+            f"expected float arrays of {' or '.join(MODULES)}, "
             f"got {type(array).__module__}.{type(array).__name__}"
         )
     return _types(module, 64 if dr.type_v(leaf) == dr.VarType.Float64 else 32)
 
 
 def types_in(module: ModuleType, bits: int = 32) -> ArrayTypes:
-    """Return the types of ``drjit.llvm.ad`` or ``drjit.cuda.ad`` with 32 or 64 bits a float."""
+    """Return the types of a module of `eigengs_dr.backend.selection.select`, of 32 or 64 bits."""
     return _types(module.__name__, bits)
 
 
@@ -143,7 +149,7 @@ def upload_rows(kind: type, rows: Iterable[Values]) -> list[Float]:
     """Copy flat NumPy arrays as `upload` does, but wait only once for all copies."""
     targets = []
     for values in rows:
-        if dr.backend_v(kind) == dr.JitBackend.CUDA:
+        if dr.backend_v(kind) != dr.JitBackend.LLVM:
             target = kind(np.ascontiguousarray(values))
         else:
             target = dr.empty(kind, len(values))

@@ -13,7 +13,7 @@ from importlib.metadata import requires
 from typing import Any
 
 from . import libllvm
-from .selection import UNTESTED_ON_GPU, version_of
+from .selection import BACKENDS, UNTESTED_ON_GPU, UNTESTED_ON_METAL, version_of
 
 TRIAL = """
 import json, sys
@@ -43,7 +43,7 @@ def report() -> dict[str, Any]:
     Returns
     -------
     dict
-        ``llvm``, ``cuda`` : dict
+        ``llvm``, ``cuda``, ``metal`` : dict
             ``works`` and ``problem`` (None, or one line that says what to do). If the backend
             works, also the entries of `eigengs_dr.backend.selection.describe`.
         ``libllvm`` : list of dict
@@ -56,8 +56,7 @@ def report() -> dict[str, Any]:
         ``python``, ``platform`` : str
     """
     return {
-        "llvm": _try("llvm"),
-        "cuda": _try("cuda"),
+        **{backend: _try(backend) for backend in BACKENDS},
         "libllvm": [
             {**library._asdict(), "usable": library.usable} for library in libllvm.candidates()
         ],
@@ -82,16 +81,19 @@ def describe(found: dict[str, Any]) -> str:
         Lines for a terminal, without a newline at the end.
     """
     lines = [f"python   {found['python']} on {found['platform']}"]
-    for name in ("llvm", "cuda"):
+    for name in BACKENDS:
         trial = found[name]
-        if not trial["works"]:
-            lines.append(f"{name}     does not work: {trial['problem']}")
+        if name == "metal" and found["platform"].startswith("Linux"):
             continue
-        versions, detail = trial["versions"], f"; {UNTESTED_ON_GPU}"
+        if not trial["works"]:
+            lines.append(f"{name:8} does not work: {trial['problem']}")
+            continue
+        states = {"cuda": UNTESTED_ON_GPU, "metal": UNTESTED_ON_METAL}
+        versions, detail = trial["versions"], f"; {states.get(name)}"
         if name == "llvm":
             library = f"LLVM {versions['libllvm']} at {versions['libllvm_path']}"
             detail = f", {library}, {trial['threads']} threads on {trial['cpu']}"
-        lines.append(f"{name}     works: Dr.Jit {versions['drjit']}{detail}")
+        lines.append(f"{name:8} works: Dr.Jit {versions['drjit']}{detail}")
     lines.append("libLLVM  found:" if found["libllvm"] else "libLLVM  none found")
     used = found["llvm"]["versions"]["libllvm_path"] if found["llvm"]["works"] else None
     for library in found["libllvm"]:

@@ -1,8 +1,18 @@
-"""Programs of Dr.Jit: one thread at a time; frozen ones are freed at a safe moment.
+"""Programs of Dr.Jit: one thread at a time; frozen ones take flat lists, and are freed safely.
 
 Dr.Jit 1.5 keeps state for the whole process. While one thread records or replays a frozen program,
 another thread that traces, differentiates, records or frees a program ends the process, hangs it,
 or lets the replay fail ("determining size of variable"). One lock of this module excludes that.
+
+Other threads free arrays at any time: Python drops a result, a worker of Dask a message. They then
+hold Python's lock and wait for Dr.Jit's. A frozen call holds Dr.Jit's lock while it walks its
+arguments and builds its result. If code of Python ran there, such as `dataclasses.fields` or the
+``__init__`` of a dataclass, Python might hand its lock to one of these threads, and both would wait
+for ever. Therefore a frozen program takes and returns lists of arrays alone, which Dr.Jit walks
+without Python, and `_flatten` and `_build` do the rest outside of the call.
+
+Nor do constants reach Dr.Jit: it mixes them up. A program recorded with the numbers 16, 32, 0 was
+replayed for 16, 32, 16. Each set of constants has a program of its own.
 """
 
 from __future__ import annotations
@@ -11,16 +21,23 @@ import atexit
 import gc
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import is_dataclass
-from functools import wraps
+from dataclasses import fields, is_dataclass
+from functools import cache, wraps
 from typing import Any
 
 import drjit as dr
 
 Program = Callable[..., Any]
 """A function of Dr.Jit arrays."""
+
+Shape = Any
+"""What is left of a value without its arrays: None for an array; the type and the value of a
+constant; the type, the names and the shapes of the parts of a list, a dictionary or a dataclass."""
+
+CONSTANTS = (int, float, bool, str, range)
+"""Types of constants, beside None. Each value of one has a program of its own."""
 
 _LOCK = threading.RLock()
 """The thread that holds it may use Dr.Jit."""
@@ -118,7 +135,8 @@ def freeze_program(function: Program) -> Iterator[Program]:
     Parameters
     ----------
     function : callable
-        A function that `drjit.freeze` accepts.
+        A function of positional arguments: arrays of Dr.Jit, numbers, texts and None, in lists,
+        tuples, dictionaries and dataclasses; so is its result. It changes none of them in place.
 
     Yields
     ------
@@ -126,15 +144,15 @@ def freeze_program(function: Program) -> Iterator[Program]:
         The frozen function, with the arguments and the result of `function`. Its calls are
         `exclusive`.
     """
-    program = dr.freeze(function, warn_after=MANY_RECORDINGS)
+    programs, call = _freeze(function)
     try:
-        yield _guarded(program, function)
+        yield call
     finally:
-        _retire(program.clear)
+        _retire(programs.clear)
 
 
 KEPT_RECORDINGS = 8
-"""Recordings that a program of `record` keeps: those that were used last."""
+"""Recordings that a function of `record` keeps: those that were used last."""
 
 LARGEST_RECORDED = 1 << 22
 """Size of the largest array of a call that is recorded. A replay frees its temporary arrays at its
@@ -148,58 +166,121 @@ def record(function: Program) -> Program:
     needs must be in its arguments, and these must be positional: a replay notices nothing else.
     The function may not sort: on cuda, Dr.Jit 1.5 ends the process when it records `drjit.argsort`.
     """
-    program = dr.freeze(
-        lambda sizes, *arguments: function(*arguments),
-        limit=KEPT_RECORDINGS,
-        warn_after=MANY_RECORDINGS,
-    )
-    atexit.register(program.clear)
-    replay = _guarded(program, function)
+    programs, replay = _freeze(lambda sizes, arguments: function(*arguments), KEPT_RECORDINGS)
+    atexit.register(programs.clear)
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
-        arrays = list(_arrays_in(arguments))
+        arrays: list[Any] = []
+        _flatten(arguments, arrays)
         sizes = [dr.width(array) for array in arrays]  # they may be numbers in a program
         if max(sizes) > LARGEST_RECORDED or _is_guest():
             return function(*arguments)
-        found = replay(sizes, *arguments)
+        result = replay(sizes, arguments)
         # A recording begins a new scope, a replay does not. Programs of later operations have
         # their instructions in the order of scopes: they would be others after a replay.
         dr.detail.new_scope(dr.backend_v(arrays[0]))
-        return found
+        return result
 
     return call
 
 
-def _arrays_in(arguments: Iterable[Any]) -> Iterator[Any]:
-    """Yield all arrays in some arguments."""
-    for value in arguments:
-        if dr.is_array_v(value):
-            yield value
-        elif isinstance(value, (list, tuple)):
-            yield from _arrays_in(value)
-        elif is_dataclass(value):
-            yield from _arrays_in(vars(value).values())
+def _freeze(function: Program, limit: int | None = None) -> tuple[dict[Shape, Any], Program]:
+    """Freeze a function by `drjit.freeze`, once for each shape of its arguments.
 
+    Parameters
+    ----------
+    function : callable
+    limit : int, optional
+        Largest number of programs; the one that was not used for longest goes first.
 
-def _guarded(program: Program, function: Program) -> Program:
-    """Return a frozen function whose calls are `exclusive`, with the collector off."""
+    Returns
+    -------
+    programs : dict
+        Its ``clear`` frees what was recorded.
+    call : callable
+        Takes the arguments of `function`; `exclusive`, with the collector off.
+    """
+    programs: dict[Shape, Any] = {}
+    results: dict[Shape, Shape] = {}
+
+    def freeze(shape: Shape) -> Any:
+        def trace(flat: list[Any]) -> list[Any]:
+            arrays: list[Any] = []
+            results[shape] = _flatten(function(*_build(shape, iter(flat))), arrays)
+            return arrays
+
+        # Dr.Jit walks the variables of a frozen function, too: this one has `trace` alone.
+        return dr.freeze(lambda flat: trace(flat), warn_after=MANY_RECORDINGS)
 
     @wraps(function)
-    def call(*arguments: Any, **settings: Any) -> Any:
+    def call(*arguments: Any) -> Any:
         global _calls
         with exclusive(), collector_off():
+            arrays: list[Any] = []
+            shape = _flatten(arguments, arrays)
+            program = programs.pop(shape, None) or freeze(shape)
+            programs[shape] = program  # now the last one
+            if limit is not None and len(programs) > limit:
+                _retire([programs.pop(next(iter(programs)))].clear)
             _calls += 1
             try:
-                return program(*arguments, **settings)
+                flat = program(arrays)
             except RuntimeError as error:
                 if isinstance(error.__cause__, KeyboardInterrupt):  # Dr.Jit wraps what it meets
                     raise KeyboardInterrupt from error
                 raise
             finally:
                 _calls -= 1
+            return _build(results[shape], iter(flat))
 
-    return call
+    return programs, call
+
+
+def _flatten(value: Any, arrays: list[Any]) -> Shape:
+    """Append the arrays of a value to a list, and return all else: its shape.
+
+    Raises
+    ------
+    TypeError
+        If the value holds something else than arrays and constants.
+    """
+    if dr.is_array_v(value):
+        arrays.append(value)
+        return None
+    kind = type(value)
+    if value is None or kind in CONSTANTS:
+        return kind, value
+    if is_dataclass(kind):
+        names: Any = _field_names(kind)
+        parts = [getattr(value, name) for name in names]
+    elif kind is dict:
+        names, parts = tuple(value), list(value.values())
+    elif isinstance(value, (list, tuple)):
+        names, parts = (), list(value)
+    else:
+        raise TypeError(f"a frozen program takes arrays and numbers, not {kind.__name__}")
+    return kind, names, tuple(_flatten(part, arrays) for part in parts)
+
+
+@cache
+def _field_names(kind: type) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind))
+
+
+def _build(shape: Shape, arrays: Iterator[Any]) -> Any:
+    """Return the value that `_flatten` took apart."""
+    if shape is None:
+        return next(arrays)
+    if len(shape) == 2:
+        return shape[1]
+    kind, names, parts = shape
+    values = [_build(part, arrays) for part in parts]
+    if kind is dict:
+        return dict(zip(names, values, strict=True))
+    if names:
+        return kind(**dict(zip(names, values, strict=True)))
+    return kind(*values) if hasattr(kind, "_fields") else kind(values)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Choice of the Dr.Jit backend: llvm or cuda."""
+"""Choice of the Dr.Jit backend: llvm, cuda or metal."""
 
 import importlib
 import importlib.metadata
@@ -13,11 +13,17 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from . import gpu
 from .feedback import warn
 from .libllvm import MIN_VERSION, advice, load_failure, loaded_path, too_old
 
+BACKENDS = ("llvm", "cuda", "metal")
+
 UNTESTED_ON_GPU = "tested with a simulated driver only, not yet on a GPU"
 """State of the cuda backend, until the whole suite has passed on a GPU."""
+
+UNTESTED_ON_METAL = "never run; only its names are tested"
+"""State of the metal backend of Dr.Jit, which is on Macs."""
 
 
 class BackendError(RuntimeError):
@@ -29,13 +35,14 @@ def select(backend: str | None = None) -> ModuleType:
 
     Parameters
     ----------
-    backend : {"llvm", "cuda"}, optional
-        By default "cuda" if the machine has a CUDA GPU, else "llvm".
+    backend : {"llvm", "cuda", "metal"}, optional
+        By default "cuda" if the machine has a CUDA GPU on which a small fit agrees with llvm, see
+        `eigengs_dr.backend.gpu.agrees`; else "llvm".
 
     Returns
     -------
     module
-        ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
+        ``drjit.llvm.ad``, ``drjit.cuda.ad`` or ``drjit.metal.ad``.
 
     Raises
     ------
@@ -48,7 +55,8 @@ def select(backend: str | None = None) -> ModuleType:
     Warns
     -----
     UserWarning
-        At the first use of cuda in a process: `UNTESTED_ON_GPU`.
+        At the first use of cuda or metal in a process: `UNTESTED_ON_GPU`, `UNTESTED_ON_METAL`. If
+        a GPU is there and disagrees with llvm.
 
     Examples
     --------
@@ -56,15 +64,20 @@ def select(backend: str | None = None) -> ModuleType:
     >>> select().Float(1, 2).shape
     (2,)
     """
-    if backend not in (None, "llvm", "cuda"):
-        raise ValueError(f"backend {backend!r} is unknown; use 'llvm' or 'cuda'")
+    if backend not in (None, *BACKENDS):
+        raise ValueError(f"backend {backend!r} is unknown; use {', '.join(map(repr, BACKENDS))}")
     dr = _import_drjit()
-    if backend != "llvm" and dr.has_backend(dr.JitBackend.CUDA):
-        _announce_cuda()
+    if backend == "metal":
+        if not _has(dr, "Metal"):
+            raise BackendError("no Metal GPU was found; use backend 'llvm'")
+        _announce("metal", UNTESTED_ON_METAL)
+        return dr.metal.ad
+    if backend != "llvm" and _has(dr, "CUDA") and (backend == "cuda" or _cuda_agrees()):
+        _announce("cuda", UNTESTED_ON_GPU)
         return dr.cuda.ad
     if backend == "cuda":
         raise BackendError("no CUDA GPU or driver was found; use backend 'llvm'")
-    if (fault := too_old()) or not dr.has_backend(dr.JitBackend.LLVM):
+    if (fault := too_old()) or not _has(dr, "LLVM"):
         raise BackendError(f"{fault or load_failure()}; {advice()}")
     version = dr.detail.llvm_version()[0]
     if version < MIN_VERSION:
@@ -72,10 +85,44 @@ def select(backend: str | None = None) -> ModuleType:
     return dr.llvm.ad
 
 
+def name_of(module: ModuleType) -> str:
+    """Return the name of the backend of a module of `select`, e.g. "llvm"."""
+    return module.__name__.split(".")[1]
+
+
+def backend_of(variant: str) -> str | None:
+    """Return the backend of a variant of Mitsuba such as ``llvm_ad_rgb``; None if it is scalar."""
+    backend = variant.partition("_")[0]
+    return backend if backend in BACKENDS else None
+
+
 @cache
-def _announce_cuda() -> None:
-    """Warn of the state of the cuda backend, once in a process."""
-    warn(f"backend cuda: {UNTESTED_ON_GPU}; compare with backend 'llvm'")
+def _has(dr: ModuleType, name: str) -> bool:
+    """Whether Dr.Jit has a backend; asked once, since the question waits for Dr.Jit's lock."""
+    kind = getattr(dr.JitBackend, name, None)  # Metal is there since Dr.Jit 1.4
+    return kind is not None and bool(dr.has_backend(kind))
+
+
+@cache
+def _announce(backend: str, state: str) -> None:
+    """Warn of the state of a backend, once in a process."""
+    warn(f"backend {backend}: {state}; compare with backend 'llvm'")
+
+
+@cache
+def _cuda_agrees() -> bool:
+    """Whether cuda may be the default: a fit agrees with llvm; warn if it does not."""
+    import drjit as dr
+
+    device = (dr.detail.cuda_version(), dr.detail.cuda_compute_capability())
+    versions = {name: version_of(name) for name in ("eigengs-dr", "drjit")}
+    right = gpu.agrees("cuda", f"{platform.node()} {device} {versions}")
+    if not right:
+        warn(
+            "backend cuda: a small fit differs from llvm, which is used instead; "
+            "'eigengs-dr doctor --gpu' tells more"
+        )
+    return right
 
 
 def describe(backend: str | None = None) -> dict[str, Any]:
@@ -83,7 +130,7 @@ def describe(backend: str | None = None) -> dict[str, Any]:
 
     Parameters
     ----------
-    backend : {"llvm", "cuda"}, optional
+    backend : {"llvm", "cuda", "metal"}, optional
         As for `select`.
 
     Returns
@@ -101,9 +148,9 @@ def describe(backend: str | None = None) -> dict[str, Any]:
     module = select(backend)
     import drjit as dr
 
-    llvm = dr.has_backend(dr.JitBackend.LLVM)
+    llvm = _has(dr, "LLVM")
     return {
-        "backend": "cuda" if module is dr.cuda.ad else "llvm",
+        "backend": name_of(module),
         "threads": dr.thread_count(),
         "cpu": _cpu_model(),
         "platform": platform.platform(),

@@ -3,13 +3,12 @@
 Commands import heavy modules when they run, so that ``--help`` and mistakes answer at once.
 """
 
-import json
 from importlib.metadata import entry_points
 
 import click
 
-from . import options
 from .console import Program
+from .doctor import doctor
 from .fit import fit
 from .info import info
 from .pack import pack
@@ -49,26 +48,6 @@ def _load() -> click.Group:
         "the benchmarks are not installed; in a checkout of eigengs-dr, run: "
         "pip install ./benchmarks"
     )
-
-
-@click.command()
-@options.as_json
-@click.pass_context
-def doctor(context: click.Context, as_json: bool) -> None:
-    """Show what works on this machine and what to install.
-
-    The exit code is 1 if no backend works.
-
-    \b
-    Examples:
-      eigengs-dr doctor
-      eigengs-dr doctor --json
-    """
-    from ..backend import doctor as doctor_module
-
-    facts = doctor_module.report()
-    click.echo(json.dumps(facts, indent=2) if as_json else doctor_module.describe(facts))
-    context.exit(0 if facts["llvm"]["works"] or facts["cuda"]["works"] else 1)
 
 
 @click.group(cls=Program, context_settings={"show_default": True})

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import click
 
+from ..backend.selection import BACKENDS
 from ..image.color import SPACES
 from ..image.pixels import ENCODINGS
 from ..image.remote import is_url
@@ -183,9 +184,7 @@ SHARED: dict[str, Option] = {
     "cluster": value(
         "--cluster", "local[:N]|tcp://HOST:PORT|FILE", str, "N processes here, or a Dask cluster."
     ),
-    "backend": choice(
-        "--backend", ["llvm", "cuda"], "Processor.  [default: cuda if present]", True
-    ),
+    "backend": choice("--backend", BACKENDS, "Processor.  [default: cuda if present]", True),
     "report": value("--report", "FILE", path, "JSON file of all figures."),
     "quiet": click.option("--quiet", is_flag=True, help="Show no progress and no summary."),
 }

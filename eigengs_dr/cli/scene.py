@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..backend.selection import select
+from ..backend.selection import backend_of, name_of, select
 from ..storage.atomic import atomic_write
 from . import options
 from .console import MISSED, bar, table
@@ -103,15 +103,14 @@ def scene(
 
 def load_mitsuba(variant: str | None, quiet: bool) -> ModuleType:
     """Import Mitsuba, set a variant and register the plugins."""
-    backend = variant.partition("_")[0] if variant else None
-    module = select(backend if backend in ("llvm", "cuda") else None)
+    module = select(backend_of(variant) if variant else None)
     from ..plugins import register_plugins  # first: its error says what to install
 
     # isort: split
     import mitsuba as mi
 
     if variant is None:
-        variant = "cuda_ad_rgb" if "cuda" in module.__name__ else "llvm_ad_rgb"
+        variant = f"{name_of(module)}_ad_rgb"
     if variant not in mi.variants():
         known = ", ".join(mi.variants())
         raise click.UsageError(f"--variant {variant}: unknown; use one of {known}")

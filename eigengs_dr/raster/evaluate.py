@@ -25,11 +25,11 @@ def exp2_neg(q: Float) -> Any:
 
     On llvm, single precision costs half of `drjit.exp2`: split ``q = n - f`` into an integer n and
     ``|f| <= 1/2``; a polynomial gives ``2^f``, and n is subtracted from its exponent bits. Outside
-    the range the result is arbitrary, and callers mask it. Double precision and cuda, where it is
+    the range the result is arbitrary, and callers mask it. Double precision and GPUs, where it is
     one instruction, use `drjit.exp2`. Not differentiable: see `falloff`.
     """
     types = types_of(q)
-    if types.bits == 64 or types.backend == "cuda":
+    if types.bits == 64 or types.backend != "llvm":
         return dr.exp2(-q)
     shifter = 12582912.0  # 1.5 * 2^23: adding it rounds to an integer in the low mantissa bits
     shifted = shifter - q

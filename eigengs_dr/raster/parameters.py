@@ -118,7 +118,7 @@ def gather_index(types: ArrayTypes, splat: UInt, i: UInt, active: Bool) -> Any:
 
     `splat` must have an even length.
     """
-    if types.backend == "cuda":
+    if types.backend != "llvm":
         return dr.gather(types.UInt, splat, i, active)
     pair = dr.gather(types.UInt2, splat, i >> 1, active)
     return dr.select((i & 1) == 0, pair[0], pair[1])

@@ -19,6 +19,7 @@ from scipy.ndimage import distance_transform_edt, zoom
 from skimage.transform import resize_local_mean
 
 from ..backend.recording import exclusive
+from ..backend.selection import backend_of
 from ..fitting.density_control import DensityControl
 from ..fitting.descent import FitProblem, run
 from ..fitting.options import PRESETS
@@ -236,7 +237,7 @@ def _fit(
     target, weight = _shrunk(target, times), _shrunk(weight, times)
     seen = _shrunk(seen[..., None].astype(np.float32), times)[..., 0] > 0
     picture = to_coded(target) if space == "linear" else target
-    start = place_adaptive(picture, count, space, "cuda" if "cuda" in mi.variant() else "llvm")
+    start = place_adaptive(picture, count, space, backend_of(mi.variant()))
     start = solve(_seen_only(start, seen), target)
     schedule = PRESETS["default"].schedule
     control = DensityControl(target, weight, picture)

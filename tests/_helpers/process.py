@@ -23,21 +23,24 @@ else:
 HUNG = """
 import faulthandler, os
 # An import of Dr.Jit hides standard error, so the watch has its own copy.
-faulthandler.dump_traceback_later(200, exit=True, file=os.dup(2))
+faulthandler.dump_traceback_later({seconds}, exit=True, file=os.dup(2))
 """
 """What lets a program that hangs end, and say where: libLLVM, Dr.Jit and threads are in play."""
 
 
-def run_python(code, **environment):
-    """Run code in a fresh interpreter, with environment variables set, or unset by None."""
+def run_python(code, seconds=200, **environment):
+    """Run code in a fresh interpreter, with environment variables set, or unset by None.
+
+    It ends after so many seconds: a library that is read for the first time may take minutes.
+    """
     merged = {**os.environ, **environment}
     return subprocess.run(
-        [sys.executable, "-c", HUNG + code],
+        [sys.executable, "-c", HUNG.format(seconds=seconds) + code],
         env={key: value for key, value in merged.items() if value is not None},
         capture_output=True,
         text=True,
         check=False,
-        timeout=250,  # a library that is read for the first time may take minutes
+        timeout=seconds + 50,
     )
 
 

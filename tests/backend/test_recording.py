@@ -95,6 +95,31 @@ def test_a_program_of_a_module_notices_other_sizes(backend):
     assert traced == [4, 5, 4]
 
 
+def test_constants_are_not_mixed_up(backend):
+    """Dr.Jit 1.5 replays a program of the constants 16, 32, 0 for 16, 32, 16."""
+    x = dr.arange(select(backend).Float, 3)
+    dr.eval(x)
+
+    @record
+    def shifted(x, constants):
+        return x + constants[2], None if constants[2] == 0 else x
+
+    for last in (0, 16, 0):
+        moved, rest = shifted(x, (16, 32, last))
+        assert dr.all(moved == x + last) and (rest is None) == (last == 0)
+
+
+def test_a_program_takes_and_returns_what_is_made_of_arrays(backend):
+    x = dr.arange(select(backend).Float, 3)
+    dr.eval(x)
+    with freeze_program(lambda pair, more: ({"a": pair.x + 1}, [more[1], pair])) as call:
+        for number in (2, 3):
+            first, (none, pair) = call(Pair(x, number), (x, None))
+            assert dr.all(first["a"] == x + 1) and none is None and pair.factor == number
+        with pytest.raises(TypeError, match="takes arrays and numbers, not object"):
+            call(object(), ())
+
+
 def test_large_arrays_are_traced(backend):
     Float, traced = select(backend).Float, []
 
@@ -141,6 +166,30 @@ def test_fits_in_four_threads_have_the_bits_of_fits_one_by_one(backend):
     alone = [fit_one(number) for number in range(40)]
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(fit_one, range(40), timeout=4 * WAIT)) == alone
+
+
+EAGER_THREADS = """
+import sys, threading
+import eigengs_dr as eg
+from _helpers.waves import picture
+
+def fits():
+    for _ in range(6):
+        eg.fit(picture(), 40, iterations=3, progress=False)
+
+sys.setswitchinterval(1e-6)
+threads = [threading.Thread(target=fits, daemon=True) for _ in range(2)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+print("whole")
+"""
+
+
+def test_threads_that_drop_results_do_not_hang():
+    """Python changes threads as often as it may, as it does once a minute on a loaded machine."""
+    assert run_python(EAGER_THREADS, PYTHONPATH=python_path()).stdout == "whole\n"
 
 
 def test_gradients_beside_fits_have_the_bits_of_gradients_alone(backend):

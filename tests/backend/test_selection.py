@@ -4,28 +4,42 @@ import json
 import subprocess
 import sys
 import warnings
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
 from _helpers.process import SELECT, run_python
-from eigengs_dr.backend import doctor, selection
+from eigengs_dr.backend import doctor, gpu, selection
 from eigengs_dr.backend import libllvm as module
 from eigengs_dr.backend.libllvm import PATH_VARIABLE
-from eigengs_dr.backend.selection import BackendError, describe, select
+from eigengs_dr.backend.selection import (
+    BACKENDS,
+    BackendError,
+    backend_of,
+    describe,
+    name_of,
+    select,
+)
 
 
-def fake_drjit(monkeypatch, *, llvm, version, cuda=False):
-    """Put a Dr.Jit in place that has a GPU or none, and an LLVM backend or none."""
-    kinds = SimpleNamespace(CUDA="cuda", LLVM="llvm")
-    drjit = SimpleNamespace(
-        JitBackend=kinds,
-        has_backend=lambda kind: {"llvm": llvm, "cuda": cuda}[kind],
-        cuda=SimpleNamespace(ad=SimpleNamespace()),
-        detail=SimpleNamespace(llvm_version=lambda: version),
+def fake_drjit(monkeypatch, *, llvm=True, version=(19, 1, 7), cuda=False, metal=False):
+    """Put a Dr.Jit in place that has GPUs or none, and an LLVM backend or none."""
+    works = {"LLVM": llvm, "CUDA": cuda, "Metal": metal}
+    drjit = ModuleType("drjit")
+    drjit.JitBackend = SimpleNamespace(**{name: name for name in works})
+    drjit.has_backend = works.__getitem__
+    for name in BACKENDS:
+        setattr(drjit, name, SimpleNamespace(ad=ModuleType(f"drjit.{name}.ad")))
+    drjit.detail = SimpleNamespace(
+        llvm_version=lambda: version,
+        cuda_version=lambda: (12, 8),
+        cuda_compute_capability=lambda: 90,
     )
     monkeypatch.setitem(sys.modules, "drjit", drjit)
     monkeypatch.delenv(PATH_VARIABLE, raising=False)
+    selection._announce.cache_clear()
+    selection._cuda_agrees.cache_clear()
+    return drjit
 
 
 @pytest.mark.parametrize(
@@ -43,28 +57,85 @@ def test_machine_without_an_llvm_that_works(monkeypatch, works, version, words):
 
 
 def test_cuda_without_gpu(monkeypatch):
-    fake_drjit(monkeypatch, llvm=True, version=(19, 1, 7))
+    fake_drjit(monkeypatch)
     with pytest.raises(BackendError, match=r"no CUDA GPU or driver was found; use backend 'llvm'"):
         select("cuda")
 
 
 def test_first_use_of_cuda_says_that_no_gpu_was_tested(monkeypatch):
-    fake_drjit(monkeypatch, llvm=True, version=(19, 1, 7), cuda=True)
-    selection._announce_cuda.cache_clear()
+    drjit = fake_drjit(monkeypatch, cuda=True)
     with pytest.warns(UserWarning, match="backend cuda: .* not yet on a GPU; compare with") as told:
-        assert select("cuda") is sys.modules["drjit"].cuda.ad
+        assert select("cuda") is drjit.cuda.ad
     assert "\n" not in str(told[0].message)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        select()
+        select("cuda")
+
+
+@pytest.mark.filterwarnings("ignore:backend cuda")
+def test_cuda_is_the_default_where_it_agrees_with_llvm(monkeypatch, tmp_path):
+    """The verdict is that of a file: another device or version is tried anew."""
+    monkeypatch.setenv("DRJIT_CACHE_DIR", str(tmp_path))
+    drjit = fake_drjit(monkeypatch, cuda=True)
+    tried = []
+    monkeypatch.setattr(gpu, "run_trial", lambda name, backend: tried.append(backend) or trial)
+    trial = gpu.Trial(0.1, [30.0])
+    assert select() is drjit.cuda.ad and tried == ["llvm", "cuda"]
+    fake_drjit(monkeypatch, cuda=True)
+    select()
+    assert tried == ["llvm", "cuda"]
+    drjit = fake_drjit(monkeypatch, cuda=True)
+    drjit.detail.cuda_version = lambda: (13, 0)
+    trial = gpu.Trial(0.1, [float("nan")])
+    with pytest.warns(UserWarning, match="a small fit differs from llvm, which is used instead"):
+        assert select() is drjit.llvm.ad
+    assert select("cuda") is drjit.cuda.ad  # who asks for it gets it
+
+
+def test_a_gpu_that_ends_the_process_does_not_agree(tmp_path, monkeypatch):
+    monkeypatch.setenv("DRJIT_CACHE_DIR", str(tmp_path))
+    if gpu.run_trial("fit", "cuda").problem == "":
+        pytest.skip("a GPU is here")
+    assert not gpu.agrees("cuda", "this machine")
+    assert json.loads(gpu.verdict_file().read_text()) == {"this machine": False}
+
+
+def test_figures_are_compared_by_their_largest_difference(monkeypatch):
+    figures = {"llvm": [2.0, -4.0], "cuda": [2.0, -4.002]}
+    monkeypatch.setattr(gpu, "run_trial", lambda name, b: gpu.Trial(1.0, figures[b]))
+    row = gpu.compare("gradients", "cuda")
+    assert row.agrees and row.difference == pytest.approx(5e-4)
+    figures["cuda"] = [2.0]
+    assert not gpu.compare("gradients", "cuda").agrees
+
+
+def test_metal_by_its_names(monkeypatch):
+    """By stand-in: Dr.Jit's wheels for Linux have no Metal."""
+    drjit = fake_drjit(monkeypatch, metal=True)
+    with pytest.warns(UserWarning, match="backend metal: never run"):
+        assert select("metal") is drjit.metal.ad
+    assert select() is drjit.llvm.ad
+    assert name_of(drjit.metal.ad) == backend_of("metal_ad_rgb") == "metal"
+    assert backend_of("scalar_rgb") is None
+    fake_drjit(monkeypatch)
+    with pytest.raises(BackendError, match="no Metal GPU"):
+        select("metal")
 
 
 def test_doctor_says_that_no_gpu_was_tested():
     trial = {"works": True, "versions": {"drjit": "1.5.0"}}
     refused = {"works": False, "problem": "no"}
-    found = {"python": "3.11", "platform": "x", "llvm": refused, "cuda": trial, "libllvm": []}
+    found = {
+        "python": "3.11",
+        "platform": "macOS",
+        "llvm": refused,
+        "cuda": trial,
+        "libllvm": [],
+        "metal": trial,
+    }
     text = doctor.describe({**found, "mitsuba": {"version": None, "variants": None}})
     assert "cuda     works: Dr.Jit 1.5.0; tested with a simulated driver only" in text
+    assert "metal    works: Dr.Jit 1.5.0; never run" in text
 
 
 def test_drjit_that_cannot_be_imported(tmp_path):
@@ -82,8 +153,8 @@ def test_drjit_that_cannot_be_imported(tmp_path):
 
 
 def test_unknown_backend():
-    with pytest.raises(ValueError, match="'metal' is unknown"):
-        select("metal")
+    with pytest.raises(ValueError, match="'vulkan' is unknown"):
+        select("vulkan")
 
 
 def test_describe(backend):

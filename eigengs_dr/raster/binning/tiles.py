@@ -2,7 +2,7 @@
 
 A tile is a block of pixels. A closed form gives the tiles of each row that the cutoff ellipse of a
 Gaussian touches. An elongated Gaussian therefore visits only the tiles along its axis, not all
-tiles of its bounding box. `GRANULARITY` is the one place that chooses, by backend, how much work
+tiles of its bounding box. `granularity_of` is the one place that chooses, by backend, how much work
 one lane of a kernel gets.
 """
 
@@ -56,17 +56,16 @@ SMALL = 1 << 12
 """Most tiles of an image, 256x256 pixels, that takes `Granularity.visits` whatever its lists. In a
 batch the number may not depend on the lists of other images: it decides in which order sums run."""
 
-GRANULARITY = {
-    "llvm": Granularity(rows=4, visits=16, long_visits=64, ordered=True, products=True),
-    "cuda": Granularity(rows=1, visits=16, long_visits=16, ordered=False, products=False),
-}
-"""Granularity by backend. On llvm a lane shares the parameters of a Gaussian among 16 pixels; on a
-GPU more lanes with fewer registers hide the latency of memory."""
+ON_CPU = Granularity(rows=4, visits=16, long_visits=64, ordered=True, products=True)
+"""On llvm a lane shares the parameters of a Gaussian among 16 pixels."""
+
+ON_GPU = Granularity(rows=1, visits=16, long_visits=16, ordered=False, products=False)
+"""On a GPU more lanes with fewer registers hide the latency of memory."""
 
 
 def granularity_of(types: ArrayTypes) -> Granularity:
     """Return the granularity for the backend of some array types."""
-    return GRANULARITY[types.backend]
+    return ON_CPU if types.backend == "llvm" else ON_GPU
 
 
 TILE = (4, 4)

@@ -10,7 +10,7 @@ from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, 
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.binning.lists import PACKET, build_lists, order_lanes
-from eigengs_dr.raster.binning.tiles import GRANULARITY, TILE, Grid
+from eigengs_dr.raster.binning.tiles import ON_CPU, ON_GPU, TILE, Grid
 
 RADIUS = 3.0
 
@@ -84,6 +84,9 @@ def check_lists(backend, mean, factor, grid=GRID):
     excess = member & (least_distance(mean, factor, grid) > RADIUS * (1 + EDGE))
     assert not excess.any(), np.argwhere(excess)
     return member
+
+
+GRANULARITY = {"llvm": ON_CPU, "cuda": ON_GPU}
 
 
 @few

@@ -1,0 +1,188 @@
+"""The command ``eigengs-dr doctor``: what works on this machine, and whether its GPU is right."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import click
+import numpy as np
+
+from ..backend import doctor as machine
+from ..backend.gpu import ALLOWED, Comparison, compare
+from ..backend.selection import BACKENDS
+from . import options
+from .console import MISSED, say, table
+
+
+@click.command()
+@options.as_json
+@click.option("--gpu", is_flag=True, help="Compare the GPU with llvm, in one to three minutes.")
+@click.option("--trial", type=click.Choice(list(ALLOWED)), hidden=True)
+@options.choice("--backend", BACKENDS, "GPU to compare, or where a trial runs.", True)
+@click.pass_context
+def doctor(
+    context: click.Context, as_json: bool, gpu: bool, trial: str | None, backend: str | None
+) -> None:
+    """Show what works on this machine and what to install.
+
+    With --gpu, a small fit, gradients, textures and a scene run on the GPU and on llvm; the page
+    that follows tells their times and how far they differ, and is made to be pasted into a report.
+    The exit code is 1 if no backend works, or if the GPU differs.
+
+    \b
+    Examples:
+      eigengs-dr doctor
+      eigengs-dr doctor --json
+      eigengs-dr doctor --gpu
+    """
+    if trial:
+        click.echo(json.dumps(_run_trial(trial, backend or "llvm")))
+        return
+    facts = machine.report()
+    works = any(facts[name]["works"] for name in BACKENDS)
+    device = backend or ("metal" if facts["metal"]["works"] else "cuda")
+    comparisons: list[Comparison] = []
+    if gpu and not facts[device]["works"]:
+        raise click.ClickException(f"--gpu: {device} does not work: {facts[device]['problem']}")
+    for name in ALLOWED if gpu else ():
+        say(f"{name}: on llvm and on {device}")
+        comparisons.append(compare(name, device))
+    if as_json:
+        rows = [{**row._asdict(), "agrees": row.agrees} for row in comparisons]
+        facts |= {"trials": rows} if gpu else {}
+        click.echo(json.dumps(facts, indent=2, default=str))
+    else:
+        click.echo(machine.describe(facts))
+    if gpu and not as_json:
+        click.echo("\n".join(["", *_describe(comparisons, device)]))
+    context.exit(0 if works and all(row.agrees for row in comparisons) else MISSED)
+
+
+def _describe(comparisons: list[Comparison], device: str) -> list[str]:
+    """Return the trials as lines: times, differences, and what has failed."""
+    rows = [["trial", "llvm, s", f"{device}, s", "difference", "allowed", ""]]
+    problems = []
+    for row in comparisons:
+        times = [f"{t.seconds:.3f}" if not t.problem else "failed" for t in (row.llvm, row.gpu)]
+        verdict = "agrees" if row.agrees else "DIFFERS"
+        rows.append([row.name, *times, f"{row.difference:.1e}", f"{ALLOWED[row.name]:g}", verdict])
+        for place, trial in (("llvm", row.llvm), (device, row.gpu)):
+            if trial.problem:
+                problems.append(f"{row.name} on {place}: {trial.problem}")
+    return table(rows) + problems
+
+
+# ---------------------------------------------------------------------------------------------
+#  Trials: each returns figures that a GPU must have too
+# ---------------------------------------------------------------------------------------------
+
+
+def _run_trial(name: str, backend: str) -> dict[str, Any]:
+    """Run a trial twice, the second time with compiled programs; return its time and figures."""
+    trials: dict[str, Callable[[str], Any]] = {
+        "fit": _fit,
+        "gradients": _gradients,
+        "texture": _texture,
+        "scene": _scene,
+    }
+    trials[name](backend)
+    started = time.perf_counter()
+    figures = np.asarray(trials[name](backend), float)
+    return {"seconds": time.perf_counter() - started, "figures": figures.ravel().tolist()}
+
+
+def _picture() -> Any:
+    """Return a picture of waves and an edge, (48, 64, 3) in [0, 1]."""
+    y, x = np.mgrid[0:48, 0:64] / 64
+    waves = [0.5 + 0.4 * np.sin(a * x + b * y) for a, b in ((9, 4), (5, -13), (17, 3))]
+    return np.stack(waves, axis=-1) * np.where(x + y > 0.9, 0.6, 1.0)[..., None]
+
+
+def _fit(backend: str) -> Any:
+    """Return the PSNRs of a fit."""
+    import eigengs_dr as eg
+
+    result = eg.fit(_picture(), 200, iterations=30, backend=backend, progress=False)
+    return [row["psnr_rgb"] for row in result.trace] + [result.psnr_ycbcr]
+
+
+def _set(backend: str) -> Any:
+    """Return a set that is not fitted, so that it is the same on every backend."""
+    import eigengs_dr as eg
+
+    random = np.random.default_rng(0)
+    factor = np.stack([*random.uniform(0.2, 0.5, (2, 60)), np.full(60, 0.3)], axis=1)
+    factor[:, 1] -= 0.35
+    return eg.Gaussians.from_arrays(
+        random.uniform([0, 0], [32, 24], (60, 2)),
+        factor,
+        random.uniform(-0.2, 0.3, (60, 3)),
+        background=np.full(3, 0.4),
+        size=(32, 24),
+        space="linear",
+        backend=backend,
+    )
+
+
+def _gradients(backend: str) -> Any:
+    """Return the derivatives of a weighted sum of the pixels by all parameters."""
+    import drjit as dr
+
+    import eigengs_dr as eg
+
+    gaussians = _set(backend)
+    parameters = gaussians.mean, gaussians.factor, gaussians.color
+    dr.enable_grad(*parameters)
+    picture = eg.render(gaussians).array
+    weights = dr.sin(dr.arange(type(picture), dr.width(picture)) * 0.37)
+    dr.backward(dr.sum(picture * weights))
+    return np.concatenate([np.ravel(dr.grad(p).numpy()) for p in parameters])
+
+
+def _mitsuba(backend: str) -> Any:
+    """Import Mitsuba with the plugins, and set the variant of a backend."""
+    from ..plugins import register_plugins  # first: its error says what to install
+
+    # isort: split
+    import mitsuba as mi
+
+    mi.set_variant(f"{backend}_ad_rgb")
+    register_plugins()
+    return mi
+
+
+def _texture(backend: str) -> Any:
+    """Return lookups of a texture, at points and filtered."""
+    mi = _mitsuba(backend)
+    import drjit as dr
+
+    from ..plugins import texture_of
+
+    random = np.random.default_rng(1)
+    si = dr.zeros(mi.SurfaceInteraction3f, 200)
+    si.uv = mi.Point2f(*(mi.Float(row.astype(np.float32)) for row in random.uniform(size=(2, 200))))
+    si.t, si.wi = 2.0, mi.Vector3f(0.6, 0.0, 0.8)  # what a camera sees in a slanted pixel
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    textures = [mi.load_dict(texture_of(_set(backend), prefilter=p)) for p in (0.0, 0.05)]
+    return np.concatenate([np.ravel(texture.eval(si).numpy()) for texture in textures])
+
+
+def _scene(backend: str) -> Any:
+    """Return the pixels of a rectangle with the texture, under an even light."""
+    mi = _mitsuba(backend)
+    from ..plugins import texture_of
+
+    look = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+    wall = {"type": "diffuse", "reflectance": texture_of(_set(backend))}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "direct"},
+        "sensor": {"type": "perspective", "fov": 40, "to_world": look, "film": film},
+        "sky": {"type": "constant"},
+        "wall": {"type": "rectangle", "bsdf": wall},
+    }
+    return np.ravel(mi.render(mi.load_dict(scene), spp=256, seed=0).numpy())
