@@ -14,6 +14,7 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from itertools import islice
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import dask
@@ -22,6 +23,7 @@ from distributed.comm import CommClosedError
 from distributed.protocol.pickle import dumps, loads
 from distributed.scheduler import KilledWorker
 
+from .. import __version__
 from ..backend.executor import ClusterError, Done, Function
 from ..backend.feedback import defer_interrupts, terminate_as_interrupt
 from .local import local_cluster
@@ -129,7 +131,7 @@ class ClusterExecutor:
     Raises
     ------
     ClusterError
-        If no worker comes within `NO_WORKER_SECONDS`.
+        If no worker comes within `NO_WORKER_SECONDS`, or one lacks this version of the package.
     """
 
     def __init__(self, client: Client) -> None:
@@ -137,6 +139,7 @@ class ClusterExecutor:
         self.address = client.scheduler.address if client.scheduler else "?"
         with self._explained():
             self._require_worker(f"the scheduler {self.address} has no workers; start some")
+            self._require_package()
             self.workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
 
     def map(
@@ -202,6 +205,18 @@ class ClusterExecutor:
             self.client.wait_for_workers(1, timeout=NO_WORKER_SECONDS)
         except TimeoutError:
             raise ClusterError(otherwise) from None
+
+    def _require_package(self) -> None:
+        """Ask the workers by a function of Python: what they cannot load ends their connection."""
+        answers = self.client.run(resolve_name, "eigengs_dr:__version__", on_error="return")
+        for address, answer in answers.items():
+            if isinstance(answer, ModuleNotFoundError):
+                raise answer
+            if isinstance(answer, str) and answer != __version__:
+                raise ClusterError(
+                    f"worker {address} has eigengs_dr {answer}, but this process has "
+                    f"{__version__}; install equal versions"
+                )
 
     @contextmanager
     def _explained(self) -> Iterator[None]:

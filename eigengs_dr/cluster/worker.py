@@ -19,7 +19,6 @@ from distributed import Worker, get_worker
 from distributed.protocol.pickle import dumps, loads
 from threadpoolctl import threadpool_limits
 
-from .. import __version__
 from ..backend.executor import ClusterError
 from ..backend.recording import exclusive, release_later
 from ..backend.selection import BackendError, describe
@@ -142,7 +141,7 @@ def limited_threads(count: int) -> Iterator[None]:
 
 def package_versions() -> dict[str, str]:
     """Return the versions of packages that must be equal everywhere, for equal bits."""
-    return {"eigengs_dr": __version__, "drjit": version("drjit"), "numpy": version("numpy")}
+    return {name: version(name) for name in ("drjit", "numpy")}
 
 
 @cache

@@ -140,13 +140,13 @@ def fail_with(task, shared):
     return witness
 
 
-def hide_package():
-    """Let this process have no such package."""
-    sys.modules["eigengs_dr.cluster.worker"] = None
+def replace_package(package):
+    """Let this process have another package of this name, or none."""
+    sys.kept_package, sys.modules["eigengs_dr"] = sys.modules["eigengs_dr"], package
 
 
-def show_package():
-    del sys.modules["eigengs_dr.cluster.worker"]
+def restore_package():
+    sys.modules["eigengs_dr"] = sys.kept_package
 
 
 def patch_write(replacement):

@@ -2,12 +2,14 @@
 
 import logging
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import dask
 import numpy as np
@@ -337,13 +339,23 @@ def test_other_versions_are_refused(client):
         client.submit(run_task, b"", other, pure=False).result()
 
 
-def test_workers_without_the_package_are_refused(client):
-    client.run(clusters.hide_package)
+@pytest.mark.parametrize(
+    ("package", "line"),
+    [
+        (None, "a worker has no eigengs_dr; install there what this process has"),
+        (SimpleNamespace(__version__="9.9"), "has eigengs_dr 9.9, but this process has"),
+    ],
+)
+def test_workers_without_the_package_are_refused(client, package, line):
+    """They get no task, which would end their connection."""
+    workers = client.run(os.getpid)
+    client.run(clusters.replace_package, package)
     try:
-        with pytest.raises(ClusterError, match=r"a worker has no eigengs_dr.*; install there"):
-            list(executor_for(client).map(clusters.add, range(2), 0))
+        with pytest.raises(ClusterError, match=re.escape(line)):
+            executor_for(client)
     finally:
-        client.run(clusters.show_package)
+        client.run(clusters.restore_package)
+    assert client.run(os.getpid) == workers
 
 
 # --- What a cluster has is left as it is ---
