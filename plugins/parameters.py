@@ -137,6 +137,10 @@ class SharedFile:
     def __init__(self, path: str, backend: str | None, first: int | None) -> None:
         self.path = path
         whole = Gaussians.load(path, backend)
+        if first is not None and first > len(whole):
+            raise ValueError(
+                f"gaussian_texture: {path}: first is {first}; the file has {len(whole)} Gaussians"
+            )
         self.gaussians = whole if first is None else whole[:first]
         self.tables: dict[tuple, Any] = {}
         self.shared = to_tensors(self.gaussians)

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import sys
+import threading
 import time
 from pathlib import Path
 
@@ -59,8 +61,8 @@ def die_once(task, shared):
     return task
 
 
-def state():
-    """What a worker was set up with."""
+def state(task=None, shared=None):
+    """What belongs to this process: as a task, what it is meanwhile."""
     import multiprocessing
 
     import drjit as dr
@@ -71,7 +73,80 @@ def state():
         "blas": {pool["num_threads"] for pool in threadpool_info()},
         "interrupt": signal.getsignal(signal.SIGINT) == signal.SIG_IGN,
         "start": multiprocessing.get_start_method(),
+        "malloc": os.environ.get("MALLOC_TRIM_THRESHOLD_"),
+        "gpus": os.environ.get("CUDA_VISIBLE_DEVICES"),
     }
+
+
+def worker_state(dask_worker):
+    """What belongs to this worker, and to its process."""
+    import dask
+
+    memory = dask_worker.memory_manager
+    return state() | {
+        "plugins": sorted(dask_worker.plugins),
+        "config": repr(dask.config.config),
+        "pause": memory.memory_pause_fraction,
+        "spill": memory.memory_spill_fraction,
+        "target": memory.memory_target_fraction,
+        "limit": memory.memory_limit,
+    }
+
+
+def held_types(dask_worker):
+    """Types of what Dask holds on this worker."""
+    return {type(value).__name__ for value in dask_worker.data.values()}
+
+
+class Traveller:
+    """A value that notes where it was pickled: processes, and whether in their main threads."""
+
+    def __init__(self, *places):
+        self.places = places
+
+    def __reduce__(self):
+        here = os.getpid(), threading.current_thread() is threading.main_thread()
+        return Traveller, (*self.places, here)
+
+
+def is_watched(task, shared):
+    """Whether Dask's profiler takes the frames of this task."""
+    from distributed import get_worker
+
+    return threading.get_ident() in get_worker().active_threads
+
+
+def travel(task, shared):
+    return shared
+
+
+class Witness:
+    """A value that writes down whether it was freed in the main thread."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __del__(self):
+        Path(self.path).write_text(str(threading.current_thread() is threading.main_thread()))
+
+
+def fail_with(task, shared):
+    """Fail while a variable, and one of the cause, hold something."""
+    witness = Witness(shared)
+    try:
+        int(task)
+    except ValueError as error:
+        raise OSError(f"task {task}") from error
+    return witness
+
+
+def replace_package(package):
+    """Let this process have another package of this name, or none."""
+    sys.kept_package, sys.modules["eigengs_dr"] = sys.modules["eigengs_dr"], package
+
+
+def restore_package():
+    sys.modules["eigengs_dr"] = sys.kept_package
 
 
 def patch_write(replacement):

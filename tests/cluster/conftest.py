@@ -7,7 +7,8 @@ pytest.importorskip("distributed")
 import dask
 from distributed import Client
 
-from eigengs_dr.cluster.executor import PATIENCE, local_cluster
+from eigengs_dr.cluster.executor import PATIENCE
+from eigengs_dr.cluster.local import local_cluster
 
 RESTART_SECONDS = 120.0
 """Time for workers that the test before has ended."""

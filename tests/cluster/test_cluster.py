@@ -1,17 +1,21 @@
 """On two processes: tasks, fits of a folder and of blocks, a basis; and what survives."""
 
+import logging
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import dask
 import numpy as np
 import pytest
 import tifffile
-from distributed import Client
+from distributed import Client, LocalCluster
 from PIL import Image
 
 import eigengs_dr as eg
@@ -29,8 +33,11 @@ from _helpers.low_rank import SIZE, assert_same, family
 from _helpers.process import run_python
 from _helpers.sets import check_equal
 from eigengs_dr.backend.executor import ClusterError, Done, executor_for
+from eigengs_dr.backend.selection import describe
 from eigengs_dr.cluster import executor as module
-from eigengs_dr.cluster.executor import WorkerSetup, connect, local_cluster, versions
+from eigengs_dr.cluster.executor import connect
+from eigengs_dr.cluster.local import local_cluster
+from eigengs_dr.cluster.worker import Shared, package_versions, run_task, share
 from eigengs_dr.collection.manifest import NAME, read_manifest
 from eigengs_dr.eigenbasis import training
 from eigengs_dr.eigenbasis.options import TrainOptions
@@ -131,8 +138,11 @@ def test_ctrl_c_leaves_what_is_done(client, photos, output, expected):
     assert_complete(output, expected)
 
 
-def test_a_scheduler_that_goes_away(photos, output, expected, tmp_path):
+def test_a_scheduler_that_goes_away(photos, output, expected, tmp_path, caplog):
     """The run ends with one line, and the same call continues without the cluster."""
+    logger = logging.getLogger("distributed.client")  # a level of its own, and no parents
+    logger.addHandler(caplog.handler)
+    level = logger.level
     file = tmp_path / "scheduler.json"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 
@@ -158,8 +168,10 @@ def test_a_scheduler_that_goes_away(photos, output, expected, tmp_path):
             client.run(slow_writes)
             with pytest.raises(eg.ClusterError, match=r"the scheduler tcp://.* is gone") as error:
                 eg.fit_many(photos, output, client=client, progress=kill, **QUICK)
-        assert "\n" not in str(error.value)
+        assert "\n" not in str(error.value) and not caplog.messages
+        assert logger.level == level
     finally:
+        logger.removeHandler(caplog.handler)
         for process in processes:
             process.kill()
             process.wait()
@@ -296,28 +308,132 @@ def test_a_worker_that_starts_slowly_comes_back(tmp_path):
     """Dask must not give it up while its nanny restarts it."""
     with (
         dask.config.set({"distributed.deploy.lost-worker-timeout": "100ms"}),
-        local_cluster(1) as cluster,
-        Client(cluster) as client,
+        connect("local:1") as client,
     ):
         found = done(executor_for(client), clusters.die_once, range(3), str(tmp_path))
     assert found == [Done(k, k) for k in range(3)]
 
 
-def test_other_versions_are_refused():
-    setup = WorkerSetup(local=True, wanted=versions() | {"eigengs_dr": "9.9"})
-    with pytest.raises(ClusterError, match=r"tcp://node:1 has eigengs_dr .*, but .* has 9\.9"):
-        setup.setup(SimpleNamespace(address="tcp://node:1"))
+def test_a_cluster_without_workers(monkeypatch):
+    """Before the first task, and after the last worker has gone."""
+    monkeypatch.setattr(module, "NO_WORKER_SECONDS", 0.5)
+    with user_cluster() as (cluster, client):
+        executor = executor_for(client)
+        cluster.scale(0)
+        with pytest.raises(ClusterError, match="no worker is left; start some"):
+            list(executor.map(clusters.add, range(2), 0))
+        with pytest.raises(ClusterError, match=r"the scheduler .* has no workers; start some"):
+            executor_for(client)
 
 
-def test_workers_without_the_package_are_refused(client, monkeypatch):
-    def missing(plugin):
-        raise ModuleNotFoundError("No module named 'eigengs_dr'", name="eigengs_dr")
+def test_other_versions_are_refused(client):
+    """Those of the client, and LLVM among the workers."""
+    task = client.submit(share, b"", package_versions() | {"drjit": "9.9"}, pure=False)
+    with pytest.raises(ClusterError, match=r"worker tcp://.* has drjit .*began with 9\.9"):
+        task.result()
+    shared = client.submit(share, b"", package_versions(), pure=False).result()
+    llvm = shared.versions["LLVM"]
+    assert llvm == describe("llvm")["versions"]["libllvm"]
+    other = Shared(b"", shared.versions | {"LLVM": "1.2.3"})
+    with pytest.raises(ClusterError, match=rf"has LLVM {llvm}, .* with 1\.2\.3; install equal"):
+        client.submit(run_task, b"", other, pure=False).result()
 
-    monkeypatch.setattr(client, "register_plugin", missing)
-    with pytest.raises(ClusterError, match="the workers have no eigengs_dr; install eigengs-dr"):
-        executor_for(client)
+
+@pytest.mark.parametrize(
+    ("package", "line"),
+    [
+        (None, "a worker has no eigengs_dr; install there what this process has"),
+        (SimpleNamespace(__version__="9.9"), "has eigengs_dr 9.9, but this process has"),
+    ],
+)
+def test_workers_without_the_package_are_refused(client, package, line):
+    """They get no task, which would end their connection."""
+    workers = client.run(os.getpid)
+    client.run(clusters.replace_package, package)
+    try:
+        with pytest.raises(ClusterError, match=re.escape(line)):
+            executor_for(client)
+    finally:
+        client.run(clusters.restore_package)
+    assert client.run(os.getpid) == workers
 
 
-def test_workers_are_set_up(executor, client):
-    for found in client.run(clusters.state).values():
-        assert found == {"threads": 1, "blas": {1}, "interrupt": True, "start": "spawn"}
+# --- What a cluster has is left as it is ---
+
+
+@contextmanager
+def user_cluster():
+    """Two workers that somebody else has started, in this process."""
+    with (
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0"
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield cluster, client
+
+
+def test_workers_of_this_machine_are_set_up(executor, client):
+    for entry in executor.map(clusters.state, range(2)):
+        during = entry.value
+        assert during["threads"] == 1 and during["blas"] == {1}
+        assert during["interrupt"] and during["start"] == "spawn"
+    for found in client.run(clusters.worker_state).values():
+        assert not (found["pause"] or found["spill"] or found["target"])
+
+
+@pytest.mark.parametrize("task", [clusters.state, clusters.fail])
+def test_a_cluster_of_others_is_as_it_was(task):
+    """After a run, and after an error; their numbers of threads count during a task alone."""
+    with user_cluster() as (_, client):
+        executor = executor_for(client)
+        before = client.run(clusters.worker_state)
+        scheduler = client.cluster.scheduler
+        plugins = sorted(scheduler.plugins), sorted(scheduler.worker_plugins)
+        if task is clusters.fail:
+            with pytest.raises(ValueError, match="task"):
+                list(executor.map(task, range(4)))
+        else:
+            for entry in executor.map(task, range(4)):
+                assert entry.value["threads"] == 1 and entry.value["blas"] == {1}
+        deadline = time.monotonic() + 30  # other tasks end after an error
+        while client.run(clusters.worker_state) != before and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert client.run(clusters.worker_state) == before
+        assert (sorted(scheduler.plugins), sorted(scheduler.worker_plugins)) == plugins
+
+
+def test_two_clients_share_a_cluster(client, photos, tmp_path, expected):
+    threshold = dask.config.get("distributed.admin.large-graph-warning-threshold")
+
+    def fit(folder):
+        with Client(client.scheduler.address, set_as_default=False) as other:
+            return eg.fit_many(photos, tmp_path / folder, client=other, **QUICK)
+
+    with ThreadPoolExecutor(2) as pool:
+        for rows in pool.map(fit, "ab"):
+            assert [row.status for row in rows] == ["done"] * 12
+    assert_complete(tmp_path / "a", expected)
+    assert_complete(tmp_path / "b", expected)
+    assert dask.config.get("distributed.admin.large-graph-warning-threshold") == threshold
+
+
+def test_dask_holds_bytes(executor, client):
+    """Its threads must not use Dr.Jit beside a task: values are pickled by the task's thread."""
+    held = set()
+    for entry in executor.map(clusters.travel, range(8), clusters.Traveller()):
+        (here, in_main), (there, in_loop) = entry.value.places
+        assert (here, in_main, in_loop) == (os.getpid(), True, False) and there != here
+        held |= set().union(*client.run(clusters.held_types).values())
+    assert held <= {"bytes", "Shared"} and "Shared" in held
+
+
+def test_no_profiler_holds_the_frames_of_a_task(executor):
+    """Its thread would free the arrays in them."""
+    assert not any(entry.value for entry in executor.map(clusters.is_watched, range(2)))
+
+
+def test_what_a_failed_task_held_is_freed_by_its_thread(executor, tmp_path):
+    with pytest.raises(OSError, match="task a"):
+        list(executor.map(clusters.fail_with, ["a"], str(tmp_path / "freed")))
+    assert (tmp_path / "freed").read_text() == "False"

@@ -23,6 +23,9 @@ def test_first_so_many_of_a_file(tmp_path):
     for wrong in (-1, True, 2.5):
         with pytest.raises(RuntimeError, match="must be a number of Gaussians"):
             mi.load_dict({**plain, "first": wrong})
+    more = f"first is {COUNT + 1}; the file has {COUNT} Gaussians"
+    with pytest.raises(RuntimeError, match=more):
+        mi.load_dict({**plain, "first": COUNT + 1})
 
 
 class TestValues:

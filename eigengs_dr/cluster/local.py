@@ -1,0 +1,62 @@
+"""Workers on this machine that a run starts for itself, and set up as Dr.Jit needs it.
+
+Dask loads this module in them before their first task.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from pathlib import Path
+
+import dask
+from distributed import LocalCluster, Worker
+
+MEMORY = {f"distributed.worker.memory.{limit}": False for limit in ("target", "spill", "pause")}
+"""Setting of Dask. Dr.Jit keeps memory for reuse during a task, so nothing is gained by writing
+results to a disk, or by a wait. A worker that reaches 95 % of its limit is restarted."""
+
+MALLOC = {
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 27,
+    "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 25,
+}
+"""Setting of Dask: the C library, if it is glibc, reuses freed memory. Dask sets 64 KiB for the
+first one. Every large array then gets new pages from the kernel, and a fit of 256x256 pixels takes
+a tenth longer."""
+
+
+def local_cluster(workers: int, **settings: object) -> LocalCluster:
+    """Start worker processes of one thread on this machine.
+
+    Parameters
+    ----------
+    workers : int
+        Number of processes. They are spawned, never forked: Dr.Jit's threads do not survive that.
+    settings : object
+        More arguments of `distributed.LocalCluster`.
+    """
+    preload = [*dask.config.get("distributed.worker.preload"), __name__]
+    options = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL, **settings}
+    options |= {"n_workers": workers, "threads_per_worker": 1, "processes": True}
+    with dask.config.set(MEMORY | MALLOC):
+        return LocalCluster(preload=preload, **options)
+
+
+def dask_setup(worker: Worker) -> None:
+    """Set up the process of a worker; Dask calls this function before its first task."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes
+    choose_gpu(worker.name)
+
+
+def choose_gpu(name: object) -> None:
+    """Give each worker of a machine one of its GPUs, unless CUDA_VISIBLE_DEVICES is set.
+
+    Parameters
+    ----------
+    name : object
+        Name of the worker. Workers of a `distributed.LocalCluster` are called 0, 1, 2.
+    """
+    count = len(list(Path("/proc/driver/nvidia/gpus").glob("*")))
+    if count > 1 and isinstance(name, int):
+        os.environ.setdefault("CUDA_VISIBLE_DEVICES", str(name % count))
