@@ -17,7 +17,7 @@ from ..gaussian.file import SetHead
 from ..storage import npz
 from ..storage.atomic import reader_of
 from . import options
-from .console import table
+from .console import printable, table
 from .outputs import check_outputs, name_pictures
 from .scene import explained, load_mitsuba
 
@@ -166,7 +166,7 @@ def _load_textures(key: str, file: str, maps: Any = (), **_: Any) -> Facts:
 def _text(truncation: Any = (), maps: Any = (), ledger: Any = (), **facts: Any) -> str:
     """Format facts as lines, and maps, arrays and the truncation curve as tables below."""
     width = max(map(len, facts)) + 1
-    lines = [f"{key:{width}} {value}" for key, value in facts.items()]
+    lines = [printable(f"{key:{width}} {value}") for key, value in facts.items()]
     if maps:
         rows = [(m["name"], str(m["channels"]), m["space"], f"{m['weight']:.3g}") for m in maps]
         lines += ["", *table([("map", "channels", "space", "weight"), *rows])]

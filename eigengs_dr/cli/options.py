@@ -13,6 +13,7 @@ from ..image.color import SPACES
 from ..image.pixels import ENCODINGS
 from ..image.remote import is_url
 from ..storage.atomic import refuse_url
+from .console import printable
 from .outputs import describe_run, write_json
 
 EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -201,10 +202,10 @@ class Run(NamedTuple):
     report: Path | None = None
     cluster: str | None = None
 
-    def tell(self, text: str) -> None:
+    def tell(self, *lines: str) -> None:
         """Write the summary of a command, unless it is quiet."""
         if not self.quiet:
-            click.echo(text)
+            click.echo("\n".join(map(printable, lines)))
 
     def write_report(self, figures: dict[str, object], backend: str | None = None) -> None:
         """Write the figures and the machine, on a backend or that of the option, as JSON."""

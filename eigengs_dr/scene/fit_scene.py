@@ -35,6 +35,7 @@ from ..image.metrics import psnr as psnr_of
 from ..plugins.cone import PIXEL
 from ..plugins.versions import Texture
 from ..raster.render import render
+from .bitmaps import Unsuitable
 from .target import MARGIN, error_weights, seen_by, smoothest_target
 from .visibility import Visibility, visibility
 
@@ -269,7 +270,7 @@ def _search_count(
 
     Raises
     ------
-    ValueError
+    Unsuitable
         If the number `most` does not suffice.
     """
     tried: list[tuple[int, float]] = []
@@ -283,7 +284,7 @@ def _search_count(
         if lowest >= bound:
             high, best = count, (gaussians, reached)
         elif count == most:
-            raise ValueError(
+            raise Unsuitable(
                 f"{most} Gaussians reach {lowest:.1f} dB, but the cameras shall see {bound:g} dB; "
                 "lower the PSNR, or allow more Gaussians or iterations"
             )

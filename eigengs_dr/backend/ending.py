@@ -1,0 +1,64 @@
+"""The end of the program ``eigengs-dr`` by Ctrl-C or SIGTERM, from its first line on.
+
+A `KeyboardInterrupt` may be raised in any line: in an import it becomes an error that blames the
+installation, in Dr.Jit an abort. So the program raises none. It deletes its temporary files and
+ends, but in blocks that end their work by themselves, see `eigengs_dr.backend.feedback`. What uses
+the package as a library has the signals as they were.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+NAME = "eigengs-dr"
+"""Name of the program; every line on standard error starts with it."""
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells define it, and after SIGTERM."""
+
+_undo: dict[object, Callable[[], object]] = {}
+"""What the program calls before it ends, the last first."""
+
+
+def is_program() -> bool:
+    """Return whether this process is the program itself, and none that imports the package."""
+    words = sys.orig_argv[1:3]
+    script = os.path.splitext(os.path.basename(words[0]))[0] if words else ""
+    return script == NAME or words == ["-m", "eigengs_dr"]
+
+
+def end_at_signals() -> None:
+    """Let Ctrl-C and SIGTERM end this process with one line; an ignored signal stays ignored."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    for number, handler in usual.items():
+        if signal.getsignal(number) == handler:
+            signal.signal(number, end_program)
+
+
+def end_program(number: int, frame: Any) -> None:
+    """End the process as the handler of a signal; what is under way is deleted first."""
+    for other in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(other, signal.SIG_IGN)
+    for undo in reversed([*_undo.values()]):
+        with suppress(Exception):
+            undo()
+    with suppress(OSError):
+        # A bar may stand in the line; standard error may be closed.
+        os.write(2, (b"\r\033[K" if os.isatty(2) else b"") + f"{NAME}: interrupted\n".encode())
+    os._exit(INTERRUPTED)
+
+
+@contextmanager
+def undone_at_end(undo: Callable[[], object]) -> Iterator[None]:
+    """Call a function if a signal ends the program during a block."""
+    key = object()
+    _undo[key] = undo
+    try:
+        yield
+    finally:
+        del _undo[key]
