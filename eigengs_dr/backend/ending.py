@@ -8,6 +8,7 @@ the package as a library has the signals as they were.
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -24,6 +25,9 @@ INTERRUPTED = 130
 _undo: dict[object, Callable[[], object]] = {}
 """What the program calls before it ends, the last first."""
 
+_stderr = -1
+"""A copy of standard error, which an import of Dr.Jit hides for a moment."""
+
 
 def is_program() -> bool:
     """Return whether this process is the program itself, and none that imports the package."""
@@ -34,6 +38,10 @@ def is_program() -> bool:
 
 def end_at_signals() -> None:
     """Let Ctrl-C and SIGTERM end this process with one line; an ignored signal stays ignored."""
+    global _stderr
+    with suppress(OSError):  # it may be closed
+        _stderr = os.dup(2)
+    atexit.register(_ignore_signals)
     usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
     for number, handler in usual.items():
         if signal.getsignal(number) == handler:
@@ -42,15 +50,20 @@ def end_at_signals() -> None:
 
 def end_program(number: int, frame: Any) -> None:
     """End the process as the handler of a signal; what is under way is deleted first."""
-    for other in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(other, signal.SIG_IGN)
+    _ignore_signals()
     for undo in reversed([*_undo.values()]):
         with suppress(Exception):
             undo()
     with suppress(OSError):
-        # A bar may stand in the line; standard error may be closed.
-        os.write(2, (b"\r\033[K" if os.isatty(2) else b"") + f"{NAME}: interrupted\n".encode())
+        clear = b"\r\033[K" if os.isatty(_stderr) else b""  # a bar may stand there
+        os.write(_stderr, clear + f"{NAME}: interrupted\n".encode())
     os._exit(INTERRUPTED)
+
+
+def _ignore_signals() -> None:
+    """Ignore signals: from here on the end takes no time, and Python forgets its handlers."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 @contextmanager
