@@ -141,7 +141,8 @@ def fit_large(
     Notes
     -----
     The result draws no random numbers. It does not depend on the order of the blocks, nor on where
-    they are fitted or whether the run was interrupted.
+    they are fitted or whether the run was interrupted; a run that goes on beside another processor
+    differs in the last bits.
 
     Examples
     --------

@@ -117,14 +117,9 @@ def require_writable(path: str | os.PathLike[str]) -> None:
     OSError
         If the file cannot be written: one line that names the file and the reason.
     """
-    target = _target(path)
-    try:
-        # Mode bits do not show read-only disks, quotas and access lists.
-        with _temporary(target, path):
-            pass
-    except OSError as error:
-        reason = f"cannot create a file in {target.parent} ({error.strerror})"
-        raise OSError(f"{path}: {reason}; choose another path") from error
+    # Mode bits do not show read-only disks, quotas and access lists.
+    with _temporary(_target(path), path):
+        pass
 
 
 def refuse_url(path: str | os.PathLike[str]) -> None:

@@ -73,7 +73,8 @@ def _open_locked(path: Path, output: str | os.PathLike[str], wait: float) -> tup
         try:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
-            raise OSError(error.errno, error.strerror, os.fspath(output)) from error
+            reason = f"cannot create a file in {path.parent} ({error.strerror})"
+            raise OSError(f"{os.fspath(output)}: {reason}; choose another path") from error
         try:
             locked = lock_descriptor(descriptor, blocking=False)
             # The run before may have deleted the file between the two calls.
