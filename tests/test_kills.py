@@ -30,6 +30,6 @@ def test_kills(inputs, tmp_path, name, monkeypatch):
     whole = shutil.copytree(inputs, tmp_path / "whole")
     assert kill_commands.run(words, whole).returncode == 0
     for sent in ("KILL", "TERM", "INT"):
-        for delay in (0.2, 1.2, 2.0):
+        for delay in (0.3, 1.2, 2.5):
             work = shutil.copytree(inputs, tmp_path / f"{sent}-{delay}")
             assert kill_commands.kill_once(words, leaves, work, whole, sent, delay) == []

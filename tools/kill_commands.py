@@ -147,9 +147,10 @@ def kill_once(
     faults = []
     # Before the first line runs, and after the last, Python itself ends as the system says.
     code, early = process.returncode, -getattr(signal, f"SIG{sent}")
-    starts = not said and code == early
+    is_own = "/eigengs_dr/" in said or "eigengs-dr" in said
+    starts = not is_own and ((not said and code == early) or "KeyboardInterrupt" in said)
     lines = [line for line in said.splitlines() if " note: " not in line]
-    if "Traceback" in said:
+    if "Traceback" in said and not starts:
         faults.append(f"traceback: {said.strip().splitlines()[-1][:90]}")
     elif sent == "KILL":
         if code not in (0, early):

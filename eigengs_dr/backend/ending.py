@@ -12,9 +12,11 @@ import atexit
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from typing import Any
+
+TYPE_CHECKING = False  # `typing` and `contextlib` take longer than all else before the first line
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Any
 
 NAME = "eigengs-dr"
 """Name of the program; every line on standard error starts with it."""
@@ -39,8 +41,10 @@ def is_program() -> bool:
 def end_at_signals() -> None:
     """Let Ctrl-C and SIGTERM end this process with one line; an ignored signal stays ignored."""
     global _stderr
-    with suppress(OSError):  # it may be closed
+    try:
         _stderr = os.dup(2)
+    except OSError:
+        _stderr = -1  # it is closed
     atexit.register(_ignore_signals)
     usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
     for number, handler in usual.items():
@@ -52,12 +56,15 @@ def end_program(number: int, frame: Any) -> None:
     """End the process as the handler of a signal; what is under way is deleted first."""
     _ignore_signals()
     for undo in reversed([*_undo.values()]):
-        with suppress(Exception):
+        try:
             undo()
-    with suppress(OSError):
+        except Exception:
+            continue  # the next run deletes it
+    try:
         clear = b"\r\033[K" if os.isatty(_stderr) else b""  # a bar may stand there
         os.write(_stderr, clear + f"{NAME}: interrupted\n".encode())
-    os._exit(INTERRUPTED)
+    finally:
+        os._exit(INTERRUPTED)
 
 
 def _ignore_signals() -> None:
@@ -66,12 +73,14 @@ def _ignore_signals() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-@contextmanager
-def undone_at_end(undo: Callable[[], object]) -> Iterator[None]:
+class undone_at_end:
     """Call a function if a signal ends the program during a block."""
-    key = object()
-    _undo[key] = undo
-    try:
-        yield
-    finally:
-        del _undo[key]
+
+    def __init__(self, undo: Callable[[], object]) -> None:
+        self.undo = undo
+
+    def __enter__(self) -> None:
+        _undo[self] = self.undo
+
+    def __exit__(self, *error: object) -> None:
+        del _undo[self]
