@@ -4,6 +4,11 @@
 package neither loads Dr.Jit nor sets a Mitsuba variant.
 """
 
+from .backend import ending
+
+if ending.is_program():  # before the imports, which take half a second
+    ending.end_at_signals()
+
 import sys
 from importlib.util import spec_from_file_location
 from pathlib import Path

@@ -97,7 +97,8 @@ def _show(section: Any, rows: list[Row], output: Path, run: options.Run) -> None
     for name, figure in section.charts.items():
         save_figure(output / f"{name}.svg", figure)
     charts = [f"chart: {output / name}.svg" for name in section.charts]
-    run.tell("\n\n".join([*map(as_text, section.tables), "\n".join(sources_of(rows) + charts)]))
+    text = "\n\n".join([*map(as_text, section.tables), "\n".join(sources_of(rows) + charts)])
+    run.tell(*text.split("\n"))
 
 
 @click.group("bench")

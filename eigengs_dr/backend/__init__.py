@@ -5,6 +5,7 @@
 - ``arrays``: array types that go together; copies of NumPy arrays; exact arithmetic on cuda
 - ``recording``: frozen programs; one thread at a time
 - ``feedback``: bars, warnings, Ctrl-C and SIGTERM between steps, pictures in a notebook
+- ``ending``: how the program ends by Ctrl-C or SIGTERM
 - ``executor``: where tasks run, in this process or on a cluster
 - ``doctor``: what works here and what to install
 """

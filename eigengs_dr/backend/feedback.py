@@ -12,6 +12,8 @@ from functools import wraps
 from inspect import signature
 from typing import Any, TypeVar
 
+from .ending import end_program
+
 HTML: list[Callable[[Any], str]] = []
 """The function that makes HTML of objects; `eigengs_dr` puts that of the viewer here."""
 
@@ -22,8 +24,14 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def printable(text: str) -> str:
-    """Return a text from a file with "?" for what a terminal would obey or could not show."""
-    return "".join(c if c.isprintable() else "?" for c in text)
+    """Escape what may not reach a terminal: control characters, and bytes that are no UTF-8."""
+    return "".join(c if c.isprintable() else _escaped(c) for c in text)
+
+
+def _escaped(character: str) -> str:
+    number = ord(character)
+    is_byte = 0xDC80 <= number <= 0xDCFF  # as Python keeps bytes of names
+    return f"\\x{number - 0xDC00:02x}" if is_byte else repr(character)[1:-1]
 
 
 def to_html(value: Any) -> str:
@@ -139,21 +147,23 @@ def _is_heard(handler: Handler) -> bool:
 
 @contextmanager
 def terminate_as_interrupt() -> Iterator[None]:
-    """Turn SIGTERM into a `KeyboardInterrupt` during a block, so that the block cleans up.
+    """Turn Ctrl-C and SIGTERM into a `KeyboardInterrupt` during a block, so that it cleans up.
 
-    A second SIGTERM ends the process. The block changes nothing in other threads than the main
-    thread, nor where something else handles SIGTERM, such as `defer_interrupts`.
+    A second signal ends the process. The block changes nothing in other threads than the main
+    thread, nor where something else handles a signal, such as `defer_interrupts`.
 
     Raises
     ------
     KeyboardInterrupt
-        At SIGTERM.
+        At a signal.
     """
 
     def interrupt() -> None:
         raise KeyboardInterrupt
 
-    with _first_signal([signal.SIGTERM], lambda handler: handler == signal.SIG_DFL, interrupt):
+    with _first_signal(
+        SIGNALS, lambda handler: handler in (signal.SIG_DFL, end_program), interrupt
+    ):
         yield
 
 

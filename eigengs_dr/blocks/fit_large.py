@@ -19,7 +19,7 @@ from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
 from ..image.metrics import psnr_from_mse
 from ..storage.atomic import require_writable
-from ..storage.checkpoint import Checkpoint
+from ..storage.checkpoint import open_checkpoint
 from .block import Settings
 from .grid import Block, choose_halo, divide
 from .run import Run
@@ -141,7 +141,8 @@ def fit_large(
     Notes
     -----
     The result draws no random numbers. It does not depend on the order of the blocks, nor on where
-    they are fitted or whether the run was interrupted.
+    they are fitted or whether the run was interrupted; a run that goes on beside another processor
+    differs in the last bits.
 
     Examples
     --------
@@ -170,7 +171,7 @@ def fit_large(
         names = ("iterations", "space", "solve_steps", "cutoff", "encoding")
         decisive = {name: getattr(options, name) for name in names}
         decisive |= {"gaussians": settings.gaussians, "block": block}
-        keep = Checkpoint(output, source.identity | decisive, [])
+        keep = open_checkpoint(output, source.identity | decisive, [])
     with (
         keep as checkpoint,
         defer_interrupts() if client is None else nullcontext() as interrupted,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -11,15 +12,10 @@ from typing import Any
 
 import click
 
+from ..backend.ending import INTERRUPTED, NAME
 from ..backend.executor import ClusterError
-from ..backend.feedback import progress_bar, terminate_as_interrupt
+from ..backend.feedback import printable, progress_bar, terminate_as_interrupt
 from ..backend.selection import BackendError
-
-NAME = "eigengs-dr"
-"""Name of the program; every line on standard error starts with it."""
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells define it."""
 
 MISSED = 1
 """Exit code if the target PSNR cannot be reached."""
@@ -37,6 +33,9 @@ class Program(click.Group):
     def main(self, args: Sequence[str] | None = None, *rest: Any, **extra: Any) -> Any:
         """Run a command and exit; see `click.Command.main`."""
         arguments = sys.argv[1:] if args is None else list(args)
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")  # what the terminal cannot show
         extra.update(prog_name=NAME, standalone_mode=False, obj=list(arguments))
         try:
             with warnings.catch_warnings():
@@ -46,20 +45,38 @@ class Program(click.Group):
                 sys.exit(super().main(arguments, *rest, **extra))
         except click.exceptions.NoArgsIsHelpError as error:
             error.show()
-        except click.ClickException as error:
-            say(f"error: {error.format_message()}")
-        except OSError as error:
-            complete = error.filename is not None and error.strerror is not None
-            say(f"error: {error.filename}: {error.strerror}" if complete else f"error: {error}")
-        except (ValueError, ImportError, BackendError, ClusterError) as error:
-            say(f"error: {error}")
-        except RuntimeError as error:
-            # Click raises one for Ctrl-C, and Dr.Jit while it traces a program.
-            if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
-                raise
+        except ERRORS as error:
+            _end_if_interrupted(error)
+            say(f"error: {_message(error)}")
+        except BaseException as error:
+            _end_if_interrupted(error)
+            raise
+        sys.exit(FAILED)
+
+
+ERRORS = (click.ClickException, OSError, ValueError, ImportError, BackendError, ClusterError)
+"""Errors that a user can act on."""
+
+
+def _message(error: Exception) -> str:
+    if isinstance(error, click.ClickException):
+        return error.format_message()
+    if isinstance(error, OSError) and error.filename is not None and error.strerror is not None:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
+def _end_if_interrupted(error: BaseException | None) -> None:
+    """End the program if a chain of errors began with Ctrl-C.
+
+    It does in a block that cleans up by itself, see `terminate_as_interrupt`. Click, Dr.Jit and
+    imports make other errors of it.
+    """
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
             say("interrupted")
             sys.exit(INTERRUPTED)
-        sys.exit(FAILED)
+        error = error.__cause__ or error.__context__
 
 
 def say(text: str) -> None:
@@ -67,7 +84,7 @@ def say(text: str) -> None:
     from tqdm import tqdm
 
     with tqdm.external_write_mode(file=sys.stderr, nolock=True):
-        click.echo(f"{NAME}: {' '.join(text.split())}", err=True)
+        click.echo(f"{NAME}: {printable(' '.join(text.split()))}", err=True)
 
 
 @contextmanager
@@ -82,7 +99,12 @@ def bar(quiet: bool) -> Iterator[Callable[..., None]]:
         label restarts the bar.
     """
     with progress_bar(False if quiet else None) as show:
-        yield show or (lambda *values: None)
+
+        def show_printable(label: str, *values: Any) -> None:
+            if show:
+                show(printable(label), *values)
+
+        yield show_printable
 
 
 @contextmanager
@@ -97,6 +119,7 @@ def about(name: Path | str) -> Iterator[None]:
 
 def table(rows: Sequence[Sequence[str]]) -> list[str]:
     """Return rows of cells as lines, with the first column to the left and others to the right."""
+    rows = [[printable(cell) for cell in row] for row in rows]
     first, *others = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         f"{row[0]:{first}}" + "".join(f"  {c:>{w}}" for c, w in zip(row[1:], others, strict=True))

@@ -22,7 +22,7 @@ from ..image.metrics import float_space, target_key
 from . import options
 from .console import FAILED, INTERRUPTED, MISSED, about, bar, open_cluster, say
 from .options import MapFile
-from .outputs import check_outputs, keeps_result, name_outputs, name_pictures
+from .outputs import check_outputs, check_replaceable, claim, name_outputs, name_pictures
 
 Record = dict[str, Any]
 """The figures of one image, for its lines in the terminal and for the report."""
@@ -54,7 +54,7 @@ NOT_OF_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "cluster")
 @options.encoding
 @options.number("--seed", "Seed of --init random.", 0)
 @options.value("--preview", "FILE", options.path, "Picture (or folder) of photo, fit and outlines.")
-@click.option("--overwrite", is_flag=True, help="Fit images whose results exist again.")
+@click.option("--overwrite", is_flag=True, help="Of several images, fit all again.")
 @options.shared("cluster", "backend", "report", "quiet")
 def fit(
     run: options.Run,
@@ -74,8 +74,9 @@ def fit(
     row for each. An image that cannot be fitted is left out; the exit code is then 2. With
     --cluster the processes of a Dask cluster fit the images, with the same results.
 
-    An image whose result exists is skipped, so that the same command continues a run; --overwrite
-    fits it again. A file that is no set of Gaussians is never replaced.
+    The result of one image is written anew. Of several images, those whose results exist are
+    skipped, so that the same command continues a run; other options than those of the results are
+    refused, and --overwrite fits all again. A file that is no set of Gaussians is never replaced.
 
     Ctrl-C writes the best fit so far of one image, or ends after the last complete one of several,
     and exits with code 130. If --target-psnr cannot be reached, the command says so, writes the
@@ -121,8 +122,8 @@ def fit(
     check_outputs([*outputs, *pictures, run.report], [*files, *([basis] if basis else [])])
     if several and blocks:
         raise ValueError("--blocks fits one image; run the command for each image")
-    if not several and keeps_result(outputs[0], overwrite, run.quiet, bool(maps)):
-        return
+    if not several:
+        check_replaceable(outputs[0], bool(maps))
     if not (several or maps):
         blocks = blocks or _plan_memory(run, files[0], settings, preview)
     if blocks and not _has_blocks(settings, preview):
@@ -192,6 +193,7 @@ def _fit_whole(
 ) -> Record:
     """Fit one image or maps, write its files, and return its figures."""
     started, choices = time.perf_counter(), dict(vars(settings))
+    claim(output)
     maps = source if isinstance(source, dict) else {}
     name = (output if isinstance(source, dict) else Path(source)).name
     if maps:
@@ -213,7 +215,7 @@ def _fit_whole(
             eg.save_image(picture, _comparison(image, result))
     times = {"seconds_load": loaded - started, "seconds_total": time.perf_counter() - started}
     title = str(output if maps else source)
-    run.tell(_summary(title, record | times, settings.target_space, picture))
+    run.tell(*_summary(title, record | times, settings.target_space, picture))
     return record | times
 
 
@@ -275,7 +277,9 @@ def _comparison(image: Any, result: eg.Fit) -> Any:
     return np.concatenate(rows)
 
 
-def _summary(name: str, record: Record, target_space: str, picture: Path | None = None) -> str:
+def _summary(
+    name: str, record: Record, target_space: str, picture: Path | None = None
+) -> list[str]:
     """Describe a fit for a terminal."""
     blocks = f" in {record['blocks']} blocks" if "blocks" in record else ""
     lines = [
@@ -296,7 +300,7 @@ def _summary(name: str, record: Record, target_space: str, picture: Path | None 
     lines.append(f"  wrote {record['output']}")
     if picture:
         lines.append(f"  wrote {picture} (photo, fit and outlines side by side)")
-    return "\n".join(lines)
+    return lines
 
 
 def _psnrs(space: str, floats: float, rgb: float) -> str:
@@ -348,6 +352,7 @@ def _fit_several(
 ) -> list[Record]:
     """Fit images into a folder; return the records of what is done. What failed is said at once."""
     started, folder = time.perf_counter(), outputs[0].parent
+    given = _given(run.context, settings)
     picture_of = {path.stem: picture for path, picture in zip(outputs, pictures, strict=True)}
 
     def note(done: int, total: int | None, row: eg.ImageRow) -> None:
@@ -362,30 +367,43 @@ def _fit_several(
     with bar(run.quiet) as show:
         try:
             rows = eg.fit_many(
-                files, folder, overwrite=overwrite, progress=note, client=client, **vars(settings)
+                files, folder, overwrite=overwrite, progress=note, client=client, **given
             )
         except eg.RunInterrupted as stop:
             rows = stop.rows
             done = f"{len(rows)} of {len(files)} images are done"
             say(f"interrupted; {done}; the same command fits the others")
-    run.tell(_summary_of_all(rows, folder, time.perf_counter() - started, settings.space))
+    run.tell(*_summary_of_all(rows, folder, time.perf_counter() - started, settings.space))
     known = [{k: v for k, v in vars(row).items() if v not in (None, "")} for row in rows]
     return [{"stopped": record["status"]} | record for record in known]
 
 
-def _summary_of_all(rows: list[eg.ImageRow], folder: Path, seconds: float, space: str) -> str:
+def _given(context: click.Context, settings: FitOptions) -> dict[str, Any]:
+    """Return the options that the command line gives, and what stands for the others."""
+    default = click.core.ParameterSource.DEFAULT
+    names = [n for n in context.params if context.get_parameter_source(n) is not default]
+    if settings.start is not None:
+        names.append("start")
+    return {name: value for name, value in vars(settings).items() if name in names}
+
+
+def _summary_of_all(rows: list[eg.ImageRow], folder: Path, seconds: float, space: str) -> list[str]:
     """Describe a run for a terminal."""
     fitted = [row for row in rows if row.status == "done"]
     counts = Counter(row.status for row in rows)
     others = "".join(f", {counts[k]} {k}" for k in ("skipped", "failed") if counts[k])
+    lines = []
     text = f"{len(fitted)} image{'s' * (len(fitted) != 1)} fitted{others} in {seconds:.1f} s"
     if fitted:
         pairs = [(row.psnr_ycbcr, row.psnr_rgb) for row in fitted]
         floats, rgb = (sum(values) / len(fitted) for values in zip(*pairs, strict=True))
-        text += f" ({len(fitted) / seconds:.2g} images/s)\n  mean{_psnrs(space, floats, rgb)[1:]}"
+        text += f" ({len(fitted) / seconds:.2g} images/s)"
+        lines.append(f"  mean{_psnrs(space, floats, rgb)[1:]}")
     if counts["skipped"]:
-        text += "\n  --overwrite fits the skipped images, whose results exist, again"
-    return f"{text}\n  wrote {folder}" if fitted else text
+        lines.append("  --overwrite fits the skipped images, whose results exist, again")
+    if fitted:
+        lines.append(f"  wrote {folder}")
+    return [text, *lines]
 
 
 # ---------------------------------------------------------------------------------------------
@@ -459,7 +477,7 @@ def _fit_by_blocks(
             say(
                 f"interrupted; finished blocks are in {output}.checkpoint; the same command goes on"
             )
-            run.context.exit(INTERRUPTED)
+            return {"input": path, "output": output, "stopped": "interrupted"}
     record = {"input": path, "output": output, "stopped": "iterations", **_figures(result)}
-    run.tell(_summary(str(path), record, settings.target_space))
+    run.tell(*_summary(str(path), record, settings.target_space))
     return record | {"blocks_resumed": result.resumed}

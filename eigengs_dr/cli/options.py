@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import click
 
+from ..backend.feedback import printable
 from ..backend.selection import BACKENDS
 from ..image.color import SPACES
 from ..image.pixels import ENCODINGS
@@ -200,10 +201,10 @@ class Run(NamedTuple):
     report: Path | None = None
     cluster: str | None = None
 
-    def tell(self, text: str) -> None:
+    def tell(self, *lines: str) -> None:
         """Write the summary of a command, unless it is quiet."""
         if not self.quiet:
-            click.echo(text)
+            click.echo("\n".join(map(printable, lines)))
 
     def write_report(self, figures: dict[str, object], backend: str | None = None) -> None:
         """Write the figures and the machine, on a backend or that of the option, as JSON."""

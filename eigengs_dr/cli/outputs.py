@@ -3,6 +3,7 @@
 import json
 import os
 import shlex
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,9 @@ from ..backend.selection import describe
 from ..gaussian.file import FORMAT, MATERIAL
 from ..image.remote import stem_of
 from ..storage import npz
-from ..storage.atomic import atomic_write, require_writable
-from .console import NAME, say
+from ..storage.atomic import atomic_write, remove_stale, require_writable
+from ..storage.locks import lock_output
+from .console import NAME
 
 
 def name_outputs(
@@ -55,7 +57,7 @@ def name_outputs(
     if not output.is_dir() and (output.exists() or output.suffix.lower() in suffixes):
         raise ValueError(f"{output}: is a file; several images, or a folder of them, need a folder")
     names = [stem_of(path) + suffixes[0] for path in inputs]
-    if twice := [name for name in names if names.count(name) > 1]:
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
         advice = "give an image once, or rename one of them"
         raise ValueError(f"{output / twice[0]}: two images have this name; {advice}")
     output.mkdir(parents=True, exist_ok=True)
@@ -76,6 +78,8 @@ def name_pictures(
 def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | str]) -> None:
     """Check that every output can be written and overwrites neither an input nor another output.
 
+    What killed runs left beside the outputs goes.
+
     Parameters
     ----------
     outputs : iterable of Path or None
@@ -91,6 +95,7 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | str]) 
         If a file cannot be written.
     """
     uses = {os.path.realpath(path): "is read" for path in inputs}
+    folders: set[str] = set()
     for output in outputs:
         if output is None:
             continue
@@ -98,11 +103,23 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | str]) 
         if real in uses:
             raise ValueError(f"{output}: {uses[real]} too; write to another file")
         uses[real] = "is written"
-        require_writable(output)
+        folder = os.path.dirname(real)
+        is_first = folder not in folders  # one look at a folder, of perhaps 100,000 files
+        if is_first or (os.path.exists(real) and not os.path.isfile(real)):
+            require_writable(output)
+        if is_first:
+            folders.add(folder)
+            remove_stale(Path(folder))
 
 
-def keeps_result(output: Path, overwrite: bool, quiet: bool, maps: bool) -> bool:
-    """Return whether the result of a fit, of maps or of one image, exists and stays; say so.
+def claim(*outputs: Path) -> None:
+    """Let no other run write outputs until the command ends; see `lock_output`."""
+    for output in outputs:
+        click.get_current_context().with_resource(lock_output(output))
+
+
+def check_replaceable(output: Path, maps: bool) -> None:
+    """Check that a fit, of maps or of one image, may replace a file.
 
     Raises
     ------
@@ -110,17 +127,14 @@ def keeps_result(output: Path, overwrite: bool, quiet: bool, maps: bool) -> bool
         If the file is something else than such a result. It is never replaced.
     """
     if not output.exists():
-        return False
+        return
     try:
-        found = npz.format_of(output)
+        kind = npz.format_of(output)
     except ValueError:
-        found = ""
-    if found != (MATERIAL if maps else FORMAT):
+        kind = ""
+    if kind != (MATERIAL if maps else FORMAT):
         name = "material" if maps else "set of Gaussians"
         raise ValueError(f"{output}: exists and is no {name}; choose another name with -o")
-    if not overwrite and not quiet:
-        say(f"{output}: exists and is kept; --overwrite fits it again")
-    return not overwrite
 
 
 def describe_run(context: click.Context, backend: str | None) -> dict[str, object]:

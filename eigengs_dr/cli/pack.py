@@ -12,7 +12,7 @@ import eigengs_dr as eg
 from ..backend.selection import select
 from . import options
 from .console import about
-from .outputs import check_outputs, name_outputs
+from .outputs import check_outputs, claim, name_outputs
 
 SUFFIX, BUDGET = ".egs", 0.5
 """Suffix of packed files and default loss in dB; copies, because `eigengs_dr.codec` imports
@@ -57,6 +57,7 @@ def pack(
     [target] = name_outputs([file], output, [SUFFIX])
     inputs = [file, *([image] if image else []), *(m.path for m in maps.values())]
     check_outputs([target, run.report], inputs)
+    claim(target)
     select(run.backend)
     gaussians = eg.Gaussians.load(file, run.backend)
     if maps and not gaussians.maps:
@@ -81,7 +82,7 @@ def pack(
     if gaussians.maps:
         figure = "psnr_rgb"
     run.tell(
-        f"{file}: {len(gaussians):,} Gaussians, {before:,} bytes\n"
-        f"  wrote {target}: {packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bits per pixel\n"
-        f"  lost {packed.psnr_drop:.2f} dB; {figure} against {against}: {shown}"
+        f"{file}: {len(gaussians):,} Gaussians, {before:,} bytes",
+        f"  wrote {target}: {packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bits per pixel",
+        f"  lost {packed.psnr_drop:.2f} dB; {figure} against {against}: {shown}",
     )

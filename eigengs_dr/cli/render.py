@@ -8,7 +8,7 @@ import click
 from ..backend.selection import select
 from . import options
 from .console import bar
-from .outputs import check_outputs, name_outputs
+from .outputs import check_outputs, claim, name_outputs
 
 
 @click.command()
@@ -61,6 +61,7 @@ def render(
     [output] = name_outputs([file], output, SUFFIXES)
     depth = bits_of(output, int(bits) if bits else None)
     check_outputs([output], [file])
+    claim(output)
     select(run.backend)
     from ..blocks.draw import save_region
     from ..gaussian.file import read_map
@@ -84,4 +85,4 @@ def render(
     options.check_pixels(*size, output.suffix.lower() in TIFF_SUFFIXES)
     with bar(run.quiet) as show:
         save_region(output, data, region, size, run.backend, partial(show, output.name), depth)
-    run.tell(f"{file}: {count:,} Gaussians\n  wrote {output} ({size[0]}x{size[1]})")
+    run.tell(f"{file}: {count:,} Gaussians", f"  wrote {output} ({size[0]}x{size[1]})")

@@ -21,7 +21,7 @@ from ..backend.selection import backend_of, name_of, select
 from ..storage.atomic import atomic_write
 from . import options
 from .console import MISSED, bar, table
-from .outputs import check_outputs, name_outputs
+from .outputs import check_outputs, claim, name_outputs
 
 if TYPE_CHECKING:
     import numpy as np
@@ -81,6 +81,7 @@ def scene(
     """
     outputs = name_outputs(scenes, output, SUFFIXES)
     check_outputs(outputs, scenes)
+    claim(*outputs)
     mi = load_mitsuba(variant, run.quiet)
     from ..scene.convert import render_in_passes
 
@@ -97,7 +98,8 @@ def scene(
         height, width = pixels.shape[:2]
         run.tell(
             f"{path}: {width}x{height}, samples per pixel: {samples}, "
-            f"{time.perf_counter() - started:.1f} s\n  wrote {target}"
+            f"{time.perf_counter() - started:.1f} s",
+            f"  wrote {target}",
         )
 
 
@@ -208,12 +210,12 @@ def convert(
     figures["psnr_rgb"] = found.psnr
     run.write_report(figures, mi.variant().partition("_")[0])
     seconds = time.perf_counter() - started
-    run.tell(f"{_table(found, before, after)}\nwrote {found.scene} in {seconds:.1f} s")
+    run.tell(*_table(found, before, after), f"wrote {found.scene} in {seconds:.1f} s")
     if any(psnr < target_psnr for psnr in found.psnr):
         run.context.exit(MISSED)
 
 
-def _table(found: ConvertedScene, before: int, after: int) -> str:
+def _table(found: ConvertedScene, before: int, after: int) -> list[str]:
     """Lay out the textures, what stayed, and how close the renderings are."""
     rows = [("texture", "texels", "bytes", "Gaussians", "bytes", "PSNR seen")]
     for t in found.textures:
@@ -226,4 +228,4 @@ def _table(found: ConvertedScene, before: int, after: int) -> str:
     lines += [f"left alone: {name}: {reason}" for name, reason in found.left]
     psnrs = enumerate(found.psnr, 1)
     lines += [f"camera {k}: psnr_rgb {psnr:.1f} dB between the renderings" for k, psnr in psnrs]
-    return "\n".join(lines)
+    return lines

@@ -71,6 +71,7 @@ def train(
             result = training.train(folder, output, settings, run.backend, show, client)
     except training.Interrupted as error:
         say(f"interrupted; {error}")
+        run.write_report(vars(settings) | {"input": folder, "stopped": "interrupted"})
         run.context.exit(INTERRUPTED)
     if picture:
         save_image(picture, component_sheet(result.model, result.basis))
@@ -86,6 +87,7 @@ def train(
     run.tell(
         f"{folder}: {found['images']} images, {components} components, "
         f"{found['gaussians']} Gaussians in {found['seconds']:.1f} s; "
-        f"{split}\n  {measured}\n"
-        f"  wrote {output}" + (f" and {picture}" if picture else "")
+        f"{split}",
+        f"  {measured}",
+        f"  wrote {output}" + (f" and {picture}" if picture else ""),
     )

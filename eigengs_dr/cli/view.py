@@ -16,7 +16,7 @@ from ..storage import npz
 from ..storage.atomic import reader_of
 from . import options
 from .console import about
-from .outputs import check_outputs, name_outputs
+from .outputs import check_outputs, claim, name_outputs
 
 SUFFIXES = (".html", ".htm")
 
@@ -59,6 +59,7 @@ def view(
     """
     [page] = name_outputs([file], output, SUFFIXES)
     check_outputs([page], [file, *([image] if image else [])])
+    claim(page)
     select(run.backend)
     source, counts = _load(file, name, levels, run.backend)
     photo: Any = image

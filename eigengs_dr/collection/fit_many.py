@@ -15,10 +15,11 @@ from ..fitting.fit import Fit, fit_image
 from ..fitting.options import FitOptions, refuse_unknown
 from ..fitting.start import load_start
 from ..fitting.target import unit_of
+from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
 from ..image.pixels import EncodedImage
 from .fit_batch import fit_batch, fits_in_batches
-from .manifest import ImageRow
+from .manifest import ImageRow, fingerprint
 from .run import Job, run_images
 from .sources import Images
 
@@ -54,9 +55,10 @@ def fit_many(
         file is written completely or not at all. ``manifest.jsonl`` has a row for each image. By
         default the results stay in memory.
     overwrite : bool, optional
-        Fit images whose output exists. By default such images are skipped, whatever the options of
-        the earlier run were: a run that was interrupted continues if it is repeated. A file that
-        is no set of Gaussians is never replaced.
+        Fit images whose output exists. By default such images are skipped: a run that was
+        interrupted continues if it is repeated. Options that the results do not have are an error
+        if they are given or there is work to do, else a warning. A file that is no set of Gaussians
+        is never replaced.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         ``progress(done, total, row)`` after every image, with its `ImageRow`, which in this process
@@ -79,7 +81,8 @@ def fit_many(
     Raises
     ------
     ValueError
-        If an option is out of range, two images have one name, or there is no image. In an
+        If an option is out of range, two images have one name, there is no image, or the output
+        folder has results of other options. In an
         iterator, the second image of one name has a row with an error instead.
     TypeError
         If an option is unknown.
@@ -121,8 +124,19 @@ def fit_many(
         rendered_as(settings.space) is None,
         settings.encoding,
         settings.iterations,
+        _decisive(settings),
+        list(options),
     )
     return run_images(images, output, overwrite, job, progress, client)
+
+
+def _decisive(settings: FitOptions) -> dict[str, Any]:
+    """Return the options on which results depend; a start by what it holds."""
+    options = {name: value for name, value in vars(settings).items() if name != "backend"}
+    if settings.start is not None:
+        start: Any = settings.start
+        options["start"] = fingerprint(start if isinstance(start, Gaussians) else start.gaussians)
+    return options
 
 
 def _may_join(group: list[EncodedImage], added: EncodedImage, options: FitOptions) -> bool:

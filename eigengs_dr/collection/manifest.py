@@ -2,20 +2,27 @@
 
 The files of results are whole or not there, so they say what a run need not do again. During a run
 ``manifest.jsonl`` grows by a line for each image, a JSON object; the last line of an image counts.
-The end of a run leaves one line an image, sorted by name.
+The end of a run leaves one line an image, sorted by name. A row holds the options of its result,
+so that a run goes on with the same options alone.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from ..storage.atomic import atomic_write, lock_folder, remove_stale
+import numpy as np
+
+from ..gaussian.gaussians import Gaussians
+from ..storage.atomic import atomic_write, remove_stale
+from ..storage.locks import lock_folder
+from ..storage.settings import Settings, difference, to_json
 
 
 @dataclass(frozen=True)
@@ -89,15 +96,21 @@ NAME = "manifest.jsonl"
 
 STATUSES = ("done", "skipped", "failed")
 
-KEYS = [field.name for field in fields(ImageRow) if field.name != "result"]
+KEYS = [*(field.name for field in fields(ImageRow) if field.name != "result"), "options"]
 """Keys of a row."""
 
 Row = dict[str, Any]
 
 
 @contextmanager
-def open_manifest(folder: Path) -> Iterator[Manifest]:
+def open_manifest(folder: Path, options: Settings | None = None) -> Iterator[Manifest]:
     """Open the manifest of an existing folder, and hold the lock of the folder, during a block.
+
+    Parameters
+    ----------
+    folder : Path
+    options : dict, optional
+        Options on which the results of the run depend, with values that JSON can hold.
 
     Raises
     ------
@@ -106,7 +119,7 @@ def open_manifest(folder: Path) -> Iterator[Manifest]:
     ValueError
         If the file is no manifest.
     """
-    path = folder / NAME
+    path, settings = folder / NAME, to_json(options or {})
     with lock_folder(folder):
         remove_stale(folder)
         rows, clean = read_manifest(path)
@@ -114,7 +127,7 @@ def open_manifest(folder: Path) -> Iterator[Manifest]:
             write_manifest(path, rows)  # else the next row would continue a half line
         file = path.open("ab")
         try:
-            yield Manifest(path, rows, file)
+            yield Manifest(path, rows, file, settings)
         finally:
             # If the disk is too full for a second file, the longer one holds the same rows.
             with suppress(OSError):
@@ -133,17 +146,41 @@ class Manifest(NamedTuple):
         The last row of each image, by its name.
     file : file
         Takes the rows to come.
+    options : dict
+        The options of the rows to come.
     """
 
     path: Path
     rows: dict[str, Row]
     file: BinaryIO
+    options: Settings
+
+    def other_options(self, names: Collection[str]) -> str:
+        """Say which of some options the results do not have, and what to do; else nothing.
+
+        Rows of older versions do not say their options.
+        """
+        wanted = {name: value for name, value in self.options.items() if name in names}
+        for row in self.rows.values():
+            known = row.get("options") if row["status"] == "done" else None
+            if isinstance(known, dict) and (different := difference(known, wanted)):
+                return (
+                    f"{self.path.parent}: holds results with {different}; use their options or "
+                    "another folder, or do all again with --overwrite (overwrite=True)"
+                )
+        return ""
 
     def add(self, row: ImageRow) -> None:
-        """Record what became of an image. A skipped image keeps the row of its result."""
-        if row.status == "skipped" and self.rows.get(row.name, {}).get("status") == "done":
-            return
-        self.rows[row.name] = _to_json(row)
+        """Record what became of an image. A skipped image keeps the row of its result.
+
+        If a run was killed between the file of a result and its row, the file has the figures.
+        """
+        if row.status == "skipped":
+            if self.rows.get(row.name, {}).get("status") == "done":
+                return
+            if row.psnr_rgb is not None:
+                row = replace(row, status="done")
+        self.rows[row.name] = _to_json(row) | {"options": self.options}
         try:
             self.file.write(json.dumps(self.rows[row.name]).encode() + b"\n")
             self.file.flush()
@@ -193,9 +230,16 @@ def read_manifest(path: Path) -> tuple[dict[str, Row], bool]:
     return rows, not rest
 
 
+def fingerprint(gaussians: Gaussians) -> str:
+    """Return a text that tells a set from others, for options."""
+    arrays = gaussians.to_arrays().values()
+    data = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
 def _to_json(row: ImageRow) -> Row:
     """Return a row as types of JSON; the output without its folder, which may move."""
-    plain: Row = {key: getattr(row, key) for key in KEYS}
+    plain: Row = {key: getattr(row, key) for key in KEYS if key != "options"}
     plain["input"] = None if row.input is None else str(row.input)
     plain["output"] = None if row.output is None else row.output.name
     infinite = [k for k, v in plain.items() if isinstance(v, float) and not math.isfinite(v)]

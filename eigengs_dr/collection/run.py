@@ -12,7 +12,7 @@ import os
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -25,12 +25,13 @@ import numpy as np
 from ..backend.executor import Executor, executor_for
 from ..backend.feedback import defer_interrupts, warn
 from ..fitting.fit import Fit
-from ..gaussian.file import write
+from ..gaussian.file import FitFigures, write
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import read_ahead
 from ..image.io import check_data, read_floats
 from ..image.pixels import EncodedImage
 from ..storage.atomic import refuse_url, require_writable
+from ..storage.settings import Settings
 from .manifest import ImageRow, Manifest, RowProgress, RunInterrupted, open_manifest
 from .sources import Images, Source, list_sources, plan_output
 
@@ -63,6 +64,10 @@ class Job(NamedTuple):
         See `eigengs_dr.image.io.check_image`.
     steps : int
         Steps of gradient descent of an image: how much work it is.
+    options : dict or None
+        Options on which the results depend, with values that JSON can hold.
+    given : collection of str
+        Names of the options that the caller gave; others have their defaults.
     """
 
     work: Callable[[list[EncodedImage]], list[Fit] | list[Gaussians]]
@@ -70,6 +75,8 @@ class Job(NamedTuple):
     keep_grey: bool = False
     encoding: str | None = None
     steps: int = 0
+    options: Settings | None = None
+    given: Collection[str] = ()
 
 
 class Finished(NamedTuple):
@@ -123,13 +130,20 @@ def run_images(
                 planned = plan_output(source, manifest, overwrite)
             if isinstance(planned, ImageRow):
                 note(source.place, planned)
-            else:
-                yield planned
+                continue
+            if other:
+                raise ValueError(other)
+            yield planned
 
     with ExitStack() as stack:
         manifest: Manifest | None = None
+        other = ""  # options that results do not have
         if output is not None:
-            manifest = stack.enter_context(open_manifest(make_folder(output)))
+            manifest = stack.enter_context(open_manifest(make_folder(output), job.options))
+            if not overwrite:
+                if given := manifest.other_options(job.given):
+                    raise ValueError(given)
+                other = manifest.other_options(job.options or {})
         if executor is None:
             found = run_here(with_work(), job)
         else:
@@ -139,6 +153,8 @@ def run_images(
                 note(place, row)
         except KeyboardInterrupt:
             raise RunInterrupted([rows[place] for place in sorted(rows)]) from None
+    if other:
+        warn(other)
     return [rows[place] for place in sorted(rows)]
 
 
@@ -196,7 +212,7 @@ def run_here(sources: Iterable[Source], job: Job) -> Generator[Finished, None, N
                     file = None
                     if gaussians is not None and row.output:
                         # The thread that calls this owns all work of Dr.Jit.
-                        file = pool.submit(write, row.output, gaussians.data())
+                        file = pool.submit(write, row.output, gaussians.data(), _figures_of(row))
                     writing.append((source, row, file))
                     while writing and (len(writing) > MAX_WRITING or _is_written(writing[0])):
                         yield _finish(*writing.popleft())
@@ -260,6 +276,14 @@ def _work_on(group: list[Decoded], job: Job) -> Iterator[tuple[Source, ImageRow,
         figures = {name: getattr(result, name) for name in FIGURES if hasattr(result, name)}
         figures |= {"width": width, "height": height, "gaussians": len(gaussians)}
         yield source, source.row("done", seconds=seconds, result=result, **figures), gaussians
+
+
+def _figures_of(row: ImageRow) -> FitFigures | None:
+    """Return what the file of a fit says of it."""
+    if row.psnr_ycbcr is None or row.psnr_rgb is None:
+        return None
+    name = "" if row.input is None else Path(row.input).name
+    return FitFigures(row.psnr_ycbcr, row.psnr_rgb, row.iterations or 0, name)
 
 
 def _results(images: list[Any], job: Job) -> list[Any]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..gaussian.file import read_head
+from ..gaussian.file import read_figures, read_head
 from ..image.folder import list_images
 from ..image.remote import is_url, stem_of
 from .manifest import ImageRow, Manifest
@@ -129,4 +129,7 @@ def plan_output(source: Source, manifest: Manifest, overwrite: bool) -> Source |
     if overwrite or row.get("status") == "failed":
         return source
     width, height = head.size
-    return source.row("skipped", width=width, height=height, gaussians=head.gaussians)
+    figures: dict[str, Any] = {"width": width, "height": height, "gaussians": head.gaussians}
+    if fit := read_figures(output):
+        figures |= {k: v for k, v in fit._asdict().items() if k != "source"}
+    return source.row("skipped", **figures)

@@ -277,11 +277,15 @@ class EigenGS:
         ValueError, OSError, RunInterrupted
             See `encode` and `eigengs_dr.fit_many`.
         """
+        from ..collection.manifest import fingerprint
         from ..collection.run import Job, run_images
         from .encoder import check_encoding
 
         check_encoding(colors, mean, target_psnr)
-        job = Job(partial(_encode_all, model=self, options=(colors, mean, target_psnr)))
+        work = partial(_encode_all, model=self, options=(colors, mean, target_psnr))
+        options = {"colors": colors, "mean": mean, "target_psnr": target_psnr}
+        options |= {"model": fingerprint(self.gaussians)}
+        job = Job(work, options=options, given=list(options))
         return run_images(images, output, overwrite, job, progress, client)
 
     @takes_numbers

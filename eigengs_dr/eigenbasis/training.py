@@ -20,7 +20,7 @@ from ..image.metrics import psnr
 from ..image.remote import is_url
 from ..image.resize import center_crop
 from ..raster.render import render
-from ..storage.checkpoint import Checkpoint
+from ..storage.checkpoint import Checkpoint, open_checkpoint
 from .components.bands import State
 from .components.solve import fit_model
 from .eigengs import EigenGS
@@ -103,7 +103,7 @@ def train(
     names = [path if isinstance(path, str) else path.name for path in found]
     steps = settings.training_steps
     record = {**asdict(settings), "iterations": steps, "folder": str(folder)}
-    with Checkpoint(output, record, names) as checkpoint, defer_interrupts() as interrupted:
+    with open_checkpoint(output, record, names) as checkpoint, defer_interrupts() as interrupted:
         if names != checkpoint.files:
             warn(
                 f"{folder}: the images have changed since this training began; it goes on with "

@@ -183,21 +183,25 @@ def read_pixels(props: Properties) -> NDArray[np.float32]:
     return np.array(converted).reshape(bitmap.height(), bitmap.width(), -1)
 
 
+class Unsuitable(ValueError):
+    """Pixels that must stay a bitmap; the message says why."""
+
+
 def space_of(pixels: NDArray[np.float32], data: bool) -> str:
     """Return the space of the Gaussians for pixels.
 
     Raises
     ------
-    ValueError
-        If the pixels must stay a bitmap, with the reason.
+    Unsuitable
+        If the pixels must stay a bitmap.
     """
     low, high = pixels.min(), pixels.max()
     if low < -0.001 or (data and high > 1.001):
-        raise ValueError(f"values from {low:g} to {high:g}, beyond 0 and 1")
+        raise Unsuitable(f"values from {low:g} to {high:g}, beyond 0 and 1")
     if high > 1.001:
         return "radiance"
     shown = pixels if data else to_coded(pixels)
     extreme = float(((shown <= 0.02) | (shown >= 0.98)).all(axis=2).mean())
     if extreme >= TWO_VALUES and np.ptp(shown) > 0.5:
-        raise ValueError("a mask of two values: Gaussians would soften its edges")
+        raise Unsuitable("a mask of two values: Gaussians would soften its edges")
     return "data" if data else "linear"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,15 +16,29 @@ from ..backend.feedback import shows_progress, warn
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
 from ..image.color import to_coded
-from ..image.io import save_image
+from ..image.io import ImageError, save_image
 from ..image.metrics import psnr
-from ..storage.atomic import refuse_url
-from .bitmaps import KEPT, Parsed, Use, file_keys, is_bitmap, parse, read_pixels, space_of, uses_of
+from ..storage.atomic import atomic_folder, refuse_url, remove_stale
+from ..storage.locks import lock_output
+from .bitmaps import (
+    KEPT,
+    Parsed,
+    Unsuitable,
+    Use,
+    file_keys,
+    is_bitmap,
+    parse,
+    read_pixels,
+    space_of,
+    uses_of,
+)
 from .fit_scene import SceneFit, fit_for_scene
 
 SCENE = "scene.xml"
 """Name of the new scene in its folder."""
 
+Progress = Callable[[str, int, int], None]
+"""``progress(label, done, total)``."""
 
 NO_SHAPE = "no shape outside of groups has it, so that no camera sees it directly"
 
@@ -148,69 +160,82 @@ def convert_scene(
         raise ValueError("no variant is set; call mi.set_variant('llvm_ad_rgb') first")
     if not 0 < target_psnr < 60:
         raise ValueError(f"target_psnr is {target_psnr:g}; it must be above 0 and below 60 dB")
-    progress = progress or (lambda *_: None)
     refuse_url(output)
-    target = Path(output)
-    work = _workplace(target)
-    try:
-        parsed, again = parse(scene, parameters), parse(scene, parameters)
-        uses, left = uses_of(parsed)
-        before = mi.parser.instantiate(parsed.config, parsed.state)
-        made = dict[int, str]()
-        textures = list[ConvertedTexture]()
-        groups: dict[tuple[str, bool], list[Use]] = {}
-        on_shapes = [mi.traverse(shape).hierarchy for shape in before.shapes()]
-        for use in uses:
-            if any(_texture(parsed, use) in found for found in on_shapes):
-                groups.setdefault((use.file, use.raw), []).append(use)
-            else:
-                left.append((use.name, NO_SHAPE))
-        for number, group in enumerate(groups.values()):
-            progress("textures", number, len(groups))
-            file = _file_name(group[0], {texture.file for texture in textures})
-            pixels = read_pixels(again.state.nodes[group[0].node].props)
-            found = _convert(before, parsed, group, pixels, target_psnr, iterations)
-            if isinstance(found, str):
-                left += [(use.name, found) for use in group]
-                continue
-            found.gaussians.save(work / file)
-            made |= {use.node: file for use in group}
-            textures.append(_describe(group, file, found))
-        progress("textures", len(groups), len(groups))
-        _rewrite(again, made, work, target)
-        (work / SCENE).write_text(_to_xml(again), encoding="utf-8")
-        seen = list[float]()
-        if spp != 0:
-            after = mi.load_file(str(work / SCENE))
-            seen = compare_renderings(before, after, work, spp, progress)
-        if target.exists():
-            target.rmdir()  # it is empty
-        os.replace(work, target)
-    except BaseException:
-        shutil.rmtree(work, ignore_errors=True)
-        raise
+    target = Path(os.path.realpath(output))  # of a link, the folder that it names
+    _check_empty(output, target)
+    with lock_output(output):
+        remove_stale(target.parent)
+        with atomic_folder(output) as work:
+            textures, left, seen = _convert_into(
+                work, target, scene, parameters, target_psnr, iterations, spp, progress or _silent
+            )
     for camera, decibels in enumerate(seen, 1):
         if decibels < target_psnr:
             warn(
-                f"{target}: camera {camera} sees psnr_rgb {decibels:.1f} dB between the "
+                f"{output}: camera {camera} sees psnr_rgb {decibels:.1f} dB between the "
                 f"renderings, below the goal of {target_psnr:g}; look at difference-{camera}.png"
             )
-    return ConvertedScene(target / SCENE, textures, left, seen)
+    return ConvertedScene(Path(output) / SCENE, textures, left, seen)
 
 
-def _workplace(target: Path) -> Path:
-    """Make a folder beside the target, which becomes the target at the end."""
+def _check_empty(output: str | os.PathLike[str], target: Path) -> None:
+    """Raise ValueError if there is something in a folder to write."""
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise ValueError(f"{target}: exists and is not empty; choose another folder")
-    parent = target.resolve().parent
-    work = parent / f".{secrets.token_hex(8)}"
-    try:
-        work.mkdir()
-        return work
-    except OSError as error:
-        raise OSError(
-            f"{target}: cannot create a folder in {parent} ({error.strerror}); choose another path"
-        ) from error
+        raise ValueError(f"{output}: exists and is not empty; choose another folder")
+
+
+def _silent(label: str, done: int, total: int) -> None:
+    """Show no progress."""
+
+
+def _convert_into(
+    work: Path,
+    target: Path,
+    scene: str | os.PathLike[str] | dict[str, Any],
+    parameters: Mapping[str, str] | None,
+    target_psnr: float,
+    iterations: int,
+    spp: int | None,
+    progress: Progress,
+) -> tuple[list[ConvertedTexture], list[tuple[str, str]], list[float]]:
+    """Write a scene and its files into a folder that becomes the target.
+
+    Returns
+    -------
+    textures, left, psnr
+        See `ConvertedScene`.
+    """
+    parsed, again = parse(scene, parameters), parse(scene, parameters)
+    uses, left = uses_of(parsed)
+    before = mi.parser.instantiate(parsed.config, parsed.state)
+    made = dict[int, str]()
+    textures = list[ConvertedTexture]()
+    groups: dict[tuple[str, bool], list[Use]] = {}
+    on_shapes = [mi.traverse(shape).hierarchy for shape in before.shapes()]
+    for use in uses:
+        if any(_texture(parsed, use) in found for found in on_shapes):
+            groups.setdefault((use.file, use.raw), []).append(use)
+        else:
+            left.append((use.name, NO_SHAPE))
+    for number, group in enumerate(groups.values()):
+        progress("textures", number, len(groups))
+        file = _file_name(group[0], {texture.file for texture in textures})
+        pixels = read_pixels(again.state.nodes[group[0].node].props)
+        found = _convert(before, parsed, group, pixels, target_psnr, iterations)
+        if isinstance(found, str):
+            left += [(use.name, found) for use in group]
+            continue
+        found.gaussians.save(work / file)
+        made |= {use.node: file for use in group}
+        textures.append(_describe(group, file, found))
+    progress("textures", len(groups), len(groups))
+    _rewrite(again, made, work, target)
+    (work / SCENE).write_text(_to_xml(again), encoding="utf-8")
+    seen = list[float]()
+    if spp != 0:
+        after = mi.load_file(str(work / SCENE))
+        seen = compare_renderings(before, after, work, spp, progress)
+    return textures, left, seen
 
 
 # --- The textures --------------------------------------------------------------------------------
@@ -240,7 +265,7 @@ def _convert(
             wrap_mode=[use.wrap for use in group],
             encoding="linear",
         )
-    except ValueError as error:
+    except (Unsuitable, ImageError) as error:
         return str(error)
     if _memory(found.gaussians) >= pixels.size:
         return f"{len(found.gaussians):,} Gaussians take more memory than its texels"
@@ -299,7 +324,7 @@ def _rewrite(parsed: Parsed, made: dict[int, str], work: Path, target: Path) -> 
         for key in file_keys(props):
             path = Path(props[key])
             if path.is_absolute() and path.exists():
-                props[key] = os.path.relpath(path, target.resolve())
+                props[key] = os.path.relpath(path, target)
 
 
 def _to_xml(parsed: Parsed) -> str:
@@ -354,8 +379,6 @@ def render_in_passes(
 
 LOUDER = 8.0
 """Factor of the differences in their pictures."""
-
-Progress = Callable[[str, int, int], None]
 
 
 def compare_renderings(

@@ -37,6 +37,7 @@ from ..image.metrics import psnr as psnr_of
 from ..plugins.cone import PIXEL
 from ..plugins.versions import Texture
 from ..raster.render import render
+from .bitmaps import Unsuitable
 from .target import MARGIN, error_weights, seen_by, smoothest_target
 from .visibility import Visibility, visibility
 
@@ -272,7 +273,7 @@ def _search_count(
 
     Raises
     ------
-    ValueError
+    Unsuitable
         If the number `most` does not suffice.
     """
     tried: list[tuple[int, float]] = []
@@ -286,7 +287,7 @@ def _search_count(
         if lowest >= bound:
             high, best = count, (gaussians, reached)
         elif count == most:
-            raise ValueError(
+            raise Unsuitable(
                 f"{most} Gaussians reach {lowest:.1f} dB, but the cameras shall see {bound:g} dB; "
                 "lower the PSNR, or allow more Gaussians or iterations"
             )

@@ -26,6 +26,7 @@ from ..plugins.cone import PIXEL
 from ..plugins.properties import WRAPS, to_uv
 from ..plugins.versions import Interaction, Texture, texture_class
 from ..raster.lookup.points import fold
+from .bitmaps import Unsuitable
 
 SPACING = 0.5
 """Largest distance of neighbouring rays in texels, so that rays hit each texel."""
@@ -241,7 +242,7 @@ def visibility(
         np.minimum(footprint, _min_footprint(hits, width, height), out=footprint)
         lookups.append(_rows(hits, width, height))
     if not lookups:
-        raise ValueError(
+        raise Unsuitable(
             f"no pixel of the scene's {len(scene.sensors())} cameras sees {_name(texture)}; check "
             "where the cameras look, and what hides the texture"
         )

@@ -1,6 +1,8 @@
 """Files of arrays, whole or not at all. NumPy only.
 
-- ``atomic``: replaces a file in one step; a folder for one run at a time; readers by format
+- ``locks``: one writer for a file or a folder
+- ``atomic``: files and folders that appear in one step; readers by format
 - ``npz``: arrays with a format, a version and checks
+- ``settings``: the options on which a result depends
 - ``checkpoint``: the work of an unfinished training
 """

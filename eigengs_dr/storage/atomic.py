@@ -1,31 +1,26 @@
-"""Files that are replaced in one step, a folder for one process, and who reads which file."""
+"""Files and folders that appear in one step, and who reads which file."""
 
 from __future__ import annotations
 
-import errno
 import os
-import platform
-import re
 import secrets
-import time
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import Any, NamedTuple
 
-TEMPORARY = re.compile(r"\.[0-9a-f]{16}")
-"""Names of temporary files, without their suffix."""
-
-STALE_SECONDS = 60.0
-"""Age from which on a temporary file is what a killed process left; a write takes milliseconds, and
-its file is young until the end."""
+from ..backend.ending import undone_at_end
+from .locks import PREFIX, hold
 
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Replace a file in one step: write a temporary file, then rename it to the target.
 
-    Readers see the old file or the new file, never a part of it, even after a crash.
+    Readers see the old file or the new file, never a part of it, even after a crash. Who may read
+    and write the old file may do so with the new one.
 
     Parameters
     ----------
@@ -50,38 +45,63 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     >>> with atomic_write("/tmp/note.txt") as temporary:
     ...     _ = temporary.write_text("whole")
     """
-    target, temporary = _target(path)
-    try:
+    target = _target(path)
+    with _names(path), _temporary(target, path) as temporary:
         # tempfile would make a file that only its owner may read.
-        temporary.touch(exist_ok=False)
+        mode = target.stat().st_mode & 0o777 if target.exists() else 0o666
+        temporary.touch(mode | 0o200, exist_ok=False)
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
+        if target.exists():
+            shutil.copymode(target, temporary)
         os.replace(temporary, target)
-    except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink()
-        if isinstance(error, OSError) and error.filename in (None, str(temporary)):
-            # The error has no name, as that of a full disk, or the name of the temporary file.
-            raise OSError(error.errno, error.strerror or str(error), str(path)) from error
-        raise
 
 
-def remove_stale(folder: Path) -> None:
-    """Delete the temporary files of processes that were killed while they wrote.
+@contextmanager
+def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Make a folder in one step, as `atomic_write` replaces a file.
 
     Parameters
     ----------
-    folder : Path
-        A folder of results. Files younger than `STALE_SECONDS` stay: they may be written now. So do
-        folders, in which work may go on for long, and what cannot be deleted.
+    path : str or os.PathLike
+        The target, which is missing or an empty folder. A symbolic link is followed.
+
+    Yields
+    ------
+    Path
+        An empty folder beside the target, with a hidden name.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be made. The message names the target.
     """
-    now = time.time()
-    for path in folder.glob(".*"):
-        if TEMPORARY.fullmatch(path.stem) and path.is_file():
-            with suppress(OSError):
-                if now - path.stat().st_mtime > STALE_SECONDS:
-                    path.unlink()
+    target = Path(os.path.realpath(path))
+    with _names(path), _temporary(target, path) as temporary:
+        temporary.mkdir()
+        yield temporary
+        if target.exists():  # Windows replaces no folder
+            target.rmdir()
+        os.replace(temporary, target)
+
+
+def remove_folder(path: Path) -> None:
+    """Delete a folder in one step, with all that it holds."""
+    with _temporary(path, path) as temporary:
+        os.replace(path, temporary)
+
+
+def remove_stale(folder: Path) -> None:
+    """Delete what killed processes left in a folder: temporary files and folders, and locks.
+
+    What a process still works on is locked, and stays; so does what cannot be deleted.
+    """
+    for path in folder.glob(f"{PREFIX}*"):
+        name = path.name.removesuffix(".lock")
+        with suppress(OSError), hold(folder / f"{name}.lock", path, 0) as locked:
+            if locked:
+                _delete(folder / name)
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:
@@ -97,14 +117,9 @@ def require_writable(path: str | os.PathLike[str]) -> None:
     OSError
         If the file cannot be written: one line that names the file and the reason.
     """
-    target, probe = _target(path)
-    try:
-        # Mode bits do not show read-only disks, quotas and access lists.
-        probe.touch(exist_ok=False)
-        probe.unlink()
-    except OSError as error:
-        reason = f"cannot create a file in {target.parent} ({error.strerror})"
-        raise OSError(f"{path}: {reason}; choose another path") from error
+    # Mode bits do not show read-only disks, quotas and access lists.
+    with _temporary(_target(path), path):
+        pass
 
 
 def refuse_url(path: str | os.PathLike[str]) -> None:
@@ -117,85 +132,50 @@ def refuse_url(path: str | os.PathLike[str]) -> None:
         raise OSError(f"{path}: results cannot be written to URLs; write to a folder, and copy it")
 
 
-def _target(path: str | os.PathLike[str]) -> tuple[Path, Path]:
-    """Follow links to a target, and name a temporary file beside it.
-
-    A target that must not be replaced, such as /dev/null, is refused.
-    """
+def _target(path: str | os.PathLike[str]) -> Path:
+    """Follow links to a target; refuse one that must not be replaced, such as /dev/null."""
     refuse_url(path)
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
         kind = "a folder" if target.is_dir() else "a device"
         raise OSError(f"{path}: is {kind}; choose another path")
-    return target, target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
-
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
-NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
-"""Errors of file systems without locks."""
+    return target
 
 
 @contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
-    """Hold the file ``.lock`` of a folder during a block.
+def _temporary(target: Path, output: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield an unused name beside a target, and delete what has this name after the block.
 
-    The operating system frees the lock when the process ends, however it ends. Network file systems
-    (NFS from version 4 on, Lustre with ``flock``) lock between machines too. On a file system
-    without locks the block runs without a lock. So it does on Windows, without the file too: it
-    could not be deleted while it is open.
-
-    Parameters
-    ----------
-    folder : Path
-        An existing folder.
-
-    Raises
-    ------
-    OSError
-        If another run holds the lock: one line that names the folder and the run. If the file
-        cannot be created.
+    The name is locked, so that `remove_stale` knows what nobody works on any more.
     """
-    if fcntl is None:
-        yield
-        return
-    path = folder / ".lock"
-    with _locked(path) as file:
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {platform.node()}")
-        file.flush()
+    path = target.with_name(f"{PREFIX}{secrets.token_hex(8)}{target.suffix}")
+    with hold(path.with_name(f"{path.name}.lock"), output), undone_at_end(partial(_delete, path)):
         try:
-            yield
+            yield path
         finally:
-            path.unlink(missing_ok=True)  # before the lock goes: a later run makes a new file
+            _delete(path)
 
 
-def _locked(path: Path) -> TextIO:
-    """Open the lock file and lock it."""
-    file = path.open("a+", errors="replace")
+def _delete(path: Path) -> None:
+    """Delete a file or a folder, if there is one and it can be deleted."""
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
+
+
+@contextmanager
+def _names(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Put the name of a target into errors that have none, or that of a temporary file."""
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        with file:
-            file.seek(0)
-            holder = file.read(200) or "another process"
-        raise OSError(
-            f"{path.parent}: {holder} writes into this folder; wait for its end, or use another "
-            "folder"
-        ) from None
+        yield
     except OSError as error:
-        if error.errno not in NO_LOCKS:
-            file.close()
+        # That of a full disk has no name.
+        name = os.path.basename(str(error.filename or ""))
+        if error.errno is None or (name and not name.startswith(PREFIX)):
             raise
-    # The run before may have deleted the file between the two calls.
-    with suppress(FileNotFoundError):
-        if os.path.samestat(path.stat(), os.fstat(file.fileno())):
-            return file
-    file.close()
-    return _locked(path)
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
 
 
 class Reader(NamedTuple):

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.ending import undone_at_end
 from . import npz
-from .atomic import atomic_write
+from .atomic import atomic_folder, remove_folder, remove_stale
+from .locks import lock_output
+from .settings import Settings, difference, to_json
 
 FORMAT, VERSION = "eigengs_dr.checkpoint", 1
 
@@ -20,20 +25,82 @@ MAX_ENTRIES = 1 << 31
 """Largest number of elements of one array; the components of large images need so large a limit."""
 
 
-class Checkpoint:
-    """A folder with the named sets of arrays of one run.
+HEAD = "run.json"
+"""Name of the file of settings and images; it is there as soon as the folder is."""
 
-    As a context manager it deletes the folder at the end of the block. If the block raises, the
-    folder stays, unless it holds no work.
+
+@contextmanager
+def open_checkpoint(
+    output: str | os.PathLike[str], settings: Settings, files: list[str]
+) -> Iterator[Checkpoint]:
+    """Hold the lock of an output during a block, and the folder with the work of its run.
+
+    The folder is deleted at the end of the block. If the block raises, it stays, unless it holds no
+    work. What a run left that was killed before it kept anything, or while it deleted the folder,
+    is begun anew.
 
     Parameters
     ----------
     output : path-like
-        The file of the model; the folder has the same name with ".checkpoint" added.
+        The file of the result; the folder has the same name with ".checkpoint" added.
     settings : dict
         Options on which the result depends, with values that JSON can hold.
     files : list of str
         Images to train on. If the folder exists, its list replaces this one.
+
+    Raises
+    ------
+    ValueError
+        If the folder belongs to a run with other settings, or holds other files.
+    OSError
+        If another run writes the output, or the folder cannot be created.
+    """
+    folder = Path(f"{os.fspath(output)}.checkpoint")
+    with lock_output(output):
+        remove_stale(folder.absolute().parent)
+        checkpoint = _resumed(folder, to_json(settings))
+        if checkpoint is None:
+            with atomic_folder(folder) as temporary:
+                head = {"settings": to_json(settings), "files": files}
+                (temporary / HEAD).write_text(json.dumps(head), encoding="utf-8")
+            checkpoint = Checkpoint(folder, files, resumed=False)
+        try:
+            with undone_at_end(checkpoint.close):
+                yield checkpoint
+        except BaseException:
+            checkpoint.close()
+            raise
+        with suppress(OSError):
+            remove_folder(folder)
+
+
+def _resumed(folder: Path, settings: Settings) -> Checkpoint | None:
+    """Return the checkpoint that a folder holds; delete a folder that holds none."""
+    if not folder.exists():
+        return None
+    remove_stale(folder)
+    try:
+        head = json.loads((folder / HEAD).read_text(encoding="utf-8"))
+        known, files = dict(head["settings"]), [str(name) for name in head["files"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        is_ours = folder.is_dir() and all(
+            path.suffix == ".npz" or path.name == HEAD for path in folder.iterdir()
+        )
+        if not is_ours:
+            raise ValueError(f"{folder}: not a readable checkpoint; move it away") from None
+        remove_folder(folder)
+        return None
+    if different := difference(known, settings):
+        raise ValueError(
+            f"{folder}: holds an interrupted run with {different}; use its settings, or delete "
+            "the folder"
+        )
+    return Checkpoint(folder, files, resumed=True)
+
+
+@dataclass
+class Checkpoint:
+    """A folder with the named sets of arrays of one run, see `open_checkpoint`.
 
     Attributes
     ----------
@@ -42,51 +109,17 @@ class Checkpoint:
         Images of the run, in the order of its first start.
     resumed : bool
         Whether the folder existed, so that the run continues an earlier run.
-
-    Raises
-    ------
-    ValueError
-        If the folder belongs to a run with other settings, or is damaged.
-    OSError
-        If the folder cannot be created.
     """
 
-    def __init__(
-        self, output: str | os.PathLike[str], settings: dict[str, Any], files: list[str]
-    ) -> None:
-        # JSON has no tuples, and no numbers of NumPy.
-        settings = json.loads(json.dumps(settings, default=lambda number: number.item()))
-        self.folder = Path(f"{os.fspath(output)}.checkpoint")
-        self.files = files
-        self.resumed = self.folder.exists()
-        head = self.folder / "run.json"
-        if not self.resumed:
-            self.folder.mkdir()
-            with atomic_write(head) as temporary:
-                temporary.write_text(json.dumps({"settings": settings, "files": files}))
-            return
-        try:
-            found = json.loads(head.read_text())
-            known, self.files = found["settings"], [str(name) for name in found["files"]]
-        except (OSError, ValueError, KeyError, TypeError):
-            raise ValueError(
-                f"{self.folder}: not a readable checkpoint; delete the folder to start again"
-            ) from None
-        different = [key for key in settings if known.get(key) != settings[key]]
-        if different:
-            key = different[0]
-            raise ValueError(
-                f"{self.folder}: holds an interrupted run with {key} {known.get(key)} "
-                f"instead of {settings[key]}; use its settings, or delete the folder"
-            )
+    folder: Path
+    files: list[str]
+    resumed: bool
 
-    def __enter__(self) -> Checkpoint:
-        return self
-
-    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        """Delete the folder if the block ended without an error or nothing was saved."""
-        if error is None or not self.holds_work:
-            shutil.rmtree(self.folder, ignore_errors=True)
+    def close(self) -> None:
+        """Delete the folder if it holds no work."""
+        if not self.holds_work:
+            with suppress(OSError):
+                remove_folder(self.folder)
 
     @property
     def holds_work(self) -> bool:

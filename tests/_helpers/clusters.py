@@ -154,7 +154,7 @@ def patch_write(replacement):
     from eigengs_dr.collection import run
     from eigengs_dr.gaussian.file import write
 
-    run.write = lambda path, data: replacement(write, path, data)
+    run.write = lambda *arguments: replacement(write, *arguments)
 
 
 def mend_writes():
@@ -168,9 +168,9 @@ def mend_writes():
 def slow_writes():
     """Let every write of a result take long, in this process."""
 
-    def slow(write, path, data):
+    def slow(write, *arguments):
         time.sleep(0.5)
-        write(path, data)
+        write(*arguments)
 
     patch_write(slow)
 
@@ -182,11 +182,11 @@ class DieInWrite(WorkerPlugin):
         self.file = name
 
     def setup(self, worker):
-        def die(write, path, data):
+        def die(write, path, *arguments):
             if path.name == self.file:
-                path.with_name(".0123456789abcdef.npz").write_bytes(b"half")
+                path.with_name(".eigengs_dr-0123456789abcdef.npz").write_bytes(b"half")
                 os.kill(os.getpid(), signal.SIGKILL)
-            write(path, data)
+            write(path, *arguments)
 
         patch_write(die)
 

@@ -16,6 +16,7 @@ from eigengs_dr.backend.executor import Done
 from eigengs_dr.blocks.draw import BAND_PIXELS, draw_region, save_region
 from eigengs_dr.fitting.memory import estimate_memory
 from eigengs_dr.gaussian.file import read
+from eigengs_dr.storage.checkpoint import read_arrays, write_arrays
 
 
 def near_borders(side, block, distance):
@@ -275,6 +276,18 @@ def test_a_round_with_a_hole_is_taken_again(tmp_path, part):
 
     assert_same_bits(whole, eg.fit_large(mosaic(64), output, progress=note, **settings))
     assert rows == sorted(rows) and rows[-1] == 4 * 32
+
+
+def test_a_run_goes_on_beside_another_processor(tmp_path):
+    """Its sums differ in the last bits; the run goes on with those of the first call."""
+    pixels, output = mosaic(128), tmp_path / "a.npz"
+    whole = eg.fit_large(pixels, **FEW)
+    stop_after(output, pixels, "fit", 0.5)
+    survey = tmp_path / "a.npz.checkpoint" / "survey.npz"
+    figures = read_arrays(survey)["figures"]
+    write_arrays(survey, {"figures": figures * (1 + 1e-7)})
+    again = eg.fit_large(pixels, output, **FEW)
+    assert again.resumed >= 1 and again.psnr_rgb == pytest.approx(whole.psnr_rgb, abs=1e-3)
 
 
 def test_folder_of_another_run_is_refused(tmp_path):

@@ -15,6 +15,7 @@ from eigengs_dr.backend.selection import BackendError, select
 from eigengs_dr.cli.fit import DEFAULT_BASIS
 from eigengs_dr.cli.main import main
 from eigengs_dr.eigenbasis.eigengs import SHIPPED
+from eigengs_dr.storage.locks import lock_output
 
 QUICK = ("--gaussians", 20, "--iterations", 1)
 
@@ -152,6 +153,8 @@ def test_interrupts(photo, tmp_path, interrupts, case, monkeypatch):
     if case == "whole":
         assert json.loads((tmp_path / "r.json").read_text())["stopped"] == "interrupted"
         assert len(eg.Gaussians.load(out)) == 20
+    if case == "blocks":
+        assert json.loads((tmp_path / "r.json").read_text())["stopped"] == "interrupted"
     if case == "many":
         assert len(json.loads((tmp_path / "r.json").read_text())["images"]) == 1
 
@@ -184,21 +187,23 @@ def test_a_model_is_never_replaced(trained, photo, tmp_path, monkeypatch, option
     assert (tmp_path / "photo.npz").read_bytes() == before
 
 
-@pytest.mark.parametrize("options", [[], ["-o", "photo.npz"], ["--blocks", 32]])
-def test_a_result_is_kept(photo, tmp_path, monkeypatch, options):
-    """As those of several images are; nothing else is written either."""
+@pytest.mark.parametrize("options", [[], ["-o", "photo.npz", "--overwrite"], ["--blocks", 32]])
+def test_a_result_is_written_anew(photo, tmp_path, monkeypatch, options):
+    """As `render`, `pack` and `train` do; so a killed run is repeated by the same command."""
     monkeypatch.chdir(tmp_path)
     command = ["fit", photo, *options, "--gaussians", 20, "--iterations"]
     succeeded(run(*command, 1))
     before = (tmp_path / "photo.npz").read_bytes()
-    again = succeeded(run(*command, 2, "--report", "r.json"))
-    line = "eigengs-dr: photo.npz: exists and is kept; --overwrite fits it again\n"
-    assert (again.stdout, again.stderr) == ("", line)
-    assert succeeded(run(*command, 2, "--quiet")).output == ""
-    assert (tmp_path / "photo.npz").read_bytes() == before
-    assert not (tmp_path / "r.json").exists()
-    succeeded(run(*command, 2, "--overwrite"))
+    succeeded(run(*command, 2, "--report", "r.json"))
     assert (tmp_path / "photo.npz").read_bytes() != before
+    assert json.loads((tmp_path / "r.json").read_text())["iterations"] == 2
+    assert {path.name for path in tmp_path.iterdir()} == {"photo.png", "photo.npz", "r.json"}
+
+
+def test_a_second_run_into_one_file_says_who_writes(photo, existing):
+    with lock_output(existing):
+        told = run("fit", photo, "-o", existing, *QUICK)
+    assert_refused(told, "existing.npz: process", "writes into this file; wait for its end")
 
 
 # --- From an eigenbasis ---

@@ -164,7 +164,7 @@ def test_mistakes_of_convert(scene, tmp_path):
     for arguments, words in (
         ([bad, "-o", tmp_path / "new"], "scene.xml: "),
         ([tmp_path / "none.xml", "-o", tmp_path / "new"], "does not exist"),
-        ([bad, "-o", tmp_path / "a" / "b"], "cannot create a folder"),
+        ([bad, "-o", tmp_path / "a" / "b"], "cannot create a file"),
     ):
         assert_refused(run("convert", *arguments), words)
         assert list(tmp_path.iterdir()) == [bad]

@@ -296,7 +296,6 @@ def test_a_folder_that_grew_meanwhile(folder, output, tmp_path, in_pieces):
 @pytest.mark.parametrize(
     ("stage", "call", "name"),
     [
-        ("components", 8, "run.json"),
         ("components", 8, "pca-0.npz"),
         ("weights", 1, "basis.npz"),
         ("shapes", 3, "shapes-0.npz"),

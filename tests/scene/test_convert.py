@@ -1,5 +1,6 @@
 """A scene whose bitmaps become Gaussians: what is converted, what stays, and mistakes."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import eigengs_dr as eg
 from _helpers.bitmap_scenes import cornell, room, save_images, sky, wall
 from _helpers.poster import mi
 from eigengs_dr.image.io import load_image
+from eigengs_dr.storage.locks import lock_output
 
 pytestmark = pytest.mark.mitsuba
 
@@ -100,7 +102,7 @@ def test_mistakes(folder, tmp_path):
     good = wall(folder)
     for scene, target, settings, error, words in (
         (good, tmp_path / "full", {}, ValueError, "exists and is not empty"),
-        (good, tmp_path / "a" / "b", {}, OSError, "cannot create a folder in"),
+        (good, tmp_path / "a" / "b", {}, OSError, "cannot create a file in"),
         (good, tmp_path / "new", {"target_psnr": 70}, ValueError, "target_psnr is 70"),
         (tmp_path / "bad.xml", tmp_path / "new", {}, RuntimeError, "pars"),
         (tmp_path / "shape.xml", tmp_path / "new", {}, ValueError, "holds no scene"),
@@ -109,6 +111,38 @@ def test_mistakes(folder, tmp_path):
         with pytest.raises(error, match=words):
             eg.convert_scene(scene, target, **settings)
         assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_link_to_a_folder_is_followed(folder, tmp_path):
+    """What a killed run left beside the folder goes."""
+    stale = tmp_path / ".eigengs_dr-0123456789abcdef"
+    stale.mkdir()
+    (stale / "photo.npz").write_bytes(b"half")
+    link, real = tmp_path / "link", tmp_path / "real"
+    link.symlink_to(real, target_is_directory=True)
+    for make in (lambda: None, real.mkdir):
+        make()
+        found = eg.convert_scene(wall(folder), link, spp=0, target_psnr=20, iterations=1)
+        assert found.scene == link / "scene.xml" and found.scene.exists()
+        assert sorted(tmp_path.iterdir()) == [link, real] and link.is_symlink()
+        shutil.rmtree(real)
+    real.write_text("")
+    with pytest.raises(ValueError, match="link: exists and is not empty"):
+        eg.convert_scene(wall(folder), link)
+
+
+def test_two_runs_into_one_folder(folder, tmp_path):
+    with (
+        lock_output(tmp_path / "new"),
+        pytest.raises(OSError, match=r"new: process \d+ on .*; wait for its end"),
+    ):
+        eg.convert_scene(wall(folder), tmp_path / "new", spp=0, **QUICK)
+
+
+def test_an_error_is_no_reason_to_leave_a_bitmap(folder, tmp_path):
+    with pytest.raises(ValueError, match="iterations is -1"):
+        eg.convert_scene(wall(folder), tmp_path / "new", iterations=-1)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_cornell_box(folder, tmp_path):

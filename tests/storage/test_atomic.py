@@ -1,18 +1,19 @@
-"""Files that are replaced in one step, and a folder for one run."""
+"""Files and folders that appear in one step, one writer for each, and what killed runs leave."""
 
 import errno
 import os
-import time
 
 import pytest
 
+from _helpers.process import python_path, run_python
 from eigengs_dr.storage.atomic import (
-    STALE_SECONDS,
+    atomic_folder,
     atomic_write,
-    lock_folder,
+    remove_folder,
     remove_stale,
     require_writable,
 )
+from eigengs_dr.storage.locks import lock_folder, lock_output
 
 
 @pytest.fixture
@@ -81,27 +82,75 @@ def test_what_cannot_be_written_is_named(tmp_path, path, message):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_old_temporary_files_go(target):
-    """Young ones, folders and other names stay."""
-    stale = ["." + 16 * "a" + ".npz", "." + 16 * "b" + ".txt"]
-    kept = ["." + 16 * "c" + ".npz", ".hidden", "." + 16 * "d"]
-    for name in [*stale, *kept[:2]]:
-        target.with_name(name).write_text("")
-    target.with_name(kept[2]).mkdir()
-    for name in [*stale, *kept[1:], "x.txt"]:
-        os.utime(target.with_name(name), (0, 0))
-    young = target.with_name(kept[0])
-    os.utime(young, (time.time() - STALE_SECONDS / 2,) * 2)
-    remove_stale(target.parent)
-    assert sorted(names(target)) == sorted([*kept, "x.txt"])
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such modes")
+@pytest.mark.parametrize("mode", [0o600, 0o664, 0o444])
+def test_a_replaced_file_keeps_its_mode(target, mode):
+    target.chmod(mode)
+    with atomic_write(target) as temporary:
+        assert not temporary.stat().st_mode & 0o777 & ~(mode | 0o200)  # nor do others read it now
+        temporary.write_text("new")
+    assert target.stat().st_mode & 0o777 == mode and target.read_text() == "new"
 
 
-def test_a_folder_has_one_run(tmp_path):
-    with lock_folder(tmp_path):
-        message = rf"process {os.getpid()} on .* writes into this folder; wait"
-        with pytest.raises(OSError, match=message), lock_folder(tmp_path):
-            pass
-        assert os.listdir(tmp_path) == [".lock"]
-    assert os.listdir(tmp_path) == []
-    with lock_folder(tmp_path):
+def test_a_folder_appears_whole_and_goes_whole(target):
+    folder = target.with_name("made")
+    link = target.with_name("link")
+    link.symlink_to(folder, target_is_directory=True)
+    with pytest.raises(ValueError, match="stop"), atomic_folder(link) as temporary:
+        (temporary / "a").touch()
+        raise ValueError("stop")
+    assert sorted(names(target)) == ["link", "x.txt"]
+    with atomic_folder(link) as temporary:
+        (temporary / "a").touch()
+        assert not folder.exists()
+    assert os.listdir(folder) == ["a"] and link.is_symlink()
+    remove_folder(folder)
+    assert sorted(names(target)) == ["link", "x.txt"]
+
+
+KILLED = """
+import os
+from pathlib import Path
+from eigengs_dr.storage.atomic import atomic_folder, atomic_write
+from eigengs_dr.storage.locks import lock_output
+folder = Path({folder!r})
+with lock_output(folder / "y.txt"), atomic_folder(folder / "made") as made:
+    (made / "half").touch()
+    with atomic_write(folder / "y.txt") as temporary:
+        temporary.write_text("half")
+        os.kill(os.getpid(), 9)
+"""
+
+
+def test_what_killed_processes_left_goes_at_once(target):
+    """Not what is worked on, nor what is of somebody else."""
+    code = KILLED.format(folder=str(target.parent))
+    run_python(code, PYTHONPATH=python_path())
+    assert len([name for name in names(target) if name.startswith(".eigengs_dr-")]) == 5
+    target.with_name(".0123456789abcdef.npz").touch()
+    with atomic_write(target) as temporary, atomic_folder(target.with_name("made")) as made:
+        temporary.write_text("new")
+        remove_stale(target.parent)
+        assert temporary.exists() and made.exists()
+    assert sorted(names(target)) == [".0123456789abcdef.npz", "made", "x.txt"]
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_an_output_has_one_run(target, kind):
+    path, lock = (target.parent, lock_folder) if kind == "folder" else (target, lock_output)
+    with lock(path):
+        message = rf"{path}: process {os.getpid()} on .* writes into this {kind}; wait for its end"
+        for _ in range(2):
+            with pytest.raises(OSError, match=message), lock(path):
+                pass
+        assert len(names(target)) == 2
+    assert names(target) == ["x.txt"]
+    with lock(path):
+        pass
+
+
+def test_links_to_one_file_have_one_lock(target):
+    link = target.with_name("link.txt")
+    link.symlink_to(target)
+    with lock_output(link), pytest.raises(OSError, match=r"x\.txt: process"), lock_output(target):
         pass

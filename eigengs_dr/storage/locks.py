@@ -1,0 +1,124 @@
+"""One writer for a file or a folder: locks that the operating system frees with the process."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import platform
+import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from pathlib import Path
+
+from ..backend.ending import undone_at_end
+
+PREFIX = ".eigengs_dr-"
+"""First characters of the names of temporary files and of locks beside outputs."""
+
+NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
+"""Errors of file systems without locks."""
+
+WAIT, POLL = 0.3, 0.02
+"""Seconds to wait for a lock, since another run may be about to end, and between two looks."""
+
+
+@contextmanager
+def hold(path: Path, output: str | os.PathLike[str], wait: float = WAIT) -> Iterator[bool]:
+    """Hold the lock of an output during a block, by a file that is made and deleted.
+
+    The operating system frees the lock when the process ends, however it ends. Network file systems
+    (NFS from version 4 on, Lustre with ``flock``) lock between machines too.
+
+    Parameters
+    ----------
+    path : Path
+        The lock file, in an existing folder.
+    output : path-like
+        The file or the folder that the lock is of, for the error.
+    wait : float, optional
+        Seconds until another holder is an error.
+
+    Yields
+    ------
+    bool
+        False on a file system without locks, where the block runs without one.
+
+    Raises
+    ------
+    OSError
+        If another run holds the lock: one line that names the output and the run. If the file
+        cannot be created.
+    """
+    descriptor, locked = _open_locked(path, output, wait)
+    with undone_at_end(path.unlink):
+        try:
+            yield locked
+        finally:
+            # Before the lock goes: a later run makes a new file.
+            with suppress(OSError):
+                path.unlink()
+            os.close(descriptor)
+            if os.name == "nt":  # Windows deletes no file that is open
+                with suppress(OSError):
+                    path.unlink()
+
+
+def _open_locked(path: Path, output: str | os.PathLike[str], wait: float) -> tuple[int, bool]:
+    """Open and lock a file; write into it who holds it."""
+    from filelock import lock_descriptor  # takes 0.1 s, and the help of commands writes nothing
+
+    deadline = time.monotonic() + wait
+    while True:
+        try:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError as error:
+            reason = f"cannot create a file in {path.parent} ({error.strerror})"
+            raise OSError(f"{os.fspath(output)}: {reason}; choose another path") from error
+        try:
+            locked = lock_descriptor(descriptor, blocking=False)
+            # The run before may have deleted the file between the two calls.
+            if locked and _is_file(path, descriptor):
+                os.ftruncate(descriptor, 0)
+                # Windows locks the first byte against readers.
+                os.write(descriptor, f"\0process {os.getpid()} on {platform.node()}".encode())
+                return descriptor, True
+            os.lseek(descriptor, 1, os.SEEK_SET)
+            holder = "" if locked else os.read(descriptor, 200).decode(errors="replace")
+        except OSError as error:
+            if error.errno in NO_LOCKS:
+                return descriptor, False
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
+        if not locked:
+            if time.monotonic() >= deadline:
+                kind = "folder" if os.path.isdir(output) else "file"
+                raise OSError(
+                    f"{os.fspath(output)}: {holder or 'another process'} writes into this {kind}; "
+                    f"wait for its end, or use another {kind}"
+                )
+            time.sleep(POLL)
+
+
+def _is_file(path: Path, descriptor: int) -> bool:
+    """Return whether a path still names the file that is open."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+
+
+def lock_output(output: str | os.PathLike[str]) -> AbstractContextManager[bool]:
+    """Let one run write a file or a folder, by a hidden file beside it, during a block; see `hold`.
+
+    The output need not exist; links are followed.
+    """
+    real = Path(os.path.realpath(output))
+    name = hashlib.sha256(os.fsencode(real.name)).hexdigest()[:16]
+    return hold(real.with_name(f"{PREFIX}{name}.lock"), output)
+
+
+def lock_folder(folder: Path) -> AbstractContextManager[bool]:
+    """Let one run write into an existing folder, by a file in it, during a block; see `hold`."""
+    return hold(folder / ".lock", folder)

@@ -1,0 +1,195 @@
+"""Kill commands at random times, and count what does not go as the manual says.
+
+Each trial starts a command on tiny inputs, sends it a signal after a random time, and runs the same
+command once more. Counted are: exit codes other than the manual's, lines beyond one, tracebacks,
+second calls that fail, files that stay after the second call, and results that differ from those of
+a run that nobody interrupted.
+
+    python tools/kill_commands.py --trials 40
+    python tools/kill_commands.py --commands fit,pack --signals TERM --trials 5 --seed 3
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+SCENE = """<scene version="3.0.0">
+  <integrator type="direct"/>
+  <sensor type="perspective">
+    <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="16"/>
+      <integer name="height" value="16"/></film>
+    <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
+  </sensor>
+  <emitter type="constant"/>
+  <shape type="rectangle"><bsdf type="diffuse"><texture name="reflectance" type="bitmap">
+    <string name="filename" value="photo.png"/></texture></bsdf></shape>
+</scene>"""
+
+FIT = ["--gaussians", "20", "--iterations", "3"]
+SMALL = ["--size", "16x16", "--components", "4", "--gaussians", "30"]
+
+
+class Command(NamedTuple):
+    """A command, and the folders and files that it leaves."""
+
+    words: list[str]
+    leaves: set[str]
+
+
+COMMANDS = {
+    "fit": Command(
+        ["fit", "photo.png", "-o", "x.npz", "--preview", "x.png", "--report", "x.json", *FIT],
+        {"x.npz", "x.png", "x.json"},
+    ),
+    "folder": Command(
+        ["fit", "photos", "-o", "fits", "--report", "x.json", *FIT], {"fits", "x.json"}
+    ),
+    "large": Command(
+        ["fit", "photo.png", "-o", "x.npz", "--blocks", "32", "--iterations", "3"], {"x.npz"}
+    ),
+    "train": Command(
+        ["train", "photos", "-o", "m.npz", "--report", "x.json", *SMALL], {"m.npz", "x.json"}
+    ),
+    "convert": Command(
+        ["convert", "scene.xml", "-o", "new", "--target-psnr", "25", "--iterations", "3"],
+        {"new"},
+    ),
+    "pack": Command(["pack", "set.npz", "-o", "x.egs", "--report", "x.json"], {"x.egs", "x.json"}),
+}
+
+
+def main() -> None:
+    """Run the trials that the options ask for, and print a table of counts."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--commands", default=",".join(COMMANDS))
+    parser.add_argument("--signals", default="KILL,TERM,INT")
+    parser.add_argument("--trials", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        inputs = Path(folder) / "inputs"
+        write_inputs(inputs)
+        for name in options.commands.split(","):
+            kill_often(name, inputs, options)
+
+
+def write_inputs(folder: Path) -> None:
+    """Write two photos, a folder of ten, a scene and a set."""
+    from PIL import Image
+
+    (folder / "photos").mkdir(parents=True)
+    y, x, c = np.mgrid[:64, :64, :3]
+    for number in range(10):
+        waves = 127 + 60 * np.sin(x / (5 + number) + c) + 60 * np.cos(y / 7 + number)
+        image = Image.fromarray(waves.astype(np.uint8))
+        image.resize((32, 32)).save(folder / "photos" / f"{number}.png")
+        if not number:
+            image.save(folder / "photo.png")
+    (folder / "scene.xml").write_text(SCENE)
+    run(["fit", "photo.png", "-o", "set.npz", *FIT], folder)
+
+
+def run(words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    program = [sys.executable, "-m", "eigengs_dr", *words]
+    return subprocess.run(program, cwd=folder, capture_output=True, text=True, timeout=200)
+
+
+def kill_often(name: str, inputs: Path, options: argparse.Namespace) -> None:
+    """Kill one command in all trials of each signal, and print the counts."""
+    words, leaves = COMMANDS[name]
+    with tempfile.TemporaryDirectory() as folder:
+        whole = Path(folder) / "whole"
+        shutil.copytree(inputs, whole)
+        started = time.perf_counter()
+        run(words, whole)
+        seconds = time.perf_counter() - started
+        chance = random.Random(f"{options.seed} {name}")
+        for sent in options.signals.split(","):
+            counts: Counter[str] = Counter()
+            for number in range(options.trials):
+                work = Path(folder) / f"{sent}-{number}"
+                shutil.copytree(inputs, work)
+                faults = kill_once(words, leaves, work, whole, sent, chance.uniform(0, seconds))
+                counts.update(faults or ["right"])
+                for fault in faults:
+                    print(f"  {name} {sent} {number}: {fault}", flush=True)
+                shutil.rmtree(work)
+            kinds = Counter(kind.partition(":")[0] for kind in counts.elements())
+            print(f"{name:8} {sent:5} {seconds:4.1f} s  {dict(kinds)}", flush=True)
+
+
+def kill_once(
+    words: list[str], leaves: set[str], work: Path, whole: Path, sent: str, delay: float
+) -> list[str]:
+    """Interrupt a command after some seconds, run it again, and return what is wrong."""
+    program = [sys.executable, "-m", "eigengs_dr", *words]
+    process = subprocess.Popen(
+        program, cwd=work, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    time.sleep(delay)
+    process.send_signal(getattr(signal, f"SIG{sent}"))
+    _, said = process.communicate(timeout=200)
+    faults = []
+    # Before the first line runs, and after the last, Python itself ends as the system says.
+    code, early = process.returncode, -getattr(signal, f"SIG{sent}")
+    is_own = "/eigengs_dr/" in said or "eigengs-dr" in said
+    starts = not is_own and ((not said and code == early) or "KeyboardInterrupt" in said)
+    lines = [line for line in said.splitlines() if " note: " not in line]
+    if "Traceback" in said and not starts:
+        faults.append(f"traceback: {said.strip().splitlines()[-1][:90]}")
+    elif sent == "KILL":
+        if code not in (0, early):
+            faults.append(f"code: {code}")
+    elif not starts and (code not in (0, 130) or (code == 130 and len(lines) != 1)):
+        faults.append(f"code: {code}, said {said[-200:]!r}")
+    again = run(words, work)
+    if again.returncode:
+        complete = "is not empty" in again.stderr and (work / "new" / "scene.xml").exists()
+        faults += [] if complete else [f"second call: {again.stderr[-300:]!r}"]
+    names = {path.name for path in work.iterdir()} - {path.name for path in whole.iterdir()}
+    hidden = {str(path.relative_to(work)) for path in work.rglob(".*")}
+    if names | hidden:
+        faults.append(f"files: {sorted(names | hidden)}")
+    if not leaves <= {path.name for path in work.iterdir()}:
+        faults.append(f"missing: {sorted(leaves - {path.name for path in work.iterdir()})}")
+    return faults + differences(work, whole)
+
+
+def differences(work: Path, whole: Path) -> list[str]:
+    """Return which results differ from those of a run that nobody interrupted."""
+    faults = []
+    for path in sorted(whole.rglob("*.npz")) + sorted(whole.rglob("*.egs")):
+        other = work / path.relative_to(whole)
+        if not other.exists():
+            faults.append(f"lacks: {other.name}")
+        elif path.suffix == ".egs":
+            faults += [] if other.read_bytes() == path.read_bytes() else [f"differs: {path.name}"]
+        else:
+            with np.load(path) as expected, np.load(other) as found:
+                same = all(np.array_equal(expected[key], found[key]) for key in expected)
+            faults += [] if same else [f"differs: {path.name}"]
+    manifest = work / "fits" / "manifest.jsonl"
+    if manifest.exists():
+        rows = [json.loads(line) for line in manifest.read_text().splitlines()]
+        lost = [row["name"] for row in rows if row["status"] != "done" or row["psnr_rgb"] is None]
+        faults += [f"rows: {lost} not done"] if lost else []
+    return faults
+
+
+if __name__ == "__main__":
+    main()
