@@ -16,8 +16,10 @@ from itertools import islice
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
+from uuid import uuid4
 
 import dask
+from dask.utils import funcname
 from distributed import CancelledError, Client, Future, as_completed
 from distributed.comm import CommClosedError
 from distributed.protocol.pickle import dumps, loads
@@ -153,18 +155,19 @@ class ClusterExecutor:
         suspects: deque[Any] = deque()
         with self._explained(), terminate_as_interrupt():
             # A task, not `scatter`: the scheduler repeats it if the workers that hold it are lost.
-            constant = self._submit(share, dumps((function, shared)), package_versions())
-            with closing(self._run(tasks, constant, AHEAD * self.workers)) as ended:
+            constant = self._submit("share", share, dumps((function, shared)), package_versions())
+            name = funcname(function)
+            with closing(self._run(name, tasks, constant, AHEAD * self.workers)) as ended:
                 for done in ended:
                     if done.lost:  # perhaps by the fault of another task of that worker
                         suspects.append(done.task)
                     else:
                         yield done
-            with closing(self._run(suspects, constant, 1)) as ended:
+            with closing(self._run(name, suspects, constant, 1)) as ended:
                 yield from ended
 
     def _run(
-        self, tasks: Iterable[Any], constant: Future, limit: int
+        self, name: str, tasks: Iterable[Any], constant: Future, limit: int
     ) -> Generator[Done, None, None]:
         """Run tasks, `limit` of them at once."""
         under_way: dict[Future, Any] = {}
@@ -173,7 +176,7 @@ class ClusterExecutor:
         try:
             while True:
                 for task in islice(waiting, limit - len(under_way)):
-                    future = self._submit(run_task, dumps(task), constant)
+                    future = self._submit(name, run_task, dumps(task), constant)
                     under_way[future] = task
                     ended.add(future)
                 try:
@@ -195,9 +198,10 @@ class ClusterExecutor:
     def _watch(self, futures: Iterable[Future]) -> as_completed:
         return as_completed(list(futures), loop=self.client.loop, timeout=NO_WORKER_SECONDS)
 
-    def _submit(self, function: Any, *arguments: Any) -> Future:
+    def _submit(self, name: str, function: Any, *arguments: Any) -> Future:
+        """Submit a task; Dask learns from those of the same name how long it takes."""
         with _SUBMIT_LOCK, dask.config.set(LARGE_TASKS):
-            return self.client.submit(function, *arguments, pure=False)
+            return self.client.submit(function, *arguments, key=f"{name}-{uuid4()}")
 
     def _require_worker(self, otherwise: str) -> None:
         """Wait until there is a worker."""

@@ -13,10 +13,6 @@ from pathlib import Path
 import dask
 from distributed import LocalCluster, Worker
 
-MEMORY = {f"distributed.worker.memory.{limit}": False for limit in ("target", "spill", "pause")}
-"""Setting of Dask. Dr.Jit keeps memory for reuse during a task, so nothing is gained by writing
-results to a disk, or by a wait. A worker that reaches 95 % of its limit is restarted."""
-
 MALLOC = {
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 27,
     "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 25,
@@ -39,7 +35,7 @@ def local_cluster(workers: int, **settings: object) -> LocalCluster:
     preload = [*dask.config.get("distributed.worker.preload"), __name__]
     options = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL, **settings}
     options |= {"n_workers": workers, "threads_per_worker": 1, "processes": True}
-    with dask.config.set(MEMORY | MALLOC):
+    with dask.config.set(MALLOC):
         return LocalCluster(preload=preload, **options)
 
 
@@ -47,6 +43,11 @@ def dask_setup(worker: Worker) -> None:
     """Set up the process of a worker; Dask calls this function before its first task."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes
     choose_gpu(worker.name)
+    # Dr.Jit keeps memory for reuse during a task, so a wait gains nothing, nor does a disk. At 95 %
+    # of its limit a worker is restarted. A configuration would not reach the new process.
+    worker.memory_manager.memory_pause_fraction = False
+    worker.memory_manager.memory_spill_fraction = False
+    worker.memory_manager.memory_target_fraction = False
 
 
 def choose_gpu(name: object) -> None:

@@ -373,7 +373,10 @@ def user_cluster():
         yield cluster, client
 
 
-def test_workers_of_this_machine_are_set_up(executor, client):
+def test_workers_of_this_machine_are_set_up(client):
+    """Also those that were restarted."""
+    client.restart(timeout=60)
+    executor = executor_for(client)
     for entry in executor.map(clusters.state, range(2)):
         during = entry.value
         assert during["threads"] == 1 and during["blas"] == {1}
