@@ -282,8 +282,9 @@ def _summary(
 ) -> list[str]:
     """Describe a fit for a terminal."""
     blocks = f" in {record['blocks']} blocks" if "blocks" in record else ""
+    size, count = f"{record['width']}x{record['height']}", record["gaussians"]
     lines = [
-        f"{name}: {record['width']}x{record['height']}{blocks}, {record['gaussians']:,} Gaussians, "
+        f"{name}: {size}{blocks}, {count:,} Gaussian{'s' * (count != 1)}, "
         f"{record['iterations']} iterations in {record['seconds']:.1f} s"
     ]
     if "seconds_total" in record:

@@ -52,7 +52,7 @@ def test_interruption_leaves_no_thread(tmp_path):
         ({"components": -1}, "components is -1; expected no negative"),
         ({"components": (1, 2)}, r"components is \(1, 2\); expected a number, or three"),
         ({"components": 1.5}, "components is 1.5; expected"),
-        ({"energy": 0}, "energy is 0; expected a share"),
+        ({"energy": 0}, "energy is 0.0; expected a share"),
         ({"energy": float("nan")}, "energy is nan; expected a share"),
         ({"size": (0, 3)}, "size is 0x3"),
         ({"space": "linear"}, "'linear' is unknown; use one of"),
