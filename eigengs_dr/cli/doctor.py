@@ -19,7 +19,7 @@ from .console import MISSED, say, table
 
 @click.command()
 @options.as_json
-@click.option("--gpu", is_flag=True, help="Compare the GPU with llvm, in one to three minutes.")
+@click.option("--gpu", is_flag=True, help="Compare the GPU with llvm, in a few minutes.")
 @click.option("--trial", type=click.Choice(list(ALLOWED)), hidden=True)
 @options.choice("--backend", BACKENDS, "GPU to compare, or where a trial runs.", True)
 @click.pass_context
